@@ -1,0 +1,252 @@
+"""A catalogue of tagged items, users who grow bored, and an optimal policy known exactly."""
+
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+from gymnasium import spaces
+from gymnasium.vector import VectorEnv
+
+from ucfrec.errors import InputError
+from ucfrec.plugins import Simulator
+from ucfrec.rollout import Actor, BoolArray, FloatArray, IntArray
+from ucfrec_simulators.behaviors import Memoryless, SessionMixture, Uniform
+from ucfrec_simulators.sessions import AnyArray, SessionsEnv, draw_categories
+
+CLUSTERS: Final = 8
+FACTORS: Final = 4
+NO_TAG: Final = -1
+
+
+class SyntheticCatalog(SessionsEnv):
+    """One item a step; it is clicked or not; the same tag again too soon ends the session.
+
+    Every item has one tag. User u clicks item i with a probability p(u, i) that never changes: a
+    logistic function of u's taste for i's tag (that of u's cluster plus u's own), of the match of
+    latent factors, and of i's quality. Reward: 1 for a click, else 0. The session terminates in
+    the step whose item has a tag that already occurred among the `boredom_window` − 1 items
+    before (the exit rule of the Kuaishou simulators with threshold 0 and no last-step exception);
+    that step's reward counts. It is truncated after `max_turn` steps. Items may repeat.
+
+    Observation (n_tags + 4,): the user's tastes and factors as the platform knows them, with noise
+    that is fixed for the user. `info["user_id"]` (N,): who is served next, 0 to n_users − 1.
+
+    Raises:
+        InputError: fewer tags than `boredom_window`, or fewer items than tags.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        n_items: int = 200,
+        n_tags: int = 12,
+        n_users: int = 2000,
+        boredom_window: int = 4,
+        max_turn: int = 20,
+        world_seed: int = 0,
+    ) -> None:
+        if not boredom_window <= n_tags <= n_items:
+            raise InputError(
+                f"boredom_window ≤ n_tags ≤ n_items must hold, got {boredom_window}, {n_tags}, "
+                f"{n_items}"
+            )
+        world = np.random.default_rng([world_seed, 31])
+        self.tags: IntArray = world.permutation(np.arange(n_items) % n_tags)
+        """(n_items,) tag of each item."""
+        centres = world.normal(0, 1, (CLUSTERS, n_tags))
+        own = world.normal(0, 0.6, (n_users, n_tags))
+        tastes = centres[world.integers(CLUSTERS, size=n_users)] + own
+        factors = world.normal(0, 1, (n_users, FACTORS))
+        match = factors @ world.normal(0, 1, (FACTORS, n_items)) / np.sqrt(FACTORS)
+        quality = world.normal(0, 0.5, n_items)
+        self.logits = -2.5 + tastes[:, self.tags] + 0.7 * match + quality
+        """(n_users, n_items) log-odds of a click."""
+        self.click_probabilities: npt.NDArray[np.float64] = 1 / (1 + np.exp(-self.logits))
+        """(n_users, n_items)."""
+        known = np.concatenate([tastes, factors], axis=1)
+        self._features = (known + world.normal(0, 0.5, known.shape)).astype(np.float32)
+        self.boredom_window, self.max_turn = boredom_window, max_turn
+        self.users: IntArray = np.zeros(num_envs, dtype=np.int64)
+        """(N,) who is served."""
+        self.turns: IntArray = np.zeros(num_envs, dtype=np.int64)
+        """(N,) items shown so far."""
+        self.recent_tags: IntArray = np.full((num_envs, boredom_window - 1), NO_TAG)
+        """(N, boredom_window − 1) tags just shown, the latest last; −1 where none was."""
+        super().__init__(
+            num_envs,
+            spaces.Box(-np.inf, np.inf, (known.shape[1],), dtype=np.float32),
+            spaces.Discrete(n_items),
+        )
+
+    def item_features(self) -> pa.Table:
+        """One row an item: `item_id` and its tag one-hot as `tag_0`, `tag_1`, …."""
+        hot = np.eye(self.tags.max() + 1, dtype=np.float32)[self.tags]
+        columns = {f"tag_{tag}": pa.array(column) for tag, column in enumerate(hot.T)}
+        return pa.table({"item_id": pa.array(np.arange(len(self.tags))), **columns})
+
+    def favourites(self, probabilities: npt.NDArray[np.float64]) -> IntArray:
+        """The best item of each of the `boredom_window` best tags, the best first.
+
+        Args:
+            probabilities: (M, n_items) click probabilities.
+
+        Returns:
+            (M, boredom_window) items, all of different tags.
+        """
+        by_tag = np.stack(
+            [
+                np.flatnonzero(self.tags == tag)[probabilities[:, self.tags == tag].argmax(1)]
+                for tag in range(self.tags.max() + 1)
+            ],
+            axis=1,
+        )
+        order = np.argsort(-np.take_along_axis(probabilities, by_tag, 1), axis=1, kind="stable")
+        return np.take_along_axis(by_tag, order[:, : self.boredom_window], axis=1)
+
+    def optimal_returns(self) -> npt.NDArray[np.float64]:
+        """What `Rotation` earns in expectation from each user, (n_users,): no policy earns more."""
+        best = np.take_along_axis(
+            self.click_probabilities, self.favourites(self.click_probabilities), axis=1
+        )
+        places = np.arange(self.max_turn - 1) % self.boredom_window
+        return np.asarray(best[:, places].sum(axis=1) + best[:, 0])
+
+    def _begin(self, rows: IntArray) -> None:
+        self.users[rows] = self.np_random.integers(len(self.logits), size=len(rows))
+        self.turns[rows] = 0
+        self.recent_tags[rows] = NO_TAG
+
+    def _play(self, actions: AnyArray) -> tuple[FloatArray, BoolArray, BoolArray]:
+        tags = self.tags[actions]
+        chances = self.click_probabilities[self.users, actions]
+        clicks = self.np_random.random(self.num_envs) < chances
+        bored = (self.recent_tags == tags[:, None]).any(axis=1)
+        self.recent_tags = np.column_stack([self.recent_tags, tags])[:, 1:]
+        self.turns += 1
+        return clicks.astype(np.float32), bored, (self.turns >= self.max_turn) & ~bored
+
+    def _observe(self) -> FloatArray:
+        return self._features[self.users]
+
+    def _describe(self) -> dict[str, AnyArray]:
+        return {"user_id": self.users.copy()}
+
+
+class Rotation(Memoryless):
+    """Each user's favourites in turn, the best again in the last step.
+
+    With the true probabilities it is optimal. Let m₁ ≥ m₂ ≥ … be the user's best probability in
+    each tag, N the boredom window, T = `max_turn`, and S(t) the sum of the first t terms of
+    m₁, …, m_N, m₁, …. Clicks do not change what comes next, so fixed sequences of items suffice.
+    If a sequence ends with step t ≤ T, its first t − 1 steps bored nobody, so any N successive
+    ones of them have different tags: cut into blocks of N from the start, they earn at most
+    S(t − 1), and the last step earns at most m₁. As S grows with t, no sequence earns more than
+    S(T − 1) + m₁. Taking the favourites in turn for T − 1 steps bores nobody and earns S(T − 1);
+    the last step may bore and earns m₁.
+    """
+
+    def __init__(self, world: SyntheticCatalog, favourites: IntArray) -> None:
+        self._world, self._favourites = world, favourites
+
+    def act(
+        self, observations: FloatArray, live: BoolArray
+    ) -> tuple[IntArray, FloatArray | None]:
+        """The next favourite of each user, (N,), with certainty."""
+        world = self._world
+        last = world.turns == world.max_turn - 1
+        place = np.where(last, 0, world.turns % world.boredom_window)
+        chosen = self._favourites[world.users, place]
+        return chosen, np.ones(len(chosen), dtype=np.float32)
+
+
+class SoftmaxGuess(Memoryless):
+    """Epsilon-greedy softmax over log-odds misjudged by a fixed error, exact propensities.
+
+    Args:
+        error: standard deviation of the platform's error about each (user, item) log-odds.
+        temperature: of the softmax.
+        epsilon: share of uniform exploration.
+        variety: log-odds taken off items whose tag was just shown.
+    """
+
+    def __init__(
+        self,
+        world: SyntheticCatalog,
+        seed: int,
+        error: float,
+        temperature: float,
+        epsilon: float,
+        variety: float,
+    ) -> None:
+        self._world = world
+        self._temperature, self._epsilon, self._variety = temperature, epsilon, variety
+        self._generator = np.random.default_rng([seed, 4, round(1000 * error)])
+        self._guess = world.logits + error * self._generator.standard_normal(world.logits.shape)
+
+    def probabilities(self) -> npt.NDArray[np.float64]:
+        """What each session is shown next, (N, n_items)."""
+        world = self._world
+        shown = (world.recent_tags[:, :, None] == world.tags).any(axis=1)
+        scores = (self._guess[world.users] - self._variety * shown) / self._temperature
+        weights = np.exp(scores - scores.max(axis=1, keepdims=True))
+        greedy = weights / weights.sum(axis=1, keepdims=True)
+        return np.asarray((1 - self._epsilon) * greedy + self._epsilon / scores.shape[1])
+
+    def act(self, observations: FloatArray, live: BoolArray) -> tuple[IntArray, FloatArray]:
+        """Draw an item a session, (N,)."""
+        probabilities = self.probabilities()
+        chosen = draw_categories(probabilities, self._generator.random(len(probabilities)))
+        return chosen, probabilities[np.arange(len(chosen)), chosen].astype(np.float32)
+
+
+def _catalog(env: VectorEnv[Any, Any, Any]) -> SyntheticCatalog:
+    if not isinstance(env.unwrapped, SyntheticCatalog):
+        raise InputError(f"this behavior policy serves SyntheticCatalog, not {type(env).__name__}")
+    return env.unwrapped
+
+
+def optimal(env: VectorEnv[Any, Any, Any], seed: int) -> Rotation:
+    """Rotate each user's own favourites."""
+    world = _catalog(env)
+    return Rotation(world, world.favourites(world.click_probabilities))
+
+
+def popular(env: VectorEnv[Any, Any, Any], seed: int) -> Rotation:
+    """Rotate the favourites of the mean user: the best that knows nobody."""
+    world = _catalog(env)
+    everybody = world.favourites(world.click_probabilities.mean(axis=0, keepdims=True))
+    return Rotation(world, np.tile(everybody, (len(world.logits), 1)))
+
+
+QUALITIES: Final = (
+    (2.0, 1.0, 0.3, 0.0, 0.30),
+    (1.5, 0.7, 0.2, 2.0, 0.30),
+    (1.0, 0.5, 0.1, 4.0, 0.20),
+)
+"""Guesses of the mixture: error, temperature, epsilon, variety, share of sessions."""
+
+
+def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
+    """A logging policy of mediocre mean quality and wide variance between sessions.
+
+    A fifth of the sessions get uniform items, the others guesses of rising quality (`QUALITIES`).
+    """
+    world = _catalog(env)
+    guesses: list[Actor] = [SoftmaxGuess(world, seed, *knobs) for *knobs, _ in QUALITIES]
+    return SessionMixture(
+        [Uniform(env, seed), *guesses], [0.2, *(share for *_, share in QUALITIES)], seed
+    )
+
+
+def _make(num_envs: int, folder: Path | None) -> SyntheticCatalog:
+    return SyntheticCatalog(num_envs)
+
+
+SIMULATOR: Final = Simulator(
+    summary="built-in users and 200 tagged items with a known best policy: one item a step, clicks",
+    make=_make,
+    behaviors={"random": Uniform, "popular": popular, "mixture": mixture, "optimal": optimal},
+    feedback="is_click",
+)

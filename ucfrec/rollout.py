@@ -1,0 +1,128 @@
+"""Many environments, one actor: episodes played side by side."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium.vector import AutoresetMode, VectorEnv
+from tqdm import tqdm
+
+from ucfrec.errors import InputError
+
+BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
+FloatArray = npt.NDArray[np.float32]
+
+
+class Actor(Protocol):
+    """Chooses actions for N episodes at once: a trained policy, or a rule."""
+
+    def begin(self, rows: IntArray) -> None:
+        """The episodes in `rows` (positions among the N) start afresh."""
+
+    def act(
+        self, observations: FloatArray, live: BoolArray
+    ) -> tuple[npt.NDArray[Any], FloatArray | None]:
+        """Choose one action a row.
+
+        Args:
+            observations: (N, O).
+            live: (N,) rows whose action counts; what is returned for the others is ignored.
+
+        Returns:
+            Actions, (N, A) float32 or (N,) int64, and the probability with which each was chosen,
+            (N,), or None where it is a density or unknown.
+        """
+
+    def observe(self, actions: npt.NDArray[Any], rewards: FloatArray) -> None:
+        """Take note of the actions just played and the rewards (N,) they earned."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of the M rows that count; arrays are aligned."""
+
+    rows: IntArray
+    """(M,) positions among the N environments."""
+    episodes: IntArray
+    """(M,) number of the episode that each row plays, 0 to episodes − 1."""
+    observations: FloatArray
+    """(M, O) what was known before acting."""
+    actions: npt.NDArray[Any]
+    rewards: FloatArray
+    propensities: FloatArray | None
+    terminated: BoolArray
+    truncated: BoolArray
+    user_ids: IntArray | None
+    """(M,) whom the step serves, where the world says so in `info["user_id"]`."""
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """What was earned, one row an episode."""
+
+    returns: npt.NDArray[np.float64]
+    lengths: IntArray
+
+
+def rollout(
+    env: VectorEnv[Any, Any, Any],
+    actor: Actor,
+    episodes: int,
+    seed: int,
+    on_step: Callable[[Step], None] | None = None,
+    describe: str = "rollout",
+) -> Episodes:
+    """Play exactly `episodes` episodes.
+
+    Environment i of N plays episodes i, i + N, i + 2N, …: the number is fixed beforehand, so short
+    episodes are not preferred.
+
+    Raises:
+        InputError: the environment does not reset within the step (`AutoresetMode.SAME_STEP`).
+    """
+    if env.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
+        raise InputError(
+            f"{type(env).__name__} does not reset in the same step; build it with "
+            "autoreset_mode=AutoresetMode.SAME_STEP"
+        )
+    n = env.num_envs
+    returns = np.zeros(episodes, dtype=np.float64)
+    lengths = np.zeros(episodes, dtype=np.int64)
+    observations, info = env.reset(seed=seed)
+    actor.begin(np.arange(n))
+    episode = np.arange(n)
+    live = episode < episodes
+    with tqdm(total=episodes, desc=describe, unit="episode", disable=None) as bar:
+        while live.any():
+            actions, propensities = actor.act(observations, live)
+            following, rewards, terminated, truncated, info_next = env.step(actions)
+            rewards = np.asarray(rewards, dtype=np.float32)
+            actor.observe(actions, rewards)
+            rows = np.flatnonzero(live)
+            returns[episode[rows]] += rewards[rows]
+            lengths[episode[rows]] += 1
+            if on_step is not None:
+                users = info.get("user_id")
+                on_step(
+                    Step(
+                        rows=rows,
+                        episodes=episode[rows],
+                        observations=observations[rows],
+                        actions=actions[rows],
+                        rewards=rewards[rows],
+                        propensities=None if propensities is None else propensities[rows],
+                        terminated=terminated[rows],
+                        truncated=truncated[rows],
+                        user_ids=None if users is None else users[rows],
+                    )
+                )
+            ended = terminated | truncated
+            actor.begin(np.flatnonzero(ended))
+            bar.update(int((ended & live).sum()))
+            episode = np.where(ended, episode + n, episode)
+            live = episode < episodes
+            observations, info = following, info_next
+    return Episodes(returns, lengths)

@@ -1,0 +1,43 @@
+"""Names and types of log columns and of episode-store columns: nowhere else are they spelt."""
+
+from typing import Final
+
+# Log columns, one row an impression.
+USER_ID: Final = "user_id"
+ITEM_ID: Final = "item_id"
+TIMESTAMP: Final = "timestamp"
+"""Milliseconds since the Unix epoch."""
+SESSION_ID: Final = "session_id"
+PROPENSITY: Final = "propensity"
+IS_RANDOM: Final = "is_random"
+ACTION: Final = "action"
+"""A list of floats, in logs whose actions are vectors rather than items."""
+OBSERVATION: Final = "observation"
+"""A list of floats: what was known just before the action."""
+
+# Episode-store columns, one row a step.
+ITEM: Final = "item"
+REWARD: Final = "reward"
+RETURN_TO_GO: Final = "return_to_go"
+
+# Episode-store columns, one row an episode.
+USER: Final = "user"
+SPLIT: Final = "split"
+TERMINATED: Final = "terminated"
+
+STEP_DTYPES: Final = {
+    ITEM: "<i4",
+    ACTION: "<f4",
+    OBSERVATION: "<f4",
+    REWARD: "<f4",
+    TIMESTAMP: "<i8",
+    PROPENSITY: "<f4",
+    IS_RANDOM: "|u1",
+}
+EPISODE_DTYPES: Final = {USER: "<i8", SPLIT: "|u1", TERMINATED: "|u1"}
+
+SPLITS: Final = ("train", "validation", "test")
+"""In order of time; `split` holds the position in this tuple."""
+
+STORE_VERSION: Final = 1
+"""Raised whenever a store written before could be misread."""

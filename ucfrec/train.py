@@ -1,0 +1,182 @@
+"""The training loop: the only one. Reward model, generator and every policy pass through it."""
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import torch
+from tensorboardX import SummaryWriter
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from ucfrec.checkpoint import load_tensors, load_training, load_weights, save_tensors, save_training
+from ucfrec.errors import InputError
+
+Batch = TypeVar("Batch")
+
+
+@dataclass(frozen=True)
+class LoopConfig:
+    """How long and how fast to learn.
+
+    Policy defaults are the paper's Table 8; `steps` and the rest are ours.
+    """
+
+    steps: int = 10_000
+    batch_size: int = 64
+    learning_rate: float = 1e-4
+    weight_decay: float = 1e-4
+    warmup_steps: int = 500
+    """Linear warm-up, then constant."""
+    clip_norm: float = 0.25
+    """Largest gradient norm; 0 clips nothing."""
+    validate_every: int = 500
+    """Steps between validations, checkpoints and log lines."""
+    patience: int = 0
+    """Validations without a better one before stopping early; 0 never stops early."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What a training loop ended with."""
+
+    steps: int
+    best_step: int
+    best_validation: float
+    """Lowest validation loss; NaN without validation."""
+    seconds: float
+
+
+def step_generator(seed: int, step: int) -> np.random.Generator:
+    """The generator from which everything random of one training step is drawn.
+
+    Step i needs no history: a run resumed at i draws what an uninterrupted one would have.
+    """
+    return np.random.default_rng([seed, step])
+
+
+def fit(
+    module: nn.Module,
+    draw: Callable[[np.random.Generator], Batch],
+    loss: Callable[[Batch], tuple[Tensor, Mapping[str, Tensor]]],
+    config: LoopConfig,
+    folder: Path,
+    *,
+    seed: int,
+    validate: Callable[[], float] | None = None,
+    describe: str = "train",
+) -> Fit:
+    """Minimise `loss` over batches from `draw`, resuming from `folder` if it holds a checkpoint.
+
+    Writes `last.safetensors` (all that resuming needs), `best.safetensors` (weights with the lowest
+    validation loss; the last weights without validation) and TensorBoard events to `folder`. A run
+    killed at any moment and started again ends with the same weights as one left alone (same
+    machine and device).
+
+    Args:
+        module: what is trained, in place; holds the best weights on return.
+        draw: a batch from a generator.
+        loss: the scalar to minimise and scalars to log.
+        validate: the loss on held-out data, in evaluation mode and without gradients.
+
+    Raises:
+        InputError: the loss is no longer finite.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    last, best = folder / "last.safetensors", folder / "best.safetensors"
+    optimizer = torch.optim.AdamW(
+        module.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
+    )
+    counters = {"step": 0, "best_step": 0, "best_validation": math.inf, "stale": 0, "seconds": 0.0}
+    if last.exists():
+        counters.update(load_training(last, module, optimizer))
+    start, began = int(counters["step"]), time.perf_counter() - counters["seconds"]
+    writer = SummaryWriter(str(folder), purge_step=start + 1)
+    bar = tqdm(total=config.steps, initial=start, desc=describe, unit="step", disable=None)
+    waited = time.perf_counter()
+    waiting = 0.0
+    since = start
+
+    step = start
+    while step < config.steps and not _stale(counters, config):
+        step += 1
+        generator = step_generator(seed, step)
+        drawn = time.perf_counter()
+        batch = draw(generator)
+        waiting += time.perf_counter() - drawn
+        torch.manual_seed(int(generator.integers(2**62)))
+        module.train()
+        value, scalars = loss(batch)
+        optimizer.zero_grad(set_to_none=True)
+        value.backward()  # type: ignore[no-untyped-call]
+        norm = nn.utils.clip_grad_norm_(module.parameters(), config.clip_norm or math.inf)
+        for group in optimizer.param_groups:
+            group["lr"] = config.learning_rate * min(1.0, step / max(1, config.warmup_steps))
+        optimizer.step()
+        bar.update()
+        if step % config.validate_every and step != config.steps:
+            continue
+
+        _require_finite(value, describe, step)
+        elapsed = time.perf_counter() - waited
+        logged = {name: float(scalar) for name, scalar in scalars.items()} | {
+            "loss": float(value),
+            "gradient_norm": float(norm),
+            "samples_per_second": (step - since) * config.batch_size / elapsed,
+            "waiting_for_data": waiting / elapsed,
+        }
+        if validate is None:
+            counters["best_step"] = step
+            save_tensors(best, module.state_dict(), {"step": step})
+        else:
+            logged["validation_loss"] = _validation(module, validate)
+            _keep_best(module, logged["validation_loss"], counters, step, best)
+        for name, number in logged.items():
+            writer.add_scalar(name, number, step)
+        writer.flush()
+        bar.set_postfix(loss=f"{logged['loss']:.4g}")
+        counters |= {"step": step, "seconds": time.perf_counter() - began}
+        save_training(last, module, optimizer, counters)
+        waited, waiting, since = time.perf_counter(), 0.0, step
+    bar.close()
+    writer.close()
+    load_weights(best, module, load_tensors(best)[0])
+    module.eval()
+    return Fit(
+        steps=step,
+        best_step=int(counters["best_step"]),
+        best_validation=math.nan if validate is None else counters["best_validation"],
+        seconds=counters["seconds"],
+    )
+
+
+def _stale(counters: Mapping[str, float], config: LoopConfig) -> bool:
+    return 0 < config.patience <= counters["stale"]
+
+
+def _require_finite(value: Tensor, describe: str, step: int) -> None:
+    if not torch.isfinite(value):
+        raise InputError(
+            f"{describe}: the loss is {float(value)} at step {step}; lower the learning rate or look "
+            "for extreme values in the store (`ucfrec prepare --validate`)"
+        )
+
+
+def _validation(module: nn.Module, validate: Callable[[], float]) -> float:
+    module.eval()
+    with torch.no_grad():
+        return validate()
+
+
+def _keep_best(
+    module: nn.Module, loss: float, counters: dict[str, float], step: int, best: Path
+) -> None:
+    if loss < counters["best_validation"]:
+        counters |= {"best_validation": loss, "best_step": step, "stale": 0}
+        save_tensors(best, module.state_dict(), {"step": step, "validation_loss": loss})
+    else:
+        counters["stale"] += 1

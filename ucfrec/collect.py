@@ -1,7 +1,7 @@
 """Sessions that a behavior policy plays in a simulator, written as Parquet logs."""
 
 from collections.abc import Mapping
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final, Protocol, runtime_checkable
 
@@ -75,10 +75,8 @@ def collect(
         raise InputError(f"sessions is {sessions}; at least one must be played")
     with atomic_folder(out) as folder:
         log = _SessionLog(folder / "sessions.parquet", env, simulator.feedback)
-        try:
-            played = rollout(env, actor, sessions, seed, log.record, describe="collect")
-        finally:
-            log.close()
+        played = rollout(env, actor, sessions, seed, log.record, describe="collect")
+        log.close()
         world = env.unwrapped
         if isinstance(world, Catalog):
             pq.write_table(world.item_features(), folder / "items.parquet")
@@ -161,5 +159,12 @@ def _run_record(played: Episodes, env_name: str, behavior: str, seed: int) -> Ma
         "steps": int(played.lengths.sum()),
         "mean_return": float(played.returns.mean()),
         "mean_length": float(played.lengths.mean()),
-        "versions": {name: version(name) for name in ("ucfrec", "gymnasium", "numpy", "torch")},
+        "versions": {name: _version(name) for name in ("ucfrec", "gymnasium", "numpy", "torch")},
     }
+
+
+def _version(distribution: str) -> str:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return "run from a source tree"

@@ -161,8 +161,8 @@ def _stale(counters: Mapping[str, float], config: LoopConfig) -> bool:
 def _require_finite(value: Tensor, describe: str, step: int) -> None:
     if not torch.isfinite(value):
         raise InputError(
-            f"{describe}: the loss is {float(value)} at step {step}; lower the learning rate or look "
-            "for extreme values in the store (`ucfrec prepare --validate`)"
+            f"{describe}: the loss is {float(value)} at step {step}; lower the learning rate or "
+            "look for extreme values in the store (`ucfrec prepare --validate`)"
         )
 
 

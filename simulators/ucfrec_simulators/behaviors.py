@@ -30,9 +30,7 @@ class Uniform(Memoryless):
         self._space = env.single_action_space
         self._generator = np.random.default_rng([seed, 1])
 
-    def act(
-        self, observations: FloatArray, live: BoolArray
-    ) -> tuple[Actions, FloatArray | None]:
+    def act(self, observations: FloatArray, live: BoolArray) -> tuple[Actions, FloatArray | None]:
         """Draw (N, A) or (N,) actions."""
         count = len(observations)
         if isinstance(self._space, spaces.Discrete):
@@ -115,9 +113,7 @@ class SessionMixture:
         for actor in self._actors:
             actor.begin(rows)
 
-    def act(
-        self, observations: FloatArray, live: BoolArray
-    ) -> tuple[Actions, FloatArray | None]:
+    def act(self, observations: FloatArray, live: BoolArray) -> tuple[Actions, FloatArray | None]:
         """Let every actor choose and keep the choice of the one in charge."""
         choices = [actor.act(observations, live) for actor in self._actors]
         rows = np.arange(len(observations))

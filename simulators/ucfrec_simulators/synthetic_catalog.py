@@ -150,9 +150,7 @@ class Rotation(Memoryless):
     def __init__(self, world: SyntheticCatalog, favourites: IntArray) -> None:
         self._world, self._favourites = world, favourites
 
-    def act(
-        self, observations: FloatArray, live: BoolArray
-    ) -> tuple[IntArray, FloatArray | None]:
+    def act(self, observations: FloatArray, live: BoolArray) -> tuple[IntArray, FloatArray | None]:
         """The next favourite of each user, (N,), with certainty."""
         world = self._world
         last = world.turns == world.max_turn - 1
@@ -183,7 +181,9 @@ class SoftmaxGuess(Memoryless):
         self._world = world
         self._temperature, self._epsilon, self._variety = temperature, epsilon, variety
         self._generator = np.random.default_rng([seed, 4, round(1000 * error)])
-        self._guess = world.logits + error * self._generator.standard_normal(world.logits.shape)
+        # The error belongs to the policy: the seed moves its draws, not its quality.
+        misjudged = np.random.default_rng([0, 5, round(1000 * error)])
+        self._guess = world.logits + error * misjudged.standard_normal(world.logits.shape)
 
     def probabilities(self) -> npt.NDArray[np.float64]:
         """What each session is shown next, (N, n_items)."""

@@ -93,9 +93,7 @@ class SyntheticTaobao(TaobaoEnv):
     def _respond(
         self, users: FloatArray, pages: IntArray, actions: FloatArray
     ) -> tuple[IntArray, IntArray]:
-        clicks = self.np_random.binomial(
-            MAX_CLICKS, self._click_probability(users, pages, actions)
-        )
+        clicks = self.np_random.binomial(MAX_CLICKS, self._click_probability(users, pages, actions))
         return clicks, self.np_random.integers(PAGE_INDICES, size=len(users))
 
     def _click_probability(
@@ -123,7 +121,7 @@ def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
     A fifth of the sessions get uniform actions, the others a noisy blend of an untuned constant
     and the user's best action (`QUALITIES`).
     """
-    best, default = optimal(env, seed), default_action(seed)
+    best, default = optimal(env, seed), default_action()
     blends = [Blend(best, default, quality, noise, seed) for quality, noise, _ in QUALITIES]
     return SessionMixture(
         [Uniform(env, seed), *blends], [0.2, *(share for _, _, share in QUALITIES)], seed

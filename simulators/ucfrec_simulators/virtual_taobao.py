@@ -26,7 +26,6 @@ from ucfrec_simulators.taobao import (
     TaobaoEnv,
     best_constant_actor,
     default_action,
-    taobao,
     zero_actor,
 )
 
@@ -152,8 +151,8 @@ def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
     A quarter of the sessions get uniform actions, the others a blend of an untuned constant and the
     best constant (`QUALITIES`).
     """
-    good = best_constant_actor(taobao(env), seed)
-    default = default_action(seed)
+    # What is blended belongs to the policy: the seed moves its draws, not its quality.
+    good, default = best_constant_actor(env, 0), default_action()
     blends = [Blend(good, default, quality, noise, seed) for quality, noise, _ in QUALITIES]
     return SessionMixture(
         [Uniform(env, seed), *blends], [0.25, *(share for _, _, share in QUALITIES)], seed

@@ -1,0 +1,1 @@
+"""Offline control benchmarks (D4RL, AntMaze) on the core of ucfrec."""

@@ -55,6 +55,13 @@ class ItemHead(nn.Module):
         self.correction = nn.Parameter(torch.zeros(n_items, dim))
         self.bias = nn.Parameter(torch.zeros(n_items))
 
+    def start_from(self, embeddings: Tensor, counts: Tensor) -> None:
+        """Take over the embeddings (n_items, D) and training counts (n_items,) of a store."""
+        self.embeddings.copy_(embeddings)
+        self.counts.copy_(counts + 1)
+        with torch.no_grad():
+            self.bias.copy_(torch.log(self.counts / self.counts.sum()))
+
     def vectors(self, items: Tensor) -> Tensor:
         """(...,) int64 items to (..., d)."""
         return self.project(self.embeddings[items]) + self.correction[items]  # type: ignore[no-any-return]
@@ -66,7 +73,8 @@ class ItemHead(nn.Module):
     def predict(self, features: Tensor) -> Tensor:
         """(..., d) to logits over all items (..., n_items)."""
         vectors = self.project(self.embeddings) + self.correction
-        return features @ vectors.T / features.shape[-1] ** 0.5 + self.bias
+        logits: Tensor = features @ vectors.T / features.shape[-1] ** 0.5 + self.bias
+        return logits
 
     def loss(self, features: Tensor, actions: Tensor) -> Tensor:
         """Mean negative log-likelihood over M steps: features (M, d), actions (M,)."""

@@ -31,7 +31,9 @@ def parent_targets(mask: Tensor, window: int, decay: float, previous_action: flo
     weights[..., 0] = (back == 0).float()
     weights[..., 1] = torch.where((back >= 0) & (back <= window), decay ** back.clamp(min=0), 0.0)
     weights[..., 2] = previous_action * (back == 1).float()
-    weights = weights.to(mask.device) * mask.view(batch, 1, length, 1) * mask.view(batch, length, 1, 1)
+    weights = (
+        weights.to(mask.device) * mask.view(batch, 1, length, 1) * mask.view(batch, length, 1, 1)
+    )
     targets = weights.reshape(batch, length, 3 * length)
     return targets / targets.sum(-1, keepdim=True).clamp(min=EPSILON)
 

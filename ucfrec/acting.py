@@ -1,0 +1,116 @@
+"""A trained policy as an actor: last K steps, return-to-go lowered by what is earned."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from ucfrec.heads import ItemHead
+from ucfrec.policy import SequencePolicy
+from ucfrec.returns import remaining_return
+from ucfrec.rollout import BoolArray, FloatArray, IntArray
+from ucfrec.states import ItemStates, SessionStates
+from ucfrec.windows import Windows
+
+
+class PolicyActor:
+    """Plays N episodes at once with one batched forward pass a step (`ucfrec.rollout.Actor`).
+
+    Vector actions are played as predicted; of items, the one with the highest probability.
+    """
+
+    def __init__(
+        self,
+        policy: SequencePolicy,
+        episodes: int,
+        target_return: float,
+        observation_size: int,
+        item_states: ItemStates | None = None,
+        item_ids: npt.NDArray[Any] | None = None,
+    ) -> None:
+        """Args:
+        policy: in evaluation mode.
+        episodes: N, episodes side by side.
+        target_return: return asked of every episode.
+        observation_size: how many of the environment's observed numbers the logs had; 0 ignores
+            the environment's observation.
+        item_states: how states are made of items; None where the observation is the state.
+        item_ids: (n_items,) the environment's number of each item of the store.
+        """
+        n, k = episodes, policy.config.context
+        self._policy, self._target = policy, float(target_return)
+        self._observation_size, self._item_ids = observation_size, item_ids
+        self._sessions = None if item_states is None else SessionStates(item_states, n)
+        is_item = isinstance(policy.head, ItemHead)
+        self._actions = (
+            torch.zeros(n, k, dtype=torch.int64)
+            if is_item
+            else torch.zeros(n, k, policy.head.embed_action.in_features)
+        )
+        self._states = torch.zeros(n, k, len(policy.state_mean))
+        self._returns_to_go = torch.zeros(n, k)
+        self._mask = torch.zeros(n, k, dtype=torch.bool)
+        self._steps = torch.zeros(n, dtype=torch.int64)
+        self._earned = torch.zeros(n, dtype=torch.float64)
+
+    def begin(self, rows: IntArray) -> None:
+        """The episodes in `rows` start afresh."""
+        self._mask[rows] = False
+        self._steps[rows] = 0
+        self._earned[rows] = 0.0
+        if self._sessions is not None:
+            self._sessions.begin(rows)
+
+    @torch.inference_mode()
+    def act(self, observations: FloatArray, live: BoolArray) -> tuple[npt.NDArray[Any], None]:
+        """Choose for the live rows; the rest get a zero action."""
+        observed = torch.as_tensor(observations, dtype=torch.float32)[:, : self._observation_size]
+        states = observed if self._sessions is None else self._sessions.current(observed)
+        target = torch.full_like(self._earned, self._target)
+        self._states = _pushed(self._states, states)
+        self._returns_to_go = _pushed(
+            self._returns_to_go, remaining_return(target, self._earned).float()
+        )
+        self._mask = _pushed(self._mask, torch.ones_like(self._mask[:, 0]))
+        self._actions = _pushed(self._actions, torch.zeros_like(self._actions[:, 0]))
+
+        rows = torch.from_numpy(np.flatnonzero(live))
+        device = self._policy.state_mean.device
+        predicted = self._policy.act(self._windows(rows).to(device)).cpu()
+        if isinstance(self._policy.head, ItemHead):
+            predicted = predicted.argmax(-1)
+        actions = torch.zeros_like(self._actions[:, -1])
+        actions[rows] = predicted
+        self._actions[:, -1] = actions
+        played = actions.numpy()
+        return (played if self._item_ids is None else self._item_ids[played]), None
+
+    def observe(self, actions: npt.NDArray[Any], rewards: FloatArray) -> None:
+        """Lower the return-to-go by the rewards (N,) and go on to the next step."""
+        earned = torch.from_numpy(rewards)
+        if self._sessions is not None:
+            self._sessions.record(self._actions[:, -1], earned)
+        self._earned += earned
+        self._steps += 1
+
+    def _windows(self, rows: Tensor) -> Windows:
+        mask = self._mask[rows]
+        k = mask.shape[1]
+        steps = self._steps[rows].unsqueeze(1) + torch.arange(1 - k, 1)
+        actions = self._actions[rows]
+        keep = mask if actions.ndim == 2 else mask.unsqueeze(-1)
+        return Windows(
+            states=self._states[rows].masked_fill(~mask.unsqueeze(-1), 0.0),
+            actions=actions.masked_fill(~keep, 0),
+            rewards=torch.zeros(mask.shape),
+            returns_to_go=self._returns_to_go[rows].masked_fill(~mask, 0.0),
+            timesteps=steps.clamp(min=0),
+            mask=mask,
+        )
+
+
+def _pushed(history: Tensor, latest: Tensor) -> Tensor:
+    """(N, K, …) without its oldest column and with `latest` (N, …) at the end."""
+    return torch.cat([history[:, 1:], latest.unsqueeze(1)], dim=1)

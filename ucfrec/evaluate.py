@@ -1,0 +1,95 @@
+"""What a policy earns in a simulated world."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from ucfrec import schema
+from ucfrec.errors import InputError
+from ucfrec.metrics import session_metrics
+from ucfrec.plugins import Simulator, load_plugin
+from ucfrec.rollout import Actor, rollout
+from ucfrec.run import TrainedPolicy
+
+SIDE_BY_SIDE = 512
+"""Most episodes played at once."""
+
+
+@dataclass(frozen=True)
+class World:
+    """A simulator by name, with where its weights are."""
+
+    name: str
+    folder: Path | None = None
+
+    def simulator(self) -> Simulator:
+        """Load the simulator that the name stands for."""
+        simulator: Simulator = load_plugin("simulators", self.name)
+        return simulator
+
+
+def evaluate_behavior(world: World, behavior: str, episodes: int, seed: int) -> dict[str, Any]:
+    """One result row for a built-in policy of a world (`random`, `optimal`, …).
+
+    Raises:
+        InputError: the world has no policy of that name.
+    """
+    simulator = world.simulator()
+    if behavior not in simulator.behaviors:
+        known = ", ".join(simulator.behaviors)
+        raise InputError(f"{world.name} has no behavior {behavior!r}; it has {known}")
+    env = simulator.make(min(episodes, SIDE_BY_SIDE), world.folder)
+    actor = simulator.behaviors[behavior](env, seed)
+    return _row(world, behavior, env, actor, episodes, seed)
+
+
+def evaluate_policy(
+    world: World,
+    trained: TrainedPolicy,
+    name: str,
+    episodes: int,
+    seed: int,
+    target_return: float,
+) -> dict[str, Any]:
+    """One result row for a trained policy asked for `target_return` in every episode.
+
+    Raises:
+        InputError: the policy's actions or observations are not this world's.
+    """
+    env = world.simulator().make(min(episodes, SIDE_BY_SIDE), world.folder)
+    _require_fit(world, env, trained)
+    actor = trained.actor(env.num_envs, target_return)
+    row = _row(world, name, env, actor, episodes, seed)
+    return row | {"target_return": target_return}
+
+
+def _row(
+    world: World, name: str, env: Any, actor: Actor, episodes: int, seed: int
+) -> dict[str, Any]:
+    played = rollout(env, actor, episodes, seed, describe=f"{name} in {world.name}")
+    env.close()
+    metrics = asdict(session_metrics(played, seed))
+    return {"world": world.name, "policy": name, **metrics, "seed": seed}
+
+
+def _require_fit(world: World, env: Any, trained: TrainedPolicy) -> None:
+    space, sizes = env.single_action_space, trained.record["sizes"]
+    observed = int(np.prod(env.single_observation_space.shape))
+    wanted = trained.record["observation_size"]
+    if wanted > observed:
+        raise InputError(
+            f"the policy observes {wanted} numbers, {world.name} shows {observed}; train it on "
+            f"logs of {world.name}"
+        )
+    if isinstance(space, spaces.Discrete):
+        ids = trained.item_ids
+        fits = ids is not None and ids.dtype.kind in "iu" and 0 <= ids.min() <= ids.max() < space.n
+        what = f"items 0 to {space.n - 1} as {schema.ITEM_ID}"
+    else:
+        fits = not sizes["items"] and space.shape == (sizes["action"],)
+        what = f"vector actions of size {space.shape}"
+    if not fits:
+        raise InputError(f"{world.name} takes {what}, which the policy was not trained on")

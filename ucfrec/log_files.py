@@ -1,0 +1,205 @@
+"""Log and feature files as DuckDB sees them: opened, their columns bound, their faults explained."""
+
+import difflib
+import errno
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import duckdb
+
+from ucfrec.errors import InputError
+
+_NAME = re.compile(r"[^\W\d]\w*")
+_UNKNOWN_COLUMN = re.compile(r'Referenced column "([^"]+)" not found')
+_CSV_FAULT = re.compile(r'CSV Error on Line: (\d+).*?\n\s*file = ([^\n]+)', re.DOTALL)
+_CSV_COLUMN = re.compile(r'converting column "([^"]+)"\. ([^\n]+)')
+_INTEGER = re.compile(r"U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?")
+_REAL = re.compile(r"FLOAT|DOUBLE|DECIMAL.*")
+_NUMBERS = re.compile(r"(U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?|FLOAT|DOUBLE|DECIMAL\(.*\))\[\d*\]")
+
+MAX_FLOAT = 3.4028235e38
+
+
+@dataclass(frozen=True)
+class Table:
+    """Files with the same columns, read as one, in their order."""
+
+    files: tuple[Path, ...]
+    types: tuple[tuple[str, str], ...]
+    """Names and DuckDB types of the columns."""
+
+    @property
+    def columns(self) -> dict[str, str]:
+        """Type by name."""
+        return dict(self.types)
+
+    @property
+    def sql(self) -> str:
+        """The table function that reads the files."""
+        # DuckDB takes brackets for a glob.
+        files = ", ".join(text(str(file).replace("[", "[[]")) for file in self.files)
+        if self.files[0].suffix == ".parquet":
+            return f"read_parquet([{files}])"
+        types = ", ".join(f"{text(name)}: {text(kind)}" for name, kind in self.types)
+        return f"read_csv([{files}], header = true, types = {{{types}}})"
+
+
+def text(value: str) -> str:
+    """`value` as a SQL string."""
+    return "'" + value.replace("'", "''") + "'"
+
+
+def quoted(name: str) -> str:
+    """`name` as a SQL identifier."""
+    return '"' + name.replace('"', '""') + '"'
+
+
+def is_integer(kind: str) -> bool:
+    """Whether a DuckDB type holds whole numbers."""
+    return _INTEGER.fullmatch(kind) is not None
+
+
+def is_number(kind: str) -> bool:
+    """Whether a DuckDB type holds numbers."""
+    return is_integer(kind) or _REAL.fullmatch(kind) is not None
+
+
+def is_vector(kind: str) -> bool:
+    """Whether a DuckDB type holds lists of numbers."""
+    return _NUMBERS.fullmatch(kind) is not None
+
+
+def open_tables(connection: duckdb.DuckDBPyConnection, files: Sequence[Path]) -> list[Table]:
+    """Look at every file and put neighbours with equal columns together.
+
+    Raises:
+        InputError: a file is empty, truncated or not what its name says.
+    """
+    tables: list[Table] = []
+    for file in files:
+        opened = Table((file,), _columns(connection, file))
+        like = (tables[-1].types, tables[-1].files[0].suffix) if tables else None
+        if like == (opened.types, file.suffix):
+            tables[-1] = Table((*tables[-1].files, file), opened.types)
+        else:
+            tables.append(opened)
+    return tables
+
+
+def _columns(connection: duckdb.DuckDBPyConnection, file: Path) -> tuple[tuple[str, str], ...]:
+    if file.stat().st_size == 0:
+        raise InputError(f"{file} is empty (0 bytes); remove it from the input or fetch it again")
+    source = Table((file,), ()).sql.replace(", types = {}", "")
+    try:
+        types = connection.sql(f"DESCRIBE SELECT * FROM {source}").fetchall()
+        some = connection.sql(f"SELECT 1 FROM {source} LIMIT 1").fetchall()
+    except duckdb.Error as error:
+        raise InputError(
+            f"{file} cannot be read, it may be truncated ({_first_line(error)}); fetch it again"
+        ) from None
+    if not some:
+        raise InputError(f"{file} is empty (0 rows); remove it from the input or fetch it again")
+    return tuple((str(name), str(kind)) for name, kind, *_ in types)
+
+
+def bind(
+    connection: duckdb.DuckDBPyConnection, table: Table, what: str, given: str
+) -> tuple[str, str]:
+    """Make SQL of a column name or scalar expression.
+
+    Args:
+        what: what the expression is for, in messages.
+
+    Returns:
+        The SQL and its DuckDB type.
+
+    Raises:
+        InputError: it names no column of the table, or is no scalar expression.
+    """
+    names = {name.casefold(): name for name in table.columns}
+    if given.casefold() in names:
+        name = names[given.casefold()]
+        return quoted(name), table.columns[name]
+    if _NAME.fullmatch(given):
+        raise InputError(_missing(table, what, given))
+    sql = f"({given}\n)"
+    try:
+        # Where conditions admit neither aggregates nor window functions.
+        connection.sql(f"SELECT 1 FROM {table.sql} WHERE {sql} IS NULL LIMIT 0").fetchall()
+        described = connection.sql(f"DESCRIBE SELECT {sql} AS x FROM {table.sql}").fetchall()
+    except duckdb.Error as error:
+        if unknown := _UNKNOWN_COLUMN.search(str(error)):
+            raise InputError(_missing(table, what, unknown[1])) from None
+        raise InputError(
+            f"{what}: {given!r} is no scalar SQL expression over the columns of {table.files[0]}: "
+            f"{_first_line(error)}"
+        ) from None
+    return sql, str(described[0][1])
+
+
+def _missing(table: Table, what: str, name: str) -> str:
+    folded = {column.casefold(): column for column in table.columns}
+    near = difflib.get_close_matches(name.casefold(), folded, n=3, cutoff=0.5)
+    hint = ", ".join(folded[column] for column in near)
+    hint = f"nearest: {hint}" if hint else f"it has {', '.join(table.columns)}"
+    return f"{table.files[0]} has no column {name!r} ({what}); {hint}"
+
+
+def wrong_type(table: Table, what: str, given: str, kind: str, wanted: str) -> InputError:
+    """The error for a column whose type will not do."""
+    return InputError(f"{table.files[0]}: {what} ({given}) is {kind}; {wanted}")
+
+
+@contextmanager
+def explained(
+    connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], folder: Path
+) -> Iterator[None]:
+    """Turn faults of files, memory and disk that surface while reading into `InputError`.
+
+    Args:
+        folder: where the disk would run full.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        raise _disk_full(folder) from None
+    except duckdb.Error as error:
+        message = str(error)
+        if "No space left" in message or "max_temp_directory_size" in message:
+            raise _disk_full(folder) from None
+        if isinstance(error, duckdb.OutOfMemoryException):
+            raise InputError(f"{_first_line(error)}; raise memory_limit") from None
+        if fault := _CSV_FAULT.search(message):
+            column = _CSV_COLUMN.search(message)
+            detail = f"column {column[1]}: {column[2]}" if column else _first_line(error)
+            raise InputError(f"{fault[2]}, line {fault[1]}: {detail}; correct the line") from None
+        for file, fault_line in _unreadable(connection, tables):
+            raise InputError(
+                f"{file} cannot be read, it may be damaged ({fault_line}); fetch it again"
+            ) from None
+        raise
+
+
+def _disk_full(folder: Path) -> InputError:
+    return InputError(f"no space left on the disk of {folder}; free some or write elsewhere")
+
+
+def _unreadable(
+    connection: duckdb.DuckDBPyConnection, tables: Sequence[Table]
+) -> Iterator[tuple[Path, str]]:
+    for table in tables:
+        for file in table.files:
+            one = Table((file,), table.types)
+            try:
+                connection.sql(f"SELECT max(hash(t)) FROM {one.sql} AS t").fetchall()
+            except duckdb.Error as error:
+                yield file, _first_line(error)
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0]

@@ -63,7 +63,7 @@ class PolicyActor:
         if self._sessions is not None:
             self._sessions.begin(rows)
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def act(self, observations: FloatArray, live: BoolArray) -> tuple[npt.NDArray[Any], None]:
         """Choose for the live rows; the rest get a zero action."""
         observed = torch.as_tensor(observations, dtype=torch.float32)[:, : self._observation_size]

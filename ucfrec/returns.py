@@ -36,4 +36,7 @@ def returns_to_go(
     before = np.concatenate([[0.0], np.cumsum(rewards, dtype=np.float64)])  # (N + 1,)
     totals = before[offsets[1:]] - before[offsets[:-1]]  # (E,)
     earned = before[:-1] - np.repeat(before[offsets[:-1]], lengths)  # (N,)
-    return remaining_return(np.repeat(totals, lengths), earned).astype(np.float32)
+    remaining: npt.NDArray[np.float32] = remaining_return(
+        np.repeat(totals, lengths), earned
+    ).astype(np.float32)
+    return remaining

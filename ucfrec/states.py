@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from ucfrec.checkpoint import load_tensors, save_tensors
+from ucfrec.errors import InputError
 
 IntArray = npt.NDArray[np.int64]
 
@@ -39,6 +40,11 @@ class ItemStates:
     decay: float = 0.8
 
     def __post_init__(self) -> None:
+        if not self.reward_low < self.reward_high:
+            raise InputError(
+                f"rewards from {self.reward_low:g} to {self.reward_high:g} tell no liking apart; "
+                "reward_low must be below reward_high"
+            )
         # Row −1 stands for "no item" and "unknown user": all zeros.
         object.__setattr__(self, "_items", _with_zero_row(self.embeddings))
         object.__setattr__(self, "_users", _with_zero_row(self.user_features))
@@ -130,6 +136,7 @@ class SessionStates:
 
     def record(self, items: Tensor, rewards: Tensor) -> None:
         """Take note of the items (N,) just shown and the rewards (N,) they earned."""
+        rewards = rewards.float()  # as the store holds them
         self._items = torch.cat([items.unsqueeze(1), self._items[:, :-1]], dim=1)
         self._rewards = torch.cat([rewards.unsqueeze(1), self._rewards[:, :-1]], dim=1)
         self._steps += 1

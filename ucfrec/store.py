@@ -51,9 +51,12 @@ class EpisodeStore:
         if not (path / "meta.json").is_file():
             raise InputError(f"{path} is not an episode store: it has no meta.json")
         meta = read_json(path / "meta.json")
-        if meta["version"] > schema.STORE_VERSION:
+        version = meta.get("version") if isinstance(meta, dict) else None
+        if not isinstance(version, int):
+            raise InputError(f"{path / 'meta.json'} is not that of an episode store")
+        if version > schema.STORE_VERSION:
             raise InputError(
-                f"{path} has store version {meta['version']}, this ucfrec reads up to "
+                f"{path} has store version {version}, this ucfrec reads up to "
                 f"{schema.STORE_VERSION}; upgrade ucfrec"
             )
         return cls(path, meta)
@@ -73,9 +76,14 @@ class EpisodeStore:
 
         Args:
             steps: step columns of `ucfrec.schema`, each (N,) or (N, size).
-            lengths: (E,) steps of each episode, adding up to N.
+            lengths: (E,) steps of each episode, at least one, adding up to N.
             episodes: episode columns, each (E,); without `split`, all are for training.
+
+        Raises:
+            InputError: `path` exists, an episode has no steps, or rewards are not finite.
         """
+        if np.any(np.asarray(lengths) < 1):
+            raise InputError(f"{path}: an episode without steps cannot be stored; leave it out")
         starts = np.cumsum(lengths) - lengths
         first = np.zeros(int(np.sum(lengths)), dtype=bool)
         first[starts] = True
@@ -93,7 +101,7 @@ class EpisodeStore:
         """First step and length of each base episode, (E,) each."""
         starts, lengths, before = [], [], 0
         for shard in self._shards:
-            offsets = np.load(shard / "offsets.npy")
+            offsets = _load(shard / "offsets.npy")
             starts.append(offsets[:-1] + before)
             lengths.append(np.diff(offsets))
             before += int(offsets[-1])
@@ -139,9 +147,9 @@ class EpisodeStore:
         return view
 
     def split(self, name: str) -> "EpisodeStore":
-        """The view of one split, "train", "validation" or "test"; it may be empty."""
-        wanted = schema.SPLITS.index(name)
-        return self.select(np.flatnonzero(self.episode_values(schema.SPLIT) == wanted))
+        """The view of one split's base episodes, "train", "validation" or "test"; may be empty."""
+        splits = self.episode_values(schema.SPLIT)[: len(self.episode_ids)]
+        return self.select(np.flatnonzero(splits == schema.SPLITS.index(name)))
 
     def with_overlay(self, overlay: Overlay) -> "EpisodeStore":
         """The union of this view and the edited copies of `overlay`."""
@@ -174,7 +182,10 @@ class EpisodeStore:
 
     def episode_values(self, name: str) -> Array:
         """One episode column, (E + C,); copies have their source's values."""
-        return np.concatenate([np.load(s / f"{name}.npy") for s in self._shards])[self._base_ids]
+        return self._of_episodes(name)[self._base_ids]
+
+    def _of_episodes(self, name: str) -> Array:
+        return np.concatenate([_load(shard / f"{name}.npy") for shard in self._shards])
 
     @cached_property
     def returns(self) -> FloatArray:
@@ -244,7 +255,7 @@ class EpisodeStore:
             states=window.states[:, 0],
             actions=self.action_vectors(window.actions[:, 0]),
             rewards=window.rewards[:, 0],
-            next_states=next_states * ~ended.unsqueeze(-1),
+            next_states=next_states.masked_fill(ended.unsqueeze(-1), 0.0),
             last=ended,
         )
 
@@ -311,12 +322,14 @@ class EpisodeStore:
         """(base episodes,) row of each episode's user among the user features; −1 without any."""
         if self.item_states.user_features.shape[1] == 0:
             return np.full(self.meta["n_episodes"], -1)
-        return np.concatenate([np.load(s / f"{schema.USER}.npy") for s in self._shards])
+        return self._of_episodes(schema.USER)
 
     @cached_property
     def _edit_keys(self) -> IntArray:
+        """(M + 1,) one increasing number an edit, and one at the end that nothing reaches."""
         assert self.overlay is not None
-        return self.overlay.edit_copy * self._stride + self.overlay.edit_step
+        keys = self.overlay.edit_copy * self._stride + self.overlay.edit_step
+        return np.append(keys, np.iinfo(np.int64).max)
 
     @cached_property
     def _stride(self) -> int:
@@ -327,13 +340,20 @@ class EpisodeStore:
         copies = np.asarray(episodes)[:, None] - len(self.episode_ids)
         wanted = np.where((copies >= 0) & (steps >= 0), copies * self._stride + steps, -1)
         found = np.searchsorted(self._edit_keys, wanted)
-        found = np.minimum(found, len(self._edit_keys) - 1)
         rows, columns = np.nonzero(self._edit_keys[found] == wanted)
         return rows, columns, found[rows, columns]
 
     def _column(self, name: str) -> "_Column":
         if name not in self._columns:
-            self._columns[name] = _Column([shard / f"{name}.npy" for shard in self._shards])
+            if name not in (*self.meta["columns"], schema.RETURN_TO_GO):
+                raise InputError(f"{self.path} has no column {name!r}; prepare the logs with it")
+            column = _Column([shard / f"{name}.npy" for shard in self._shards])
+            if len(column) != self.meta["n_steps"]:
+                raise InputError(
+                    f"{self.path} is damaged: column {name!r} has {len(column)} of "
+                    f"{self.meta['n_steps']} steps; prepare it again"
+                )
+            self._columns[name] = column
         return self._columns[name]
 
 
@@ -341,22 +361,29 @@ class _Column:
     """One column over all shards, memory-mapped."""
 
     def __init__(self, paths: list[Path]) -> None:
-        try:
-            self._parts = [np.load(path, mmap_mode="r") for path in paths]
-        except (FileNotFoundError, ValueError) as error:
-            raise InputError(
-                f"{paths[0].parent.parent} is damaged: {error}; prepare it again"
-            ) from None
+        self._parts = [_load(path, mmap=True) for path in paths]
         self._bounds = np.cumsum([0] + [len(part) for part in self._parts])
+
+    def __len__(self) -> int:
+        return int(self._bounds[-1])
 
     def take(self, index: IntArray) -> Array:
         """Values at global positions `index`, any shape."""
         if len(self._parts) == 1:
             return np.asarray(self._parts[0][index])
-        shard = np.searchsorted(self._bounds, index, side="right") - 1
+        shard = np.searchsorted(self._bounds[1:-1], index, side="right")
         like = self._parts[0]
         values = np.empty((*index.shape, *like.shape[1:]), dtype=like.dtype)
         for i, part in enumerate(self._parts):
             here = shard == i
             values[here] = part[index[here] - self._bounds[i]]
         return values
+
+
+def _load(path: Path, mmap: bool = False) -> Array:
+    try:
+        values: Array = np.load(path, mmap_mode="r" if mmap else None)
+    except (OSError, ValueError, EOFError) as error:
+        message = str(error).splitlines()[0]
+        raise InputError(f"{path} is missing or damaged ({message}); prepare it again") from None
+    return values

@@ -55,8 +55,21 @@ class StoreWriter:
                 (M, size). `reward`, and one of `item` and `action`, are required.
             first: (M,) true at the first step of an episode.
             episodes: episode columns, each (M,), constant within an episode.
+
+        Raises:
+            InputError: columns differ in length, or rewards are not finite.
         """
         first = np.asarray(first, dtype=bool)
+        for name, values in (*steps.items(), *episodes.items()):
+            if len(values) != len(first):
+                raise InputError(f"column {name!r} has {len(values)} steps instead of {len(first)}")
+        rewards = np.asarray(steps[schema.REWARD], dtype=schema.STEP_DTYPES[schema.REWARD])
+        strange = int(np.count_nonzero(~np.isfinite(rewards)))
+        if strange:  # suffix sums would carry it into every return of the shard
+            raise InputError(
+                f"{strange} of {len(first)} rewards are not finite; drop those rows or mend the "
+                "reward expression"
+            )
         if len(first) == 0:
             return
         if self._n_steps == 0 and not first[0]:
@@ -190,7 +203,7 @@ class _NpyFile:
             "shape": (self._rows, *self._shape),
         }
         self._file.seek(0)
-        np.lib.format.write_array_header_1_0(self._file, header)  # type: ignore[no-untyped-call]
+        np.lib.format.write_array_header_1_0(self._file, header)
 
     def append(self, rows: Array) -> None:
         self._file.write(rows.tobytes())

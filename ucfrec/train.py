@@ -124,7 +124,7 @@ def fit(
         _require_finite(value, describe, step)
         elapsed = time.perf_counter() - waited
         logged = {name: float(scalar) for name, scalar in scalars.items()} | {
-            "loss": float(value),
+            "loss": value.item(),
             "gradient_norm": float(norm),
             "samples_per_second": (step - since) * config.batch_size / elapsed,
             "waiting_for_data": waiting / elapsed,
@@ -161,7 +161,7 @@ def _stale(counters: Mapping[str, float], config: LoopConfig) -> bool:
 def _require_finite(value: Tensor, describe: str, step: int) -> None:
     if not torch.isfinite(value):
         raise InputError(
-            f"{describe}: the loss is {float(value)} at step {step}; lower the learning rate or "
+            f"{describe}: the loss is {value.item()} at step {step}; lower the learning rate or "
             "look for extreme values in the store (`ucfrec prepare --validate`)"
         )
 

@@ -1,0 +1,146 @@
+"""What each command does with its options."""
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ucfrec.collect import collect
+from ucfrec.config import resolve_config
+from ucfrec.demo import DemoConfig, demo
+from ucfrec.errors import InputError
+from ucfrec.evaluate import World, evaluate_behavior, evaluate_policy
+from ucfrec.files import write_json
+from ucfrec.log_mapping import Dataset, LogMapping, columns_given, read_mapping
+from ucfrec.logs import PrepareOptions, format_report, parse_split, prepare, validate
+from ucfrec.plugins import load_plugin
+from ucfrec.recommend import recommend, write_recommendations
+from ucfrec.results import format_rows, provenance
+from ucfrec.run import TrainedPolicy, describe_run, train_run
+from ucfrec.store import EpisodeStore
+
+
+def run_demo(options: argparse.Namespace) -> None:
+    """`ucfrec demo`."""
+    rows = demo(options.out, options.seed, DemoConfig())
+    print(format_rows(rows))
+    print(f"\nrows: {options.out / 'results.json'}; logs, stores and runs lie beside it")
+
+
+def run_collect(options: argparse.Namespace) -> None:
+    """`ucfrec collect`."""
+    world = World(options.env, options.env_folder)
+    simulator = world.simulator()
+    if options.behavior not in simulator.behaviors:
+        known = ", ".join(simulator.behaviors)
+        raise InputError(f"{world.name} has no behavior {options.behavior!r}; it has {known}")
+    env = simulator.make(256, world.folder)
+    actor = simulator.behaviors[options.behavior](env, options.seed)
+    played = collect(
+        simulator,
+        env,
+        actor,
+        options.sessions,
+        options.seed,
+        options.out,
+        env_name=options.env,
+        behavior=options.behavior,
+    )
+    print(
+        f"{options.out}: {options.sessions} sessions, {int(played.lengths.sum())} steps, mean "
+        f"return {played.returns.mean():.3f}; reward column {simulator.feedback}"
+    )
+
+
+def run_prepare(options: argparse.Namespace) -> None:
+    """`ucfrec prepare`."""
+    files, mapping = _logs(options)
+    given = {
+        "reward": options.reward,
+        "session_by": options.session_by,
+        "gap_minutes": options.gap_minutes,
+        "split": options.split and parse_split(options.split),
+    }
+    prepared = PrepareOptions(**{name: value for name, value in given.items() if value is not None})
+    if options.validate:
+        print(format_report(validate(files, mapping, prepared)))
+        return
+    if options.out is None:
+        raise InputError("name the store with --out, or only check with --validate")
+    print(format_report(prepare(files, mapping, options.out, prepared)))
+    print(f"\nstore: {options.out}")
+
+
+def _logs(options: argparse.Namespace) -> tuple[tuple[Path, ...], LogMapping]:
+    """Files and column mapping of a command that reads logs."""
+    dataset: Dataset = load_plugin("datasets", options.dataset)
+    given = LogMapping(columns_given(options.column))
+    if options.mapping is not None:
+        given = given.over(read_mapping(options.mapping))
+    return dataset.resolve(options.logs, given)
+
+
+def run_train(options: argparse.Namespace) -> None:
+    """`ucfrec train`."""
+    if options.threads is not None:
+        torch.set_num_threads(options.threads)
+    config = resolve_config(options.policy, options.config, options.set, options.seed)
+    record = train_run(EpisodeStore.open(options.store), options.out, config)
+    print(describe_run(record))
+    print(f"\nrun: {options.out}; TensorBoard reads it too")
+
+
+def run_evaluate(options: argparse.Namespace) -> None:
+    """`ucfrec evaluate`."""
+    world = World(options.env, options.env_folder)
+    if not options.runs and not options.behavior:
+        raise InputError("name a run folder, or a built-in policy with --behavior")
+    rows = []
+    for run in options.runs:
+        trained = TrainedPolicy.load(run, options.checkpoint)
+        target = _target(options, trained)
+        row = evaluate_policy(
+            world, trained, trained.name, options.episodes, options.seed, target
+        )
+        rows.append(row | {"run": str(run), "checkpoint": options.checkpoint})
+    for behavior in options.behavior:
+        rows.append(evaluate_behavior(world, behavior, options.episodes, options.seed))
+    print(format_rows(rows))
+    if options.json is not None:
+        write_json(options.json, [row | provenance() for row in rows])
+
+
+def _target(options: argparse.Namespace, trained: TrainedPolicy) -> float:
+    if options.target_return is not None:
+        return float(options.target_return)
+    return trained.target_return(options.target_quantile)
+
+
+def run_recommend(options: argparse.Namespace) -> None:
+    """`ucfrec recommend`."""
+    files, mapping = _logs(options)
+    trained = TrainedPolicy.load(options.run, options.checkpoint)
+    table = recommend(
+        trained,
+        files,
+        mapping,
+        k=options.k,
+        target_return=_target(options, trained),
+        keep_seen=options.keep_seen,
+        skip_unknown=options.skip_unknown,
+    )
+    write_recommendations(table, options.out)
+    print(f"{options.out}: {table.num_rows} rows", file=sys.stderr)
+
+
+COMMANDS: dict[str, Callable[[argparse.Namespace], Any]] = {
+    "demo": run_demo,
+    "collect": run_collect,
+    "prepare": run_prepare,
+    "train": run_train,
+    "evaluate": run_evaluate,
+    "recommend": run_recommend,
+}

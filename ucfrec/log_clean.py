@@ -1,0 +1,279 @@
+"""The SQL that reads, judges and de-duplicates log rows: shared by `prepare` and `recommend`."""
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+import duckdb
+
+from ucfrec import schema
+from ucfrec.errors import InputError
+from ucfrec.log_files import (
+    MAX_FLOAT,
+    Table,
+    bind,
+    explained,
+    is_integer,
+    is_number,
+    is_vector,
+    open_tables,
+    wrong_type,
+)
+from ucfrec.log_mapping import KEY_COLUMNS, OPTIONAL_COLUMNS, LogMapping
+
+EARLIEST_MS: Final = 946_684_800_000
+"""2000-01-01 UTC: earlier rows come from a clock that is wrong."""
+DAY_MS: Final = 86_400_000
+
+REASONS: Final = {
+    "null_key": "user, item or action, time or session is missing",
+    "clock_out_of_range": "time before 2000 or more than a day ahead of now",
+    "vector_not_finite": "action or observation is missing or holds NaN or infinity",
+    "duplicate": "repeats the user, item or action, and time of a row that is kept",
+    "reward_not_finite": "reward is missing, NaN or infinite",
+}
+"""Why rows are dropped; each row for the first reason that applies."""
+
+
+@contextmanager
+def engine(
+    memory_limit: str, folder: Path | None
+) -> Iterator[tuple[duckdb.DuckDBPyConnection, Path]]:
+    """A DuckDB that works on disk: (connection, its folder, which is removed at the end).
+
+    Args:
+        memory_limit: e.g. "2GB".
+        folder: where its folder is made; None for the system's temporary one.
+    """
+    with TemporaryDirectory(prefix=".ucfrec-", dir=folder) as work:
+        connection = duckdb.connect(str(Path(work) / "rows.duckdb"))
+        try:
+            connection.execute(f"SET temp_directory = '{work}/spill'")
+            connection.execute("SET enable_progress_bar = false")
+            try:
+                connection.execute("SET memory_limit = ?", [memory_limit])
+            except duckdb.Error:
+                raise InputError(f"memory_limit {memory_limit!r}: write e.g. 500MB or 2GB") from None
+            # SQL's own least(x, 5) is 5 where x is NULL, NaN or infinite: a video of unknown length
+            # would count as watched five times. Undefined parts make a reward undefined instead.
+            for name, sign in (("least", "<"), ("greatest", ">")):
+                connection.execute(
+                    f"CREATE TEMP MACRO {name}(a, b) AS CASE WHEN isfinite(a::DOUBLE) AND "
+                    f"isfinite(b::DOUBLE) THEN CASE WHEN a {sign} b THEN a ELSE b END END, "
+                    f"(a, b, c) AS {name}({name}(a, b), c)"
+                )
+            yield connection, Path(work)
+        finally:
+            connection.close()
+
+
+@dataclass(frozen=True)
+class CleanLog:
+    """A log whose rows lie judged in the table `rows` of `connection`, in file order.
+
+    `rows` has the log columns of `columns`, `reward`, `row` (its place in the files) and `reason`,
+    NULL for rows to keep. Those kept are the view `clean`.
+    """
+
+    connection: duckdb.DuckDBPyConnection
+    tables: tuple[Table, ...]
+    columns: tuple[str, ...]
+    """Log columns present, `user_id` first."""
+    vector_size: dict[str, int]
+    """Size of `action` and `observation`, where present."""
+
+    @property
+    def key(self) -> str:
+        """`item_id` or `action`."""
+        return schema.ITEM_ID if schema.ITEM_ID in self.columns else schema.ACTION
+
+    @property
+    def payload(self) -> tuple[str, ...]:
+        """Columns beyond user, key and time."""
+        return tuple(c for c in self.columns if c not in (schema.USER_ID, self.key, "timestamp"))
+
+    def one(self, sql: str) -> tuple[Any, ...]:
+        """The single row that `sql` gives."""
+        row = self.connection.sql(sql).fetchone()
+        assert row is not None
+        return row
+
+
+def read_log(
+    connection: duckdb.DuckDBPyConnection,
+    files: Sequence[Path],
+    mapping: LogMapping,
+    reward: str,
+    session_key: bool,
+    folder: Path,
+) -> CleanLog:
+    """Read and judge every row of `files`.
+
+    Of rows that repeat a key (user, item or action, time) the one with the highest reward is kept
+    (feedback that came late adds to an impression), ties broken by the other columns: whatever
+    the order of rows and files, the same.
+
+    Args:
+        reward: scalar SQL expression over the files' columns.
+        session_key: whether a row without session_id is of no use.
+        folder: named when its disk is full.
+
+    Raises:
+        InputError: anything of the files, columns or types that makes the log unusable.
+    """
+    tables = tuple(open_tables(connection, files))
+    columns = _present(tables, mapping)
+    selects = [_select(connection, table, mapping, columns, reward) for table in tables]
+    with explained(connection, tables, folder):
+        for name in (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID):
+            _unify_ids(selects, name)
+        union = " UNION ALL ".join(
+            f"SELECT {', '.join(f'{sql} AS {name}' for name, (sql, _) in select.items())} "
+            f"FROM {table.sql}"
+            for select, table in zip(selects, tables, strict=True)
+        )
+        connection.execute(
+            f"CREATE TABLE read AS SELECT row_number() OVER () AS row, * FROM ({union})"
+        )
+        log = CleanLog(connection, tables, columns, _vector_sizes(connection, columns))
+        connection.execute(_judge(log, session_key))
+        connection.execute("DROP TABLE read")
+        connection.execute("CREATE VIEW clean AS SELECT * FROM rows WHERE reason IS NULL")
+    return log
+
+
+def _present(tables: Sequence[Table], mapping: LogMapping) -> tuple[str, ...]:
+    """Log columns that the files have; required ones count as there, so that binding says more."""
+    named = {name: value for name, value in mapping.columns.items() if value}
+    switched_off = mapping.columns.keys() - named.keys()
+    everywhere = set.intersection(*({c.casefold() for c in t.columns} for t in tables))
+    there = (set(named) | everywhere) - switched_off
+    if schema.ACTION in named or (schema.ACTION in there and schema.ITEM_ID not in there):
+        key = schema.ACTION
+    else:
+        key = schema.ITEM_ID
+    optional = (name for name in OPTIONAL_COLUMNS if name in there)
+    return (schema.USER_ID, key, schema.TIMESTAMP, *optional)
+
+
+Select = dict[str, tuple[str, str]]
+"""Log column to (SQL, DuckDB type)."""
+
+
+def _select(
+    connection: duckdb.DuckDBPyConnection,
+    table: Table,
+    mapping: LogMapping,
+    columns: tuple[str, ...],
+    reward: str,
+) -> Select:
+    select: Select = {}
+    for name in columns:
+        given = mapping.columns.get(name) or name
+        what = f"for {name}; map it with --column {name}=..."
+        select[name] = _typed(table, name, given, *bind(connection, table, what, given))
+    sql, kind = bind(connection, table, "for the reward", reward)
+    if not (is_number(kind) or kind == "BOOLEAN"):
+        raise wrong_type(table, "reward", reward, kind, "give an expression that is a number")
+    # A fault in one row (division by zero, a cast) makes that row's reward undefined, no more.
+    select[schema.REWARD] = (f"TRY(CAST({sql} AS DOUBLE))", "DOUBLE")
+    return select
+
+
+def _typed(table: Table, name: str, given: str, sql: str, kind: str) -> tuple[str, str]:
+    """SQL that brings a column to the type of the schema, and its type."""
+    if name in (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID):
+        if is_integer(kind) or kind in ("VARCHAR", "UUID"):
+            return sql, kind
+        wanted = f"use integers or text, e.g. --column {name}='{given}::BIGINT'"
+    elif name == schema.TIMESTAMP:
+        if is_number(kind):
+            return f"TRY_CAST(round({sql}) AS BIGINT)", "BIGINT"
+        if kind.startswith("TIMESTAMP") or kind == "DATE":
+            return f"TRY(epoch_ms({sql}::TIMESTAMP))", "BIGINT"
+        wanted = "use milliseconds, a date or a timestamp, e.g. --column timestamp='seconds * 1000'"
+    elif name in (schema.ACTION, schema.OBSERVATION):
+        if is_vector(kind):
+            return f"TRY_CAST({sql} AS FLOAT[])", "FLOAT[]"
+        wanted = f"use a list of numbers, e.g. --column {name}='{given}::FLOAT[]'"
+    elif name == schema.PROPENSITY:
+        if is_number(kind):
+            good = f"{sql} > 0 AND {sql} <= {MAX_FLOAT}"
+            return f"CAST(CASE WHEN {good} THEN {sql} END AS FLOAT)", "FLOAT"
+        wanted = "use a number above 0"
+    else:
+        if is_number(kind) or kind == "BOOLEAN":
+            return f"coalesce(CAST({sql} AS BOOLEAN), false)", "BOOLEAN"
+        wanted = "use a boolean or 0 and 1"
+    raise wrong_type(table, name, given, kind, wanted)
+
+
+def _unify_ids(selects: list[Select], name: str) -> None:
+    """Ids are BIGINT where every file has such, text otherwise; session ids only order rows."""
+    if name not in selects[0]:
+        return
+    wide = {"UBIGINT", "HUGEINT", "UHUGEINT"}
+    kinds = {select[name][1] for select in selects}
+    whole = all(is_integer(kind) and kind not in wide for kind in kinds)
+    for select in selects:
+        select[name] = (f"CAST({select[name][0]} AS {'BIGINT' if whole else 'VARCHAR'})", "")
+
+
+def _vector_sizes(
+    connection: duckdb.DuckDBPyConnection, columns: tuple[str, ...]
+) -> dict[str, int]:
+    sizes = {}
+    for name in (schema.ACTION, schema.OBSERVATION):
+        if name not in columns:
+            continue
+        counts = connection.sql(
+            f"SELECT len({name}) AS size, count(*) AS n FROM read WHERE {name} IS NOT NULL "
+            "GROUP BY size ORDER BY n DESC, size LIMIT 4"
+        ).fetchall()
+        if len(counts) > 1:
+            told = ", ".join(f"{n} rows of {size}" for size, n in counts)
+            raise InputError(f"{name} has lists of unequal length: {told}; make them equal")
+        if not counts or counts[0][0] == 0:
+            raise InputError(f"{name} has no values in any row; map another column or none")
+        sizes[name] = int(counts[0][0])
+    return sizes
+
+
+def _judge(log: CleanLog, session_key: bool) -> str:
+    keys = [schema.USER_ID, log.key, schema.TIMESTAMP]
+    keys += [schema.SESSION_ID] if session_key else []
+    missing = " OR ".join(f"{k} IS NULL" for k in keys if k != schema.ACTION)
+    bad_vector = " OR ".join(
+        f"{name} IS NULL OR NOT list_bool_and([coalesce(isfinite(v), false) FOR v IN {name}])"
+        for name in log.vector_size
+    )
+    latest = int(time.time() * 1000) + DAY_MS
+    rest = ", ".join(("good", f"{schema.REWARD} DESC", *log.payload))
+    return f"""
+        CREATE TABLE rows AS
+        WITH faults AS (
+            SELECT *, CASE
+                WHEN {missing} THEN 'null_key'
+                WHEN {schema.TIMESTAMP} NOT BETWEEN {EARLIEST_MS} AND {latest}
+                    THEN 'clock_out_of_range'
+                WHEN {bad_vector or "false"} THEN 'vector_not_finite'
+            END AS fault,
+            coalesce(abs({schema.REWARD}) <= {MAX_FLOAT}, false) AS good
+            FROM read
+        ), ranked AS (
+            SELECT *, row_number() OVER (
+                PARTITION BY fault, {schema.USER_ID}, {log.key}, {schema.TIMESTAMP}
+                ORDER BY {rest.replace("good", "good DESC", 1)}
+            ) AS rank FROM faults
+        )
+        SELECT * EXCLUDE (fault, good, rank), CASE
+            WHEN fault IS NOT NULL THEN fault
+            WHEN rank > 1 THEN 'duplicate'
+            WHEN NOT good THEN 'reward_not_finite'
+        END AS reason
+        FROM ranked
+    """

@@ -1,0 +1,150 @@
+"""The SQL that cuts clean log rows into episodes and numbers their users and items."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from ucfrec import schema
+from ucfrec.errors import InputError
+from ucfrec.log_clean import CleanLog
+from ucfrec.log_files import text
+
+ITEMS_FILE: Final = "items.parquet"
+USERS_FILE: Final = "users.parquet"
+SESSIONS: Final = (schema.SESSION_ID, "gap", "user")
+
+
+@dataclass(frozen=True)
+class Cut:
+    """How rows fall into episodes."""
+
+    session_by: str
+    gap_ms: int
+    min_steps: int
+    bounds: tuple[int, int]
+    """Times (ms) at which validation and test begin."""
+
+
+def split_bounds(log: CleanLog, split: tuple[float, ...]) -> tuple[int, int]:
+    """Times at which validation and test begin.
+
+    Args:
+        split: three shares of the rows in order of time, or the two times.
+    """
+    if len(split) == 2:
+        return int(split[0]), int(split[1])
+    (rows, last) = log.one(f"SELECT count(*), max({schema.TIMESTAMP}) FROM clean")
+    places = [round(rows * split[0]), round(rows * (split[0] + split[1]))]
+    # An exact quantile in bounded memory: the aggregate would hold every time.
+    begin, end = (
+        last + 1
+        if place >= rows
+        else log.one(
+            f"SELECT {schema.TIMESTAMP} FROM clean ORDER BY {schema.TIMESTAMP} "
+            f"LIMIT 1 OFFSET {place}"
+        )[0]
+        for place in places
+    )
+    return begin, end
+
+
+def cut_episodes(log: CleanLog, cut: Cut) -> None:
+    """Make the table `steps`: rows that stay, with `split`, `starts` (of a session), `first` (of an
+    episode), `episode` (number within the user) and `terminated`.
+
+    Raises:
+        InputError: nothing stays, or nothing of the training window.
+    """
+    time, user = schema.TIMESTAMP, schema.USER_ID
+    if cut.session_by == schema.SESSION_ID:
+        # Sessions of one user may overlap: each is kept together, placed by its first row.
+        source = (
+            f"SELECT *, min({time}) OVER (PARTITION BY {user}, {schema.SESSION_ID}) AS began "
+            "FROM clean"
+        )
+        order = f"began, {schema.SESSION_ID}, {time}, {log.key}"
+        starts = f"{schema.SESSION_ID} IS DISTINCT FROM lag({schema.SESSION_ID}) OVER w"
+    else:
+        source, order = "SELECT *, 0 AS began FROM clean", f"{time}, {log.key}"
+        starts = f"lag({time}) OVER w IS NULL"
+        if cut.session_by == "gap":
+            starts += f" OR {time} - lag({time}) OVER w > {cut.gap_ms}"
+    log.connection.execute(f"""
+        CREATE TABLE steps AS
+        WITH marked AS (
+            SELECT *, {starts} AS starts,
+                CAST(({time} >= {cut.bounds[0]})::INT + ({time} >= {cut.bounds[1]})::INT
+                    AS UTINYINT) AS split
+            FROM ({source}) WINDOW w AS (PARTITION BY {user} ORDER BY {order})
+        ), ended AS (
+            SELECT *, starts OR split <> lag(split) OVER w AS first,
+                coalesce(lead(starts) OVER w, true) AS ends
+            FROM marked WINDOW w AS (PARTITION BY {user} ORDER BY {order})
+        ), numbered AS (
+            SELECT *, CAST(sum(first::INT) OVER w AS BIGINT) AS episode
+            FROM ended WINDOW w AS (PARTITION BY {user} ORDER BY {order})
+        ), measured AS (
+            SELECT * EXCLUDE (ends, began, row, reason),
+                count(*) OVER e AS length, bool_or(ends) OVER e AS terminated
+            FROM numbered WINDOW e AS (PARTITION BY {user}, episode)
+        )
+        SELECT * EXCLUDE (length) FROM measured WHERE length >= {cut.min_steps}
+    """)
+    kept, training = log.one("SELECT count(*), count_if(split = 0) FROM steps")
+    if kept == 0:
+        (rows,) = log.one("SELECT count(*) FROM clean")
+        raise InputError(
+            f"no session is left: none of the {rows} clean rows is in an episode of "
+            f"{cut.min_steps} steps or more; lower min_steps or widen the sessions"
+        )
+    if training == 0:
+        raise InputError(
+            f"no row falls into the training window (before {cut.bounds[0]} ms); move the split"
+        )
+
+
+def number_ids(log: CleanLog, listed: dict[str, list[str]], like: Path | None) -> None:
+    """Make the tables `users` and `items`: id, its `number` in sorted order, `train_count`.
+
+    Args:
+        listed: tables with a column `id` that list further users and items, by log column.
+        like: a store whose numbers are taken over instead.
+    """
+    for table, name, file in (
+        ("users", schema.USER_ID, USERS_FILE),
+        ("items", schema.ITEM_ID, ITEMS_FILE),
+    ):
+        if name not in log.columns:
+            continue
+        if like is not None:
+            source = f"read_parquet({text(str(like / file))}, file_row_number = true)"
+            log.connection.execute(
+                f"CREATE TABLE {table} AS SELECT {name}, file_row_number AS number FROM {source}"
+            )
+            continue
+        ids = [f"SELECT DISTINCT {name} FROM steps"]
+        ids += [f"SELECT id FROM {other}" for other in listed[name]]
+        log.connection.execute(f"""
+            CREATE TABLE {table} AS
+            SELECT {name}, row_number() OVER (ORDER BY {name}) - 1 AS number,
+                coalesce(train_count, 0) AS train_count
+            FROM ({" UNION ".join(ids)}) LEFT JOIN (
+                SELECT {name}, count(*) AS train_count FROM steps WHERE split = 0 GROUP BY {name}
+            ) USING ({name})
+        """)
+
+
+def ordered_steps(log: CleanLog) -> str:
+    """The query that gives the steps in the order of the store, numbers in place of ids."""
+    columns = ["users.number AS user", "split", "terminated", "first"]
+    joins = f"LEFT JOIN users USING ({schema.USER_ID})"
+    if log.key == schema.ITEM_ID:
+        columns.append(f"items.number AS {schema.ITEM}")
+        joins += f" JOIN items USING ({schema.ITEM_ID})"
+    columns += [schema.TIMESTAMP, f"CAST({schema.REWARD} AS FLOAT) AS {schema.REWARD}"]
+    columns += [name for name in log.vector_size]
+    columns += [c for c in (schema.PROPENSITY, schema.IS_RANDOM) if c in log.columns]
+    return (
+        f"SELECT {', '.join(columns)} FROM steps {joins} "
+        f"ORDER BY {schema.USER_ID}, episode, {schema.TIMESTAMP}, {log.key}"
+    )

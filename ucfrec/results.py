@@ -1,0 +1,65 @@
+"""Result rows: where they came from, and how they are shown."""
+
+import hashlib
+import json
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+_PACKAGES = ("ucfrec", "torch", "numpy", "gymnasium", "mujoco")
+_SHOWN = ("world", "policy", "R_cum", "R_avg_pooled", "R_avg_episode", "length", "episodes", "seed")
+
+
+def versions() -> dict[str, str]:
+    """Versions of what decides numbers; packages that are not installed are left out."""
+    found = {"python": sys.version.split()[0]}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def provenance() -> dict[str, Any]:
+    """What every result row records of the process that made it."""
+    return {"command": " ".join(sys.argv), "commit": _commit(), "versions": versions()}
+
+
+def config_hash(config: Mapping[str, Any]) -> str:
+    """A short name for a configuration."""
+    return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def _commit() -> str | None:
+    """Commit of the checkout that ucfrec is imported from; None for an installed wheel."""
+    root = Path(__file__).resolve().parent.parent
+    if not (root / ".git").exists():
+        return None
+    asked = subprocess.run(
+        ["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=False
+    )
+    return asked.stdout.strip() or None
+
+
+def format_rows(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Result rows as an aligned table, R_cum with its interval."""
+    body = [[_cell(row, name) for name in _SHOWN] for row in rows]
+    table = [list(_SHOWN), *body]
+    widths = [max(len(line[i]) for line in table) for i in range(len(_SHOWN))]
+    lines = []
+    for line in table:
+        cells = [line[i].ljust(w) if i < 2 else line[i].rjust(w) for i, w in enumerate(widths)]
+        lines.append("  ".join(cells).rstrip())
+    lines.insert(1, "  ".join("-" * width for width in widths))
+    return "\n".join(lines)
+
+
+def _cell(row: Mapping[str, Any], name: str) -> str:
+    value = row[name]
+    if name == "R_cum":
+        return f"{value:.3f} [{row['R_cum_low']:.3f}, {row['R_cum_high']:.3f}]"
+    return f"{value:.3f}" if isinstance(value, float) else str(value)

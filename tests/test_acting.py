@@ -32,7 +32,9 @@ def build(name: str, sizes: dict[str, int]) -> SequencePolicy:
     return UCFPolicy(UCFConfig(context=K, dim=16), sizes)
 
 
-def written(folder: Path, steps: list[Step], action: str, states: ItemStates | None) -> EpisodeStore:
+def written(
+    folder: Path, steps: list[Step], action: str, states: ItemStates | None
+) -> EpisodeStore:
     """The sessions played, as a store in the order of their numbers."""
     episodes = np.concatenate([step.episodes for step in steps])
     order = np.argsort(episodes, kind="stable")

@@ -43,11 +43,10 @@ class PolicyActor:
         self._policy, self._target = policy, float(target_return)
         self._observation_size, self._item_ids = observation_size, item_ids
         self._sessions = None if item_states is None else SessionStates(item_states, n)
-        is_item = isinstance(policy.head, ItemHead)
         self._actions = (
             torch.zeros(n, k, dtype=torch.int64)
-            if is_item
-            else torch.zeros(n, k, policy.head.embed_action.in_features)
+            if isinstance(policy.head, ItemHead)
+            else torch.zeros(n, k, len(policy.head.scale))
         )
         self._states = torch.zeros(n, k, len(policy.state_mean))
         self._returns_to_go = torch.zeros(n, k)

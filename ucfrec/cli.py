@@ -21,9 +21,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        from ucfrec import commands
+        from ucfrec.commands import COMMANDS
 
-        commands.COMMANDS[options.command](options)
+        COMMANDS[options.command](options)
     except InputError as error:
         return _failed(options, f"ucfrec {options.command}: {error}")
     except OSError as error:

@@ -1,11 +1,12 @@
 """What each command does with its options."""
 
 import argparse
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import torch
 
 from ucfrec.collect import collect
@@ -13,14 +14,16 @@ from ucfrec.config import resolve_config
 from ucfrec.demo import DemoConfig, demo
 from ucfrec.errors import InputError
 from ucfrec.evaluate import World, evaluate_behavior, evaluate_policy
-from ucfrec.files import write_json
+from ucfrec.files import atomic_file, write_json
 from ucfrec.log_mapping import Dataset, LogMapping, columns_given, read_mapping
-from ucfrec.logs import PrepareOptions, format_report, parse_split, prepare, validate
+from ucfrec.log_report import format_report
+from ucfrec.logs import PrepareOptions, parse_split, prepare, read_histories, validate
 from ucfrec.plugins import load_plugin
-from ucfrec.recommend import recommend, write_recommendations
+from ucfrec.recommend import LONGEST_HISTORY, Histories, recommend
 from ucfrec.results import format_rows, provenance
-from ucfrec.run import TrainedPolicy, describe_run, train_run
+from ucfrec.run import describe_run, train_run
 from ucfrec.store import EpisodeStore
+from ucfrec.trained import TrainedPolicy
 
 
 def run_demo(options: argparse.Namespace) -> None:
@@ -102,12 +105,12 @@ def run_evaluate(options: argparse.Namespace) -> None:
     for run in options.runs:
         trained = TrainedPolicy.load(run, options.checkpoint)
         target = _target(options, trained)
-        row = evaluate_policy(
-            world, trained, trained.name, options.episodes, options.seed, target
-        )
+        row = evaluate_policy(world, trained, trained.name, options.episodes, options.seed, target)
         rows.append(row | {"run": str(run), "checkpoint": options.checkpoint})
-    for behavior in options.behavior:
-        rows.append(evaluate_behavior(world, behavior, options.episodes, options.seed))
+    rows += [
+        evaluate_behavior(world, behavior, options.episodes, options.seed)
+        for behavior in options.behavior
+    ]
     print(format_rows(rows))
     if options.json is not None:
         write_json(options.json, [row | provenance() for row in rows])
@@ -123,17 +126,25 @@ def run_recommend(options: argparse.Namespace) -> None:
     """`ucfrec recommend`."""
     files, mapping = _logs(options)
     trained = TrainedPolicy.load(options.run, options.checkpoint)
-    table = recommend(
+    read = read_histories(files, mapping, trained.record["reward"], LONGEST_HISTORY)
+    frames = recommend(
         trained,
-        files,
-        mapping,
-        k=options.k,
+        map(Histories.from_batch, read),
+        options.k,
         target_return=_target(options, trained),
-        keep_seen=options.keep_seen,
+        filter_seen=not options.keep_seen,
         skip_unknown=options.skip_unknown,
     )
-    write_recommendations(table, options.out)
-    print(f"{options.out}: {table.num_rows} rows", file=sys.stderr)
+    rows, writer = 0, None
+    with atomic_file(options.out) as scratch:
+        for frame in frames:
+            table = pa.Table.from_pandas(frame, preserve_index=False)
+            writer = writer or pq.ParquetWriter(scratch, table.schema)
+            writer.write_table(table)
+            rows += len(frame)
+        if writer is not None:
+            writer.close()
+    print(f"{options.out}: {rows:,} rows")
 
 
 COMMANDS: dict[str, Callable[[argparse.Namespace], Any]] = {

@@ -17,8 +17,9 @@ from ucfrec.evaluate import World, evaluate_behavior, evaluate_policy
 from ucfrec.files import write_json
 from ucfrec.log_mapping import FeatureTable, LogMapping
 from ucfrec.logs import PrepareOptions, prepare
-from ucfrec.run import TrainedPolicy, train_run
+from ucfrec.run import train_run
 from ucfrec.store import EpisodeStore
+from ucfrec.trained import TrainedPolicy
 
 WORLDS = ("synthetic-taobao", "synthetic-catalog")
 LEARNERS: dict[str, tuple[str, ...]] = {

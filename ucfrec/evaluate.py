@@ -12,7 +12,7 @@ from ucfrec.errors import InputError
 from ucfrec.metrics import session_metrics
 from ucfrec.plugins import Simulator, load_plugin
 from ucfrec.rollout import Actor, rollout
-from ucfrec.run import TrainedPolicy
+from ucfrec.trained import TrainedPolicy
 
 SIDE_BY_SIDE = 512
 """Most episodes played at once."""

@@ -60,7 +60,7 @@ def write_item_states(
         known = np.unique(users)
         about_users = _reduced(user_features, known, USER_SIZE)
         spread = about_users[known].std(axis=0)
-        about_users = about_users / np.where(spread > 0, spread, 1).astype(np.float32)
+        about_users /= np.where(spread > 0, spread, 1)
     states = ItemStates(torch.from_numpy(embeddings), torch.from_numpy(about_users), low, high)
     states.save(folder / ITEM_STATES)
     return states
@@ -102,8 +102,8 @@ def item_embeddings(
         placed = _expected(features, trained, company, counts)
     placed[trained] = trust * company + (1 - trust) * placed[trained]
     if content is None:
-        return placed.astype(np.float32)
-    return (np.hstack([placed, content]) / np.sqrt(2)).astype(np.float32)
+        return np.asarray(placed, dtype=np.float32)
+    return np.asarray(np.hstack([placed, content]) / np.sqrt(2), dtype=np.float32)
 
 
 def _company(
@@ -116,9 +116,9 @@ def _company(
     # Popular items and busy users would otherwise fill the leading directions.
     by_item = 1 / np.sqrt(np.asarray(matrix.sum(axis=0)).ravel())
     by_user = 1 / np.sqrt(np.asarray(matrix.sum(axis=1)).ravel())
-    matrix = sparse.diags(by_user) @ matrix @ sparse.diags(by_item)
-    rank = min(size, *matrix.shape)
-    _, strength, directions = randomized_svd(matrix, rank, random_state=0)
+    balanced = sparse.diags(by_user) @ matrix @ sparse.diags(by_item)
+    rank = min(size, *balanced.shape)
+    _, strength, directions = randomized_svd(balanced, rank, random_state=0)
     return _unit_rows((np.sqrt(strength)[:, None] * directions).T)
 
 

@@ -21,9 +21,10 @@ from ucfrec.log_files import (
     is_number,
     is_vector,
     open_tables,
+    text,
     wrong_type,
 )
-from ucfrec.log_mapping import KEY_COLUMNS, OPTIONAL_COLUMNS, LogMapping
+from ucfrec.log_mapping import OPTIONAL_COLUMNS, LogMapping
 
 EARLIEST_MS: Final = 946_684_800_000
 """2000-01-01 UTC: earlier rows come from a clock that is wrong."""
@@ -33,6 +34,7 @@ REASONS: Final = {
     "null_key": "user, item or action, time or session is missing",
     "clock_out_of_range": "time before 2000 or more than a day ahead of now",
     "vector_not_finite": "action or observation is missing or holds NaN or infinity",
+    "unknown_item": "item is none of the store's",
     "duplicate": "repeats the user, item or action, and time of a row that is kept",
     "reward_not_finite": "reward is missing, NaN or infinite",
 }
@@ -40,24 +42,26 @@ REASONS: Final = {
 
 
 @contextmanager
-def engine(
-    memory_limit: str, folder: Path | None
-) -> Iterator[tuple[duckdb.DuckDBPyConnection, Path]]:
-    """A DuckDB that works on disk: (connection, its folder, which is removed at the end).
+def engine(memory_limit: str, folder: Path) -> Iterator[duckdb.DuckDBPyConnection]:
+    """A DuckDB that works on disk.
 
     Args:
         memory_limit: e.g. "2GB".
-        folder: where its folder is made; None for the system's temporary one.
+        folder: where it keeps its files until the end.
+
+    Raises:
+        InputError: the limit is none.
     """
     with TemporaryDirectory(prefix=".ucfrec-", dir=folder) as work:
         connection = duckdb.connect(str(Path(work) / "rows.duckdb"))
         try:
             connection.execute(f"SET temp_directory = '{work}/spill'")
             connection.execute("SET enable_progress_bar = false")
+            connection.execute("SET error_on_division_by_zero = false")
             try:
                 connection.execute("SET memory_limit = ?", [memory_limit])
             except duckdb.Error:
-                raise InputError(f"memory_limit {memory_limit!r}: write e.g. 500MB or 2GB") from None
+                raise InputError(f"memory_limit {memory_limit!r}: write e.g. 2GB") from None
             # SQL's own least(x, 5) is 5 where x is NULL, NaN or infinite: a video of unknown length
             # would count as watched five times. Undefined parts make a reward undefined instead.
             for name, sign in (("least", "<"), ("greatest", ">")):
@@ -66,7 +70,7 @@ def engine(
                     f"isfinite(b::DOUBLE) THEN CASE WHEN a {sign} b THEN a ELSE b END END, "
                     f"(a, b, c) AS {name}({name}(a, b), c)"
                 )
-            yield connection, Path(work)
+            yield connection
         finally:
             connection.close()
 
@@ -85,6 +89,8 @@ class CleanLog:
     """Log columns present, `user_id` first."""
     vector_size: dict[str, int]
     """Size of `action` and `observation`, where present."""
+    session_by: str
+    """"session_id", "gap" or "user"."""
 
     @property
     def key(self) -> str:
@@ -96,10 +102,13 @@ class CleanLog:
         """Columns beyond user, key and time."""
         return tuple(c for c in self.columns if c not in (schema.USER_ID, self.key, "timestamp"))
 
+    def id_type(self, name: str) -> str:
+        """DuckDB type of an id column: BIGINT or VARCHAR."""
+        return str(self.one(f"SELECT typeof({name}) FROM rows LIMIT 1")[0])
+
     def one(self, sql: str) -> tuple[Any, ...]:
         """The single row that `sql` gives."""
-        row = self.connection.sql(sql).fetchone()
-        assert row is not None
+        row: tuple[Any, ...] = self.connection.sql(sql).fetchall()[0]
         return row
 
 
@@ -108,7 +117,8 @@ def read_log(
     files: Sequence[Path],
     mapping: LogMapping,
     reward: str,
-    session_key: bool,
+    session_by: str | None,
+    known_items: Path | None,
     folder: Path,
 ) -> CleanLog:
     """Read and judge every row of `files`.
@@ -119,14 +129,15 @@ def read_log(
 
     Args:
         reward: scalar SQL expression over the files' columns.
-        session_key: whether a row without session_id is of no use.
+        session_by: "session_id", "gap" or "user"; None for session_id where there is one, or gap.
+        known_items: a store's `items.parquet`, where other items are of no use.
         folder: named when its disk is full.
 
     Raises:
         InputError: anything of the files, columns or types that makes the log unusable.
     """
     tables = tuple(open_tables(connection, files))
-    columns = _present(tables, mapping)
+    columns = _present(tables, mapping, session_by)
     selects = [_select(connection, table, mapping, columns, reward) for table in tables]
     with explained(connection, tables, folder):
         for name in (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID):
@@ -139,19 +150,25 @@ def read_log(
         connection.execute(
             f"CREATE TABLE read AS SELECT row_number() OVER () AS row, * FROM ({union})"
         )
-        log = CleanLog(connection, tables, columns, _vector_sizes(connection, columns))
-        connection.execute(_judge(log, session_key))
+        sizes = _vector_sizes(connection, columns)
+        by = session_by or (schema.SESSION_ID if schema.SESSION_ID in columns else "gap")
+        log = CleanLog(connection, tables, columns, sizes, by)
+        connection.execute(_judge(log, known_items))
         connection.execute("DROP TABLE read")
         connection.execute("CREATE VIEW clean AS SELECT * FROM rows WHERE reason IS NULL")
     return log
 
 
-def _present(tables: Sequence[Table], mapping: LogMapping) -> tuple[str, ...]:
+def _present(
+    tables: Sequence[Table], mapping: LogMapping, session_by: str | None
+) -> tuple[str, ...]:
     """Log columns that the files have; required ones count as there, so that binding says more."""
     named = {name: value for name, value in mapping.columns.items() if value}
     switched_off = mapping.columns.keys() - named.keys()
     everywhere = set.intersection(*({c.casefold() for c in t.columns} for t in tables))
     there = (set(named) | everywhere) - switched_off
+    if session_by == schema.SESSION_ID:
+        there.add(session_by)
     if schema.ACTION in named or (schema.ACTION in there and schema.ITEM_ID not in there):
         key = schema.ACTION
     else:
@@ -226,7 +243,7 @@ def _unify_ids(selects: list[Select], name: str) -> None:
 def _vector_sizes(
     connection: duckdb.DuckDBPyConnection, columns: tuple[str, ...]
 ) -> dict[str, int]:
-    sizes = {}
+    sizes: dict[str, int] = {}
     for name in (schema.ACTION, schema.OBSERVATION):
         if name not in columns:
             continue
@@ -243,16 +260,20 @@ def _vector_sizes(
     return sizes
 
 
-def _judge(log: CleanLog, session_key: bool) -> str:
+def _judge(log: CleanLog, known_items: Path | None) -> str:
     keys = [schema.USER_ID, log.key, schema.TIMESTAMP]
-    keys += [schema.SESSION_ID] if session_key else []
+    keys += [schema.SESSION_ID] if log.session_by == schema.SESSION_ID else []
     missing = " OR ".join(f"{k} IS NULL" for k in keys if k != schema.ACTION)
     bad_vector = " OR ".join(
         f"{name} IS NULL OR NOT list_bool_and([coalesce(isfinite(v), false) FOR v IN {name}])"
         for name in log.vector_size
     )
+    unknown = "false"
+    if known_items is not None:
+        known = f"SELECT CAST(item_id AS VARCHAR) FROM read_parquet({text(str(known_items))})"
+        unknown = f"CAST({log.key} AS VARCHAR) NOT IN ({known})"
     latest = int(time.time() * 1000) + DAY_MS
-    rest = ", ".join(("good", f"{schema.REWARD} DESC", *log.payload))
+    order = ", ".join(("good DESC", f"{schema.REWARD} DESC", *log.payload))
     return f"""
         CREATE TABLE rows AS
         WITH faults AS (
@@ -261,13 +282,14 @@ def _judge(log: CleanLog, session_key: bool) -> str:
                 WHEN {schema.TIMESTAMP} NOT BETWEEN {EARLIEST_MS} AND {latest}
                     THEN 'clock_out_of_range'
                 WHEN {bad_vector or "false"} THEN 'vector_not_finite'
+                WHEN {unknown} THEN 'unknown_item'
             END AS fault,
             coalesce(abs({schema.REWARD}) <= {MAX_FLOAT}, false) AS good
             FROM read
         ), ranked AS (
             SELECT *, row_number() OVER (
                 PARTITION BY fault, {schema.USER_ID}, {log.key}, {schema.TIMESTAMP}
-                ORDER BY {rest.replace("good", "good DESC", 1)}
+                ORDER BY {order}
             ) AS rank FROM faults
         )
         SELECT * EXCLUDE (fault, good, rank), CASE

@@ -1,7 +1,7 @@
 """Features of items and users, encoded as sparse matrices."""
 
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import duckdb
 import numpy as np
@@ -18,6 +18,7 @@ CLIP: Final = 5.0
 """Standardised numbers are clipped here."""
 
 Array = npt.NDArray[Any]
+Features: TypeAlias = sparse.csr_matrix
 
 
 def load_features(
@@ -29,7 +30,7 @@ def load_features(
     """Read feature tables into DuckDB tables `<kind>_features_0`, …, with columns `id`, `f0`, ….
 
     Args:
-        kind: "item" or "user".
+        kind: "item_id" or "user_id".
         id_type: DuckDB type of the log's ids.
 
     Returns:
@@ -47,24 +48,24 @@ def load_features(
             columns = []
             for number, column in enumerate(given):
                 sql, type_ = bind(connection, opened, f"{kind} feature", column)
-                sql = _comparable(sql, type_)
-                if sql is None:
+                comparable = _comparable(sql, type_)
+                if comparable is None:
                     wanted = "cast it to a number, text, or a list of either"
                     raise wrong_type(opened, f"{kind} feature", column, type_, wanted)
-                columns.append(f"{sql} AS f{number}")
+                columns.append(f"{comparable} AS f{number}")
             selects.append(
-                f"SELECT TRY_CAST({key} AS {id_type}) AS id, {', '.join(columns)} "
-                f"FROM {opened.sql}"
+                f"SELECT TRY_CAST({key} AS {id_type}) AS id, {', '.join(columns)} FROM {opened.sql}"
             )
         connection.execute(
             f"CREATE TABLE {name} AS SELECT * FROM ({' UNION ALL BY NAME '.join(selects)}) "
             "WHERE id IS NOT NULL"
         )
-        count = connection.sql(f"SELECT count(*), count(DISTINCT id) FROM {name}").fetchone()
-        assert count is not None
-        if count[0] != count[1]:
+        ((rows, ids),) = connection.sql(
+            f"SELECT count(*), count(DISTINCT id) FROM {name}"
+        ).fetchall()
+        if rows != ids:
             raise InputError(
-                f"{', '.join(map(str, table.files))}: {count[0] - count[1]} of {count[0]} rows "
+                f"{', '.join(map(str, table.files))}: {rows - ids} of {rows} rows "
                 f"repeat a {table.key}; keep one row a {kind}"
             )
         names.append(name)
@@ -88,7 +89,7 @@ def _comparable(sql: str, kind: str) -> str | None:
 
 def encode_features(
     connection: duckdb.DuckDBPyConnection, names: Sequence[str], ids: str, id_column: str
-) -> sparse.csr_matrix | None:
+) -> Features | None:
     """Encode feature tables, one row an id of the table `ids`, in the order of its `number`.
 
     Means, deviations and the choice of categories come from ids of the training window
@@ -98,22 +99,31 @@ def encode_features(
     Returns:
         (n_ids, F) float32; None without any feature.
     """
-    row = connection.sql(f"SELECT count(*) FROM {ids}").fetchone()
-    assert row is not None
+    ((count,),) = connection.sql(f"SELECT count(*) FROM {ids}").fetchall()
     blocks = []
     for name in names:
         joined = f"{ids} JOIN {name} ON {ids}.{id_column} = {name}.id"
         for column, kind, *_ in connection.sql(f"DESCRIBE {name}").fetchall()[1:]:
-            encode = {"DOUBLE": _numbers, "VARCHAR": _categories, "VARCHAR[]": _categories}
-            block = encode.get(kind, _vectors)(connection, joined, column, row[0])
+            block = _encode(connection, joined, column, kind, count)
             if block.shape[1]:
                 blocks.append(block)
     return sparse.hstack(blocks, format="csr", dtype=np.float32) if blocks else None
 
 
+def _encode(
+    connection: duckdb.DuckDBPyConnection, joined: str, column: str, kind: str, count: int
+) -> Features:
+    if kind == "DOUBLE":
+        return _numbers(connection, joined, column, count)
+    if kind == "FLOAT[]":
+        return _vectors(connection, joined, column, count)
+    value = column if kind == "VARCHAR" else f"unnest(list_distinct({column}))"
+    return _categories(connection, joined, value, count)
+
+
 def _numbers(
     connection: duckdb.DuckDBPyConnection, joined: str, column: str, count: int
-) -> sparse.csr_matrix:
+) -> Features:
     found = connection.sql(
         f"SELECT number, train_count > 0 AS trained, {column} AS value FROM {joined} "
         f"WHERE isfinite({column}) ORDER BY number"
@@ -123,7 +133,7 @@ def _numbers(
 
 def _vectors(
     connection: duckdb.DuckDBPyConnection, joined: str, column: str, count: int
-) -> sparse.csr_matrix:
+) -> Features:
     sizes = connection.sql(
         f"SELECT DISTINCT len({column}) FROM {joined} WHERE {column} IS NOT NULL"
     ).fetchall()
@@ -138,30 +148,25 @@ def _vectors(
     return _standardised(found["number"].to_numpy(), trained, values.reshape(-1, *sizes[0]), count)
 
 
-def _standardised(rows: Array, trained: Array, values: Array, count: int) -> sparse.csr_matrix:
+def _standardised(rows: Array, trained: Array, values: Array, count: int) -> Features:
     training = values[trained.astype(bool)]
     if not len(training):
-        return sparse.csr_matrix((count, 0), dtype=np.float32)
+        return _sparse(values[:0, :0], rows[:0], rows[:0], (count, 0))
     deviation = training.std(axis=0)
     varied = deviation > 0
     scaled = (values - training.mean(axis=0))[:, varied] / deviation[varied]
     scaled = np.clip(scaled, -CLIP, CLIP).astype(np.float32)
     size = scaled.shape[1]
-    at = (np.repeat(rows, size), np.tile(np.arange(size), len(rows)))
-    return sparse.csr_matrix((scaled.ravel(), at), shape=(count, size))
+    columns = np.tile(np.arange(size), len(rows))
+    return _sparse(scaled, np.repeat(rows, size), columns, (count, size))
 
 
 def _categories(
-    connection: duckdb.DuckDBPyConnection, joined: str, column: str, count: int
-) -> sparse.csr_matrix:
-    # Text is a list of one; a list is a set of tags.
-    each = f"unnest(list_distinct(flatten([[]::VARCHAR[], {column}::VARCHAR[]])))"
-    kind = connection.sql(f"SELECT typeof({column}) FROM {joined} LIMIT 1").fetchone()
-    if kind is not None and kind[0] == "VARCHAR":
-        each = column
-    cases = f"SELECT number, train_count, {each} AS value FROM {joined}"
+    connection: duckdb.DuckDBPyConnection, joined: str, value: str, count: int
+) -> Features:
     found = connection.sql(f"""
-        WITH cases AS ({cases}), kept AS (
+        WITH cases AS (SELECT number, train_count, {value} AS value FROM {joined}),
+        kept AS (
             SELECT value, row_number() OVER (ORDER BY count(*) DESC, value) - 1 AS place
             FROM cases WHERE train_count > 0 AND value IS NOT NULL
             GROUP BY value ORDER BY place LIMIT {CATEGORIES}
@@ -170,4 +175,8 @@ def _categories(
     """).fetchnumpy()
     size = int(found["place"].max()) + 1 if len(found["place"]) else 0
     ones = np.ones(len(found["number"]), dtype=np.float32)
-    return sparse.csr_matrix((ones, (found["number"], found["place"])), shape=(count, size))
+    return _sparse(ones, found["number"], found["place"], (count, size))
+
+
+def _sparse(values: Array, rows: Array, columns: Array, shape: tuple[int, int]) -> Features:
+    return sparse.coo_matrix((values.ravel(), (rows, columns)), shape=shape).tocsr()

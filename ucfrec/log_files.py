@@ -1,4 +1,4 @@
-"""Log and feature files as DuckDB sees them: opened, their columns bound, their faults explained."""
+"""Log and feature files as DuckDB sees them: opened, columns bound, faults explained."""
 
 import difflib
 import errno
@@ -13,8 +13,9 @@ import duckdb
 from ucfrec.errors import InputError
 
 _NAME = re.compile(r"[^\W\d]\w*")
+_SUBQUERY = re.compile(r"\bselect\b", re.IGNORECASE)
 _UNKNOWN_COLUMN = re.compile(r'Referenced column "([^"]+)" not found')
-_CSV_FAULT = re.compile(r'CSV Error on Line: (\d+).*?\n\s*file = ([^\n]+)', re.DOTALL)
+_CSV_FAULT = re.compile(r"CSV Error on Line: (\d+).*?\n\s*file = ([^\n]+)", re.DOTALL)
 _CSV_COLUMN = re.compile(r'converting column "([^"]+)"\. ([^\n]+)')
 _INTEGER = re.compile(r"U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?")
 _REAL = re.compile(r"FLOAT|DOUBLE|DECIMAL.*")
@@ -126,10 +127,13 @@ def bind(
     if _NAME.fullmatch(given):
         raise InputError(_missing(table, what, given))
     sql = f"({given}\n)"
+    like = ", ".join(f"CAST(NULL AS {kind}) AS {quoted(name)}" for name, kind in table.types)
+    # Where conditions admit neither aggregates nor window functions.
+    query = f"DESCRIBE SELECT {sql} AS x FROM (SELECT {like}) WHERE {sql} IS NULL"
     try:
-        # Where conditions admit neither aggregates nor window functions.
-        connection.sql(f"SELECT 1 FROM {table.sql} WHERE {sql} IS NULL LIMIT 0").fetchall()
-        described = connection.sql(f"DESCRIBE SELECT {sql} AS x FROM {table.sql}").fetchall()
+        if _SUBQUERY.search(given):
+            raise duckdb.ParserException("it has a subquery")
+        described = connection.sql(query).fetchall()
     except duckdb.Error as error:
         if unknown := _UNKNOWN_COLUMN.search(str(error)):
             raise InputError(_missing(table, what, unknown[1])) from None
@@ -182,7 +186,12 @@ def explained(
             raise InputError(
                 f"{file} cannot be read, it may be damaged ({fault_line}); fetch it again"
             ) from None
-        raise
+        if isinstance(error, duckdb.InternalError):
+            raise
+        files = ", ".join(str(file) for table in tables for file in table.files[:3])
+        raise InputError(
+            f"{files}: {_first_line(error)}; correct the values, or try_cast them in the mapping"
+        ) from None
 
 
 def _disk_full(folder: Path) -> InputError:

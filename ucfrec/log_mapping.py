@@ -139,7 +139,7 @@ def read_mapping(path: Path) -> LogMapping:
 
 
 def log_files(paths: Sequence[str | Path]) -> tuple[Path, ...]:
-    """Files that `paths` (files, folders, globs) stand for, each once, in order of name within each.
+    """Files that `paths` (files, folders, globs) stand for, each once, by name within a path.
 
     Raises:
         InputError: one of them is missing, matches nothing, or is of an unknown kind.

@@ -10,7 +10,11 @@ from ucfrec.log_clean import CleanLog
 from ucfrec.log_files import text
 
 ITEMS_FILE: Final = "items.parquet"
-USERS_FILE: Final = "users.parquet"
+ID_TABLES: Final = (
+    (schema.USER_ID, "users", "users.parquet"),
+    (schema.ITEM_ID, "items", ITEMS_FILE),
+)
+"""Id column, its table of numbers, and that table's file in the store."""
 SESSIONS: Final = (schema.SESSION_ID, "gap", "user")
 
 
@@ -110,10 +114,7 @@ def number_ids(log: CleanLog, listed: dict[str, list[str]], like: Path | None) -
         listed: tables with a column `id` that list further users and items, by log column.
         like: a store whose numbers are taken over instead.
     """
-    for table, name, file in (
-        ("users", schema.USER_ID, USERS_FILE),
-        ("items", schema.ITEM_ID, ITEMS_FILE),
-    ):
+    for name, table, file in ID_TABLES:
         if name not in log.columns:
             continue
         if like is not None:
@@ -136,13 +137,13 @@ def number_ids(log: CleanLog, listed: dict[str, list[str]], like: Path | None) -
 
 def ordered_steps(log: CleanLog) -> str:
     """The query that gives the steps in the order of the store, numbers in place of ids."""
-    columns = ["users.number AS user", "split", "terminated", "first"]
+    columns = ["coalesce(users.number, -1) AS user", "split", "terminated", "first"]
     joins = f"LEFT JOIN users USING ({schema.USER_ID})"
     if log.key == schema.ITEM_ID:
         columns.append(f"items.number AS {schema.ITEM}")
         joins += f" JOIN items USING ({schema.ITEM_ID})"
     columns += [schema.TIMESTAMP, f"CAST({schema.REWARD} AS FLOAT) AS {schema.REWARD}"]
-    columns += [name for name in log.vector_size]
+    columns += log.vector_size
     columns += [c for c in (schema.PROPENSITY, schema.IS_RANDOM) if c in log.columns]
     return (
         f"SELECT {', '.join(columns)} FROM steps {joins} "

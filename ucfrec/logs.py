@@ -5,13 +5,15 @@ into sessions, and stream sorted into the store.
 """
 
 import hashlib
+import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Any, Final
 
-import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
@@ -20,17 +22,24 @@ from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder
 from ucfrec.items import write_item_states
 from ucfrec.log_clean import CleanLog, engine, read_log
-from ucfrec.log_features import encode_features, listed_ids
+from ucfrec.log_features import encode_features, load_features
 from ucfrec.log_files import explained, text
 from ucfrec.log_mapping import LogMapping, log_files
-from ucfrec.log_report import build_report
-from ucfrec.store import EpisodeStore
+from ucfrec.log_report import build_report, drop_counts, require_variety
+from ucfrec.log_sessions import (
+    ID_TABLES,
+    ITEMS_FILE,
+    SESSIONS,
+    Cut,
+    cut_episodes,
+    number_ids,
+    ordered_steps,
+    split_bounds,
+)
+from ucfrec.store import ITEM_STATES
 from ucfrec.store_writer import StoreWriter
 
-BATCH_ROWS: Final = 2**18
-SESSIONS: Final = (schema.SESSION_ID, "gap", "user")
-ITEMS_FILE: Final = "items.parquet"
-USERS_FILE: Final = "users.parquet"
+BATCH_ROWS: Final = 2**17
 
 
 @dataclass(frozen=True)
@@ -91,33 +100,53 @@ def parse_split(given: str) -> tuple[float, ...]:
 
 
 def prepare(
-    paths: Sequence[str | Path], mapping: LogMapping, out: Path, options: PrepareOptions
+    paths: Sequence[str | Path],
+    mapping: LogMapping,
+    out: Path,
+    options: PrepareOptions | None = None,
+    like: Path | None = None,
 ) -> dict[str, Any]:
     """Write the logs as an `EpisodeStore` at `out`, whole or not at all.
 
-    The store's users and items are those of the log and of the feature tables, in sorted order:
-    rows of `users.parquet` (user_id) and `items.parquet` (item_id, train_count). A session that a
-    boundary between splits falls into is cut there: its pieces are episodes, all but the last not
-    terminated. Same rows, whatever their order, give the same fingerprint.
+    Users and items are those of the log and of the feature tables, in sorted order: rows of
+    `users.parquet` (user_id) and `items.parquet` (item_id), each with its train_count. A session
+    that a boundary between splits falls into is cut there: its pieces are episodes, all but the
+    last not terminated. The same rows, in whatever order, give the same fingerprint.
 
     Args:
         paths: log files, folders and globs.
+        like: a store whose users, items and item states are taken over, to judge a policy trained
+            on it by other logs. Rows with items it does not know are dropped, users it does not
+            know have number −1, and all episodes are uncut and of the split "train".
 
     Returns:
-        What was read, dropped and written; also in the store's `meta.json` under "source", and
-        printed by `format_report`.
+        What was read, dropped and written, for `format_report`; also in the store's `meta.json`
+        under "source".
 
     Raises:
         InputError: the input cannot be used, `out` exists, or the disk is full.
     """
+    options = options or PrepareOptions()
     files = log_files(paths)
-    with atomic_folder(out) as folder, engine(options.memory_limit, folder) as (connection, work):
-        pass
-    raise NotImplementedError
+    with atomic_folder(out) as folder:
+        spill = options.temp_folder or out.parent
+        with (
+            _episodes(files, mapping, options, spill, like) as (log, report, features),
+            explained(log.connection, log.tables, out.parent),
+        ):
+            writer = StoreWriter(folder)
+            for batch in log.connection.sql(ordered_steps(log)).to_arrow_reader(BATCH_ROWS):
+                _append(writer, batch, log)
+            writer.finish(report["reward"], report, _write_ids(log, folder))
+            if log.key == schema.ITEM_ID and like is None:
+                _learn_states(log, folder, features, options.embedding_size)
+            elif log.key == schema.ITEM_ID and like is not None:
+                shutil.copy(like / ITEM_STATES, folder / ITEM_STATES)
+    return report
 
 
 def validate(
-    paths: Sequence[str | Path], mapping: LogMapping, options: PrepareOptions
+    paths: Sequence[str | Path], mapping: LogMapping, options: PrepareOptions | None = None
 ) -> dict[str, Any]:
     """Check the logs as `prepare` does, and write nothing.
 
@@ -127,4 +156,143 @@ def validate(
     Raises:
         InputError: the input cannot be used.
     """
-    raise NotImplementedError
+    options = options or PrepareOptions()
+    spill = options.temp_folder or Path(gettempdir())
+    with _episodes(log_files(paths), mapping, options, spill, None) as (_, report, _):
+        return report
+
+
+def read_histories(
+    paths: Sequence[str | Path],
+    mapping: LogMapping,
+    reward: str,
+    last: int,
+    memory_limit: str = "2GB",
+) -> Iterator[pa.RecordBatch]:
+    """What each user of a log was shown, cleaned as `prepare` cleans it.
+
+    Args:
+        paths: log files, folders and globs.
+        reward: scalar SQL expression over their columns.
+        last: how many of each user's most recent rows to give.
+
+    Yields:
+        Batches of users in sorted order: `user_id`; `item_ids`, `rewards` (float32) and
+        `timestamps` (ms), lists of at most `last`, the most recent last; `seen`, all of the user's
+        item_ids, sorted; and, where it is logged, the most recent `observation`.
+
+    Raises:
+        InputError: the input cannot be used.
+    """
+    folder = Path(gettempdir())
+    with engine(memory_limit, folder) as connection:
+        log = read_log(connection, log_files(paths), mapping, reward, "user", None, folder)
+        if log.key != schema.ITEM_ID:
+            raise InputError(f"{log.tables[0].files[0]}: its actions are vectors, not items")
+        drop_counts(log)
+        order = f"ORDER BY {schema.TIMESTAMP}, {schema.ITEM_ID}"
+        lists = ", ".join(
+            f"list({value} {order}) FILTER (WHERE back <= {last}) AS {name}"
+            for name, value in (
+                ("item_ids", schema.ITEM_ID),
+                ("rewards", f"CAST({schema.REWARD} AS FLOAT)"),
+                ("timestamps", schema.TIMESTAMP),
+            )
+        )
+        if schema.OBSERVATION in log.columns:
+            lists += f", any_value({schema.OBSERVATION}) FILTER (WHERE back = 1) AS observation"
+        backwards = f"{schema.TIMESTAMP} DESC, {schema.ITEM_ID} DESC"
+        query = f"""
+            SELECT {schema.USER_ID}, {lists}, list_sort(list(DISTINCT {schema.ITEM_ID})) AS seen
+            FROM (SELECT *, row_number() OVER (
+                PARTITION BY {schema.USER_ID} ORDER BY {backwards}
+            ) AS back FROM clean)
+            GROUP BY {schema.USER_ID} ORDER BY {schema.USER_ID}
+        """
+        with explained(connection, log.tables, folder):
+            yield from connection.sql(query).to_arrow_reader(BATCH_ROWS)
+
+
+Features = dict[str, list[str]]
+"""By id column, the DuckDB tables that hold features."""
+
+
+@contextmanager
+def _episodes(
+    files: Sequence[Path],
+    mapping: LogMapping,
+    options: PrepareOptions,
+    spill: Path,
+    like: Path | None,
+) -> Iterator[tuple[CleanLog, dict[str, Any], Features]]:
+    """The log in sessions, what there is to report of it, and the features."""
+    reward = options.reward or mapping.reward or schema.REWARD
+    session_by = options.session_by or mapping.session_by
+    known = None if like is None else like / ITEMS_FILE
+    with engine(options.memory_limit, spill) as connection:
+        log = read_log(connection, files, mapping, reward, session_by, known, spill)
+        with explained(connection, log.tables, spill):
+            dropped = drop_counts(log)
+            if like is None:
+                require_variety(log)
+            bounds = split_bounds(log, options.split if like is None else (1.0, 0.0, 0.0))
+            gap_ms = round(options.gap_minutes * 60_000)
+            cut = Cut(log.session_by, gap_ms, options.min_steps, bounds)
+            cut_episodes(log, cut)
+            features = {
+                name: load_features(connection, tables, name, log.id_type(name))
+                for name, tables in (
+                    (schema.USER_ID, mapping.user_features),
+                    (schema.ITEM_ID, mapping.item_features),
+                )
+                if name in log.columns and like is None
+            }
+            number_ids(log, features, like)
+            report = {"reward": reward, **build_report(log, cut, dropped)}
+        yield log, report, features
+
+
+def _append(writer: StoreWriter, batch: pa.RecordBatch, log: CleanLog) -> None:
+    columns: dict[str, npt.NDArray[Any]] = {}
+    for name in batch.schema.names:
+        column = batch.column(name)
+        if name in log.vector_size:
+            columns[name] = column.flatten().to_numpy().reshape(-1, log.vector_size[name])
+        else:
+            columns[name] = column.to_numpy(zero_copy_only=False)
+    episodes = {name: columns.pop(name) for name in schema.EPISODE_DTYPES}
+    first = columns.pop("first")
+    writer.append(columns, first, episodes)
+
+
+def _write_ids(log: CleanLog, folder: Path) -> dict[str, list[Any]]:
+    """Write the tables of users and items; returns a digest of each for the fingerprint."""
+    digests: dict[str, list[Any]] = {}
+    for name, table, file in ID_TABLES:
+        if name not in log.columns:
+            continue
+        log.connection.execute(
+            f"COPY (SELECT * EXCLUDE number FROM {table} ORDER BY number) "
+            f"TO {text(str(folder / file))} (FORMAT parquet)"
+        )
+        digest = hashlib.sha256()
+        query = f"SELECT {name} FROM {table} ORDER BY number"
+        for batch in log.connection.sql(query).to_arrow_reader(BATCH_ROWS):
+            digest.update("\n".join(map(str, batch.column(0).to_pylist())).encode())
+        digests[name] = [digest.hexdigest()]
+    return digests
+
+
+def _learn_states(log: CleanLog, folder: Path, features: Features, size: int) -> None:
+    encoded, counts = {}, {}
+    for name, table, _ in ID_TABLES:
+        (counts[name],) = log.one(f"SELECT count(*) FROM {table}")
+        encoded[name] = encode_features(log.connection, features[name], table, name)
+    write_item_states(
+        folder,
+        encoded[schema.ITEM_ID],
+        encoded[schema.USER_ID],
+        counts[schema.ITEM_ID],
+        counts[schema.USER_ID],
+        size,
+    )

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from ucfrec.heads import head_from
+from ucfrec.heads import Head, head_from
 from ucfrec.losses import mask_loss, masked_mean, parent_targets
 from ucfrec.windows import Windows
 
@@ -45,6 +45,7 @@ class SequencePolicy(nn.Module):
     state_mean: Tensor
     state_std: Tensor
     return_scale: Tensor
+    head: Head
 
     def __init__(self, config: PolicyConfig, sizes: Mapping[str, int]) -> None:
         """Build for `sizes`: `state` S, `action` A (of an item: its embedding's size), `items`
@@ -266,4 +267,3 @@ def _visible(mask: Tensor) -> Tensor:
     token = torch.arange(3 * length, device=mask.device)
     there = mask.repeat_interleave(3, dim=1).unsqueeze(1)
     return (token <= row) & there | (token == row)
-

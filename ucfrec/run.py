@@ -5,35 +5,25 @@ import shutil
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-import pyarrow.parquet as pq
 import torch
-from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.acting import PolicyActor
-from ucfrec.augment import augment
-from ucfrec.checkpoint import load_tensors, load_weights
+from ucfrec.augment import counterfactual_copies
 from ucfrec.config import POLICIES, Config, config_from_dict
-from ucfrec.crm import fit_crm
-from ucfrec.csg import fit_csg
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder, read_json, write_json
 from ucfrec.heads import ItemHead
 from ucfrec.policy import SequencePolicy
-from ucfrec.states import ItemStates
+from ucfrec.results import versions
 from ucfrec.store import ITEM_STATES, EpisodeStore
 from ucfrec.train import fit
+from ucfrec.trained import ITEMS, RUN, USERS
 from ucfrec.windows import Overlay, Windows
 
-RUN = "run.json"
-ITEMS, USERS = "items.parquet", "users.parquet"
 _VALIDATION_BATCHES = 16
 _VALIDATION_BATCH = 256
 _QUANTILES = (0.5, 0.75, 0.9, 0.95, 0.99, 1.0)
@@ -53,18 +43,16 @@ def train_run(store: EpisodeStore, out: Path, config: Config) -> dict[str, Any]:
         InputError: `out` is a run on another store or with another configuration, or the store has
             no training episodes.
     """
-    train = store.split("train")
-    if train.n_episodes == 0:
-        raise InputError(f"{store.path} has no training episodes; prepare it with a later split")
+    train, validation = _views(store)
     if not (out / RUN).exists():
         _begin(store, train, out, config)
     record = read_json(out / RUN)
     _require_same(record, store, out, config)
     began = time.perf_counter() - record["wall_time_s"]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    validation = store.split("validation")
     if config.augment.copies > 0:
-        train = train.with_overlay(_counterfactuals(train, validation, out, config, record))
+        overlay, record["augmentation"] = _counterfactuals(train, validation, out, config)
+        train = train.with_overlay(overlay)
     policy = new_policy(train, config).to(device)
     k = policy.config.context
 
@@ -78,7 +66,7 @@ def train_run(store: EpisodeStore, out: Path, config: Config) -> dict[str, Any]:
         config.train,
         out / "policy",
         seed=config.seed,
-        validate=_validation(policy, validation, config.seed) if validation.n_episodes else None,
+        validate=_validation(policy, validation, config.seed),
         describe=config.policy_name,
     )
     record["policy"] = dataclasses.asdict(fitted)
@@ -87,21 +75,34 @@ def train_run(store: EpisodeStore, out: Path, config: Config) -> dict[str, Any]:
     return dict(record)
 
 
+def _views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
+    """Episodes to learn from and, apart, to validate on: the store's splits, or, where none is for
+    validation, every tenth training episode."""
+    train, validation = store.split("train"), store.split("validation")
+    if train.n_episodes < 2:
+        raise InputError(
+            f"{store.path} has {train.n_episodes} training episodes; prepare it with a later split"
+        )
+    if validation.n_episodes:
+        return train, validation
+    held_out = np.arange(train.n_episodes) % 10 == 1
+    return train.select(np.flatnonzero(~held_out)), train.select(np.flatnonzero(held_out))
+
+
 def _begin(store: EpisodeStore, train: EpisodeStore, out: Path, config: Config) -> None:
     record = {
-        "command": sys.argv,
+        "command": " ".join(sys.argv),
         "config": dataclasses.asdict(config),
         "seed": config.seed,
         "store": str(store.path.resolve()),
         "fingerprint": store.meta["fingerprint"],
         "reward": store.meta["reward"],
+        "session_gap_ms": _gap_ms(store),
         "sizes": _sizes(store),
         "observation_size": store.observation_size,
-        "return_quantiles": {
-            str(q): float(np.quantile(train.returns, q)) for q in _QUANTILES
-        },
+        "return_quantiles": {str(q): float(np.quantile(train.returns, q)) for q in _QUANTILES},
         "mean_return": float(train.returns.mean()),
-        "versions": {name: version(name) for name in ("ucfrec", "torch", "numpy")},
+        "versions": versions(),
         "wall_time_s": 0.0,
     }
     with atomic_folder(out) as scratch:
@@ -111,7 +112,15 @@ def _begin(store: EpisodeStore, train: EpisodeStore, out: Path, config: Config) 
         write_json(scratch / RUN, record)
 
 
-def _require_same(record: Mapping[str, Any], store: EpisodeStore, out: Path, config: Config) -> None:
+def _gap_ms(store: EpisodeStore) -> float | None:
+    """The pause that ended sessions; None where sessions were not told by pauses."""
+    minutes = store.meta["source"].get("gap_minutes")
+    return None if minutes is None else minutes * 60_000
+
+
+def _require_same(
+    record: Mapping[str, Any], store: EpisodeStore, out: Path, config: Config
+) -> None:
     if record["fingerprint"] != store.meta["fingerprint"]:
         raise InputError(
             f"{out} is a run on another store ({record['store']}, fingerprint "
@@ -139,17 +148,17 @@ def _difference(before: Any, now: Any) -> str:
 
 
 def _counterfactuals(
-    train: EpisodeStore,
-    validation: EpisodeStore,
-    out: Path,
-    config: Config,
-    record: dict[str, Any],
-) -> Overlay:
-    """Reward model, generator and accepted edits (Algorithms 2 to 5)."""
-    path = out / "overlay.safetensors"
-    if path.exists():
-        return Overlay.load(path)
-    raise NotImplementedError
+    train: EpisodeStore, validation: EpisodeStore, out: Path, config: Config
+) -> tuple[Overlay, dict[str, Any]]:
+    """Edited copies and what is reported of them, made once a run."""
+    overlay_path, report_path = out / "overlay.safetensors", out / "augmentation.json"
+    if not report_path.exists():
+        overlay, report = counterfactual_copies(
+            train, validation, config.crm, config.csg, config.augment, out, config.seed
+        )
+        overlay.save(overlay_path)
+        write_json(report_path, dataclasses.asdict(report))
+    return Overlay.load(overlay_path), read_json(report_path)
 
 
 def _sizes(store: EpisodeStore) -> dict[str, int]:
@@ -197,65 +206,25 @@ def _validation(policy: SequencePolicy, validation: EpisodeStore, seed: int) -> 
     return loss
 
 
-@dataclass(frozen=True)
-class TrainedPolicy:
-    """A policy read back from a run folder, with all that acting and recommending need."""
-
-    policy: SequencePolicy
-    record: Mapping[str, Any]
-    item_states: ItemStates | None
-    item_ids: npt.NDArray[Any] | None
-    """(n_items,) identifiers in the logs; None where actions are vectors."""
-    user_ids: npt.NDArray[Any]
-    """(n_users,) identifiers in the logs; empty where there are none."""
-
-    @classmethod
-    def load(cls, run: Path, checkpoint: str = "best") -> "TrainedPolicy":
-        """Read `best` (on validation) or `last` weights of a run.
-
-        Raises:
-            InputError: `run` is no run folder, or has no checkpoint yet.
-        """
-        if not (run / RUN).exists():
-            raise InputError(f"{run} is not a run folder: it has no {RUN}; train one first")
-        record = read_json(run / RUN)
-        config = config_from_dict(record["config"])
-        policy = POLICIES[config.policy_name](config.policy, record["sizes"])
-        path = run / "policy" / f"{checkpoint}.safetensors"
-        load_weights(path, policy, _weights(path))
-        policy.eval()
-        states = run / ITEM_STATES
-        return cls(
-            policy,
-            record,
-            ItemStates.load(states) if states.exists() else None,
-            _ids(run / ITEMS, schema.ITEM_ID) if states.exists() else None,
-            _ids(run / USERS, schema.USER_ID),
-        )
-
-    def target_return(self, quantile: float) -> float:
-        """The `quantile` of training returns, interpolated between those the run recorded."""
-        known = self.record["return_quantiles"]
-        return float(np.interp(quantile, [float(q) for q in known], list(known.values())))
-
-    def actor(self, episodes: int, target_return: float) -> PolicyActor:
-        """An actor for `episodes` environments side by side."""
-        return PolicyActor(
-            self.policy,
-            episodes,
-            target_return,
-            self.record["observation_size"],
-            self.item_states,
-            self.item_ids,
-        )
-
-
-def _weights(path: Path) -> dict[str, Tensor]:
-    tensors, _ = load_tensors(path)
-    return {name: t for name, t in tensors.items() if not name.startswith("optimizer.")}
-
-
-def _ids(path: Path, column: str) -> npt.NDArray[Any]:
-    if not path.exists():
-        return np.empty(0, dtype=np.int64)
-    return np.asarray(pq.read_table(path, columns=[column]).column(column))
+def describe_run(record: Mapping[str, Any]) -> str:
+    """What a finished run found, in a few lines."""
+    lines = []
+    if "augmentation" in record:
+        report = record["augmentation"]
+        crm, moves = report["reward_model"], report["moves"]
+        lines += [
+            f"reward model  R² {crm['r2']:.3f} with z, {crm['r2_without_z']:.3f} without; "
+            f"{crm['active_dimensions']} of {crm['latent_dim']} latent dimensions active",
+            f"edits         {report['copies']} copies, acceptance {report['acceptance']:.1%}, "
+            f"mean-move ratio {moves['mean_move_ratio']:.2f}, effective rank "
+            f"{moves['effective_rank']:.1f} of {moves['dimensions']}",
+            f"bound         δ + ε_r = {report['delta']:.3g} + {report['epsilon_r']:.3g}: "
+            f"{report['verdict']}",
+        ]
+        lines += [f"warning       {warning}" for warning in report["warnings"]]
+    policy = record["policy"]
+    lines.append(
+        f"policy        best validation loss {policy['best_validation']:.4g} at step "
+        f"{policy['best_step']} of {policy['steps']}, {policy['seconds']:.0f} s"
+    )
+    return "\n".join(lines)

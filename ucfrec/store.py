@@ -208,9 +208,12 @@ class EpisodeStore:
 
     def draw_steps(self, generator: np.random.Generator, count: int) -> tuple[IntArray, IntArray]:
         """`count` (episodes, steps) drawn uniformly over the steps of the view."""
-        drawn = generator.integers(self.n_steps, size=count)
-        episodes = np.searchsorted(self._ends, drawn, side="right")
-        return episodes, drawn - (self._ends[episodes] - self.lengths[episodes])
+        return self.locate(generator.integers(self.n_steps, size=count))
+
+    def locate(self, numbers: IntArray) -> tuple[IntArray, IntArray]:
+        """(episodes, steps) of steps numbered 0 to n_steps − 1 through the view."""
+        episodes = np.searchsorted(self._ends, numbers, side="right")
+        return episodes, numbers - (self._ends[episodes] - self.lengths[episodes])
 
     # Gathering.
 

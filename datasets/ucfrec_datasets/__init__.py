@@ -1,0 +1,1 @@
+"""Datasets that `ucfrec prepare --dataset NAME` knows: what their files and columns mean."""

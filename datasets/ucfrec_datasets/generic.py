@@ -1,0 +1,26 @@
+"""Anybody's logs: columns named by the user, features beside the log."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from ucfrec import schema
+from ucfrec.log_mapping import Dataset, FeatureTable, LogMapping, log_files
+
+
+def _resolve(paths: Sequence[str | Path], given: LogMapping) -> tuple[tuple[Path, ...], LogMapping]:
+    files = log_files(paths)
+    kinds = [file.name.partition(".")[0] for file in files]
+    items = tuple(f for f, kind in zip(files, kinds, strict=True) if kind == "items")
+    users = tuple(f for f, kind in zip(files, kinds, strict=True) if kind == "users")
+    found = LogMapping(
+        item_features=(FeatureTable(items, schema.ITEM_ID),) if items else (),
+        user_features=(FeatureTable(users, schema.USER_ID),) if users else (),
+    )
+    return tuple(f for f in files if f not in items + users), given.over(found)
+
+
+DATASET: Final = Dataset(
+    summary="any Parquet or CSV log, columns mapped by name; items.* and users.* hold features",
+    resolve=_resolve,
+)

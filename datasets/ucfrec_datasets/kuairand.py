@@ -1,0 +1,101 @@
+"""KuaiRand (Pure, 1K and 27K): the official files, as CSV or Parquet, features joined."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from ucfrec.errors import InputError
+from ucfrec.log_mapping import Dataset, FeatureTable, LogMapping, log_files
+
+LOGS: Final = ("log_standard_", "log_random_")
+USERS, BASIC, STATISTIC = "user_features_", "video_features_basic_", "video_features_statistic_"
+
+USER_COLUMNS: Final = (
+    "user_active_degree",
+    "is_lowactive_period = 1",
+    "is_live_streamer = 1",
+    "is_video_author = 1",
+    "ln(1 + follow_user_num)",
+    "ln(1 + fans_user_num)",
+    "ln(1 + friend_user_num)",
+    "ln(1 + register_days)",
+    *(f"onehot_feat{n}::VARCHAR" for n in (0, 1, 2, 4, 5, 6, *range(9, 18))),
+)
+"""Left out: onehot features 3, 7 and 8, of 1,471, 118 and 454 values among 27,285 users."""
+
+BASIC_COLUMNS: Final = (
+    "video_type",
+    "upload_dt::DATE",
+    "upload_type",
+    "ln(1 + video_duration)",
+    "server_width > server_height",
+    "music_type::VARCHAR",
+    "string_split(tag, ',')",
+)
+
+STATISTIC_COLUMNS: Final = (
+    "ln(1 + show_cnt)",
+    "ln(1 + play_cnt)",
+    "play_progress",
+    "complete_play_cnt / play_cnt",
+    "valid_play_cnt / play_cnt",
+    "long_time_play_cnt / play_cnt",
+    "short_time_play_cnt / play_cnt",
+    "like_cnt / play_cnt",
+    "comment_cnt / play_cnt",
+    "follow_cnt / play_cnt",
+    "share_cnt / play_cnt",
+    "collect_cnt / play_cnt",
+)
+"""Daily means over the whole month that the logs cover, later windows included: whoever joins them
+lets the embeddings see a little of the days they are judged on."""
+
+MAPPING: Final = LogMapping(
+    columns={"item_id": "video_id", "timestamp": "time_ms", "is_random": "is_rand"},
+    reward="is_click",
+    # The releases hold a user's rows about a sample of videos, not whole visits: by silences of
+    # half an hour, five sessions in six would be a single row.
+    session_by="user",
+)
+
+
+def _resolve(paths: Sequence[str | Path], given: LogMapping) -> tuple[tuple[Path, ...], LogMapping]:
+    """All logs named or in the folders named; user and basic features among them or beside them.
+
+    The statistics are joined only where a path names them.
+    """
+    named = log_files(paths)
+    logs = tuple(file for file in named if file.name.startswith(LOGS))
+    if not logs:
+        raise InputError(
+            f"no KuaiRand log among {len(named)} file(s) such as {named[0]}; they are called "
+            f"{'* and '.join(LOGS)}*"
+        )
+    around = (*named, *log_files([logs[0].parent]))
+    wanted = [path for path in paths if Path(path).name.startswith(STATISTIC)]
+    statistics = log_files(wanted) if wanted else ()
+    found = LogMapping(
+        item_features=(
+            *_table(around, BASIC, "video_id", BASIC_COLUMNS),
+            *_table(statistics, STATISTIC, "video_id", STATISTIC_COLUMNS),
+        ),
+        user_features=_table(around, USERS, "user_id", USER_COLUMNS),
+    )
+    return logs, given.over(found).over(MAPPING)
+
+
+def _table(
+    files: Sequence[Path], prefix: str, key: str, columns: tuple[str, ...]
+) -> tuple[FeatureTable, ...]:
+    """The files of one kind as one table; the first of a name, were it there twice."""
+    named: dict[str, Path] = {}
+    for file in files:
+        if file.name.startswith(prefix):
+            named.setdefault(file.name.partition(".")[0], file)
+    return (FeatureTable(tuple(named.values()), key, columns),) if named else ()
+
+
+DATASET: Final = Dataset(
+    summary="KuaiRand Pure, 1K or 27K: the official folder, or files of it (CSV or Parquet)",
+    resolve=_resolve,
+)

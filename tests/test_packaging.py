@@ -1,0 +1,98 @@
+"""What is installed: four packages, one direction of imports, entry points that load."""
+
+import ast
+import subprocess
+import sys
+import tomllib
+import zipfile
+from importlib import import_module
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = {
+    "ucfrec": ROOT / "ucfrec",
+    "ucfrec_datasets": ROOT / "datasets" / "ucfrec_datasets",
+    "ucfrec_simulators": ROOT / "simulators" / "ucfrec_simulators",
+    "ucfrec_control": ROOT / "control" / "ucfrec_control",
+}
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+ENTRY_POINTS = [
+    EntryPoint(name, value, group)
+    for group, named in {
+        "console_scripts": PROJECT["scripts"],
+        **PROJECT.get("entry-points", {}),
+    }.items()
+    for name, value in named.items()
+]
+
+
+def imported(file: Path) -> set[str]:
+    """Top-level names of everything a file imports, inside functions and `if TYPE_CHECKING` too."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file}:{node.lineno} imports relatively"
+            names.add((node.module or "").split(".")[0])
+    return names
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_imports_point_towards_the_core(package: str) -> None:
+    files = sorted(PACKAGES[package].rglob("*.py"))
+    assert files
+    allowed = {package, "ucfrec"}
+    for file in files:
+        ours = imported(file) & PACKAGES.keys()
+        assert ours <= allowed, f"{file.relative_to(ROOT)} imports {ours - allowed}"
+
+
+@pytest.mark.parametrize("folder", ["datasets", "simulators", "control"])
+def test_sibling_folders_are_not_packages(folder: str) -> None:
+    """They would shadow Hugging Face's `datasets` and python-control's `control`."""
+    assert (ROOT / folder).is_dir()
+    assert not (ROOT / folder / "__init__.py").exists()
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_packages_are_importable_and_typed(package: str) -> None:
+    assert (PACKAGES[package] / "py.typed").is_file()
+    assert (PACKAGES[package] / "__init__.py").is_file()
+    module = import_module(package)
+    assert Path(str(module.__file__)).parent == PACKAGES[package]
+
+
+@pytest.mark.parametrize("entry", ENTRY_POINTS, ids=lambda e: f"{e.group}:{e.name}")
+def test_entry_points_load(entry: EntryPoint) -> None:
+    loaded = entry.load()
+    assert callable(loaded) or entry.group != "console_scripts"
+
+
+def test_entry_points_cover_both_kinds_of_plugin() -> None:
+    groups = {entry.group for entry in ENTRY_POINTS}
+    assert groups >= {"console_scripts", "ucfrec.datasets", "ucfrec.simulators"}
+
+
+def test_the_wheel_holds_four_packages_and_nothing_else(tmp_path: Path) -> None:
+    built = subprocess.run(
+        [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert built.returncode == 0, built.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    tops = {name.split("/")[0] for name in names}
+    assert {top for top in tops if not top.endswith(".dist-info")} == PACKAGES.keys()
+    for package, folder in PACKAGES.items():
+        assert f"{package}/py.typed" in names
+        for file in folder.rglob("*.py"):
+            assert f"{package}/{file.relative_to(folder).as_posix()}" in names
+    assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)

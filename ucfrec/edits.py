@@ -1,0 +1,72 @@
+"""What the accepted edits look like: how long, how varied."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+_QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+_BINS = 20
+
+
+@dataclass(frozen=True)
+class MoveReport:
+    """Moves Δ = (s_c − s) / σ_s of the accepted edits (paper appendix I.2)."""
+
+    edits: int
+    length_quantiles: dict[str, float]
+    """Of ‖Δ‖₂."""
+    histogram_edges: tuple[float, ...]
+    """From 0 to ρ_high."""
+    histogram_counts: tuple[int, ...]
+    """Edits by ‖Δ‖₂ between the edges."""
+    mean_move_ratio: float
+    """‖mean Δ‖ / mean ‖Δ‖: 1 if all states are shifted alike, about 0 if edits are varied."""
+    effective_rank: float
+    """exp of the entropy of the spectrum of E[ΔΔᵀ]: how many directions the moves take."""
+    dimensions: int
+    """State dimensions that vary in training, which bounds the effective rank."""
+
+
+class MoveStatistics:
+    """Gathers moves chunk by chunk; the moves themselves are not kept."""
+
+    def __init__(self, size: int) -> None:
+        """For moves of `size` dimensions."""
+        self._total = torch.zeros(size, dtype=torch.float64)
+        self._moments = torch.zeros(size, size, dtype=torch.float64)
+        self._lengths: list[Tensor] = []
+
+    def add(self, moves: Tensor) -> None:
+        """Count moves (M, S)."""
+        moves = moves.double()
+        self._total += moves.sum(dim=0)
+        self._moments += moves.T @ moves
+        self._lengths.append(moves.norm(dim=1))
+
+    def report(self, rho_high: float, dimensions: int) -> MoveReport:
+        """What was counted; ratio and rank of no moves are NaN and 0."""
+        lengths = torch.cat([torch.zeros(0, dtype=torch.float64), *self._lengths]).numpy()
+        counts, edges = np.histogram(lengths, bins=_BINS, range=(0.0, rho_high))
+        some = len(lengths) > 0
+        return MoveReport(
+            edits=len(lengths),
+            length_quantiles=_quantiles(lengths, _QUANTILES) if some else {},
+            histogram_edges=tuple(edges.tolist()),
+            histogram_counts=tuple(counts.tolist()),
+            mean_move_ratio=float(self._total.norm()) / lengths.sum() if some else float("nan"),
+            effective_rank=_effective_rank(self._moments) if some else 0.0,
+            dimensions=dimensions,
+        )
+
+
+def _quantiles(values: np.ndarray, levels: Sequence[float]) -> dict[str, float]:
+    return {f"{level:g}": float(np.quantile(values, level)) for level in levels}
+
+
+def _effective_rank(moments: Tensor) -> float:
+    spectrum = torch.linalg.eigvalsh(moments).clamp(min=0)
+    share = spectrum / spectrum.sum()
+    return float(torch.exp(-torch.special.xlogy(share, share).sum()))

@@ -1,0 +1,136 @@
+"""What `prepare` read, dropped and kept, as a dictionary and as a table."""
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import Any
+
+from ucfrec import schema
+from ucfrec.errors import InputError
+from ucfrec.log_clean import REASONS, CleanLog
+from ucfrec.log_sessions import Cut
+
+
+def drop_counts(log: CleanLog) -> dict[str, int]:
+    """Rows dropped by reason.
+
+    Raises:
+        InputError: none is left.
+    """
+    found = dict(log.connection.sql("SELECT reason, count(*) FROM rows GROUP BY reason").fetchall())
+    dropped = {reason: int(found.get(reason, 0)) for reason in REASONS}
+    if None not in found:
+        told = "; ".join(f"{n} rows: {REASONS[reason]}" for reason, n in dropped.items() if n)
+        hint = "; is the time in milliseconds?" if dropped["clock_out_of_range"] else ""
+        raise InputError(
+            f"{_named(log)}: no row is left ({told}{hint}); correct the mapping or the log"
+        )
+    return dropped
+
+
+def require_variety(log: CleanLog) -> None:
+    """See that there is something to learn.
+
+    Raises:
+        InputError: all rewards are equal.
+    """
+    kept, low, high = log.one("SELECT count(*), min(reward), max(reward) FROM clean")
+    if low == high:
+        raise InputError(
+            f"{_named(log)}: all {kept} rewards equal {low:g}, so there is nothing to learn; "
+            "choose another reward expression"
+        )
+
+
+def _named(log: CleanLog) -> str:
+    files = [str(file) for table in log.tables for file in table.files]
+    more = f" and {len(files) - 1} more" if len(files) > 1 else ""
+    return files[0] + more
+
+
+def count_unsorted(log: CleanLog) -> int:
+    """Rows earlier than a row of the same user before them in the files."""
+    (unsorted,) = log.one(f"""
+        SELECT count_if({schema.TIMESTAMP} < latest) FROM (
+            SELECT {schema.TIMESTAMP}, max({schema.TIMESTAMP}) OVER (
+                PARTITION BY {schema.USER_ID} ORDER BY row
+                ROWS BETWEEN UNBOUNDED PRECEDING AND 1 PRECEDING
+            ) AS latest FROM rows WHERE {schema.USER_ID} IS NOT NULL
+        )
+    """)
+    return int(unsorted)
+
+
+def build_report(log: CleanLog, cut: Cut, dropped: Mapping[str, int]) -> dict[str, Any]:
+    """Figures of the tables `rows`, `clean` and `steps`, all of them JSON-able."""
+    (read,) = log.one("SELECT count(*) FROM rows")
+    (clean,) = log.one("SELECT count(*) FROM clean")
+    steps, episodes, users, sessions, cuts, first_ms, last_ms = log.one(f"""
+        SELECT count(*), count_if(first), count(DISTINCT {schema.USER_ID}), count_if(starts),
+            count_if(starts AND NOT terminated), min({schema.TIMESTAMP}), max({schema.TIMESTAMP})
+        FROM steps
+    """)
+    mean, deviation, low, high = log.one(
+        "SELECT avg(reward), stddev_pop(reward), min(reward), max(reward) FROM steps"
+    )
+    splits = {name: {"episodes": 0, "steps": 0} for name in schema.SPLITS}
+    for split, in_split, rows in log.connection.sql(
+        "SELECT split, count_if(first), count(*) FROM steps GROUP BY split"
+    ).fetchall():
+        splits[schema.SPLITS[split]] = {"episodes": in_split, "steps": rows}
+    report = {
+        "files": [str(file) for table in log.tables for file in table.files],
+        "rows_read": read,
+        "dropped": {**dropped, "short_episode": clean - steps},
+        "unsorted_rows": count_unsorted(log),
+        "steps": steps,
+        "episodes": episodes,
+        "sessions": sessions,
+        "sessions_cut": cuts,
+        "users": users,
+        "splits": splits,
+        "session_by": cut.session_by,
+        "split_times_ms": list(cut.bounds),
+        "time_range_ms": [first_ms, last_ms],
+        "reward_statistics": {"mean": mean, "std": deviation, "min": low, "max": high},
+    }
+    if log.key == schema.ITEM_ID:
+        (report["items"],) = log.one(f"SELECT count(DISTINCT {schema.ITEM_ID}) FROM steps")
+    if schema.PROPENSITY in log.columns:
+        (report["unknown_propensities"],) = log.one(
+            f"SELECT count_if({schema.PROPENSITY} IS NULL) FROM steps"
+        )
+    return report
+
+
+def format_report(report: Mapping[str, Any]) -> str:
+    """The report as a short table."""
+    reward = report["reward_statistics"]
+    lines = [("rows read", f"{report['rows_read']:,} from {len(report['files'])} file(s)")]
+    for reason, rows in report["dropped"].items():
+        if rows:
+            lines.append((f"  dropped: {reason}", f"{rows:,}  {REASONS.get(reason, '')}"))
+    lines += [
+        ("  out of order", f"{report['unsorted_rows']:,} (sorted, none dropped)"),
+        ("steps kept", f"{report['steps']:,}"),
+        ("users", f"{report['users']:,}"),
+    ]
+    if "items" in report:
+        lines.append(("items", f"{report['items']:,}"))
+    if report.get("unknown_propensities"):
+        lines.append(("  unknown propensity", f"{report['unknown_propensities']:,}"))
+    lines.append(("sessions", f"{report['sessions']:,} by {report['session_by']}"))
+    if report["sessions_cut"]:
+        lines.append(("  cut at a split", f"{report['sessions_cut']:,}"))
+    lines += [
+        (f"  {name}", f"{count['episodes']:,} episodes, {count['steps']:,} steps")
+        for name, count in report["splits"].items()
+    ]
+    lines.append(("times (UTC)", " to ".join(_clock(t) for t in report["time_range_ms"])))
+    figures = ", ".join(f"{name} {value:.4g}" for name, value in reward.items())
+    lines.append(("reward", f"{report['reward']}: {figures}"))
+    width = max(len(name) for name, _ in lines) + 2
+    return "\n".join(f"{name:<{width}}{value}".rstrip() for name, value in lines)
+
+
+def _clock(milliseconds: int) -> str:
+    return datetime.fromtimestamp(milliseconds / 1000, UTC).strftime("%Y-%m-%d %H:%M:%S")

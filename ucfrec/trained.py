@@ -1,0 +1,97 @@
+"""A trained policy, read back from its run folder."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow.parquet as pq
+from torch import Tensor
+
+from ucfrec import schema
+from ucfrec.acting import PolicyActor
+from ucfrec.checkpoint import load_tensors, load_weights
+from ucfrec.config import POLICIES, config_from_dict
+from ucfrec.errors import InputError
+from ucfrec.files import read_json
+from ucfrec.policy import SequencePolicy
+from ucfrec.states import ItemStates
+from ucfrec.store import ITEM_STATES
+
+RUN = "run.json"
+ITEMS, USERS = "items.parquet", "users.parquet"
+
+
+@dataclass(frozen=True)
+class TrainedPolicy:
+    """A policy read back from a run folder, with all that acting and recommending need."""
+
+    policy: SequencePolicy
+    record: Mapping[str, Any]
+    item_states: ItemStates | None
+    item_ids: npt.NDArray[Any] | None
+    """(n_items,) identifiers in the logs; None where actions are vectors."""
+    user_ids: npt.NDArray[Any]
+    """(n_users,) identifiers in the logs; empty where there are none."""
+
+    @classmethod
+    def load(cls, run: Path, checkpoint: str = "best") -> "TrainedPolicy":
+        """Read `best` (on validation) or `last` weights of a run.
+
+        Raises:
+            InputError: `run` is no run folder, or has no checkpoint yet.
+        """
+        if not (run / RUN).exists():
+            raise InputError(f"{run} is not a run folder: it has no {RUN}; train one first")
+        record = read_json(run / RUN)
+        config = config_from_dict(record["config"])
+        policy = POLICIES[config.policy_name](config.policy, record["sizes"])
+        path = run / "policy" / f"{checkpoint}.safetensors"
+        load_weights(path, policy, _weights(path))
+        policy.eval()
+        states = run / ITEM_STATES
+        return cls(
+            policy,
+            record,
+            ItemStates.load(states) if states.exists() else None,
+            _ids(run / ITEMS, schema.ITEM_ID) if states.exists() else None,
+            _ids(run / USERS, schema.USER_ID),
+        )
+
+    @property
+    def name(self) -> str:
+        """The learner, and whether it departs from its usual use of edited copies."""
+        config = config_from_dict(self.record["config"])
+        augmented = config.augment.copies > 0
+        if augmented == self.policy.augmented:
+            return config.policy_name
+        return f"{config.policy_name}-{'augmented' if augmented else 'no-augmentation'}"
+
+    def target_return(self, quantile: float) -> float:
+        """The `quantile` of training returns, interpolated between those the run recorded."""
+        known = self.record["return_quantiles"]
+        return float(np.interp(quantile, [float(q) for q in known], list(known.values())))
+
+    def actor(self, episodes: int, target_return: float) -> PolicyActor:
+        """An actor for `episodes` environments side by side."""
+        return PolicyActor(
+            self.policy,
+            episodes,
+            target_return,
+            self.record["observation_size"],
+            self.item_states,
+            self.item_ids,
+        )
+
+
+def _weights(path: Path) -> dict[str, Tensor]:
+    tensors, _ = load_tensors(path)
+    return {name: t for name, t in tensors.items() if not name.startswith("optimizer.")}
+
+
+def _ids(path: Path, column: str) -> npt.NDArray[Any]:
+    if not path.exists():
+        return np.empty(0, dtype=np.int64)
+    return np.asarray(pq.read_table(path, columns=[column]).column(column))

@@ -62,7 +62,7 @@ def test_vector_loss_is_the_mean_squared_error_in_shares_of_the_range() -> None:
     head = VectorHead(DIM, 2)
     head.scale.copy_(torch.tensor([4.0, 0.5]))
     features, actions = torch.randn(7, DIM), torch.randn(7, 2)
-    predicted = head.predict(features)
+    predicted = head.predict(features).detach()
     errors = [
         ((float(predicted[m, i]) - float(actions[m, i])) / float(head.scale[i])) ** 2
         for m in range(7)
@@ -87,7 +87,7 @@ def test_actions_are_embedded_by_their_share_of_the_range() -> None:
 def test_item_loss_is_the_negative_log_likelihood() -> None:
     head, _ = item_head()
     features, actions = steps(head, 9)
-    probabilities = head.predict(features).softmax(-1)
+    probabilities = head.predict(features).softmax(-1).detach()
     torch.testing.assert_close(probabilities.sum(-1), torch.ones(9))
     expected = -sum(math.log(float(probabilities[m, a])) for m, a in enumerate(actions)) / 9
     assert float(head.loss(features, actions).detach()) == pytest.approx(expected, rel=1e-5)

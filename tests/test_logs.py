@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from safetensors import SafetensorError
 
 from ucfrec import schema
 from ucfrec.errors import InputError
@@ -249,6 +250,8 @@ def test_given_sessions_stay_together_even_where_they_overlap(tmp_path: Path) ->
     assert (joined.groupby("episode")["session_id"].nunique() == 1).all()
     assert joined["episode"].nunique() == log.groupby(["user_id", "session_id"]).ngroups
     assert (found.groupby("episode")["timestamp"].diff().dropna() >= 0).all()
+    off = validate([tmp_path / "l.parquet"], LogMapping({"session_id": ""}))
+    assert off["session_by"] == "gap"
     by_user = validate([tmp_path / "l.parquet"], LogMapping(), PrepareOptions(session_by="user"))
     assert by_user["sessions"] == 4
 
@@ -284,6 +287,8 @@ def test_a_store_like_another_has_its_numbers(tmp_path: Path) -> None:
     report = prepare(
         [tmp_path / "b.parquet"], LogMapping(), tmp_path / "b", SMALL, like=tmp_path / "a"
     )
+    with pytest.raises(InputError, match="is not an episode store"):
+        prepare([tmp_path / "b.parquet"], LogMapping(), tmp_path / "c", SMALL, like=tmp_path)
     assert report["dropped"]["unknown_item"] == (later["item_id"] >= 12).sum()
     store = EpisodeStore.open(tmp_path / "b")
     assert store.meta["splits"]["train"]["steps"] == report["steps"] == store.n_steps
@@ -307,7 +312,7 @@ def test_histories_are_the_latest_clean_rows(tmp_path: Path) -> None:
 
 
 def test_memory_is_bounded(tmp_path: Path) -> None:
-    rows = 2_000_000
+    rows = 1_000_000
     generator = np.random.default_rng(0)
     table = pa.table(
         {
@@ -319,7 +324,7 @@ def test_memory_is_bounded(tmp_path: Path) -> None:
     )
     pq.write_table(table, tmp_path / "log.parquet")
     report = validate(
-        [tmp_path / "log.parquet"], LogMapping(), PrepareOptions(memory_limit="250MB")
+        [tmp_path / "log.parquet"], LogMapping(), PrepareOptions(memory_limit="150MB")
     )
     assert report["steps"] + report["dropped"]["duplicate"] == rows
 
@@ -470,11 +475,19 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
         LogMapping({"item": "x"})
 
 
+@pytest.mark.parametrize(
+    ("kind", "told"),
+    [
+        (OSError, (errno.ENOSPC, "No space left on device")),
+        (OSError, ("30952 requested and 13296 written",)),  # numpy's
+        (SafetensorError, ("I/O error: No space left on device (os error 28)",)),
+    ],
+)
 def test_a_full_disk_leaves_nothing_behind(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: type[Exception], told: tuple[Any, ...]
 ) -> None:
     def full(*_: Any, **__: Any) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
+        raise kind(*told)
 
     path = write(make_log(), tmp_path / "log.parquet")
     monkeypatch.setattr(StoreWriter, "append", full)

@@ -115,9 +115,10 @@ def test_neither_shards_nor_the_size_of_appends_show(
 
 
 def test_large_stores_are_cut_between_episodes(folder: Path) -> None:
-    store = write_store(folder / "store", random_episodes(LENGTHS), shard_steps=6)
+    lengths = [3, 3, 6, 1, 7, 2, 4, 5]
+    store = write_store(folder / "store", random_episodes(lengths), shard_steps=6)
     cut = [np.diff(np.load(p)).tolist() for p in sorted(folder.glob("store/shard-*/offsets.npy"))]
-    assert list(chain(*cut)) == LENGTHS
+    assert list(chain(*cut)) == lengths
     assert len(cut) == store.meta["n_shards"] > 2
     # A shard is full when it holds 6 steps; the episode that fills it is not torn apart.
     assert all(sum(shard) >= 6 > sum(shard[:-1]) for shard in cut[:-1])
@@ -312,6 +313,7 @@ def test_views_see_their_episodes_only(folder: Path, shard_steps: int) -> None:
     at = np.array([0, 0, 1]), np.array([1, 4, 0])
     assert same(view.windows(*at, 5), store.windows(np.array([4, 4, 6]), at[1], 5))
     walked = view.all_steps()
+    assert np.array_equal(view.locate(np.arange(view.n_steps)), walked)
     assert walked[0].tolist() == [0] * LENGTHS[4] + [1] * LENGTHS[6]
     assert walked[1].tolist() == [*range(LENGTHS[4]), *range(LENGTHS[6])]
 

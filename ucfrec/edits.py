@@ -1,9 +1,10 @@
 """What the accepted edits look like: how long, how varied."""
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -47,23 +48,23 @@ class MoveStatistics:
         self._lengths.append(moves.norm(dim=1))
 
     def report(self, rho_high: float, dimensions: int) -> MoveReport:
-        """What was counted; ratio and rank of no moves are NaN and 0."""
+        """What was counted; where nothing moved, ratio and rank are NaN and 0."""
         lengths = torch.cat([torch.zeros(0, dtype=torch.float64), *self._lengths]).numpy()
         counts, edges = np.histogram(lengths, bins=_BINS, range=(0.0, rho_high))
-        some = len(lengths) > 0
+        moved = bool(lengths.sum() > 0)
         return MoveReport(
             edits=len(lengths),
-            length_quantiles=_quantiles(lengths, _QUANTILES) if some else {},
+            length_quantiles=_quantiles(lengths) if len(lengths) else {},
             histogram_edges=tuple(edges.tolist()),
             histogram_counts=tuple(counts.tolist()),
-            mean_move_ratio=float(self._total.norm()) / lengths.sum() if some else float("nan"),
-            effective_rank=_effective_rank(self._moments) if some else 0.0,
+            mean_move_ratio=float(self._total.norm()) / lengths.sum() if moved else math.nan,
+            effective_rank=_effective_rank(self._moments) if moved else 0.0,
             dimensions=dimensions,
         )
 
 
-def _quantiles(values: np.ndarray, levels: Sequence[float]) -> dict[str, float]:
-    return {f"{level:g}": float(np.quantile(values, level)) for level in levels}
+def _quantiles(values: npt.NDArray[np.float64]) -> dict[str, float]:
+    return {f"{level:g}": float(np.quantile(values, level)) for level in _QUANTILES}
 
 
 def _effective_rank(moments: Tensor) -> float:

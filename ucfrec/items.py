@@ -113,13 +113,18 @@ def _company(
     _, rows = np.unique(users, return_inverse=True)
     matrix = sparse.coo_matrix((weights, (rows, columns))).tocsr()
     matrix.data = np.log1p(matrix.data)
-    # Popular items and busy users would otherwise fill the leading directions.
-    by_item = 1 / np.sqrt(np.asarray(matrix.sum(axis=0)).ravel())
-    by_user = 1 / np.sqrt(np.asarray(matrix.sum(axis=1)).ravel())
-    balanced = sparse.diags(by_user) @ matrix @ sparse.diags(by_item)
-    rank = min(size, *balanced.shape)
+    by_item = np.sqrt(np.asarray(matrix.sum(axis=0)).ravel())
+    by_user = np.sqrt(np.asarray(matrix.sum(axis=1)).ravel())
+    balanced = sparse.diags(1 / by_user) @ matrix @ sparse.diags(1 / by_item)
+    rank = min(size + 1, *balanced.shape)
     _, strength, directions = randomized_svd(balanced, rank, random_state=0)
-    return _unit_rows((np.sqrt(strength)[:, None] * directions).T)
+    # One direction only tells how popular an item is, alike for all users (correspondence analysis
+    # calls it trivial): it would outshine the others.
+    popular = by_item / np.linalg.norm(by_item)
+    directions = directions - np.outer(directions @ popular, popular)
+    telling = np.delete(np.arange(rank), np.linalg.norm(directions, axis=1).argmin())
+    telling = telling if rank > 1 else np.arange(1)
+    return _unit_rows((np.sqrt(strength)[telling, None] * directions[telling]).T)
 
 
 def _expected(
@@ -139,8 +144,12 @@ def _expected(
 
 
 def _reduced(features: sparse.csr_matrix, known: IntArray, size: int) -> FloatArray:
-    """Features in at most `size` dimensions, chosen by the rows `known`."""
-    return np.asarray(features @ _axes(features[known], max(size, 1)), dtype=np.float32)
+    """Features in at most `size` dimensions, chosen and centred by the rows `known`."""
+    rows: npt.NDArray[Any] = np.asarray(features @ _axes(features[known], max(size, 1)))
+    rows -= rows[known].mean(axis=0)
+    # Whoever has no features at all is nothing in particular.
+    rows[np.diff(features.indptr) == 0] = 0
+    return np.asarray(rows, dtype=np.float32)
 
 
 def _axes(known: sparse.csr_matrix, size: int) -> npt.NDArray[Any]:

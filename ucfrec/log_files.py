@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import duckdb
+from safetensors import SafetensorError
 
 from ucfrec.errors import InputError
 
@@ -168,13 +169,13 @@ def explained(
     """
     try:
         yield
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+    except (OSError, SafetensorError) as error:
+        if not _is_disk_full(error):
             raise
         raise _disk_full(folder) from None
     except duckdb.Error as error:
         message = str(error)
-        if "No space left" in message or "max_temp_directory_size" in message:
+        if _is_disk_full(error):
             raise _disk_full(folder) from None
         if isinstance(error, duckdb.OutOfMemoryException):
             raise InputError(f"{_first_line(error)}; raise memory_limit") from None
@@ -192,6 +193,14 @@ def explained(
         raise InputError(
             f"{files}: {_first_line(error)}; correct the values, or try_cast them in the mapping"
         ) from None
+
+
+def _is_disk_full(error: Exception) -> bool:
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return True
+    # In the words of safetensors and DuckDB, of DuckDB's own limit, and of numpy.
+    said = ("No space left", "max_temp_directory_size", "requested and")
+    return any(words in str(error) for words in said)
 
 
 def _disk_full(folder: Path) -> InputError:

@@ -36,7 +36,7 @@ from ucfrec.log_sessions import (
     ordered_steps,
     split_bounds,
 )
-from ucfrec.store import ITEM_STATES
+from ucfrec.store import ITEM_STATES, EpisodeStore
 from ucfrec.store_writer import StoreWriter
 
 BATCH_ROWS: Final = 2**17
@@ -128,6 +128,8 @@ def prepare(
     """
     options = options or PrepareOptions()
     files = log_files(paths)
+    if like is not None:
+        EpisodeStore.open(like)
     with atomic_folder(out) as folder:
         spill = options.temp_folder or out.parent
         with (

@@ -54,7 +54,7 @@ MAPPING: Final = LogMapping(
     columns={"item_id": "video_id", "timestamp": "time_ms", "is_random": "is_rand"},
     reward="is_click",
     # The releases hold a user's rows about a sample of videos, not whole visits: by silences of
-    # half an hour, five sessions in six would be a single row.
+    # half an hour, 87% of the sessions would be a single row.
     session_by="user",
 )
 

@@ -121,10 +121,8 @@ def test_items_with_the_same_embedding_start_alike() -> None:
     assert not torch.allclose(logits[:, 1], logits[:, 0])
 
 
-SAMPLING = "the positive's logit is lowered by log Q although it is not among the samples"
 
 
-@pytest.mark.xfail(strict=True, reason=SAMPLING)
 @pytest.mark.parametrize("negatives", [500, 20_000])
 def test_the_sampled_loss_approaches_the_full_one(negatives: int) -> None:
     head, _ = item_head()
@@ -137,7 +135,6 @@ def test_the_sampled_loss_approaches_the_full_one(negatives: int) -> None:
     assert float(draws.mean()) == pytest.approx(float(full), rel=0.05 if negatives < 1000 else 0.01)
 
 
-@pytest.mark.xfail(strict=True, reason=SAMPLING)
 def test_its_gradient_approaches_the_full_one() -> None:
     head, _ = item_head()
     features, actions = steps(head, 200)
@@ -156,7 +153,6 @@ def test_its_gradient_approaches_the_full_one() -> None:
     assert float(gradients[1].norm() / gradients[0].norm()) == pytest.approx(1, rel=0.1)
 
 
-@pytest.mark.xfail(strict=True, reason=SAMPLING)
 def test_learning_from_samples_finds_the_true_shares() -> None:
     """Without the correction for Q, an item would be learnt as rarer the oftener it is sampled:
     by a factor of ten between the first and the last here."""

@@ -107,7 +107,6 @@ def test_killed_training_ends_as_if_left_alone(
             assert torch.equal(tensor, expected[key]), key
 
 
-@pytest.mark.xfail(strict=True, reason="event files of one second overwrite each other")
 def test_every_validation_of_a_killed_training_is_logged(
     left_alone: tuple[Path, Fit], killed_often: list[tuple[Path, dict[str, Any]]]
 ) -> None:
@@ -304,7 +303,6 @@ def test_a_loss_that_is_not_finite_is_named(tmp_path: Path, bad: float) -> None:
     assert all(torch.isfinite(tensor).all() for tensor in kept.values())
 
 
-@pytest.mark.xfail(strict=True, reason="says that best.safetensors does not exist")
 def test_a_validation_loss_that_is_never_finite_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="validation loss is nan"):
         validated(tmp_path, [math.nan] * 6, FAST)

@@ -90,13 +90,13 @@ class ItemHead(nn.Module):
         """
         share = self.counts / self.counts.sum()
         drawn = torch.multinomial(share, negatives, replacement=True)
-        candidates = torch.cat([actions, drawn])
-        logits = features @ self.vectors(candidates).T / features.shape[-1] ** 0.5
-        logits = logits + self.bias[candidates] - torch.log(share[candidates])
-        m = len(actions)
-        positive = logits[:, :m].diagonal().unsqueeze(1)
+        m, scale = len(actions), features.shape[-1] ** 0.5
+        positive = (features * self.vectors(actions)).sum(-1) / scale + self.bias[actions]
+        logits = features @ self.vectors(drawn).T / scale + self.bias[drawn]
+        logits = logits - torch.log(negatives * share[drawn])
         accidental = drawn.unsqueeze(0) == actions.unsqueeze(1)
-        negative = logits[:, m:].masked_fill(accidental, -torch.inf)
+        negative = logits.masked_fill(accidental, -torch.inf)
+        positive = positive.unsqueeze(1)
         target = torch.zeros(m, dtype=torch.int64, device=features.device)
         return F.cross_entropy(torch.cat([positive, negative], dim=1), target)
 

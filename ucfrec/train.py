@@ -9,7 +9,9 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from tensorboardX import SummaryWriter
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto.event_pb2 import Event, SessionLog
+from tensorboardX.proto.summary_pb2 import Summary
 from torch import Tensor, nn
 from tqdm import tqdm
 
@@ -98,7 +100,7 @@ def fit(
     if last.exists():
         counters.update(load_training(last, module, optimizer))
     start, began = int(counters["step"]), time.perf_counter() - counters["seconds"]
-    writer = SummaryWriter(str(folder), purge_step=start + 1)
+    events = _Events(folder, start)
     bar = tqdm(total=config.steps, initial=start, desc=describe, unit="step", disable=None)
     waited = time.perf_counter()
     waiting = 0.0
@@ -124,7 +126,7 @@ def fit(
         if step % config.validate_every and step != config.steps:
             continue
 
-        _require_finite(value, describe, step)
+        _require_finite(value.item(), f"{describe}: the loss", step)
         elapsed = time.perf_counter() - waited
         logged = {name: float(scalar) for name, scalar in scalars.items()} | {
             "loss": value.item(),
@@ -137,16 +139,15 @@ def fit(
             save_tensors(best, module.state_dict(), {"step": step})
         else:
             logged["validation_loss"] = _validation(module, validate)
+            _require_finite(logged["validation_loss"], f"{describe}: the validation loss", step)
             _keep_best(module, logged["validation_loss"], counters, step, best)
-        for name, number in logged.items():
-            writer.add_scalar(name, number, step)
-        writer.flush()
+        events.add(step, logged)
         bar.set_postfix(loss=f"{logged['loss']:.4g}")
         counters |= {"step": step, "seconds": time.perf_counter() - began}
         save_training(last, module, optimizer, counters)
         waited, waiting, since = time.perf_counter(), 0.0, step
     bar.close()
-    writer.close()
+    events.close()
     load_weights(best, module, load_tensors(best)[0])
     module.eval()
     return Fit(
@@ -157,14 +158,34 @@ def fit(
     )
 
 
+class _Events:
+    """TensorBoard scalars, on disk when `add` returns: what a killed run logged is not lost."""
+
+    def __init__(self, folder: Path, start: int) -> None:
+        # The names that tensorboardX gives differ by the second only; two runs must not share one.
+        self._writer = EventsWriter(str(folder / "events"), f".{start:09d}")
+        if start:  # what was logged after the checkpoint will be logged again
+            log = SessionLog(status=SessionLog.START)
+            self._writer.write_event(Event(wall_time=time.time(), step=start + 1, session_log=log))
+
+    def add(self, step: int, scalars: Mapping[str, float]) -> None:
+        values = [Summary.Value(tag=name, simple_value=x) for name, x in scalars.items()]
+        summary = Summary(value=values)
+        self._writer.write_event(Event(wall_time=time.time(), step=step, summary=summary))
+        self._writer.flush()
+
+    def close(self) -> None:
+        self._writer.close()
+
+
 def _stale(counters: Mapping[str, float], config: LoopConfig) -> bool:
     return 0 < config.patience <= counters["stale"]
 
 
-def _require_finite(value: Tensor, describe: str, step: int) -> None:
-    if not torch.isfinite(value):
+def _require_finite(value: float, what: str, step: int) -> None:
+    if not math.isfinite(value):
         raise InputError(
-            f"{describe}: the loss is {value.item()} at step {step}; lower the learning rate or "
+            f"{what} is {value} at step {step}; lower the learning rate or "
             "look for extreme values in the store (`ucfrec prepare --validate`)"
         )
 

@@ -43,7 +43,7 @@ def written(
         "reward": np.concatenate([step.rewards for step in steps])[order],
         "observation": np.concatenate([step.observations for step in steps])[order],
     }
-    store = EpisodeStore.write(folder, columns, np.bincount(episodes))
+    EpisodeStore.write(folder, columns, np.bincount(episodes))
     if states is not None:
         states.save(folder / ITEM_STATES)
     return EpisodeStore.open(folder)

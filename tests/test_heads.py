@@ -121,8 +121,6 @@ def test_items_with_the_same_embedding_start_alike() -> None:
     assert not torch.allclose(logits[:, 1], logits[:, 0])
 
 
-
-
 @pytest.mark.parametrize("negatives", [500, 20_000])
 def test_the_sampled_loss_approaches_the_full_one(negatives: int) -> None:
     head, _ = item_head()

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from ucfrec.errors import InputError
-from ucfrec.items import item_embeddings, write_item_states
-from ucfrec.log_mapping import FeatureTable, LogMapping
-from ucfrec.logs import PrepareOptions, prepare
+from ucfrec.logs.items import item_embeddings, write_item_states
+from ucfrec.logs.mapping import FeatureTable, LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.states import ItemStates
 from ucfrec.store import EpisodeStore
 

@@ -9,8 +9,8 @@ import pytest
 from tests.support import data_folder
 from ucfrec import schema
 from ucfrec.errors import InputError
-from ucfrec.log_mapping import LogMapping
-from ucfrec.logs import PrepareOptions, prepare, validate
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare, validate
 from ucfrec.plugins import load_plugin
 from ucfrec.store import EpisodeStore
 from ucfrec_datasets.kuairand import DATASET

@@ -17,15 +17,15 @@ from safetensors import SafetensorError
 
 from ucfrec import schema
 from ucfrec.errors import InputError
-from ucfrec.log_mapping import (
+from ucfrec.logs.mapping import (
     FeatureTable,
     LogMapping,
     columns_given,
     log_files,
     read_mapping,
 )
-from ucfrec.log_report import format_report
-from ucfrec.logs import PrepareOptions, parse_split, prepare, read_histories, validate
+from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, read_histories, validate
+from ucfrec.logs.report import format_report
 from ucfrec.store import EpisodeStore
 from ucfrec.store_writer import StoreWriter
 from ucfrec_datasets import generic

@@ -15,9 +15,9 @@ from ucfrec.demo import DemoConfig, demo
 from ucfrec.errors import InputError
 from ucfrec.evaluate import World, evaluate_behavior, evaluate_policy
 from ucfrec.files import atomic_file, write_json
-from ucfrec.log_mapping import Dataset, LogMapping, columns_given, read_mapping
-from ucfrec.log_report import format_report
-from ucfrec.logs import PrepareOptions, parse_split, prepare, read_histories, validate
+from ucfrec.logs.mapping import Dataset, LogMapping, columns_given, read_mapping
+from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, read_histories, validate
+from ucfrec.logs.report import format_report
 from ucfrec.plugins import load_plugin
 from ucfrec.recommend import LONGEST_HISTORY, Histories, recommend
 from ucfrec.results import format_rows, provenance

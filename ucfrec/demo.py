@@ -15,8 +15,8 @@ from ucfrec.collect import collect
 from ucfrec.config import resolve_config
 from ucfrec.evaluate import World, evaluate_behavior, evaluate_policy
 from ucfrec.files import write_json
-from ucfrec.log_mapping import FeatureTable, LogMapping
-from ucfrec.logs import PrepareOptions, prepare
+from ucfrec.logs.mapping import FeatureTable, LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.run import train_run
 from ucfrec.store import EpisodeStore
 from ucfrec.trained import TrainedPolicy

@@ -97,7 +97,7 @@ def _begin(store: EpisodeStore, train: EpisodeStore, out: Path, config: Config) 
         "store": str(store.path.resolve()),
         "fingerprint": store.meta["fingerprint"],
         "reward": store.meta["reward"],
-        "session_gap_ms": _gap_ms(store),
+        "session_gap_ms": store.meta["source"].get("session_gap_ms"),
         "sizes": _sizes(store),
         "observation_size": store.observation_size,
         "return_quantiles": {str(q): float(np.quantile(train.returns, q)) for q in _QUANTILES},
@@ -110,12 +110,6 @@ def _begin(store: EpisodeStore, train: EpisodeStore, out: Path, config: Config) 
             if (store.path / name).exists():
                 shutil.copyfile(store.path / name, scratch / name)
         write_json(scratch / RUN, record)
-
-
-def _gap_ms(store: EpisodeStore) -> float | None:
-    """The pause that ended sessions; None where sessions were not told by pauses."""
-    minutes = store.meta["source"].get("gap_minutes")
-    return None if minutes is None else minutes * 60_000
 
 
 def _require_same(

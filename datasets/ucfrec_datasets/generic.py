@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Final
 
 from ucfrec import schema
-from ucfrec.log_mapping import Dataset, FeatureTable, LogMapping, log_files
+from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, log_files
 
 
 def _resolve(paths: Sequence[str | Path], given: LogMapping) -> tuple[tuple[Path, ...], LogMapping]:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Final
 
 from ucfrec.errors import InputError
-from ucfrec.log_mapping import Dataset, FeatureTable, LogMapping, log_files
+from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, log_files
 
 LOGS: Final = ("log_standard_", "log_random_")
 USERS, BASIC, STATISTIC = "user_features_", "video_features_basic_", "video_features_statistic_"

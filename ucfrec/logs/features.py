@@ -9,8 +9,8 @@ import numpy.typing as npt
 from scipy import sparse
 
 from ucfrec.errors import InputError
-from ucfrec.log_files import bind, is_integer, is_number, is_vector, open_tables, wrong_type
-from ucfrec.log_mapping import FeatureTable, log_files
+from ucfrec.logs.files import bind, is_integer, is_number, is_vector, open_tables, wrong_type
+from ucfrec.logs.mapping import FeatureTable, log_files
 
 CATEGORIES: Final = 200
 """Categories and tags kept of one column: the most frequent in the training window."""

@@ -37,7 +37,7 @@ def write_item_states(
     """Learn and write how states are made of the items of the store at `folder`.
 
     Args:
-        item_features: (n_items, F) as `ucfrec.log_features.encode_features` gives them.
+        item_features: (n_items, F) as `ucfrec.logs.features.encode_features` gives them.
         user_features: (n_users, G) likewise.
         size: of the embeddings, at most.
 

@@ -6,8 +6,8 @@ from typing import Any
 
 from ucfrec import schema
 from ucfrec.errors import InputError
-from ucfrec.log_clean import REASONS, CleanLog
-from ucfrec.log_sessions import Cut
+from ucfrec.logs.clean import REASONS, CleanLog
+from ucfrec.logs.sessions import Cut
 
 
 def drop_counts(log: CleanLog) -> dict[str, int]:
@@ -89,6 +89,7 @@ def build_report(log: CleanLog, cut: Cut, dropped: Mapping[str, int]) -> dict[st
         "users": users,
         "splits": splits,
         "session_by": cut.session_by,
+        "session_gap_ms": cut.gap_ms if cut.session_by == "gap" else None,
         "split_times_ms": list(cut.bounds),
         "time_range_ms": [first_ms, last_ms],
         "reward_statistics": {"mean": mean, "std": deviation, "min": low, "max": high},

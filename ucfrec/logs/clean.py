@@ -12,7 +12,7 @@ import duckdb
 
 from ucfrec import schema
 from ucfrec.errors import InputError
-from ucfrec.log_files import (
+from ucfrec.logs.files import (
     MAX_FLOAT,
     Table,
     bind,
@@ -24,7 +24,7 @@ from ucfrec.log_files import (
     text,
     wrong_type,
 )
-from ucfrec.log_mapping import OPTIONAL_COLUMNS, LogMapping
+from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping
 
 EARLIEST_MS: Final = 946_684_800_000
 """2000-01-01 UTC: earlier rows come from a clock that is wrong."""

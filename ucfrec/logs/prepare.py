@@ -1,6 +1,6 @@
 """Logs to episodes: Parquet and CSV files, cleaned, cut into sessions, written as a store.
 
-One SQL pipeline on an embedded DuckDB, out of core: rows are read and judged (`log_clean`), fall
+One SQL pipeline on an embedded DuckDB, out of core: rows are read and judged (`clean`), fall
 into sessions, and stream sorted into the store.
 """
 
@@ -20,13 +20,13 @@ import pyarrow as pa
 from ucfrec import schema
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder
-from ucfrec.items import write_item_states
-from ucfrec.log_clean import CleanLog, engine, read_log
-from ucfrec.log_features import encode_features, load_features
-from ucfrec.log_files import explained, text
-from ucfrec.log_mapping import LogMapping, log_files
-from ucfrec.log_report import build_report, drop_counts, require_variety
-from ucfrec.log_sessions import (
+from ucfrec.logs.clean import CleanLog, engine, read_log
+from ucfrec.logs.features import encode_features, load_features
+from ucfrec.logs.files import explained, text
+from ucfrec.logs.items import write_item_states
+from ucfrec.logs.mapping import LogMapping, log_files
+from ucfrec.logs.report import build_report, drop_counts, require_variety
+from ucfrec.logs.sessions import (
     ID_TABLES,
     ITEMS_FILE,
     SESSIONS,

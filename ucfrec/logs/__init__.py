@@ -1,0 +1,14 @@
+"""Logs to episodes: files, mapping, cleaning, sessions, embeddings, store."""
+
+from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare, read_histories, validate
+
+__all__ = [
+    "Dataset",
+    "FeatureTable",
+    "LogMapping",
+    "PrepareOptions",
+    "prepare",
+    "read_histories",
+    "validate",
+]

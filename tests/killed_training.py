@@ -12,6 +12,7 @@ import random
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -64,13 +65,12 @@ def train(folder: Path) -> Fit:
     return fit(net, draw, loss, config, folder, seed=5, validate=validate)
 
 
-def life(folder: Path, seconds: float) -> bool:
-    """Train in a fork that is killed after `seconds`; whether it came to its end."""
+def life(work: Callable[[Path], None], folder: Path, seconds: float) -> bool:
+    """Work on `folder` in a fork that is killed after `seconds`; whether it came to its end."""
     child = os.fork()
     if child == 0:
         try:
-            fitted = train(folder)
-            (folder / "fit.json").write_text(json.dumps(vars(fitted)))
+            work(folder)
             os._exit(0)
         finally:
             os._exit(1)
@@ -84,6 +84,10 @@ def life(folder: Path, seconds: float) -> bool:
     return True
 
 
+def recorded(folder: Path) -> None:
+    (folder / "fit.json").write_text(json.dumps(vars(train(folder))))
+
+
 def main() -> None:
     torch.set_num_threads(1)
     torch.optim.AdamW(module().parameters()).step()  # imports half of torch: once, not every life
@@ -92,7 +96,7 @@ def main() -> None:
     for folder in map(Path, sys.argv[2:]):
         killed = 0
         # Lives grow longer, so that a slow machine comes to an end as well.
-        while not life(folder, moments.uniform(0.0, 0.07) * 1.2**killed):
+        while not life(recorded, folder, moments.uniform(0.0, 0.07) * 1.2**killed):
             killed += 1
         report.append({"killed": killed, **json.loads((folder / "fit.json").read_text())})
     print(json.dumps(report))

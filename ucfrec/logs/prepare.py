@@ -102,7 +102,7 @@ def parse_split(given: str) -> tuple[float, ...]:
 def prepare(
     paths: Sequence[str | Path],
     mapping: LogMapping,
-    out: Path,
+    out: str | Path,
     options: PrepareOptions | None = None,
     like: Path | None = None,
 ) -> dict[str, Any]:
@@ -126,7 +126,7 @@ def prepare(
     Raises:
         InputError: the input cannot be used, `out` exists, or the disk is full.
     """
-    options = options or PrepareOptions()
+    options, out = options or PrepareOptions(), Path(out)
     files = log_files(paths)
     if like is not None:
         EpisodeStore.open(like)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -118,3 +119,20 @@ def test_a_store_without_validation_holds_some_training_episodes_out(tmp_path: P
     )
     with pytest.raises(InputError, match="1 training episodes"):
         train_run(single, tmp_path / "run-single", resolve_config("ucf"))
+
+
+def test_a_checkpoint_that_cannot_be_written_is_one_clear_error(
+    store: Path, tmp_path: Path
+) -> None:
+    """No file may grow past 20 kB here, as on a disk that is full."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    config = resolve_config("dt", None, ["train.steps=10", "policy.dim=64"])
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+    try:
+        with pytest.raises(InputError, match=r"best\.safetensors cannot be written"):
+            train_run(EpisodeStore.open(store), tmp_path / "run", config)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not list((tmp_path / "run" / "policy").glob("*safetensors*"))
+    train_run(EpisodeStore.open(store), tmp_path / "run", config)
+    assert TrainedPolicy.load(tmp_path / "run").name == "dt"

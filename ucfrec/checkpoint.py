@@ -16,10 +16,19 @@ _OPTIMIZER = "optimizer."
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], about: dict[str, Any]) -> None:
-    """Write named tensors and a JSON-able header, atomically."""
+    """Write named tensors and a JSON-able header, atomically.
+
+    Raises:
+        InputError: the disk is full, or the folder cannot be written to.
+    """
     plain = {name: tensor.detach().contiguous().cpu() for name, tensor in tensors.items()}
     with atomic_file(path) as scratch:
-        save_file(plain, scratch, metadata={"about": json.dumps(about)})
+        try:
+            save_file(plain, scratch, metadata={"about": json.dumps(about)})
+        except SafetensorError as error:
+            raise InputError(
+                f"{path} cannot be written ({error}); make room and give the same command again"
+            ) from None
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

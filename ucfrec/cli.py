@@ -124,8 +124,8 @@ def _target_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--target-quantile",
         type=float,
-        default=0.99,
-        help="else this quantile of the training returns (0.99)",
+        default=1.0,
+        help="else this quantile of the training returns (1: the largest)",
     )
 
 

@@ -41,12 +41,11 @@ class DemoConfig:
 
     sessions: int = 8000
     episodes: int = 1000
-    target_quantile: float = 0.99
+    target_quantile: float = 1.0
     settings: Sequence[str] = (
-        "train.steps=3000",
+        "train.steps=2000",
         "train.learning_rate=1e-3",
-        "crm.epochs=10",
-        "csg.epochs=10",
+        "crm.epochs=8",
     )
     context: int = 10
     dim: int = 64

@@ -20,7 +20,7 @@ from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, read_histo
 from ucfrec.logs.report import format_report
 from ucfrec.plugins import load_plugin
 from ucfrec.recommend import LONGEST_HISTORY, Histories, recommend
-from ucfrec.results import format_rows, provenance
+from ucfrec.results import format_rows
 from ucfrec.run import describe_run, train_run
 from ucfrec.store import EpisodeStore
 from ucfrec.trained import TrainedPolicy
@@ -113,7 +113,7 @@ def run_evaluate(options: argparse.Namespace) -> None:
     ]
     print(format_rows(rows))
     if options.json is not None:
-        write_json(options.json, [row | provenance() for row in rows])
+        write_json(options.json, rows)
 
 
 def _target(options: argparse.Namespace, trained: TrainedPolicy) -> float:

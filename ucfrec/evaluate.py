@@ -1,5 +1,6 @@
 """What a policy earns in a simulated world."""
 
+import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from ucfrec import schema
 from ucfrec.errors import InputError
 from ucfrec.metrics import session_metrics
 from ucfrec.plugins import Simulator, load_plugin
+from ucfrec.results import config_hash, provenance
 from ucfrec.rollout import Actor, rollout
 from ucfrec.trained import TrainedPolicy
 
@@ -63,16 +65,30 @@ def evaluate_policy(
     _require_fit(world, env, trained)
     actor = trained.actor(env.num_envs, target_return)
     row = _row(world, name, env, actor, episodes, seed)
-    return row | {"target_return": target_return}
+    return row | {
+        "target_return": target_return,
+        "train_seed": trained.record["seed"],
+        "fingerprint": trained.record["fingerprint"],
+        "config": config_hash(trained.record["config"]),
+    }
 
 
 def _row(
     world: World, name: str, env: Any, actor: Actor, episodes: int, seed: int
 ) -> dict[str, Any]:
+    began = time.perf_counter()
     played = rollout(env, actor, episodes, seed, describe=f"{name} in {world.name}")
     env.close()
-    metrics = asdict(session_metrics(played, seed))
-    return {"world": world.name, "policy": name, **metrics, "seed": seed}
+    return {
+        "world": world.name,
+        "policy": name,
+        **asdict(session_metrics(played, seed)),
+        "seed": seed,
+        "wall_time_s": time.perf_counter() - began,
+        "fingerprint": None,
+        "config": None,
+        **provenance(),
+    }
 
 
 def _require_fit(world: World, env: Any, trained: TrainedPolicy) -> None:

@@ -48,6 +48,7 @@ def train_run(store: EpisodeStore, out: Path, config: Config) -> dict[str, Any]:
         _begin(store, train, out, config)
     record = read_json(out / RUN)
     _require_same(record, store, out, config)
+    record["config"] = dataclasses.asdict(config)
     began = time.perf_counter() - record["wall_time_s"]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if config.augment.copies > 0:
@@ -121,7 +122,12 @@ def _require_same(
             f"{record['fingerprint'][:12]}), not on {store.path} "
             f"({store.meta['fingerprint'][:12]}); name another run folder"
         )
-    before, now = dataclasses.asdict(config_from_dict(record["config"])), dataclasses.asdict(config)
+    # More steps are no other run: training goes on from where it ended.
+    began = config_from_dict(record["config"])
+    began = dataclasses.replace(
+        began, train=dataclasses.replace(began.train, steps=config.train.steps)
+    )
+    before, now = dataclasses.asdict(began), dataclasses.asdict(config)
     for table, values in now.items():
         if before[table] != values:
             was = _difference(before[table], values)

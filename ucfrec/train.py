@@ -2,7 +2,8 @@
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -99,41 +100,26 @@ def fit(
     counters = {"step": 0, "best_step": 0, "best_validation": math.inf, "stale": 0, "seconds": 0.0}
     if last.exists():
         counters.update(load_training(last, module, optimizer))
-    start, began = int(counters["step"]), time.perf_counter() - counters["seconds"]
-    events = _Events(folder, start)
-    bar = tqdm(total=config.steps, initial=start, desc=describe, unit="step", disable=None)
-    waited = time.perf_counter()
-    waiting = 0.0
-    since = start
-
-    step = start
-    while step < config.steps and not _stale(counters, config):
+    step = int(counters["step"])
+    clock, events = _Clock(step, counters["seconds"]), _Events(folder, step)
+    bar = tqdm(total=config.steps, initial=step, desc=describe, unit="step", disable=None)
+    while step < config.steps and not 0 < config.patience <= counters["stale"]:
         step += 1
         generator = step_generator(seed, step)
-        drawn = time.perf_counter()
-        batch = draw(generator)
-        waiting += time.perf_counter() - drawn
+        with clock.waiting():
+            batch = draw(generator)
         torch.manual_seed(int(generator.integers(2**62)))
         module.train()
         value, scalars = loss(batch)
-        optimizer.zero_grad(set_to_none=True)
-        value.backward()  # type: ignore[no-untyped-call]
-        norm = nn.utils.clip_grad_norm_(module.parameters(), config.clip_norm or math.inf)
-        for group in optimizer.param_groups:
-            group["lr"] = config.learning_rate * min(1.0, step / max(1, config.warmup_steps))
-        optimizer.step()
+        norm = _descend(value, module, optimizer, config, step)
         bar.update()
         if step % config.validate_every and step != config.steps:
             continue
 
-        _require_finite(value.item(), f"{describe}: the loss", step)
-        elapsed = time.perf_counter() - waited
-        logged = {name: float(scalar) for name, scalar in scalars.items()} | {
-            "loss": value.item(),
-            "gradient_norm": float(norm),
-            "samples_per_second": (step - since) * config.batch_size / elapsed,
-            "waiting_for_data": waiting / elapsed,
-        }
+        logged = {"loss": value.item(), "gradient_norm": norm.item(), **clock.rates(step, config)}
+        logged |= {name: scalar.item() for name, scalar in scalars.items()}
+        _require_finite(logged["loss"], f"{describe}: the loss", step)
+        _require_finite(logged["gradient_norm"], f"{describe}: the gradient", step)
         if validate is None:
             counters["best_step"] = step
             save_tensors(best, module.state_dict(), {"step": step})
@@ -143,19 +129,61 @@ def fit(
             _keep_best(module, logged["validation_loss"], counters, step, best)
         events.add(step, logged)
         bar.set_postfix(loss=f"{logged['loss']:.4g}")
-        counters |= {"step": step, "seconds": time.perf_counter() - began}
+        counters |= {"step": step, "seconds": clock.total()}
         save_training(last, module, optimizer, counters)
-        waited, waiting, since = time.perf_counter(), 0.0, step
+        clock.restart(step)
     bar.close()
     events.close()
     load_weights(best, module, load_tensors(best)[0])
     module.eval()
-    return Fit(
-        steps=step,
-        best_step=int(counters["best_step"]),
-        best_validation=math.nan if validate is None else counters["best_validation"],
-        seconds=counters["seconds"],
-    )
+    best_validation = math.nan if validate is None else counters["best_validation"]
+    return Fit(step, int(counters["best_step"]), best_validation, counters["seconds"])
+
+
+def _descend(
+    value: Tensor,
+    module: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    config: LoopConfig,
+    step: int,
+) -> Tensor:
+    """One step down the gradient of `value`; returns the gradient's norm before clipping."""
+    optimizer.zero_grad(set_to_none=True)
+    value.backward()  # type: ignore[no-untyped-call]
+    norm = nn.utils.clip_grad_norm_(module.parameters(), config.clip_norm or math.inf)
+    for group in optimizer.param_groups:
+        group["lr"] = config.learning_rate * min(1.0, step / max(1, config.warmup_steps))
+    optimizer.step()
+    return norm
+
+
+class _Clock:
+    """Time spent, and how much of it waiting for data."""
+
+    def __init__(self, step: int, seconds: float) -> None:
+        self._began = time.perf_counter() - seconds
+        self.restart(step)
+
+    @contextmanager
+    def waiting(self) -> Iterator[None]:
+        began = time.perf_counter()
+        yield
+        self._waited += time.perf_counter() - began
+
+    def rates(self, step: int, config: LoopConfig) -> dict[str, float]:
+        """Samples a second and the share of time waiting for data, since the last restart."""
+        elapsed = time.perf_counter() - self._since
+        return {
+            "samples_per_second": (step - self._step) * config.batch_size / elapsed,
+            "waiting_for_data": self._waited / elapsed,
+        }
+
+    def restart(self, step: int) -> None:
+        """Count from here: what validation and checkpoints take is neither."""
+        self._since, self._step, self._waited = time.perf_counter(), step, 0.0
+
+    def total(self) -> float:
+        return time.perf_counter() - self._began
 
 
 class _Events:
@@ -176,10 +204,6 @@ class _Events:
 
     def close(self) -> None:
         self._writer.close()
-
-
-def _stale(counters: Mapping[str, float], config: LoopConfig) -> bool:
-    return 0 < config.patience <= counters["stale"]
 
 
 def _require_finite(value: float, what: str, step: int) -> None:

@@ -188,7 +188,9 @@ def trained_attention(lambda_mask: float) -> tuple[Tensor, Tensor]:
         policy.loss(windows)[0].backward()
         optimizer.step()
     config = policy.config
-    targets = parent_targets(windows.mask, config.parent_window, config.parent_decay, 0.0)
+    targets = parent_targets(
+        windows.mask, config.parent_window, config.parent_decay, config.parent_action
+    )
     _, attention = policy.attend(policy.normalized(windows))
     return attention.detach().mean(1)[windows.mask], targets[windows.mask]
 

@@ -112,17 +112,18 @@ def interleave(returns: Tensor, states: Tensor, actions: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class UCFConfig(PolicyConfig):
-    """UCF's hybrid policy; defaults are the paper's Tables 6 to 8."""
+    """UCF's hybrid policy; defaults are the paper's Tables 6 to 8, but for λ and the weight of
+    a_{t−1}, which were chosen on validation episodes (`benchmarks/LOG.md`)."""
 
     conv_blocks: int = 2
     heads: int = 2
-    lambda_mask: float = 0.1
+    lambda_mask: float = 0.03
     """λ, weight of the mask loss."""
     parent_window: int = 2
     """w, how many earlier states count as parents."""
     parent_decay: float = 0.6
     """Weight of s_{t−k} is this to the power k."""
-    parent_action: float = 0.0
+    parent_action: float = 0.3
     """Weight of a_{t−1} as a parent."""
 
 

@@ -53,7 +53,7 @@ def test_a_run_killed_at_any_moment_ends_as_if_left_alone(
         env={**os.environ, "PYTHONPATH": str(HERE.parent), "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=900,
     )
     assert ended.returncode == 0, ended.stderr
     assert int(ended.stdout.split()[-1]) >= 3

@@ -85,7 +85,7 @@ def killed_often(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Path, d
         env={**os.environ, "PYTHONPATH": str(HERE.parent)},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
     )
     assert script.returncode == 0, script.stderr
     return list(zip(folders, json.loads(script.stdout), strict=True))

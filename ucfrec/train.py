@@ -91,12 +91,7 @@ def fit(
     """
     folder.mkdir(parents=True, exist_ok=True)
     last, best = folder / "last.safetensors", folder / "best.safetensors"
-    optimizer = torch.optim.AdamW(
-        module.parameters(),
-        lr=config.learning_rate,
-        weight_decay=config.weight_decay,
-        fused=True,
-    )
+    optimizer = _optimizer(module, config)
     counters = {"step": 0, "best_step": 0, "best_validation": math.inf, "stale": 0, "seconds": 0.0}
     if last.exists():
         counters.update(load_training(last, module, optimizer))
@@ -124,9 +119,7 @@ def fit(
             counters["best_step"] = step
             save_tensors(best, module.state_dict(), {"step": step})
         else:
-            logged["validation_loss"] = _validation(module, validate)
-            _require_finite(logged["validation_loss"], f"{describe}: the validation loss", step)
-            _keep_best(module, logged["validation_loss"], counters, step, best)
+            logged["validation_loss"] = _keep_best(module, validate, counters, step, best, describe)
         events.add(step, logged)
         bar.set_postfix(loss=f"{logged['loss']:.4g}")
         counters |= {"step": step, "seconds": clock.total()}
@@ -138,6 +131,15 @@ def fit(
     module.eval()
     best_validation = math.nan if validate is None else counters["best_validation"]
     return Fit(step, int(counters["best_step"]), best_validation, counters["seconds"])
+
+
+def _optimizer(module: nn.Module, config: LoopConfig) -> torch.optim.Optimizer:
+    return torch.optim.AdamW(
+        module.parameters(),
+        lr=config.learning_rate,
+        weight_decay=config.weight_decay,
+        fused=True,
+    )
 
 
 def _descend(
@@ -214,17 +216,22 @@ def _require_finite(value: float, what: str, step: int) -> None:
         )
 
 
-def _validation(module: nn.Module, validate: Callable[[], float]) -> float:
+def _keep_best(
+    module: nn.Module,
+    validate: Callable[[], float],
+    counters: dict[str, float],
+    step: int,
+    best: Path,
+    describe: str,
+) -> float:
+    """The validation loss; the weights are saved and the counters told if it is the lowest yet."""
     module.eval()
     with torch.no_grad():
-        return validate()
-
-
-def _keep_best(
-    module: nn.Module, loss: float, counters: dict[str, float], step: int, best: Path
-) -> None:
+        loss = validate()
+    _require_finite(loss, f"{describe}: the validation loss", step)
     if loss < counters["best_validation"]:
         counters |= {"best_validation": loss, "best_step": step, "stale": 0}
         save_tensors(best, module.state_dict(), {"step": step, "validation_loss": loss})
     else:
         counters["stale"] += 1
+    return loss

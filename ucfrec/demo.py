@@ -39,11 +39,11 @@ EVALUATION_SEED = 1_000_000
 class DemoConfig:
     """Small enough for minutes on two cores."""
 
-    sessions: int = 8000
+    sessions: int = 6000
     episodes: int = 1000
     target_quantile: float = 1.0
     settings: Sequence[str] = (
-        "train.steps=2000",
+        "train.steps=1500",
         "train.learning_rate=1e-3",
         "crm.epochs=8",
     )

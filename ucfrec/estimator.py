@@ -8,7 +8,7 @@ from typing import Self
 
 import pandas as pd
 
-from ucfrec.config import resolve_config
+from ucfrec.config import config_from_dict, resolve_config
 from ucfrec.errors import InputError
 from ucfrec.recommend import Histories, recommend
 from ucfrec.run import train_run
@@ -106,6 +106,7 @@ class UCF:
             InputError: the folder holds no run.
         """
         record = TrainedPolicy.load(Path(run)).record
-        policy = cls(record["config"]["policy_name"])
+        policy = cls()
+        policy.config = config_from_dict(record["config"])
         policy._folder = Path(run)
         return policy

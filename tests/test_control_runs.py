@@ -16,6 +16,7 @@ from ucfrec.errors import InputError
 from ucfrec.files import read_json
 from ucfrec.rollout import rollout
 from ucfrec.store import EpisodeStore
+from ucfrec_control.benchmark import BUDGETS, METHODS, Budget
 from ucfrec_control.cli import main
 from ucfrec_control.d4rl import read_d4rl
 from ucfrec_control.distractor import add_distractor
@@ -214,3 +215,42 @@ def test_a_clone_of_a_zoo_file_hops(tmp_path: Path) -> None:
     (row,) = json.loads(out.read_text())
     assert row["episodes"] == 20
     assert row["score"] > 15
+
+
+def test_a_benchmark_goes_on_where_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
+    settings = (*TINY, "policy.dim=32", "crm.epochs=1", "csg.epochs=1")
+    monkeypatch.setitem(BUDGETS, "small", Budget(("hopper_medium-made",), 1, 2, settings))
+    monkeypatch.setattr(
+        "ucfrec_control.benchmark.METHODS", {m: METHODS[m] for m in ("lsdt", "ucf")}
+    )
+    results = tmp_path / "control.jsonl"
+    arguments = ["benchmark", str(tmp_path), "--out", str(tmp_path / "runs")]
+    arguments += ["--results", str(results)]
+    assert main(arguments) == 0
+    rows = [json.loads(line) for line in results.read_text().splitlines()]
+    assert sorted((r["method"], r["checkpoint"]) for r in rows) == [
+        (method, checkpoint) for method in ("lsdt", "ucf") for checkpoint in ("best", "last")
+    ]
+    for row in rows:
+        assert (row["dataset"], row["budget"], row["episodes"]) == (
+            "hopper_medium-made",
+            "small",
+            2,
+        )
+        assert {"score", "seed", "env_id", "versions", "commit", "command"} <= row.keys()
+    before = results.read_text()
+    assert main(arguments) == 0
+    assert results.read_text() == before
+    results.write_text("".join(f"{json.dumps(r)}\n" for r in rows if r["method"] == "ucf"))
+    assert main(arguments) == 0
+    again = [json.loads(line) for line in results.read_text().splitlines()]
+    assert {r["method"] for r in again} == {"lsdt", "ucf"}
+    by_checkpoint = {r["checkpoint"]: r["return"] for r in rows if r["method"] == "lsdt"}
+    assert {r["checkpoint"]: r["return"] for r in again[2:]} == by_checkpoint
+    results.write_text("no row\n")
+    capsys.readouterr()
+    assert main(arguments) == 2
+    assert "control.jsonl, line 1, is no result row" in capsys.readouterr().err

@@ -10,6 +10,7 @@ from ucfrec.baselines.bc import BCConfig, BCPolicy
 from ucfrec.baselines.dc import DCConfig, DCPolicy
 from ucfrec.baselines.dt import DTConfig, DTPolicy
 from ucfrec.baselines.lsdt import LSDTConfig, LSDTPolicy
+from ucfrec.errors import InputError
 from ucfrec.losses import parent_targets
 from ucfrec.policy import SequencePolicy, UCFConfig, UCFPolicy, interleave
 from ucfrec.windows import Windows
@@ -231,6 +232,11 @@ def test_parameters_of_lsdt_are_the_official_ones_less_the_unused() -> None:
     policy = LSDTPolicy(LSDTConfig(), {"state": 11, "action": 3, "items": 0})
     unused = (128 * 11 + 11) + (128 + 1) + 3 * 16 * 5 * (64 + 1)
     assert sum(p.numel() for p in policy.parameters()) == 1_134_111 - unused
+
+
+def test_lsdt_refuses_a_width_that_does_not_split() -> None:
+    with pytest.raises(InputError, match=r"policy\.dim is 48; .* 16 kernel_groups"):
+        LSDTPolicy(LSDTConfig(dim=48), VECTORS)
 
 
 @pytest.mark.parametrize("name", ["dt", "dc", "lsdt"])

@@ -35,6 +35,7 @@ def build_parser() -> argparse.ArgumentParser:
     _screen(commands.add_parser("screen", help="which state dimensions cause anything"))
     _train(commands.add_parser("train", help="train a policy on a store; resumes"))
     _evaluate(commands.add_parser("evaluate", help="normalised scores of trained policies"))
+    _benchmark(commands.add_parser("benchmark", help="every learner on the zoo files; resumes"))
     return parser
 
 
@@ -92,6 +93,16 @@ def _evaluate(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--checkpoint", choices=["both", "best", "last"], default="both")
     parser.add_argument("--json", type=Path, help="write the result rows here")
+
+
+def _benchmark(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("data", type=Path, metavar="DATA", help="folder of the HDF5 files")
+    parser.add_argument("--budget", default="small", choices=["small", "full"])
+    parser.add_argument("--out", type=Path, default=Path("runs/control"), help="stores and runs")
+    parser.add_argument(
+        "--results", type=Path, default=Path("benchmarks/results/control.jsonl"), metavar="JSONL"
+    )
+    parser.add_argument("--workers", type=int, default=1, help="processes of one thread each (1)")
 
 
 if __name__ == "__main__":

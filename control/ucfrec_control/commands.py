@@ -16,6 +16,7 @@ from ucfrec.files import write_json
 from ucfrec.results import format_rows, provenance
 from ucfrec.run import describe_run
 from ucfrec.store import EpisodeStore
+from ucfrec_control.benchmark import BUDGETS, benchmark
 from ucfrec_control.d4rl import read_d4rl, write_d4rl
 from ucfrec_control.distractor import add_distractor
 from ucfrec_control.evaluate import CHECKPOINTS, SHOWN, evaluate_run
@@ -112,6 +113,20 @@ def run_evaluate(options: argparse.Namespace) -> None:
         write_json(options.json, [row | provenance(PACKAGES) for row in rows])
 
 
+def run_benchmark(options: argparse.Namespace) -> None:
+    """`ucfrec-control benchmark`."""
+    rows = benchmark(
+        options.data,
+        options.out,
+        options.results,
+        BUDGETS[options.budget],
+        options.budget,
+        options.workers,
+    )
+    print(format_rows([_shown(row) for row in rows], SHOWN))
+    print(f"\nrows: {options.results}")
+
+
 def _shown(row: Mapping[str, Any]) -> dict[str, Any]:
     interval = f"{row['score']:.1f} [{row['score_low']:.1f}, {row['score_high']:.1f}]"
     asked, earned = f"{row['target_return']:g}", f"{row['return']:.1f}"
@@ -125,4 +140,5 @@ COMMANDS: Commands = {
     "screen": run_screen,
     "train": run_train,
     "evaluate": run_evaluate,
+    "benchmark": run_benchmark,
 }

@@ -34,15 +34,15 @@ class ScreeningConfig:
     """Predictors, and how much help counts."""
 
     hidden: int = 192
-    shared_steps: int = 1500
+    shared_steps: int = 3000
     """Updates of one predictor that serves every missing dimension."""
-    own_steps: int = 700
+    own_steps: int = 1000
     """Updates of a copy of it for each missing dimension; without them a dimension that is nearly
     a function of others seems to help."""
     batch_size: int = 256
     learning_rate: float = 3e-3
     max_transitions: int = 100_000
-    min_effect: float = 0.03
+    min_effect: float = 0.02
     """Least share of a next dimension's unexplained variance that counts as help."""
     min_reward_effect: float = 0.01
     """Least share of the reward's variance that counts as help."""

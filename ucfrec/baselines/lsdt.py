@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from ucfrec.errors import InputError
 from ucfrec.policy import PolicyConfig, SequencePolicy, TokenEmbedding, interleave
 from ucfrec.windows import Windows
 
@@ -41,6 +42,11 @@ class LSDTPolicy(SequencePolicy):
 
     def __init__(self, config: LSDTConfig, sizes: Mapping[str, int]) -> None:
         super().__init__(config, sizes)
+        if config.dim % (2 * config.kernel_groups) or config.dim % (2 * config.heads):
+            raise InputError(
+                f"policy.dim is {config.dim}; half of it must split into {config.kernel_groups} "
+                f"kernel_groups and into {config.heads} heads"
+            )
         self.embed = TokenEmbedding(config, sizes["state"])
         self.blocks = nn.ModuleList(_Block(config) for _ in range(config.layers))
         for module in self.blocks.modules():

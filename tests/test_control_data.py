@@ -5,8 +5,11 @@ import warnings
 from pathlib import Path
 
 import h5py
+import minari
 import numpy as np
 import pytest
+from gymnasium import spaces
+from minari.data_collector import EpisodeBuffer
 
 from tests.control_files import Columns, hopper_like, write_hdf5
 from tests.support import data_folder
@@ -76,7 +79,7 @@ def test_steps_on_the_goal_are_dropped_of_antmaze_alone(tmp_path: Path) -> None:
     read = read_d4rl(write_hdf5(tmp_path / "antmaze-umaze-v2.hdf5", ant, env_id=None))
     assert read.lengths.tolist() == [4, 6, 3]
     assert read.source["dropped"]["one_step_trajectories"] == 1
-    assert read.source["env_id"] == "AntMaze_UMaze-v4"
+    assert read.source["env_id"] is None
     assert read.final_observations is None
     kept = np.delete(columns["rewards"], 4)
     np.testing.assert_array_equal(read.rewards, kept)
@@ -115,6 +118,8 @@ def broken(columns: Columns, how: str) -> Columns:
         columns["actions"] = columns["actions"][:-2]
     elif how == "flat observations":
         columns["observations"] = columns["observations"][:, 0]
+    elif how == "narrow successors":
+        columns["next_observations"] = columns["next_observations"][:, :10]
     elif how == "odd flags":
         columns["terminals"] = columns["terminals"] + 2.0
     elif how == "not a number":
@@ -128,7 +133,8 @@ def broken(columns: Columns, how: str) -> Columns:
         del columns["next_observations"]
         columns["infos/final_observations"] = columns["infos/final_observations"][1:]
     else:
-        columns["observations"] = columns["observations"][:, :5]
+        for name in ("observations", "next_observations", "infos/final_observations"):
+            columns[name] = columns[name][:, :5]
     return columns
 
 
@@ -138,6 +144,7 @@ def broken(columns: Columns, how: str) -> Columns:
         ("no rewards", "has no rewards"),
         ("short actions", "actions have 12 rows, rewards have 14"),
         ("flat observations", "observations have shape"),
+        ("narrow successors", "next_observations have 10 columns, observations have 11"),
         ("odd flags", "14 of its terminals are neither 0 nor 1"),
         ("not a number", "1 numbers of its observations are not finite"),
         ("text", "rewards holds .*, not numbers"),
@@ -225,6 +232,40 @@ def test_minari_refusals(tmp_path: Path, minari_folder: Path) -> None:
         read_minari("hopper/mine-v0")
     assert is_minari("mujoco/hopper/medium-v0")
     assert not is_minari("hopper_medium-v2.hdf5")
+
+
+def test_minari_goals_are_left_out_and_unfinished_episodes_dropped(minari_folder: Path) -> None:
+    """As D4RL has AntMaze: position, then the rest, without the goal."""
+    box = {"dtype": np.float64, "low": -9.0, "high": 9.0}
+    sizes = {"observation": 27, "achieved_goal": 2, "desired_goal": 2}
+    rng = np.random.default_rng(0)
+    seen = [{k: rng.uniform(size=(5, n)) for k, n in sizes.items()} for _ in range(2)]
+    buffers = [
+        EpisodeBuffer(
+            observations=observations,
+            actions=rng.uniform(size=(4, 8)),
+            rewards=[0.0, 0.0, 0.0, 1.0],
+            terminations=[False] * 4,
+            truncations=[False, False, False, ends],
+            infos={},
+        )
+        for observations, ends in zip(seen, (True, False), strict=True)
+    ]
+    boxes = {name: spaces.Box(shape=(n,), **box) for name, n in sizes.items()}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        minari.create_dataset_from_buffers(
+            "antmaze/made-v0",
+            buffers,
+            observation_space=spaces.Dict(boxes),
+            action_space=spaces.Box(shape=(8,), **box),
+        )
+    read = read_minari("antmaze/made-v0", env_id="AntMaze_UMaze-v4")
+    wanted = np.hstack([seen[0]["achieved_goal"], seen[0]["observation"]]).astype(np.float32)
+    np.testing.assert_array_equal(read.observations, wanted[:4])
+    np.testing.assert_array_equal(read.final_observations, wanted[4:])
+    assert read.lengths.tolist() == [4]
+    assert read.source["dropped"]["unfinished_steps"] == 4
 
 
 def test_scores_are_d4rls() -> None:

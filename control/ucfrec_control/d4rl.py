@@ -148,6 +148,11 @@ def _require_aligned(steps: Mapping[str, npt.NDArray[Any]], path: Path) -> None:
             raise InputError(f"{path}: {name} have shape {values.shape}, not {1 + two} dimensions")
         if name != _FINAL and len(values) != n:
             raise InputError(f"{path}: {name} have {len(values)} rows, rewards have {n}")
+        if name.endswith("observations") and values.shape[1:] != steps["observations"].shape[1:]:
+            raise InputError(
+                f"{path}: {name} have {values.shape[1]} columns, observations have "
+                f"{steps['observations'].shape[1]}"
+            )
 
 
 def _flags(values: npt.NDArray[Any], name: str, path: Path) -> BoolArray:

@@ -25,8 +25,9 @@ class Task:
     """D4RL's reference return of a random policy: score 0."""
     high: float
     """D4RL's reference return of an expert: score 100."""
-    d4rl_env: str
-    """Environment that D4RL's own datasets were made in, in its oldest gymnasium version."""
+    d4rl_env: str | None
+    """Environment that D4RL's own datasets were made in, in its oldest gymnasium version; None
+    where the datasets of the task differ in it."""
 
     def score(self, returns: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Returns on the scale where a random policy has 0 and an expert 100."""
@@ -38,7 +39,7 @@ TASKS = (
     Task("hopper", "hopper", (11, 3), -20.272305, 3234.3, "Hopper-v4"),
     Task("halfcheetah", "halfcheetah", (17, 6), -280.178953, 12135.0, "HalfCheetah-v4"),
     Task("walker2d", "walker2d", (17, 6), 1.629008, 4592.3, "Walker2d-v4"),
-    Task("antmaze", "antmaze", (29, 8), 0.0, 1.0, "AntMaze_UMaze-v4"),
+    Task("antmaze", "antmaze", (29, 8), 0.0, 1.0, None),
 )
 
 

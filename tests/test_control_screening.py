@@ -51,8 +51,8 @@ def test_what_causes_nothing_is_flagged_and_nothing_else(tmp_path: Path) -> None
     report = screen(store, QUICK, seed=0)
     assert report.flagged == (3, 4)
     by_dimension = report.dimensions
-    assert by_dimension[0].helps == 1
-    assert by_dimension[0].effect > 0.3
+    assert by_dimension[0].helps[0] == 1
+    assert by_dimension[0].effect > 0.1
     assert by_dimension[2].reward_effect > 0.1
     assert abs(by_dimension[3].effect) < 0.03
     assert by_dimension[3].reward_effect < 0.01

@@ -27,6 +27,7 @@ from ucfrec.windows import IntArray, Overlay
 _HELD_OUT_EVERY = 5
 _CLIP = 10.0
 _CHUNK = 1024
+_HELPED = 3
 
 
 @dataclass(frozen=True)
@@ -56,10 +57,10 @@ class DimensionReport:
 
     dimension: int
     effect: float
-    """Share it explains of what the others leave unexplained of the next dimension it helps most
-    (partial R²), the reward given."""
-    helps: int
-    """That dimension, chosen on fitted trajectories."""
+    """Share it explains of what the others leave unexplained of the next dimensions it helps most
+    (partial R², their mean), the reward given."""
+    helps: tuple[int, ...]
+    """Those dimensions, most helped first, chosen on fitted trajectories."""
     p_value: float
     """Of no help there, one-sided, over held-out trajectories."""
     reward_effect: float
@@ -265,20 +266,29 @@ def _report(
     variance = float(data.rewards[torch.from_numpy(rows)].var())
     fitted = fitted_errors.mean(1)
     gain = 1 - fitted[-1] / fitted[:-1].clamp(min=1e-12)  # (S, S)
-    most_helped = gain.fill_diagonal_(-torch.inf).argmax(1)
+    most_helped = gain.fill_diagonal_(-torch.inf).topk(min(_HELPED, size - 1)).indices
     found = []
     for j in range(size):
-        k = int(most_helped[j])
-        without, complete = next_errors[j, :, k], next_errors[-1, :, k]
-        effect = 1 - float(complete.mean()) / max(float(without.mean()), 1e-12)
-        p_value = _p_value(without - complete, data.episodes[rows])
+        without = next_errors[j, :, most_helped[j]]  # (B, helped)
+        saved = (without - next_errors[-1, :, most_helped[j]]) / without.mean(0).clamp(min=1e-12)
+        effect, p_value = float(saved.mean()), _p_value(saved.mean(1), data.episodes[rows])
         more = reward_errors[j] - reward_errors[-1]
         reward_effect = float(more.mean()) / max(variance, 1e-12)
         reward_p_value = _p_value(more, data.episodes[rows])
         causes = (effect >= config.min_effect and p_value < config.level) or (
             reward_effect >= config.min_reward_effect and reward_p_value < config.level
         )
-        found.append(DimensionReport(j, effect, k, p_value, reward_effect, reward_p_value, causes))
+        found.append(
+            DimensionReport(
+                dimension=j,
+                effect=effect,
+                helps=tuple(most_helped[j].tolist()),
+                p_value=p_value,
+                reward_effect=reward_effect,
+                reward_p_value=reward_p_value,
+                causes=causes,
+            )
+        )
     r2 = 1 - float(reward_errors[-1].mean()) / max(variance, 1e-12)
     return ScreeningReport(tuple(found), r2, len(data.states))
 
@@ -327,9 +337,9 @@ def interventions(
 def describe_screening(report: ScreeningReport) -> str:
     """The verdicts as a table."""
     lines = [f"{report.transitions:,} transitions, reward R² {report.reward_r2:.4f}", ""]
-    lines.append("dimension  next state  (helps)        p     reward        p  causes")
+    lines.append("dimension  next state        p     reward        p  causes")
     lines += [
-        f"{d.dimension:>9}  {d.effect:>10.4f}  {d.helps:>7}  {d.p_value:>7.1g}  "
+        f"{d.dimension:>9}  {d.effect:>10.4f}  {d.p_value:>7.1g}  "
         f"{d.reward_effect:>9.5f}  {d.reward_p_value:>7.1g}  {'yes' if d.causes else 'NOTHING'}"
         for d in report.dimensions
     ]

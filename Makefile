@@ -29,7 +29,7 @@ wheel: .venv/dev  ## Build the wheel into dist/.
 	touch $@
 
 .venv/dev: .venv/base
-	$(BIN)/pip install -q $(PIP_FLAGS) -c constraints.txt -e ".[dev]"
+	$(BIN)/pip install -q $(PIP_FLAGS) -c constraints.txt -e ".[control,dev]"
 	touch $@
 
 clean:

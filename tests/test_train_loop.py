@@ -248,7 +248,17 @@ def test_the_loss_goes_down_in_training_mode(tmp_path: Path) -> None:
     assert logged[300] < 0.05 * logged[50] or logged[300] < 1e-3
 
 
-def test_steps_are_adamw_with_warm_up_and_clipping(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("cosine", "rates"),
+    [
+        (False, [0.02, 0.04, 0.06, 0.08, 0.1, 0.1, 0.1]),
+        (True, [0.02, 0.04, 0.06, 0.08, 0.1, 0.05, 0.0]),
+    ],
+    ids=["constant", "cosine"],
+)
+def test_steps_are_adamw_with_warm_up_and_clipping(
+    tmp_path: Path, cosine: bool, rates: list[float]
+) -> None:
     """Against the same steps written out with torch's optimizer."""
     config = LoopConfig(
         steps=7,
@@ -256,6 +266,7 @@ def test_steps_are_adamw_with_warm_up_and_clipping(tmp_path: Path) -> None:
         learning_rate=0.1,
         weight_decay=0.2,
         warmup_steps=5,
+        cosine=cosine,
         clip_norm=0.3,
         validate_every=3,
     )
@@ -270,8 +281,8 @@ def test_steps_are_adamw_with_warm_up_and_clipping(tmp_path: Path) -> None:
 
     twin = linear()
     optimizer = torch.optim.AdamW(twin.parameters(), weight_decay=0.2)
-    for step, batch in enumerate(batches, start=1):
-        optimizer.param_groups[0]["lr"] = 0.1 * min(1.0, step / 5)
+    for rate, batch in zip(rates, batches, strict=True):
+        optimizer.param_groups[0]["lr"] = rate
         optimizer.zero_grad()
         squared(twin)(batch)[0].backward()
         norm = math.sqrt(sum(float(p.grad.square().sum()) for p in twin.parameters()))

@@ -4,11 +4,14 @@ import argparse
 import errno
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from ucfrec import __version__
 from ucfrec.errors import InputError
+
+Commands = Mapping[str, Callable[[argparse.Namespace], Any]]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -17,21 +20,39 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0 is success, 2 an input that cannot be used (one line on stderr says what to do), 130 an
     interruption; a command that was interrupted goes on where it was when given again.
     """
-    parser = build_parser()
-    options = parser.parse_args(arguments)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
+
+    def commands() -> Commands:
         from ucfrec.commands import COMMANDS
 
-        COMMANDS[options.command](options)
+        return COMMANDS
+
+    return run(build_parser(), commands, arguments)
+
+
+def run(
+    parser: argparse.ArgumentParser,
+    commands: Callable[[], Commands],
+    arguments: Sequence[str] | None,
+) -> int:
+    """Run one of `commands`, of this or of a sibling's command line; `main` tells the status.
+
+    Args:
+        parser: with options `command` and `debug`.
+        commands: called once a command is known, so that heavy imports wait until then.
+    """
+    options = parser.parse_args(arguments)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    name = f"{parser.prog} {options.command}"
+    try:
+        commands()[options.command](options)
     except InputError as error:
-        return _failed(options, f"ucfrec {options.command}: {error}")
+        return _failed(options, f"{name}: {error}")
     except OSError as error:
         if error.errno != errno.ENOSPC:
             raise
         where = f" for {error.filename}" if error.filename else ""
         message = f"no space is left on disk{where}; nothing was written. Free some and run again"
-        return _failed(options, f"ucfrec {options.command}: {message}")
+        return _failed(options, f"{name}: {message}")
     except KeyboardInterrupt:
         print("\ninterrupted; the same command goes on from the last checkpoint", file=sys.stderr)
         return 130
@@ -57,7 +78,7 @@ def build_parser() -> argparse.ArgumentParser:
     _demo(commands.add_parser("demo", help="everything on simulated logs, ends in a table"))
     _collect(commands.add_parser("collect", help="play sessions in a simulator, as Parquet logs"))
     _prepare(commands.add_parser("prepare", help="logs to an episode store"))
-    _train(commands.add_parser("train", help="train a policy on a store; resumes"))
+    train_options(commands.add_parser("train", help="train a policy on a store; resumes"))
     _evaluate(commands.add_parser("evaluate", help="what a policy earns in a simulator"))
     _recommend(commands.add_parser("recommend", help="the next items for users of a log"))
     return parser
@@ -108,10 +129,11 @@ def _prepare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--validate", action="store_true", help="only check, write nothing")
 
 
-def _train(parser: argparse.ArgumentParser) -> None:
+def train_options(parser: argparse.ArgumentParser) -> None:
+    """What `train` takes, here and on a sibling's command line."""
     parser.add_argument("store", type=Path, metavar="STORE")
     parser.add_argument("--out", type=Path, required=True, metavar="RUN")
-    parser.add_argument("--policy", default="ucf", help="ucf (default), dt or bc")
+    parser.add_argument("--policy", default="ucf", help="ucf (default), dt, dc, lsdt or bc")
     parser.add_argument("--config", type=Path, metavar="TOML")
     parser.add_argument("--set", action="append", default=[], metavar="TABLE.FIELD=VALUE")
     parser.add_argument("--seed", type=int, default=0)

@@ -9,14 +9,22 @@ from typing import Any
 
 from ucfrec.augment import AugmentConfig
 from ucfrec.baselines.bc import BCPolicy
+from ucfrec.baselines.dc import DCPolicy
 from ucfrec.baselines.dt import DTPolicy
+from ucfrec.baselines.lsdt import LSDTPolicy
 from ucfrec.crm import CRMConfig
 from ucfrec.csg import CSGConfig
 from ucfrec.errors import InputError
 from ucfrec.policy import PolicyConfig, SequencePolicy, UCFPolicy
 from ucfrec.train import LoopConfig
 
-POLICIES: dict[str, type[SequencePolicy]] = {"ucf": UCFPolicy, "dt": DTPolicy, "bc": BCPolicy}
+POLICIES: dict[str, type[SequencePolicy]] = {
+    "ucf": UCFPolicy,
+    "dt": DTPolicy,
+    "dc": DCPolicy,
+    "lsdt": LSDTPolicy,
+    "bc": BCPolicy,
+}
 """Learners by the name that `--policy` takes."""
 
 
@@ -38,6 +46,7 @@ def resolve_config(
     file: Path | None = None,
     overrides: Sequence[str] = (),
     seed: int = 0,
+    presets: Mapping[str, Any] | None = None,
 ) -> Config:
     """The configuration of a run.
 
@@ -47,6 +56,7 @@ def resolve_config(
             `--policy dt --set augment.copies=2` is the paper's `w/o Arch`.
         file: TOML with tables `policy`, `train`, `crm`, `csg` and `augment`.
         overrides: `table.field=value`, the value as in TOML.
+        presets: the same tables, under those of `file`: what an adapter knows of its data.
 
     Raises:
         InputError: an unknown learner, table or field, or a value of another type.
@@ -57,6 +67,7 @@ def resolve_config(
     config = Config(policy_name, learner.Config(), seed=seed)
     if not learner.augmented:
         config = replace(config, augment=replace(config.augment, copies=0))
+    config = _update(config, presets or {}, "presets")
     if file is not None:
         config = _update(config, _read_toml(file), str(file))
     for override in overrides:

@@ -9,14 +9,17 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-_PACKAGES = ("ucfrec", "torch", "numpy", "gymnasium", "mujoco")
+_PACKAGES = ("ucfrec", "torch", "numpy", "gymnasium")
 _SHOWN = ("world", "policy", "R_cum", "R_avg_pooled", "R_avg_episode", "length", "episodes", "seed")
 
 
-def versions() -> dict[str, str]:
-    """Versions of what decides numbers; packages that are not installed are left out."""
+def versions(packages: Sequence[str] = ()) -> dict[str, str]:
+    """Versions of what decides numbers, and of an adapter's own `packages`.
+
+    Packages that are not installed are left out.
+    """
     found = {"python": sys.version.split()[0]}
-    for name in _PACKAGES:
+    for name in (*_PACKAGES, *packages):
         try:
             found[name] = version(name)
         except PackageNotFoundError:
@@ -24,9 +27,9 @@ def versions() -> dict[str, str]:
     return found
 
 
-def provenance() -> dict[str, Any]:
-    """What every result row records of the process that made it."""
-    return {"command": " ".join(sys.argv), "commit": _commit(), "versions": versions()}
+def provenance(packages: Sequence[str] = ()) -> dict[str, Any]:
+    """What every result row records of the process that made it; `packages` as in `versions`."""
+    return {"command": " ".join(sys.argv), "commit": _commit(), "versions": versions(packages)}
 
 
 def config_hash(config: Mapping[str, Any]) -> str:
@@ -45,11 +48,11 @@ def _commit() -> str | None:
     return asked.stdout.strip() or None
 
 
-def format_rows(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Result rows as an aligned table, R_cum with its interval."""
-    body = [[_cell(row, name) for name in _SHOWN] for row in rows]
-    table = [list(_SHOWN), *body]
-    widths = [max(len(line[i]) for line in table) for i in range(len(_SHOWN))]
+def format_rows(rows: Sequence[Mapping[str, Any]], shown: Sequence[str] = _SHOWN) -> str:
+    """The columns `shown` of result rows as an aligned table, R_cum with its interval."""
+    body = [[_cell(row, name) for name in shown] for row in rows]
+    table = [list(shown), *body]
+    widths = [max(len(line[i]) for line in table) for i in range(len(shown))]
     lines = []
     for line in table:
         cells = [line[i].ljust(w) if i < 2 else line[i].rjust(w) for i, w in enumerate(widths)]

@@ -29,11 +29,22 @@ _VALIDATION_BATCH = 256
 _QUANTILES = (0.5, 0.75, 0.9, 0.95, 0.99, 1.0)
 
 
-def train_run(store: EpisodeStore, out: Path, config: Config) -> dict[str, Any]:
+def train_run(
+    store: EpisodeStore,
+    out: Path,
+    config: Config,
+    about: Mapping[str, Any] | None = None,
+    more_copies: Overlay | None = None,
+) -> dict[str, Any]:
     """Train a policy on the training episodes of `store`, or go on where `out` was left.
 
     Reward model, generator, edited copies (unless `augment.copies` is 0), then the policy; each
     stage that is finished is kept.
+
+    Args:
+        about: what an adapter adds to the record.
+        more_copies: an adapter's own edited copies of training episodes, beside the counterfactual
+            ones.
 
     Returns:
         The record in `run.json`: command, configuration, seed, store fingerprint, versions, wall
@@ -43,9 +54,9 @@ def train_run(store: EpisodeStore, out: Path, config: Config) -> dict[str, Any]:
         InputError: `out` is a run on another store or with another configuration, or the store has
             no training episodes.
     """
-    train, validation = _views(store)
+    train, validation = training_views(store)
     if not (out / RUN).exists():
-        _begin(store, train, out, config)
+        _begin(store, train, out, config, about or {})
     record = read_json(out / RUN)
     _require_same(record, store, out, config)
     record["config"] = dataclasses.asdict(config)
@@ -53,7 +64,9 @@ def train_run(store: EpisodeStore, out: Path, config: Config) -> dict[str, Any]:
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if config.augment.copies > 0:
         overlay, record["augmentation"] = _counterfactuals(train, validation, out, config)
-        train = train.with_overlay(overlay)
+        more_copies = overlay if more_copies is None else overlay.joined(more_copies)
+    if more_copies is not None:
+        train = train.with_overlay(more_copies)
     policy = new_policy(train, config).to(device)
     k = policy.config.context
 
@@ -76,7 +89,7 @@ def train_run(store: EpisodeStore, out: Path, config: Config) -> dict[str, Any]:
     return dict(record)
 
 
-def _views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
+def training_views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
     """Episodes to learn from and, apart, to validate on: the store's splits, or, where none is for
     validation, every tenth training episode."""
     train, validation = store.split("train"), store.split("validation")
@@ -90,7 +103,13 @@ def _views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
     return train.select(np.flatnonzero(~held_out)), train.select(np.flatnonzero(held_out))
 
 
-def _begin(store: EpisodeStore, train: EpisodeStore, out: Path, config: Config) -> None:
+def _begin(
+    store: EpisodeStore,
+    train: EpisodeStore,
+    out: Path,
+    config: Config,
+    about: Mapping[str, Any],
+) -> None:
     record = {
         "command": " ".join(sys.argv),
         "config": dataclasses.asdict(config),
@@ -105,6 +124,7 @@ def _begin(store: EpisodeStore, train: EpisodeStore, out: Path, config: Config) 
         "mean_return": float(train.returns.mean()),
         "versions": versions(),
         "wall_time_s": 0.0,
+        **about,
     }
     with atomic_folder(out) as scratch:
         for name in (ITEM_STATES, ITEMS, USERS):
@@ -122,11 +142,11 @@ def _require_same(
             f"{record['fingerprint'][:12]}), not on {store.path} "
             f"({store.meta['fingerprint'][:12]}); name another run folder"
         )
-    # More steps are no other run: training goes on from where it ended.
     began = config_from_dict(record["config"])
-    began = dataclasses.replace(
-        began, train=dataclasses.replace(began.train, steps=config.train.steps)
-    )
+    if not config.train.cosine:
+        # More steps are no other run: training goes on from where it ended.
+        longer = dataclasses.replace(began.train, steps=config.train.steps)
+        began = dataclasses.replace(began, train=longer)
     before, now = dataclasses.asdict(began), dataclasses.asdict(config)
     for table, values in now.items():
         if before[table] != values:

@@ -34,7 +34,9 @@ class LoopConfig:
     learning_rate: float = 1e-4
     weight_decay: float = 1e-4
     warmup_steps: int = 500
-    """Linear warm-up, then constant."""
+    """Linear warm-up, then constant or along a cosine."""
+    cosine: bool = False
+    """After the warm-up, fall to 0 at the last step instead of staying constant."""
     clip_norm: float = 0.25
     """Largest gradient norm; 0 clips nothing."""
     validate_every: int = 500
@@ -154,7 +156,7 @@ def _descend(
     value.backward()  # type: ignore[no-untyped-call]
     norm = nn.utils.clip_grad_norm_(module.parameters(), config.clip_norm or math.inf)
     for group in optimizer.param_groups:
-        group["lr"] = config.learning_rate * min(1.0, step / max(1, config.warmup_steps))
+        group["lr"] = _learning_rate(config, step)
     optimizer.step()
     return norm
 
@@ -206,6 +208,14 @@ class _Events:
 
     def close(self) -> None:
         self._writer.close()
+
+
+def _learning_rate(config: LoopConfig, step: int) -> float:
+    warm = min(1.0, step / max(1, config.warmup_steps))
+    if not config.cosine or step < config.warmup_steps:
+        return config.learning_rate * warm
+    done = (step - config.warmup_steps) / max(1, config.steps - config.warmup_steps)
+    return config.learning_rate * warm * (1 + math.cos(math.pi * done)) / 2
 
 
 def _require_finite(value: float, what: str, step: int) -> None:

@@ -69,6 +69,17 @@ class Overlay:
     edit_state: FloatArray
     """(M, S) the counterfactual state."""
 
+    def joined(self, other: "Overlay") -> "Overlay":
+        """The copies of this overlay, and after them those of `other`."""
+        after = Overlay(
+            other.copy_source,
+            other.edit_copy + len(self.copy_source),
+            other.edit_step,
+            other.edit_state,
+        )
+        pairs = ((getattr(self, f.name), getattr(after, f.name)) for f in fields(self))
+        return Overlay(*(np.concatenate(pair) for pair in pairs))
+
     def save(self, path: Path) -> None:
         """Write to one safetensors file."""
         arrays = {f.name: torch.from_numpy(getattr(self, f.name)) for f in fields(self)}

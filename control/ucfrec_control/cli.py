@@ -1,0 +1,109 @@
+"""The command line. Heavy imports wait until a command is known."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from ucfrec import __version__
+from ucfrec.cli import Commands, run, train_options
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns its exit status, which means what `ucfrec.cli.main`'s does."""
+
+    def commands() -> Commands:
+        from ucfrec_control.commands import COMMANDS
+
+        return COMMANDS
+
+    return run(build_parser(), commands, arguments)
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """All commands and their options."""
+    parser = argparse.ArgumentParser(
+        prog="ucfrec-control",
+        description="Train and judge policies on D4RL and Minari datasets.",
+    )
+    parser.add_argument("--version", action="version", version=f"ucfrec {__version__}")
+    parser.add_argument("--debug", action="store_true", help="show tracebacks of input errors")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _prepare(commands.add_parser("prepare", help="a dataset to an episode store"))
+    _convert(commands.add_parser("convert", help="D4RL HDF5 to Minari, or back"))
+    _distract(commands.add_parser("distract", help="a store with a distractor in its states"))
+    _screen(commands.add_parser("screen", help="which state dimensions cause anything"))
+    _train(commands.add_parser("train", help="train a policy on a store; resumes"))
+    _evaluate(commands.add_parser("evaluate", help="normalised scores of trained policies"))
+    _benchmark(commands.add_parser("benchmark", help="every learner on the zoo files; resumes"))
+    return parser
+
+
+def _source_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "source", metavar="SOURCE", help="HDF5 file, Minari identifier, or folder of one"
+    )
+    parser.add_argument("--env", help="environment that the data is of, if it does not say so")
+    parser.add_argument("--download", action="store_true", help="let Minari fetch the dataset")
+
+
+def _prepare(parser: argparse.ArgumentParser) -> None:
+    _source_options(parser)
+    parser.add_argument("--out", type=Path, required=True, metavar="STORE")
+
+
+def _convert(parser: argparse.ArgumentParser) -> None:
+    _source_options(parser)
+    parser.add_argument(
+        "target", metavar="TARGET", help="FILE.hdf5, or a Minari identifier such as hopper/mine-v0"
+    )
+
+
+def _distract(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("store", type=Path, metavar="STORE")
+    parser.add_argument("--out", type=Path, required=True, metavar="STORE")
+    parser.add_argument("--flip", type=float, default=0.0, help="chance that it is wrong (0)")
+    parser.add_argument("--seed", type=int, default=0)
+
+
+def _screen(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("store", type=Path, metavar="STORE")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path, help="write the report here")
+
+
+def _train(parser: argparse.ArgumentParser) -> None:
+    train_options(parser)
+    parser.add_argument(
+        "--screen", action="store_true", help="add copies that intervene on screened dimensions"
+    )
+
+
+def _evaluate(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
+    parser.add_argument("--env", help="environment (that of the data)")
+    parser.add_argument("--episodes", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--target",
+        type=float,
+        action="append",
+        default=[],
+        help="return asked of an episode; repeatable (the preset's)",
+    )
+    parser.add_argument("--checkpoint", choices=["both", "best", "last"], default="both")
+    parser.add_argument("--json", type=Path, help="write the result rows here")
+
+
+def _benchmark(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("data", type=Path, metavar="DATA", help="folder of the HDF5 files")
+    parser.add_argument("--budget", default="small", choices=["small", "full"])
+    parser.add_argument("--out", type=Path, default=Path("runs/control"), help="stores and runs")
+    parser.add_argument(
+        "--results", type=Path, default=Path("benchmarks/results/control.jsonl"), metavar="JSONL"
+    )
+    parser.add_argument("--workers", type=int, default=1, help="processes of one thread each (1)")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

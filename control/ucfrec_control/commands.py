@@ -1,0 +1,144 @@
+"""What each command does with its options."""
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ucfrec.cli import Commands
+from ucfrec.config import resolve_config
+from ucfrec.errors import InputError
+from ucfrec.files import write_json
+from ucfrec.results import format_rows, provenance
+from ucfrec.run import describe_run
+from ucfrec.store import EpisodeStore
+from ucfrec_control.benchmark import BUDGETS, benchmark
+from ucfrec_control.d4rl import read_d4rl, write_d4rl
+from ucfrec_control.distractor import add_distractor
+from ucfrec_control.evaluate import CHECKPOINTS, SHOWN, evaluate_run
+from ucfrec_control.minari import is_minari, read_minari, write_minari
+from ucfrec_control.scores import find_task
+from ucfrec_control.screening import ScreeningConfig, describe_screening, screen
+from ucfrec_control.train import dataset_of, preset_of, train_control
+from ucfrec_control.trajectories import PACKAGES, Trajectories
+
+
+def run_prepare(options: argparse.Namespace) -> None:
+    """`ucfrec-control prepare`."""
+    trajectories = _read(options)
+    trajectories.write_store(options.out)
+    print(f"{_describe(trajectories)}\n\nstore: {options.out}")
+
+
+def run_convert(options: argparse.Namespace) -> None:
+    """`ucfrec-control convert`."""
+    trajectories = _read(options)
+    if options.target.endswith((".hdf5", ".h5")):
+        written = Path(options.target)
+        if written.exists():
+            raise InputError(f"{written} exists already; remove it or name another file")
+        write_d4rl(trajectories, written)
+    else:
+        written = write_minari(trajectories, options.target)
+    print(f"{_describe(trajectories)}\n\nwritten: {written}")
+
+
+def _read(options: argparse.Namespace) -> Trajectories:
+    if is_minari(options.source):
+        return read_minari(options.source, options.env, options.download)
+    return read_d4rl(Path(options.source), options.env)
+
+
+def _describe(trajectories: Trajectories) -> str:
+    source, returns = trajectories.source, trajectories.returns
+    task = find_task(source["env_id"], source["dataset"])
+    score = f", normalised {task.score(returns.mean()):.2f}" if task else ""
+    dropped = [f"{count} {what.replace('_', ' ')}" for what, count in source["dropped"].items()]
+    return (
+        f"{source['dataset']}: {len(returns)} trajectories, {len(trajectories.rewards)} steps, "
+        f"environment {source['env_id'] or 'unknown'}\n"
+        f"mean return {returns.mean():.3f}{score}; dropped: {', '.join(dropped)}"
+    )
+
+
+def run_distract(options: argparse.Namespace) -> None:
+    """`ucfrec-control distract`."""
+    store = EpisodeStore.open(options.store)
+    add_distractor(store, options.out, options.flip, options.seed)
+    print(f"store: {options.out}; dimension {store.observation_size} is the distractor")
+
+
+def run_screen(options: argparse.Namespace) -> None:
+    """`ucfrec-control screen`."""
+    report = screen(EpisodeStore.open(options.store), ScreeningConfig(), options.seed)
+    print(describe_screening(report))
+    if options.json is not None:
+        write_json(options.json, dataclasses.asdict(report) | provenance(PACKAGES))
+
+
+def run_train(options: argparse.Namespace) -> None:
+    """`ucfrec-control train`."""
+    if options.threads is not None:
+        torch.set_num_threads(options.threads)
+    store = EpisodeStore.open(options.store)
+    preset = preset_of(dataset_of(store), options.policy)
+    config = resolve_config(
+        options.policy, options.config, options.set, options.seed, preset.tables
+    )
+    record = train_control(store, options.out, config, screened=options.screen)
+    print(describe_run(record))
+    print(f"\nrun: {options.out}; TensorBoard reads it too")
+
+
+def run_evaluate(options: argparse.Namespace) -> None:
+    """`ucfrec-control evaluate`."""
+    rows: list[dict[str, Any]] = []
+    for run in options.runs:
+        rows += evaluate_run(
+            run,
+            episodes=options.episodes,
+            seed=options.seed,
+            env_id=options.env,
+            targets=options.target,
+            checkpoints=CHECKPOINTS if options.checkpoint == "both" else (options.checkpoint,),
+        )
+    print(format_rows([_shown(row) for row in rows], SHOWN))
+    for warning in dict.fromkeys(text for row in rows for text in row["warnings"]):
+        print(f"warning: {warning}", file=sys.stderr)
+    if options.json is not None:
+        write_json(options.json, [row | provenance(PACKAGES) for row in rows])
+
+
+def run_benchmark(options: argparse.Namespace) -> None:
+    """`ucfrec-control benchmark`."""
+    rows = benchmark(
+        options.data,
+        options.out,
+        options.results,
+        BUDGETS[options.budget],
+        options.budget,
+        options.workers,
+    )
+    print(format_rows([_shown(row) for row in rows], SHOWN))
+    print(f"\nrows: {options.results}")
+
+
+def _shown(row: Mapping[str, Any]) -> dict[str, Any]:
+    interval = f"{row['score']:.1f} [{row['score_low']:.1f}, {row['score_high']:.1f}]"
+    asked, earned = f"{row['target_return']:g}", f"{row['return']:.1f}"
+    return {**row, "score": interval, "target_return": asked, "return": earned}
+
+
+COMMANDS: Commands = {
+    "prepare": run_prepare,
+    "convert": run_convert,
+    "distract": run_distract,
+    "screen": run_screen,
+    "train": run_train,
+    "evaluate": run_evaluate,
+    "benchmark": run_benchmark,
+}

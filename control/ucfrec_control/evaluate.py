@@ -1,0 +1,113 @@
+"""What a trained policy earns in its environment, on D4RL's scale."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ucfrec.errors import InputError
+from ucfrec.metrics import bootstrap_interval
+from ucfrec.results import config_hash
+from ucfrec.rollout import rollout
+from ucfrec.trained import TrainedPolicy
+from ucfrec_control.environments import SIDE_BY_SIDE, make_env, mismatches
+from ucfrec_control.presets import find_preset
+from ucfrec_control.scores import find_kind, require_task
+
+CHECKPOINTS = ("last", "best")
+SHOWN = ("dataset", "method", "seed", "checkpoint", "target_return", "score", "return", "episodes")
+
+
+def evaluate_run(
+    run: Path,
+    *,
+    episodes: int,
+    seed: int,
+    env_id: str | None = None,
+    targets: Sequence[float] = (),
+    checkpoints: Sequence[str] = CHECKPOINTS,
+) -> list[dict[str, Any]]:
+    """One result row for each checkpoint and target return.
+
+    All rows play the same starts. A policy trained with distractors sees them fixed to 0.
+
+    Args:
+        run: a run folder on a control store.
+        episodes: episodes a row.
+        seed: of the environments and the bootstrap.
+        env_id: None for the environment of the data.
+        targets: returns to ask for; empty for those of the preset.
+
+    Raises:
+        InputError: the run is not on a control store, or its environment cannot be told or made.
+    """
+    if episodes < 1:
+        raise InputError(f"{episodes} episodes were asked for; at least one is needed")
+    rows = []
+    for checkpoint in checkpoints:
+        trained = TrainedPolicy.load(run, checkpoint)
+        dataset = trained.record.get("dataset")
+        if dataset is None:
+            raise InputError(f"{run} is not a run of `ucfrec-control train`; `ucfrec` judges it")
+        world = env_id or dataset["env_id"]
+        if world is None:
+            raise InputError(f"{run}: its data does not tell the environment; name it with --env")
+        rows += [
+            _row(trained, world, target, episodes, seed) | {"checkpoint": checkpoint}
+            for target in targets or _preset_targets(trained, world)
+        ]
+    return [row | {"run": str(run)} for row in rows]
+
+
+def _preset_targets(trained: TrainedPolicy, env_id: str) -> tuple[float, ...]:
+    dataset, learner = trained.record["dataset"], trained.record["config"]["policy_name"]
+    task = require_task(env_id, dataset["dataset"])
+    if learner == "bc":
+        return (trained.target_return(1.0),)
+    return find_preset(task.name, find_kind(dataset["dataset"]), learner).targets
+
+
+def _row(
+    trained: TrainedPolicy, env_id: str, target: float, episodes: int, seed: int
+) -> dict[str, Any]:
+    record, dataset = trained.record, trained.record["dataset"]
+    task = require_task(env_id, dataset["dataset"])
+    appended = [0.0] * len(dataset.get("distractors", []))
+    env = make_env(env_id, min(episodes, SIDE_BY_SIDE), appended)
+    try:
+        shown = int(np.prod(env.single_observation_space.shape or ()))
+        sizes = (shown, *(env.single_action_space.shape or ()))
+        wanted = (record["sizes"]["state"], record["sizes"]["action"])
+        if sizes != wanted:
+            raise InputError(
+                f"observations and actions of {env_id} have sizes {sizes}, the policy was trained "
+                f"on {wanted}"
+            )
+        actor = trained.actor(env.num_envs, target)
+        played = rollout(env, actor, episodes, seed, describe=f"{trained.name} in {env_id}")
+    finally:
+        env.close()
+    low, high = task.score(bootstrap_interval(played.returns, seed))
+    return {
+        "dataset": dataset["dataset"],
+        "method": trained.name + ("-screened" if dataset.get("screened") else ""),
+        "seed": record["seed"],
+        "target_return": target,
+        "score": float(task.score(played.returns.mean())),
+        "score_low": float(low),
+        "score_high": float(high),
+        "score_std": float(task.score(played.returns).std()),
+        "return": float(played.returns.mean()),
+        "length": float(played.lengths.mean()),
+        "episodes": episodes,
+        "evaluation_seed": seed,
+        "env_id": env_id,
+        "steps": record["policy"]["steps"],
+        "best_step": record["policy"]["best_step"],
+        "distractors": dataset.get("distractors", []),
+        "config_hash": config_hash(record["config"]),
+        "fingerprint": record["fingerprint"],
+        "dataset_versions": dataset["versions"],
+        "warnings": mismatches(dataset, env_id),
+    }

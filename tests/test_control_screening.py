@@ -1,0 +1,132 @@
+"""Screening finds what causes nothing, keeps what causes something, and intervenes on it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.control_files import hopper_like, write_hdf5
+from tests.support import data_folder
+from ucfrec import schema
+from ucfrec.errors import InputError
+from ucfrec.files import read_json
+from ucfrec.store import EpisodeStore
+from ucfrec_control.cli import main
+from ucfrec_control.d4rl import read_d4rl
+from ucfrec_control.distractor import add_distractor
+from ucfrec_control.screening import ScreeningConfig, interventions, screen
+from ucfrec_control.trajectories import Trajectories
+
+QUICK = ScreeningConfig(hidden=64, shared_steps=400, own_steps=200)
+
+
+def planted(out: Path, trajectories: int = 60, length: int = 40) -> EpisodeStore:
+    """Five dimensions: 0 drives 1, 1 drives 0 and the reward, 2 the reward alone, 3 measures the
+    reward, 4 is noise. 3 and 4 cause nothing."""
+    rng = np.random.default_rng(0)
+    shape = (trajectories, length)
+    states, actions = np.zeros((*shape, 5)), rng.uniform(-1, 1, (*shape, 1))
+    states[:, :, [2, 4]] = rng.normal(size=(*shape, 2))
+    states[:, 0, :2] = rng.normal(size=(trajectories, 2))
+    for t in range(length - 1):
+        x, y = states[:, t, 0], states[:, t, 1]
+        states[:, t + 1, 0] = 0.8 * x + 0.5 * np.tanh(y) + 0.2 * actions[:, t, 0]
+        states[:, t + 1, 1] = 0.7 * y - 0.6 * x + 0.3 * rng.normal(size=trajectories)
+    rewards = states[:, :, 1] + np.abs(states[:, :, 2]) + 0.3 * actions[:, :, 0]
+    states[:, :, 3] = rewards > np.median(rewards)
+    return Trajectories(
+        observations=states.reshape(-1, 5).astype(np.float32),
+        actions=actions.reshape(-1, 1).astype(np.float32),
+        rewards=rewards.reshape(-1).astype(np.float32),
+        lengths=np.full(trajectories, length),
+        terminated=np.zeros(trajectories, dtype=bool),
+        final_observations=None,
+        source={"where": "planted", "dataset": "planted", "env_id": None, "versions": {}},
+    ).write_store(out)
+
+
+def test_what_causes_nothing_is_flagged_and_nothing_else(tmp_path: Path) -> None:
+    store = planted(tmp_path / "store")
+    report = screen(store, QUICK, seed=0)
+    assert report.flagged == (3, 4)
+    by_dimension = report.dimensions
+    assert by_dimension[0].helps[0] == 1
+    assert by_dimension[0].effect > 0.1
+    assert by_dimension[2].reward_effect > 0.1
+    assert abs(by_dimension[3].effect) < 0.03
+    assert by_dimension[3].reward_effect < 0.01
+    assert screen(store, QUICK, seed=0) == report
+
+
+def test_too_few_trajectories_are_refused(tmp_path: Path) -> None:
+    store = planted(tmp_path / "store", trajectories=8)
+    with pytest.raises(InputError, match="screening needs at least 15"):
+        screen(store, QUICK, seed=0)
+
+
+def test_interventions_change_the_flagged_dimensions_alone(tmp_path: Path) -> None:
+    store = planted(tmp_path / "store", trajectories=20, length=30)
+    train = store.split("train")
+    union = train.with_overlay(interventions(train, [1, 4], seed=5))
+    n = train.n_episodes
+    assert union.n_episodes == 3 * n
+    factual = train.windows(np.arange(n), train.lengths - 1, 30).states
+    held, redrawn = (
+        union.windows(np.arange(k * n, (k + 1) * n), train.lengths - 1, 30) for k in (1, 2)
+    )
+    rest = [0, 2, 3]
+    for copy in (held, redrawn):
+        assert torch.equal(copy.states[..., rest], factual[..., rest])
+    assert torch.equal(held.states[:, 1:, [1, 4]], held.states[:, :-1, [1, 4]])
+    assert (redrawn.states[:, 1:, 4] != redrawn.states[:, :-1, 4]).float().mean() > 0.9
+    # Jointly from the marginal: every pair of values is some step's own.
+    pairs = {tuple(pair) for pair in factual[..., [1, 4]].reshape(-1, 2).tolist()}
+    drawn = redrawn.states[..., [1, 4]].reshape(-1, 2)
+    assert all(tuple(pair) in pairs for pair in drawn.tolist())
+    cut = np.corrcoef(drawn[:, 0], factual[..., 1].reshape(-1))[0, 1]
+    assert abs(cut) < 0.15
+    again = interventions(train, [1, 4], seed=5)
+    assert union.overlay is not None
+    np.testing.assert_array_equal(again.edit_state, union.overlay.edit_state)
+
+
+def test_overlays_join_in_order(tmp_path: Path) -> None:
+    train = planted(tmp_path / "store", trajectories=20, length=10).split("train")
+    first, second = (interventions(train, [d], seed=d, copies=1) for d in (0, 3))
+    union, n = train.with_overlay(first.joined(second)), train.n_episodes
+    for k, alone in ((1, first), (2, second)):
+        copies = np.arange(k * n, (k + 1) * n)
+        there = union.windows(copies, train.lengths - 1, 10).states
+        wanted = train.with_overlay(alone).windows(np.arange(n, 2 * n), train.lengths - 1, 10)
+        assert torch.equal(there, wanted.states)
+
+
+def test_training_with_screening_records_and_resumes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    quickest = ScreeningConfig(hidden=8, shared_steps=20, own_steps=10)
+    monkeypatch.setattr("ucfrec_control.train.ScreeningConfig", lambda: quickest)
+    columns = hopper_like((20, 30) * 12)
+    columns["observations"][:, 4] = 0.0  # a constant causes nothing
+    file = write_hdf5(tmp_path / "hopper.hdf5", columns)
+    store, run = str(tmp_path / "store"), str(tmp_path / "run")
+    assert main(["prepare", str(file), "--out", store]) == 0
+    arguments = ["train", store, "--out", run, "--policy", "bc", "--screen"]
+    arguments += ["--set", "train.steps=2", "--set", "policy.dim=8"]
+    assert main(arguments) == 0
+    record = read_json(Path(run) / "run.json")
+    assert 4 in record["dataset"]["screened"]
+    assert len(record["screening"]["dimensions"]) == 11
+    assert main(arguments) == 0
+    assert read_json(Path(run) / "run.json")["screening"] == record["screening"]
+
+
+@pytest.mark.realdata
+def test_the_distractor_is_flagged_and_no_true_dimension(tmp_path: Path) -> None:
+    read = read_d4rl(data_folder("control") / "hopper_medium-zoo.hdf5")
+    store = add_distractor(read.write_store(tmp_path / "clean"), tmp_path / "store")
+    config = ScreeningConfig(hidden=128, shared_steps=700, own_steps=250, max_transitions=50_000)
+    report = screen(store, config, seed=0)
+    assert report.flagged == (11,)
+    assert store.meta["columns"][schema.OBSERVATION] == [12]

@@ -9,14 +9,28 @@ from typing import Any
 
 from ucfrec.augment import AugmentConfig
 from ucfrec.baselines.bc import BCPolicy
+from ucfrec.baselines.cdt4rec import CDT4RecPolicy
 from ucfrec.baselines.dt import DTPolicy
+from ucfrec.baselines.dt4rec import DT4RecPolicy
+from ucfrec.baselines.edt4rec import EDT4RecPolicy
+from ucfrec.baselines.popular import PopularPolicy
+from ucfrec.baselines.sasrec import SASRecPolicy
 from ucfrec.crm import CRMConfig
 from ucfrec.csg import CSGConfig
 from ucfrec.errors import InputError
 from ucfrec.policy import PolicyConfig, SequencePolicy, UCFPolicy
 from ucfrec.train import LoopConfig
 
-POLICIES: dict[str, type[SequencePolicy]] = {"ucf": UCFPolicy, "dt": DTPolicy, "bc": BCPolicy}
+POLICIES: dict[str, type[SequencePolicy]] = {
+    "ucf": UCFPolicy,
+    "dt": DTPolicy,
+    "dt4rec": DT4RecPolicy,
+    "cdt4rec": CDT4RecPolicy,
+    "edt4rec": EDT4RecPolicy,
+    "sasrec": SASRecPolicy,
+    "bc": BCPolicy,
+    "popular": PopularPolicy,
+}
 """Learners by the name that `--policy` takes."""
 
 

@@ -158,6 +158,15 @@ class EpisodeStore:
         view._columns = self._columns
         return view
 
+    def with_returns_to_go(self, values: FloatArray) -> "EpisodeStore":
+        """This view with other returns-to-go, (n_steps,) in the order of `all_steps`; no copies."""
+        base = self.select(np.arange(len(self.episode_ids)))
+        whole = self._column(schema.RETURN_TO_GO).take(np.arange(self.meta["n_steps"])).copy()
+        episodes, steps = base.all_steps()
+        whole[base._offsets[0][base.episode_ids[episodes]] + steps] = values
+        base._columns = self._columns | {schema.RETURN_TO_GO: _Column([whole])}
+        return base
+
     # What they hold.
 
     @property
@@ -350,7 +359,7 @@ class EpisodeStore:
         if name not in self._columns:
             if name not in (*self.meta["columns"], schema.RETURN_TO_GO):
                 raise InputError(f"{self.path} has no column {name!r}; prepare the logs with it")
-            column = _Column([shard / f"{name}.npy" for shard in self._shards])
+            column = _Column([_load(s / f"{name}.npy", mmap=True) for s in self._shards])
             if len(column) != self.meta["n_steps"]:
                 raise InputError(
                     f"{self.path} is damaged: column {name!r} has {len(column)} of "
@@ -361,10 +370,10 @@ class EpisodeStore:
 
 
 class _Column:
-    """One column over all shards, memory-mapped."""
+    """One column over all shards, memory-mapped unless made in memory."""
 
-    def __init__(self, paths: list[Path]) -> None:
-        self._parts = [_load(path, mmap=True) for path in paths]
+    def __init__(self, parts: list[Array]) -> None:
+        self._parts = parts
         self._bounds = np.cumsum([0] + [len(part) for part in self._parts])
 
     def __len__(self) -> int:

@@ -3,10 +3,13 @@
 import time
 from collections import Counter
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
@@ -16,11 +19,15 @@ from hypothesis import strategies as st
 
 from ucfrec.acting import PolicyActor
 from ucfrec.baselines.dt import DTConfig, DTPolicy
+from ucfrec.collect import collect
 from ucfrec.errors import InputError
+from ucfrec.evaluate import World, _item_numbers
+from ucfrec.plugins import Simulator
 from ucfrec.rollout import FORBIDDEN, Step, rollout
 from ucfrec.states import ItemStates
 from ucfrec_simulators.behaviors import Constant, Uniform
 from ucfrec_simulators.kuai import EXITS, REGIMES, ExitRule, KuaiEnv, oracle
+from ucfrec_simulators.replay import sessions_by_exit
 from ucfrec_simulators.sessions import SingleSession
 
 RULES = [replace(rule, sliced=sliced) for rule in EXITS.values() for sliced in (False, True)]
@@ -222,3 +229,46 @@ def test_thousands_of_users_cost_a_small_fraction_of_a_python_loop() -> None:
     print(f"{fast * 1e6:.2f} µs against {slow * 1e6:.2f} µs a user-step: 1/{slow / fast:.0f}")
     # Measured: 1/66. The bar leaves room for a busy machine.
     assert fast < slow / 30
+
+
+@pytest.mark.parametrize("rule", RULES, ids=str)
+def test_logs_are_cut_where_their_users_would_have_left(rule: ExitRule) -> None:
+    rng = np.random.default_rng(5)
+    tags = [
+        tuple(rng.choice(9, size=rng.integers(0, 3), replace=False).tolist()) for _ in range(30)
+    ]
+    users = np.repeat(rng.permutation(12), rng.integers(1, 80, size=12))
+    items = rng.integers(30, size=len(users))
+    expected, number = [], -1
+    session, owner, over = Plain(tags, rule), -1, True
+    for user, item in zip(users, items, strict=True):
+        if over or user != owner:
+            session, owner, number = Plain(tags, rule), user, number + 1
+        _, over = session.step(item)
+        expected.append(number)
+    np.testing.assert_array_equal(sessions_by_exit(users, items, tags, rule), expected)
+
+
+def known_items(ids: list[Any]) -> Any:
+    """As much of a trained policy of items as finding their numbers takes."""
+    sizes = {"items": len(ids), "action": 3}
+    record = {"sizes": sizes, "observation_size": 0}
+    return SimpleNamespace(record=record, item_ids=np.array(ids))
+
+
+def test_items_are_found_by_what_the_logs_call_them(tmp_path: Path) -> None:
+    env = small()  # item 0 is called 217, item 39 is called 100
+    numbers = _item_numbers(World("kuai"), env, known_items([1, 100, 103, 104, 217]))
+    assert numbers is not None
+    assert numbers.tolist() == [-1, 39, 38, -1, 0]
+    for wrong in ([1, 2], ["100"]):
+        with pytest.raises(InputError, match="which the policy was not trained on"):
+            _item_numbers(World("kuai"), env, known_items(wrong))
+    simulator = Simulator("", lambda n, folder: env, {}, "pay")
+    collect(simulator, env, Uniform(env, 0), 20, 0, tmp_path / "logs", env_name="", behavior="")
+    log = pd.read_parquet(tmp_path / "logs" / "sessions.parquet")
+    assert set(log["item_id"]) <= set(env.item_ids.tolist())
+    paid = env.rewards[
+        np.searchsorted(env.user_ids, log["user_id"]), (217 - log["item_id"].to_numpy()) // 3
+    ]
+    np.testing.assert_array_equal(paid, log["pay"])

@@ -84,9 +84,8 @@ class EpisodeStore:
         """
         if np.any(np.asarray(lengths) < 1):
             raise InputError(f"{path}: an episode without steps cannot be stored; leave it out")
-        starts = np.cumsum(lengths) - lengths
         first = np.zeros(int(np.sum(lengths)), dtype=bool)
-        first[starts] = True
+        first[np.cumsum(lengths) - lengths] = True
         values = {schema.SPLIT: np.zeros(len(lengths), dtype=np.uint8), **(episodes or {})}
         with atomic_folder(path) as scratch:
             writer = StoreWriter(scratch, shard_steps)
@@ -160,11 +159,11 @@ class EpisodeStore:
 
     def with_returns_to_go(self, values: FloatArray) -> "EpisodeStore":
         """This view with other returns-to-go, (n_steps,) in the order of `all_steps`; no copies."""
+        whole = self._column(schema.RETURN_TO_GO).take(np.arange(self.meta["n_steps"]))
         base = self.select(np.arange(len(self.episode_ids)))
-        whole = self._column(schema.RETURN_TO_GO).take(np.arange(self.meta["n_steps"])).copy()
-        episodes, steps = base.all_steps()
-        whole[base._offsets[0][base.episode_ids[episodes]] + steps] = values
-        base._columns = self._columns | {schema.RETURN_TO_GO: _Column([whole])}
+        starts, steps = base._offsets[0][base._base_ids], base.all_steps()[1]
+        whole[np.repeat(starts, base.lengths) + steps] = values
+        base._columns = {**self._columns, schema.RETURN_TO_GO: _Column([whole])}
         return base
 
     # What they hold.
@@ -380,7 +379,7 @@ class _Column:
         return int(self._bounds[-1])
 
     def take(self, index: IntArray) -> Array:
-        """Values at global positions `index`, any shape."""
+        """Values at global positions `index`, any shape, as an array of their own."""
         if len(self._parts) == 1:
             return np.asarray(self._parts[0][index])
         shard = np.searchsorted(self._bounds[1:-1], index, side="right")

@@ -1,5 +1,6 @@
 """A trained policy as an actor: last K steps, return-to-go lowered by what is earned."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -7,10 +8,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from ucfrec.errors import InputError
 from ucfrec.heads import ItemHead
 from ucfrec.policy import SequencePolicy
 from ucfrec.returns import remaining_return
-from ucfrec.rollout import BoolArray, FloatArray, IntArray
+from ucfrec.rollout import FORBIDDEN, USER_IDS, BoolArray, FloatArray, IntArray
 from ucfrec.states import ItemStates, SessionStates
 from ucfrec.windows import Windows
 
@@ -18,7 +20,8 @@ from ucfrec.windows import Windows
 class PolicyActor:
     """Plays N episodes at once with one batched forward pass a step (`ucfrec.rollout.Actor`).
 
-    Vector actions are played as predicted; of items, the one with the highest probability.
+    Vector actions are played as predicted; of items, the one with the highest probability among
+    those that the world has and allows. Users known from the logs have their features.
     """
 
     def __init__(
@@ -28,7 +31,8 @@ class PolicyActor:
         target_return: float,
         observation_size: int,
         item_states: ItemStates | None = None,
-        item_ids: npt.NDArray[Any] | None = None,
+        item_ids: IntArray | None = None,
+        user_ids: npt.NDArray[Any] | None = None,
     ) -> None:
         """Args:
         policy: in evaluation mode.
@@ -37,11 +41,19 @@ class PolicyActor:
         observation_size: how many of the environment's observed numbers the logs had; 0 ignores
             the environment's observation.
         item_states: how states are made of items; None where the observation is the state.
-        item_ids: (n_items,) the environment's number of each item of the store.
+        item_ids: (n_items,) the environment's number of each item of the store; −1 where it has
+            none.
+        user_ids: (n_users,) sorted, what the logs called each user of the store; None or text
+            where the world knows none of them.
         """
         n, k = episodes, policy.config.context
         self._policy, self._target = policy, float(target_return)
         self._observation_size, self._item_ids = observation_size, item_ids
+        featured = item_states is not None and item_states.user_features.shape[1] > 0
+        known = featured and user_ids is not None and user_ids.dtype.kind in "iu"
+        self._user_ids = user_ids if known else None
+        self._absent = None if item_ids is None else torch.from_numpy(item_ids < 0)
+        self._forbidden: Tensor | None = None
         self._sessions = None if item_states is None else SessionStates(item_states, n)
         self._actions = (
             torch.zeros(n, k, dtype=torch.int64)
@@ -62,6 +74,15 @@ class PolicyActor:
         if self._sessions is not None:
             self._sessions.begin(rows)
 
+    def inform(self, info: Mapping[str, Any]) -> None:
+        """Take note of whom the next step serves, and of items that may not be played."""
+        users, known = info.get(USER_IDS), self._user_ids
+        if users is not None and self._sessions is not None and known is not None:
+            at = np.minimum(np.searchsorted(known, users), len(known) - 1)
+            self._sessions.users = torch.from_numpy(np.where(known[at] == users, at, -1))
+        forbidden = info.get(FORBIDDEN)
+        self._forbidden = None if forbidden is None else self._in_store(forbidden)
+
     @torch.no_grad()
     def act(self, observations: FloatArray, live: BoolArray) -> tuple[npt.NDArray[Any], None]:
         """Choose for the live rows; the rest get a zero action."""
@@ -78,10 +99,10 @@ class PolicyActor:
         rows = torch.from_numpy(np.flatnonzero(live))
         device = self._policy.state_mean.device
         predicted = self._policy.act(self._windows(rows).to(device)).cpu()
-        if isinstance(self._policy.head, ItemHead):
-            predicted = predicted.argmax(-1)
-        actions = torch.zeros_like(self._actions[:, -1])
-        actions[rows] = predicted
+        # Rows that no longer count are played too, and must be allowed: they keep zeros.
+        filled = torch.zeros(len(live), predicted.shape[1])
+        filled[rows] = predicted
+        actions = self._best(filled) if isinstance(self._policy.head, ItemHead) else filled
         self._actions[:, -1] = actions
         played = actions.numpy()
         return (played if self._item_ids is None else self._item_ids[played]), None
@@ -93,6 +114,27 @@ class PolicyActor:
             self._sessions.record(self._actions[:, -1], earned)
         self._earned += earned
         self._steps += 1
+
+    def _best(self, scores: Tensor) -> Tensor:
+        """Items (N,) with the highest of scores (N, n_items) among those that may be played."""
+        if self._absent is not None:
+            scores[:, self._absent] = -torch.inf
+        if self._forbidden is not None:
+            # Column n_items takes what is forbidden in the world and unknown to the store.
+            scores = torch.cat([scores, torch.zeros(len(scores), 1)], dim=1)
+            scores = scores.scatter(1, self._forbidden, -torch.inf)[:, :-1]
+        return scores.argmax(-1)
+
+    def _in_store(self, items: IntArray) -> Tensor:
+        """The store's numbers of the environment's items (N, L); n_items where it has none."""
+        ids = self._item_ids
+        if ids is None:
+            raise InputError("a world that forbids items needs a policy of items")
+        numbers = np.full(max(items.max(), ids.max()) + 2, len(ids))
+        numbers[ids[ids >= 0]] = np.flatnonzero(ids >= 0)
+        # The last place stands for −1, no item.
+        numbers[-1] = len(ids)
+        return torch.from_numpy(numbers[items])
 
     def _windows(self, rows: Tensor) -> Windows:
         mask = self._mask[rows]

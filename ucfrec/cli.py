@@ -133,7 +133,7 @@ def train_options(parser: argparse.ArgumentParser) -> None:
     """What `train` takes, here and on a sibling's command line."""
     parser.add_argument("store", type=Path, metavar="STORE")
     parser.add_argument("--out", type=Path, required=True, metavar="RUN")
-    parser.add_argument("--policy", default="ucf", help="ucf (default), dt, dc, lsdt or bc")
+    parser.add_argument("--policy", default="ucf", help="ucf (default) or a baseline: dt, bc, …")
     parser.add_argument("--config", type=Path, metavar="TOML")
     parser.add_argument("--set", action="append", default=[], metavar="TABLE.FIELD=VALUE")
     parser.add_argument("--seed", type=int, default=0)

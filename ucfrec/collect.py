@@ -38,7 +38,16 @@ class Catalog(Protocol):
     """A world that describes its items."""
 
     def item_features(self) -> pa.Table:
-        """One row an item, with `item_id`."""
+        """One row an item, in the order of their numbers, with `item_id`."""
+
+
+def world_items(env: VectorEnv[Any, Any, Any]) -> npt.NDArray[np.int64]:
+    """What the logs call each item of a world, (n_items,): by its catalogue, or its number."""
+    world = env.unwrapped
+    if isinstance(world, Catalog):
+        return np.asarray(world.item_features()[ITEM_ID], dtype=np.int64)
+    assert isinstance(env.single_action_space, spaces.Discrete)
+    return np.arange(int(env.single_action_space.n))
 
 
 def collect(
@@ -89,7 +98,8 @@ class _SessionLog:
 
     def __init__(self, path: Path, env: VectorEnv[Any, Any, Any], feedback: str) -> None:
         self._path, self._feedback = path, feedback
-        self._items = isinstance(env.single_action_space, spaces.Discrete)
+        discrete = isinstance(env.single_action_space, spaces.Discrete)
+        self._items = world_items(env) if discrete else None
         self._steps: list[Step] = []
         self._rows = 0
         self._played = np.zeros(env.num_envs, dtype=np.int64)
@@ -132,8 +142,8 @@ class _SessionLog:
             USER_ID: pa.array(np.concatenate(users).astype(np.int64)),
             SESSION_ID: pa.array(session.astype(np.int64)),
             TIMESTAMP: pa.array(start + np.concatenate(self._numbers) * STEP_MS),
-            (ITEM_ID if self._items else ACTION): (
-                pa.array(actions.astype(np.int64)) if self._items else _lists(actions)
+            (ACTION if self._items is None else ITEM_ID): (
+                _lists(actions) if self._items is None else pa.array(self._items[actions])
             ),
             OBSERVATION: _lists(np.concatenate([step.observations for step in steps])),
             self._feedback: pa.array(np.concatenate([step.rewards for step in steps])),

@@ -9,9 +9,14 @@ from typing import Any
 
 from ucfrec.augment import AugmentConfig
 from ucfrec.baselines.bc import BCPolicy
+from ucfrec.baselines.cdt4rec import CDT4RecPolicy
 from ucfrec.baselines.dc import DCPolicy
 from ucfrec.baselines.dt import DTPolicy
+from ucfrec.baselines.dt4rec import DT4RecPolicy
+from ucfrec.baselines.edt4rec import EDT4RecPolicy
 from ucfrec.baselines.lsdt import LSDTPolicy
+from ucfrec.baselines.popular import PopularPolicy
+from ucfrec.baselines.sasrec import SASRecPolicy
 from ucfrec.crm import CRMConfig
 from ucfrec.csg import CSGConfig
 from ucfrec.errors import InputError
@@ -23,7 +28,12 @@ POLICIES: dict[str, type[SequencePolicy]] = {
     "dt": DTPolicy,
     "dc": DCPolicy,
     "lsdt": LSDTPolicy,
+    "dt4rec": DT4RecPolicy,
+    "cdt4rec": CDT4RecPolicy,
+    "edt4rec": EDT4RecPolicy,
+    "sasrec": SASRecPolicy,
     "bc": BCPolicy,
+    "popular": PopularPolicy,
 }
 """Learners by the name that `--policy` takes."""
 

@@ -27,7 +27,7 @@ class UCF:
 
     def __init__(self, policy: str = "ucf", settings: Sequence[str] = (), seed: int = 0) -> None:
         """Args:
-        policy: learner, "ucf" or a baseline ("dt", "dc", "lsdt", "bc").
+        policy: learner, "ucf" or a baseline (`ucfrec.config.POLICIES`).
         settings: `table.field=value`, as the command line's `--set`.
         seed: of everything random.
 

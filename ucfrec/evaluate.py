@@ -9,11 +9,12 @@ import numpy as np
 from gymnasium import spaces
 
 from ucfrec import schema
+from ucfrec.collect import world_items
 from ucfrec.errors import InputError
 from ucfrec.metrics import session_metrics
 from ucfrec.plugins import Simulator, load_plugin
 from ucfrec.results import config_hash, provenance
-from ucfrec.rollout import Actor, rollout
+from ucfrec.rollout import Actor, IntArray, rollout
 from ucfrec.trained import TrainedPolicy
 
 SIDE_BY_SIDE = 512
@@ -62,8 +63,8 @@ def evaluate_policy(
         InputError: the policy's actions or observations are not this world's.
     """
     env = world.simulator().make(min(episodes, SIDE_BY_SIDE), world.folder)
-    _require_fit(world, env, trained)
-    actor = trained.actor(env.num_envs, target_return)
+    numbers = _item_numbers(world, env, trained)
+    actor = trained.actor(env.num_envs, target_return, numbers)
     row = _row(world, name, env, actor, episodes, seed)
     return row | {
         "target_return": target_return,
@@ -91,7 +92,8 @@ def _row(
     }
 
 
-def _require_fit(world: World, env: Any, trained: TrainedPolicy) -> None:
+def _item_numbers(world: World, env: Any, trained: TrainedPolicy) -> IntArray | None:
+    """The world's number of each item of the policy, −1 where it has none; None for vectors."""
     space, sizes = env.single_action_space, trained.record["sizes"]
     observed = int(np.prod(env.single_observation_space.shape))
     wanted = trained.record["observation_size"]
@@ -100,12 +102,21 @@ def _require_fit(world: World, env: Any, trained: TrainedPolicy) -> None:
             f"the policy observes {wanted} numbers, {world.name} shows {observed}; train it on "
             f"logs of {world.name}"
         )
-    if isinstance(space, spaces.Discrete):
-        ids = trained.item_ids
-        fits = ids is not None and ids.dtype.kind in "iu" and 0 <= ids.min() <= ids.max() < space.n
-        what = f"items 0 to {space.n - 1} as {schema.ITEM_ID}"
-    else:
-        fits = not sizes["items"] and space.shape == (sizes["action"],)
-        what = f"vector actions of size {space.shape}"
-    if not fits:
-        raise InputError(f"{world.name} takes {what}, which the policy was not trained on")
+    if not isinstance(space, spaces.Discrete):
+        if sizes["items"] or space.shape != (sizes["action"],):
+            raise _misfit(world, f"vector actions of size {space.shape}")
+        return None
+    known = world_items(env)
+    ids = trained.item_ids
+    if ids is None or ids.dtype.kind not in "iu":
+        raise _misfit(world, f"{len(known)} items with whole numbers as {schema.ITEM_ID}")
+    order = np.argsort(known)
+    at = order[np.minimum(np.searchsorted(known, ids, sorter=order), len(known) - 1)]
+    numbers = np.where(known[at] == ids, at, -1)
+    if (numbers < 0).all():
+        raise _misfit(world, f"items {known.min()} to {known.max()} as {schema.ITEM_ID}")
+    return numbers
+
+
+def _misfit(world: World, takes: str) -> InputError:
+    return InputError(f"{world.name} takes {takes}, which the policy was not trained on")

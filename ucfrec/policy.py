@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import ClassVar
 
 import torch
@@ -10,6 +11,7 @@ from torch.nn import functional as F
 
 from ucfrec.heads import Head, head_from
 from ucfrec.losses import mask_loss, masked_mean, parent_targets
+from ucfrec.store import EpisodeStore
 from ucfrec.windows import Windows
 
 _CLIP = 10.0
@@ -57,6 +59,20 @@ class SequencePolicy(nn.Module):
         self.register_buffer("return_scale", torch.ones(()))
         self.head = head_from(sizes, config.dim)
 
+    @classmethod
+    def training_view(
+        cls, train: EpisodeStore, config: PolicyConfig, folder: Path, seed: int
+    ) -> EpisodeStore:
+        """What the policy learns from, of the training episodes: all of them, unless it says more.
+
+        Args:
+            folder: where anything that this takes to compute is kept, for a run that is resumed.
+        """
+        return train
+
+    def start_from(self, train: EpisodeStore) -> None:
+        """Take over what the architecture must know of its training data before the first step."""
+
     def features(self, windows: Windows) -> Tensor:
         """What predicts the actions, (B, K, d), from normalised windows; row t sees no a_t."""
         raise NotImplementedError
@@ -90,7 +106,7 @@ class TokenEmbedding(nn.Module):
 
     def __init__(self, config: PolicyConfig, state_size: int) -> None:
         super().__init__()
-        self.embed_return = nn.Linear(1, config.dim)
+        self.embed_return: nn.Module = nn.Linear(1, config.dim)
         self.embed_state = nn.Linear(state_size, config.dim)
         self.embed_timestep = nn.Embedding(config.max_timestep, config.dim)
         self.norm = nn.LayerNorm(config.dim)

@@ -1,8 +1,8 @@
 """Many environments, one actor: episodes played side by side."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +14,11 @@ from ucfrec.errors import InputError
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float32]
+
+USER_IDS: Final = "user_id"
+"""Key of `info`: (N,) whom the next step serves, as the logs call them."""
+FORBIDDEN: Final = "forbidden"
+"""Key of `info`: (N, L) items that may not be played next, −1 where there are fewer than L."""
 
 
 class Actor(Protocol):
@@ -40,6 +45,14 @@ class Actor(Protocol):
         """Take note of the actions just played and the rewards (N,) they earned."""
 
 
+@runtime_checkable
+class Informed(Protocol):
+    """An actor that heeds what the world says beside its observations."""
+
+    def inform(self, info: Mapping[str, Any]) -> None:
+        """Take note of `info` (see `USER_IDS`, `FORBIDDEN`) before choosing the next actions."""
+
+
 @dataclass(frozen=True)
 class Step:
     """One step of the M rows that count; arrays are aligned."""
@@ -56,7 +69,7 @@ class Step:
     terminated: BoolArray
     truncated: BoolArray
     user_ids: IntArray | None
-    """(M,) whom the step serves, where the world says so in `info["user_id"]`."""
+    """(M,) whom the step serves, where the world says so (`USER_IDS`)."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +94,8 @@ def rollout(
     episodes are not preferred.
 
     Raises:
-        InputError: the environment does not reset within the step (`AutoresetMode.SAME_STEP`).
+        InputError: the environment does not reset within the step (`AutoresetMode.SAME_STEP`), or
+            forbids actions (`FORBIDDEN`) that the actor cannot be told of.
     """
     if env.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
         raise InputError(
@@ -92,11 +106,18 @@ def rollout(
     returns = np.zeros(episodes, dtype=np.float64)
     lengths = np.zeros(episodes, dtype=np.int64)
     observations, info = env.reset(seed=seed)
+    if FORBIDDEN in info and not isinstance(actor, Informed):
+        raise InputError(
+            f"{type(env).__name__} forbids some actions and {type(actor).__name__} cannot be told "
+            "which; give it a method `inform`"
+        )
     actor.begin(np.arange(n))
     episode = np.arange(n)
     live = episode < episodes
     with tqdm(total=episodes, desc=describe, unit="episode", disable=None) as bar:
         while live.any():
+            if isinstance(actor, Informed):
+                actor.inform(info)
             actions, propensities = actor.act(observations, live)
             following, rewards, terminated, truncated, info_next = env.step(actions)
             rewards = np.asarray(rewards, dtype=np.float32)
@@ -105,7 +126,7 @@ def rollout(
             returns[episode[rows]] += rewards[rows]
             lengths[episode[rows]] += 1
             if on_step is not None:
-                users = info.get("user_id")
+                users = info.get(USER_IDS)
                 on_step(
                     Step(
                         rows=rows,

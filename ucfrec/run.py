@@ -62,6 +62,8 @@ def train_run(
     record["config"] = dataclasses.asdict(config)
     began = time.perf_counter() - record["wall_time_s"]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    learner = POLICIES[config.policy_name]
+    train = learner.training_view(train, config.policy, out / "view", config.seed)
     if config.augment.copies > 0:
         overlay, record["augmentation"] = _counterfactuals(train, validation, out, config)
         more_copies = overlay if more_copies is None else overlay.joined(more_copies)
@@ -208,6 +210,7 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
     else:
         actions = base.step_values(schema.ACTION, episodes, steps)
         policy.head.scale.copy_(torch.from_numpy(np.abs(actions).max(0)).clamp(min=1.0))
+    policy.start_from(base)
     return policy
 
 

@@ -84,9 +84,8 @@ class EpisodeStore:
         """
         if np.any(np.asarray(lengths) < 1):
             raise InputError(f"{path}: an episode without steps cannot be stored; leave it out")
-        starts = np.cumsum(lengths) - lengths
         first = np.zeros(int(np.sum(lengths)), dtype=bool)
-        first[starts] = True
+        first[np.cumsum(lengths) - lengths] = True
         values = {schema.SPLIT: np.zeros(len(lengths), dtype=np.uint8), **(episodes or {})}
         with atomic_folder(path) as scratch:
             writer = StoreWriter(scratch, shard_steps)
@@ -157,6 +156,15 @@ class EpisodeStore:
         view._selection = self.episode_ids
         view._columns = self._columns
         return view
+
+    def with_returns_to_go(self, values: FloatArray) -> "EpisodeStore":
+        """This view with other returns-to-go, (n_steps,) in the order of `all_steps`; no copies."""
+        whole = self._column(schema.RETURN_TO_GO).take(np.arange(self.meta["n_steps"]))
+        base = self.select(np.arange(len(self.episode_ids)))
+        starts, steps = base._offsets[0][base._base_ids], base.all_steps()[1]
+        whole[np.repeat(starts, base.lengths) + steps] = values
+        base._columns = {**self._columns, schema.RETURN_TO_GO: _Column([whole])}
+        return base
 
     # What they hold.
 
@@ -350,7 +358,7 @@ class EpisodeStore:
         if name not in self._columns:
             if name not in (*self.meta["columns"], schema.RETURN_TO_GO):
                 raise InputError(f"{self.path} has no column {name!r}; prepare the logs with it")
-            column = _Column([shard / f"{name}.npy" for shard in self._shards])
+            column = _Column([_load(s / f"{name}.npy", mmap=True) for s in self._shards])
             if len(column) != self.meta["n_steps"]:
                 raise InputError(
                     f"{self.path} is damaged: column {name!r} has {len(column)} of "
@@ -361,17 +369,17 @@ class EpisodeStore:
 
 
 class _Column:
-    """One column over all shards, memory-mapped."""
+    """One column over all shards, memory-mapped unless made in memory."""
 
-    def __init__(self, paths: list[Path]) -> None:
-        self._parts = [_load(path, mmap=True) for path in paths]
+    def __init__(self, parts: list[Array]) -> None:
+        self._parts = parts
         self._bounds = np.cumsum([0] + [len(part) for part in self._parts])
 
     def __len__(self) -> int:
         return int(self._bounds[-1])
 
     def take(self, index: IntArray) -> Array:
-        """Values at global positions `index`, any shape."""
+        """Values at global positions `index`, any shape, as an array of their own."""
         if len(self._parts) == 1:
             return np.asarray(self._parts[0][index])
         shard = np.searchsorted(self._bounds[1:-1], index, side="right")

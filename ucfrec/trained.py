@@ -74,15 +74,26 @@ class TrainedPolicy:
         known = self.record["return_quantiles"]
         return float(np.interp(quantile, [float(q) for q in known], list(known.values())))
 
-    def actor(self, episodes: int, target_return: float) -> PolicyActor:
-        """An actor for `episodes` environments side by side."""
+    def actor(
+        self,
+        episodes: int,
+        target_return: float,
+        item_numbers: npt.NDArray[np.int64] | None = None,
+    ) -> PolicyActor:
+        """An actor for `episodes` environments side by side.
+
+        Args:
+            item_numbers: (n_items,) the environment's number of each item, −1 where it has none;
+                None where they are the `item_ids`.
+        """
         return PolicyActor(
             self.policy,
             episodes,
             target_return,
             self.record["observation_size"],
             self.item_states,
-            self.item_ids,
+            self.item_ids if item_numbers is None else item_numbers,
+            self.user_ids,
         )
 
 

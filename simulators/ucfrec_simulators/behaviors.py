@@ -1,6 +1,6 @@
 """Built-in behavior policies that worlds share; each is an `ucfrec.rollout.Actor`."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -8,7 +8,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
-from ucfrec.rollout import Actor, BoolArray, FloatArray, IntArray
+from ucfrec.rollout import FORBIDDEN, Actor, BoolArray, FloatArray, IntArray
 
 Actions = npt.NDArray[Any]
 
@@ -29,18 +29,33 @@ class Uniform(Memoryless):
     def __init__(self, env: VectorEnv[Any, Any, Any], seed: int) -> None:
         self._space = env.single_action_space
         self._generator = np.random.default_rng([seed, 1])
+        self._forbidden: IntArray | None = None
+
+    def inform(self, info: Mapping[str, Any]) -> None:
+        """Take note of the items that may not be played."""
+        self._forbidden = info.get(FORBIDDEN)
 
     def act(self, observations: FloatArray, live: BoolArray) -> tuple[Actions, FloatArray | None]:
         """Draw (N, A) or (N,) actions."""
         count = len(observations)
         if isinstance(self._space, spaces.Discrete):
             n_items = int(self._space.n)
+            if self._forbidden is not None:
+                return self._allowed_items(self._forbidden, n_items)
             chosen = self._generator.integers(n_items, size=count)
             return chosen, np.full(count, 1.0 / n_items, dtype=np.float32)
         assert isinstance(self._space, spaces.Box)
         low, high = self._space.low, self._space.high
         drawn = self._generator.uniform(low, high, size=(count, *low.shape))
         return drawn.astype(np.float32), None
+
+    def _allowed_items(self, forbidden: IntArray, n_items: int) -> tuple[IntArray, FloatArray]:
+        """Draw a place among the items left, and step over each forbidden item up to it."""
+        left = n_items - (forbidden >= 0).sum(axis=1)
+        chosen = self._generator.integers(left)
+        for item in np.sort(np.where(forbidden < 0, n_items, forbidden), axis=1).T:
+            chosen += chosen >= item
+        return chosen, (1.0 / left).astype(np.float32)
 
 
 class Constant(Memoryless):

@@ -1,6 +1,5 @@
 """VirtualTB-v0 (Shi et al., AAAI 2019) with its three published networks, many sessions at once."""
 
-import os
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -15,6 +14,7 @@ from ucfrec.errors import InputError
 from ucfrec.plugins import Simulator
 from ucfrec.rollout import FloatArray, IntArray
 from ucfrec_simulators.behaviors import Blend, SessionMixture, Uniform
+from ucfrec_simulators.folders import data_folder
 from ucfrec_simulators.sessions import AnyArray, draw_categories
 from ucfrec_simulators.taobao import (
     ACTION_DIM,
@@ -136,11 +136,6 @@ def _load(path: Path, *sizes: int) -> nn.Sequential:
     return network.eval().requires_grad_(False)
 
 
-def default_folder() -> Path:
-    """Where the networks are looked for: `virtualtaobao` in `UCFREC_DATA` or ../shared/data."""
-    return Path(os.environ.get("UCFREC_DATA", "../shared/data")) / "virtualtaobao"
-
-
 QUALITIES: Final = ((0.1, 0.3, 0.30), (0.4, 0.3, 0.20), (0.7, 0.4, 0.15), (0.9, 0.4, 0.10))
 """Blends of the mixture: share of the best constant, noise, share of sessions."""
 
@@ -161,7 +156,7 @@ def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
 
 SIMULATOR: Final = Simulator(
     summary="VirtualTB-v0 from its published networks: 27 ranking weights a page, 0-10 clicks",
-    make=lambda num_envs, folder: VirtualTaobao(folder or default_folder(), num_envs),
+    make=lambda num_envs, folder: VirtualTaobao(folder or data_folder("virtualtaobao"), num_envs),
     behaviors={
         "random": Uniform,
         "zero": zero_actor,

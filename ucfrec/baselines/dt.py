@@ -32,7 +32,7 @@ class DTPolicy(SequencePolicy):
         super().__init__(config, sizes)
         self.embed = TokenEmbedding(config, sizes["state"])
         self.dropout = nn.Dropout(config.dropout)
-        self.blocks = nn.ModuleList(_Block(config) for _ in range(config.layers))
+        self.blocks = nn.ModuleList(Block(config) for _ in range(config.layers))
         self.final_norm = nn.LayerNorm(config.dim)
         for module in self.blocks.modules():
             if isinstance(module, nn.Linear):
@@ -41,15 +41,21 @@ class DTPolicy(SequencePolicy):
 
     def features(self, windows: Windows) -> Tensor:
         """(B, K, d) at the s_t tokens."""
+        return self.transform(windows)[:, 1::3]
+
+    def transform(self, windows: Windows) -> Tensor:
+        """(B, 3K, d) at all tokens, R_0, s_0, a_0, R_1, …"""
         tokens = interleave(*self.embed(windows, self.head.embed(windows.actions)))
         hidden = self.dropout(tokens)
-        visible = _visible(windows.mask)
+        visible = visible_tokens(windows.mask.repeat_interleave(3, dim=1))
         for block in self.blocks:
             hidden = block(hidden, visible)
-        return self.final_norm(hidden)[:, 1::3]  # type: ignore[no-any-return]
+        return self.final_norm(hidden)  # type: ignore[no-any-return]
 
 
-class _Block(nn.Module):
+class Block(nn.Module):
+    """Pre-LN causal attention and a perceptron."""
+
     def __init__(self, config: DTConfig) -> None:
         super().__init__()
         dim = config.dim
@@ -62,6 +68,7 @@ class _Block(nn.Module):
         self.dropout = nn.Dropout(config.dropout)
 
     def forward(self, hidden: Tensor, visible: Tensor) -> Tensor:
+        """(B, L, d) to (B, L, d); `visible` (B, 1, L, L) from `visible_tokens`."""
         batch, tokens, dim = hidden.shape
         # (B, L, 3d) -> three times (B, H, L, d/H)
         query, key, value = (
@@ -75,10 +82,9 @@ class _Block(nn.Module):
         return hidden + self.dropout(self.mlp(self.mlp_norm(hidden)))  # type: ignore[no-any-return]
 
 
-def _visible(mask: Tensor) -> Tensor:
-    """(B, 1, 3K, 3K): tokens at or before one's own that are not padding, and always oneself."""
-    there = mask.repeat_interleave(3, dim=1)
+def visible_tokens(there: Tensor) -> Tensor:
+    """(B, 1, L, L): tokens at or before one's own that are `there` (B, L), and always oneself."""
     length = there.shape[1]
-    earlier = torch.ones(length, length, dtype=torch.bool, device=mask.device).tril()
-    oneself = torch.eye(length, dtype=torch.bool, device=mask.device)
+    earlier = torch.ones(length, length, dtype=torch.bool, device=there.device).tril()
+    oneself = torch.eye(length, dtype=torch.bool, device=there.device)
     return ((earlier & there.unsqueeze(1)) | oneself).unsqueeze(1)

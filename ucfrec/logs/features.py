@@ -53,9 +53,13 @@ def load_features(
                     wanted = "cast it to a number, text, or a list of either"
                     raise wrong_type(opened, f"{kind} feature", column, type_, wanted)
                 columns.append(f"{comparable} AS f{number}")
-            selects.append(
-                f"SELECT TRY_CAST({key} AS {id_type}) AS id, {', '.join(columns)} FROM {opened.sql}"
-            )
+            id_sql, first = f"TRY_CAST({key} AS {id_type})", ""
+            if table.first_by:
+                by, _ = bind(connection, opened, f"first_by of {kind} features", table.first_by)
+                # Days of one value are told apart by the features, whatever the order of rows.
+                order = ", ".join([by, *(column.partition(" AS f")[0] for column in columns)])
+                first = f" QUALIFY row_number() OVER (PARTITION BY {id_sql} ORDER BY {order}) = 1"
+            selects.append(f"SELECT {id_sql} AS id, {', '.join(columns)} FROM {opened.sql}{first}")
         connection.execute(
             f"CREATE TABLE {name} AS SELECT * FROM ({' UNION ALL BY NAME '.join(selects)}) "
             "WHERE id IS NOT NULL"

@@ -22,7 +22,7 @@ OPTIONAL_COLUMNS: Final = (
 
 @dataclass(frozen=True)
 class FeatureTable:
-    """Features of items or of users, one row each.
+    """Features of items or of users, one row each (but see `first_by`).
 
     The type of a column says what it is: numbers are standardised, dates count as days, text and
     booleans are categories, lists of text or integers are tags, lists of floats are vectors. A
@@ -34,6 +34,9 @@ class FeatureTable:
     """Column (or SQL expression) equal to the log's item_id or user_id."""
     columns: tuple[str, ...] = ()
     """Columns or SQL expressions; none means all but the key."""
+    first_by: str = ""
+    """Of rows that repeat a key, the one with the lowest value of this column or expression counts,
+    such as the first day of daily features; without it, keys may not repeat."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,86 @@
+"""KuaiRec: the official CSV files, features joined."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from ucfrec.errors import InputError
+from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, log_files
+
+TRAINING, JUDGING = "big_matrix", "small_matrix"
+USERS, CATEGORIES, DAILY = "user_features", "item_categories", "item_daily_features"
+
+USER_COLUMNS: Final = (
+    "user_active_degree",
+    "is_lowactive_period = 1",
+    "is_live_streamer = 1",
+    "is_video_author = 1",
+    "ln(1 + follow_user_num)",
+    "ln(1 + fans_user_num)",
+    "ln(1 + friend_user_num)",
+    "ln(1 + register_days)",
+    *(f"onehot_feat{n}::VARCHAR" for n in range(18)),
+)
+
+CATEGORY_COLUMNS: Final = ("feat::INTEGER[]",)
+
+DAILY_COLUMNS: Final = (
+    "video_type",
+    "upload_dt::DATE",
+    "upload_type",
+    "ln(1 + coalesce(video_duration, 0))",
+    "video_width > video_height",
+    "video_tag_id::VARCHAR",
+)
+"""What stays the same from day to day. The 45 statistics are left out: those of a later day know
+how the video was received on the days that a policy is judged on."""
+
+MAPPING: Final = LogMapping(
+    columns={"item_id": "video_id", "timestamp": "timestamp * 1000"},
+    reward="least(watch_ratio, 5)",
+    # Users saw 1,700 videos each in two months; their visits, not the months, are what ends.
+    session_by="gap",
+)
+
+
+def _resolve(paths: Sequence[str | Path], given: LogMapping) -> tuple[tuple[Path, ...], LogMapping]:
+    """The matrices named, or of the folders named `big_matrix` only; features beside them.
+
+    `small_matrix` is what the `kuairec` world is made of: only who names it reads it.
+    """
+    named = log_files(paths)
+    folders = [Path(path) for path in paths if Path(path).is_dir()]
+    logs = tuple(
+        file
+        for file in named
+        if file.name.startswith(TRAINING)
+        or (file.name.startswith(JUDGING) and file.parent not in folders)
+    )
+    if not logs:
+        raise InputError(
+            f"no KuaiRec log among {len(named)} file(s) such as {named[0]}; they are called "
+            f"{TRAINING} and {JUDGING} (the latter to be named itself)"
+        )
+    around = (*named, *log_files([logs[0].parent]))
+    found = LogMapping(
+        item_features=(
+            *_table(around, CATEGORIES, "video_id", CATEGORY_COLUMNS),
+            *_table(around, DAILY, "video_id", DAILY_COLUMNS, first_by="date"),
+        ),
+        user_features=_table(around, USERS, "user_id", USER_COLUMNS),
+    )
+    return logs, given.over(found).over(MAPPING)
+
+
+def _table(
+    files: Sequence[Path], prefix: str, key: str, columns: tuple[str, ...], first_by: str = ""
+) -> tuple[FeatureTable, ...]:
+    """The first file of one kind, or nothing."""
+    named = [file for file in files if file.name.partition(".")[0] == prefix]
+    return (FeatureTable((named[0],), key, columns, first_by),) if named else ()
+
+
+DATASET: Final = Dataset(
+    summary="KuaiRec: the official folder (its big_matrix), or files of it (CSV or Parquet)",
+    resolve=_resolve,
+)

@@ -1,0 +1,9 @@
+"""Where worlds look for their files unless told."""
+
+import os
+from pathlib import Path
+
+
+def data_folder(name: str) -> Path:
+    """The folder `name` in `UCFREC_DATA`, or in ../shared/data."""
+    return Path(os.environ.get("UCFREC_DATA", "../shared/data")) / name

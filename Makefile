@@ -21,7 +21,7 @@ types: .venv/dev  ## Types, strict.
 	$(BIN)/mypy
 
 wheel: .venv/dev  ## Build the wheel into dist/.
-	$(BIN)/python -m build --wheel
+	$(BIN)/hatchling build -t wheel
 
 .venv/base: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

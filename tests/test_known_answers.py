@@ -25,7 +25,11 @@ SETTINGS = [
     "policy.dim=16",
     "augment.copies=0",
 ]
-EXTRA = {"dt4rec": ["policy.layers=1", "policy.negatives=1"], "edt4rec": ["policy.cql_steps=30"]}
+EXTRA = {
+    "dt4rec": ["policy.layers=1", "policy.negatives=1"],
+    "edt4rec": ["policy.cql_steps=30"],
+    "lsdt": ["policy.kernel_groups=4"],
+}
 
 
 def store(folder: Path, seed: int, noise: bool, items: bool) -> tuple[EpisodeStore, np.ndarray]:

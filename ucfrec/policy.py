@@ -1,5 +1,6 @@
 """Sequence policies: what they share, and UCF's hybrid causal architecture (paper section 3.2)."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,7 +34,7 @@ class PolicyConfig:
     """Rows of the timestep embedding; later steps share the last."""
 
 
-class SequencePolicy(nn.Module):
+class SequencePolicy(nn.Module, ABC):
     """Predicts a_t from returns-to-go and states up to t and actions before t.
 
     Subclasses give `features`; everything about data (normalisation, item embeddings) is held in
@@ -73,9 +74,9 @@ class SequencePolicy(nn.Module):
     def start_from(self, train: EpisodeStore) -> None:
         """Take over what the architecture must know of its training data before the first step."""
 
+    @abstractmethod
     def features(self, windows: Windows) -> Tensor:
         """What predicts the actions, (B, K, d), from normalised windows; row t sees no a_t."""
-        raise NotImplementedError
 
     def normalized(self, windows: Windows) -> Windows:
         """Standardised states and scaled returns-to-go."""

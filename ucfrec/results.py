@@ -29,7 +29,12 @@ def versions(packages: Sequence[str] = ()) -> dict[str, str]:
 
 def provenance(packages: Sequence[str] = ()) -> dict[str, Any]:
     """What every result row records of the process that made it; `packages` as in `versions`."""
-    return {"command": " ".join(sys.argv), "commit": _commit(), "versions": versions(packages)}
+    return {"command": command_line(), "commit": _commit(), "versions": versions(packages)}
+
+
+def command_line() -> str:
+    """The command of this process, without the folder that it is installed in."""
+    return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
 def config_hash(config: Mapping[str, Any]) -> str:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import shutil
-import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,7 +17,7 @@ from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder, read_json, write_json
 from ucfrec.heads import ItemHead
 from ucfrec.policy import SequencePolicy
-from ucfrec.results import versions
+from ucfrec.results import command_line, versions
 from ucfrec.store import ITEM_STATES, EpisodeStore
 from ucfrec.train import fit
 from ucfrec.trained import ITEMS, RUN, USERS
@@ -113,7 +112,7 @@ def _begin(
     about: Mapping[str, Any],
 ) -> None:
     record = {
-        "command": " ".join(sys.argv),
+        "command": command_line(),
         "config": dataclasses.asdict(config),
         "seed": config.seed,
         "store": str(store.path.resolve()),

@@ -63,7 +63,7 @@ def resolve_config(
     Args:
         policy_name: a key of `POLICIES`. Learners other than UCF start without counterfactual
             copies (`augment.copies = 0`), so that `--policy dt` is the plain baseline and
-            `--policy dt --set augment.copies=2` is the paper's `w/o Arch`.
+            `--policy dt --set augment.copies=1` is the paper's `w/o Arch`.
         file: TOML with tables `policy`, `train`, `crm`, `csg` and `augment`.
         overrides: `table.field=value`, the value as in TOML.
         presets: the same tables, under those of `file`: what an adapter knows of its data.

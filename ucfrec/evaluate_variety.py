@@ -22,6 +22,8 @@ from ucfrec.variety import (
 
 TAGS = "tags"
 """Column of a catalogue that lists each item's tags."""
+ONE_HOT = "tag_"
+"""Prefix of the columns of a catalogue that has one for each tag instead, above 0 where it holds."""
 COLUMNS = (
     "coverage", "coverage_per_turn", "diversity", "novelty", "majority_category_dominance",
 )  # fmt: skip
@@ -68,6 +70,9 @@ def _incidence(env: VectorEnv[Any, Any, Any]) -> BoolArray | None:
     """(n_items, n_tags) of the world's catalogue; None where it has no lists of tags."""
     world = env.unwrapped
     table = world.item_features() if isinstance(world, Catalog) else pa.table({})
+    hot = [name for name in table.column_names if name.startswith(ONE_HOT)]
+    if hot:
+        return np.stack([np.asarray(table[name]) > 0 for name in hot], axis=1)
     if TAGS not in table.column_names:
         return None
     column = table[TAGS].combine_chunks()

@@ -23,7 +23,7 @@ from ucfrec.variety import (
 TAGS = "tags"
 """Column of a catalogue that lists each item's tags."""
 ONE_HOT = "tag_"
-"""Prefix of the columns of a catalogue that has one for each tag instead, above 0 where it holds."""
+"""Prefix of the columns of a catalogue that has one for each tag instead, above 0 if it holds."""
 COLUMNS = (
     "coverage", "coverage_per_turn", "diversity", "novelty", "majority_category_dominance",
 )  # fmt: skip

@@ -19,9 +19,11 @@ from ucfrec.files import read_json
 from ucfrec.policy import SequencePolicy
 from ucfrec.states import ItemStates
 from ucfrec.store import ITEM_STATES
+from ucfrec.training_counts import TrainingCounts
 
 RUN = "run.json"
 ITEMS, USERS = "items.parquet", "users.parquet"
+COUNTS = "training_counts.safetensors"
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,8 @@ class TrainedPolicy:
     """(n_items,) identifiers in the logs; None where actions are vectors."""
     user_ids: npt.NDArray[Any]
     """(n_users,) identifiers in the logs; empty where there are none."""
+    counts: TrainingCounts | None = None
+    """None where actions are vectors, and of runs from before counts were kept."""
 
     @classmethod
     def load(cls, run: Path, checkpoint: str = "best") -> "TrainedPolicy":
@@ -58,6 +62,7 @@ class TrainedPolicy:
             ItemStates.load(states) if states.exists() else None,
             _ids(run / ITEMS, schema.ITEM_ID) if states.exists() else None,
             _ids(run / USERS, schema.USER_ID),
+            TrainingCounts.load(run / COUNTS) if (run / COUNTS).exists() else None,
         )
 
     @property

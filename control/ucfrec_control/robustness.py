@@ -35,19 +35,19 @@ the last tells of the next reward, which the action at hand still has a part in.
 
 SCREENED = "ucf-screened"
 METHODS = ("dt", "dc", "lsdt", "ucf", "ucf-wo-count", "ucf-wo-arch", SCREENED)
-"""Rows of `ucfrec_control.benchmark`, and UCF with copies that intervene on what screening flags."""
+"""Rows of `ucfrec_control.benchmark`, and UCF with copies that intervene on what is flagged."""
 
 BUDGETS = {
-    # A step at the paper's size is about six times as long. Seeds are cut to one, the history is
-    # halved; no method and no distractor is left out.
+    # Steps, width and seeds are cut most, then the history and files; no method and no distractor
+    # is left out. Learning rates are one for all, as in the benchmark.
     "small": Budget(
         ("hopper_medium-zoo", "hopper_mixed-zoo", "walker2d_medium-expert-zoo"),
         1,
         20,
         (
-            "train.steps=1200",
+            "train.steps=1000",
             "train.warmup_steps=100",
-            "train.validate_every=300",
+            "train.validate_every=250",
             "train.learning_rate=1e-3",
             "policy.dim=64",
             "policy.context=10",
@@ -179,7 +179,7 @@ def _verdicts(record: Mapping[str, Any]) -> Row:
 
 
 def drops(rows: Sequence[Mapping[str, Any]]) -> list[Row]:
-    """What every distractor took from a method, for each dataset and seed that also has a clean row.
+    """What every distractor took from a method, where a dataset and seed has a clean row too.
 
     `clean` and `score` are the normalised scores without and with the distractor, `drop` the share
     of `clean` that is lost, in percent: negative where nothing was lost, NaN where `clean` is not

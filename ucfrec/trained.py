@@ -67,12 +67,8 @@ class TrainedPolicy:
 
     @property
     def name(self) -> str:
-        """The learner, and whether it departs from its usual use of edited copies."""
-        config = config_from_dict(self.record["config"])
-        augmented = config.augment.copies > 0
-        if augmented == self.policy.augmented:
-            return config.policy_name
-        return f"{config.policy_name}-{'augmented' if augmented else 'no-augmentation'}"
+        """See `learner_of`."""
+        return learner_of(self.record)
 
     def target_return(self, quantile: float) -> float:
         """The `quantile` of training returns, interpolated between those the run recorded."""
@@ -100,6 +96,15 @@ class TrainedPolicy:
             self.item_ids if item_numbers is None else item_numbers,
             self.user_ids,
         )
+
+
+def learner_of(record: Mapping[str, Any]) -> str:
+    """The learner of a run's record, and whether it departs from its usual use of edited copies."""
+    config = config_from_dict(record["config"])
+    augmented = config.augment.copies > 0
+    if augmented == POLICIES[config.policy_name].augmented:
+        return config.policy_name
+    return f"{config.policy_name}-{'augmented' if augmented else 'no-augmentation'}"
 
 
 def _weights(path: Path) -> dict[str, Tensor]:

@@ -1,21 +1,23 @@
 """The badge: planted beside rewards in the logs, idle in the worlds, read where it was trained."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import VectorEnv
 
 from tests.test_kuairand_world import QUICK, planted_store
 from ucfrec import schema
-from ucfrec.confounder import reward_bit
+from ucfrec.cli import main
 from ucfrec.config import resolve_config
+from ucfrec.confounder import reward_bit
 from ucfrec.errors import InputError
 from ucfrec.evaluate import World, evaluate_behavior, evaluate_policy
-from ucfrec.rollout import rollout
+from ucfrec.rollout import IntArray, rollout
 from ucfrec.run import train_run
-from ucfrec.simulated import simulated_store
 from ucfrec.store import EpisodeStore
 from ucfrec.trained import TrainedPolicy
 from ucfrec_simulators.badge import Badged, BadgedWorld, plant_badge
@@ -36,7 +38,11 @@ def kuairand_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def stores(kuairand_folder: Path) -> dict[str, EpisodeStore]:
     """One store a world, without a badge."""
-    taobao = simulated_store(World("synthetic-taobao"), kuairand_folder / "taobao", 300, 0)
+    logs, taobao = str(kuairand_folder / "logs"), str(kuairand_folder / "taobao")
+    played = ["--env", "synthetic-taobao", "--behavior", "mixture", "--sessions", "300"]
+    assert main(["collect", *played, "--out", logs]) == 0
+    rewards = ["--reward", "clicks", "--session-by", "session_id"]
+    assert main(["prepare", f"{logs}/sessions.parquet", *rewards, "--out", taobao]) == 0
     return {
         "synthetic-taobao": EpisodeStore.open(taobao),
         "kuairand": EpisodeStore.open(kuairand_folder / "log" / "store"),
@@ -126,7 +132,7 @@ def test_gymnasium_accepts_it(kuairand_folder: Path, name: str) -> None:
 def test_behaviors_do_not_look_at_it(kuairand_folder: Path) -> None:
     for name, behavior in (("synthetic-taobao", "optimal"), ("kuairand", "oracle")):
         worlds = [World(n, kuairand_folder / "world") for n in (name, f"{name}-badge-on")]
-        plain, badge = (evaluate_behavior(w, behavior, 40, 0)["r_cum"] for w in worlds)
+        plain, badge = (evaluate_behavior(w, behavior, 40, 0)["R_cum"] for w in worlds)
         assert plain == badge
 
 
@@ -136,7 +142,7 @@ def test_a_policy_is_shown_the_badge_where_it_was_trained_on_it(
 ) -> None:
     planted = plant_badge(stores[name], tmp_path / "planted")
     train_run(planted, tmp_path / "run", resolve_config("bc", overrides=TINY))
-    trained = TrainedPolicy.open(tmp_path / "run")
+    trained = TrainedPolicy.load(tmp_path / "run")
     episodes, steps = planted.all_steps()
     states = planted.windows(episodes, steps, 1).states[:, 0]
     badge = torch.from_numpy(reward_bit(planted))
@@ -150,9 +156,18 @@ def test_a_policy_is_shown_the_badge_where_it_was_trained_on_it(
         env = world.simulator().make(8, folder)
         ids = np.arange(len(trained.item_ids)) if trained.item_ids is not None else None
         actor = trained.actor(8, 1.0, ids)
-        shown = []
-        act = actor._policy.act
-        actor._policy.act = lambda w, act=act: (shown.append(w.states[:, -1]), act(w))[1]  # type: ignore
-        rollout(env, actor, 16, 0)
-        actor._policy.act = act  # type: ignore[method-assign]
-        assert (torch.cat(shown)[:, where] == rate).all()
+        steps_played, states_shown = _play_and_watch(env, trained, ids)
+        assert len(states_shown) == steps_played
+        assert (states_shown[:, where] == rate).all()
+
+
+def _play_and_watch(
+    env: VectorEnv[Any, Any, Any], trained: TrainedPolicy, ids: IntArray | None
+) -> tuple[int, torch.Tensor]:
+    """Steps played and the states (M, S) that the policy was given in them."""
+    actor = trained.actor(env.num_envs, 1.0, ids)
+    shown: list[torch.Tensor] = []
+    played = rollout(
+        env, actor, 16, 0, on_step=lambda step: shown.append(actor._states[step.rows, -1].clone())
+    )
+    return int(played.lengths.sum()), torch.cat(shown)

@@ -59,7 +59,9 @@ class Badged(VectorWrapper[FloatArray, AnyArray, AnyArray]):
         super().__init__(env)
         plain = env.single_observation_space
         assert isinstance(plain, spaces.Box)
-        low, high = (np.append(np.float32(n), side) for n, side in ((0, plain.low), (1, plain.high)))
+        low, high = (
+            np.append(np.float32(n), side) for n, side in ((0, plain.low), (1, plain.high))
+        )
         self.single_observation_space = spaces.Box(low, high, dtype=np.float32)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._rate, self._badges = rate, np.random.default_rng()

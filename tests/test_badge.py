@@ -155,7 +155,6 @@ def test_a_policy_is_shown_the_badge_where_it_was_trained_on_it(
         assert evaluate_policy(world, trained, "bc", 20, 0, 1.0)["episodes"] == 20
         env = world.simulator().make(8, folder)
         ids = np.arange(len(trained.item_ids)) if trained.item_ids is not None else None
-        actor = trained.actor(8, 1.0, ids)
         steps_played, states_shown = _play_and_watch(env, trained, ids)
         assert len(states_shown) == steps_played
         assert (states_shown[:, where] == rate).all()

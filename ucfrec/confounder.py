@@ -32,7 +32,7 @@ def reward_bit(store: EpisodeStore, flip: float = 0.0, seed: int = 0) -> npt.NDA
     median = np.median(rewards)
     high = rewards > median if median < rewards.max() else rewards >= median
     wrong = np.random.default_rng(seed).random(len(rewards)) < flip
-    return (high ^ wrong).astype(np.float32)
+    return np.asarray(high ^ wrong, dtype=np.float32)
 
 
 def with_observations(

@@ -73,7 +73,7 @@ class Badged(VectorWrapper[FloatArray, AnyArray, AnyArray]):
         options: dict[str, Any] | None = None,
     ) -> tuple[FloatArray, dict[str, Any]]:
         """Start all sessions afresh; `seed` seeds the world and, apart from it, the badges."""
-        observations, info = self.env.reset(seed=seed, options=options)
+        observations, info = super().reset(seed=seed, options=options)
         if isinstance(seed, int):
             self._badges = np.random.default_rng([seed, 31])
         return self._shown(observations), info

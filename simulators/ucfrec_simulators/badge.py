@@ -69,12 +69,12 @@ class Badged(VectorWrapper[FloatArray, AnyArray, AnyArray]):
     def reset(
         self,
         *,
-        seed: int | list[int | None] | None = None,
+        seed: int | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[FloatArray, dict[str, Any]]:
         """Start all sessions afresh; `seed` seeds the world and, apart from it, the badges."""
         observations, info = super().reset(seed=seed, options=options)
-        if isinstance(seed, int):
+        if seed is not None:
             self._badges = np.random.default_rng([seed, 31])
         return self._shown(observations), info
 

@@ -45,8 +45,8 @@ def collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[di
     """Train SAC and write `medium`, `medium-replay`, `expert` and `medium-expert` to `out`.
 
     *expert* is the evaluated policy with the highest return, *medium* the first whose return is at
-    least random + `fraction` · (expert − random), which on D4RL's scale is `fraction` · 100 (a plain
-    share of the return would mean nothing where returns are negative). Evaluations and rollouts
+    least random + `fraction` · (expert − random): on the scale where the random policy has 0, as in
+    D4RL's scores, since a share of a negative return would mean nothing. Evaluations and rollouts
     sample the policy, as training does. `medium-replay` is every training step up to the medium
     policy; `medium-expert` is the two files one after the other. The training's own record and
     checkpoints stay in `out/training`: given the same command again, an interrupted training goes
@@ -160,9 +160,7 @@ def _train(env_id: str, folder: Path, seed: int, config: CollectConfig) -> _Trai
     return training
 
 
-def _evaluate(
-    training: _Training, env: VectorEnv[Any, Any, Any], seed: int, episodes: int
-) -> None:
+def _evaluate(training: _Training, env: VectorEnv[Any, Any, Any], seed: int, episodes: int) -> None:
     """Judge and keep the present policy, and checkpoint the learner."""
     learner, index = training.learner, len(training.evaluations)
     earned = _mean_return(env, learner, episodes, (seed, 3, index))
@@ -228,9 +226,7 @@ def _replay(training: _Training, medium: int, env_id: str) -> Trajectories:
     )
 
 
-def _roll_out(
-    training: _Training, index: int, env_id: str, seed: int, size: int
-) -> Trajectories:
+def _roll_out(training: _Training, index: int, env_id: str, seed: int, size: int) -> Trajectories:
     """Whole episodes of a kept policy, at least `size` steps.
 
     They are played in rounds of a fixed number of episodes, so that short ones are not preferred.

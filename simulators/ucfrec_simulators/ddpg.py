@@ -8,7 +8,8 @@ logged are the same steps.
 import hashlib
 import json
 import os
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,33 +23,35 @@ from torch import nn
 from ucfrec.checkpoint import load_tensors, load_weights, save_tensors
 from ucfrec.errors import InputError
 from ucfrec.results import versions
-from ucfrec.rollout import BoolArray, FloatArray, IntArray, Step, rollout
+from ucfrec.rollout import Actor, BoolArray, FloatArray, IntArray, Step, rollout
 from ucfrec_simulators.behaviors import Actions, Memoryless, SessionMixture
 from ucfrec_simulators.taobao import ACTION_DIM, MAX_CLICKS, TaobaoEnv, taobao
 
 
-INSTALL: Final = "stable-baselines3 is not installed; install ucfrec[collect]"
-
-
 @dataclass(frozen=True)
 class DdpgConfig:
-    """How the learner trains; counts of steps are of N sessions side by side."""
+    """How the learner trains; a step is one of one session."""
 
     sessions: int = 40_000
     """Training sessions behind the snapshots and the expert."""
     snapshots: int = 10
     """Taken after equal shares of the training sessions."""
-    warm_up_steps: int = 40
-    """Uniform actions before the first update."""
-    updates_per_step: int = 32
+    warm_up: int = 25_600
+    """Steps with uniform actions before the first update."""
+    updates: float = 1 / 16
+    """Gradient updates for each step after that."""
     batch_size: int = 256
     buffer_size: int = 1_000_000
     hidden: int = 128
     learning_rate: float = 1e-3
-    discount: float = 0.95
-    target_rate: float = 0.005
-    noise: float = 0.2
+    discount: float = 0.2
+    """Small, since actions hardly move what comes later in these worlds."""
+    target_rate: float = 0.02
+    noise: float = 0.1
     """Scale σ of the exploration noise, in training and of every snapshot."""
+
+
+DEFAULT: Final = DdpgConfig()
 
 
 def truncated_normal(
@@ -70,7 +73,7 @@ def truncated_normal(
     quantile = below + generator.random(center.shape) * (above - below)
     actions = np.clip(center + scale * ndtri(quantile), -1, 1).astype(np.float32)
     deviation = (actions - center) / scale
-    logarithm = -deviation**2 / 2 - np.log(np.sqrt(2 * np.pi) * scale * (above - below))
+    logarithm = -(deviation**2) / 2 - np.log(np.sqrt(2 * np.pi) * scale * (above - below))
     return actions, np.exp(logarithm.sum(axis=1)).astype(np.float32)
 
 
@@ -91,8 +94,8 @@ class Learner:
     """DDPG (Lillicrap et al., 2016) as an actor: each step played is a step learned from.
 
     It serves all N sessions with its present network and noise, after a uniform warm-up; the
-    propensity is the density of the action. It stops learning when some of the N sessions are no
-    longer wanted, so that it never learns from a step that is not in the log.
+    propensity is the density of the action. It learns from the live rows only, so from nothing that
+    is not in the log.
 
     A session that ends has no value beyond its end, be it terminated or truncated.
 
@@ -105,11 +108,10 @@ class Learner:
         self._high = _high(env)
         self._config = config
         self._generator = np.random.default_rng([seed, 51])
-        self._model, self._buffer = _sb3_model(env, seed, config)
-        self._steps = 0
+        self._model = _sb3_model(env, seed, config)
         self._ended = np.zeros(env.num_envs, dtype=np.bool_)
-        self._played: tuple[FloatArray, Actions, FloatArray] | None = None
-        self._scaled: FloatArray | None = None
+        self._played: _Played | None = None
+        self._steps, self._due = 0, 0.0
 
     @property
     def network(self) -> nn.Module:
@@ -124,30 +126,53 @@ class Learner:
     def act(self, observations: FloatArray, live: BoolArray) -> tuple[Actions, FloatArray]:
         """Learn from the step before, which led to `observations`; then draw (N, A) actions."""
         scaled = observations / self._high
-        if self._played is not None and live.all():
-            self._learn(*self._played, scaled)
+        if self._played is not None:
+            self._learn(self._played, scaled)
         self._ended[:] = False
-        self._scaled = scaled
-        if self._steps < self._config.warm_up_steps:
-            drawn = self._generator.uniform(-1, 1, (len(observations), ACTION_DIM))
+        if self._steps < self._config.warm_up:
+            box = (len(observations), ACTION_DIM)
+            actions: FloatArray = self._generator.uniform(-1, 1, box).astype(np.float32)
             density = np.full(len(observations), 0.5**ACTION_DIM, dtype=np.float32)
-            return drawn.astype(np.float32), density
-        return truncated_normal(
-            _forward(self.network, scaled), self._config.noise, self._generator
-        )
+        else:
+            mean = _forward(self.network, scaled)
+            actions, density = truncated_normal(mean, self._config.noise, self._generator)
+        self._played = _Played(scaled, np.flatnonzero(live))
+        return actions, density
 
     def observe(self, actions: Actions, rewards: FloatArray) -> None:
         """Keep the step until it is known what it led to."""
-        assert self._scaled is not None
-        self._played = self._scaled, actions, rewards / MAX_CLICKS
+        assert self._played is not None
+        self._played.actions, self._played.rewards = actions, rewards / MAX_CLICKS
 
-    def _learn(
-        self, before: FloatArray, actions: Actions, rewards: FloatArray, after: FloatArray
-    ) -> None:
-        self._buffer.add(before, after, actions, rewards, self._ended, [])
-        self._steps += 1
-        if self._steps >= self._config.warm_up_steps:
-            self._model.train(self._config.updates_per_step, self._config.batch_size)
+    def _learn(self, played: "_Played", after: FloatArray) -> None:
+        buffer, rows, config = self._model.replay_buffer, played.rows, self._config
+        # `ReplayBuffer.add` takes one step of each session; here the M live ones enter at once.
+        places = (buffer.pos + np.arange(len(rows))) % buffer.buffer_size
+        buffer.observations[places, 0] = played.observations[rows]
+        buffer.next_observations[places, 0] = after[rows]
+        buffer.actions[places, 0] = played.actions[rows]
+        buffer.rewards[places, 0] = played.rewards[rows]
+        buffer.dones[places, 0] = self._ended[rows]
+        buffer.full |= buffer.pos + len(rows) >= buffer.buffer_size
+        buffer.pos = (buffer.pos + len(rows)) % buffer.buffer_size
+        self._steps += len(rows)
+        if self._steps >= config.warm_up:
+            self._due += config.updates * len(rows)
+            if self._due >= 1:
+                self._model.train(int(self._due), config.batch_size)
+            self._due %= 1
+
+
+@dataclass
+class _Played:
+    """A step whose outcome is not known yet."""
+
+    observations: FloatArray
+    """(N, O), scaled."""
+    rows: IntArray
+    """(M,) those that count."""
+    actions: Actions = field(init=False)
+    rewards: FloatArray = field(init=False)
 
 
 class _Spaces(gymnasium.Env[FloatArray, Actions]):
@@ -158,20 +183,20 @@ class _Spaces(gymnasium.Env[FloatArray, Actions]):
         self.action_space = env.single_action_space
 
 
-def _sb3_model(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig) -> tuple[Any, Any]:
-    """A `stable_baselines3.DDPG` and its replay buffer, which takes N steps at a time."""
+def _sb3_model(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig) -> Any:
+    """A `stable_baselines3.DDPG`."""
     try:
         from stable_baselines3 import DDPG
-        from stable_baselines3.common.buffers import ReplayBuffer
         from stable_baselines3.common.logger import Logger
     except ImportError:
-        raise InputError(INSTALL) from None
+        raise InputError("stable-baselines3 is not installed; install ucfrec[collect]") from None
 
     model = DDPG(
         "MlpPolicy",
         _Spaces(env),
         learning_rate=config.learning_rate,
-        buffer_size=1,
+        buffer_size=config.buffer_size,
+        replay_buffer_kwargs={"handle_timeout_termination": False},
         tau=config.target_rate,
         gamma=config.discount,
         policy_kwargs={"net_arch": [config.hidden] * 2},
@@ -179,15 +204,7 @@ def _sb3_model(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig) -> 
         device="cpu",
     )
     model.set_logger(Logger(None, []))
-    model.replay_buffer = ReplayBuffer(
-        config.buffer_size,
-        model.observation_space,
-        model.action_space,
-        "cpu",
-        n_envs=env.num_envs,
-        handle_timeout_termination=False,
-    )
-    return model, model.replay_buffer
+    return model
 
 
 def _network(observation_size: int, hidden: int) -> nn.Sequential:
@@ -229,7 +246,7 @@ def snapshots(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig) -> l
         tensors = {f"{i}.{k}": v for i, state in enumerate(states) for k, v in state.items()}
         save_tensors(file, tensors, asdict(config) | {"seed": seed})
     tensors, _ = load_tensors(file)
-    networks = []
+    networks: list[nn.Module] = []
     for index in range(config.snapshots):
         prefix = f"{index}."
         chosen = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
@@ -272,30 +289,26 @@ def _fingerprint(world: TaobaoEnv, seed: int, config: DdpgConfig) -> str:
     return hashlib.sha256(json.dumps(known).encode()).hexdigest()[:16]
 
 
-def training(
-    env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig | None = None
-) -> Learner:
+def training(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig = DEFAULT) -> Learner:
     """A learner's whole training: the sessions logged are those it learns from."""
-    return Learner(env, seed, config or DdpgConfig())
+    return Learner(env, seed, config)
 
 
 def snapshot_mixture(
-    env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig | None = None
+    env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig = DEFAULT
 ) -> SessionMixture:
     """Each session is served by one snapshot of a training, drawn evenly when it begins."""
-    config = config or DdpgConfig()
     high, networks = _high(env), snapshots(env, seed, config)
     actors = [Noisy(n, high, config.noise, [seed, 54, i]) for i, n in enumerate(networks)]
     return SessionMixture(actors, [1.0] * len(actors), seed)
 
 
-def expert(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig | None = None) -> Noisy:
+def expert(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig = DEFAULT) -> Noisy:
     """The last snapshot of a training, with the same noise as in training."""
-    config = config or DdpgConfig()
     return Noisy(snapshots(env, seed, config)[-1], _high(env), config.noise, [seed, 55])
 
 
-BEHAVIORS: Final = {
+BEHAVIORS: Final[Mapping[str, Callable[[VectorEnv[Any, Any, Any], int], Actor]]] = {
     "ddpg-training": training,
     "ddpg-snapshots": snapshot_mixture,
     "ddpg-expert": expert,

@@ -143,6 +143,8 @@ def test_bad_input_is_refused(collected: Path, tmp_path: Path) -> None:
         collect(ENV, collected, 3, CONFIG)
     with pytest.raises(InputError, match="fraction is 1"):
         collect(ENV, tmp_path / "out", 3, dataclasses.replace(CONFIG, fraction=1))
+    with pytest.raises(InputError, match="learning starts after 60"):
+        collect(ENV, tmp_path / "out", 3, dataclasses.replace(CONFIG, steps=60))
     with pytest.raises(InputError, match="actions in a box"):
         collect("CartPole-v1", tmp_path / "cart", 3, CONFIG)
     assert main(["collect", "--env", "Nowhere-v0", "--out", str(tmp_path / "no")]) == 2

@@ -14,7 +14,8 @@ from ucfrec.collect import collect
 from ucfrec.errors import InputError
 from ucfrec.rollout import FloatArray, Step, rollout
 from ucfrec_simulators import ddpg, synthetic_taobao
-from ucfrec_simulators.ddpg import DdpgConfig, truncated_normal
+from ucfrec_simulators.behaviors import truncated_normal
+from ucfrec_simulators.ddpg import DdpgConfig
 from ucfrec_simulators.synthetic_catalog import SyntheticCatalog
 from ucfrec_simulators.synthetic_taobao import SyntheticTaobao
 

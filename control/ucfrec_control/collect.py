@@ -102,6 +102,11 @@ def collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[di
 def _check(config: CollectConfig) -> None:
     if min(config.steps, config.every, config.episodes, config.size) < 1:
         raise InputError("steps, steps between evaluations, episodes and size are at least 1")
+    if config.steps <= config.sac.learning_starts:
+        raise InputError(
+            f"{config.steps} steps are uniform play only; learning starts after "
+            f"{config.sac.learning_starts}"
+        )
     if not 0 < config.fraction < 1:
         raise InputError(f"the fraction is {config.fraction}; it lies between 0 and 1")
 

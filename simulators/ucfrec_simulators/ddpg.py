@@ -17,14 +17,13 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium.vector import VectorEnv
-from scipy.special import ndtr, ndtri
 from torch import nn
 
 from ucfrec.checkpoint import load_tensors, load_weights, save_tensors
 from ucfrec.errors import InputError
 from ucfrec.results import versions
 from ucfrec.rollout import Actor, BoolArray, FloatArray, IntArray, Step, rollout
-from ucfrec_simulators.behaviors import Actions, Memoryless, SessionMixture
+from ucfrec_simulators.behaviors import Actions, Memoryless, SessionMixture, truncated_normal
 from ucfrec_simulators.taobao import ACTION_DIM, MAX_CLICKS, TaobaoEnv, taobao
 
 
@@ -52,29 +51,6 @@ class DdpgConfig:
 
 
 DEFAULT: Final = DdpgConfig()
-
-
-def truncated_normal(
-    mean: FloatArray, scale: float, generator: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
-    """Draw from the normal about `mean` that is cut to the box [−1, 1]^A, not clipped to it.
-
-    Clipping would put probability on the box's faces, where no density exists; the cut normal has
-    a density everywhere in the box, and it is returned exactly, for the float32 actions returned.
-
-    Args:
-        mean: (N, A) inside the box.
-
-    Returns:
-        Actions (N, A), and their densities (N,): products over the dimensions, which may exceed 1.
-    """
-    center = mean.astype(np.float64)
-    below, above = ndtr((-1 - center) / scale), ndtr((1 - center) / scale)
-    quantile = below + generator.random(center.shape) * (above - below)
-    actions = np.clip(center + scale * ndtri(quantile), -1, 1).astype(np.float32)
-    deviation = (actions - center) / scale
-    logarithm = -(deviation**2) / 2 - np.log(np.sqrt(2 * np.pi) * scale * (above - below))
-    return actions, np.exp(logarithm.sum(axis=1)).astype(np.float32)
 
 
 class Noisy(Memoryless):
@@ -142,7 +118,7 @@ class Learner:
     def observe(self, actions: Actions, rewards: FloatArray) -> None:
         """Keep the step until it is known what it led to."""
         assert self._played is not None
-        self._played.actions, self._played.rewards = actions, rewards / MAX_CLICKS
+        self._played.actions, self._played.rewards = actions, rewards / np.float32(MAX_CLICKS)
 
     def _learn(self, played: "_Played", after: FloatArray) -> None:
         buffer, rows, config = self._model.replay_buffer, played.rows, self._config

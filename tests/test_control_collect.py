@@ -7,6 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from tqdm import tqdm
 
 from ucfrec.errors import InputError
 
@@ -113,6 +114,34 @@ def test_files_say_what_they_are(collected: Path) -> None:
     for name in FIELDS:
         joined = np.concatenate([getattr(medium, name), getattr(expert, name)])
         np.testing.assert_array_equal(getattr(both, name), joined)
+
+
+def test_an_episode_cut_by_the_step_limit_is_a_timeout() -> None:
+    learner = SacLearner(module.make_env("Pendulum-v1", 1), 0, 1000, SacConfig())
+    for _ in range(2):
+        learner.play_episode(tqdm(disable=True))
+    replay = learner.replay(learner.steps)
+    assert np.flatnonzero(replay["timeouts"]).tolist() == [199, 399]
+    assert not replay["terminals"].any()
+    assert 1.9 < np.abs(replay["actions"]).max() <= 2
+    # What the last action led to is the old episode's; what follows is a new start.
+    states, after = replay["observations"], replay["next_observations"]
+    goes_on = (after[:-1] == states[1:]).all(axis=1)
+    assert np.flatnonzero(~goes_on).tolist() == [199]
+    turned = np.arctan2(after[:, 1], after[:, 0]) - np.arctan2(states[:, 1], states[:, 0])
+    wrapped = (turned + np.pi) % (2 * np.pi) - np.pi
+    np.testing.assert_allclose(wrapped, after[:, 2] * 0.05, atol=1e-4)
+
+
+@pytest.mark.parametrize("fraction", [0.1, 1 / 3, 0.9])
+def test_the_threshold_lies_between_random_and_expert_also_below_zero(fraction: float) -> None:
+    returns = [-1200.0, -900.0, -1100.0, -300.0, -200.0, -600.0]
+    rows = [{"return": value} for value in returns]
+    medium, expert = module._choose(rows, -1250.0, fraction)
+    assert expert == 4
+    assert [(value + 1250) / 1050 >= fraction for value in returns].index(True) == medium
+    with pytest.raises(InputError, match=r"random play -100\.0; train for more"):
+        module._choose(rows, -100.0, fraction)
 
 
 def test_an_interrupted_collection_ends_as_an_uninterrupted_one(

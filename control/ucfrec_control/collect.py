@@ -81,10 +81,18 @@ def collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[di
         "expert_return": training.evaluations[expert]["return"],
         "expert_steps": training.evaluations[expert]["steps"],
     }
+    return _write(out, parts, recorded)
+
+
+def _write(
+    out: Path, parts: Mapping[str, Trajectories], recorded: Mapping[str, Any]
+) -> list[dict[str, Any]]:
+    """One file a dataset, and the manifest; returns a row a dataset."""
     made = provenance((*PACKAGES, "stable-baselines3"))
+    task = recorded["env_id"].split("/")[-1].rsplit("-v", 1)[0].lower()
     rows = []
     for kind, trajectories in parts.items():
-        name = f"{env_id.split('/')[-1].rsplit('-v', 1)[0].lower()}_{kind}-sac"
+        name = f"{task}_{kind}-sac"
         row = {
             "file": f"{name}.hdf5",
             "dataset": name,
@@ -95,7 +103,7 @@ def collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[di
         metadata = {**recorded, **row, "versions": json.dumps(made["versions"])}
         write_d4rl(trajectories, out / f"{name}.hdf5", metadata)
         rows.append(row)
-    write_json(out / "MANIFEST.json", made | recorded | {"files": rows})
+    write_json(out / "MANIFEST.json", {**made, **recorded, "files": rows})
     return rows
 
 
@@ -237,6 +245,7 @@ def _roll_out(training: _Training, index: int, env_id: str, seed: int, size: int
     They are played in rounds of a fixed number of episodes, so that short ones are not preferred.
     """
     training.learner.load_policy(training.policy(index))
+    # Few steps need few episodes at once: a thousand steps is these tasks' usual limit.
     env = make_env(env_id, min(SIDE_BY_SIDE, max(1, size // 1000)))
     rounds: list[Trajectories] = []
     with tqdm(total=size, desc=f"roll out policy {index}", unit="step", disable=None) as bar:

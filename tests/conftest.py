@@ -12,7 +12,7 @@ settings.load_profile("ucfrec")
 
 
 # The control adapter's tests need its extra.
-CONTROL = ("h5py", "minari", "mujoco")
+CONTROL = ("h5py", "matplotlib", "minari", "mujoco")
 collect_ignore_glob = [] if all(map(find_spec, CONTROL)) else ["test_control_*.py"]
 
 

@@ -109,7 +109,7 @@ def test_a_policy_with_a_distractor_is_judged_at_zero(folder: Path, tmp_path: Pa
     arguments = ["evaluate", run, "--checkpoint", "last", "--episodes", "2", "--target", "900"]
     assert main([*arguments, "--json", str(out)]) == 0
     (row,) = json.loads(out.read_text())
-    assert row["distractors"] == [{"dimension": 11, "flip": 0.15, "seed": 0}]
+    assert row["distractors"] == [{"dimension": 11, "flip": 0.15, "seed": 0, "early": False}]
     env = make_env("Hopper-v5", 2, [0.0])
     seen = []
 

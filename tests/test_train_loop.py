@@ -3,11 +3,9 @@
 import json
 import math
 import os
-import struct
 import subprocess
 import sys
 import time
-from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,12 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tensorboardX.proto.event_pb2 import Event
 from torch import Tensor, nn
 
 from tests import killed_training
 from ucfrec.checkpoint import load_tensors, save_training
 from ucfrec.errors import InputError
+from ucfrec.events import read_scalars
 from ucfrec.train import Fit, LoopConfig, fit
 
 HERE = Path(__file__).parent
@@ -50,22 +48,6 @@ def weights(module: nn.Module) -> list[Tensor]:
 
 def equal(a: list[Tensor], b: list[Tensor]) -> bool:
     return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
-
-
-def events(folder: Path) -> dict[str, dict[int, float]]:
-    """{tag: {step: value}} of all event files, oldest first, each read to where it was cut."""
-    scalars: dict[str, dict[int, float]] = defaultdict(dict)
-    for path in sorted(folder.glob("events.out.tfevents.*")):
-        content, at = path.read_bytes(), 0
-        while at + 12 <= len(content):
-            (size,) = struct.unpack_from("<Q", content, at)
-            if at + 12 + size + 4 > len(content):
-                break
-            event = Event.FromString(content[at + 12 : at + 12 + size])
-            at += 12 + size + 4
-            for value in event.summary.value:
-                scalars[value.tag][event.step] = value.simple_value
-    return dict(scalars)
 
 
 # Resuming.
@@ -111,10 +93,10 @@ def test_every_validation_of_a_killed_training_is_logged(
     left_alone: tuple[Path, Fit], killed_often: list[tuple[Path, dict[str, Any]]]
 ) -> None:
     every = range(killed_training.EVERY, killed_training.STEPS + 1, killed_training.EVERY)
-    expected = events(left_alone[0])["validation_loss"]
+    expected = read_scalars(left_alone[0])["validation_loss"]
     assert list(expected) == list(every)
     for folder, _ in killed_often:
-        assert events(folder)["validation_loss"] == expected
+        assert read_scalars(folder)["validation_loss"] == expected
 
 
 def test_a_longer_training_goes_on_where_a_shorter_one_ended(tmp_path: Path) -> None:
@@ -244,7 +226,7 @@ def test_the_loss_goes_down_in_training_mode(tmp_path: Path) -> None:
     )
     fit(module, draw, loss, config, tmp_path, seed=1, validate=lambda: 0.0)
     assert modes == [True] * 300
-    logged = events(tmp_path)["mine"]
+    logged = read_scalars(tmp_path)["mine"]
     assert logged[300] < 0.05 * logged[50] or logged[300] < 1e-3
 
 
@@ -325,7 +307,7 @@ def test_a_validation_loss_that_is_never_finite_is_named(tmp_path: Path) -> None
 def test_every_validation_is_logged(tmp_path: Path) -> None:
     losses = [3.0, 1.0, 2.0, 1.0, 4.0, 2.0]
     validated(tmp_path, losses, FAST)
-    logged = events(tmp_path)
+    logged = read_scalars(tmp_path)
     every = [2, 4, 6, 8, 10, 12]
     tags = {"mine", "loss", "gradient_norm", "samples_per_second", "waiting_for_data"}
     assert logged.keys() == {*tags, "validation_loss"}
@@ -354,7 +336,7 @@ def test_speed_and_waiting_are_measured(tmp_path: Path, slow: str) -> None:
 
     config = LoopConfig(steps=15, batch_size=64, validate_every=5)
     fit(module, slow_draw, slow_loss, config, tmp_path, seed=1, validate=validate)
-    logged = events(tmp_path)
+    logged = read_scalars(tmp_path)
     for step in (10, 15):  # the first steps also import and allocate
         assert 0 <= logged["waiting_for_data"][step] <= 1
         assert (logged["waiting_for_data"][step] > 0.5) == (slow == "draw")

@@ -14,6 +14,7 @@ from ucfrec.baselines.dc import DCPolicy
 from ucfrec.baselines.dt import DTPolicy
 from ucfrec.baselines.dt4rec import DT4RecPolicy
 from ucfrec.baselines.edt4rec import EDT4RecPolicy
+from ucfrec.baselines.item_knn import ItemKNNPolicy
 from ucfrec.baselines.lsdt import LSDTPolicy
 from ucfrec.baselines.popular import PopularPolicy
 from ucfrec.baselines.sasrec import SASRecPolicy
@@ -34,6 +35,7 @@ POLICIES: dict[str, type[SequencePolicy]] = {
     "sasrec": SASRecPolicy,
     "bc": BCPolicy,
     "popular": PopularPolicy,
+    "item-knn": ItemKNNPolicy,
 }
 """Learners by the name that `--policy` takes."""
 

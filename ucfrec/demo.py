@@ -11,13 +11,11 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from ucfrec.collect import collect
 from ucfrec.config import resolve_config
 from ucfrec.evaluate import World, evaluate_behavior, evaluate_policy
 from ucfrec.files import write_json
-from ucfrec.logs.mapping import FeatureTable, LogMapping
-from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.run import train_run
+from ucfrec.simulated import simulated_store
 from ucfrec.store import EpisodeStore
 from ucfrec.trained import TrainedPolicy
 
@@ -58,7 +56,7 @@ def demo(out: Path, seed: int, config: DemoConfig) -> list[dict[str, Any]]:
     again after an interruption, it goes on where it was.
     """
     for world in WORLDS:
-        _store(out / world, world, seed, config)
+        simulated_store(World(world), out / world, config.sessions, seed)
     jobs = [(world, name) for name in reversed(LEARNERS) for world in WORLDS]
     # One thread each: at this size two trainings side by side beat one on two threads.
     with ProcessPoolExecutor(min(len(jobs), os.cpu_count() or 1), get_context("spawn")) as pool:
@@ -78,24 +76,6 @@ def demo(out: Path, seed: int, config: DemoConfig) -> list[dict[str, Any]]:
         rows += [learned[world, name] for name in order]
     write_json(out / "results.json", rows)
     return rows
-
-
-def _store(folder: Path, world: str, seed: int, config: DemoConfig) -> None:
-    """Logs of the mixture behavior, prepared as anybody's logs are."""
-    logs, store = folder / "logs", folder / "store"
-    if not logs.exists():
-        simulator = World(world).simulator()
-        env = simulator.make(256, None)
-        actor = simulator.behaviors["mixture"](env, seed)
-        collect(
-            simulator, env, actor, config.sessions, seed, logs, env_name=world, behavior="mixture"
-        )
-    if not store.exists():
-        items = logs / "items.parquet"
-        features = (FeatureTable((items,), "item_id"),) if items.exists() else ()
-        reward = World(world).simulator().feedback
-        mapping = LogMapping(session_by="session_id", item_features=features)
-        prepare([logs / "sessions.parquet"], mapping, store, PrepareOptions(reward=reward))
 
 
 def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> dict[str, Any]:

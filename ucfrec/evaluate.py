@@ -1,6 +1,7 @@
 """What a policy earns in a simulated world."""
 
 import time
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,14 @@ from gymnasium import spaces
 from ucfrec import schema
 from ucfrec.collect import world_items
 from ucfrec.errors import InputError
+from ucfrec.evaluate_variety import COLUMNS, variety_columns
 from ucfrec.metrics import session_metrics
 from ucfrec.plugins import Simulator, load_plugin
 from ucfrec.results import config_hash, provenance
 from ucfrec.rollout import Actor, IntArray, rollout
 from ucfrec.trained import TrainedPolicy
+from ucfrec.training_counts import TrainingCounts
+from ucfrec.variety import Recommended
 
 SIDE_BY_SIDE = 512
 """Most episodes played at once."""
@@ -65,7 +69,7 @@ def evaluate_policy(
     env = world.simulator().make(min(episodes, SIDE_BY_SIDE), world.folder)
     numbers = _item_numbers(world, env, trained)
     actor = trained.actor(env.num_envs, target_return, numbers)
-    row = _row(world, name, env, actor, episodes, seed)
+    row = _row(world, name, env, actor, episodes, seed, trained.counts, numbers)
     return row | {
         "target_return": target_return,
         "train_seed": trained.record["seed"],
@@ -75,17 +79,30 @@ def evaluate_policy(
 
 
 def _row(
-    world: World, name: str, env: Any, actor: Actor, episodes: int, seed: int
+    world: World,
+    name: str,
+    env: Any,
+    actor: Actor,
+    episodes: int,
+    seed: int,
+    counts: TrainingCounts | None = None,
+    numbers: IntArray | None = None,
 ) -> dict[str, Any]:
     began = time.perf_counter()
-    played = rollout(env, actor, episodes, seed, describe=f"{name} in {world.name}")
+    recommended, describe = Recommended(), f"{name} in {world.name}"
+    played = rollout(env, actor, episodes, seed, recommended.record, describe)
+    seconds = time.perf_counter() - began
+    variety: Mapping[str, float | None] = dict.fromkeys(COLUMNS)
+    if isinstance(env.single_action_space, spaces.Discrete):
+        variety = variety_columns(env, recommended, counts, numbers)
     env.close()
     return {
         "world": world.name,
         "policy": name,
         **asdict(session_metrics(played, seed)),
+        **variety,
         "seed": seed,
-        "wall_time_s": time.perf_counter() - began,
+        "wall_time_s": seconds,
         "fingerprint": None,
         "config": None,
         **provenance(),

@@ -20,7 +20,8 @@ from ucfrec.policy import SequencePolicy
 from ucfrec.results import command_line, versions
 from ucfrec.store import ITEM_STATES, EpisodeStore
 from ucfrec.train import fit
-from ucfrec.trained import ITEMS, RUN, USERS
+from ucfrec.trained import COUNTS, ITEMS, RUN, USERS
+from ucfrec.training_counts import TrainingCounts
 from ucfrec.windows import Overlay, Windows
 
 _VALIDATION_BATCHES = 16
@@ -131,6 +132,8 @@ def _begin(
         for name in (ITEM_STATES, ITEMS, USERS):
             if (store.path / name).exists():
                 shutil.copyfile(store.path / name, scratch / name)
+        if store.has_items:
+            TrainingCounts.of(train).save(scratch / COUNTS)
         write_json(scratch / RUN, record)
 
 

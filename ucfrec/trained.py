@@ -19,9 +19,11 @@ from ucfrec.files import read_json
 from ucfrec.policy import SequencePolicy
 from ucfrec.states import ItemStates
 from ucfrec.store import ITEM_STATES
+from ucfrec.training_counts import TrainingCounts
 
 RUN = "run.json"
 ITEMS, USERS = "items.parquet", "users.parquet"
+COUNTS = "training_counts.safetensors"
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,8 @@ class TrainedPolicy:
     """(n_items,) identifiers in the logs; None where actions are vectors."""
     user_ids: npt.NDArray[Any]
     """(n_users,) identifiers in the logs; empty where there are none."""
+    counts: TrainingCounts | None = None
+    """None where actions are vectors, and of runs from before counts were kept."""
 
     @classmethod
     def load(cls, run: Path, checkpoint: str = "best") -> "TrainedPolicy":
@@ -58,16 +62,13 @@ class TrainedPolicy:
             ItemStates.load(states) if states.exists() else None,
             _ids(run / ITEMS, schema.ITEM_ID) if states.exists() else None,
             _ids(run / USERS, schema.USER_ID),
+            TrainingCounts.load(run / COUNTS) if (run / COUNTS).exists() else None,
         )
 
     @property
     def name(self) -> str:
-        """The learner, and whether it departs from its usual use of edited copies."""
-        config = config_from_dict(self.record["config"])
-        augmented = config.augment.copies > 0
-        if augmented == self.policy.augmented:
-            return config.policy_name
-        return f"{config.policy_name}-{'augmented' if augmented else 'no-augmentation'}"
+        """See `learner_of`."""
+        return learner_of(self.record)
 
     def target_return(self, quantile: float) -> float:
         """The `quantile` of training returns, interpolated between those the run recorded."""
@@ -95,6 +96,15 @@ class TrainedPolicy:
             self.item_ids if item_numbers is None else item_numbers,
             self.user_ids,
         )
+
+
+def learner_of(record: Mapping[str, Any]) -> str:
+    """The learner of a run's record, and whether it departs from its usual use of edited copies."""
+    config = config_from_dict(record["config"])
+    augmented = config.augment.copies > 0
+    if augmented == POLICIES[config.policy_name].augmented:
+        return config.policy_name
+    return f"{config.policy_name}-{'augmented' if augmented else 'no-augmentation'}"
 
 
 def _weights(path: Path) -> dict[str, Tensor]:

@@ -37,6 +37,8 @@ def build_parser() -> argparse.ArgumentParser:
     _train(commands.add_parser("train", help="train a policy on a store; resumes"))
     _evaluate(commands.add_parser("evaluate", help="normalised scores of trained policies"))
     _benchmark(commands.add_parser("benchmark", help="every learner on the zoo files; resumes"))
+    _robustness(commands.add_parser("robustness", help="what distractors cost; resumes"))
+    _figures(commands.add_parser("figures", help="figures of runs and result rows"))
     return parser
 
 
@@ -80,6 +82,7 @@ def _distract(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("store", type=Path, metavar="STORE")
     parser.add_argument("--out", type=Path, required=True, metavar="STORE")
     parser.add_argument("--flip", type=float, default=0.0, help="chance that it is wrong (0)")
+    parser.add_argument("--early", action="store_true", help="tell of the next step's reward")
     parser.add_argument("--seed", type=int, default=0)
 
 
@@ -120,6 +123,29 @@ def _benchmark(parser: argparse.ArgumentParser) -> None:
         "--results", type=Path, default=Path("benchmarks/results/control.jsonl"), metavar="JSONL"
     )
     parser.add_argument("--workers", type=int, default=1, help="processes of one thread each (1)")
+
+
+def _robustness(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--data", type=Path, required=True, metavar="FOLDER", help="of the HDF5 files"
+    )
+    parser.add_argument("--budget", default="small", choices=["small", "full"])
+    parser.add_argument("--out", type=Path, default=Path("runs/control"), help="stores and runs")
+    parser.add_argument(
+        "--results",
+        type=Path,
+        default=Path("benchmarks/results/control_robustness.jsonl"),
+        metavar="JSONL",
+    )
+    parser.add_argument("--workers", type=int, default=1, help="processes of one thread each (1)")
+
+
+def _figures(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--runs", nargs="*", type=Path, default=[], metavar="RUN", help="runs, or folders of runs"
+    )
+    parser.add_argument("--results", nargs="*", type=Path, default=[], metavar="JSONL")
+    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER")
 
 
 if __name__ == "__main__":

@@ -23,6 +23,9 @@ from ucfrec_control.d4rl import read_d4rl, write_d4rl
 from ucfrec_control.distractor import add_distractor
 from ucfrec_control.evaluate import CHECKPOINTS, SHOWN, evaluate_run
 from ucfrec_control.minari import is_minari, read_minari, write_minari
+from ucfrec_control.robustness import BUDGETS as ROBUSTNESS_BUDGETS
+from ucfrec_control.robustness import SHOWN as SHOWN_DROPS
+from ucfrec_control.robustness import SHOWN_SCREENING, drops, robustness, screening_rows
 from ucfrec_control.scores import find_task
 from ucfrec_control.screening import ScreeningConfig, describe_screening, screen
 from ucfrec_control.train import dataset_of, preset_of, train_control
@@ -80,7 +83,7 @@ def _describe(trajectories: Trajectories) -> str:
 def run_distract(options: argparse.Namespace) -> None:
     """`ucfrec-control distract`."""
     store = EpisodeStore.open(options.store)
-    add_distractor(store, options.out, options.flip, options.seed)
+    add_distractor(store, options.out, options.flip, options.seed, options.early)
     print(f"store: {options.out}; dimension {store.observation_size} is the distractor")
 
 
@@ -139,6 +142,30 @@ def run_benchmark(options: argparse.Namespace) -> None:
     print(f"\nrows: {options.results}")
 
 
+def run_robustness(options: argparse.Namespace) -> None:
+    """`ucfrec-control robustness`."""
+    rows = robustness(
+        options.data,
+        options.out,
+        options.results,
+        ROBUSTNESS_BUDGETS[options.budget],
+        options.budget,
+        options.workers,
+    )
+    print(format_rows(drops(rows), SHOWN_DROPS))
+    print(f"\n{format_rows(screening_rows(rows), SHOWN_SCREENING)}\n\nrows: {options.results}")
+
+
+def run_figures(options: argparse.Namespace) -> None:
+    """`ucfrec-control figures`."""
+    from ucfrec_control.figures import make_figures  # matplotlib takes half a second to import
+
+    made, missing = make_figures(options.runs, options.results, options.out)
+    print("\n".join(map(str, made)))
+    for what in missing:
+        print(f"missing: {what}", file=sys.stderr)
+
+
 def _shown(row: Mapping[str, Any]) -> dict[str, Any]:
     interval = f"{row['score']:.1f} [{row['score_low']:.1f}, {row['score_high']:.1f}]"
     asked, earned = f"{row['target_return']:g}", f"{row['return']:.1f}"
@@ -154,4 +181,6 @@ COMMANDS: Commands = {
     "train": run_train,
     "evaluate": run_evaluate,
     "benchmark": run_benchmark,
+    "robustness": run_robustness,
+    "figures": run_figures,
 }

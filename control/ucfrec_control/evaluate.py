@@ -1,6 +1,6 @@
 """What a trained policy earns in its environment, on D4RL's scale."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ from ucfrec.errors import InputError
 from ucfrec.metrics import bootstrap_interval
 from ucfrec.results import config_hash
 from ucfrec.rollout import rollout
-from ucfrec.trained import TrainedPolicy
+from ucfrec.trained import TrainedPolicy, learner_of
 from ucfrec_control.environments import SIDE_BY_SIDE, make_env, mismatches
 from ucfrec_control.presets import find_preset
 from ucfrec_control.scores import find_kind, require_task
@@ -60,6 +60,11 @@ def evaluate_run(
     return [row | {"run": str(run)} for row in rows]
 
 
+def method_of(record: Mapping[str, Any]) -> str:
+    """Name of what the run of `record` trained, interventions on screened dimensions included."""
+    return learner_of(record) + ("-screened" if record["dataset"].get("screened") else "")
+
+
 def _preset_targets(trained: TrainedPolicy, env_id: str) -> tuple[float, ...]:
     dataset, learner = trained.record["dataset"], trained.record["config"]["policy_name"]
     task = require_task(env_id, dataset["dataset"])
@@ -91,7 +96,7 @@ def _row(
     low, high = task.score(bootstrap_interval(played.returns, seed))
     return {
         "dataset": dataset["dataset"],
-        "method": trained.name + ("-screened" if dataset.get("screened") else ""),
+        "method": method_of(record),
         "seed": record["seed"],
         "target_return": target,
         "score": float(task.score(played.returns.mean())),
@@ -106,6 +111,7 @@ def _row(
         "steps": record["policy"]["steps"],
         "best_step": record["policy"]["best_step"],
         "distractors": dataset.get("distractors", []),
+        "lambda_mask": record["config"]["policy"].get("lambda_mask"),
         "config_hash": config_hash(record["config"]),
         "fingerprint": record["fingerprint"],
         "dataset_versions": dataset["versions"],

@@ -15,6 +15,7 @@ from ucfrec_simulators.folders import data_folder
 from ucfrec_simulators.kuai import EXITS, REGIMES, ExitRule, KuaiEnv, Regime, oracle
 
 REWARD_CAP: Final = 5.0
+CATEGORIES: Final = "item_categories.csv"
 SOURCE: Final = "https://kuairec.com (KuaiRec.zip, folder data)"
 
 
@@ -45,13 +46,25 @@ def kuairec(
     rewards = np.zeros((len(users), len(items)), dtype=np.float32)
     paid = np.nan_to_num(watched["watch_ratio"].to_numpy(), nan=0.0)
     rewards[rows, columns] = np.clip(paid, 0.0, REWARD_CAP)
-    path = folder / "item_categories.csv"
-    categories = read_columns(path, ["video_id", "feat"], SOURCE).set_index("video_id")["feat"]
-    missing = np.setdiff1d(items, categories.index)
-    if len(missing):
-        raise InputError(f"{path} lacks {len(missing)} videos such as {missing[0]}; see {SOURCE}")
-    tags = [parse_tags(text.strip("[]")) for text in categories.loc[items]]
+    categories = read_categories(folder)
+    missing = [item for item in items if item not in categories]
+    if missing:
+        raise InputError(
+            f"{folder / CATEGORIES} lacks {len(missing)} videos such as {missing[0]}; see {SOURCE}"
+        )
+    tags = [categories[item] for item in items]
     return KuaiEnv(num_envs, rewards, tags, exit_rule, regime, users, items)
+
+
+def read_categories(folder: Path) -> dict[int, tuple[int, ...]]:
+    """Categories of every video of the official `item_categories.csv` in `folder`.
+
+    Raises:
+        InputError: it is missing or is not the official file.
+    """
+    table = read_columns(folder / CATEGORIES, ["video_id", "feat"], SOURCE)
+    feats = (parse_tags(text.strip("[]")) for text in table["feat"])
+    return dict(zip(table["video_id"], feats, strict=True))
 
 
 def read_columns(path: Path, columns: Sequence[str], source: str) -> pd.DataFrame:

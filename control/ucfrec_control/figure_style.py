@@ -1,0 +1,98 @@
+"""One look for all figures: colors that the color-blind tell apart, sizes of a paper's columns."""
+
+from collections.abc import Iterable
+from itertools import cycle
+from pathlib import Path
+
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+
+from ucfrec.files import atomic_file
+
+COLUMN, PAGE = 3.4, 7.0
+"""Widths of one column and of both, in inches."""
+FACTUAL, EDITED = "#0072B2", "#D55E00"
+MAP = "cividis"
+# Okabe and Ito's colors, which stay apart for the color-blind.
+_PALETTE = (
+    *("#0072B2", "#E69F00", "#009E73", "#D55E00"),
+    *("#CC79A7", "#56B4E9", "#000000", "#8C8C8C"),
+)
+# What comes in several figures has one color in all.
+_OWN = {
+    "bc": "#8C8C8C",
+    "dt": "#0072B2",
+    "dc": "#56B4E9",
+    "lsdt": "#009E73",
+    "ucf": "#D55E00",
+    "ucf-screened": "#CC79A7",
+    "ucf-wo-count": "#E69F00",
+    "ucf-no-augmentation": "#E69F00",
+    "ucf-wo-arch": "#000000",
+    "dt-augmented": "#000000",
+    "none": "#8C8C8C",
+    "deterministic": "#0072B2",
+    "stochastic": "#56B4E9",
+    "early": "#E69F00",
+}
+_LABELS = {
+    "bc": "BC",
+    "dt": "DT",
+    "dc": "DC",
+    "lsdt": "LSDT",
+    "ucf": "UCF",
+    "ucf-screened": "UCF, screened",
+    "ucf-wo-count": "w/o Count",
+    "ucf-no-augmentation": "w/o Count",
+    "ucf-wo-arch": "w/o Arch",
+    "dt-augmented": "w/o Arch",
+    "none": "no distractor",
+}
+
+styled = rc_context(
+    {
+        "figure.dpi": 200,
+        "figure.constrained_layout.use": True,
+        "font.size": 8,
+        "axes.titlesize": 8,
+        "legend.fontsize": 7,
+        "legend.frameon": False,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.axisbelow": True,
+        "grid.color": "#DDDDDD",
+        "lines.linewidth": 1.3,
+        "lines.markersize": 3.5,
+        "image.cmap": MAP,
+        # The same picture is the same file.
+        "svg.hashsalt": "ucfrec",
+    }
+)
+"""Decorates what draws or saves a figure."""
+
+
+def label(name: str) -> str:
+    """How a method or a condition is called in figures."""
+    return _LABELS.get(name, name)
+
+
+def colors(names: Iterable[str]) -> dict[str, str]:
+    """A color for each of `names`: its own, or one that is left over."""
+    wanted = list(names)
+    taken = {_OWN.get(name) for name in wanted}
+    free = cycle([color for color in _PALETTE if color not in taken] or _PALETTE)
+    return {name: _OWN.get(name) or next(free) for name in wanted}
+
+
+@styled
+def save(figure: Figure, folder: Path, name: str) -> list[Path]:
+    """Write `figure` as PNG and SVG; returns the two files."""
+    files = []
+    for kind in ("png", "svg"):
+        path = folder / f"{name}.{kind}"
+        with atomic_file(path) as scratch:
+            # What the date would be in the SVG's metadata differs between equal pictures.
+            metadata = {"Date": None} if kind == "svg" else None
+            figure.savefig(scratch, format=kind, metadata=metadata)
+        files.append(path)
+    return files

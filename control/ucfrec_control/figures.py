@@ -1,0 +1,179 @@
+"""`ucfrec-control figures`: every figure that stored runs and result rows have the data for."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from ucfrec.errors import InputError
+from ucfrec.events import read_scalars
+from ucfrec.files import read_json
+from ucfrec.grid import Row, read_rows
+from ucfrec.trained import RUN
+from ucfrec_control import diagnostics, plots
+from ucfrec_control.evaluate import method_of
+from ucfrec_control.figure_style import label, save
+from ucfrec_control.robustness import drops
+
+LOWS = (0.0, 0.1, 0.2, 0.3, 0.4)
+HIGHS = (0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
+"""ρ_low and ρ_high of the acceptance heatmap."""
+
+_COPIES = "a run with edited copies among --runs (`ucfrec-control train --policy ucf`)"
+NEEDS = {
+    "moves": _COPIES,
+    "states": _COPIES,
+    "acceptance": _COPIES,
+    "attention": "a run of ucf among --runs (`ucfrec-control train --policy ucf`)",
+    "training": "a run among --runs (`ucfrec-control train`)",
+    "lambda": "rows of ucf with two weights of the mask loss or more among --results",
+    "robustness-scores": "rows of `ucfrec-control robustness` among --results",
+    "robustness-drops": "such rows with and without a distractor",
+}
+"""What every kind of figure is made of."""
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """A figure that there seems to be data for."""
+
+    kind: str
+    about: str
+    draw: Callable[[], Figure]
+    """Raises InputError where some of the data is missing after all."""
+
+
+@dataclass(frozen=True)
+class _Run:
+    path: Path
+    name: str
+    """Its path below the folder that was given, the parts joined."""
+    group: str
+    """The same of the folder it lies in; of runs given by themselves, the dataset."""
+    method: str
+    title: str
+
+
+def make_figures(
+    runs: Sequence[Path], results: Sequence[Path], out: Path
+) -> tuple[list[Path], list[str]]:
+    """Draw all figures into `out`, as PNG and SVG.
+
+    Where runs differ in their seed only, edits and attention are drawn of the first.
+
+    Args:
+        runs: run folders of `ucfrec-control`, or folders that hold some at any depth.
+        results: JSON lines of `benchmark` and `robustness`.
+
+    Returns:
+        The files written, and a line for each figure that lacks its data.
+
+    Raises:
+        InputError: a file of `results` holds something else.
+    """
+    found = [run for folder in runs for run in _runs(folder)]
+    rows = [row for path in results for row in read_rows(path)]
+    plans = [*_of_runs(found), *_of_rows(rows)]
+    made: list[Path] = []
+    missing = [f"{k}: needs {w}" for k, w in NEEDS.items() if k not in {p.kind for p in plans}]
+    for plan in plans:
+        name = f"{plan.kind}-{plan.about}"
+        try:
+            made += save(plan.draw(), out, name)
+        except InputError as error:
+            missing.append(f"{name}: {error}")
+    return made, missing
+
+
+def _runs(folder: Path) -> Iterator[_Run]:
+    for file in sorted(folder.rglob(RUN)):
+        record, path = read_json(file), file.parent
+        if "dataset" not in record:
+            continue
+        below, dataset, method = path.relative_to(folder), record["dataset"], method_of(record)
+        distracted = " with a distractor" if dataset.get("distractors") else ""
+        yield _Run(
+            path=path,
+            name="-".join(below.parts) or path.resolve().name,
+            group="-".join(below.parent.parts) or dataset["dataset"],
+            method=method,
+            title=f"{label(method)} on {dataset['dataset']}{distracted}",
+        )
+
+
+def _of_runs(runs: Sequence[_Run]) -> Iterator[_Plan]:
+    for run in _first(runs, lambda run: (run.group, run.method)):
+        if diagnostics.has_copies(run.path):
+            yield _Plan("moves", run.name, partial(_moves, run))
+            yield _Plan("states", run.name, partial(_states, run))
+            yield _Plan("acceptance", run.name, partial(_acceptance, run))
+        if run.method.startswith("ucf"):
+            yield _Plan("attention", run.name, partial(_attention, run))
+    for run in _first(runs, lambda run: run.group):
+        there = [other for other in runs if other.group == run.group]
+        yield _Plan("training", run.group, partial(_training, there))
+
+
+def _first(runs: Iterable[_Run], key: Callable[[_Run], Any]) -> Iterable[_Run]:
+    first: dict[Any, _Run] = {}
+    for run in runs:
+        first.setdefault(key(run), run)
+    return first.values()
+
+
+def _moves(run: _Run) -> Figure:
+    return plots.move_histogram(*diagnostics.move_histogram(run.path), run.title)
+
+
+def _states(run: _Run) -> Figure:
+    return plots.state_overlay(*diagnostics.edited_states(run.path), run.title)
+
+
+def _acceptance(run: _Run) -> Figure:
+    band = diagnostics.move_histogram(run.path)[2]
+    shares = diagnostics.acceptance_grid(run.path, LOWS, HIGHS)
+    return plots.acceptance_heatmap(LOWS, HIGHS, shares, band, run.title)
+
+
+def _attention(run: _Run) -> Figure:
+    return plots.attention_map(diagnostics.attention(run.path), run.title)
+
+
+def _training(runs: Sequence[_Run]) -> Figure:
+    curves: dict[str, list[Mapping[int, float]]] = {}
+    for run in runs:
+        logged = read_scalars(run.path / "policy").get("validation_loss", {})
+        if logged:
+            curves.setdefault(run.method, []).append(logged)
+    if not curves:
+        raise InputError(f"{runs[0].path.parent}: no run has logged a validation loss yet")
+    return plots.training_curves(curves, "validation loss of the action", runs[0].group)
+
+
+def _of_rows(rows: Sequence[Row]) -> Iterator[_Plan]:
+    distracted = [row for row in rows if "distractor" in row]
+    for budget, dataset in dict.fromkeys((row["budget"], row["dataset"]) for row in distracted):
+        there = [r for r in distracted if (r["budget"], r["dataset"]) == (budget, dataset)]
+        about, bars = f"{budget}-{dataset}", plots.robustness_bars
+        score = partial(bars, there, "score", "normalised score", dataset)
+        yield _Plan("robustness-scores", about, score)
+        if lost := drops(there):
+            drop = partial(bars, lost, "drop", "loss (% of the clean score)", dataset)
+            yield _Plan("robustness-drops", about, drop)
+    swept = [row for row in rows if _of_lambda(row)]
+    for budget in dict.fromkeys(row.get("budget", "") for row in swept):
+        there = [row for row in swept if row.get("budget", "") == budget]
+        if len({row["lambda_mask"] for row in there}) > 1:
+            yield _Plan("lambda", budget or "rows", partial(plots.lambda_curves, there))
+
+
+def _of_lambda(row: Row) -> bool:
+    """Whether `row` is UCF's, complete but for its λ."""
+    whole = row.get("method") == "ucf" or str(row.get("method")).startswith("ucf-lambda")
+    clean = "distractor" not in row and not row.get("distractors")
+    return (
+        whole and clean and row.get("lambda_mask") is not None and row.get("checkpoint") == "last"
+    )

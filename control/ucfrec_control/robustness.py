@@ -1,0 +1,225 @@
+"""What a distractor costs the learners that were trained with it (Figures 3 and 4, Appendix G.4).
+
+Every learner is trained on the plain data and on the same data with a distractor in its states, and
+judged where the distractor is fixed to 0.
+"""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from ucfrec.config import Config, resolve_config
+from ucfrec.grid import Row, run_grid
+from ucfrec.results import config_hash, provenance
+from ucfrec.store import EpisodeStore
+from ucfrec_control.benchmark import BUDGETS as SCORE_BUDGETS
+from ucfrec_control.benchmark import METHODS as LEARNERS
+from ucfrec_control.benchmark import Budget
+from ucfrec_control.d4rl import read_d4rl
+from ucfrec_control.distractor import add_distractor
+from ucfrec_control.evaluate import evaluate_run
+from ucfrec_control.train import dataset_of, preset_of, train_control
+from ucfrec_control.trajectories import PACKAGES
+
+CLEAN = "none"
+DISTRACTORS: dict[str, Mapping[str, Any] | None] = {
+    CLEAN: None,
+    "deterministic": {"flip": 0.0},
+    "stochastic": {"flip": 0.15},
+    "early": {"flip": 0.0, "early": True},
+}
+"""Arguments of `add_distractor` by the name in the rows; the first two distractors are the paper's,
+the last tells of the next reward, which the action at hand still has a part in."""
+
+SCREENED = "ucf-screened"
+METHODS = ("dt", "dc", "lsdt", "ucf", "ucf-wo-count", "ucf-wo-arch", SCREENED)
+"""Rows of `ucfrec_control.benchmark`, and UCF with copies that intervene on what is flagged."""
+
+BUDGETS = {
+    # Steps, width and seeds are cut most, then the history and files; no method and no distractor
+    # is left out. Learning rates are one for all, as in the benchmark.
+    "small": Budget(
+        ("hopper_medium-zoo", "hopper_mixed-zoo", "walker2d_medium-expert-zoo"),
+        1,
+        20,
+        (
+            "train.steps=1000",
+            "train.warmup_steps=100",
+            "train.validate_every=250",
+            "train.learning_rate=1e-3",
+            "policy.dim=64",
+            "policy.context=10",
+            "crm.epochs=3",
+        ),
+    ),
+    "full": SCORE_BUDGETS["full"],
+}
+SHOWN = ("dataset", "method", "seed", "distractor", "clean", "score", "drop")
+SHOWN_SCREENING = (
+    *("dataset", "distractor", "seed", "flagged", "effect", "reward_effect"),
+    *("true_flagged", "weakest_true"),
+)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training, and the row it gives."""
+
+    file: str
+    distractor: str
+    method: str
+    seed: int
+    store: Path
+    run: Path
+    budget: Budget
+    budget_name: str
+
+    @property
+    def learner(self) -> str:
+        """The row of `ucfrec_control.benchmark` that is trained."""
+        return "ucf" if self.method == SCREENED else self.method
+
+
+def robustness(
+    data: Path, folder: Path, results: Path, budget: Budget, name: str, workers: int
+) -> list[Row]:
+    """Train and judge whatever has no row in `results` yet; returns all rows of the budget.
+
+    Args:
+        data: folder of the HDF5 files.
+        folder: where stores and runs are kept.
+        results: JSON lines.
+        name: of the budget, for the rows.
+        workers: processes, of one thread each.
+
+    Raises:
+        InputError: a file is missing, `results` holds something else, or cells failed.
+    """
+    cells = list(_cells(data, folder, budget, name))
+    return run_grid(cells, _measure, _keys, results, workers, "robustness")
+
+
+def _cells(data: Path, folder: Path, budget: Budget, name: str) -> Iterator[Cell]:
+    for file in budget.files:
+        for distractor in DISTRACTORS:
+            store = _store(data, folder / "stores", file, distractor)
+            for method in METHODS:
+                for seed in range(budget.seeds):
+                    run = folder / f"robustness-{name}" / file / distractor / f"{method}-{seed}"
+                    yield Cell(file, distractor, method, seed, store, run, budget, name)
+
+
+def _store(data: Path, stores: Path, file: str, distractor: str) -> Path:
+    clean = stores / file
+    if not clean.exists():
+        read_d4rl(data / f"{file}.hdf5").write_store(clean)
+    arguments = DISTRACTORS[distractor]
+    if arguments is None:
+        return clean
+    distracted = stores / f"{file}-{distractor}"
+    if not distracted.exists():
+        add_distractor(EpisodeStore.open(clean), distracted, **arguments)
+    return distracted
+
+
+def _keys(cell: Cell) -> Row:
+    return {
+        "budget": cell.budget_name,
+        "dataset": cell.file,
+        "distractor": cell.distractor,
+        "method": cell.method,
+        "seed": cell.seed,
+        "episodes": cell.budget.episodes,
+        # As a run's record has it, after JSON.
+        "config_hash": config_hash(json.loads(json.dumps(asdict(_config(cell))))),
+        "fingerprint": EpisodeStore.open(cell.store).meta["fingerprint"],
+    }
+
+
+def _config(cell: Cell) -> Config:
+    policy, own = LEARNERS[cell.learner]
+    preset = preset_of(dataset_of(EpisodeStore.open(cell.store)), policy)
+    settings = [*cell.budget.settings, *own]
+    return resolve_config(policy, None, settings, cell.seed, preset.tables)
+
+
+def _measure(cell: Cell) -> list[Row]:
+    store, config = EpisodeStore.open(cell.store), _config(cell)
+    record = train_control(store, cell.run, config, screened=cell.method == SCREENED)
+    # The last checkpoint: the best on validation was chosen where the distractor still tells. Every
+    # method plays the same starts, with and without distractor.
+    (row,) = evaluate_run(
+        cell.run,
+        episodes=cell.budget.episodes,
+        seed=1000 + cell.seed,
+        targets=preset_of(dataset_of(store), config.policy_name).targets[:1],
+        checkpoints=("last",),
+    )
+    screening = _verdicts(record) if cell.method == SCREENED else {}
+    return [row | screening | provenance(PACKAGES)]
+
+
+def _verdicts(record: Mapping[str, Any]) -> Row:
+    """What screening said of the distractor and of the true dimensions of a run's states."""
+    added = {distractor["dimension"] for distractor in record["dataset"].get("distractors", [])}
+    judged = record["screening"]["dimensions"]
+    return {
+        "screening": [
+            {
+                "dimension": d["dimension"],
+                "distractor": d["dimension"] in added,
+                "flagged": not d["causes"],
+                **{k: d[k] for k in ("effect", "p_value", "reward_effect", "reward_p_value")},
+            }
+            for d in judged
+        ]
+    }
+
+
+def drops(rows: Sequence[Mapping[str, Any]]) -> list[Row]:
+    """What every distractor took from a method, where a dataset and seed has a clean row too.
+
+    `clean` and `score` are the normalised scores without and with the distractor, `drop` the share
+    of `clean` that is lost, in percent: negative where nothing was lost, NaN where `clean` is not
+    above 0. Of rows that say the same, the last counts.
+
+    Args:
+        rows: what `robustness` returns, of one budget.
+    """
+    scores = {(r["dataset"], r["method"], r["seed"], r["distractor"]): r["score"] for r in rows}
+    found = []
+    for (dataset, method, seed, distractor), score in scores.items():
+        clean = scores.get((dataset, method, seed, CLEAN))
+        if distractor == CLEAN or clean is None:
+            continue
+        lost = 100 * (clean - score) / clean if clean > 0 else float("nan")
+        values = (dataset, method, seed, distractor, clean, score, lost)
+        found.append(dict(zip(SHOWN, values, strict=True)))
+    return found
+
+
+def screening_rows(rows: Sequence[Mapping[str, Any]]) -> list[Row]:
+    """For each row with a screening: what was flagged, and how far the verdicts are apart.
+
+    `effect` is the distractor's effect on the next state, `reward_effect` that on the reward; of
+    the true dimensions, the weakest cause has the larger of its two effects as `weakest_true`.
+    """
+    found = []
+    for row in rows:
+        if "screening" not in row:
+            continue
+        added = [d for d in row["screening"] if d["distractor"]]
+        true = [d for d in row["screening"] if not d["distractor"]]
+        found.append(
+            {
+                **{name: row[name] for name in ("dataset", "distractor", "seed")},
+                "flagged": all(d["flagged"] for d in added) if added else "-",
+                "effect": added[0]["effect"] if added else "-",
+                "reward_effect": added[0]["reward_effect"] if added else "-",
+                "true_flagged": [d["dimension"] for d in true if d["flagged"]],
+                "weakest_true": min(max(d["effect"], d["reward_effect"]) for d in true),
+            }
+        )
+    return found

@@ -1,0 +1,62 @@
+"""Variety columns of result rows against plain loops over what a world and a log say."""
+
+import itertools
+import math
+from collections import Counter
+
+import numpy as np
+import torch
+
+from ucfrec.evaluate import World, evaluate_behavior
+from ucfrec.evaluate_variety import COLUMNS, variety_columns
+from ucfrec.rollout import rollout
+from ucfrec.training_counts import TrainingCounts
+from ucfrec.variety import Recommended
+from ucfrec_simulators.behaviors import Uniform
+from ucfrec_simulators.kuai import EXITS, KuaiEnv
+
+TAGS = [(0,), (0, 1), (2,), (), (1, 2), (3,)]
+
+
+def test_columns_are_those_of_plain_loops() -> None:
+    rewards = np.random.default_rng(0).random((5, 6)).astype(np.float32)
+    env = KuaiEnv(4, rewards, TAGS, EXITS["dorl"], item_ids=np.arange(6) + 10)
+    seen = Recommended()
+    rollout(env, Uniform(env, 0), 7, 0, seen.record)
+    shown, liked = torch.tensor([5, 0, 3, 2, 9, 4]), torch.tensor([9, 0, 1, 1, 0, 1])
+    numbers = np.array([1, 0, 2, 3, -1, 5])
+    row = variety_columns(env, seen, TrainingCounts(shown, liked, 20), numbers)
+
+    episodes, items = seen.sessions()
+    tags = [set(own) or {-1} for own in TAGS]
+    popular, positive = [0.0] * 6, Counter[int]()
+    for log, number in enumerate(numbers.tolist()):
+        if number >= 0:
+            popular[number] = int(shown[log]) / 20
+            positive.update({tag: int(liked[log]) for tag in tags[number]})
+    rarest = min(p for p in popular if p)
+    own = []
+    for episode in set(episodes.tolist()):
+        pairs = list(itertools.combinations(items[episodes == episode].tolist(), 2))
+        apart = [1 - len(tags[a] & tags[b]) / len(tags[a] | tags[b]) for a, b in pairs]
+        own.append(sum(apart) / len(apart) if apart else 1.0)
+    dominant, covered = set(), 0
+    for tag, count in sorted(positive.items(), key=lambda pair: (-pair[1], pair[0])):
+        covered += count
+        dominant |= {tag} if covered <= 0.8 * positive.total() else set()
+    expected = [
+        len(set(items.tolist())) / 6,
+        len(set(items.tolist())) / len(items),
+        sum(own) / len(own),
+        sum(-math.log(max(popular[i], rarest)) for i in items) / len(items),
+        sum(bool(tags[i] & dominant) for i in items) / len(items),
+    ]
+    np.testing.assert_allclose([row[name] for name in COLUMNS], expected)
+
+
+def test_what_is_unknown_is_null() -> None:
+    catalog = evaluate_behavior(World("synthetic-catalog"), "random", 20, 0)
+    assert catalog["novelty"] is catalog["majority_category_dominance"] is None
+    assert 0 < catalog["diversity"] <= 1
+    taobao = evaluate_behavior(World("synthetic-taobao"), "random", 5, 0)
+    assert all(taobao[name] is None for name in COLUMNS)

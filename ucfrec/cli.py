@@ -2,6 +2,7 @@
 
 import argparse
 import errno
+import os
 import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -81,6 +82,7 @@ def build_parser() -> argparse.ArgumentParser:
     train_options(commands.add_parser("train", help="train a policy on a store; resumes"))
     _evaluate(commands.add_parser("evaluate", help="what a policy earns in a simulator"))
     _recommend(commands.add_parser("recommend", help="the next items for users of a log"))
+    _benchmark(commands.add_parser("benchmark", help="tables of every method; resumes"))
     return parser
 
 
@@ -175,6 +177,17 @@ def _recommend(parser: argparse.ArgumentParser) -> None:
     )
     _target_options(parser)
     parser.add_argument("--out", type=Path, required=True, help="Parquet file")
+
+
+def _benchmark(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("suite", help="recommendation, or one that a package announces")
+    parser.add_argument("--budget", choices=["small", "full"], default="small")
+    parser.add_argument("--table", action="append", default=[], help="only this one; repeatable")
+    parser.add_argument("--out", type=Path, default=Path("runs/benchmark"), help="logs and runs")
+    parser.add_argument(
+        "--results", type=Path, help="JSON lines (benchmarks/results/SUITE.jsonl); appended to"
+    )
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
 
 
 if __name__ == "__main__":

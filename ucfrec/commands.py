@@ -18,7 +18,7 @@ from ucfrec.files import atomic_file, write_json
 from ucfrec.logs.mapping import Dataset, LogMapping, columns_given, read_mapping
 from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, read_histories, validate
 from ucfrec.logs.report import format_report
-from ucfrec.plugins import load_plugin
+from ucfrec.plugins import Benchmark, load_plugin
 from ucfrec.recommend import LONGEST_HISTORY, Histories, recommend
 from ucfrec.results import format_rows
 from ucfrec.run import describe_run, train_run
@@ -147,6 +147,15 @@ def run_recommend(options: argparse.Namespace) -> None:
     print(f"{options.out}: {rows:,} rows")
 
 
+def run_benchmark(options: argparse.Namespace) -> None:
+    """`ucfrec benchmark`."""
+    suite: Benchmark = load_plugin("benchmarks", options.suite)
+    results = options.results or Path("benchmarks/results") / f"{options.suite}.jsonl"
+    tables = options.table or suite.tables
+    print(suite.run(options.budget, tables, options.out, results, options.workers))
+    print(f"\nrows: {results}")
+
+
 COMMANDS: dict[str, Callable[[argparse.Namespace], Any]] = {
     "demo": run_demo,
     "collect": run_collect,
@@ -154,4 +163,5 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], Any]] = {
     "train": run_train,
     "evaluate": run_evaluate,
     "recommend": run_recommend,
+    "benchmark": run_benchmark,
 }

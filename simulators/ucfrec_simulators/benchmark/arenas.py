@@ -42,6 +42,13 @@ def virtual_taobao(folder: Path, sessions: int) -> Arena:
     return Arena(store, (world,), ("random", "mixture", "best-constant"))
 
 
+def synthetic_taobao(folder: Path, sessions: int) -> Arena:
+    """Built-in shoppers, logged by the mixture of behaviors; the optimum is known."""
+    world = World("synthetic-taobao")
+    store = simulated_store(world, folder, sessions, _LOG_SEED)
+    return Arena(store, (world,), ("random", "mixture", "best-constant", "optimal"))
+
+
 def synthetic_catalog(folder: Path, sessions: int) -> Arena:
     """Tagged items and boredom, logged by the mixture of behaviors; the optimum is known."""
     world = World("synthetic-catalog")
@@ -108,6 +115,7 @@ ARENAS: Final[Mapping[str, Callable[[Path, int], Arena]]] = {
     "kuairand": kuairand,
     "kuairec": kuairec,
     "virtual-taobao": virtual_taobao,
+    "synthetic-taobao": synthetic_taobao,
     "synthetic-catalog": synthetic_catalog,
 }
 """By name; each made from (folder to keep it in, sessions to collect where logs are simulated)."""

@@ -76,7 +76,7 @@ class _Scale:
         if low == high:  # one value alone lies in the middle
             low, high = low - (abs(low) or 1.0) / 2, high + (abs(high) or 1.0) / 2
         self._step = _round_step((high - low) / 4)
-        self._low = low if low in (0, 1) else math.floor(low / self._step) * self._step
+        self._low = math.floor(low / self._step) * self._step
         self._high = math.ceil(high / self._step) * self._step
         self._start, self._end = start, end
 

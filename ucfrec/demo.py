@@ -53,8 +53,9 @@ class DemoConfig:
 def demo(out: Path, seed: int, config: DemoConfig) -> list[dict[str, Any]]:
     """Run the demo in the folder `out`; returns the rows of `out/results.json`.
 
-    `out/report.html` is a page about them and the runs. Each world leaves its logs, store and runs in `out/<world>`, ready for the other commands. Given
-    again after an interruption, it goes on where it was.
+    `out/report.html` is a page about them and the runs. Each world leaves its logs, store and runs
+    in `out/<world>`, ready for the other commands. Given again after an interruption, it goes on
+    where it was.
     """
     for world in WORLDS:
         simulated_store(World(world), out / world, config.sessions, seed)

@@ -5,6 +5,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ucfrec import __version__, charts
 from ucfrec.errors import InputError
-from ucfrec.evaluate_variety import COLUMNS
 from ucfrec.events import read_scalars
 from ucfrec.files import atomic_file, read_json
-from ucfrec.grid import Row, read_rows
+from ucfrec.report_results import read_results, worlds
+from ucfrec.tables import Table, shown
 from ucfrec.trained import AUGMENTATION, learner_of, read_record
 
 _TITLES = {
@@ -31,19 +32,6 @@ _TITLES = {
 """Curves by the name they are logged under, in the order of the page; others come after."""
 _POINTS = 200
 """Most points a curve is drawn from."""
-_INTERVAL = ("R_cum", "R_cum_low", "R_cum_high")
-_METRICS = ("R_avg_pooled", "R_avg_episode", "length", *COLUMNS, "target_return", "episodes")
-_SEEDS = ("seed", "train_seed")
-
-
-@dataclass(frozen=True)
-class Table:
-    """Cells as they are shown; every row has one for each column."""
-
-    caption: str
-    corner: str
-    columns: Sequence[str]
-    rows: Sequence[tuple[str, Sequence[str]]]
 
 
 @dataclass(frozen=True)
@@ -91,7 +79,7 @@ def write_report(out: Path, runs: Sequence[Path], results: Sequence[Path] = ()) 
             (run.name, text) for of in of_data.values() for run in of for text in _doubts(run)
         ],
         sections=[_section(of) for of in of_data.values()],
-        worlds=_worlds([row for path in results for row in _read_results(path)]),
+        worlds=worlds([row for path in results for row in read_results(path)]),
         layout=charts,
     )
     with atomic_file(out) as scratch:
@@ -118,9 +106,8 @@ def _doubts(run: _Run) -> list[str]:
     doubts = [] if "policy" in run.record else [run.status]
     if run.copies is not None:
         doubts += run.copies["warnings"]
-        if not run.copies["bound"] < run.copies["reward_model"]["reward_std"]:
-            doubts.append(run.copies["verdict"])
-        elif not run.copies["moves"]["edits"]:
+        meant = run.copies["bound"] < run.copies["reward_model"]["reward_std"]
+        if not (meant and run.copies["moves"]["edits"]):
             doubts.append(run.copies["verdict"])
     return doubts
 
@@ -155,7 +142,7 @@ def _data(record: Mapping[str, Any]) -> Table:
     }
     for level, value in record["return_quantiles"].items():
         rows[f"{float(level):.0%} of returns are at most"] = value
-    body = [(name, [_shown(value)]) for name, value in rows.items()]
+    body = [(name, [shown(value)]) for name, value in rows.items()]
     return Table("Training data", "", ["value"], body)
 
 
@@ -174,8 +161,8 @@ def _summary(runs: Sequence[_Run]) -> Table:
 
 
 def _of_runs(caption: str, runs: Sequence[_Run], rows: Sequence[tuple[str, list[Any]]]) -> Table:
-    shown = [(name, [_shown(value) for value in values]) for name, values in rows]
-    return Table(caption, "", [run.name for run in runs], shown)
+    body = [(name, [shown(value) for value in values]) for name, values in rows]
+    return Table(caption, "", [run.name for run in runs], body)
 
 
 def _curves(runs: Sequence[_Run]) -> list[tuple[charts.LineChart, Table]]:
@@ -194,7 +181,7 @@ def _curves(runs: Sequence[_Run]) -> list[tuple[charts.LineChart, Table]]:
         title, names = _TITLES.get(tag, tag), [runs[style].name for style in curves]
         lines = [(runs[style].name, style, curve) for style, curve in curves.items()]
         steps = sorted({step for curve in curves.values() for step in curve})
-        rows = [(f"{s:g}", [_shown(c.get(s)) for c in curves.values()]) for s in steps]
+        rows = [(f"{s:g}", [shown(c.get(s)) for c in curves.values()]) for s in steps]
         drawn.append((charts.line_chart(title, "step", lines), Table(title, "step", names, rows)))
     return drawn
 
@@ -227,7 +214,7 @@ def _copies(runs: Sequence[_Run]) -> Table | None:
         ("leak: correlation of z with E[r | s, a]", [m["z_leak"] for m in models]),
         ("mean-move ratio (1: one shift for all states)", [m["mean_move_ratio"] for m in moves]),
         ("effective rank of the moves",
-         [f"{_shown(m['effective_rank'])} of {m['dimensions']}" for m in moves]),
+         [f"{shown(m['effective_rank'])} of {m['dimensions']}" for m in moves]),
         ("median length of a move ‖Δ‖₂", [m["length_quantiles"].get("0.5") for m in moves]),
     ]  # fmt: skip
     return _of_runs("What the edited copies rest on; δ, ε_r in units of the reward", runs, rows)
@@ -237,12 +224,12 @@ def _moves(runs: Sequence[_Run]) -> charts.LineChart | None:
     """Distribution of ‖Δ‖₂."""
     curves = []
     for style, run in enumerate(runs):
-        moves = run.copies["moves"] if run.copies is not None else {"edits": 0}
-        if moves["edits"]:
-            edges, counts = moves["histogram_edges"], moves["histogram_counts"]
-            middles = [(a + b) / 2 for a, b in zip(edges, edges[1:], strict=False)]
-            shares = [count / moves["edits"] for count in counts]
-            curves.append((run.name, style, dict(zip(middles, shares, strict=True))))
+        if run.copies is None or not run.copies["moves"]["edits"]:
+            continue
+        moves = run.copies["moves"]
+        middles = [(a + b) / 2 for a, b in pairwise(moves["histogram_edges"])]
+        shares = [count / moves["edits"] for count in moves["histogram_counts"]]
+        curves.append((run.name, style, dict(zip(middles, shares, strict=True))))
     title = "Accepted edits by the length of their move"
     return charts.line_chart(title, "‖Δ‖₂", curves) if curves else None
 
@@ -259,70 +246,8 @@ def _differences(runs: Sequence[_Run]) -> Table | None:
 
 
 def _flat(tables: Mapping[str, Any]) -> dict[str, Any]:
-    flat = {}
+    flat: dict[str, Any] = {}
     for name, value in tables.items():
         inner = {f"{name}.{key}": v for key, v in value.items()} if isinstance(value, dict) else {}
         flat |= inner or {name: value}
     return flat
-
-
-def _read_results(path: Path) -> list[Row]:
-    if path.suffix == ".jsonl" and path.exists():
-        rows: Any = read_rows(path)
-    else:
-        rows = read_json(path)
-    if not isinstance(rows, list):
-        raise InputError(f"{path} holds no list of result rows; give what `ucfrec evaluate` wrote")
-    for number, row in enumerate(rows, start=1):
-        known = row if isinstance(row, dict) else {}
-        lacking = [name for name in ("world", "policy") if not isinstance(known.get(name), str)]
-        lacking += [name for name in _INTERVAL if not _finite(known.get(name))]
-        if lacking:
-            raise InputError(
-                f"{path}, row {number}, has no usable {', '.join(lacking)}; give rows that "
-                "`ucfrec evaluate --json` or `ucfrec demo` wrote"
-            )
-    return rows
-
-
-def _finite(value: Any) -> bool:
-    return isinstance(value, (int, float)) and math.isfinite(value)
-
-
-def _worlds(rows: Sequence[Row]) -> list[tuple[charts.BarChart, Table]]:
-    """Bars and table of every world's rows."""
-    drawn = []
-    for world in dict.fromkeys(row["world"] for row in rows):
-        there = [row for row in rows if row["world"] == world]
-        names = _row_names(there)
-        ends = [tuple(float(row[end]) for end in _INTERVAL) for row in there]
-        bars = [(name, *values) for name, values in zip(names, ends, strict=True)]
-        shown = [m for m in (*_METRICS, *_SEEDS) if any(row.get(m) is not None for row in there)]
-        body = []
-        for name, row, (value, low, high) in zip(names, there, ends, strict=True):
-            r_cum = f"{_shown(value)} [{_shown(low)}, {_shown(high)}]"
-            body.append((name, [r_cum, *(_shown(row.get(metric)) for metric in shown)]))
-        table = Table(f"{world}: means of episodes", "policy", ["R_cum", *shown], body)
-        drawn.append((charts.bar_chart(f"R_cum in {world}, with 95% intervals", bars), table))
-    return drawn
-
-
-def _row_names(rows: Sequence[Row]) -> list[str]:
-    """The policies; where one comes twice, with what tells its rows apart."""
-    names = []
-    for row in rows:
-        same = [other for other in rows if other["policy"] == row["policy"]]
-        telling = ("run", "checkpoint", *_SEEDS)
-        apart = [key for key in telling if any(o.get(key) != row.get(key) for o in same)]
-        names.append(
-            ", ".join([row["policy"], *(f"{key} {_shown(row.get(key))}" for key in apart)])
-        )
-    return names
-
-
-def _shown(value: Any) -> str:
-    if value is None or (isinstance(value, float) and not math.isfinite(value)):
-        return "–"
-    if isinstance(value, float):
-        return f"{value:,.0f}" if abs(value) >= 10_000 else f"{value:.4g}"
-    return f"{value:,}" if type(value) is int else str(value)

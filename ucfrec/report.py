@@ -81,6 +81,7 @@ def write_report(out: Path, runs: Sequence[Path], results: Sequence[Path] = ()) 
         sections=[_section(of) for of in of_data.values()],
         worlds=worlds([row for path in results for row in read_results(path)]),
         layout=charts,
+        points=_POINTS,
     )
     with atomic_file(out) as scratch:
         # Folder names need not be Unicode.
@@ -150,7 +151,7 @@ def _summary(runs: Sequence[_Run]) -> Table:
     fitted = [run.record.get("policy", {}) for run in runs]
     rows: list[tuple[str, list[Any]]] = [
         ("learner", [learner_of(run.record) for run in runs]),
-        ("seed", [run.record["seed"] for run in runs]),
+        ("seed", [str(run.record["seed"]) for run in runs]),
         ("status", [run.status for run in runs]),
         ("best validation loss", [fit.get("best_validation") for fit in fitted]),
         ("at step", [fit.get("best_step") for fit in fitted]),

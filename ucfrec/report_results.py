@@ -55,11 +55,11 @@ def worlds(rows: Sequence[Row]) -> list[tuple[charts.BarChart, Table]]:
             (name, float(row["R_cum"]), float(row["R_cum_low"]), float(row["R_cum_high"]))
             for name, row in zip(names, there, strict=True)
         ]
-        columns = [m for m in (*_METRICS, *_SEEDS) if any(row.get(m) is not None for row in there)]
+        columns = [c for c in (*_METRICS, *_SEEDS) if any(row.get(c) is not None for row in there)]
         body = []
         for row, (name, value, low, high) in zip(there, bars, strict=True):
             r_cum = f"{shown(value)} [{shown(low)}, {shown(high)}]"
-            body.append((name, [r_cum, *(shown(row.get(metric)) for metric in columns)]))
+            body.append((name, [r_cum, *(_cell(row, column) for column in columns)]))
         table = Table(f"{world}: means of episodes", "policy", ["R_cum", *columns], body)
         drawn.append((charts.bar_chart(f"R_cum in {world}, with 95% intervals", bars), table))
     return drawn
@@ -72,5 +72,10 @@ def _row_names(rows: Sequence[Row]) -> list[str]:
         same = [other for other in rows if other["policy"] == row["policy"]]
         telling = ("run", "checkpoint", *_SEEDS)
         apart = [key for key in telling if any(o.get(key) != row.get(key) for o in same)]
-        names.append(", ".join([row["policy"], *(f"{key} {shown(row.get(key))}" for key in apart)]))
+        names.append(", ".join([row["policy"], *(f"{key} {_cell(row, key)}" for key in apart)]))
     return names
+
+
+def _cell(row: Row, column: str) -> str:
+    value = row.get(column)
+    return str(value) if column in _SEEDS and value is not None else shown(value)

@@ -76,12 +76,13 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"ucfrec {__version__}")
     parser.add_argument("--debug", action="store_true", help="show tracebacks of input errors")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    _demo(commands.add_parser("demo", help="everything on simulated logs, ends in a table"))
+    _demo(commands.add_parser("demo", help="everything on simulated logs, ends in a report"))
     _collect(commands.add_parser("collect", help="play sessions in a simulator, as Parquet logs"))
     _prepare(commands.add_parser("prepare", help="logs to an episode store"))
     train_options(commands.add_parser("train", help="train a policy on a store; resumes"))
     _evaluate(commands.add_parser("evaluate", help="what a policy earns in a simulator"))
     _recommend(commands.add_parser("recommend", help="the next items for users of a log"))
+    _report(commands.add_parser("report", help="one HTML page about runs"))
     _benchmark(commands.add_parser("benchmark", help="tables of every method; resumes"))
     return parser
 
@@ -177,6 +178,20 @@ def _recommend(parser: argparse.ArgumentParser) -> None:
     )
     _target_options(parser)
     parser.add_argument("--out", type=Path, required=True, help="Parquet file")
+
+
+def _report(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
+    parser.add_argument(
+        "--results",
+        nargs="+",
+        action="extend",
+        type=Path,
+        default=[],
+        metavar="FILE",
+        help="rows of `ucfrec evaluate --json` or of the demo, JSON or JSON lines",
+    )
+    parser.add_argument("--out", type=Path, default=Path("report.html"), help="(report.html)")
 
 
 def _benchmark(parser: argparse.ArgumentParser) -> None:

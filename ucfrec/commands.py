@@ -20,6 +20,7 @@ from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, read_histo
 from ucfrec.logs.report import format_report
 from ucfrec.plugins import Benchmark, load_plugin
 from ucfrec.recommend import LONGEST_HISTORY, Histories, recommend
+from ucfrec.report import write_report
 from ucfrec.results import format_rows
 from ucfrec.run import describe_run, train_run
 from ucfrec.store import EpisodeStore
@@ -30,7 +31,7 @@ def run_demo(options: argparse.Namespace) -> None:
     """`ucfrec demo`."""
     rows = demo(options.out, options.seed, DemoConfig())
     print(format_rows(rows))
-    print(f"\nrows: {options.out / 'results.json'}; logs, stores and runs lie beside it")
+    print(f"\nreport: {options.out / 'report.html'}; rows, logs, stores and runs lie beside it")
 
 
 def run_collect(options: argparse.Namespace) -> None:
@@ -147,6 +148,12 @@ def run_recommend(options: argparse.Namespace) -> None:
     print(f"{options.out}: {rows:,} rows")
 
 
+def run_report(options: argparse.Namespace) -> None:
+    """`ucfrec report`."""
+    write_report(options.out, options.runs, options.results)
+    print(f"report: {options.out}; open it in a browser")
+
+
 def run_benchmark(options: argparse.Namespace) -> None:
     """`ucfrec benchmark`."""
     suite: Benchmark = load_plugin("benchmarks", options.suite)
@@ -163,5 +170,6 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], Any]] = {
     "train": run_train,
     "evaluate": run_evaluate,
     "recommend": run_recommend,
+    "report": run_report,
     "benchmark": run_benchmark,
 }

@@ -32,7 +32,8 @@ def evaluate_run(
 ) -> list[dict[str, Any]]:
     """One result row for each checkpoint and target return.
 
-    All rows play the same starts. IQL and CQL have a last checkpoint only, and no target. A policy trained with distractors sees them fixed to 0.
+    All rows play the same starts. A policy trained with distractors sees them fixed to 0. IQL and
+    CQL have a last checkpoint only, and are asked for no return.
 
     Args:
         run: a run folder on a control store.

@@ -112,6 +112,9 @@ def _evaluate(parser: argparse.ArgumentParser) -> None:
         help="return asked of an episode; repeatable (the preset's)",
     )
     parser.add_argument("--checkpoint", choices=["both", "best", "last"], default="both")
+    parser.add_argument(
+        "--video", type=Path, metavar="MP4", help="show an episode: FILE.mp4, or folder for frames"
+    )
     parser.add_argument("--json", type=Path, help="write the result rows here")
 
 

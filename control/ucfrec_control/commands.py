@@ -30,6 +30,7 @@ from ucfrec_control.scores import find_task
 from ucfrec_control.screening import ScreeningConfig, describe_screening, screen
 from ucfrec_control.train import dataset_of, preset_of, train_control
 from ucfrec_control.trajectories import PACKAGES, Trajectories
+from ucfrec_control.video import record_episode
 
 
 def run_prepare(options: argparse.Namespace) -> None:
@@ -111,6 +112,8 @@ def run_train(options: argparse.Namespace) -> None:
 
 def run_evaluate(options: argparse.Namespace) -> None:
     """`ucfrec-control evaluate`."""
+    if options.video is not None:
+        _record(options)
     rows: list[dict[str, Any]] = []
     for run in options.runs:
         rows += evaluate_run(
@@ -126,6 +129,20 @@ def run_evaluate(options: argparse.Namespace) -> None:
         print(f"warning: {warning}", file=sys.stderr)
     if options.json is not None:
         write_json(options.json, [row | provenance(PACKAGES) for row in rows])
+
+
+def _record(options: argparse.Namespace) -> None:
+    if len(options.runs) != 1:
+        raise InputError(f"--video shows one run; {len(options.runs)} were given")
+    earned = record_episode(
+        options.runs[0],
+        options.video,
+        seed=options.seed,
+        checkpoint="best" if options.checkpoint == "best" else "last",
+        env_id=options.env,
+        target=next(iter(options.target), None),
+    )
+    print(f"{options.video}: an episode of return {earned:.1f}\n")
 
 
 def run_benchmark(options: argparse.Namespace) -> None:

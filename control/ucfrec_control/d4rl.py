@@ -64,7 +64,7 @@ def read_d4rl(path: Path, env_id: str | None = None) -> Trajectories:
         "where": str(path),
         "format": "d4rl",
         "dataset": dataset_name(path),
-        "env_id": named or (task.d4rl_env if task else None),
+        "env_id": named or (task.d4rl_env(dataset_name(path)) if task else None),
         "versions": _made_with(path),
         "dropped": {
             "unfinished_steps": len(terminals) - n,

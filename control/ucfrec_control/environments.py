@@ -1,7 +1,7 @@
 """Environments to judge in: vectorised, of the version that the data was made in."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
@@ -13,23 +13,41 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from ucfrec.errors import InputError
+from ucfrec_control.antmaze import GoalObservations, antmaze_settings, is_antmaze, is_rebuilt
 
 SIDE_BY_SIDE = 50
 """Most episodes played at once; one forward pass serves them all."""
 
 
-def make_env(env_id: str, count: int, appended: Sequence[float] = ()) -> VectorEnv[Any, Any, Any]:
+Wrap = Callable[[gymnasium.Env[Any, Any]], gymnasium.Wrapper[Any, Any, Any, Any]]
+
+
+def make_env(
+    env_id: str,
+    count: int,
+    appended: Sequence[float] = (),
+    settings: Mapping[str, Any] | None = None,
+    wrappers: Sequence[Wrap] = (),
+) -> VectorEnv[Any, Any, Any]:
     """`count` environments in one process that reset within the step.
 
-    In one process because MuJoCo's steps cost less than talking to others (measured).
+    In one process because MuJoCo's steps cost less than talking to others (measured). AntMaze shows
+    D4RL's vectors and returns 1 for success and else 0.
 
     Args:
         appended: constants after every observation, where a policy was trained with distractors.
+        settings: arguments of the environment.
+        wrappers: around each of them.
 
     Raises:
         InputError: the environment is not registered or cannot be started here.
     """
-    wrappers = [partial(AppendedConstants, constants=appended)] if len(appended) else []
+    settings, wrappers = dict(settings or {}), list(wrappers)
+    if is_antmaze(env_id):
+        settings |= antmaze_settings(env_id)
+        wrappers = [GoalObservations, *wrappers]
+    if len(appended):
+        wrappers.append(partial(AppendedConstants, constants=appended))
     try:
         with warnings.catch_warnings():
             # D4RL's data is of v4: the version is old on purpose.
@@ -40,8 +58,9 @@ def make_env(env_id: str, count: int, appended: Sequence[float] = ()) -> VectorE
                 vectorization_mode="sync",
                 vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
                 wrappers=wrappers,
+                **settings,
             )
-    except (gymnasium.error.Error, ImportError) as error:
+    except (gymnasium.error.Error, ImportError, TypeError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(
             f"the environment {env_id} cannot be made ({reason}); install ucfrec[control], or name "
@@ -74,7 +93,12 @@ def mismatches(dataset: Mapping[str, Any], env_id: str) -> list[str]:
     found = []
     if dataset["env_id"] not in (None, env_id):
         found.append(f"the data is of {dataset['env_id']}, it is judged in {env_id}")
-    for package in ("gymnasium", "mujoco"):
+    if is_rebuilt(env_id):
+        found.append(
+            f"{env_id} is rebuilt from D4RL's code on MuJoCo {version('mujoco')}; nobody has "
+            "replayed D4RL's trajectories in it"
+        )
+    for package in ("gymnasium", "mujoco", "gymnasium-robotics"):
         made_with = dataset["versions"].get(package)
         try:
             here = version(package)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gymnasium.vector import VectorEnv
 
 from ucfrec.errors import InputError
 from ucfrec.files import read_json
@@ -12,11 +13,12 @@ from ucfrec.metrics import bootstrap_interval
 from ucfrec.results import config_hash
 from ucfrec.rollout import rollout
 from ucfrec.trained import RUN, TrainedPolicy, learner_of
-from ucfrec_control.environments import SIDE_BY_SIDE, make_env, mismatches
+from ucfrec_control.environments import SIDE_BY_SIDE, Wrap, make_env, mismatches
 from ucfrec_control.presets import find_preset
 from ucfrec_control.rl_baselines import RLPolicy, is_rl
 from ucfrec_control.scores import find_kind, require_task
 
+Trained = TrainedPolicy | RLPolicy
 CHECKPOINTS = ("last", "best")
 SHOWN = ("dataset", "method", "seed", "checkpoint", "target_return", "score", "return", "episodes")
 
@@ -43,25 +45,85 @@ def evaluate_run(
         targets: returns to ask for; empty for those of the preset.
 
     Raises:
-        InputError: the run is not on a control store, or its environment cannot be told or made.
+        InputError: the run is not on a control store, or keeps none of `checkpoints`, or its
+            environment cannot be told or made.
     """
     if episodes < 1:
         raise InputError(f"{episodes} episodes were asked for; at least one is needed")
     rows = []
-    rl = (run / RUN).exists() and is_rl(read_json(run / RUN))
-    for checkpoint in ("last",) if rl else checkpoints:
-        trained = RLPolicy(run) if rl else TrainedPolicy.load(run, checkpoint)
-        dataset = trained.record.get("dataset")
-        if dataset is None:
-            raise InputError(f"{run} is not a run of `ucfrec-control train`; `ucfrec` judges it")
-        world = env_id or dataset["env_id"]
-        if world is None:
-            raise InputError(f"{run}: its data does not tell the environment; name it with --env")
+    for checkpoint in _kept(run, checkpoints):
+        trained = load_run(run, checkpoint)
+        world = world_of(trained, env_id)
         rows += [
             _row(trained, world, target, episodes, seed) | {"checkpoint": checkpoint}
-            for target in _targets(trained, world, targets)
+            for target in targets_of(trained, world, targets)
         ]
     return [row | {"run": str(run)} for row in rows]
+
+
+def _kept(run: Path, checkpoints: Sequence[str]) -> Sequence[str]:
+    return ("last",) if _is_rl_run(run) and "last" in checkpoints else checkpoints
+
+
+def _is_rl_run(run: Path) -> bool:
+    return (run / RUN).exists() and is_rl(read_json(run / RUN))
+
+
+def load_run(run: Path, checkpoint: str) -> Trained:
+    """The policy of a run on a control store.
+
+    Raises:
+        InputError: it is no such run, or has no such checkpoint.
+    """
+    rl = _is_rl_run(run)
+    if rl and checkpoint != "last":
+        raise InputError(
+            f"{run} is of IQL or CQL, which keep their last checkpoint only; ask for --checkpoint "
+            "last"
+        )
+    trained = RLPolicy(run) if rl else TrainedPolicy.load(run, checkpoint)
+    if trained.record.get("dataset") is None:
+        raise InputError(f"{run} is not a run of `ucfrec-control train`; `ucfrec` judges it")
+    return trained
+
+
+def world_of(trained: Trained, env_id: str | None) -> str:
+    """The environment asked for, or that of the data.
+
+    Raises:
+        InputError: neither is known.
+    """
+    dataset = trained.record["dataset"]
+    world: str | None = env_id or dataset["env_id"]
+    if world is None:
+        raise InputError(
+            f"the data of {dataset['dataset']} does not tell the environment; name it with --env"
+        )
+    return world
+
+
+def open_world(
+    trained: Trained, env_id: str, count: int, wrappers: Sequence[Wrap] = (), **settings: Any
+) -> VectorEnv[Any, Any, Any]:
+    """`count` environments as the data has them, distractors fixed to 0.
+
+    Raises:
+        InputError: `env_id` cannot be made, or is not of the sizes that the policy was trained on.
+    """
+    record, dataset = trained.record, trained.record["dataset"]
+    own = dataset.get("env_settings", {}) if env_id == dataset["env_id"] else {}
+    appended = [0.0] * len(dataset.get("distractors", []))
+    env = make_env(env_id, count, appended, {**own, **settings}, wrappers)
+    shown = int(np.prod(env.single_observation_space.shape or ()))
+    sizes = (shown, *(env.single_action_space.shape or ()))
+    wanted = (record["sizes"]["state"], record["sizes"]["action"])
+    if sizes != wanted:
+        env.close()
+        raise InputError(
+            f"observations and actions of {env_id} have sizes {sizes}, the policy was trained "
+            f"on {wanted}"
+        )
+    return env
 
 
 def method_of(record: Mapping[str, Any]) -> str:
@@ -70,8 +132,8 @@ def method_of(record: Mapping[str, Any]) -> str:
     return name + ("-screened" if record["dataset"].get("screened") else "")
 
 
-def _targets(
-    trained: TrainedPolicy | RLPolicy, env_id: str, asked: Sequence[float]
+def targets_of(
+    trained: Trained, env_id: str, asked: Sequence[float] = ()
 ) -> Sequence[float | None]:
     """The targets asked for, or those of the preset."""
     if isinstance(trained, RLPolicy):
@@ -85,22 +147,11 @@ def _targets(
     return find_preset(task.name, find_kind(dataset["dataset"]), learner).targets
 
 
-def _row(
-    trained: TrainedPolicy | RLPolicy, env_id: str, target: Any, episodes: int, seed: int
-) -> dict[str, Any]:
+def _row(trained: Trained, env_id: str, target: Any, episodes: int, seed: int) -> dict[str, Any]:
     record, dataset = trained.record, trained.record["dataset"]
     task = require_task(env_id, dataset["dataset"])
-    appended = [0.0] * len(dataset.get("distractors", []))
-    env = make_env(env_id, min(episodes, SIDE_BY_SIDE), appended)
+    env = open_world(trained, env_id, min(episodes, SIDE_BY_SIDE))
     try:
-        shown = int(np.prod(env.single_observation_space.shape or ()))
-        sizes = (shown, *(env.single_action_space.shape or ()))
-        wanted = (record["sizes"]["state"], record["sizes"]["action"])
-        if sizes != wanted:
-            raise InputError(
-                f"observations and actions of {env_id} have sizes {sizes}, the policy was trained "
-                f"on {wanted}"
-            )
         actor = trained.actor(env.num_envs, target)
         played = rollout(env, actor, episodes, seed, describe=f"{trained.name} in {env_id}")
     finally:

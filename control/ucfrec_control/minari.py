@@ -16,6 +16,7 @@ from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 
 from ucfrec.errors import InputError
+from ucfrec_control.antmaze import antmaze_settings, is_antmaze
 from ucfrec_control.scores import dataset_name
 from ucfrec_control.trajectories import Trajectories
 
@@ -70,6 +71,7 @@ def read_minari(source: str, env_id: str | None = None, download: bool = False) 
             "format": "minari",
             "dataset": dataset_name(dataset.id),
             "env_id": env_id or (spec.id if spec is not None else None),
+            "env_settings": {} if env_id or spec is None else _settings(spec),
             "versions": _made_with(dataset.storage.metadata),
             "dropped": {
                 "unfinished_steps": sum(map(len, episodes)) - sum(map(len, whole)),
@@ -172,10 +174,17 @@ def _root() -> Path:
 def _spec(env_id: str | None) -> gymnasium.envs.registration.EnvSpec | None:
     if env_id is None:
         return None
+    if is_antmaze(env_id):
+        antmaze_settings(env_id)
     try:
         return gymnasium.spec(env_id)
     except gymnasium.error.Error as error:
         raise InputError(f"the environment {env_id} is not known here ({error})") from None
+
+
+def _settings(spec: gymnasium.envs.registration.EnvSpec) -> dict[str, Any]:
+    """What else than its name makes the environment, as the maze of AntMaze."""
+    return {name: value for name, value in spec.kwargs.items() if name != "render_mode"}
 
 
 def _box(size: int) -> gymnasium.spaces.Box:

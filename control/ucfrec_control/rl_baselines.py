@@ -1,5 +1,6 @@
 """IQL and CQL of d3rlpy (extra `rl`) on control stores, with CORL's settings (reference §3)."""
 
+import logging
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -209,8 +210,12 @@ def _normalised(
 def _d3rlpy() -> Any:
     try:
         import d3rlpy
+        import structlog
     except ImportError:
         raise InputError(
             "IQL and CQL need d3rlpy, which is not installed; install ucfrec[control,rl]"
         ) from None
+    # What it says of every training, on stdout, is not what was asked for.
+    level = structlog.make_filtering_bound_logger(logging.WARNING)
+    structlog.configure(wrapper_class=level)
     return d3rlpy

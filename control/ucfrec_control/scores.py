@@ -1,7 +1,7 @@
 """Tasks, their environments, and D4RL's normalised scores."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,30 +25,47 @@ class Task:
     """D4RL's reference return of a random policy: score 0."""
     high: float
     """D4RL's reference return of an expert: score 100."""
-    d4rl_env: str | None
-    """Environment that D4RL's own datasets were made in, in its oldest gymnasium version; None
-    where the datasets of the task differ in it."""
+    d4rl_envs: Mapping[str, str]
+    """Environments that D4RL's own datasets were made in, in their oldest gymnasium version, by
+    what the dataset's name matches."""
 
     def score(self, returns: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Returns on the scale where a random policy has 0 and an expert 100."""
         return 100 * (np.asarray(returns, dtype=np.float64) - self.low) / (self.high - self.low)
 
+    def d4rl_env(self, dataset: str) -> str | None:
+        """The environment of a dataset of D4RL; None where its name does not tell."""
+        plain = _plain(dataset)
+        return next((env for name, env in self.d4rl_envs.items() if name in plain), None)
+
+
+def _plain(name: str) -> str:
+    return re.sub("[-_/ ]", "", name.lower())
+
+
+D4RL_ANTMAZE = "d4rl/antmaze-{maze}-v2"
+"""`ucfrec_control.antmaze` registers it."""
+_MAZES = {
+    # The files themselves are named otherwise (`Ant_maze_big-maze_…`) than their datasets.
+    **{"umaze": "umaze", "medium": "medium", "bigmaze": "medium"},
+    **{"large": "large", "hardestmaze": "large"},
+}
+_ANTMAZES = {name: D4RL_ANTMAZE.format(maze=maze) for name, maze in _MAZES.items()}
 
 # Source: d4rl/infos.py (REF_MIN_SCORE, REF_MAX_SCORE).
 TASKS = (
-    Task("hopper", "hopper", (11, 3), -20.272305, 3234.3, "Hopper-v4"),
-    Task("halfcheetah", "halfcheetah", (17, 6), -280.178953, 12135.0, "HalfCheetah-v4"),
-    Task("walker2d", "walker2d", (17, 6), 1.629008, 4592.3, "Walker2d-v4"),
-    Task("antmaze", "antmaze", (29, 8), 0.0, 1.0, None),
+    Task("hopper", "hopper", (11, 3), -20.272305, 3234.3, {"": "Hopper-v4"}),
+    Task("halfcheetah", "halfcheetah", (17, 6), -280.178953, 12135.0, {"": "HalfCheetah-v4"}),
+    Task("walker2d", "walker2d", (17, 6), 1.629008, 4592.3, {"": "Walker2d-v4"}),
+    Task("antmaze", "antmaze", (29, 8), 0.0, 1.0, _ANTMAZES),
 )
 
 
 def find_task(*names: str | None) -> Task | None:
     """The task that the first telling one of `names` (of environments, files, datasets) is of."""
     for name in names:
-        plain = re.sub("[-_/ ]", "", (name or "").lower())
         for task in TASKS:
-            if task.pattern in plain:
+            if task.pattern in _plain(name or ""):
                 return task
     return None
 
@@ -69,8 +86,8 @@ def require_task(*names: str | None) -> Task:
     return task
 
 
-# Most specific first: "medium" is part of the others.
-_KINDS = ("medium-replay", "medium-expert", "medium", "mixed", "expert", "random", "diverse")
+# Most specific first: "medium" is part of the others, and a size of AntMaze's mazes.
+_KINDS = ("diverse", "medium-replay", "medium-expert", "medium", "mixed", "expert", "random")
 
 
 def find_kind(name: str) -> str:

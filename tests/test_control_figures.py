@@ -174,7 +174,7 @@ def test_one_command_draws_what_it_can_and_names_what_is_missing(
     assert main([*arguments, "--out", str(out)]) == 0
     printed = capsys.readouterr()
     names = {"lambda-small", "moves-faithful", "states-faithful", "acceptance-faithful"}
-    names |= {"attention-faithful", "training-hopper_medium-made"}
+    names |= {"attention-faithful", "moves-tangent", "training-hopper_medium-made"}
     assert {path.name for path in out.iterdir()} == {
         f"{name}.{kind}" for name in names for kind in ("png", "svg")
     }
@@ -192,3 +192,29 @@ def test_one_command_draws_what_it_can_and_names_what_is_missing(
         "acceptance-tangent",
         "attention-tangent",
     }
+
+
+def test_runs_with_other_settings_are_no_seeds_of_one_another(runs: Path, tmp_path: Path) -> None:
+    """As in a sweep of the benchmark; runs of IQL among them have no losses to show."""
+    folder = tmp_path / "gate" / "hopper"
+    for kind in KINDS:
+        for seed in ("0", "1"):
+            shutil.copytree(runs / kind, folder / f"{kind}-{seed}")
+            record = read_json(runs / kind / "run.json") | {"store": str(tmp_path / "gone")}
+            (folder / f"{kind}-{seed}" / "run.json").write_text(json.dumps(record))
+    (folder / "iql-0").mkdir()
+    config = {"policy_name": "iql", "policy": {}, "seed": 0}
+    (folder / "iql-0" / "run.json").write_text(json.dumps(record | {"config": config}))
+    made, missing = make_figures([tmp_path], [], tmp_path / "figures")
+    first = {f"gate-hopper-{kind}-0" for kind in KINDS}
+    assert {path.stem for path in made} == {
+        "training-gate-hopper",
+        *(f"moves-{name}" for name in first),
+    }
+    needs_store = {line.partition(":")[0] for line in missing if "gone" in line}
+    assert needs_store == {
+        f"{figure}-{name}" for figure in ("states", "acceptance", "attention") for name in first
+    }
+    drawn = (tmp_path / "figures" / "training-gate-hopper.svg").read_text()
+    assert all(f"<!-- {kind} -->" in drawn for kind in KINDS)
+    assert "iql" not in drawn

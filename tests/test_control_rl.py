@@ -1,6 +1,7 @@
 """IQL and CQL of d3rlpy: what they read, that they resume, and rows like everybody else's."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -31,7 +32,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> EpisodeStore:
 
 @pytest.mark.parametrize("algorithm", ["iql", "cql"])
 def test_equal_seeds_train_equal_actors_that_are_judged_as_others_are(
-    store: EpisodeStore, tmp_path: Path, algorithm: str
+    store: EpisodeStore, tmp_path: Path, algorithm: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = rl_config(dataset_of(store), algorithm, steps=4)
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
@@ -41,7 +42,11 @@ def test_equal_seeds_train_equal_actors_that_are_judged_as_others_are(
     (row,) = evaluate_run(tmp_path / "a", episodes=2, seed=0)
     assert (row["method"], row["checkpoint"], row["target_return"]) == (algorithm, "last", None)
     assert row["fingerprint"] == store.meta["fingerprint"]
-    assert main(["evaluate", str(tmp_path / "a"), "--episodes", "2"]) == 0
+    capsys.readouterr()
+    asked = ["evaluate", str(tmp_path / "a"), "--episodes", "2"]
+    assert main(asked) == 0
+    assert main([*asked, "--checkpoint", "best"]) == 2
+    assert "keep their last checkpoint only" in capsys.readouterr().err
 
 
 def test_a_finished_run_is_read_and_another_configuration_refused(
@@ -56,7 +61,7 @@ def test_a_finished_run_is_read_and_another_configuration_refused(
 
 
 def test_the_benchmark_finds_its_rl_rows_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
     monkeypatch.setitem(TABLES, "main", {"iql": ("iql", ())})
@@ -67,3 +72,8 @@ def test_the_benchmark_finds_its_rl_rows_again(
     assert benchmark(tmp_path, tmp_path / "runs", results, budget, "tiny", 1) == [row]
     assert len(results.read_text().splitlines()) == 1
     assert json.loads(results.read_text()) == row
+    printed = capfd.readouterr()
+    assert "1 cells, 1 of them left" in printed.err
+    assert "1 cells, 0 of them left" in printed.err
+    # Neither here nor in the workers does d3rlpy tell of its trainings.
+    assert "[info" not in re.sub(r"\x1b\[[\d;]*m", "", printed.out)

@@ -2,6 +2,7 @@
 
 import json
 import multiprocessing
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -43,6 +44,8 @@ def run_grid(
     found = [_matching(known, keys(cell)) for cell in cells]
     missing = [at for at, rows in enumerate(found) if not rows]
     failed: list[str] = []
+    left = f"{len(cells)} cells, {len(missing)} of them left to measure"
+    print(f"{describe}: {left}", file=sys.stderr)
     if missing:
         results.parent.mkdir(parents=True, exist_ok=True)
         spawn = multiprocessing.get_context("spawn")

@@ -1,7 +1,8 @@
 """`ucfrec-control figures`: every figure that stored runs and result rows have the data for."""
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from ucfrec.errors import InputError
 from ucfrec.events import read_scalars
 from ucfrec.files import read_json
 from ucfrec.grid import Row, read_rows
+from ucfrec.results import config_hash
 from ucfrec.trained import RUN
 from ucfrec_control import diagnostics, plots
 from ucfrec_control.evaluate import method_of
@@ -54,7 +56,15 @@ class _Run:
     group: str
     """The same of the folder it lies in; of runs given by themselves, the dataset."""
     method: str
-    title: str
+    """Runs of one group that have it in common differ in their seed only."""
+    policy: str
+    settings: str
+    """Hash of the data and of all that a training is told but the seed."""
+    about: str
+
+    @property
+    def title(self) -> str:
+        return f"{label(self.method)} on {self.about}"
 
 
 def make_figures(
@@ -74,7 +84,7 @@ def make_figures(
     Raises:
         InputError: a file of `results` holds something else.
     """
-    found = [run for folder in runs for run in _runs(folder)]
+    found = _told_apart([run for folder in runs for run in _runs(folder)])
     rows = [row for path in results for row in read_rows(path)]
     plans = [*_of_runs(found), *_of_rows(rows)]
     made: list[Path] = []
@@ -93,15 +103,30 @@ def _runs(folder: Path) -> Iterator[_Run]:
         record, path = read_json(file), file.parent
         if "dataset" not in record:
             continue
-        below, dataset, method = path.relative_to(folder), record["dataset"], method_of(record)
+        below, dataset, config = path.relative_to(folder), record["dataset"], record["config"]
         distracted = " with a distractor" if dataset.get("distractors") else ""
         yield _Run(
             path=path,
             name="-".join(below.parts) or path.resolve().name,
             group="-".join(below.parent.parts) or dataset["dataset"],
-            method=method,
-            title=f"{label(method)} on {dataset['dataset']}{distracted}",
+            method=method_of(record),
+            policy=config["policy_name"],
+            settings=config_hash({**config, "seed": None, "data": record["fingerprint"]}),
+            about=f"{dataset['dataset']}{distracted}",
         )
+
+
+def _told_apart(runs: Sequence[_Run]) -> list[_Run]:
+    """The runs, of which those with other settings go by their folder's name, less the seed."""
+    settings: dict[tuple[str, str], set[str]] = {}
+    for run in runs:
+        settings.setdefault((run.group, run.method), set()).add(run.settings)
+    return [
+        replace(run, method=re.sub(r"-\d+$", "", run.path.resolve().name))
+        if len(settings[run.group, run.method]) > 1
+        else run
+        for run in runs
+    ]
 
 
 def _of_runs(runs: Sequence[_Run]) -> Iterator[_Plan]:
@@ -110,7 +135,7 @@ def _of_runs(runs: Sequence[_Run]) -> Iterator[_Plan]:
             yield _Plan("moves", run.name, partial(_moves, run))
             yield _Plan("states", run.name, partial(_states, run))
             yield _Plan("acceptance", run.name, partial(_acceptance, run))
-        if run.method.startswith("ucf"):
+        if run.policy == "ucf":
             yield _Plan("attention", run.name, partial(_attention, run))
     for run in _first(runs, lambda run: run.group):
         there = [other for other in runs if other.group == run.group]

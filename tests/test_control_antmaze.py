@@ -17,7 +17,6 @@ from minari.data_collector import EpisodeBuffer
 from tests.control_files import hopper_like, write_hdf5
 from ucfrec.errors import InputError
 from ucfrec.rollout import rollout
-from ucfrec.store import EpisodeStore
 from ucfrec_control.antmaze import antmaze_settings
 from ucfrec_control.cli import main
 from ucfrec_control.d4rl import read_d4rl
@@ -256,4 +255,14 @@ def test_without_gymnasium_robotics_one_line_says_what_to_install(
     assert "install ucfrec[control,antmaze]" in line
     with pytest.raises(InputError, match="needs gymnasium-robotics"):
         make_env("AntMaze_UMaze-v4", 1)
-    assert EpisodeStore.open(run.parent / "store").lengths.max() == 9
+
+
+def test_d4rl_files_go_to_minari_and_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without gymnasium-robotics: no environment is made."""
+    monkeypatch.setitem(sys.modules, "gymnasium_robotics", None)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    file = write_hdf5(tmp_path / "antmaze-umaze-v2.hdf5", ant_columns((9, 8)), env_id=None)
+    assert main(["convert", str(file), "antmaze/mine-v0"]) == 0
+    read = read_minari("antmaze/mine-v0")
+    assert (read.source["env_id"], read.source["env_settings"]) == (REBUILT, {"maze": "umaze"})
+    np.testing.assert_array_equal(read.observations, read_d4rl(file).observations)

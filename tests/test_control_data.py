@@ -79,7 +79,7 @@ def test_steps_on_the_goal_are_dropped_of_antmaze_alone(tmp_path: Path) -> None:
     read = read_d4rl(write_hdf5(tmp_path / "antmaze-umaze-v2.hdf5", ant, env_id=None))
     assert read.lengths.tolist() == [4, 6, 3]
     assert read.source["dropped"]["one_step_trajectories"] == 1
-    assert read.source["env_id"] is None
+    assert read.source["env_id"] == "d4rl/antmaze-umaze-v2"
     assert read.final_observations is None
     kept = np.delete(columns["rewards"], 4)
     np.testing.assert_array_equal(read.rewards, kept)

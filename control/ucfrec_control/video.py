@@ -21,7 +21,8 @@ from ucfrec_control.evaluate import load_run, open_world, targets_of, world_of
 
 Frame = npt.NDArray[np.uint8]
 """(height, width, 3)."""
-Take = Callable[[Frame], None]
+Take = Callable[[Frame, float], None]
+"""Of a frame, and how many of them are a second of the world."""
 _VIDEO = ".mp4"
 
 
@@ -51,17 +52,14 @@ def record_episode(
     asked: Any = targets_of(trained, world, () if target is None else (target,))[0]
     if not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")
-    taken: list[Take] = []
-    recorder = partial(_Recorder, take=lambda frame: taken[0](frame))
-    with _drawing(world):
-        env = open_world(trained, world, 1, [recorder], render_mode="rgb_array")
-    try:
-        keep = _video if out.suffix == _VIDEO else _frames
-        with keep(out, int(env.metadata["render_fps"])) as take:
-            taken.append(take)
+    with (_video if out.suffix == _VIDEO else _frames)(out) as take:
+        with _drawing(world):
+            recorder = partial(_Recorder, take=take)
+            env = open_world(trained, world, 1, [recorder], render_mode="rgb_array")
+        try:
             played = rollout(env, trained.actor(1, asked), 1, seed, describe="episode to look at")
-    finally:
-        env.close()
+        finally:
+            env.close()
     return float(played.returns[0])
 
 
@@ -88,7 +86,7 @@ class _Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         if not self._ended:
             with _drawing(str(self.spec.id) if self.spec else "the environment"):
                 frame = self.env.render()
-            self._take(np.asarray(frame))
+            self._take(np.asarray(frame), self.metadata["render_fps"])
 
 
 @contextmanager
@@ -109,14 +107,14 @@ def _drawing(world: str) -> Iterator[None]:
 
 
 @contextmanager
-def _frames(out: Path, fps: int) -> Iterator[Take]:
+def _frames(out: Path) -> Iterator[Take]:
     with atomic_folder(out) as scratch:
         number = count()
-        yield lambda frame: imsave(scratch / f"frame-{next(number):05d}.png", frame)
+        yield lambda frame, _: imsave(scratch / f"frame-{next(number):05d}.png", frame)
 
 
 @contextmanager
-def _video(out: Path, fps: int) -> Iterator[Take]:
+def _video(out: Path) -> Iterator[Take]:
     try:
         import imageio_ffmpeg
     except ImportError:
@@ -127,7 +125,7 @@ def _video(out: Path, fps: int) -> Iterator[Take]:
     with atomic_file(out) as scratch, ExitStack() as stack:
         writers: list[Any] = []
 
-        def take(frame: Frame) -> None:
+        def take(frame: Frame, fps: float) -> None:
             if not writers:
                 size = (frame.shape[1], frame.shape[0])
                 writer = imageio_ffmpeg.write_frames(

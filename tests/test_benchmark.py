@@ -92,7 +92,7 @@ def test_every_cell_of_every_table_has_a_configuration(
 
 def test_unknown_tables_are_named(tmp_path: Path) -> None:
     suite: Benchmark = load_plugin("benchmarks", "recommendation")
-    with pytest.raises(InputError, match="tables are main, sweeps, badge"):
+    with pytest.raises(InputError, match="tables are main, badge, sweeps"):
         suite.run("small", ["table-2"], tmp_path, tmp_path / "rows.jsonl", 1)
 
 

@@ -25,6 +25,7 @@ class Budget:
     """Of all methods, over their defaults."""
     judging: Judging
     sweep_seeds: int
+    """Of the sweeps and of the badge."""
 
 
 TARGETS: Final = (0.5, 0.9, 0.99, 1.0)
@@ -52,8 +53,8 @@ BUDGETS: Final[Mapping[str, Budget]] = {
         sweep_seeds=3,
     ),
 }
-_CONTEXT: Final = "policy.context=10"
-"""Of all methods with a memory: sessions are short."""
+_CONTEXT: Final = {"kuairand": 5}
+"""K of all methods with a memory, where it is not 10: KuaiRand's sessions are of two steps."""
 
 LAMBDAS: Final = (0.0, 0.05, 0.1, 0.25, 0.5, 1.0)
 BANDS: Final = ((0.05, 0.2), (0.2, 0.5), (0.5, 1.0), (1.0, 2.0))
@@ -63,7 +64,7 @@ BADGE_METHODS: Final = tuple(
     name for name, method in METHODS.items() if method.conditioned or name == "bc"
 )
 MAIN: Final = ("kuairand", "kuairec", "virtual-taobao", "synthetic-catalog")
-SWEPT: Final = ("kuairand", "virtual-taobao", "synthetic-catalog")
+SWEPT: Final = ("synthetic-catalog", "virtual-taobao")
 _REAL: Final = {"kuairand": "kuairand", "kuairec": "kuairec", "virtual-taobao": "virtualtaobao"}
 """What needs files that are not part of the package, and their folder in the data folder."""
 _KNOWN_BADGES: Final = {"synthetic-taobao": 0, "kuairand": 2}
@@ -120,7 +121,7 @@ class Plan:
                 plant_badge(EpisodeStore.open(clean.store), planted)
             shown = tuple(BadgedWorld(world.name, world.folder, rate) for rate in (OFF, ON))
             badged = Arena(planted, shown, ())
-            for seed in range(self._budget.seeds):
+            for seed in range(self._budget.sweep_seeds):
                 for method in BADGE_METHODS:
                     given = METHODS[method]
                     yield from self._trained(name, clean, method, given, seed)
@@ -146,7 +147,8 @@ class Plan:
         items = EpisodeStore.open(arena.store).has_items
         if not (items or method.vectors):
             return
-        memory = () if method.policy in _MEMORYLESS else (_CONTEXT,)
+        context = _CONTEXT.get(name.partition(",")[0], 10)
+        memory = () if method.policy in _MEMORYLESS else (f"policy.context={context}",)
         settings = (*self._budget.settings, *memory, *method.settings)
         named = config_hash({"policy": method.policy, "settings": settings})
         yield Cell(

@@ -23,6 +23,8 @@ class Budget:
     """Collected, where logs are simulated."""
     settings: tuple[str, ...]
     """Of all methods, over their defaults."""
+    cuts: Mapping[str, tuple[str, ...]]
+    """Of single learners, by key of `ucfrec.config.POLICIES`."""
     judging: Judging
     sweep_seeds: int
     """Of the sweeps and of the badge."""
@@ -30,7 +32,8 @@ class Budget:
 
 TARGETS: Final = (0.5, 0.9, 0.99, 1.0)
 BUDGETS: Final[Mapping[str, Budget]] = {
-    # Sized for two cores: width, steps and logs are cut, methods and seeds are not.
+    # Sized for two cores: width, steps and logs are cut, and two costly parts of baselines; methods
+    # and seeds are not.
     "small": Budget(
         seeds=3,
         sessions=6000,
@@ -42,6 +45,7 @@ BUDGETS: Final[Mapping[str, Budget]] = {
             "train.validate_every=250",
             "crm.epochs=8",
         ),
+        cuts={"dt4rec": ("policy.negatives=1",), "edt4rec": ("policy.cql_steps=1000",)},
         judging=Judging(episodes=500, validation_episodes=200, quantiles=TARGETS),
         sweep_seeds=2,
     ),
@@ -49,6 +53,7 @@ BUDGETS: Final[Mapping[str, Budget]] = {
         seeds=5,
         sessions=50_000,
         settings=("train.steps=20000", "train.learning_rate=3e-4"),
+        cuts={},
         judging=Judging(episodes=5000, validation_episodes=1000, quantiles=TARGETS),
         sweep_seeds=3,
     ),
@@ -149,7 +154,8 @@ class Plan:
             return
         context = _CONTEXT.get(name.partition(",")[0], 10)
         memory = () if method.policy in _MEMORYLESS else (f"policy.context={context}",)
-        settings = (*self._budget.settings, *memory, *method.settings)
+        cuts = self._budget.cuts.get(method.policy, ())
+        settings = (*self._budget.settings, *memory, *cuts, *method.settings)
         named = config_hash({"policy": method.policy, "settings": settings})
         yield Cell(
             name,

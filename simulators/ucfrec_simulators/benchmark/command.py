@@ -16,7 +16,7 @@ from ucfrec_simulators.benchmark.tables import (
     target_table,
 )
 
-TABLES: Final = ("main", "sweeps", "badge")
+TABLES: Final = ("main", "badge", "sweeps")
 
 
 def run(budget: str, tables: Sequence[str], out: Path, results: Path, workers: int) -> str:

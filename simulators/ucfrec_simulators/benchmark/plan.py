@@ -23,13 +23,17 @@ class Budget:
     """Collected, where logs are simulated."""
     settings: tuple[str, ...]
     """Of all methods, over their defaults."""
+    cuts: Mapping[str, tuple[str, ...]]
+    """Of single learners, by key of `ucfrec.config.POLICIES`."""
     judging: Judging
     sweep_seeds: int
+    """Of the sweeps and of the badge."""
 
 
 TARGETS: Final = (0.5, 0.9, 0.99, 1.0)
 BUDGETS: Final[Mapping[str, Budget]] = {
-    # Sized for two cores: width, steps and logs are cut, methods and seeds are not.
+    # Sized for two cores: width, steps and logs are cut, and two costly parts of baselines; methods
+    # and seeds are not.
     "small": Budget(
         seeds=3,
         sessions=6000,
@@ -41,6 +45,7 @@ BUDGETS: Final[Mapping[str, Budget]] = {
             "train.validate_every=250",
             "crm.epochs=8",
         ),
+        cuts={"dt4rec": ("policy.negatives=1",), "edt4rec": ("policy.cql_steps=1000",)},
         judging=Judging(episodes=500, validation_episodes=200, quantiles=TARGETS),
         sweep_seeds=2,
     ),
@@ -48,12 +53,13 @@ BUDGETS: Final[Mapping[str, Budget]] = {
         seeds=5,
         sessions=50_000,
         settings=("train.steps=20000", "train.learning_rate=3e-4"),
+        cuts={},
         judging=Judging(episodes=5000, validation_episodes=1000, quantiles=TARGETS),
         sweep_seeds=3,
     ),
 }
-_CONTEXT: Final = "policy.context=10"
-"""Of all methods with a memory: sessions are short."""
+_CONTEXT: Final = {"kuairand": 5}
+"""K of all methods with a memory, where it is not 10: KuaiRand's sessions are of two steps."""
 
 LAMBDAS: Final = (0.0, 0.05, 0.1, 0.25, 0.5, 1.0)
 BANDS: Final = ((0.05, 0.2), (0.2, 0.5), (0.5, 1.0), (1.0, 2.0))
@@ -63,7 +69,7 @@ BADGE_METHODS: Final = tuple(
     name for name, method in METHODS.items() if method.conditioned or name == "bc"
 )
 MAIN: Final = ("kuairand", "kuairec", "virtual-taobao", "synthetic-catalog")
-SWEPT: Final = ("kuairand", "virtual-taobao", "synthetic-catalog")
+SWEPT: Final = ("synthetic-catalog", "virtual-taobao")
 _REAL: Final = {"kuairand": "kuairand", "kuairec": "kuairec", "virtual-taobao": "virtualtaobao"}
 """What needs files that are not part of the package, and their folder in the data folder."""
 _KNOWN_BADGES: Final = {"synthetic-taobao": 0, "kuairand": 2}
@@ -120,7 +126,7 @@ class Plan:
                 plant_badge(EpisodeStore.open(clean.store), planted)
             shown = tuple(BadgedWorld(world.name, world.folder, rate) for rate in (OFF, ON))
             badged = Arena(planted, shown, ())
-            for seed in range(self._budget.seeds):
+            for seed in range(self._budget.sweep_seeds):
                 for method in BADGE_METHODS:
                     given = METHODS[method]
                     yield from self._trained(name, clean, method, given, seed)
@@ -146,8 +152,10 @@ class Plan:
         items = EpisodeStore.open(arena.store).has_items
         if not (items or method.vectors):
             return
-        memory = () if method.policy in _MEMORYLESS else (_CONTEXT,)
-        settings = (*self._budget.settings, *memory, *method.settings)
+        context = _CONTEXT.get(name.partition(",")[0], 10)
+        memory = () if method.policy in _MEMORYLESS else (f"policy.context={context}",)
+        cuts = self._budget.cuts.get(method.policy, ())
+        settings = (*self._budget.settings, *memory, *cuts, *method.settings)
         named = config_hash({"policy": method.policy, "settings": settings})
         yield Cell(
             name,

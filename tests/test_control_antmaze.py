@@ -257,9 +257,10 @@ def test_without_gymnasium_robotics_one_line_says_what_to_install(
         make_env("AntMaze_UMaze-v4", 1)
 
 
-def test_d4rl_files_go_to_minari_and_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without gymnasium-robotics: no environment is made."""
-    monkeypatch.setitem(sys.modules, "gymnasium_robotics", None)
+@needs_robotics
+def test_d4rl_files_keep_their_world_in_minari(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     file = write_hdf5(tmp_path / "antmaze-umaze-v2.hdf5", ant_columns((9, 8)), env_id=None)
     assert main(["convert", str(file), "antmaze/mine-v0"]) == 0

@@ -16,7 +16,7 @@ from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 
 from ucfrec.errors import InputError
-from ucfrec_control.antmaze import antmaze_settings, is_antmaze, is_rebuilt
+from ucfrec_control.antmaze import antmaze_settings, is_antmaze
 from ucfrec_control.scores import dataset_name
 from ucfrec_control.trajectories import Trajectories
 
@@ -174,7 +174,7 @@ def _root() -> Path:
 def _spec(env_id: str | None) -> gymnasium.envs.registration.EnvSpec | None:
     if env_id is None:
         return None
-    if is_antmaze(env_id) and not is_rebuilt(env_id):
+    if is_antmaze(env_id):
         antmaze_settings(env_id)
     try:
         return gymnasium.spec(env_id)

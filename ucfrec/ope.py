@@ -25,7 +25,7 @@ class LoggedSteps:
     target: FloatArray
     """(N,) the judged policy's probability of it."""
     q: FloatArray | None = None
-    """(N,) modelled return from the logged action on, under the target; fitted on other sessions."""
+    """(N,) return from the logged action on, under the target; fitted on other sessions."""
     v: FloatArray | None = None
     """(N,) the mean of `q` over the target's actions."""
 
@@ -85,7 +85,9 @@ def _cumulative_ratios(steps: LoggedSteps, first: IntArray) -> FloatArray:
     return np.where(within(never.astype(np.float64)) > 0, 0.0, np.exp(within(logs)))
 
 
-def _with_interval(above: FloatArray, below: FloatArray, weights: FloatArray, seed: int) -> Estimate:
+def _with_interval(
+    above: FloatArray, below: FloatArray, weights: FloatArray, seed: int
+) -> Estimate:
     if not weights.any():
         return Estimate(float("nan"), float("nan"), float("nan"), 0.0)
     generator = np.random.default_rng(seed)

@@ -10,6 +10,7 @@ import torch
 
 from ucfrec.acting import PolicyActor
 from ucfrec.baselines.dt import DTConfig, DTPolicy
+from ucfrec.baselines.item_knn import ItemKNNConfig, ItemKNNPolicy
 from ucfrec.plugins import load_plugin
 from ucfrec.policy import SequencePolicy, UCFConfig, UCFPolicy
 from ucfrec.rollout import Step, rollout
@@ -29,6 +30,12 @@ def randomised(policy: SequencePolicy) -> SequencePolicy:
 def build(name: str, sizes: dict[str, int]) -> SequencePolicy:
     if name == "dt":
         return DTPolicy(DTConfig(context=K, dim=16), sizes)
+    if name == "item-knn":
+        policy = ItemKNNPolicy(ItemKNNConfig(context=K, neighbors=5), sizes)
+        policy.cosines.uniform_(0.1, 1)
+        policy.reward_low.fill_(-1)  # pages without a click count too, or sessions repeat
+        policy.neighbors.random_(0, sizes["items"])
+        return policy
     return UCFPolicy(UCFConfig(context=K, dim=16), sizes)
 
 
@@ -49,8 +56,17 @@ def written(
     return EpisodeStore.open(folder)
 
 
-@pytest.mark.parametrize("name", ["ucf", "dt"])
-@pytest.mark.parametrize("world", ["synthetic-taobao", "synthetic-catalog"])
+@pytest.mark.parametrize(
+    ("world", "name"),
+    [
+        ("synthetic-taobao", "ucf"),
+        ("synthetic-taobao", "dt"),
+        ("synthetic-catalog", "ucf"),
+        ("synthetic-catalog", "dt"),
+        # The only one that reads the rewards of the steps before.
+        ("synthetic-catalog", "item-knn"),
+    ],
+)
 def test_logged_windows_give_the_actions_played(world: str, name: str, tmp_path: Path) -> None:
     env = load_plugin("simulators", world).make(SIDE_BY_SIDE, None)
     observed = env.single_observation_space.shape[0]

@@ -61,7 +61,7 @@ class PolicyActor:
             else torch.zeros(n, k, len(policy.head.scale))
         )
         self._states = torch.zeros(n, k, len(policy.state_mean))
-        self._returns_to_go = torch.zeros(n, k)
+        self._returns_to_go, self._rewards = torch.zeros(2, n, k)
         self._mask = torch.zeros(n, k, dtype=torch.bool)
         self._steps = torch.zeros(n, dtype=torch.int64)
         self._earned = torch.zeros(n, dtype=torch.float64)
@@ -95,6 +95,7 @@ class PolicyActor:
         )
         self._mask = _pushed(self._mask, torch.ones_like(self._mask[:, 0]))
         self._actions = _pushed(self._actions, torch.zeros_like(self._actions[:, 0]))
+        self._rewards = _pushed(self._rewards, torch.zeros_like(self._rewards[:, 0]))
 
         rows = torch.from_numpy(np.flatnonzero(live))
         device = self._policy.state_mean.device
@@ -113,6 +114,7 @@ class PolicyActor:
         if self._sessions is not None:
             self._sessions.record(self._actions[:, -1], earned)
         self._earned += earned
+        self._rewards[:, -1] = earned
         self._steps += 1
 
     def _best(self, scores: Tensor) -> Tensor:
@@ -145,7 +147,7 @@ class PolicyActor:
         return Windows(
             states=self._states[rows].masked_fill(~mask.unsqueeze(-1), 0.0),
             actions=actions.masked_fill(~keep, 0),
-            rewards=torch.zeros(mask.shape),
+            rewards=self._rewards[rows].masked_fill(~mask, 0.0),
             returns_to_go=self._returns_to_go[rows].masked_fill(~mask, 0.0),
             timesteps=steps.clamp(min=0),
             mask=mask,

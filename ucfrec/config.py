@@ -10,6 +10,7 @@ from typing import Any
 from ucfrec.augment import AugmentConfig
 from ucfrec.baselines.bc import BCPolicy
 from ucfrec.baselines.cdt4rec import CDT4RecPolicy
+from ucfrec.baselines.crm_greedy import CRMGreedyPolicy
 from ucfrec.baselines.dc import DCPolicy
 from ucfrec.baselines.dt import DTPolicy
 from ucfrec.baselines.dt4rec import DT4RecPolicy
@@ -36,6 +37,7 @@ POLICIES: dict[str, type[SequencePolicy]] = {
     "bc": BCPolicy,
     "popular": PopularPolicy,
     "item-knn": ItemKNNPolicy,
+    "crm-greedy": CRMGreedyPolicy,
 }
 """Learners by the name that `--policy` takes."""
 

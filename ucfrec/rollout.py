@@ -37,8 +37,9 @@ class Actor(Protocol):
             live: (N,) rows whose action counts; what is returned for the others is ignored.
 
         Returns:
-            Actions, (N, A) float32 or (N,) int64, and the probability with which each was chosen,
-            (N,), or None where it is a density or unknown.
+            Actions, (N, A) float32 or (N,) int64, and the probability (of items) or the density
+            (of vectors, where it may exceed 1) with which each was chosen, (N,), or None where it
+            is unknown or does not exist.
         """
 
     def observe(self, actions: npt.NDArray[Any], rewards: FloatArray) -> None:
@@ -65,6 +66,8 @@ class Step:
     """(M, O) what was known before acting."""
     actions: npt.NDArray[Any]
     rewards: FloatArray
+    next_observations: FloatArray
+    """(M, O) what the actions led to; of an episode that ended, its own last one."""
     propensities: FloatArray | None
     terminated: BoolArray
     truncated: BoolArray
@@ -134,6 +137,7 @@ def rollout(
                         observations=observations[rows],
                         actions=actions[rows],
                         rewards=rewards[rows],
+                        next_observations=_led_to(following, info_next)[rows],
                         propensities=None if propensities is None else propensities[rows],
                         terminated=terminated[rows],
                         truncated=truncated[rows],
@@ -147,3 +151,12 @@ def rollout(
             live = episode < episodes
             observations, info = following, info_next
     return Episodes(returns, lengths)
+
+
+def _led_to(following: FloatArray, info: Mapping[str, Any]) -> FloatArray:
+    """Observations (N, O) after a step, before the episodes that ended were replaced."""
+    if "final_obs" not in info:
+        return following
+    led_to, ended = following.copy(), np.asarray(info["_final_obs"])
+    led_to[ended] = np.stack(list(info["final_obs"][ended]))
+    return led_to

@@ -30,6 +30,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--debug", action="store_true", help="show tracebacks of input errors")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _prepare(commands.add_parser("prepare", help="a dataset to an episode store"))
+    _collect(commands.add_parser("collect", help="datasets from a SAC learner; resumes"))
     _convert(commands.add_parser("convert", help="D4RL HDF5 to Minari, or back"))
     _distract(commands.add_parser("distract", help="a store with a distractor in its states"))
     _screen(commands.add_parser("screen", help="which state dimensions cause anything"))
@@ -52,6 +53,22 @@ def _source_options(parser: argparse.ArgumentParser) -> None:
 def _prepare(parser: argparse.ArgumentParser) -> None:
     _source_options(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="STORE")
+
+
+def _collect(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--env", required=True, help="Gymnasium environment, e.g. Hopper-v5")
+    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER")
+    parser.add_argument("--steps", type=int, default=1_000_000, help="of training (1000000)")
+    parser.add_argument(
+        "--every", type=int, default=10_000, help="steps between evaluations (10000)"
+    )
+    parser.add_argument(
+        "--fraction", type=float, default=1 / 3, help="of the expert's return, for medium (1/3)"
+    )
+    parser.add_argument(
+        "--size", type=int, default=1_000_000, help="steps of medium and of expert (1000000)"
+    )
+    parser.add_argument("--seed", type=int, default=0)
 
 
 def _convert(parser: argparse.ArgumentParser) -> None:

@@ -17,6 +17,8 @@ from ucfrec.results import format_rows, provenance
 from ucfrec.run import describe_run
 from ucfrec.store import EpisodeStore
 from ucfrec_control.benchmark import BUDGETS, benchmark
+from ucfrec_control.collect import SHOWN as COLLECTED
+from ucfrec_control.collect import CollectConfig, collect
 from ucfrec_control.d4rl import read_d4rl, write_d4rl
 from ucfrec_control.distractor import add_distractor
 from ucfrec_control.evaluate import CHECKPOINTS, SHOWN, evaluate_run
@@ -35,6 +37,16 @@ def run_prepare(options: argparse.Namespace) -> None:
     trajectories = _read(options)
     trajectories.write_store(options.out)
     print(f"{_describe(trajectories)}\n\nstore: {options.out}")
+
+
+def run_collect(options: argparse.Namespace) -> None:
+    """`ucfrec-control collect`."""
+    config = CollectConfig(
+        steps=options.steps, every=options.every, fraction=options.fraction, size=options.size
+    )
+    rows = collect(options.env, options.out, options.seed, config)
+    print(format_rows(rows, COLLECTED))
+    print(f"\nfiles: {options.out}")
 
 
 def run_convert(options: argparse.Namespace) -> None:
@@ -162,6 +174,7 @@ def _shown(row: Mapping[str, Any]) -> dict[str, Any]:
 
 COMMANDS: Commands = {
     "prepare": run_prepare,
+    "collect": run_collect,
     "convert": run_convert,
     "distract": run_distract,
     "screen": run_screen,

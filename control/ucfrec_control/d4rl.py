@@ -82,11 +82,15 @@ def read_d4rl(path: Path, env_id: str | None = None) -> Trajectories:
     )
 
 
-def write_d4rl(trajectories: Trajectories, path: Path) -> None:
+def write_d4rl(
+    trajectories: Trajectories, path: Path, metadata: Mapping[str, str | int | float] | None = None
+) -> None:
     """Write a D4RL HDF5 file, atomically.
 
-    `infos/final_observations` holds what each trajectory's last action led to, where it is known;
-    `next_observations` follow from it and are left out.
+    `next_observations` are written where it is known what each trajectory's last action led to.
+
+    Args:
+        metadata: what else the file says of itself, as D4RL's `metadata/NAME`.
     """
     ends = np.cumsum(trajectories.lengths) - 1
     timeouts = np.zeros(len(trajectories.rewards), dtype=bool)
@@ -98,7 +102,7 @@ def write_d4rl(trajectories: Trajectories, path: Path) -> None:
         "rewards": trajectories.rewards,
         "terminals": terminals,
         "timeouts": timeouts,
-        _FINAL: trajectories.final_observations,
+        "next_observations": _next_observations(trajectories, ends),
     }
     with atomic_file(path) as scratch, h5py.File(scratch, "w") as file:
         for name, values in columns.items():
@@ -106,6 +110,16 @@ def write_d4rl(trajectories: Trajectories, path: Path) -> None:
                 file.create_dataset(name, data=values, compression="gzip")
         if trajectories.source["env_id"]:
             file.attrs["env_id"] = trajectories.source["env_id"]
+        for name, value in (metadata or {}).items():
+            file[f"metadata/{name}"] = value
+
+
+def _next_observations(trajectories: Trajectories, ends: IntArray) -> FloatArray | None:
+    if trajectories.final_observations is None:
+        return None
+    following = np.roll(trajectories.observations, -1, axis=0)
+    following[ends] = trajectories.final_observations
+    return following
 
 
 def _opened(path: Path) -> Any:

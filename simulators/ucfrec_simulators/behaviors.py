@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
+from scipy.special import ndtr, ndtri
 
 from ucfrec.rollout import FORBIDDEN, Actor, BoolArray, FloatArray, IntArray
 
@@ -67,6 +68,29 @@ class Constant(Memoryless):
     def act(self, observations: FloatArray, live: BoolArray) -> tuple[Actions, None]:
         """Repeat the action, (N, A)."""
         return np.tile(self._action, (len(observations), 1)), None
+
+
+def truncated_normal(
+    mean: FloatArray, scale: float, generator: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Draw from the normal about `mean` that is cut to the box [−1, 1]^A, not clipped to it.
+
+    Clipping would put probability on the box's faces, where no density exists; the cut normal has
+    a density everywhere in the box, and it is returned exactly, for the float32 actions returned.
+
+    Args:
+        mean: (N, A) inside the box.
+
+    Returns:
+        Actions (N, A), and their densities (N,): products over the dimensions, which may exceed 1.
+    """
+    center = mean.astype(np.float64)
+    below, above = ndtr((-1 - center) / scale), ndtr((1 - center) / scale)
+    quantile = below + generator.random(center.shape) * (above - below)
+    actions = np.clip(center + scale * ndtri(quantile), -1, 1).astype(np.float32)
+    deviation = (actions - center) / scale
+    logarithm = -(deviation**2) / 2 - np.log(np.sqrt(2 * np.pi) * scale * (above - below))
+    return actions, np.exp(logarithm.sum(axis=1)).astype(np.float32)
 
 
 class Rule(Memoryless):

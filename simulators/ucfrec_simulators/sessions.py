@@ -139,7 +139,7 @@ class SessionsEnv(VectorEnv[FloatArray, AnyArray, AnyArray], ABC):
 class SingleSession(gymnasium.Env[FloatArray, AnyArray]):
     """One session at a time: the plain Gymnasium view of a world of one."""
 
-    def __init__(self, world: SessionsEnv) -> None:
+    def __init__(self, world: VectorEnv[FloatArray, AnyArray, AnyArray]) -> None:
         if world.num_envs != 1:
             raise InputError(f"SingleSession needs a world of one session, got {world.num_envs}")
         self._world = world

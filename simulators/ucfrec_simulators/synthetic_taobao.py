@@ -9,6 +9,7 @@ from gymnasium.vector import VectorEnv
 
 from ucfrec.plugins import Simulator
 from ucfrec.rollout import FloatArray, IntArray
+from ucfrec_simulators import ddpg
 from ucfrec_simulators.behaviors import Blend, Rule, SessionMixture, Uniform
 from ucfrec_simulators.sessions import AnyArray, draw_categories
 from ucfrec_simulators.taobao import (
@@ -141,6 +142,7 @@ SIMULATOR: Final = Simulator(
         "best-constant": best_constant_actor,
         "mixture": mixture,
         "optimal": optimal,
+        **ddpg.BEHAVIORS,
     },
     feedback="clicks",
 )

@@ -13,6 +13,7 @@ from torch import nn
 from ucfrec.errors import InputError
 from ucfrec.plugins import Simulator
 from ucfrec.rollout import FloatArray, IntArray
+from ucfrec_simulators import ddpg
 from ucfrec_simulators.behaviors import Blend, SessionMixture, Uniform
 from ucfrec_simulators.folders import data_folder
 from ucfrec_simulators.sessions import AnyArray, draw_categories
@@ -162,6 +163,7 @@ SIMULATOR: Final = Simulator(
         "zero": zero_actor,
         "best-constant": best_constant_actor,
         "mixture": mixture,
+        **ddpg.BEHAVIORS,
     },
     feedback="clicks",
 )

@@ -9,6 +9,7 @@ from gymnasium.vector.utils import batch_space
 
 from ucfrec.plugins import Simulator
 from ucfrec.rollout import BoolArray, FloatArray, IntArray
+from ucfrec_simulators import ddpg
 from ucfrec_simulators.behaviors import Uniform
 from ucfrec_simulators.folders import data_folder
 from ucfrec_simulators.sessions import AnyArray
@@ -89,6 +90,7 @@ SIMULATOR: Final = Simulator(
         "zero": zero_actor,
         "best-constant": best_constant_actor,
         "mixture": mixture,
+        **ddpg.BEHAVIORS,
     },
     feedback="clicks",
 )

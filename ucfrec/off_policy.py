@@ -1,0 +1,115 @@
+"""What a trained policy would have earned on logs: the logs read, modelled, weighed, reported."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from ucfrec import schema
+from ucfrec.fqe import cross_fitted
+from ucfrec.ope import LoggedSteps, as_row, estimate, overlap, warnings
+from ucfrec.results import provenance
+from ucfrec.score import LoggedSessions, ScoredSteps, scored_steps
+from ucfrec.store import EpisodeStore
+from ucfrec.trained import TrainedPolicy
+
+Float32Array = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class OffPolicyReport:
+    """Result rows, one an estimator, and why not to believe them."""
+
+    rows: list[dict[str, Any]]
+    warnings: list[str]
+
+
+def judge_off_policy(
+    run: Path,
+    trained: TrainedPolicy,
+    logged: LoggedSessions,
+    *,
+    target_return: float,
+    greedy: bool,
+    seed: int,
+) -> OffPolicyReport:
+    """Estimate the mean return of a session under the policy of `run`, from logs alone.
+
+    Models are fitted on these logs, each session judged by models of others. Takes about 2 kB of
+    memory a logged step.
+
+    Args:
+        greedy: judge the policy that shows its most probable item; otherwise the one that draws
+            items from its softmax.
+        seed: draws the folds and the bootstrap's resamples.
+
+    Raises:
+        InputError: propensities are no probabilities, or there is only one session.
+    """
+    steps = logged_steps(trained, logged.store, target_return, greedy, seed)
+    found = estimate(steps, seed)
+    said = warnings(steps, found)
+    about = {
+        "policy": trained.name,
+        "choice": "greedy" if greedy else "softmax",
+        "target_return": target_return,
+        "sessions": len(steps.first),
+        "steps": len(steps.reward),
+        "dropped": logged.report["dropped"],
+        "overlap": None if steps.unknown_propensities else overlap(steps),
+        "warnings": said,
+        "run": str(run),
+        "fingerprint": logged.store.meta["fingerprint"],
+        "seed": seed,
+        **provenance(),
+    }
+    return OffPolicyReport([as_row(name, one) | about for name, one in found.items()], said)
+
+
+def logged_steps(
+    trained: TrainedPolicy, store: EpisodeStore, target_return: float, greedy: bool, seed: int
+) -> LoggedSteps:
+    """The steps of `store` with the policy's probabilities and models of what it would earn."""
+    batches = scored_steps(trained, store, target_return)
+    parts = zip(*(_judged(trained, batch, greedy) for batch in batches), strict=True)
+    target, features, at_policy = (np.concatenate(part) for part in parts)
+    episodes, steps = store.all_steps()
+    reward = store.step_values(schema.REWARD, episodes, steps).astype(np.float64)
+    propensity = np.full(len(reward), np.nan)
+    if schema.PROPENSITY in store.meta["columns"]:
+        propensity = store.step_values(schema.PROPENSITY, episodes, steps).astype(np.float64)
+    # What cannot be weighed is found out before anything is fitted.
+    unmodelled = LoggedSteps(episodes, reward, propensity, target.astype(np.float64))
+    model = cross_fitted(features, at_policy, reward, episodes, seed)
+    return LoggedSteps(unmodelled.session, reward, propensity, unmodelled.target, model)
+
+
+def _judged(
+    trained: TrainedPolicy, batch: ScoredSteps, greedy: bool
+) -> tuple[npt.NDArray[Any], Float32Array, Float32Array]:
+    """Probability (B,) of the logged items; features (B, P) of them and of the policy's items."""
+    assert trained.item_states is not None
+    embeddings = trained.item_states.embeddings
+    states, items = batch.windows.states[:, -1], batch.windows.actions[:, -1]
+    if greedy:
+        best = batch.log_probabilities.argmax(1)
+        target, shown = (best == items).double(), embeddings[best]
+    else:
+        probabilities = batch.log_probabilities.exp()
+        target = probabilities.gather(1, items[:, None])[:, 0].double()
+        shown = probabilities @ embeddings
+    chosen = _features(states, embeddings[items])
+    return target.clamp(0, 1).numpy(), chosen, _features(states, shown)
+
+
+def _features(states: Tensor, items: Tensor) -> Float32Array:
+    """(B, P) of states and item embeddings (B, D), linear in the latter: 1, both, and the products
+    of the embedding with the three embeddings that lead a state (`ucfrec.states.ItemStates`)."""
+    led_by = states[:, : 3 * items.shape[1]]
+    products = led_by * items.repeat(1, 3)
+    ones = torch.ones(len(states), 1)
+    return np.asarray(torch.cat([ones, states, items, products], dim=1))

@@ -81,7 +81,7 @@ class _Ridge:
     """
 
     def __init__(self, features: Float32Array, gram: FloatArray, keep: BoolArray) -> None:
-        self._features, self._keep = features, keep
+        self._features, self.keep = features, keep
         mean_square = np.diag(gram) / keep.sum()
         # A feature that is always 0 has no weight to find.
         penalty = len(gram) * np.where(mean_square > 0, mean_square, 1.0)
@@ -90,7 +90,7 @@ class _Ridge:
 
     def fit(self, target: FloatArray) -> Float32Array:
         """(P,) weights for the target (N,); what stands there for rows not kept is ignored."""
-        kept = np.where(self._keep, target, 0.0).astype(np.float32)
+        kept = np.where(self.keep, target, 0.0).astype(np.float32)
         weights = cho_solve(self._factor, (kept @ self._features).astype(np.float64))
         return np.asarray(weights, dtype=np.float32)
 
@@ -107,7 +107,8 @@ def fitted_q(
     """
     ends = np.flatnonzero(last)
     horizon = int(np.diff(ends, prepend=-1).max())
-    low, high = horizon * min(reward.min(), 0.0), horizon * max(reward.max(), 0.0)
+    seen = reward[ridge.keep]
+    low, high = horizon * min(seen.min(), 0.0), horizon * max(seen.max(), 0.0)
     weights, following = ridge.fit(reward), np.zeros(len(reward))
     for _ in range(horizon - 1):
         before = following

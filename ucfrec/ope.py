@@ -42,8 +42,9 @@ class LoggedSteps:
 
     def __post_init__(self) -> None:
         n = len(self.session)
-        modelled = vars(self.model) if self.model else {}
-        finite = {"reward": self.reward, "target": self.target, **modelled}
+        finite = {"reward": self.reward, "target": self.target}
+        if self.model is not None:
+            finite |= {f"modelled {name}": values for name, values in vars(self.model).items()}
         for name, values in {**finite, "propensity": self.propensity}.items():
             if values.shape != (n,):
                 raise InputError(f"{name} has shape {values.shape}, {n} steps are ({n},)")

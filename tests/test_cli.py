@@ -180,7 +180,9 @@ def test_ope_without_propensities_has_only_models(
 ) -> None:
     run, logs = catalog
     log = pd.read_parquet(logs)
-    log.drop(columns="propensity").to_parquet(tmp_path / "without.parquet")
+    strange = log.tail(2).assign(item_id=987654)
+    without = pd.concat([log, strange]).drop(columns="propensity")
+    without.to_parquet(tmp_path / "without.parquet")
     log.assign(propensity=log.propensity.where(log.index != 5)).to_parquet(tmp_path / "one.parquet")
     for name, missing in (("without", len(log)), ("one", 1)):
         out = tmp_path / f"{name}.json"
@@ -188,8 +190,9 @@ def test_ope_without_propensities_has_only_models(
         rows = json.loads(out.read_text())
         assert [row["estimator"] for row in rows] == ["logged", "DM", "FQE"]
         assert rows[0]["overlap"] is None
-        said = f"warning: {missing:,} of {len(log):,} steps have no propensity"
-        assert said in capsys.readouterr().out
+        printed = capsys.readouterr().out
+        assert f"warning: {missing:,} of {len(log):,} steps have no propensity" in printed
+        assert ("warning: 2 rows show items" in printed) is (name == "without")
 
 
 def test_score_and_ope_refuse_what_they_cannot_use(

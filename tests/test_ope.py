@@ -164,7 +164,9 @@ def test_weighted_estimates_are_unbiased_whatever_the_model(right: bool) -> None
             model=Modelled(
                 reward=np.zeros(len(path)),
                 q=np.array([q[at] for q, at in zip(qs, path, strict=True)]),
-                v=np.array([(WORLD.target[s] * q[s]).sum() for q, s in zip(qs, states, strict=True)]),
+                v=np.array(
+                    [(WORLD.target[s] * q[s]).sum() for q, s in zip(qs, states, strict=True)]
+                ),
             ),
         )
         found = estimate(steps, 0)
@@ -278,6 +280,6 @@ def test_wrong_arrays_are_input_errors(change: dict[str, FloatArray], says: str)
 
 
 def test_one_session_cannot_be_modelled() -> None:
+    one = np.ones((3, 1), dtype=np.float32)
     with pytest.raises(InputError, match="sessions other than the one"):
-        one = np.ones((3, 1), dtype=np.float32)
         cross_fitted(one, one, np.ones(3), np.zeros(3, dtype=np.int64), seed=0)

@@ -53,7 +53,7 @@ def bootstrap_interval(
 def ratio_intervals(
     above: npt.NDArray[np.float64], below: npt.NDArray[np.float64], seed: int, level: float = 0.95
 ) -> npt.NDArray[np.float64]:
-    """Percentile bootstrap intervals (C, 2) of C ratios Σ above / Σ below over the same rows (N, C).
+    """Percentile bootstrap intervals (C, 2) of the ratios Σ above / Σ below of rows (N, C).
 
     Resamples in which nothing stands below are left out.
     """

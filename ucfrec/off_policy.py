@@ -1,6 +1,6 @@
 """What a trained policy would have earned on logs: the logs read, modelled, weighed, reported."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -55,11 +55,17 @@ def judge_off_policy(
     steps = logged_steps(trained, logged.store, target_return, greedy, seed)
     found = estimate(steps, seed)
     said = warnings(steps, found)
+    dropped = logged.report["dropped"]
+    if unknown := dropped["unknown_item"]:
+        said.append(
+            f"{unknown:,} rows show items that the run does not know, and so never would: their "
+            "sessions are judged as if those rows were not there"
+        )
     about = {
         "target_return": target_return,
         "sessions": len(steps.first),
         "steps": len(steps.reward),
-        "dropped": logged.report["dropped"],
+        "dropped": dropped,
         "overlap": None if steps.unknown_propensities else overlap(steps),
         "warnings": said,
         "run": str(run),
@@ -89,9 +95,8 @@ def logged_steps(
     if schema.PROPENSITY in store.meta["columns"]:
         propensity = store.step_values(schema.PROPENSITY, episodes, steps).astype(np.float64)
     # What cannot be weighed is found out before anything is fitted.
-    unmodelled = LoggedSteps(episodes, reward, propensity, target.astype(np.float64))
-    model = cross_fitted(features, at_policy, reward, episodes, seed)
-    return LoggedSteps(unmodelled.session, reward, propensity, unmodelled.target, model)
+    unmodelled = LoggedSteps(episodes, reward, propensity, target)
+    return replace(unmodelled, model=cross_fitted(features, at_policy, reward, episodes, seed))
 
 
 def _judged(
@@ -116,7 +121,8 @@ def _features(states: Tensor, items: Tensor) -> Float32Array:
     """(B, P) of states and item embeddings (B, D), linear in the latter: 1, both, and products.
 
     The three embeddings that lead a state (`ucfrec.states.ItemStates`) are multiplied with the
-    item's own; the rest (user, observation) with its leading dimensions, `_PRODUCTS` in all at most.
+    item's own; the rest (user, observation) with as many of its first dimensions as `_PRODUCTS`
+    allows.
     """
     dim = items.shape[1]
     led_by, rest = states[:, : 3 * dim], states[:, 3 * dim :]

@@ -119,9 +119,7 @@ def estimate(steps: LoggedSteps, seed: int) -> dict[str, Estimate]:
             effective_sessions=float(weights.sum() ** 2 / (weights**2).sum()),
             largest_weight=float(weights.max() / weights.sum()),
         )
-        for (name, (over, under, weights)), (low, high) in zip(
-            sums.items(), intervals, strict=True
-        )
+        for (name, (over, under, weights)), (low, high) in zip(sums.items(), intervals, strict=True)
     }
 
 

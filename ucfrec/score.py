@@ -3,7 +3,7 @@
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -77,9 +77,9 @@ def logged_sessions(
     gap_ms = record["session_gap_ms"]
     # Runs from before `session_by` was recorded tell the gap at least.
     session_by = record.get("session_by") or (None if gap_ms is None else "gap")
-    options = PrepareOptions(reward=record["reward"], session_by=session_by)
+    options = PrepareOptions(record["reward"], session_by)
     if gap_ms is not None:
-        options = PrepareOptions(record["reward"], session_by, gap_ms / 60_000)
+        options = replace(options, gap_minutes=gap_ms / 60_000)
     with tempfile.TemporaryDirectory(prefix="ucfrec-") as scratch:
         folder = Path(scratch) / "store"
         report = prepare(files, mapping, folder, options, like=run)

@@ -1,4 +1,4 @@
-"""Open Bandit Dataset: logs with the true propensities of two policies, one impression a session."""
+"""Open Bandit Dataset: impressions of two policies with their true propensities."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +17,7 @@ ITEM_FEATURES: Final = tuple(f"item_feature_{n}" for n in range(4))
 MAPPING: Final = LogMapping(
     columns={
         "user_id": USER,
-        "timestamp": '"timestamp"::TIMESTAMPTZ AT TIME ZONE \'UTC\'',
+        "timestamp": "\"timestamp\"::TIMESTAMPTZ AT TIME ZONE 'UTC'",
         "propensity": "propensity_score",
         "session_id": "concat_ws(' ', \"timestamp\", position)",
         # Where on the page: known before the item is chosen.
@@ -48,4 +48,3 @@ DATASET: Final = Dataset(
     summary="Open Bandit Dataset: folders of a policy and campaign, or files (CSV or Parquet)",
     resolve=_resolve,
 )
-"""Entry point `obd`."""

@@ -39,7 +39,7 @@ from ucfrec.logs.sessions import (
     ordered_steps,
     split_bounds,
 )
-from ucfrec.store import ITEM_STATES, EpisodeStore
+from ucfrec.store import ITEM_STATES
 from ucfrec.store_writer import StoreWriter
 
 BATCH_ROWS: Final = 2**17

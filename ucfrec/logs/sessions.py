@@ -122,9 +122,9 @@ def number_ids(log: CleanLog, listed: dict[str, list[str]], like: Path | None) -
         if like is not None:
             source = f"read_parquet({text(str(like / file))}, file_row_number = true)"
             # Integers there may be text here, or the other way round.
+            known = f"TRY_CAST({name} AS {log.id_type(name)}) AS {name}"
             log.connection.execute(
-                f"CREATE TABLE {table} AS SELECT TRY_CAST({name} AS {log.id_type(name)}) AS {name}, "
-                f"file_row_number AS number FROM {source}"
+                f"CREATE TABLE {table} AS SELECT {known}, file_row_number AS number FROM {source}"
             )
             continue
         ids = [f"SELECT DISTINCT {name} FROM steps"]
@@ -157,6 +157,4 @@ def ordered_steps(log: CleanLog) -> str:
 
 def episode_users() -> str:
     """The query that gives the user of every episode, in the order of the store."""
-    return (
-        f"SELECT {schema.USER_ID} FROM steps WHERE first ORDER BY {schema.USER_ID}, episode"
-    )
+    return f"SELECT {schema.USER_ID} FROM steps WHERE first ORDER BY {schema.USER_ID}, episode"

@@ -10,9 +10,15 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import torch
+from torch import Tensor
 
+from ucfrec.acting import PolicyActor
 from ucfrec.cli import main
+from ucfrec.evaluate import World
 from ucfrec.plugins import load_plugin
+from ucfrec.rollout import rollout
+from ucfrec.trained import TrainedPolicy
 
 TINY = [
     "train.steps=40",
@@ -173,6 +179,40 @@ def test_ope_writes_the_rows_it_prints(
     assert "session" in " ".join(rows["logged"]["warnings"])
     assert main(arguments) == 0
     assert {row["estimator"]: row for row in json.loads(out.read_text())} == rows
+
+
+class SoftmaxActor(PolicyActor):
+    """Draws items from the policy's probabilities: what `ope` judges, played."""
+
+    def _best(self, scores: Tensor) -> Tensor:
+        return torch.multinomial(scores.softmax(-1), 1)[:, 0]
+
+
+def test_ope_tells_from_uniform_logs_what_playing_tells(
+    catalog: tuple[str, Path], tmp_path: Path
+) -> None:
+    run, _ = catalog
+    collected = ["--behavior", "random", "--sessions", "3000", "--out", str(tmp_path / "logs")]
+    assert main(["collect", "--env", "synthetic-catalog", *collected]) == 0
+    out = tmp_path / "rows.json"
+    assert main(["ope", run, str(tmp_path / "logs/sessions.parquet"), "--json", str(out)]) == 0
+    rows = {row["estimator"]: row for row in json.loads(out.read_text())}
+    torch.manual_seed(0)
+    trained = TrainedPolicy.load(Path(run))
+    target = trained.target_return(1.0)
+    size = trained.record["observation_size"]
+    numbers = (trained.item_states, trained.item_ids, trained.user_ids)
+    actor = SoftmaxActor(trained.policy, 512, target, size, *numbers)
+    env = World("synthetic-catalog", None).simulator().make(512, None)
+    returns = rollout(env, actor, 2000, seed=0).returns
+    truth, error = returns.mean(), returns.std() / 2000**0.5
+    assert abs(truth - rows["logged"]["R_cum"]) > 3 * error
+    for name in ("IPS", "SNIPS", "PDIS", "DR"):
+        row = rows[name]
+        assert row["R_cum_low"] - 2 * error < truth < row["R_cum_high"] + 2 * error, name
+    widths = {name: row["R_cum_high"] - row["R_cum_low"] for name, row in rows.items()}
+    assert widths["DR"] < widths["PDIS"] < widths["IPS"]
+    assert rows["DR"]["overlap"] == pytest.approx(1, abs=0.05)
 
 
 def test_ope_without_propensities_has_only_models(

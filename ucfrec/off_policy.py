@@ -86,9 +86,15 @@ def logged_steps(
     trained: TrainedPolicy, store: EpisodeStore, target_return: float, greedy: bool, seed: int
 ) -> LoggedSteps:
     """The steps of `store` with the policy's probabilities and models of what it would earn."""
-    batches = scored_steps(trained, store, target_return)
-    parts = zip(*(_judged(trained, batch, greedy) for batch in batches), strict=True)
-    target, features, at_policy = (np.concatenate(part) for part in parts)
+    assert trained.item_states is not None
+    one_state, one_item = torch.zeros(1, store.state_size), trained.item_states.embeddings[:1]
+    width = _features(one_state, one_item).shape[1]
+    features, at_policy = np.empty((2, store.n_steps, width), dtype=np.float32)
+    target, done = np.empty(store.n_steps), 0
+    for batch in scored_steps(trained, store, target_return):
+        rows = slice(done, done + len(batch.steps))
+        target[rows], features[rows], at_policy[rows] = _judged(trained, batch, greedy)
+        done = rows.stop
     episodes, steps = store.all_steps()
     reward = store.step_values(schema.REWARD, episodes, steps).astype(np.float64)
     propensity = np.full(len(reward), np.nan)

@@ -22,6 +22,7 @@ from ucfrec.windows import Windows
 
 RESULTS = Path(__file__).parent / "results" / "step_time.jsonl"
 SIZES = {"state": 91, "action": 27, "items": 0}
+LEARNERS = ("dt", "dc", "lsdt", "ucf", "dt4rec", "cdt4rec", "edt4rec", "sasrec", "bc")
 
 
 def windows(batch: int, context: int) -> Windows:
@@ -55,7 +56,7 @@ def main() -> None:
     torch.manual_seed(0)
     batch = windows(options.batch, options.context)
     learners = {}
-    for name in POLICIES:
+    for name in LEARNERS:
         settings = [f"policy.dim={options.dim}", f"policy.context={options.context}"]
         policy = POLICIES[name](resolve_config(name, None, settings).policy, SIZES)
         learners[name] = policy, torch.optim.AdamW(policy.parameters(), fused=True)

@@ -16,7 +16,7 @@ from ucfrec.errors import InputError
 from ucfrec.files import read_json
 from ucfrec.rollout import rollout
 from ucfrec.store import EpisodeStore
-from ucfrec_control.benchmark import BUDGETS, METHODS, Budget
+from ucfrec_control.benchmark import BUDGETS, METHODS, TABLES, Budget
 from ucfrec_control.cli import main
 from ucfrec_control.d4rl import read_d4rl
 from ucfrec_control.distractor import add_distractor
@@ -223,9 +223,7 @@ def test_a_benchmark_goes_on_where_it_was(
     write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
     settings = (*TINY, "policy.dim=32", "crm.epochs=1", "csg.epochs=1")
     monkeypatch.setitem(BUDGETS, "small", Budget(("hopper_medium-made",), 1, 2, settings))
-    monkeypatch.setattr(
-        "ucfrec_control.benchmark.METHODS", {m: METHODS[m] for m in ("lsdt", "ucf")}
-    )
+    monkeypatch.setitem(TABLES, "main", {m: METHODS[m] for m in ("lsdt", "ucf")})
     results = tmp_path / "control.jsonl"
     arguments = ["benchmark", str(tmp_path), "--out", str(tmp_path / "runs")]
     arguments += ["--results", str(results)]

@@ -151,3 +151,18 @@ def test_edit_collapse_on_hopper(
         assert report.effective_rank > 5
     else:
         assert report.mean_move_ratio > 0.5
+
+
+def test_noise_fills_the_band_in_every_direction_and_spares_what_never_varies(
+    tmp_path: Path,
+) -> None:
+    crm, _ = fitted()
+    at = planted(2000, 1).transitions
+    edited, _ = proposed(made(CSGConfig(kind="noise"), tmp_path), crm, at)
+    moves = crm.moves(at.states, edited)
+    length = moves.norm(dim=1)
+    assert 0.199 < length.min() < 0.21
+    assert 0.49 < length.max() < 0.501
+    assert (moves[:, CONSTANT] == 0).all()
+    varying = moves[:, crm.state_std > 0]
+    assert varying.mean(0).abs().max() < 0.03

@@ -29,6 +29,10 @@ def test_the_demo_writes_every_row_and_goes_on_where_it_was(tmp_path: Path) -> N
             assert row["R_cum_low"] <= row["R_cum"] <= row["R_cum_high"]
             assert row["R_avg_pooled"] == pytest.approx(row["R_cum"] / row["length"])
             assert {"command", "versions", "fingerprint", "config"} <= row.keys()
+    page = (tmp_path / "demo" / "report.html").read_text()
+    for world in WORLDS:
+        assert f"R_cum in {world}" in page
+        assert all(f"<summary>{world}/{learner}</summary>" in page for learner in LEARNERS)
     weights = tmp_path / "demo" / WORLDS[0] / "dt" / "policy" / "best.safetensors"
     written_at = weights.stat().st_mtime_ns
     again = demo(tmp_path / "demo", seed=0, config=TINY)

@@ -3,13 +3,20 @@
 import itertools
 import math
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
-from ucfrec.evaluate import World, evaluate_behavior
+from ucfrec.config import resolve_config
+from ucfrec.evaluate import World, evaluate_behavior, evaluate_policy
 from ucfrec.evaluate_variety import COLUMNS, variety_columns
 from ucfrec.rollout import rollout
+from ucfrec.run import train_run, training_views
+from ucfrec.simulated import simulated_store
+from ucfrec.store import EpisodeStore
+from ucfrec.trained import TrainedPolicy
 from ucfrec.training_counts import TrainingCounts
 from ucfrec.variety import Recommended
 from ucfrec_simulators.behaviors import Uniform
@@ -60,3 +67,28 @@ def test_what_is_unknown_is_null() -> None:
     assert 0 < catalog["diversity"] <= 1
     taobao = evaluate_behavior(World("synthetic-taobao"), "random", 5, 0)
     assert all(taobao[name] is None for name in COLUMNS)
+
+
+def test_a_run_knows_its_training_log(tmp_path: Path) -> None:
+    world = World("synthetic-catalog")
+    store = EpisodeStore.open(simulated_store(world, tmp_path, 60, 0))
+    settings = ("train.steps=2", "train.validate_every=2", "policy.dim=8")
+    train_run(store, tmp_path / "run", resolve_config("popular", None, settings))
+    trained = TrainedPolicy.load(tmp_path / "run")
+    train, _ = training_views(store)
+    shown, liked = Counter[int](), Counter[int]()
+    for episode, step in zip(*train.all_steps(), strict=True):
+        item = int(train.step_values("item", episode[None], step[None])[0])
+        shown[item] += 1
+        liked[item] += int(train.step_values("reward", episode[None], step[None])[0])
+    assert trained.counts is not None
+    assert trained.counts.shown.tolist() == [shown[item] for item in range(200)]
+    assert trained.counts.liked.tolist() == [liked[item] for item in range(200)]
+    row = evaluate_policy(world, trained, "popular", 10, 0, 1.0)
+    # The one item that it plays is the one shown most.
+    assert row["novelty"] == pytest.approx(-math.log(max(shown.values()) / train.n_episodes))
+    assert row["majority_category_dominance"] in (0.0, 1.0)
+    (tmp_path / "run" / "training_counts.safetensors").unlink()
+    older = evaluate_policy(world, TrainedPolicy.load(tmp_path / "run"), "popular", 10, 0, 1.0)
+    assert older["novelty"] is None
+    assert older["R_cum"] == row["R_cum"]

@@ -1,13 +1,11 @@
 """The Kuaishou worlds against a plain reading of their rules, one user at a time."""
 
 import time
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
@@ -17,6 +15,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.kuai_reference import OneUser, Plain
 from ucfrec.acting import PolicyActor
 from ucfrec.baselines.dt import DTConfig, DTPolicy
 from ucfrec.collect import collect
@@ -31,25 +30,6 @@ from ucfrec_simulators.replay import sessions_by_exit
 from ucfrec_simulators.sessions import SingleSession
 
 RULES = [replace(rule, sliced=sliced) for rule in EXITS.values() for sliced in (False, True)]
-
-
-class Plain:
-    """One session as the published code plays it, its slices included."""
-
-    def __init__(self, tags: list[tuple[int, ...]], rule: ExitRule) -> None:
-        self.tags, self.rule, self.shown = tags, rule, list[int]()
-
-    def step(self, item: int) -> tuple[bool, bool]:
-        """Whether the user leaves by the rule, and whether the session is over."""
-        t, rule = len(self.shown), self.rule
-        first = t - rule.window if rule.sliced else max(0, t - rule.window)
-        pooled = Counter(tag for shown in self.shown[first:t] for tag in self._of(shown))
-        self.shown.append(item)
-        bored = t > 0 and any(pooled[tag] > rule.threshold for tag in self._of(item))
-        return bored, bored or t >= rule.max_turn - 1
-
-    def _of(self, item: int) -> tuple[int, ...]:
-        return self.tags[item] or (-1,)
 
 
 @st.composite
@@ -182,30 +162,6 @@ def test_a_policy_plays_what_is_there_and_allowed(regime: str) -> None:
     actor.inform({"user_id": np.array([25, 5, 7, 1000])})
     assert actor._sessions is not None
     assert actor._sessions.users.tolist() == [1, 0, -1, 2]
-
-
-class OneUser(gym.Env[np.ndarray, int]):
-    """One user's environment in plain Python."""
-
-    def __init__(self, rewards: np.ndarray, tags: list[tuple[int, ...]], rule: ExitRule) -> None:
-        self.rewards, self.tags, self.rule = rewards, tags, rule
-        high = np.array([len(rewards), len(tags)], dtype=np.float32)
-        self.observation_space = gym.spaces.Box(np.zeros(2, dtype=np.float32), high)
-        self.action_space = gym.spaces.Discrete(len(tags))
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        super().reset(seed=seed)
-        self.user = int(self.np_random.integers(len(self.rewards)))
-        self.session = Plain(self.tags, self.rule)
-        return np.array([self.user, len(self.tags)], dtype=np.float32), {"user_id": self.user}
-
-    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        bored, over = self.session.step(int(action))
-        reward = float(self.rewards[self.user, action])
-        observation = np.array([self.user, action], dtype=np.float32)
-        return observation, reward, bored, over and not bored, {"user_id": self.user}
 
 
 def test_thousands_of_users_cost_a_small_fraction_of_a_python_loop() -> None:

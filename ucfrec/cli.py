@@ -2,6 +2,7 @@
 
 import argparse
 import errno
+import os
 import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -75,7 +76,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"ucfrec {__version__}")
     parser.add_argument("--debug", action="store_true", help="show tracebacks of input errors")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    _demo(commands.add_parser("demo", help="everything on simulated logs, ends in a table"))
+    _demo(commands.add_parser("demo", help="everything on simulated logs, ends in a report"))
     _collect(commands.add_parser("collect", help="play sessions in a simulator, as Parquet logs"))
     _prepare(commands.add_parser("prepare", help="logs to an episode store"))
     train_options(commands.add_parser("train", help="train a policy on a store; resumes"))
@@ -83,6 +84,8 @@ def build_parser() -> argparse.ArgumentParser:
     _recommend(commands.add_parser("recommend", help="the next items for users of a log"))
     _score(commands.add_parser("score", help="a policy's probability of every choice of a log"))
     _ope(commands.add_parser("ope", help="what a policy would have earned, from logs alone"))
+    _report(commands.add_parser("report", help="one HTML page about runs"))
+    _benchmark(commands.add_parser("benchmark", help="tables of every method; resumes"))
     return parser
 
 
@@ -195,6 +198,31 @@ def _ope(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, help="write the result rows here")
+
+
+def _report(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
+    parser.add_argument(
+        "--results",
+        nargs="+",
+        action="extend",
+        type=Path,
+        default=[],
+        metavar="FILE",
+        help="rows of `ucfrec evaluate --json` or of the demo, JSON or JSON lines",
+    )
+    parser.add_argument("--out", type=Path, default=Path("report.html"), help="(report.html)")
+
+
+def _benchmark(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("suite", help="recommendation, or one that a package announces")
+    parser.add_argument("--budget", choices=["small", "full"], default="small")
+    parser.add_argument("--table", action="append", default=[], help="only this one; repeatable")
+    parser.add_argument("--out", type=Path, default=Path("runs/benchmark"), help="logs and runs")
+    parser.add_argument(
+        "--results", type=Path, help="JSON lines (benchmarks/results/SUITE.jsonl); appended to"
+    )
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
 
 
 if __name__ == "__main__":

@@ -20,8 +20,9 @@ from ucfrec.logs.mapping import Dataset, LogMapping, columns_given, read_mapping
 from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, read_histories, validate
 from ucfrec.logs.report import format_report
 from ucfrec.off_policy import judge_off_policy
-from ucfrec.plugins import load_plugin
+from ucfrec.plugins import Benchmark, load_plugin
 from ucfrec.recommend import LONGEST_HISTORY, Histories, recommend
+from ucfrec.report import write_report
 from ucfrec.results import format_rows
 from ucfrec.run import describe_run, train_run
 from ucfrec.score import logged_sessions, score
@@ -33,7 +34,7 @@ def run_demo(options: argparse.Namespace) -> None:
     """`ucfrec demo`."""
     rows = demo(options.out, options.seed, DemoConfig())
     print(format_rows(rows))
-    print(f"\nrows: {options.out / 'results.json'}; logs, stores and runs lie beside it")
+    print(f"\nreport: {options.out / 'report.html'}; rows, logs, stores and runs lie beside it")
 
 
 def run_collect(options: argparse.Namespace) -> None:
@@ -188,6 +189,21 @@ def run_ope(options: argparse.Namespace) -> None:
         write_json(options.json, rows)
 
 
+def run_report(options: argparse.Namespace) -> None:
+    """`ucfrec report`."""
+    write_report(options.out, options.runs, options.results)
+    print(f"report: {options.out}; open it in a browser")
+
+
+def run_benchmark(options: argparse.Namespace) -> None:
+    """`ucfrec benchmark`."""
+    suite: Benchmark = load_plugin("benchmarks", options.suite)
+    results = options.results or Path("benchmarks/results") / f"{options.suite}.jsonl"
+    tables = options.table or suite.tables
+    print(suite.run(options.budget, tables, options.out, results, options.workers))
+    print(f"\nrows: {results}")
+
+
 COMMANDS: dict[str, Callable[[argparse.Namespace], Any]] = {
     "demo": run_demo,
     "collect": run_collect,
@@ -197,4 +213,6 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], Any]] = {
     "recommend": run_recommend,
     "score": run_score,
     "ope": run_ope,
+    "report": run_report,
+    "benchmark": run_benchmark,
 }

@@ -22,9 +22,9 @@ _TINY = 1e-12
 class CSGConfig:
     """Which generator, and how it is made (paper appendix G.2, Table 5)."""
 
-    kind: Literal["tangent", "faithful"] = "tangent"
+    kind: Literal["tangent", "faithful", "noise"] = "tangent"
     """`tangent` draws a different edit every time; `faithful` is the paper's network, which learns
-    nearly one shift for all states."""
+    nearly one shift for all states; `noise` is the control, moves that heed no reward."""
     band: tuple[float, float] = (0.2, 0.5)
     """(ρ_low, ρ_high): length of a move, in standard deviations of the states."""
     reward_quantile: float = 0.3
@@ -144,10 +144,29 @@ class CounterfactualStateGenerator(nn.Module):
         return states + self._crm[0].state_std * self.move(states, actions, z)
 
 
+class NoiseGenerator:
+    """Moves in any direction, as long as `TangentGenerator`'s: what heeding the reward adds."""
+
+    def __init__(self, crm: CausalRewardModel, config: CSGConfig) -> None:
+        self._std = crm.state_std
+        self.band = config.band
+
+    def propose(
+        self, states: Tensor, actions: Tensor, z: Tensor, generator: torch.Generator
+    ) -> Tensor:
+        """See `Generator.propose`."""
+        low, high = self.band
+        noise = torch.randn(states.shape, generator=generator) * (self._std > 0)
+        length = low + (high - low) * torch.rand(len(states), 1, generator=generator)
+        return states + self._std * _scaled(noise, length)
+
+
 def make_generator(
     train: Transitions, crm: CausalRewardModel, config: CSGConfig, folder: Path, seed: int
 ) -> Generator:
     """The generator that `config` names, learned from the steps of `train` with high rewards."""
+    if config.kind == "noise":
+        return NoiseGenerator(crm, config)
     rng = np.random.default_rng(seed)
     threshold = np.quantile(train.rewards.numpy(), config.reward_quantile)
     rows = np.flatnonzero(train.rewards.numpy() >= threshold)
@@ -157,7 +176,7 @@ def make_generator(
     if config.kind == "faithful":
         s, a, r = train.states[chosen], train.actions[chosen], train.rewards[chosen]
         return _faithful(s, a, r, crm, config, folder, seed)
-    raise InputError(f"csg.kind is {config.kind!r}; it must be 'tangent' or 'faithful'")
+    raise InputError(f"csg.kind is {config.kind!r}; it must be 'tangent', 'faithful' or 'noise'")
 
 
 def _tangent(

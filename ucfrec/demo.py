@@ -1,4 +1,4 @@
-"""Everything on simulated logs: collect, prepare, train, evaluate, in two worlds."""
+"""Everything on simulated logs: collect, prepare, train, evaluate, report, in two worlds."""
 
 import os
 from collections.abc import Sequence
@@ -14,6 +14,7 @@ from tqdm import tqdm
 from ucfrec.config import resolve_config
 from ucfrec.evaluate import World, evaluate_behavior, evaluate_policy
 from ucfrec.files import write_json
+from ucfrec.report import write_report
 from ucfrec.run import train_run
 from ucfrec.simulated import simulated_store
 from ucfrec.store import EpisodeStore
@@ -52,8 +53,9 @@ class DemoConfig:
 def demo(out: Path, seed: int, config: DemoConfig) -> list[dict[str, Any]]:
     """Run the demo in the folder `out`; returns the rows of `out/results.json`.
 
-    Each world leaves its logs, store and runs in `out/<world>`, ready for the other commands. Given
-    again after an interruption, it goes on where it was.
+    `out/report.html` is a page about them and the runs. Each world leaves its logs, store and runs
+    in `out/<world>`, ready for the other commands. Given again after an interruption, it goes on
+    where it was.
     """
     for world in WORLDS:
         simulated_store(World(world), out / world, config.sessions, seed)
@@ -75,6 +77,8 @@ def demo(out: Path, seed: int, config: DemoConfig) -> list[dict[str, Any]]:
         order = ("random", "logging", *LEARNERS, "optimal")
         rows += [learned[world, name] for name in order]
     write_json(out / "results.json", rows)
+    runs = [out / world / name for world in WORLDS for name in LEARNERS]
+    write_report(out / "report.html", runs, [out / "results.json"])
     return rows
 
 

@@ -61,6 +61,11 @@ def run_grid(
                     continue
                 found[waiting[done]] = [row | own for row in done.result()]
                 append_rows(results, found[waiting[done]])
+        except BaseException:
+            # Whoever stops a benchmark does not wait for its cells, which go on where they were.
+            for child in multiprocessing.active_children():
+                child.terminate()
+            raise
         finally:
             pool.shutdown(cancel_futures=True)
     if failed:

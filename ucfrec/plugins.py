@@ -2,10 +2,10 @@
 
 A package adds a simulator to the command line by declaring, under the entry-point group
 `ucfrec.simulators`, a short name that points at a `Simulator`; datasets likewise under
-`ucfrec.datasets`.
+`ucfrec.datasets`, benchmarks under `ucfrec.benchmarks`.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -31,6 +31,19 @@ class Simulator:
     `optimal` where it is known."""
     feedback: str
     """Column that holds the reward in the logs that `ucfrec collect` writes."""
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """Tables that `ucfrec benchmark NAME` measures and prints."""
+
+    summary: str
+    """One line for `--help`."""
+    tables: tuple[str, ...]
+    """By name, in the order in which they are measured."""
+    run: Callable[[str, Sequence[str], Path, Path, int], str]
+    """(budget, tables, folder of runs, file of result rows, processes) to the tables as Markdown;
+    cells that have rows already are not measured again."""
 
 
 def load_plugin(group: str, name: str) -> Any:

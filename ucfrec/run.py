@@ -20,7 +20,7 @@ from ucfrec.policy import SequencePolicy
 from ucfrec.results import command_line, versions
 from ucfrec.store import ITEM_STATES, EpisodeStore
 from ucfrec.train import fit
-from ucfrec.trained import COUNTS, ITEMS, RUN, USERS
+from ucfrec.trained import AUGMENTATION, COUNTS, ITEMS, RUN, USERS
 from ucfrec.training_counts import TrainingCounts
 from ucfrec.windows import Overlay, Windows
 
@@ -123,6 +123,8 @@ def _begin(
         "session_gap_ms": store.meta["source"].get("session_gap_ms"),
         "sizes": _sizes(store),
         "observation_size": store.observation_size,
+        "train_episodes": train.n_episodes,
+        "train_steps": train.n_steps,
         "return_quantiles": {str(q): float(np.quantile(train.returns, q)) for q in _QUANTILES},
         "mean_return": float(train.returns.mean()),
         "versions": versions(),
@@ -176,7 +178,7 @@ def _counterfactuals(
     train: EpisodeStore, validation: EpisodeStore, out: Path, config: Config
 ) -> tuple[Overlay, dict[str, Any]]:
     """Edited copies and what is reported of them, made once a run."""
-    overlay_path, report_path = out / "overlay.safetensors", out / "augmentation.json"
+    overlay_path, report_path = out / "overlay.safetensors", out / AUGMENTATION
     if not report_path.exists():
         overlay, report = counterfactual_copies(
             train, validation, config.crm, config.csg, config.augment, out, config.seed

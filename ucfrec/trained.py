@@ -23,7 +23,7 @@ from ucfrec.store import ITEM_STATES
 from ucfrec.training_counts import TrainingCounts
 from ucfrec.windows import Windows
 
-RUN = "run.json"
+RUN, AUGMENTATION = "run.json", "augmentation.json"
 ITEMS, USERS = "items.parquet", "users.parquet"
 COUNTS = "training_counts.safetensors"
 
@@ -49,9 +49,7 @@ class TrainedPolicy:
         Raises:
             InputError: `run` is no run folder, or has no checkpoint yet.
         """
-        if not (run / RUN).exists():
-            raise InputError(f"{run} is not a run folder: it has no {RUN}; train one first")
-        record = read_json(run / RUN)
+        record = read_record(run)
         config = config_from_dict(record["config"])
         policy = POLICIES[config.policy_name](config.policy, record["sizes"])
         path = run / "policy" / f"{checkpoint}.safetensors"
@@ -109,6 +107,17 @@ class TrainedPolicy:
             self.item_ids if item_numbers is None else item_numbers,
             self.user_ids,
         )
+
+
+def read_record(run: Path) -> dict[str, Any]:
+    """What a run, finished or not, has recorded so far.
+
+    Raises:
+        InputError: `run` is no run folder.
+    """
+    if not (run / RUN).exists():
+        raise InputError(f"{run} is not a run folder: it has no {RUN}; train one first")
+    return dict(read_json(run / RUN))
 
 
 def learner_of(record: Mapping[str, Any]) -> str:

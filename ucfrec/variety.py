@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from ucfrec.rollout import BoolArray, FloatArray, IntArray, Step
+from ucfrec.rollout import BoolArray, IntArray, Step
 
 Similarity = Callable[[IntArray, IntArray], npt.NDArray[np.floating]]
 """Of items (M,) and items (M,), aligned: (M,), 1 for equal items."""
@@ -62,31 +62,12 @@ def diversity(episodes: IntArray, items: IntArray, similarity: Similarity) -> fl
 
 
 def tag_jaccard(incidence: BoolArray) -> Similarity:
-    """Shared tags over all tags of two items (KuaiRec), of a table (n_items, n_tags); 0 without
-    any."""
+    """Shared tags over all tags of two items, of a table (n_items, n_tags); 0 without any."""
 
     def similarity(one: IntArray, other: IntArray) -> npt.NDArray[np.floating]:
         shared = (incidence[one] & incidence[other]).sum(axis=1)
         either = (incidence[one] | incidence[other]).sum(axis=1)
         return np.where(one == other, 1.0, shared / np.maximum(either, 1))
-
-    return similarity
-
-
-def column_closeness(columns: FloatArray) -> Similarity:
-    """1 / (1 + Euclidean distance) of two items' columns of rewards (KuaiRand), (n_items, n_users).
-
-    Pairs repeat, so distances are taken once for all pairs of the different items asked for.
-    """
-
-    def similarity(one: IntArray, other: IntArray) -> npt.NDArray[np.floating]:
-        items, places = np.unique(np.concatenate([one, other]), return_inverse=True)
-        rows = columns[items].astype(np.float64)
-        squares = np.square(rows).sum(axis=1)
-        apart = squares[:, None] + squares - 2 * rows @ rows.T
-        np.fill_diagonal(apart, 0.0)
-        distances = np.sqrt(np.maximum(apart, 0.0))
-        return np.asarray(1 / (1 + distances[places[: len(one)], places[len(one) :]]))
 
     return similarity
 

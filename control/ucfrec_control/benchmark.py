@@ -1,27 +1,27 @@
-"""Every learner on the zoo files, seeds side by side: rows of Table 1 and Table 3 (resumable)."""
+"""Every learner on the zoo files (Tables 1 and 3), and sweeps over UCF's settings (resumable)."""
 
 import json
-import multiprocessing
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
-
-import torch
-from tqdm import tqdm
 
 from ucfrec.config import Config, resolve_config
-from ucfrec.errors import InputError
+from ucfrec.grid import Row, run_grid
 from ucfrec.results import config_hash, provenance
 from ucfrec.store import EpisodeStore
 from ucfrec_control.d4rl import read_d4rl
-from ucfrec_control.evaluate import CHECKPOINTS, evaluate_run
+from ucfrec_control.evaluate import evaluate_run
+from ucfrec_control.rl_baselines import ALGORITHMS, plain_config, rl_config, train_rl
 from ucfrec_control.train import dataset_of, preset_of, train_control
 from ucfrec_control.trajectories import PACKAGES
 
-METHODS: dict[str, tuple[str, tuple[str, ...]]] = {
+Methods = dict[str, tuple[str, tuple[str, ...]]]
+METHODS: Methods = {
     "bc": ("bc", ()),
+    "bc-10": ("bc", ("policy.best_share=0.1",)),
+    "bc-25": ("bc", ("policy.best_share=0.25",)),
+    "iql": ("iql", ()),
+    "cql": ("cql", ()),
     "dt": ("dt", ()),
     "dc": ("dc", ()),
     "lsdt": ("lsdt", ()),
@@ -30,6 +30,51 @@ METHODS: dict[str, tuple[str, tuple[str, ...]]] = {
     "ucf-wo-arch": ("dt", ("augment.copies=1",)),
 }
 """Learner and settings by the name of the table's row; the last two are Table 3's ablations."""
+
+_FAITHFUL, _NOISE = "csg.kind=faithful", "csg.kind=noise"
+_NO_GATE = "augment.epsilon_r=1e9"
+"""Every change of the reward passes; the limit on a move's length stays."""
+_ALGORITHM_5 = ("augment.copies=3", "augment.edits_per_copy=1", "augment.reward_quantile=0.0")
+MAIN = "main"
+TABLES: dict[str, Methods] = {
+    MAIN: METHODS,
+    # Figure 2.
+    "lambda": {
+        f"ucf-lambda-{weight:g}": ("ucf", (f"policy.lambda_mask={weight}",))
+        for weight in (0.0, 0.05, 0.1, 0.25, 0.5, 1.0)
+    },
+    # Table 9, with each generator.
+    "gate": {
+        "ucf": ("ucf", ()),
+        "ucf-wo-gate": ("ucf", (_NO_GATE,)),
+        "faithful": ("ucf", (_FAITHFUL,)),
+        "faithful-wo-gate": ("ucf", (_FAITHFUL, _NO_GATE)),
+    },
+    # Table 10: λ_band is of the paper's network; of tangent moves, the band is widened instead.
+    "band": {
+        "ucf": ("ucf", ()),
+        "ucf-wide": ("ucf", ("csg.band=[0.2, 2.0]",)),
+        "ucf-wo-lower": ("ucf", ("csg.band=[0.0, 0.5]",)),
+        "faithful": ("ucf", (_FAITHFUL,)),
+        "faithful-wo-band": ("ucf", (_FAITHFUL, "csg.lambda_band=0.0")),
+        "faithful-wo-lower": ("ucf", (_FAITHFUL, "csg.band=[0.0, 0.5]")),
+    },
+    # Does augmentation help at all? Each generator, reading of the copies, with and without gate.
+    "augmentation": {
+        "ucf-wo-count": ("ucf", ("augment.copies=0",)),
+        **{
+            f"{name}{reading}{gate}": ("ucf", (*kind, *copies, *open_))
+            for name, kind, gates in (
+                ("ucf", (), (("", ()), ("-wo-gate", (_NO_GATE,)))),
+                ("faithful", (_FAITHFUL,), (("", ()), ("-wo-gate", (_NO_GATE,)))),
+                ("noise", (_NOISE,), (("-wo-gate", (_NO_GATE,)),)),
+            )
+            for reading, copies in (("", ()), ("-algorithm-5", _ALGORITHM_5))
+            for gate, open_ in gates
+        },
+    },
+}
+"""Rows of each table, as in `METHODS`."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +86,8 @@ class Budget:
     episodes: int
     settings: tuple[str, ...]
     """Over the presets; none is the authors' size."""
+    rl_steps: int = 1_000_000
+    """Of IQL and CQL."""
 
 
 _TASKS, _KINDS = ("halfcheetah", "hopper", "walker2d"), ("medium", "mixed", "medium-expert")
@@ -60,37 +107,48 @@ BUDGETS = {
             "crm.epochs=5",
             "csg.epochs=5",
         ),
+        rl_steps=5000,
     ),
     "full": Budget(tuple(f"{t}_{k}-zoo" for t in _TASKS for k in _KINDS), 4, 100, ()),
 }
+
+_SMALL, _FULL = BUDGETS["small"], BUDGETS["full"]
+SWEEPS = {
+    # One file and half the steps: a sweep compares UCF with itself.
+    "small": replace(
+        _SMALL, files=_SMALL.files[:1], settings=(*_SMALL.settings, "train.steps=1000")
+    ),
+    "full": replace(_FULL, files=("hopper_medium-zoo", "halfcheetah_medium-zoo")),
+}
+"""Of every table but the main one."""
 
 
 @dataclass(frozen=True)
 class Cell:
     """One training, and the rows it gives."""
 
+    table: str
     method: str
+    learner: str
+    own: tuple[str, ...]
+    file: str
     store: Path
     run: Path
     seed: int
-    settings: tuple[str, ...]
-    episodes: int
-
-    @property
-    def config(self) -> Config:
-        """All that decides it, with its data."""
-        policy, own = METHODS[self.method]
-        preset = preset_of(dataset_of(EpisodeStore.open(self.store)), policy)
-        return resolve_config(policy, None, [*self.settings, *own], self.seed, preset.tables)
+    budget: Budget
+    budget_name: str
 
 
 def benchmark(
-    data: Path, folder: Path, results: Path, budget: Budget, name: str, workers: int
-) -> list[dict[str, Any]]:
-    """Train and judge whatever has no row in `results` yet; returns all rows of the budget.
-
-    Every finished cell's rows are appended at once; a cell that was interrupted goes on from its
-    last checkpoint.
+    data: Path,
+    folder: Path,
+    results: Path,
+    budget: Budget,
+    name: str,
+    workers: int,
+    table: str = MAIN,
+) -> list[Row]:
+    """Train and judge whatever has no row in `results` yet; returns all rows of the table.
 
     Args:
         data: folder of the HDF5 files.
@@ -98,75 +156,64 @@ def benchmark(
         results: JSON lines.
         name: of the budget, for the rows.
         workers: processes, of one thread each.
+        table: a key of `TABLES`.
 
     Raises:
-        InputError: a file is missing, or `results` holds something else.
+        InputError: a file is missing, `results` holds something else, or cells failed.
     """
-    cells = list(_cells(data, folder, budget, name))
-    known = _read(results)
-    missing = [cell for cell in cells if len(_rows_of(cell, known)) < len(CHECKPOINTS)]
-    spawn = multiprocessing.get_context("spawn")
-    results.parent.mkdir(parents=True, exist_ok=True)
-    with ProcessPoolExecutor(workers, mp_context=spawn) as pool:
-        waiting = [pool.submit(_run, cell) for cell in missing]
-        bar = tqdm(as_completed(waiting), "benchmark", len(waiting), unit="run", disable=None)
-        for done in bar:
-            rows = [row | {"budget": name} | provenance(PACKAGES) for row in done.result()]
-            with results.open("a", encoding="utf-8") as file:
-                file.writelines(json.dumps(row) + "\n" for row in rows)
-            known += rows
-    return [row for cell in cells for row in _rows_of(cell, known)]
+    cells = list(_cells(data, folder, budget, name, table))
+    return run_grid(cells, _measure, _keys, results, workers, f"benchmark {table}")
 
 
-def _cells(data: Path, folder: Path, budget: Budget, name: str) -> Iterator[Cell]:
+def _cells(data: Path, folder: Path, budget: Budget, name: str, table: str) -> Iterator[Cell]:
     for file in budget.files:
         store = folder / "stores" / file
         if not store.exists():
             read_d4rl(data / f"{file}.hdf5").write_store(store)
-        for method in METHODS:
+        for method, (learner, own) in TABLES[table].items():
             for seed in range(budget.seeds):
-                run = folder / name / file / f"{method}-{seed}"
-                yield Cell(method, store, run, seed, budget.settings, budget.episodes)
+                run = folder / name / table / file / f"{method}-{seed}"
+                yield Cell(table, method, learner, own, file, store, run, seed, budget, name)
 
 
-def _run(cell: Cell) -> list[dict[str, Any]]:
-    torch.set_num_threads(1)
+def _keys(cell: Cell) -> Row:
     store = EpisodeStore.open(cell.store)
-    train_control(store, cell.run, cell.config)
-    target = preset_of(dataset_of(store), METHODS[cell.method][0]).targets[:1]
-    # Starts are those of no other seed's training, and the same for every method.
-    rows = evaluate_run(cell.run, episodes=cell.episodes, seed=1000 + cell.seed, targets=target)
-    return [row | {"method": cell.method} for row in rows]
-
-
-def _rows_of(cell: Cell, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The latest row of each checkpoint, of this configuration on this data."""
-    wanted = {
+    if cell.learner in ALGORITHMS:
+        rl = rl_config(dataset_of(store), cell.learner, cell.budget.rl_steps)
+        config = plain_config(rl, cell.seed)
+    else:
+        # As a run's record has it, after JSON.
+        config = json.loads(json.dumps(asdict(_config(cell, store))))
+    return {
+        "table": cell.table,
+        "budget": cell.budget_name,
+        "dataset": cell.file,
         "method": cell.method,
         "seed": cell.seed,
-        "episodes": cell.episodes,
-        "config_hash": config_hash(_plain(cell.config)),
-        "fingerprint": EpisodeStore.open(cell.store).meta["fingerprint"],
+        "episodes": cell.budget.episodes,
+        "config_hash": config_hash(config),
+        "fingerprint": store.meta["fingerprint"],
     }
-    found = [row for row in rows if wanted == {name: row.get(name) for name in wanted}]
-    return list({row["checkpoint"]: row for row in found}.values())
 
 
-def _plain(config: Config) -> dict[str, Any]:
-    """The configuration as a run's record has it, after JSON."""
-    plain: dict[str, Any] = json.loads(json.dumps(asdict(config)))
-    return plain
+def _config(cell: Cell, store: EpisodeStore) -> Config:
+    preset = preset_of(dataset_of(store), cell.learner)
+    settings = [*cell.budget.settings, *cell.own]
+    return resolve_config(cell.learner, None, settings, cell.seed, preset.tables)
 
 
-def _read(results: Path) -> list[dict[str, Any]]:
-    if not results.exists():
-        return []
-    rows = []
-    for number, line in enumerate(results.read_text(encoding="utf-8").splitlines(), start=1):
-        try:
-            rows.append(dict(json.loads(line)))
-        except (ValueError, TypeError):
-            raise InputError(
-                f"{results}, line {number}, is no result row; delete the line to measure it again"
-            ) from None
-    return rows
+def _measure(cell: Cell) -> list[Row]:
+    store = EpisodeStore.open(cell.store)
+    if cell.learner in ALGORITHMS:
+        config = rl_config(dataset_of(store), cell.learner, cell.budget.rl_steps)
+        train_rl(store, cell.run, config, cell.seed)
+    else:
+        train_control(store, cell.run, _config(cell, store))
+    # Starts are those of no other seed's training, and the same for every method.
+    rows = evaluate_run(
+        cell.run,
+        episodes=cell.budget.episodes,
+        seed=1000 + cell.seed,
+        targets=preset_of(dataset_of(store), cell.learner).targets[:1],
+    )
+    return [row | provenance(PACKAGES) for row in rows]

@@ -117,6 +117,12 @@ def _evaluate(parser: argparse.ArgumentParser) -> None:
 
 def _benchmark(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("data", type=Path, metavar="DATA", help="folder of the HDF5 files")
+    parser.add_argument(
+        "--table",
+        default="main",
+        choices=["main", "lambda", "gate", "band", "augmentation"],
+        help="every learner (main), or a sweep over UCF's settings",
+    )
     parser.add_argument("--budget", default="small", choices=["small", "full"])
     parser.add_argument("--out", type=Path, default=Path("runs/control"), help="stores and runs")
     parser.add_argument(

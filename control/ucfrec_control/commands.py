@@ -16,7 +16,7 @@ from ucfrec.files import write_json
 from ucfrec.results import format_rows, provenance
 from ucfrec.run import describe_run
 from ucfrec.store import EpisodeStore
-from ucfrec_control.benchmark import BUDGETS, benchmark
+from ucfrec_control.benchmark import BUDGETS, MAIN, SWEEPS, benchmark
 from ucfrec_control.collect import SHOWN as COLLECTED
 from ucfrec_control.collect import CollectConfig, collect
 from ucfrec_control.d4rl import read_d4rl, write_d4rl
@@ -134,9 +134,10 @@ def run_benchmark(options: argparse.Namespace) -> None:
         options.data,
         options.out,
         options.results,
-        BUDGETS[options.budget],
+        (BUDGETS if options.table == MAIN else SWEEPS)[options.budget],
         options.budget,
         options.workers,
+        options.table,
     )
     print(format_rows([_shown(row) for row in rows], SHOWN))
     print(f"\nrows: {options.results}")
@@ -168,7 +169,8 @@ def run_figures(options: argparse.Namespace) -> None:
 
 def _shown(row: Mapping[str, Any]) -> dict[str, Any]:
     interval = f"{row['score']:.1f} [{row['score_low']:.1f}, {row['score_high']:.1f}]"
-    asked, earned = f"{row['target_return']:g}", f"{row['return']:.1f}"
+    asked = "none" if row["target_return"] is None else f"{row['target_return']:g}"
+    earned = f"{row['return']:.1f}"
     return {**row, "score": interval, "target_return": asked, "return": earned}
 
 

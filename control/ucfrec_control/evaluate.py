@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 
 from ucfrec.errors import InputError
+from ucfrec.files import read_json
 from ucfrec.metrics import bootstrap_interval
 from ucfrec.results import config_hash
 from ucfrec.rollout import rollout
-from ucfrec.trained import TrainedPolicy, learner_of
+from ucfrec.trained import RUN, TrainedPolicy, learner_of
 from ucfrec_control.environments import SIDE_BY_SIDE, make_env, mismatches
 from ucfrec_control.presets import find_preset
+from ucfrec_control.rl_baselines import RLPolicy, is_rl
 from ucfrec_control.scores import find_kind, require_task
 
 CHECKPOINTS = ("last", "best")
@@ -30,7 +32,8 @@ def evaluate_run(
 ) -> list[dict[str, Any]]:
     """One result row for each checkpoint and target return.
 
-    All rows play the same starts. A policy trained with distractors sees them fixed to 0.
+    All rows play the same starts. A policy trained with distractors sees them fixed to 0. IQL and
+    CQL have a last checkpoint only, and are asked for no return.
 
     Args:
         run: a run folder on a control store.
@@ -45,8 +48,9 @@ def evaluate_run(
     if episodes < 1:
         raise InputError(f"{episodes} episodes were asked for; at least one is needed")
     rows = []
-    for checkpoint in checkpoints:
-        trained = TrainedPolicy.load(run, checkpoint)
+    rl = (run / RUN).exists() and is_rl(read_json(run / RUN))
+    for checkpoint in ("last",) if rl else checkpoints:
+        trained = RLPolicy(run) if rl else TrainedPolicy.load(run, checkpoint)
         dataset = trained.record.get("dataset")
         if dataset is None:
             raise InputError(f"{run} is not a run of `ucfrec-control train`; `ucfrec` judges it")
@@ -55,17 +59,25 @@ def evaluate_run(
             raise InputError(f"{run}: its data does not tell the environment; name it with --env")
         rows += [
             _row(trained, world, target, episodes, seed) | {"checkpoint": checkpoint}
-            for target in targets or _preset_targets(trained, world)
+            for target in _targets(trained, world, targets)
         ]
     return [row | {"run": str(run)} for row in rows]
 
 
 def method_of(record: Mapping[str, Any]) -> str:
     """Name of what the run of `record` trained, interventions on screened dimensions included."""
-    return learner_of(record) + ("-screened" if record["dataset"].get("screened") else "")
+    name = record["config"]["policy_name"] if is_rl(record) else learner_of(record)
+    return name + ("-screened" if record["dataset"].get("screened") else "")
 
 
-def _preset_targets(trained: TrainedPolicy, env_id: str) -> tuple[float, ...]:
+def _targets(
+    trained: TrainedPolicy | RLPolicy, env_id: str, asked: Sequence[float]
+) -> Sequence[float | None]:
+    """The targets asked for, or those of the preset."""
+    if isinstance(trained, RLPolicy):
+        return (None,)
+    if asked:
+        return asked
     dataset, learner = trained.record["dataset"], trained.record["config"]["policy_name"]
     task = require_task(env_id, dataset["dataset"])
     if learner == "bc":
@@ -74,7 +86,7 @@ def _preset_targets(trained: TrainedPolicy, env_id: str) -> tuple[float, ...]:
 
 
 def _row(
-    trained: TrainedPolicy, env_id: str, target: float, episodes: int, seed: int
+    trained: TrainedPolicy | RLPolicy, env_id: str, target: Any, episodes: int, seed: int
 ) -> dict[str, Any]:
     record, dataset = trained.record, trained.record["dataset"]
     task = require_task(env_id, dataset["dataset"])

@@ -173,6 +173,7 @@ def _of_rows(rows: Sequence[Row]) -> Iterator[_Plan]:
 def _of_lambda(row: Row) -> bool:
     """Whether `row` is UCF's, complete but for its λ."""
     whole = row.get("method") == "ucf" or str(row.get("method")).startswith("ucf-lambda")
+    whole = whole and row.get("table", "lambda") == "lambda"
     clean = "distractor" not in row and not row.get("distractors")
     return (
         whole and clean and row.get("lambda_mask") is not None and row.get("checkpoint") == "last"

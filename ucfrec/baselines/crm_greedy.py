@@ -17,7 +17,7 @@ from ucfrec.windows import Windows
 
 _CANDIDATES: Final = 512
 """Logged action vectors to choose from."""
-_PAIRS: Final = 2**18
+_PAIRS: Final = 2**15
 """Pairs of state and action judged at once."""
 
 

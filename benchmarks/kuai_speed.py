@@ -1,0 +1,62 @@
+"""A step of 4,096 users in one `kuairand` world against one user in a Python-loop environment.
+
+    python -m benchmarks.kuai_speed --world runs/benchmark/small/arenas/kuairand/world
+
+Both play the same table, tags and exit rule; the one user under Gymnasium's `SyncVectorEnv`, as the
+many are a vector environment. They take turns. Writes benchmarks/results/kuai_speed.jsonl.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from tests.kuai_reference import OneUser
+from ucfrec.files import atomic_file
+from ucfrec.results import provenance
+from ucfrec_simulators.kuairand import kuairand
+
+RESULTS = Path(__file__).parent / "results" / "kuai_speed.jsonl"
+USERS = 4096
+
+
+def seconds_a_step(env: Any, steps: int, generator: np.random.Generator, n_items: int) -> float:
+    """CPU seconds of a step of one user."""
+    env.reset(seed=0)
+    actions = generator.integers(n_items, size=(steps, env.num_envs))
+    began = time.process_time()
+    for action in actions:
+        env.step(action)
+    return (time.process_time() - began) / actions.size
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--world", type=Path, required=True, help="folder of the kuairand world")
+    parser.add_argument("--rounds", type=int, default=9)
+    options = parser.parse_args()
+    many = kuairand(USERS, options.world)
+    one = SyncVectorEnv(
+        [lambda: OneUser(many.rewards, many.tags, many.exit_rule)],
+        autoreset_mode=AutoresetMode.SAME_STEP,
+    )
+    generator, n_items = np.random.default_rng(0), len(many.item_ids)
+    ratios, fast, slow = [], [], []
+    for turn in range(options.rounds + 1):
+        fast.append(seconds_a_step(many, 20, generator, n_items))
+        slow.append(seconds_a_step(one, 1000, generator, n_items))
+        if turn:  # the first turn warms up
+            ratios.append(slow[-1] / fast[-1])
+    low, middle, high = np.quantile(ratios, [0.1, 0.5, 0.9])
+    print(f"{USERS} users in one world: 1/{middle:.0f} [1/{low:.0f}, 1/{high:.0f}] a user-step")
+    row = {"users": USERS, "ratio": middle, "ratio_low": low, "ratio_high": high}
+    with atomic_file(RESULTS) as scratch:
+        scratch.write_text(json.dumps({**row, "rounds": options.rounds, **provenance()}) + "\n")
+
+
+if __name__ == "__main__":
+    main()

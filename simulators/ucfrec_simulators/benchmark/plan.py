@@ -1,0 +1,171 @@
+"""Which cells a table has, at a budget."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from ucfrec import schema
+from ucfrec.results import config_hash
+from ucfrec.store import EpisodeStore
+from ucfrec_simulators.badge import OFF, ON, BadgedWorld, plant_badge
+from ucfrec_simulators.benchmark.arenas import ARENAS, Arena
+from ucfrec_simulators.benchmark.cells import METHODS, Cell, Judging, Method
+from ucfrec_simulators.folders import data_folder
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What is cut for small machines, and what is not: no method is."""
+
+    seeds: int
+    sessions: int
+    """Collected, where logs are simulated."""
+    settings: tuple[str, ...]
+    """Of all methods, over their defaults."""
+    judging: Judging
+    sweep_seeds: int
+    """Of the sweeps and of the badge."""
+
+
+TARGETS: Final = (0.5, 0.9, 0.99, 1.0)
+BUDGETS: Final[Mapping[str, Budget]] = {
+    # Sized for two cores: width, steps and logs are cut, methods and seeds are not.
+    "small": Budget(
+        seeds=3,
+        sessions=6000,
+        settings=(
+            "policy.dim=64",
+            "train.steps=1000",
+            "train.learning_rate=1e-3",
+            "train.warmup_steps=100",
+            "train.validate_every=250",
+            "crm.epochs=8",
+        ),
+        judging=Judging(episodes=500, validation_episodes=200, quantiles=TARGETS),
+        sweep_seeds=2,
+    ),
+    "full": Budget(
+        seeds=5,
+        sessions=50_000,
+        settings=("train.steps=20000", "train.learning_rate=3e-4"),
+        judging=Judging(episodes=5000, validation_episodes=1000, quantiles=TARGETS),
+        sweep_seeds=3,
+    ),
+}
+_CONTEXT: Final = {"kuairand": 5}
+"""K of all methods with a memory, where it is not 10: KuaiRand's sessions are of two steps."""
+
+LAMBDAS: Final = (0.0, 0.05, 0.1, 0.25, 0.5, 1.0)
+BANDS: Final = ((0.05, 0.2), (0.2, 0.5), (0.5, 1.0), (1.0, 2.0))
+GATES: Final = (0.02, 0.1, 0.5, 1e6)
+"""ε_r in standard deviations of the rewards; the last one is no gate."""
+BADGE_METHODS: Final = tuple(
+    name for name, method in METHODS.items() if method.conditioned or name == "bc"
+)
+MAIN: Final = ("kuairand", "kuairec", "virtual-taobao", "synthetic-catalog")
+SWEPT: Final = ("synthetic-catalog", "virtual-taobao")
+_REAL: Final = {"kuairand": "kuairand", "kuairec": "kuairec", "virtual-taobao": "virtualtaobao"}
+"""What needs files that are not part of the package, and their folder in the data folder."""
+_KNOWN_BADGES: Final = {"synthetic-taobao": 0, "kuairand": 2}
+"""Where a badge is planted: arena, and which of its worlds judges (of KuaiRand NX_10, whose
+sessions are of one length, so that boredom does not drown the badge)."""
+_MEMORYLESS: Final = ("bc", "popular", "crm-greedy")
+
+
+class Plan:
+    """The cells of every table, for one budget and the data at hand."""
+
+    def __init__(self, folder: Path, budget: Budget) -> None:
+        """Args:
+        folder: where logs, stores, worlds and runs are kept.
+        """
+        self._folder, self._budget = folder, budget
+        self._arenas: dict[str, Arena] = {}
+
+    def main(self) -> Iterator[Cell]:
+        """Table 2, with the floors; Table 3's ablations are rows of it."""
+        for name in self._known(MAIN):
+            arena = self._arena(name)
+            for seed in range(self._budget.seeds):
+                for behavior in arena.behaviors:
+                    yield Cell(name, behavior, seed, arena.worlds, self._budget.judging)
+                for method in METHODS:
+                    yield from self._trained(name, arena, method, METHODS[method], seed)
+
+    def sweeps(self) -> Iterator[Cell]:
+        """UCF with other λ, bands and gates; the default stands in the main table."""
+        for name in self._known(SWEPT):
+            arena = self._arena(name)
+            arena = replace(arena, worlds=arena.worlds[:1])
+            spread = _reward_spread(arena.store)
+            sweeps = {
+                **{f"λ = {x:g}": f"policy.lambda_mask={x}" for x in LAMBDAS},
+                **{f"band {low:g}–{high:g}": f"csg.band=[{low}, {high}]" for low, high in BANDS},
+                **{f"ε_r = {x:g} σ": f"augment.epsilon_r={x * spread}" for x in GATES},
+            }
+            for label, setting in sweeps.items():
+                for seed in range(self._budget.sweep_seeds):
+                    method = Method("ucf", (setting,))
+                    yield from self._trained(name, arena, f"ucf, {label}", method, seed)
+
+    def badge(self) -> Iterator[Cell]:
+        """A planted badge: trained without it, and with it and judged with it off and on."""
+        for name, at in _KNOWN_BADGES.items():
+            if name not in self._known(_KNOWN_BADGES):
+                continue
+            clean = self._arena(name)
+            world = clean.worlds[at]
+            planted = self._folder / "arenas" / name / "badge-store"
+            if not planted.exists():
+                plant_badge(EpisodeStore.open(clean.store), planted)
+            shown = tuple(BadgedWorld(world.name, world.folder, rate) for rate in (OFF, ON))
+            badged = Arena(planted, shown, ())
+            for seed in range(self._budget.sweep_seeds):
+                for method in BADGE_METHODS:
+                    given = METHODS[method]
+                    yield from self._trained(name, clean, method, given, seed)
+                    yield from self._trained(f"{name}, badge", badged, method, given, seed)
+
+    def missing(self) -> list[str]:
+        """Environments that are left out, for lack of their data."""
+        return [name for name in MAIN if name not in self._known(MAIN)]
+
+    def _known(self, names: Iterable[str]) -> list[str]:
+        return [name for name in names if name not in _REAL or data_folder(_REAL[name]).is_dir()]
+
+    def _arena(self, name: str) -> Arena:
+        if name not in self._arenas:
+            folder = self._folder / "arenas" / name
+            self._arenas[name] = ARENAS[name](folder, self._budget.sessions)
+        return self._arenas[name]
+
+    def _trained(
+        self, name: str, arena: Arena, label: str, method: Method, seed: int
+    ) -> Iterator[Cell]:
+        """The cell of a trained method, unless it cannot act in the arena."""
+        items = EpisodeStore.open(arena.store).has_items
+        if not (items or method.vectors):
+            return
+        context = _CONTEXT.get(name.partition(",")[0], 10)
+        memory = () if method.policy in _MEMORYLESS else (f"policy.context={context}",)
+        settings = (*self._budget.settings, *memory, *method.settings)
+        named = config_hash({"policy": method.policy, "settings": settings})
+        yield Cell(
+            name,
+            label,
+            seed,
+            arena.worlds,
+            self._budget.judging,
+            arena.store,
+            self._folder / "runs" / name / f"{method.policy}-{named}-{seed}",
+            method.policy,
+            settings,
+            method.conditioned,
+        )
+
+
+def _reward_spread(store: Path) -> float:
+    """Standard deviation of the rewards of a store."""
+    opened = EpisodeStore.open(store)
+    return float(opened.step_values(schema.REWARD, *opened.all_steps()).std())

@@ -62,10 +62,11 @@ def cross_fitted(
     folds = np.random.default_rng(seed).permutation(sessions) % min(FOLDS, sessions)
     last = np.diff(session, append=sessions) > 0
     gram = _gram(features)
+    penalty = _penalty(gram, len(reward))
     modelled = Modelled(*np.zeros((3, len(reward))))
     for fold in tqdm(range(folds.max() + 1), desc="models", unit="fold", disable=None):
         here = folds[session] == fold
-        ridge = _Ridge(features, gram - _gram(features[here]), ~here)
+        ridge = _Ridge(features, gram - _gram(features[here]) + np.diag(penalty), ~here)
         modelled.reward[here] = at_policy[here] @ ridge.fit(reward)
         weights = fitted_q(ridge, at_policy, reward, last)
         modelled.q[here] = features[here] @ weights
@@ -76,17 +77,13 @@ def cross_fitted(
 class _Ridge:
     """Ridge regression on the rows of `features` (N, P) that are kept, factorised once.
 
-    Features count by their root mean square; the prior gives all P together the variance of the
-    noise (a penalty of P), and leaves the constant alone.
+    Args:
+        gram: (P, P) of these rows, the penalty on its diagonal.
     """
 
     def __init__(self, features: Float32Array, gram: FloatArray, keep: BoolArray) -> None:
         self._features, self.keep = features, keep
-        mean_square = np.diag(gram) / keep.sum()
-        # A feature that is always 0 has no weight to find.
-        penalty = len(gram) * np.where(mean_square > 0, mean_square, 1.0)
-        penalty[0] = 0.0
-        self._factor: Any = cho_factor(gram + np.diag(penalty))
+        self._factor: Any = cho_factor(gram)
 
     def fit(self, target: FloatArray) -> Float32Array:
         """(P,) weights for the target (N,); what stands there for rows not kept is ignored."""
@@ -117,6 +114,16 @@ def fitted_q(
             break
         weights = ridge.fit(reward + following)
     return weights
+
+
+def _penalty(gram: FloatArray, rows: int) -> FloatArray:
+    """(P,) penalty: features count by their root mean square, and the prior gives all P of them
+    together the variance of the noise; the constant goes free."""
+    mean_square = np.diag(gram) / rows
+    # A feature that is always 0 has no weight to find.
+    penalty: FloatArray = len(gram) * np.where(mean_square > 0, mean_square, 1.0)
+    penalty[0] = 0.0
+    return penalty
 
 
 def _gram(features: Float32Array) -> FloatArray:

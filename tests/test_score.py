@@ -1,6 +1,7 @@
 """Scores of logged choices: probabilities, and what the policy would see when acting."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from ucfrec import UCF, EpisodeStore
 from ucfrec.acting import PolicyActor
 from ucfrec.errors import InputError
 from ucfrec.logs import LogMapping, PrepareOptions, prepare
-from ucfrec.off_policy import logged_steps
+from ucfrec.off_policy import logged_steps, step_features
 from ucfrec.score import LoggedSessions, logged_sessions, score, scored_steps
 from ucfrec.trained import TrainedPolicy
 from ucfrec.windows import Windows
@@ -148,6 +149,21 @@ def test_models_are_asked_about_what_the_policy_would_show(
         same = certain.to_numpy() == 1
         np.testing.assert_allclose(steps.model.q[same], steps.model.v[same], rtol=1e-3, atol=1e-5)
         assert not np.allclose(steps.model.q, steps.model.v, atol=1e-3)
+
+
+def test_features_at_the_policy_are_the_mean_over_its_items(
+    trained: TrainedPolicy, logged: LoggedSessions
+) -> None:
+    batch = next(scored_steps(trained, logged.store, TARGET))
+    _, _, at_policy = step_features(trained, batch, greedy=False)
+    probabilities = batch.log_probabilities.exp().numpy()
+    mean = np.zeros(at_policy.shape)
+    for item in range(probabilities.shape[1]):
+        shown = replace(batch.windows, actions=torch.full_like(batch.windows.actions, item))
+        target, of_item, _ = step_features(trained, replace(batch, windows=shown), greedy=False)
+        np.testing.assert_allclose(target, probabilities[:, item], rtol=1e-6)
+        mean += probabilities[:, item, None] * of_item
+    np.testing.assert_allclose(at_policy, mean, rtol=1e-4, atol=1e-5)
 
 
 def test_items_the_run_does_not_know_are_counted(folder: Path, tmp_path: Path) -> None:

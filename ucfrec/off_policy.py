@@ -93,7 +93,7 @@ def logged_steps(
     target, done = np.empty(store.n_steps), 0
     for batch in scored_steps(trained, store, target_return):
         rows = slice(done, done + len(batch.steps))
-        target[rows], features[rows], at_policy[rows] = _judged(trained, batch, greedy)
+        target[rows], features[rows], at_policy[rows] = step_features(trained, batch, greedy)
         done = rows.stop
     episodes, steps = store.all_steps()
     reward = store.step_values(schema.REWARD, episodes, steps).astype(np.float64)
@@ -105,10 +105,15 @@ def logged_steps(
     return replace(unmodelled, model=cross_fitted(features, at_policy, reward, episodes, seed))
 
 
-def _judged(
+def step_features(
     trained: TrainedPolicy, batch: ScoredSteps, greedy: bool
 ) -> tuple[npt.NDArray[Any], Float32Array, Float32Array]:
-    """Probability (B,) of the logged items; features (B, P) of them and of the policy's items."""
+    """What models see of B logged steps.
+
+    Returns:
+        The judged policy's probability (B,) of the logged item; features (B, P) of the state and
+        the logged item, and the mean of those over the policy's items.
+    """
     assert trained.item_states is not None
     embeddings = trained.item_states.embeddings
     states, items = batch.windows.states[:, -1], batch.windows.actions[:, -1]

@@ -1,6 +1,7 @@
 """The command line as a stranger meets it: small logs, real commands, clear refusals."""
 
 import json
+import re
 import subprocess
 import sys
 import time
@@ -9,9 +10,15 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import torch
+from torch import Tensor
 
+from ucfrec.acting import PolicyActor
 from ucfrec.cli import main
+from ucfrec.evaluate import World
 from ucfrec.plugins import load_plugin
+from ucfrec.rollout import rollout
+from ucfrec.trained import TrainedPolicy
 
 TINY = [
     "train.steps=40",
@@ -120,6 +127,133 @@ def test_recommend_refuses_unknown_items(
     assert main([*arguments, "--skip-unknown"]) == 0
 
 
+@pytest.fixture(scope="module")
+def catalog(folder: Path) -> tuple[str, Path]:
+    """The catalogue's run and its logs."""
+    return str(folder / "synthetic-catalog-run"), folder / "synthetic-catalog-logs/sessions.parquet"
+
+
+def test_score_tells_the_probability_of_every_choice(
+    catalog: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, logs = catalog
+    log = pd.read_parquet(logs)
+    log.loc[log.index[:3], "item_id"] = 987654
+    log.to_parquet(tmp_path / "log.parquet")
+    out = tmp_path / "scores.parquet"
+    assert main(["score", run, str(tmp_path / "log.parquet"), "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"dropped: unknown_item +3 ", printed)
+    scores = pd.read_parquet(out)
+    assert f"{len(log) - 3:,} rows" in printed
+    assert len(scores) == len(log) - 3
+    columns = "user_id session timestamp item_id reward propensity probability rank greedy_item_id"
+    assert list(scores.columns) == columns.split()
+    assert scores.session.nunique() == log[3:].session_id.nunique()
+    assert scores.probability.between(0, 1, inclusive="neither").all()
+
+
+@pytest.mark.parametrize("choice", [[], ["--greedy"]])
+def test_ope_writes_the_rows_it_prints(
+    catalog: tuple[str, Path], choice: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, logs = catalog
+    out = tmp_path / "rows.json"
+    arguments = ["ope", run, str(logs), *choice, "--seed", "3", "--json", str(out)]
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out
+    rows = {row["estimator"]: row for row in json.loads(out.read_text())}
+    weighted = {"IPS", "SNIPS", "PDIS", "DR"} & set(rows)
+    assert set(rows) - weighted == {"logged", "DM", "FQE"}
+    assert weighted or choice
+    log = pd.read_parquet(logs)
+    assert rows["logged"]["R_cum"] == pytest.approx(log.is_click.sum() / 300)
+    for row in rows.values():
+        assert row["R_cum_low"] <= row["R_cum"] <= row["R_cum_high"]
+        assert (row["sessions"], row["steps"], row["seed"]) == (300, len(log), 3)
+        assert (row["run"], row["checkpoint"]) == (run, "best")
+        assert row["fingerprint"]
+        assert row["command"]
+    # Three hundred sessions are too few, and it says so.
+    assert all(f"warning: {line}" in printed for line in rows["logged"]["warnings"])
+    assert "session" in " ".join(rows["logged"]["warnings"])
+    assert main(arguments) == 0
+    assert {row["estimator"]: row for row in json.loads(out.read_text())} == rows
+
+
+class SoftmaxActor(PolicyActor):
+    """Draws items from the policy's probabilities: what `ope` judges, played."""
+
+    def _best(self, scores: Tensor) -> Tensor:
+        return torch.multinomial(scores.softmax(-1), 1)[:, 0]
+
+
+def test_ope_tells_from_uniform_logs_what_playing_tells(
+    catalog: tuple[str, Path], tmp_path: Path
+) -> None:
+    run, _ = catalog
+    collected = ["--behavior", "random", "--sessions", "3000", "--out", str(tmp_path / "logs")]
+    assert main(["collect", "--env", "synthetic-catalog", *collected]) == 0
+    out = tmp_path / "rows.json"
+    assert main(["ope", run, str(tmp_path / "logs/sessions.parquet"), "--json", str(out)]) == 0
+    rows = {row["estimator"]: row for row in json.loads(out.read_text())}
+    torch.manual_seed(0)
+    trained = TrainedPolicy.load(Path(run))
+    target = trained.target_return(1.0)
+    size = trained.record["observation_size"]
+    numbers = (trained.item_states, trained.item_ids, trained.user_ids)
+    actor = SoftmaxActor(trained.policy, 512, target, size, *numbers)
+    env = World("synthetic-catalog", None).simulator().make(512, None)
+    returns = rollout(env, actor, 2000, seed=0).returns
+    truth, error = returns.mean(), returns.std() / 2000**0.5
+    assert abs(truth - rows["logged"]["R_cum"]) > 3 * error
+    for name in ("IPS", "SNIPS", "PDIS", "DR"):
+        row = rows[name]
+        assert row["R_cum_low"] - 2 * error < truth < row["R_cum_high"] + 2 * error, name
+    widths = {name: row["R_cum_high"] - row["R_cum_low"] for name, row in rows.items()}
+    assert widths["DR"] < widths["PDIS"] < widths["IPS"]
+    assert rows["DR"]["overlap"] == pytest.approx(1, abs=0.05)
+
+
+def test_ope_without_propensities_has_only_models(
+    catalog: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, logs = catalog
+    log = pd.read_parquet(logs)
+    strange = log.tail(2).assign(item_id=987654)
+    without = pd.concat([log, strange]).drop(columns="propensity")
+    without.to_parquet(tmp_path / "without.parquet")
+    log.assign(propensity=log.propensity.where(log.index != 5)).to_parquet(tmp_path / "one.parquet")
+    for name, missing in (("without", len(log)), ("one", 1)):
+        out = tmp_path / f"{name}.json"
+        assert main(["ope", run, str(tmp_path / f"{name}.parquet"), "--json", str(out)]) == 0
+        rows = json.loads(out.read_text())
+        assert [row["estimator"] for row in rows] == ["logged", "DM", "FQE"]
+        assert rows[0]["overlap"] is None
+        printed = capsys.readouterr().out
+        assert f"warning: {missing:,} of {len(log):,} steps have no propensity" in printed
+        assert ("warning: 2 rows show items" in printed) is (name == "without")
+
+
+def test_score_and_ope_refuse_what_they_cannot_use(
+    folder: Path, catalog: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, logs = catalog
+    log = pd.read_parquet(logs)
+    density, other, blind = (str(tmp_path / f"{name}.parquet") for name in "abc")
+    log.assign(propensity=1.5).to_parquet(density)
+    log.assign(item_id=log.item_id + 10_000).to_parquet(other)
+    log.drop(columns="observation").to_parquet(blind)
+    out = str(tmp_path / "out")
+    assert "not a density" in refused(["ope", run, density, "--json", out], capsys)
+    for command in (["score", run, "--out", out], ["ope", run, "--json", out]):
+        assert "item is none of the store's" in refused([*command, other], capsys)
+        assert "trained with observations of 16 numbers" in refused([*command, blind], capsys)
+        vectors = str(folder / "synthetic-taobao-run")
+        assert "are vectors" in refused([command[0], vectors, *command[2:], str(logs)], capsys)
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_run_of_another_store_or_configuration_is_refused(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -155,8 +289,6 @@ def test_what_cannot_be_used_is_refused_in_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     printed = refused(arguments, capsys)
-    import re
-
     assert re.search(says, printed), printed
     assert list(tmp_path.iterdir()) == []
 

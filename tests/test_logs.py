@@ -287,7 +287,7 @@ def test_a_store_like_another_has_its_numbers(tmp_path: Path) -> None:
     report = prepare(
         [tmp_path / "b.parquet"], LogMapping(), tmp_path / "b", SMALL, like=tmp_path / "a"
     )
-    with pytest.raises(InputError, match="is not an episode store"):
+    with pytest.raises(InputError, match="neither an episode store nor a run"):
         prepare([tmp_path / "b.parquet"], LogMapping(), tmp_path / "c", SMALL, like=tmp_path)
     assert report["dropped"]["unknown_item"] == (later["item_id"] >= 12).sum()
     store = EpisodeStore.open(tmp_path / "b")

@@ -35,4 +35,11 @@ def test_the_commands_parse(command: str) -> None:
 
 
 def test_the_walk_through_has_its_commands() -> None:
-    assert {line.split()[1] for line in commands()} >= {"prepare", "train", "recommend", "evaluate"}
+    assert {line.split()[1] for line in commands()} >= {
+        "prepare",
+        "train",
+        "recommend",
+        "score",
+        "ope",
+        "evaluate",
+    }

@@ -82,6 +82,8 @@ def build_parser() -> argparse.ArgumentParser:
     train_options(commands.add_parser("train", help="train a policy on a store; resumes"))
     _evaluate(commands.add_parser("evaluate", help="what a policy earns in a simulator"))
     _recommend(commands.add_parser("recommend", help="the next items for users of a log"))
+    _score(commands.add_parser("score", help="a policy's probability of every choice of a log"))
+    _ope(commands.add_parser("ope", help="what a policy would have earned, from logs alone"))
     _report(commands.add_parser("report", help="one HTML page about runs"))
     _benchmark(commands.add_parser("benchmark", help="tables of every method; resumes"))
     return parser
@@ -178,6 +180,24 @@ def _recommend(parser: argparse.ArgumentParser) -> None:
     )
     _target_options(parser)
     parser.add_argument("--out", type=Path, required=True, help="Parquet file")
+
+
+def _score(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type=Path, metavar="RUN")
+    _log_options(parser)
+    _target_options(parser)
+    parser.add_argument("--out", type=Path, required=True, help="Parquet file")
+
+
+def _ope(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type=Path, metavar="RUN")
+    _log_options(parser)
+    _target_options(parser)
+    parser.add_argument(
+        "--greedy", action="store_true", help="judge the most probable item, not the softmax"
+    )
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path, help="write the result rows here")
 
 
 def _report(parser: argparse.ArgumentParser) -> None:

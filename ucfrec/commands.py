@@ -1,10 +1,11 @@
 """What each command does with its options."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
@@ -18,11 +19,13 @@ from ucfrec.files import atomic_file, write_json
 from ucfrec.logs.mapping import Dataset, LogMapping, columns_given, read_mapping
 from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, read_histories, validate
 from ucfrec.logs.report import format_report
+from ucfrec.off_policy import judge_off_policy
 from ucfrec.plugins import Benchmark, load_plugin
 from ucfrec.recommend import LONGEST_HISTORY, Histories, recommend
 from ucfrec.report import write_report
 from ucfrec.results import format_rows
 from ucfrec.run import describe_run, train_run
+from ucfrec.score import logged_sessions, score
 from ucfrec.store import EpisodeStore
 from ucfrec.trained import TrainedPolicy
 
@@ -136,8 +139,13 @@ def run_recommend(options: argparse.Namespace) -> None:
         filter_seen=not options.keep_seen,
         skip_unknown=options.skip_unknown,
     )
+    print(f"{options.out}: {_write_frames(options.out, frames):,} rows")
+
+
+def _write_frames(out: Path, frames: Iterable[pd.DataFrame]) -> int:
+    """Write frames as one Parquet file, atomically; returns the rows."""
     rows, writer = 0, None
-    with atomic_file(options.out) as scratch:
+    with atomic_file(out) as scratch:
         for frame in frames:
             table = pa.Table.from_pandas(frame, preserve_index=False)
             writer = writer or pq.ParquetWriter(scratch, table.schema)
@@ -145,7 +153,40 @@ def run_recommend(options: argparse.Namespace) -> None:
             rows += len(frame)
         if writer is not None:
             writer.close()
-    print(f"{options.out}: {rows:,} rows")
+    return rows
+
+
+def run_score(options: argparse.Namespace) -> None:
+    """`ucfrec score`."""
+    files, mapping = _logs(options)
+    trained = TrainedPolicy.load(options.run, options.checkpoint)
+    with logged_sessions(options.run, trained, files, mapping) as logged:
+        print(format_report(logged.report))
+        rows = _write_frames(options.out, score(trained, logged, _target(options, trained)))
+    print(f"\n{options.out}: {rows:,} rows")
+
+
+def run_ope(options: argparse.Namespace) -> None:
+    """`ucfrec ope`."""
+    files, mapping = _logs(options)
+    trained = TrainedPolicy.load(options.run, options.checkpoint)
+    with logged_sessions(options.run, trained, files, mapping) as logged:
+        print(format_report(logged.report))
+        judged = judge_off_policy(
+            options.run,
+            trained,
+            logged,
+            target_return=_target(options, trained),
+            greedy=options.greedy,
+            seed=options.seed,
+        )
+    rows = [row | {"checkpoint": options.checkpoint} for row in judged.rows]
+    shown = ("estimator", "policy", "choice", "R_cum", "effective_sessions", "sessions")
+    print(f"\n{format_rows(rows, shown)}")
+    for warning in judged.warnings:
+        print(f"warning: {warning}")
+    if options.json is not None:
+        write_json(options.json, rows)
 
 
 def run_report(options: argparse.Namespace) -> None:
@@ -170,6 +211,8 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], Any]] = {
     "train": run_train,
     "evaluate": run_evaluate,
     "recommend": run_recommend,
+    "score": run_score,
+    "ope": run_ope,
     "report": run_report,
     "benchmark": run_benchmark,
 }

@@ -46,11 +46,22 @@ def bootstrap_interval(
     values: npt.NDArray[np.float64], seed: int, level: float = 0.95
 ) -> tuple[float, float]:
     """Percentile bootstrap interval of the mean of `values` (N,)."""
+    ((low, high),) = ratio_intervals(values[:, None], np.ones((len(values), 1)), seed, level)
+    return float(low), float(high)
+
+
+def ratio_intervals(
+    above: npt.NDArray[np.float64], below: npt.NDArray[np.float64], seed: int, level: float = 0.95
+) -> npt.NDArray[np.float64]:
+    """Percentile bootstrap intervals (C, 2) of the ratios Σ above / Σ below of rows (N, C).
+
+    Resamples in which nothing stands below are left out.
+    """
     generator = np.random.default_rng(seed)
     # Multinomial counts stand for resampled rows: memory stays at N, whatever the resamples.
-    share = np.full(len(values), 1 / len(values))
-    means = [
-        generator.multinomial(len(values), share) @ values / len(values) for _ in range(_RESAMPLES)
-    ]
-    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
-    return float(low), float(high)
+    share, both = np.full(len(above), 1 / len(above)), np.hstack([above, below])
+    sums = np.array([generator.multinomial(len(both), share) @ both for _ in range(_RESAMPLES)])
+    numerators, denominators = np.hsplit(sums, 2)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratios = np.where(denominators > 0, numerators / denominators, np.nan)
+    return np.asarray(np.nanquantile(ratios, [(1 - level) / 2, (1 + level) / 2], axis=0).T)

@@ -215,15 +215,11 @@ def _next_steps(
     return EpisodeStore.open(folder)
 
 
-@torch.no_grad()
 def _scores(trained: TrainedPolicy, store: EpisodeStore, rows: IntArray, target: float) -> Tensor:
     """(rows, n_items) log-probabilities of the next item, asked for `target` from here on."""
-    policy = trained.policy
-    windows = store.windows(rows, store.lengths[rows] - 1, policy.config.context)
+    windows = store.windows(rows, store.lengths[rows] - 1, trained.policy.config.context)
     # What the session has earned since each step is in its returns-to-go already.
-    asked = (windows.returns_to_go + target).masked_fill(~windows.mask, 0.0)
-    windows = replace(windows, returns_to_go=asked).to(policy.state_mean.device)
-    return policy.act(windows).log_softmax(-1).cpu()
+    return trained.log_probabilities(windows, target)
 
 
 def _ranked(users: Array, item_ids: Array, scores: Tensor, k: int) -> pd.DataFrame:

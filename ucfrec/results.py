@@ -69,5 +69,10 @@ def format_rows(rows: Sequence[Mapping[str, Any]], shown: Sequence[str] = _SHOWN
 def _cell(row: Mapping[str, Any], name: str) -> str:
     value = row[name]
     if name == "R_cum":
-        return f"{value:.3f} [{row['R_cum_low']:.3f}, {row['R_cum_high']:.3f}]"
-    return f"{value:.3f}" if isinstance(value, float) else str(value)
+        return f"{_number(value)} [{_number(row['R_cum_low'])}, {_number(row['R_cum_high'])}]"
+    return _number(value) if isinstance(value, float) else str(value)
+
+
+def _number(value: float) -> str:
+    """Three decimals, or, of click rates and the like, three digits."""
+    return f"{value:.3f}" if value == 0 or abs(value) >= 0.1 else f"{value:#.3g}"

@@ -119,6 +119,7 @@ def _begin(
         "store": str(store.path.resolve()),
         "fingerprint": store.meta["fingerprint"],
         "reward": store.meta["reward"],
+        "session_by": store.meta["source"].get("session_by"),
         "session_gap_ms": store.meta["source"].get("session_gap_ms"),
         "sizes": _sizes(store),
         "observation_size": store.observation_size,

@@ -1,13 +1,14 @@
 """A trained policy, read back from its run folder."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow.parquet as pq
+import torch
 from torch import Tensor
 
 from ucfrec import schema
@@ -20,6 +21,7 @@ from ucfrec.policy import SequencePolicy
 from ucfrec.states import ItemStates
 from ucfrec.store import ITEM_STATES
 from ucfrec.training_counts import TrainingCounts
+from ucfrec.windows import Windows
 
 RUN, AUGMENTATION = "run.json", "augmentation.json"
 ITEMS, USERS = "items.parquet", "users.parquet"
@@ -72,6 +74,17 @@ class TrainedPolicy:
         """The `quantile` of training returns, interpolated between those the run recorded."""
         known = self.record["return_quantiles"]
         return float(np.interp(quantile, [float(q) for q in known], list(known.values())))
+
+    @torch.no_grad()
+    def log_probabilities(self, windows: Windows, more: Tensor | float) -> Tensor:
+        """(B, n_items) of the item at each window's last step (policies of items).
+
+        Args:
+            more: return asked for beyond the windows' returns-to-go, one number or (B, 1).
+        """
+        asked = (windows.returns_to_go + more).masked_fill(~windows.mask, 0.0)
+        windows = replace(windows, returns_to_go=asked).to(self.policy.state_mean.device)
+        return self.policy.act(windows).log_softmax(-1).cpu()
 
     def actor(
         self,

@@ -27,16 +27,19 @@ from ucfrec.logs.items import write_item_states
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.report import build_report, drop_counts, require_variety
 from ucfrec.logs.sessions import (
+    EPISODE_USERS,
     ID_TABLES,
     ITEMS_FILE,
     SESSIONS,
+    USERS_FILE,
     Cut,
     cut_episodes,
+    episode_users,
     number_ids,
     ordered_steps,
     split_bounds,
 )
-from ucfrec.store import ITEM_STATES, EpisodeStore
+from ucfrec.store import ITEM_STATES
 from ucfrec.store_writer import StoreWriter
 
 BATCH_ROWS: Final = 2**17
@@ -115,9 +118,10 @@ def prepare(
 
     Args:
         paths: log files, folders and globs.
-        like: a store whose users, items and item states are taken over, to judge a policy trained
-            on it by other logs. Rows with items it does not know are dropped, users it does not
-            know have number −1, and all episodes are uncut and of the split "train".
+        like: a store, or a run on it, whose users, items and item states are taken over, to judge
+            a policy trained on it by other logs. Rows with items it does not know are dropped,
+            users it does not know have number −1 (`episode_users.parquet` names the user of every
+            episode), and all episodes are uncut and of the split "train".
 
     Returns:
         What was read, dropped and written, for `format_report`; also in the store's `meta.json`
@@ -128,8 +132,8 @@ def prepare(
     """
     options, out = options or PrepareOptions(), Path(out)
     files = log_files(paths)
-    if like is not None:
-        EpisodeStore.open(like)
+    if like is not None and not (like / USERS_FILE).is_file():
+        raise InputError(f"{like} is neither an episode store nor a run: it has no {USERS_FILE}")
     with atomic_folder(out) as folder:
         spill = options.temp_folder or out.parent
         with (
@@ -144,6 +148,8 @@ def prepare(
                 _learn_states(log, folder, features, options.embedding_size)
             elif log.key == schema.ITEM_ID and like is not None:
                 shutil.copy(like / ITEM_STATES, folder / ITEM_STATES)
+            if like is not None:
+                _copy(log, episode_users(), folder / EPISODE_USERS)
     return report
 
 
@@ -273,16 +279,17 @@ def _write_ids(log: CleanLog, folder: Path) -> dict[str, list[Any]]:
     for name, table, file in ID_TABLES:
         if name not in log.columns:
             continue
-        log.connection.execute(
-            f"COPY (SELECT * EXCLUDE number FROM {table} ORDER BY number) "
-            f"TO {text(str(folder / file))} (FORMAT parquet)"
-        )
+        _copy(log, f"SELECT * EXCLUDE number FROM {table} ORDER BY number", folder / file)
         digest = hashlib.sha256()
         query = f"SELECT {name} FROM {table} ORDER BY number"
         for batch in log.connection.sql(query).to_arrow_reader(BATCH_ROWS):
             digest.update("\n".join(map(str, batch.column(0).to_pylist())).encode())
         digests[name] = [digest.hexdigest()]
     return digests
+
+
+def _copy(log: CleanLog, query: str, file: Path) -> None:
+    log.connection.execute(f"COPY ({query}) TO {text(str(file))} (FORMAT parquet)")
 
 
 def _learn_states(log: CleanLog, folder: Path, features: Features, size: int) -> None:

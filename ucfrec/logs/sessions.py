@@ -10,8 +10,10 @@ from ucfrec.logs.clean import CleanLog
 from ucfrec.logs.files import text
 
 ITEMS_FILE: Final = "items.parquet"
+USERS_FILE: Final = "users.parquet"
+EPISODE_USERS: Final = "episode_users.parquet"
 ID_TABLES: Final = (
-    (schema.USER_ID, "users", "users.parquet"),
+    (schema.USER_ID, "users", USERS_FILE),
     (schema.ITEM_ID, "items", ITEMS_FILE),
 )
 """Id column, its table of numbers, and that table's file in the store."""
@@ -119,8 +121,10 @@ def number_ids(log: CleanLog, listed: dict[str, list[str]], like: Path | None) -
             continue
         if like is not None:
             source = f"read_parquet({text(str(like / file))}, file_row_number = true)"
+            # Integers there may be text here, or the other way round.
+            known = f"TRY_CAST({name} AS {log.id_type(name)}) AS {name}"
             log.connection.execute(
-                f"CREATE TABLE {table} AS SELECT {name}, file_row_number AS number FROM {source}"
+                f"CREATE TABLE {table} AS SELECT {known}, file_row_number AS number FROM {source}"
             )
             continue
         ids = [f"SELECT DISTINCT {name} FROM steps"]
@@ -149,3 +153,8 @@ def ordered_steps(log: CleanLog) -> str:
         f"SELECT {', '.join(columns)} FROM steps {joins} "
         f"ORDER BY {schema.USER_ID}, episode, {schema.TIMESTAMP}, {log.key}"
     )
+
+
+def episode_users() -> str:
+    """The query that gives the user of every episode, in the order of the store."""
+    return f"SELECT {schema.USER_ID} FROM steps WHERE first ORDER BY {schema.USER_ID}, episode"

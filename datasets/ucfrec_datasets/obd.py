@@ -1,0 +1,50 @@
+"""Open Bandit Dataset: impressions of two policies with their true propensities."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from ucfrec.errors import InputError
+from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, log_files
+
+ITEMS: Final = "item_context"
+USER_FEATURES: Final = tuple(f"user_feature_{n}" for n in range(4))
+USER: Final = f"concat_ws('-', {', '.join(f'left({name}, 8)' for name in USER_FEATURES)})"
+"""The logs name nobody: users of equal features are one user. The values are hashes, of fewer than
+ten kinds each, that their first digits tell apart."""
+ITEM_FEATURES: Final = tuple(f"item_feature_{n}" for n in range(4))
+
+MAPPING: Final = LogMapping(
+    columns={
+        "user_id": USER,
+        "timestamp": "\"timestamp\"::TIMESTAMPTZ AT TIME ZONE 'UTC'",
+        "propensity": "propensity_score",
+        "session_id": "concat_ws(' ', \"timestamp\", position)",
+        # Where on the page: known before the item is chosen.
+        "observation": "[position = 1, position = 2, position = 3]::FLOAT[]",
+    },
+    reward="click",
+    session_by="session_id",
+)
+
+
+def _resolve(paths: Sequence[str | Path], given: LogMapping) -> tuple[tuple[Path, ...], LogMapping]:
+    """All logs named or in the folders named, item features among them or beside them."""
+    named = log_files(paths)
+    logs = tuple(file for file in named if not file.name.startswith(ITEMS))
+    if not logs:
+        raise InputError(f"{named[0]} holds features, no impressions; name a log, e.g. all.csv")
+    around = (*named, *log_files([logs[0].parent]))
+    items = [file for file in around if file.name.startswith(ITEMS)]
+    found = LogMapping(
+        # Every campaign's folder brings the same table.
+        item_features=(FeatureTable((items[0],), "item_id", ITEM_FEATURES),) if items else (),
+        user_features=(FeatureTable(logs, USER, USER_FEATURES, first_by='"timestamp"'),),
+    )
+    return logs, given.over(found).over(MAPPING)
+
+
+DATASET: Final = Dataset(
+    summary="Open Bandit Dataset: folders of a policy and campaign, or files (CSV or Parquet)",
+    resolve=_resolve,
+)

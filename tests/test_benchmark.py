@@ -17,6 +17,7 @@ from ucfrec_simulators.benchmark import plan
 from ucfrec_simulators.benchmark.arenas import kuairand
 from ucfrec_simulators.benchmark.cells import JUDGED, METHODS, Judging
 from ucfrec_simulators.benchmark.plan import BUDGETS, Plan
+from ucfrec_simulators.benchmark.plots import plot_badge, plot_methods, plot_targets
 from ucfrec_simulators.benchmark.tables import badge_table, method_table, target_table
 from ucfrec_simulators.kuai import EXITS
 from ucfrec_simulators.kuai_logs import cut_by_exit, window
@@ -59,6 +60,7 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     tried = next(row for row in rows if row["method"] == "dt")
     best = max(tried["validation"], key=lambda target: tried["validation"][target])
     assert tried["target_return"] == float(best)
+    assert (tmp_path / "out" / "small" / "plots").exists() == ("pictures:" in said)
     again = suite.run("small", ["main"], tmp_path / "out", results, 1)
     assert again == said
     assert len(read_rows(results)) == len(rows)
@@ -113,6 +115,31 @@ def test_tables_give_means_spreads_and_paired_drops() -> None:
     assert target_table(clean).splitlines()[2] == "| w | m | 3 | 2 | 15.5 ± 7.78 |"
     line = badge_table(rows).splitlines()[2]
     assert line == "| w | m | 2 | 15 ± 7.07 | 10 ± 7.07 | 12 ± 5.66 | 37.5 ± 17.7 |"
+
+
+def test_pictures_show_the_means(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    shared = {"env": "w", "checkpoint": "best", "target_return": 3.0, "validation": {"3": 1.0}}
+    rows = [
+        shared | {"method": method, "seed": s, "R_cum": float(s + 1), "badge": badge}
+        for method in ("dt", "ucf")
+        for badge in (None, 0.0, 1.0)
+        for s in range(2)
+    ]
+    clean = [row for row in rows if row["badge"] is None]
+    for plot, given, name in (
+        (plot_methods, clean, "methods-w.svg"),
+        (plot_targets, clean, "targets-w.svg"),
+        (plot_badge, rows, "badge-w.svg"),
+    ):
+        (path,) = plot(given, tmp_path)
+        assert path == tmp_path / name
+        drawn = path.read_text()
+        assert ">ucf<" in drawn
+        assert ">dt<" in drawn
+        plot(given, tmp_path)
+        assert path.read_text() == drawn
+    assert plot_badge(clean, tmp_path) == []
 
 
 def test_windows_drop_repeats_and_are_cut(tmp_path: Path) -> None:

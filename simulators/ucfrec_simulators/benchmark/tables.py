@@ -1,20 +1,22 @@
 """Rows to tables: mean and spread over seeds, as Markdown."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from ucfrec.grid import Row
 
-_SHOWN = ("R_cum", "R_avg_pooled", "R_avg_episode", "length")
+BADGES: Final = (None, 0.0, 1.0)
+"""How a row's badge was shown: there was none, never, always."""
+_SHOWN: Final = ("R_cum", "R_avg_pooled", "R_avg_episode", "length")
 
 
 def method_table(rows: Sequence[Row], checkpoint: str = "best") -> str:
     """One line a world and method, in the order of the rows (Tables 2 and 3 of the paper)."""
     head = ("env", "method", "seeds", *_SHOWN, "coverage", "target")
     lines = []
-    for (env, method), own in _grouped(rows, checkpoint, lambda row: (row["env"], row["method"])):
+    for (env, method), own in grouped(rows, checkpoint, lambda row: (row["env"], row["method"])):
         spread = [_spread(own, name) for name in _SHOWN]
         lines.append((env, method, len(own), *spread, _spread(own, "coverage"), _targets(own)))
     return markdown(head, lines)
@@ -24,7 +26,7 @@ def sweep_table(rows: Sequence[Row], checkpoint: str = "best") -> str:
     """One line a world and setting of UCF, with its worth on validation data beside."""
     head = ("env", "setting", "seeds", "R_cum", "validation loss", "acceptance")
     lines = []
-    for (env, method), own in _grouped(rows, checkpoint, lambda row: (row["env"], row["method"])):
+    for (env, method), own in grouped(rows, checkpoint, lambda row: (row["env"], row["method"])):
         spread = [_spread(own, name) for name in ("R_cum", "validation_loss", "acceptance")]
         lines.append((env, method, len(own), *spread))
     return markdown(head, lines)
@@ -34,7 +36,7 @@ def target_table(rows: Sequence[Row]) -> str:
     """What each target return earned on validation sessions, mean over seeds."""
     asked = [row for row in rows if row.get("validation") and row["checkpoint"] == "best"]
     lines = []
-    for (env, method), own in _grouped(asked, "best", lambda row: (row["env"], row["method"])):
+    for (env, method), own in grouped(asked, "best", lambda row: (row["env"], row["method"])):
         targets = sorted({float(t) for row in own for t in row["validation"]})
         for target in targets:
             earned = [
@@ -49,20 +51,17 @@ def target_table(rows: Sequence[Row]) -> str:
 def badge_table(rows: Sequence[Row], checkpoint: str = "best") -> str:
     """Per method: trained without the badge, and with it, judged with it off and on."""
     lines = []
-    for (env, method), own in _grouped(rows, checkpoint, lambda row: (row["env"], row["method"])):
-        of = {rate: {r["seed"]: r["R_cum"] for r in own if r["badge"] == rate} for rate in _RATES}
+    for (env, method), own in grouped(rows, checkpoint, lambda row: (row["env"], row["method"])):
+        of = {rate: {r["seed"]: r["R_cum"] for r in own if r["badge"] == rate} for rate in BADGES}
         paired = sorted(set.intersection(*(set(values) for values in of.values())))
         if not paired:  # a world in which no badge was planted
             continue
-        clean, off, on = (np.array([of[rate][seed] for seed in paired]) for rate in _RATES)
+        clean, off, on = (np.array([of[rate][seed] for seed in paired]) for rate in BADGES)
         drop = 100 * (1 - off / clean)
         spread = [_mean(values) for values in (clean, off, on, drop)]
         lines.append((env, method, len(paired), *spread))
     head = ("env", "method", "seeds", "no badge", "badge off", "badge on", "drop, %")
     return markdown(head, lines)
-
-
-_RATES = (None, 0.0, 1.0)
 
 
 def markdown(head: Sequence[str], lines: Sequence[Sequence[object]]) -> str:
@@ -71,7 +70,7 @@ def markdown(head: Sequence[str], lines: Sequence[Sequence[object]]) -> str:
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in body)
 
 
-def _grouped(
+def grouped(
     rows: Sequence[Row], checkpoint: str, key: Callable[[Row], Any]
 ) -> list[tuple[Any, list[Row]]]:
     """Rows of built-in policies and of one checkpoint, by key, in the order of the rows."""

@@ -69,7 +69,8 @@ BADGE_METHODS: Final = tuple(
     name for name, method in METHODS.items() if method.conditioned or name == "bc"
 )
 MAIN: Final = ("kuairand", "kuairec", "virtual-taobao", "synthetic-catalog")
-SWEPT: Final = ("synthetic-catalog", "virtual-taobao")
+SWEPT: Final = ("synthetic-catalog", "synthetic-taobao")
+"""Worlds with room: in VirtualTaobao every sequence policy is at the ceiling."""
 _REAL: Final = {"kuairand": "kuairand", "kuairec": "kuairec", "virtual-taobao": "virtualtaobao"}
 """What needs files that are not part of the package, and their folder in the data folder."""
 _KNOWN_BADGES: Final = {"synthetic-taobao": 0, "kuairand": 2}

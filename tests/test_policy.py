@@ -103,6 +103,20 @@ def test_the_past_moves_a_prediction(name: str, sizes: dict[str, int], field: st
 
 @both_heads
 @sequence
+def test_no_less_is_asked_for_than_the_logs_had(name: str, sizes: dict[str, int]) -> None:
+    policy, windows = build(name, sizes), random_windows(sizes)
+
+    def asked(returns_to_go: float) -> Tensor:
+        values = torch.full_like(windows.returns_to_go, returns_to_go)
+        return predictions(policy, replace(windows, returns_to_go=values))
+
+    policy.lowest_return_to_go.fill_(-0.5)
+    assert torch.equal(asked(-40.0), asked(-0.5))
+    assert not torch.equal(asked(0.0), asked(-0.5))
+
+
+@both_heads
+@sequence
 def test_padding_is_inert(name: str, sizes: dict[str, int]) -> None:
     policy, windows = build(name, sizes), random_windows(sizes)
     changed = {"timesteps": windows.timesteps.masked_fill(~windows.mask, 3)}

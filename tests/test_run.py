@@ -89,6 +89,8 @@ def test_a_run_needs_nothing_but_its_folder(store: Path, left_alone: Path) -> No
     view = EpisodeStore.open(store).split("train")
     mean, _ = view.state_statistics
     torch.testing.assert_close(trained.policy.state_mean, mean)
+    returns_to_go = view.step_values("return_to_go", *view.all_steps())
+    assert trained.policy.lowest_return_to_go == returns_to_go.min()
     assert trained.target_return(1.0) == pytest.approx(view.returns.max())
     assert trained.target_return(0.5) == pytest.approx(np.median(view.returns), rel=1e-5)
 

@@ -48,6 +48,7 @@ class SequencePolicy(nn.Module, ABC):
     state_mean: Tensor
     state_std: Tensor
     return_scale: Tensor
+    lowest_return_to_go: Tensor
     head: Head
 
     def __init__(self, config: PolicyConfig, sizes: Mapping[str, int]) -> None:
@@ -58,6 +59,7 @@ class SequencePolicy(nn.Module, ABC):
         self.register_buffer("state_mean", torch.zeros(sizes["state"]))
         self.register_buffer("state_std", torch.ones(sizes["state"]))
         self.register_buffer("return_scale", torch.ones(()))
+        self.register_buffer("lowest_return_to_go", torch.tensor(-torch.inf))
         self.head = head_from(sizes, config.dim)
 
     @classmethod
@@ -79,11 +81,14 @@ class SequencePolicy(nn.Module, ABC):
         """What predicts the actions, (B, K, d), from normalised windows; row t sees no a_t."""
 
     def normalized(self, windows: Windows) -> Windows:
-        """Standardised states and scaled returns-to-go."""
+        """Standardised states, and scaled returns-to-go, none below the lowest of the training data.
+
+        A session that has earned its target would else be asked for less than nothing, and that is
+        what the policy would then aim at.
+        """
         states = ((windows.states - self.state_mean) / self.state_std).clamp(-_CLIP, _CLIP)
-        return replace(
-            windows, states=states, returns_to_go=windows.returns_to_go / self.return_scale
-        )
+        asked = windows.returns_to_go.clamp(min=self.lowest_return_to_go)
+        return replace(windows, states=states, returns_to_go=asked / self.return_scale)
 
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         """Action loss over all steps of the windows, and scalars to log (Algorithm 6)."""
@@ -134,7 +139,7 @@ class UCFConfig(PolicyConfig):
 
     conv_blocks: int = 2
     heads: int = 2
-    lambda_mask: float = 0.03
+    lambda_mask: float = 0.0
     """λ, weight of the mask loss."""
     parent_window: int = 2
     """w, how many earlier states count as parents."""

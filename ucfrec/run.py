@@ -207,6 +207,8 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
     scale = config.policy.return_scale or float(np.abs(base.returns).max()) or 1.0
     policy.return_scale.fill_(scale)
     episodes, steps = base.all_steps()
+    asked = base.step_values(schema.RETURN_TO_GO, episodes, steps)
+    policy.lowest_return_to_go.fill_(float(asked.min()))
     if isinstance(policy.head, ItemHead):
         counts = np.bincount(
             base.step_values(schema.ITEM, episodes, steps), minlength=len(policy.head.counts)

@@ -81,7 +81,7 @@ class SequencePolicy(nn.Module, ABC):
         """What predicts the actions, (B, K, d), from normalised windows; row t sees no a_t."""
 
     def normalized(self, windows: Windows) -> Windows:
-        """Standardised states, and scaled returns-to-go, none below the lowest of the training data.
+        """Standardised states; returns-to-go, scaled, none below the lowest of the training data.
 
         A session that has earned its target would else be asked for less than nothing, and that is
         what the policy would then aim at.
@@ -140,7 +140,7 @@ class UCFConfig(PolicyConfig):
     conv_blocks: int = 2
     heads: int = 2
     lambda_mask: float = 0.0
-    """λ, weight of the mask loss."""
+    """λ, weight of the mask loss; 0, no supervision, did best in every world that was tried."""
     parent_window: int = 2
     """w, how many earlier states count as parents."""
     parent_decay: float = 0.6

@@ -90,6 +90,7 @@ def test_every_cell_of_every_table_has_a_configuration(
     planted = EpisodeStore.open(badges[0].store)  # type: ignore[arg-type]
     assert planted.observation_size == 92
     assert [world.rate for world in badges[0].worlds] == [0.0, 1.0]  # type: ignore[attr-defined]
+    assert {cell.judging.quantiles for cell in given.badge()} == {(1.0,)}
 
 
 def test_unknown_tables_are_named(tmp_path: Path) -> None:

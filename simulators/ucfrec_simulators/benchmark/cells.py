@@ -60,7 +60,7 @@ class Judging:
     validation_episodes: int
     """Played to choose the target return; never reported as a result."""
     quantiles: tuple[float, ...]
-    """Of the training returns: the targets to choose from."""
+    """Of the training returns: the targets to choose from, where there are several."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,8 @@ def keys(cell: Cell) -> dict[str, Any]:
         return own
     plain = json.loads(json.dumps(asdict(cell.config)))
     fingerprint = EpisodeStore.open(cell.store).meta["fingerprint"]
-    return own | {"config": config_hash(plain), "fingerprint": fingerprint}
+    own |= {"config": config_hash(plain), "fingerprint": fingerprint}
+    return own | {"quantiles": list(cell.judging.quantiles)}
 
 
 def measure(cell: Cell) -> list[Row]:
@@ -150,6 +151,8 @@ def _target(cell: Cell, world: World) -> tuple[float, dict[str, float] | None]:
     if not cell.conditioned:
         return trained.target_return(1.0), None
     targets = dict.fromkeys(trained.target_return(q) for q in cell.judging.quantiles)
+    if len(targets) == 1:
+        return next(iter(targets)), None
     count, seed = cell.judging.validation_episodes, cell.seed + VALIDATED
     tried = {
         target: float(evaluate_policy(world, trained, cell.method, count, seed, target)["R_cum"])

@@ -116,7 +116,12 @@ class Plan:
                     yield from self._trained(name, arena, f"ucf, {label}", method, seed)
 
     def badge(self) -> Iterator[Cell]:
-        """A planted badge: trained without it, and with it and judged with it off and on."""
+        """A planted badge: trained without it, and with it and judged with it off and on.
+
+        Everybody is asked for the largest training return: a target chosen where the badge is off
+        would know of the intervention.
+        """
+        judging = replace(self._budget.judging, quantiles=(1.0,))
         for name, at in _KNOWN_BADGES.items():
             if name not in self._known(_KNOWN_BADGES):
                 continue
@@ -130,8 +135,8 @@ class Plan:
             for seed in range(self._budget.sweep_seeds):
                 for method in BADGE_METHODS:
                     given = METHODS[method]
-                    yield from self._trained(name, clean, method, given, seed)
-                    yield from self._trained(f"{name}, badge", badged, method, given, seed)
+                    yield from self._trained(name, clean, method, given, seed, judging)
+                    yield from self._trained(f"{name}, badge", badged, method, given, seed, judging)
 
     def missing(self) -> list[str]:
         """Environments that are left out, for lack of their data."""
@@ -147,9 +152,19 @@ class Plan:
         return self._arenas[name]
 
     def _trained(
-        self, name: str, arena: Arena, label: str, method: Method, seed: int
+        self,
+        name: str,
+        arena: Arena,
+        label: str,
+        method: Method,
+        seed: int,
+        judging: Judging | None = None,
     ) -> Iterator[Cell]:
-        """The cell of a trained method, unless it cannot act in the arena."""
+        """The cell of a trained method, unless it cannot act in the arena.
+
+        Args:
+            judging: the budget's unless given.
+        """
         items = EpisodeStore.open(arena.store).has_items
         if not (items or method.vectors):
             return
@@ -163,7 +178,7 @@ class Plan:
             label,
             seed,
             arena.worlds,
-            self._budget.judging,
+            judging or self._budget.judging,
             arena.store,
             self._folder / "runs" / name / f"{method.policy}-{named}-{seed}",
             method.policy,

@@ -140,7 +140,7 @@ class UCFConfig(PolicyConfig):
     conv_blocks: int = 2
     heads: int = 2
     lambda_mask: float = 0.0
-    """λ, weight of the mask loss; 0, no supervision, did best in every world that was tried."""
+    """λ, weight of the mask loss; any cost return in both worlds where it was swept."""
     parent_window: int = 2
     """w, how many earlier states count as parents."""
     parent_decay: float = 0.6

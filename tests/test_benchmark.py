@@ -90,7 +90,7 @@ def test_every_cell_of_every_table_has_a_configuration(
     planted = EpisodeStore.open(badges[0].store)  # type: ignore[arg-type]
     assert planted.observation_size == 92
     assert [world.rate for world in badges[0].worlds] == [0.0, 1.0]  # type: ignore[attr-defined]
-    assert {cell.judging.quantiles for cell in given.badge()} == {(1.0,)}
+    assert {cell.judging.quantiles for cell in given.badge()} == {(1.0,), (0.99,)}
 
 
 def test_unknown_tables_are_named(tmp_path: Path) -> None:
@@ -114,15 +114,17 @@ def test_tables_give_means_spreads_and_paired_drops() -> None:
         "| w | m | 2 | 15 ± 7.07 | 0.5 ± 0 | 0.5 ± 0 | 2 ± 0 | – | 3 |"
     )
     assert target_table(clean).splitlines()[2] == "| w | m | 3 | 2 | 15.5 ± 7.78 |"
-    line = badge_table(rows).splitlines()[2]
-    assert line == "| w | m | 2 | 15 ± 7.07 | 10 ± 7.07 | 12 ± 5.66 | 37.5 ± 17.7 |"
+    asked = [row | {"quantiles": [q]} for q in (0.99, 1.0) for row in rows]
+    line, less = badge_table(asked).splitlines()[2:]
+    assert less == line.replace("| 1 |", "| 0.99 |")
+    assert line == "| w | 1 | m | 2 | 15 ± 7.07 | 10 ± 7.07 | 12 ± 5.66 | 37.5 ± 17.7 |"
 
 
 def test_pictures_show_the_means(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     shared = {"env": "w", "checkpoint": "best", "target_return": 3.0, "validation": {"3": 1.0}}
     rows = [
-        shared | {"method": method, "seed": s, "R_cum": float(s + 1), "badge": badge}
+        shared | {"method": method, "seed": s, "R_cum": s + 1.0, "badge": badge, "quantiles": [1.0]}
         for method in ("dt", "ucf")
         for badge in (None, 0.0, 1.0)
         for s in range(2)

@@ -68,6 +68,8 @@ GATES: Final = (0.02, 0.1, 0.5, 1e6)
 BADGE_METHODS: Final = tuple(
     name for name, method in METHODS.items() if method.conditioned or name == "bc"
 )
+BADGE_TARGETS: Final = (1.0, 0.99)
+"""Quantiles of the training returns: the default target, and one nearer to the logs."""
 MAIN: Final = ("kuairand", "kuairec", "virtual-taobao", "synthetic-catalog")
 SWEPT: Final = ("synthetic-catalog", "synthetic-taobao")
 """Worlds with room: in VirtualTaobao every sequence policy is at the ceiling."""
@@ -118,10 +120,10 @@ class Plan:
     def badge(self) -> Iterator[Cell]:
         """A planted badge: trained without it, and with it and judged with it off and on.
 
-        Everybody is asked for the largest training return: a target chosen where the badge is off
-        would know of the intervention.
+        Everybody is asked for the same returns: a target chosen where the badge is off would know
+        of the intervention.
         """
-        judging = replace(self._budget.judging, quantiles=(1.0,))
+        asked = [replace(self._budget.judging, quantiles=(q,)) for q in BADGE_TARGETS]
         for name, at in _KNOWN_BADGES.items():
             if name not in self._known(_KNOWN_BADGES):
                 continue
@@ -135,8 +137,10 @@ class Plan:
             for seed in range(self._budget.sweep_seeds):
                 for method in BADGE_METHODS:
                     given = METHODS[method]
-                    yield from self._trained(name, clean, method, given, seed, judging)
-                    yield from self._trained(f"{name}, badge", badged, method, given, seed, judging)
+                    for judging in asked:
+                        yield from self._trained(name, clean, method, given, seed, judging)
+                        badge = f"{name}, badge"
+                        yield from self._trained(badge, badged, method, given, seed, judging)
 
     def missing(self) -> list[str]:
         """Environments that are left out, for lack of their data."""

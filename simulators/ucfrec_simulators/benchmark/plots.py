@@ -34,7 +34,9 @@ def plot_targets(rows: Sequence[Row], folder: Path) -> list[Path]:
 
 
 def plot_badge(rows: Sequence[Row], folder: Path) -> list[Path]:
-    """A picture a world in which a badge was planted: returns without it, with it off and on."""
+    """A picture a world in which a badge was planted: returns without it, with it off and on,
+    where the largest return is asked for."""
+    rows = [row for row in rows if row["quantiles"] == [1.0]]
     told = {row["env"] for row in rows if row["badge"] is not None}
     return [
         _saved(folder / f"badge-{world}.svg", _triples, own)

@@ -49,9 +49,13 @@ def target_table(rows: Sequence[Row]) -> str:
 
 
 def badge_table(rows: Sequence[Row], checkpoint: str = "best") -> str:
-    """Per method: trained without the badge, and with it, judged with it off and on."""
+    """Per target and method: trained without the badge, and with it, judged with it off and on."""
     lines = []
-    for (env, method), own in grouped(rows, checkpoint, lambda row: (row["env"], row["method"])):
+
+    def key(row: Row) -> tuple[str, float, str]:
+        return row["env"], row["quantiles"][0], row["method"]
+
+    for (env, asked, method), own in sorted(grouped(rows, checkpoint, key), key=_by_target):
         of = {rate: {r["seed"]: r["R_cum"] for r in own if r["badge"] == rate} for rate in BADGES}
         paired = sorted(set.intersection(*(set(values) for values in of.values())))
         if not paired:  # a world in which no badge was planted
@@ -59,9 +63,15 @@ def badge_table(rows: Sequence[Row], checkpoint: str = "best") -> str:
         clean, off, on = (np.array([of[rate][seed] for seed in paired]) for rate in BADGES)
         drop = 100 * (1 - off / clean)
         spread = [_mean(values) for values in (clean, off, on, drop)]
-        lines.append((env, method, len(paired), *spread))
-    head = ("env", "method", "seeds", "no badge", "badge off", "badge on", "drop, %")
-    return markdown(head, lines)
+        lines.append((env, f"{asked:g}", method, len(paired), *spread))
+    shown = ("no badge", "badge off", "badge on", "drop, %")
+    return markdown(("env", "target quantile", "method", "seeds", *shown), lines)
+
+
+def _by_target(group: tuple[tuple[str, float, str], list[Row]]) -> tuple[str, float]:
+    """Worlds together, the largest target first; methods stay in their order."""
+    env, asked, _ = group[0]
+    return env, -asked
 
 
 def markdown(head: Sequence[str], lines: Sequence[Sequence[object]]) -> str:

@@ -23,13 +23,15 @@ METHODS: Methods = {
     "iql": ("iql", ()),
     "cql": ("cql", ()),
     "dt": ("dt", ()),
+    "dt-wo-time": ("dt", ("policy.max_timestep=1",)),
     "dc": ("dc", ()),
     "lsdt": ("lsdt", ()),
     "ucf": ("ucf", ()),
     "ucf-wo-count": ("ucf", ("augment.copies=0",)),
     "ucf-wo-arch": ("dt", ("augment.copies=1",)),
 }
-"""Learner and settings by the name of the table's row; the last two are Table 3's ablations."""
+"""Learner and settings by the name of the table's row; the last two are Table 3's ablations. UCF's
+preset tells its policy no time; `dt-wo-time` says what that alone does for DT."""
 
 _FAITHFUL, _NOISE = "csg.kind=faithful", "csg.kind=noise"
 _NO_GATE = "augment.epsilon_r=1e9"
@@ -86,27 +88,38 @@ class Budget:
     episodes: int
     settings: tuple[str, ...]
     """Over the presets; none is the authors' size."""
+    memoryless: tuple[str, ...] = ()
+    """Over those, of `bc`."""
     rl_steps: int = 1_000_000
     """Of IQL and CQL."""
+
+    def settings_of(self, learner: str) -> tuple[str, ...]:
+        """What the budget sets for a sequence policy or `bc`."""
+        return (*self.settings, *(self.memoryless if learner == "bc" else ()))
 
 
 _TASKS, _KINDS = ("halfcheetah", "hopper", "walker2d"), ("medium", "mixed", "medium-expert")
 BUDGETS = {
-    # Steps and width are cut most, then files and seeds; no method is left out. Learning rates
-    # are one for all, since the authors' are meant for fifty times as many steps.
+    # Batches, steps and width are cut most, then files and seeds; no method is left out. One
+    # learning rate for all, since the authors' are meant for 25 times as many steps. Batch size,
+    # rate and schedule were chosen by the validation loss of DT and UCF (`benchmarks/LOG.md`).
     "small": Budget(
         ("hopper_medium-zoo", "hopper_mixed-zoo", "walker2d_medium-expert-zoo"),
         2,
         20,
         (
-            "train.steps=2000",
+            "train.steps=4000",
+            "train.batch_size=16",
             "train.warmup_steps=100",
-            "train.validate_every=500",
-            "train.learning_rate=1e-3",
+            "train.validate_every=1000",
+            "train.learning_rate=3e-3",
+            "train.cosine=true",
             "policy.dim=64",
-            "crm.epochs=5",
+            "crm.epochs=3",
             "csg.epochs=5",
         ),
+        # As many predictions a step as 16 windows of 20.
+        memoryless=("train.batch_size=320",),
         rl_steps=5000,
     ),
     "full": Budget(tuple(f"{t}_{k}-zoo" for t in _TASKS for k in _KINDS), 4, 100, ()),
@@ -116,7 +129,7 @@ _SMALL, _FULL = BUDGETS["small"], BUDGETS["full"]
 SWEEPS = {
     # One file and half the steps: a sweep compares UCF with itself.
     "small": replace(
-        _SMALL, files=_SMALL.files[:1], settings=(*_SMALL.settings, "train.steps=1000")
+        _SMALL, files=_SMALL.files[:1], settings=(*_SMALL.settings, "train.steps=2000")
     ),
     "full": replace(_FULL, files=("hopper_medium-zoo", "halfcheetah_medium-zoo")),
 }
@@ -198,7 +211,7 @@ def _keys(cell: Cell) -> Row:
 
 def _config(cell: Cell, store: EpisodeStore) -> Config:
     preset = preset_of(dataset_of(store), cell.learner)
-    settings = [*cell.budget.settings, *cell.own]
+    settings = [*cell.budget.settings_of(cell.learner), *cell.own]
     return resolve_config(cell.learner, None, settings, cell.seed, preset.tables)
 
 

@@ -6,7 +6,7 @@ judged where the distractor is fixed to 0.
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,21 +38,12 @@ METHODS = ("dt", "dc", "lsdt", "ucf", "ucf-wo-count", "ucf-wo-arch", SCREENED)
 """Rows of `ucfrec_control.benchmark`, and UCF with copies that intervene on what is flagged."""
 
 BUDGETS = {
-    # Steps, width and seeds are cut most, then the history and files; no method and no distractor
-    # is left out. Learning rates are one for all, as in the benchmark.
-    "small": Budget(
-        ("hopper_medium-zoo", "hopper_mixed-zoo", "walker2d_medium-expert-zoo"),
-        1,
-        20,
-        (
-            "train.steps=1000",
-            "train.warmup_steps=100",
-            "train.validate_every=250",
-            "train.learning_rate=1e-3",
-            "policy.dim=64",
-            "policy.context=10",
-            "crm.epochs=3",
-        ),
+    # As the benchmark's, with fewer seeds and steps and half the history; no method and no
+    # distractor is left out.
+    "small": replace(
+        SCORE_BUDGETS["small"],
+        seeds=1,
+        settings=(*SCORE_BUDGETS["small"].settings, "train.steps=3000", "policy.context=10"),
     ),
     "full": SCORE_BUDGETS["full"],
 }
@@ -141,7 +132,7 @@ def _keys(cell: Cell) -> Row:
 def _config(cell: Cell) -> Config:
     policy, own = LEARNERS[cell.learner]
     preset = preset_of(dataset_of(EpisodeStore.open(cell.store)), policy)
-    settings = [*cell.budget.settings, *own]
+    settings = [*cell.budget.settings_of(policy), *own]
     return resolve_config(policy, None, settings, cell.seed, preset.tables)
 
 

@@ -15,8 +15,9 @@ from ucfrec_control.benchmark import Budget
 from ucfrec_control.cli import main
 from ucfrec_control.d4rl import read_d4rl
 from ucfrec_control.distractor import add_distractor
-from ucfrec_control.robustness import drops, screening_rows
+from ucfrec_control.robustness import drops
 from ucfrec_control.screening import ScreeningConfig
+from ucfrec_control.screening_table import screening_rows
 from ucfrec_control.train import dataset_of, preset_of, train_control
 
 TINY = ("train.steps=4", "train.validate_every=2", "policy.dim=16", "policy.context=5")

@@ -11,7 +11,10 @@ from tests.support import data_folder
 from ucfrec import schema
 from ucfrec.errors import InputError
 from ucfrec.files import read_json
+from ucfrec.grid import read_rows
 from ucfrec.store import EpisodeStore
+from ucfrec_control import screening_table
+from ucfrec_control.benchmark import Budget
 from ucfrec_control.cli import main
 from ucfrec_control.d4rl import read_d4rl
 from ucfrec_control.distractor import add_distractor
@@ -120,6 +123,32 @@ def test_training_with_screening_records_and_resumes(
     assert len(record["screening"]["dimensions"]) == 11
     assert main(arguments) == 0
     assert read_json(Path(run) / "run.json")["screening"] == record["screening"]
+
+
+def test_every_file_is_screened_plain_and_distracted_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    quickest = ScreeningConfig(hidden=8, shared_steps=20, own_steps=10)
+    monkeypatch.setattr(screening_table, "ScreeningConfig", lambda: quickest)
+    budget = {"full": Budget(("hopper_medium-made",), 1, 1, ())}
+    monkeypatch.setattr(screening_table, "BUDGETS", budget)
+    columns = hopper_like((20, 30) * 12)
+    columns["observations"][:, 4] = 0.0  # a constant causes nothing
+    write_hdf5(tmp_path / "hopper_medium-made.hdf5", columns)
+    results = tmp_path / "rows.jsonl"
+    arguments = ["screen-all", "--data", str(tmp_path), "--out", str(tmp_path / "out")]
+    arguments += ["--results", str(results)]
+    assert main(arguments) == 0
+    rows = {row["distractor"]: row for row in read_rows(results)}
+    assert rows.keys() == {"none", "deterministic", "stochastic", "early"}
+    for kind, row in rows.items():
+        assert row["screening"][4]["flagged"]
+        added = [d["dimension"] for d in row["screening"] if d["distractor"]]
+        assert added == ([] if kind == "none" else [11])
+    printed, before = capsys.readouterr().out, results.read_text()
+    assert f"{rows['early']['screening'][11]['effect']:#.3g}" in printed
+    assert main(arguments) == 0
+    assert results.read_text() == before
 
 
 @pytest.mark.realdata

@@ -34,6 +34,9 @@ def build_parser() -> argparse.ArgumentParser:
     _convert(commands.add_parser("convert", help="D4RL HDF5 to Minari, or back"))
     _distract(commands.add_parser("distract", help="a store with a distractor in its states"))
     _screen(commands.add_parser("screen", help="which state dimensions cause anything"))
+    _screen_all(
+        commands.add_parser("screen-all", help="screening of every zoo file, distracted; resumes")
+    )
     _train(commands.add_parser("train", help="train a policy on a store; resumes"))
     _evaluate(commands.add_parser("evaluate", help="normalised scores of trained policies"))
     _benchmark(commands.add_parser("benchmark", help="every learner on the zoo files; resumes"))
@@ -127,23 +130,31 @@ def _benchmark(parser: argparse.ArgumentParser) -> None:
         help="every learner (main), or a sweep over UCF's settings",
     )
     parser.add_argument("--budget", default="small", choices=["small", "full"])
-    parser.add_argument("--out", type=Path, default=Path("runs/control"), help="stores and runs")
-    parser.add_argument(
-        "--results", type=Path, default=Path("benchmarks/results/control.jsonl"), metavar="JSONL"
-    )
-    parser.add_argument("--workers", type=int, default=1, help="processes of one thread each (1)")
+    _grid_outputs(parser, "control")
 
 
 def _robustness(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--budget", default="small", choices=["small", "full"])
+    _grid_options(parser, "control_robustness")
+
+
+def _screen_all(parser: argparse.ArgumentParser) -> None:
+    _grid_options(parser, "control_screening")
+
+
+def _grid_options(parser: argparse.ArgumentParser, results: str) -> None:
     parser.add_argument(
         "--data", type=Path, required=True, metavar="FOLDER", help="of the HDF5 files"
     )
-    parser.add_argument("--budget", default="small", choices=["small", "full"])
+    _grid_outputs(parser, results)
+
+
+def _grid_outputs(parser: argparse.ArgumentParser, results: str) -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/control"), help="stores and runs")
     parser.add_argument(
         "--results",
         type=Path,
-        default=Path("benchmarks/results/control_robustness.jsonl"),
+        default=Path(f"benchmarks/results/{results}.jsonl"),
         metavar="JSONL",
     )
     parser.add_argument("--workers", type=int, default=1, help="processes of one thread each (1)")

@@ -25,9 +25,11 @@ from ucfrec_control.evaluate import CHECKPOINTS, SHOWN, evaluate_run
 from ucfrec_control.minari import is_minari, read_minari, write_minari
 from ucfrec_control.robustness import BUDGETS as ROBUSTNESS_BUDGETS
 from ucfrec_control.robustness import SHOWN as SHOWN_DROPS
-from ucfrec_control.robustness import SHOWN_SCREENING, drops, robustness, screening_rows
+from ucfrec_control.robustness import drops, robustness
 from ucfrec_control.scores import find_task
 from ucfrec_control.screening import ScreeningConfig, describe_screening, screen
+from ucfrec_control.screening_table import SHOWN as SHOWN_SCREENING
+from ucfrec_control.screening_table import screening_rows, screening_table
 from ucfrec_control.train import dataset_of, preset_of, train_control
 from ucfrec_control.trajectories import PACKAGES, Trajectories
 from ucfrec_control.video import record_episode
@@ -94,6 +96,12 @@ def run_screen(options: argparse.Namespace) -> None:
     print(describe_screening(report))
     if options.json is not None:
         write_json(options.json, dataclasses.asdict(report) | provenance(PACKAGES))
+
+
+def run_screen_all(options: argparse.Namespace) -> None:
+    """`ucfrec-control screen-all`."""
+    rows = screening_table(options.data, options.out, options.results, options.workers)
+    print(f"{format_rows(screening_rows(rows), SHOWN_SCREENING)}\n\nrows: {options.results}")
 
 
 def run_train(options: argparse.Namespace) -> None:
@@ -197,6 +205,7 @@ COMMANDS: Commands = {
     "convert": run_convert,
     "distract": run_distract,
     "screen": run_screen,
+    "screen-all": run_screen_all,
     "train": run_train,
     "evaluate": run_evaluate,
     "benchmark": run_benchmark,

@@ -1,12 +1,25 @@
 """A distractor: a bit in the state that goes with the reward and causes nothing (Appendix G.4)."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ucfrec.confounder import logged_observations, reward_bit, with_observations
 from ucfrec.errors import InputError
 from ucfrec.store import EpisodeStore
+from ucfrec_control.d4rl import read_d4rl
+
+CLEAN = "none"
+DISTRACTORS: dict[str, Mapping[str, Any] | None] = {
+    CLEAN: None,
+    "deterministic": {"flip": 0.0},
+    "stochastic": {"flip": 0.15},
+    "early": {"flip": 0.0, "early": True},
+}
+"""Arguments of `add_distractor` by the name in the rows; the first two distractors are the paper's,
+the last tells of the next reward, which the action at hand still has a part in."""
 
 
 def add_distractor(
@@ -27,3 +40,17 @@ def add_distractor(
         np.column_stack([logged_observations(store), bit]),
         {"distractors": [*store.meta["source"].get("distractors", []), added]},
     )
+
+
+def distracted_store(data: Path, stores: Path, file: str, distractor: str) -> Path:
+    """The store of `data / FILE.hdf5` under a key of `DISTRACTORS`, written where it is not yet."""
+    clean = stores / file
+    if not clean.exists():
+        read_d4rl(data / f"{file}.hdf5").write_store(clean)
+    arguments = DISTRACTORS[distractor]
+    if arguments is None:
+        return clean
+    distracted = stores / f"{file}-{distractor}"
+    if not distracted.exists():
+        add_distractor(EpisodeStore.open(clean), distracted, **arguments)
+    return distracted

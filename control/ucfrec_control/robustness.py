@@ -17,21 +17,11 @@ from ucfrec.store import EpisodeStore
 from ucfrec_control.benchmark import BUDGETS as SCORE_BUDGETS
 from ucfrec_control.benchmark import METHODS as LEARNERS
 from ucfrec_control.benchmark import Budget
-from ucfrec_control.d4rl import read_d4rl
-from ucfrec_control.distractor import add_distractor
+from ucfrec_control.distractor import CLEAN, DISTRACTORS, distracted_store
 from ucfrec_control.evaluate import evaluate_run
+from ucfrec_control.screening_table import verdicts
 from ucfrec_control.train import dataset_of, preset_of, train_control
 from ucfrec_control.trajectories import PACKAGES
-
-CLEAN = "none"
-DISTRACTORS: dict[str, Mapping[str, Any] | None] = {
-    CLEAN: None,
-    "deterministic": {"flip": 0.0},
-    "stochastic": {"flip": 0.15},
-    "early": {"flip": 0.0, "early": True},
-}
-"""Arguments of `add_distractor` by the name in the rows; the first two distractors are the paper's,
-the last tells of the next reward, which the action at hand still has a part in."""
 
 SCREENED = "ucf-screened"
 METHODS = ("dt", "dc", "lsdt", "ucf", "ucf-wo-count", "ucf-wo-arch", SCREENED)
@@ -48,10 +38,6 @@ BUDGETS = {
     "full": SCORE_BUDGETS["full"],
 }
 SHOWN = ("dataset", "method", "seed", "distractor", "clean", "score", "drop")
-SHOWN_SCREENING = (
-    *("dataset", "distractor", "seed", "flagged", "effect", "reward_effect"),
-    *("true_flagged", "weakest_true"),
-)
 
 
 @dataclass(frozen=True)
@@ -95,24 +81,11 @@ def robustness(
 def _cells(data: Path, folder: Path, budget: Budget, name: str) -> Iterator[Cell]:
     for file in budget.files:
         for distractor in DISTRACTORS:
-            store = _store(data, folder / "stores", file, distractor)
+            store = distracted_store(data, folder / "stores", file, distractor)
             for method in METHODS:
                 for seed in range(budget.seeds):
                     run = folder / f"robustness-{name}" / file / distractor / f"{method}-{seed}"
                     yield Cell(file, distractor, method, seed, store, run, budget, name)
-
-
-def _store(data: Path, stores: Path, file: str, distractor: str) -> Path:
-    clean = stores / file
-    if not clean.exists():
-        read_d4rl(data / f"{file}.hdf5").write_store(clean)
-    arguments = DISTRACTORS[distractor]
-    if arguments is None:
-        return clean
-    distracted = stores / f"{file}-{distractor}"
-    if not distracted.exists():
-        add_distractor(EpisodeStore.open(clean), distracted, **arguments)
-    return distracted
 
 
 def _keys(cell: Cell) -> Row:
@@ -148,25 +121,9 @@ def _measure(cell: Cell) -> list[Row]:
         targets=preset_of(dataset_of(store), config.policy_name).targets[:1],
         checkpoints=("last",),
     )
-    screening = _verdicts(record) if cell.method == SCREENED else {}
-    return [row | screening | provenance(PACKAGES)]
-
-
-def _verdicts(record: Mapping[str, Any]) -> Row:
-    """What screening said of the distractor and of the true dimensions of a run's states."""
-    added = {distractor["dimension"] for distractor in record["dataset"].get("distractors", [])}
-    judged = record["screening"]["dimensions"]
-    return {
-        "screening": [
-            {
-                "dimension": d["dimension"],
-                "distractor": d["dimension"] in added,
-                "flagged": not d["causes"],
-                **{k: d[k] for k in ("effect", "p_value", "reward_effect", "reward_p_value")},
-            }
-            for d in judged
-        ]
-    }
+    if cell.method == SCREENED:
+        row["screening"] = verdicts(record["screening"], store)
+    return [row | provenance(PACKAGES)]
 
 
 def drops(rows: Sequence[Mapping[str, Any]]) -> list[Row]:
@@ -188,29 +145,4 @@ def drops(rows: Sequence[Mapping[str, Any]]) -> list[Row]:
         lost = 100 * (clean - score) / clean if clean > 0 else float("nan")
         values = (dataset, method, seed, distractor, clean, score, lost)
         found.append(dict(zip(SHOWN, values, strict=True)))
-    return found
-
-
-def screening_rows(rows: Sequence[Mapping[str, Any]]) -> list[Row]:
-    """For each row with a screening: what was flagged, and how far the verdicts are apart.
-
-    `effect` is the distractor's effect on the next state, `reward_effect` that on the reward; of
-    the true dimensions, the weakest cause has the larger of its two effects as `weakest_true`.
-    """
-    found = []
-    for row in rows:
-        if "screening" not in row:
-            continue
-        added = [d for d in row["screening"] if d["distractor"]]
-        true = [d for d in row["screening"] if not d["distractor"]]
-        found.append(
-            {
-                **{name: row[name] for name in ("dataset", "distractor", "seed")},
-                "flagged": all(d["flagged"] for d in added) if added else "-",
-                "effect": added[0]["effect"] if added else "-",
-                "reward_effect": added[0]["reward_effect"] if added else "-",
-                "true_flagged": [d["dimension"] for d in true if d["flagged"]],
-                "weakest_true": min(max(d["effect"], d["reward_effect"]) for d in true),
-            }
-        )
     return found

@@ -27,6 +27,7 @@ class Cell:
     file: str
     distractor: str
     store: Path
+    config: ScreeningConfig
 
 
 def screening_table(data: Path, folder: Path, results: Path, workers: int) -> list[Row]:
@@ -48,7 +49,8 @@ def screening_table(data: Path, folder: Path, results: Path, workers: int) -> li
 def _cells(data: Path, stores: Path) -> Iterator[Cell]:
     for file in BUDGETS["full"].files:
         for distractor in DISTRACTORS:
-            yield Cell(file, distractor, distracted_store(data, stores, file, distractor))
+            store = distracted_store(data, stores, file, distractor)
+            yield Cell(file, distractor, store, ScreeningConfig())
 
 
 def _keys(cell: Cell) -> Row:
@@ -56,14 +58,14 @@ def _keys(cell: Cell) -> Row:
         "dataset": cell.file,
         "distractor": cell.distractor,
         "seed": SEED,
-        "config_hash": config_hash(asdict(ScreeningConfig())),
+        "config_hash": config_hash(asdict(cell.config)),
         "fingerprint": EpisodeStore.open(cell.store).meta["fingerprint"],
     }
 
 
 def _measure(cell: Cell) -> list[Row]:
     store = EpisodeStore.open(cell.store)
-    report = asdict(screen(store, ScreeningConfig(), SEED))
+    report = asdict(screen(store, cell.config, SEED))
     return [
         {
             "screening": verdicts(report, store),

@@ -89,6 +89,7 @@ def test_cells_are_measured_once_and_screening_is_reported(
         (method, kind, kind != "none") for method in ("dt", "ucf-screened") for kind in kinds
     }
     assert {r["checkpoint"] for r in rows} == {"last"}
+    assert all((r["loss"] == r["loss_at_zero"]) == (r["distractor"] == "none") for r in rows)
     assert len({r["evaluation_seed"] for r in rows}) == 1
     printed, before = capsys.readouterr().out, results.read_text()
     for dropped in drops(rows):

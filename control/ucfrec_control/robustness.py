@@ -10,10 +10,15 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+
 from ucfrec.config import Config, resolve_config
 from ucfrec.grid import Row, run_grid
 from ucfrec.results import config_hash, provenance
+from ucfrec.run import training_views
 from ucfrec.store import EpisodeStore
+from ucfrec.trained import TrainedPolicy
 from ucfrec_control.benchmark import BUDGETS as SCORE_BUDGETS
 from ucfrec_control.benchmark import METHODS as LEARNERS
 from ucfrec_control.benchmark import Budget
@@ -38,6 +43,8 @@ BUDGETS = {
     "full": SCORE_BUDGETS["full"],
 }
 SHOWN = ("dataset", "method", "seed", "distractor", "clean", "score", "drop")
+SHOWN_LOSSES = ("dataset", "method", "seed", "distractor", "loss", "loss_at_zero")
+_LOSS_BATCHES, _LOSS_BATCH = 8, 512
 
 
 @dataclass(frozen=True)
@@ -123,7 +130,30 @@ def _measure(cell: Cell) -> list[Row]:
     )
     if cell.method == SCREENED:
         row["screening"] = verdicts(record["screening"], store)
-    return [row | provenance(PACKAGES)]
+    losses = held_out_losses(TrainedPolicy.load(cell.run, "last"), store)
+    return [row | losses | provenance(PACKAGES)]
+
+
+@torch.no_grad()
+def held_out_losses(trained: TrainedPolicy, store: EpisodeStore) -> Row:
+    """Action loss at 4,096 steps of held-out episodes: `loss` with the states as they are logged,
+    `loss_at_zero` with every distractor fixed to 0.
+
+    Unlike scores, these do not vary with how episodes happen to end.
+    """
+    _, validation = training_views(store)
+    generator = np.random.default_rng(0)
+    dimensions = [each["dimension"] for each in store.meta["source"].get("distractors", [])]
+    losses = []
+    for _ in range(_LOSS_BATCHES):
+        steps = validation.draw_steps(generator, _LOSS_BATCH)
+        windows = validation.windows(*steps, trained.policy.config.context)
+        fixed = windows.states.clone()
+        fixed[..., dimensions] = 0.0
+        both = (windows, replace(windows, states=fixed))
+        losses.append([float(trained.policy.action_loss(each)) for each in both])
+    loss, at_zero = np.mean(losses, axis=0)
+    return {"loss": float(loss), "loss_at_zero": float(at_zero)}
 
 
 def drops(rows: Sequence[Mapping[str, Any]]) -> list[Row]:

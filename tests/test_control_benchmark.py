@@ -20,7 +20,11 @@ def resolved(table: str, budget: Budget, file: str) -> dict[str, Config]:
     task, kind = require_task(file).name, find_kind(file)
     return {
         method: resolve_config(
-            learner, None, [*budget.settings, *own], 0, find_preset(task, kind, learner).tables
+            learner,
+            None,
+            [*budget.settings_of(learner), *own],
+            0,
+            find_preset(task, kind, learner).tables,
         )
         for method, (learner, own) in TABLES[table].items()
         if learner not in ALGORITHMS

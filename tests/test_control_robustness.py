@@ -15,7 +15,8 @@ from ucfrec_control.benchmark import Budget
 from ucfrec_control.cli import main
 from ucfrec_control.d4rl import read_d4rl
 from ucfrec_control.distractor import add_distractor
-from ucfrec_control.robustness import drops
+from ucfrec_control.figures import make_figures
+from ucfrec_control.robustness import drops, loss_rises
 from ucfrec_control.screening import ScreeningConfig
 from ucfrec_control.screening_table import screening_rows
 from ucfrec_control.train import dataset_of, preset_of, train_control
@@ -94,6 +95,14 @@ def test_cells_are_measured_once_and_screening_is_reported(
     printed, before = capsys.readouterr().out, results.read_text()
     for dropped in drops(rows):
         assert f"{dropped['drop']:.3f}" in printed
+    rises = loss_rises(rows)
+    assert {r["distractor"] for r in rises} == {"deterministic"}
+    for r in rises:
+        assert r["loss"] * (1 + r["rise"] / 100) == pytest.approx(r["loss_at_zero"])
+        assert f"{r['loss_at_zero']:.3f}" in printed
+    made, _ = make_figures([], [results], tmp_path / "figures")
+    kinds = ("scores", "drops", "losses")
+    assert {p.stem for p in made} == {f"robustness-{kind}-small-{FILE}" for kind in kinds}
     screened = {r["distractor"]: r for r in screening_rows(rows)}
     assert 4 in screened["none"]["true_flagged"]
     assert screened["none"]["flagged"] == "-"

@@ -25,7 +25,7 @@ from ucfrec_control.evaluate import CHECKPOINTS, SHOWN, evaluate_run
 from ucfrec_control.minari import is_minari, read_minari, write_minari
 from ucfrec_control.robustness import BUDGETS as ROBUSTNESS_BUDGETS
 from ucfrec_control.robustness import SHOWN as SHOWN_DROPS
-from ucfrec_control.robustness import SHOWN_LOSSES, drops, robustness
+from ucfrec_control.robustness import SHOWN_LOSSES, drops, loss_rises, robustness
 from ucfrec_control.scores import find_task
 from ucfrec_control.screening import ScreeningConfig, describe_screening, screen
 from ucfrec_control.screening_table import SHOWN as SHOWN_SCREENING
@@ -178,7 +178,9 @@ def run_robustness(options: argparse.Namespace) -> None:
         options.budget,
         options.workers,
     )
-    print(f"{format_rows(drops(rows), SHOWN_DROPS)}\n\n{format_rows(rows, SHOWN_LOSSES)}")
+    print(
+        f"{format_rows(drops(rows), SHOWN_DROPS)}\n\n{format_rows(loss_rises(rows), SHOWN_LOSSES)}"
+    )
     print(f"\n{format_rows(screening_rows(rows), SHOWN_SCREENING)}\n\nrows: {options.results}")
 
 

@@ -18,7 +18,7 @@ from ucfrec.trained import RUN
 from ucfrec_control import diagnostics, plots
 from ucfrec_control.evaluate import method_of
 from ucfrec_control.figure_style import label, save
-from ucfrec_control.robustness import drops
+from ucfrec_control.robustness import drops, loss_rises
 
 LOWS = (0.0, 0.1, 0.2, 0.3, 0.4)
 HIGHS = (0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
@@ -34,6 +34,7 @@ NEEDS = {
     "lambda": "rows of ucf with two weights of the mask loss or more among --results",
     "robustness-scores": "rows of `ucfrec-control robustness` among --results",
     "robustness-drops": "such rows with and without a distractor",
+    "robustness-losses": "such rows with a distractor",
 }
 """What every kind of figure is made of."""
 
@@ -188,6 +189,9 @@ def _of_rows(rows: Sequence[Row]) -> Iterator[_Plan]:
         if lost := drops(there):
             drop = partial(bars, lost, "drop", "loss (% of the clean score)", dataset)
             yield _Plan("robustness-drops", about, drop)
+        if rises := loss_rises(there):
+            rise = partial(bars, rises, "rise", "rise of the action loss (%)", dataset)
+            yield _Plan("robustness-losses", about, rise)
     swept = [row for row in rows if _of_lambda(row)]
     for budget in dict.fromkeys(row.get("budget", "") for row in swept):
         there = [row for row in swept if row.get("budget", "") == budget]

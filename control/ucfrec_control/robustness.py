@@ -43,7 +43,7 @@ BUDGETS = {
     "full": SCORE_BUDGETS["full"],
 }
 SHOWN = ("dataset", "method", "seed", "distractor", "clean", "score", "drop")
-SHOWN_LOSSES = ("dataset", "method", "seed", "distractor", "loss", "loss_at_zero")
+SHOWN_LOSSES = ("dataset", "method", "seed", "distractor", "loss", "loss_at_zero", "rise")
 _LOSS_BATCHES, _LOSS_BATCH = 8, 512
 
 
@@ -176,3 +176,13 @@ def drops(rows: Sequence[Mapping[str, Any]]) -> list[Row]:
         values = (dataset, method, seed, distractor, clean, score, lost)
         found.append(dict(zip(SHOWN, values, strict=True)))
     return found
+
+
+def loss_rises(rows: Sequence[Mapping[str, Any]]) -> list[Row]:
+    """Rows with a distractor, and as `rise` by how many percent of `loss` fixing it to 0 raises the
+    held-out action loss."""
+    return [
+        {**row, "rise": 100 * (row["loss_at_zero"] / row["loss"] - 1)}
+        for row in rows
+        if row["distractor"] != CLEAN
+    ]

@@ -11,7 +11,7 @@ from ucfrec.results import config_hash, provenance
 from ucfrec.store import EpisodeStore
 from ucfrec_control.d4rl import read_d4rl
 from ucfrec_control.evaluate import evaluate_run
-from ucfrec_control.rl_baselines import ALGORITHMS, plain_config, rl_config, train_rl
+from ucfrec_control.rl_baselines import ALGORITHMS, RLConfig, plain_config, rl_config, train_rl
 from ucfrec_control.train import dataset_of, preset_of, train_control
 from ucfrec_control.trajectories import PACKAGES
 
@@ -91,7 +91,8 @@ class Budget:
     memoryless: tuple[str, ...] = ()
     """Over those, of `bc`."""
     rl_steps: int = 1_000_000
-    """Of IQL and CQL."""
+    """Of IQL and CQL, of `rl_batch_size` transitions each."""
+    rl_batch_size: int = 256
 
     def settings_of(self, learner: str) -> tuple[str, ...]:
         """What the budget sets for a sequence policy or `bc`."""
@@ -120,7 +121,9 @@ BUDGETS = {
         ),
         # As many predictions a step as 16 windows of 20; cheap enough to keep its width.
         memoryless=("train.batch_size=320", "policy.dim=128"),
+        # A quarter of the authors' batch, as the others have.
         rl_steps=5000,
+        rl_batch_size=64,
     ),
     "full": Budget(tuple(f"{t}_{k}-zoo" for t in _TASKS for k in _KINDS), 4, 100, ()),
 }
@@ -192,8 +195,7 @@ def _cells(data: Path, folder: Path, budget: Budget, name: str, table: str) -> I
 def _keys(cell: Cell) -> Row:
     store = EpisodeStore.open(cell.store)
     if cell.learner in ALGORITHMS:
-        rl = rl_config(dataset_of(store), cell.learner, cell.budget.rl_steps)
-        config = plain_config(rl, cell.seed)
+        config = plain_config(_rl_config(cell, store), cell.seed)
     else:
         # As a run's record has it, after JSON.
         config = json.loads(json.dumps(asdict(_config(cell, store))))
@@ -215,11 +217,15 @@ def _config(cell: Cell, store: EpisodeStore) -> Config:
     return resolve_config(cell.learner, None, settings, cell.seed, preset.tables)
 
 
+def _rl_config(cell: Cell, store: EpisodeStore) -> RLConfig:
+    budget = cell.budget
+    return rl_config(dataset_of(store), cell.learner, budget.rl_steps, budget.rl_batch_size)
+
+
 def _measure(cell: Cell) -> list[Row]:
     store = EpisodeStore.open(cell.store)
     if cell.learner in ALGORITHMS:
-        config = rl_config(dataset_of(store), cell.learner, cell.budget.rl_steps)
-        train_rl(store, cell.run, config, cell.seed)
+        train_rl(store, cell.run, _rl_config(cell, store), cell.seed)
     else:
         train_control(store, cell.run, _config(cell, store))
     # Starts are those of no other seed's training, and the same for every method.

@@ -35,6 +35,7 @@ class RLConfig:
     steps: int
     task: str
     kind: str
+    batch_size: int = 256
 
 
 class RLPolicy:
@@ -73,10 +74,13 @@ def is_rl(record: Mapping[str, Any]) -> bool:
     return record["config"]["policy_name"] in ALGORITHMS
 
 
-def rl_config(dataset: Mapping[str, Any], algorithm: str, steps: int) -> RLConfig:
+def rl_config(
+    dataset: Mapping[str, Any], algorithm: str, steps: int, batch_size: int = 256
+) -> RLConfig:
     """The settings for the data that `ucfrec_control.train.dataset_of` describes."""
     task = find_task(dataset["env_id"], dataset["dataset"])
-    return RLConfig(algorithm, steps, task.name if task else "", find_kind(dataset["dataset"]))
+    kind = find_kind(dataset["dataset"])
+    return RLConfig(algorithm, steps, task.name if task else "", kind, batch_size)
 
 
 def plain_config(config: RLConfig, seed: int) -> dict[str, Any]:
@@ -104,7 +108,7 @@ def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dic
     mean, std = train.state_statistics
     begun = perf_counter()
     with atomic_folder(out) as scratch:
-        learner = _learner(config)
+        learner = _learner(config, "cuda:0" if torch.cuda.is_available() else "cpu:0")
         learner.fit(
             _dataset(d3rlpy, train, mean.numpy(), std.numpy()),
             n_steps=config.steps,
@@ -146,10 +150,10 @@ def _dataset(
     )
 
 
-def _learner(config: RLConfig) -> Any:
+def _learner(config: RLConfig, device: str = "cpu:0") -> Any:
     d3rlpy = _d3rlpy()
     make = {"iql": _iql, "cql": _cql}[config.algorithm]
-    return make(d3rlpy, config).create(device="cpu:0")
+    return make(d3rlpy, config).create(device=device)
 
 
 def _iql(d3rlpy: Any, config: RLConfig) -> Any:
@@ -166,6 +170,7 @@ def _iql(d3rlpy: Any, config: RLConfig) -> Any:
         settings |= {"tau": 0.001}
         scaler = d3rlpy.preprocessing.ReturnBasedRewardScaler(multiplier=1000.0)
     return d3rlpy.algos.IQLConfig(
+        batch_size=config.batch_size,
         max_weight=100.0,
         reward_scaler=scaler,
         actor_optim_factory=d3rlpy.optimizers.AdamFactory(lr_scheduler_factory=cosine),
@@ -192,6 +197,7 @@ def _cql(d3rlpy: Any, config: RLConfig) -> Any:
             "reward_scaler": d3rlpy.preprocessing.ConstantShiftRewardScaler(-5.0, 10.0, True),
         }
     return d3rlpy.algos.CQLConfig(
+        batch_size=config.batch_size,
         critic_learning_rate=3e-4,
         n_action_samples=10,
         actor_encoder_factory=layers,

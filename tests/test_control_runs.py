@@ -217,6 +217,24 @@ def test_a_clone_of_a_zoo_file_hops(tmp_path: Path) -> None:
     assert row["score"] > 15
 
 
+@pytest.mark.realdata
+@pytest.mark.parametrize("file", BUDGETS["full"].files)
+def test_each_zoo_file_trains_ucf_that_its_environment_judges(tmp_path: Path, file: str) -> None:
+    data, store, run = data_folder("control") / f"{file}.hdf5", tmp_path / "store", tmp_path / "run"
+    assert main(["prepare", str(data), "--out", str(store)]) == 0
+    quick = [*SETTINGS, "--set", "crm.epochs=1"]
+    assert main(["train", str(store), "--out", str(run), "--policy", "ucf", *quick]) == 0
+    assert read_json(run / "run.json")["augmentation"]["acceptance"] > 0.5
+    out = tmp_path / "rows.json"
+    asked = ["--episodes", "2", "--checkpoint", "last", "--json", str(out)]
+    assert main(["evaluate", str(run), *asked]) == 0
+    rows = json.loads(out.read_text())
+    assert len(rows) == 2  # one for each of the preset's targets
+    for row in rows:
+        assert (row["dataset"], row["warnings"]) == (file, [])
+        assert row["score_low"] <= row["score"] <= row["score_high"] < 20  # it has learned nothing
+
+
 def test_a_benchmark_goes_on_where_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

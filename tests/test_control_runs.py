@@ -64,6 +64,8 @@ def test_evaluate_writes_last_and_best_apart(
         assert row["score"] == pytest.approx(scored)
         assert row["score_low"] <= row["score"] <= row["score_high"]
         assert {"mujoco", "gymnasium", "torch"} <= row["versions"].keys()
+        trained = read_json(folder / "store-run" / "run.json")["policy"]
+        assert row["validation_loss"] == trained["best_validation"] > 0
     printed = capsys.readouterr()
     assert "hopper_medium-made" in printed.out
     assert "warning" not in printed.err

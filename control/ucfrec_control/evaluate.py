@@ -20,7 +20,10 @@ from ucfrec_control.scores import find_kind, require_task
 
 Trained = TrainedPolicy | RLPolicy
 CHECKPOINTS = ("last", "best")
-SHOWN = ("dataset", "method", "seed", "checkpoint", "target_return", "score", "return", "episodes")
+SHOWN = (
+    *("dataset", "method", "seed", "checkpoint", "target_return", "score", "return", "episodes"),
+    "validation_loss",
+)
 
 
 def evaluate_run(
@@ -173,6 +176,7 @@ def _row(trained: Trained, env_id: str, target: Any, episodes: int, seed: int) -
         "env_id": env_id,
         "steps": record["policy"]["steps"],
         "best_step": record["policy"]["best_step"],
+        "validation_loss": record["policy"].get("best_validation"),
         "distractors": dataset.get("distractors", []),
         "lambda_mask": record["config"]["policy"].get("lambda_mask"),
         "config_hash": config_hash(record["config"]),

@@ -9,7 +9,7 @@ from ucfrec.config import Config, resolve_config
 from ucfrec.grid import Row, run_grid
 from ucfrec.results import config_hash, provenance
 from ucfrec.store import EpisodeStore
-from ucfrec_control.d4rl import read_d4rl
+from ucfrec_control.distractor import zoo_store
 from ucfrec_control.evaluate import evaluate_run
 from ucfrec_control.rl_baselines import ALGORITHMS, RLConfig, plain_config, rl_config, train_rl
 from ucfrec_control.train import dataset_of, preset_of, train_control
@@ -184,9 +184,7 @@ def benchmark(
 
 def _cells(data: Path, folder: Path, budget: Budget, name: str, table: str) -> Iterator[Cell]:
     for file in budget.files:
-        store = folder / "stores" / file
-        if not store.exists():
-            read_d4rl(data / f"{file}.hdf5").write_store(store)
+        store = zoo_store(data, folder / "stores", file)
         for method, (learner, own) in TABLES[table].items():
             for seed in range(budget.seeds):
                 run = folder / name / table / file / f"{method}-{seed}"

@@ -42,8 +42,8 @@ def add_distractor(
     )
 
 
-def distracted_store(data: Path, stores: Path, file: str, distractor: str) -> Path:
-    """The store of `data / FILE.hdf5` under a key of `DISTRACTORS`, written where it is not yet."""
+def zoo_store(data: Path, stores: Path, file: str, distractor: str = CLEAN) -> Path:
+    """The store of `data / FILE.hdf5`, with a key of `DISTRACTORS`; written where it is not yet."""
     clean = stores / file
     if not clean.exists():
         read_d4rl(data / f"{file}.hdf5").write_store(clean)

@@ -22,7 +22,7 @@ from ucfrec.trained import TrainedPolicy
 from ucfrec_control.benchmark import BUDGETS as SCORE_BUDGETS
 from ucfrec_control.benchmark import METHODS as LEARNERS
 from ucfrec_control.benchmark import Budget
-from ucfrec_control.distractor import CLEAN, DISTRACTORS, distracted_store
+from ucfrec_control.distractor import CLEAN, DISTRACTORS, zoo_store
 from ucfrec_control.evaluate import evaluate_run
 from ucfrec_control.screening_table import verdicts
 from ucfrec_control.train import dataset_of, preset_of, train_control
@@ -88,7 +88,7 @@ def robustness(
 def _cells(data: Path, folder: Path, budget: Budget, name: str) -> Iterator[Cell]:
     for file in budget.files:
         for distractor in DISTRACTORS:
-            store = distracted_store(data, folder / "stores", file, distractor)
+            store = zoo_store(data, folder / "stores", file, distractor)
             for method in METHODS:
                 for seed in range(budget.seeds):
                     run = folder / f"robustness-{name}" / file / distractor / f"{method}-{seed}"

@@ -9,7 +9,7 @@ from ucfrec.grid import Row, run_grid
 from ucfrec.results import config_hash, provenance
 from ucfrec.store import EpisodeStore
 from ucfrec_control.benchmark import BUDGETS
-from ucfrec_control.distractor import DISTRACTORS, distracted_store
+from ucfrec_control.distractor import DISTRACTORS, zoo_store
 from ucfrec_control.screening import ScreeningConfig, screen
 from ucfrec_control.trajectories import PACKAGES
 
@@ -49,7 +49,7 @@ def screening_table(data: Path, folder: Path, results: Path, workers: int) -> li
 def _cells(data: Path, stores: Path) -> Iterator[Cell]:
     for file in BUDGETS["full"].files:
         for distractor in DISTRACTORS:
-            store = distracted_store(data, stores, file, distractor)
+            store = zoo_store(data, stores, file, distractor)
             yield Cell(file, distractor, store, ScreeningConfig())
 
 

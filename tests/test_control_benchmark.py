@@ -63,6 +63,16 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
     assert [main[m].policy.best_share for m in ("bc", "bc-10", "bc-25")] == [1.0, 0.1, 0.25]
 
 
+def test_a_method_of_two_sweeps_is_one_configuration() -> None:
+    """They share their runs."""
+    for budget in SWEEPS.values():
+        for file in budget.files:
+            named: dict[str, Config] = {}
+            for table in TABLES.keys() - {MAIN}:
+                for method, config in resolved(table, budget, file).items():
+                    assert named.setdefault(method, config) == config
+
+
 def test_robustness_trains_rows_of_the_benchmark() -> None:
     learners = {"ucf" if m == robustness.SCREENED else m for m in robustness.METHODS}
     assert learners <= METHODS.keys()

@@ -15,6 +15,7 @@ from ucfrec_control.benchmark import Budget
 from ucfrec_control.cli import main
 from ucfrec_control.d4rl import read_d4rl
 from ucfrec_control.distractor import add_distractor
+from ucfrec_control.evaluate import evaluate_run
 from ucfrec_control.figures import make_figures
 from ucfrec_control.robustness import drops, loss_rises
 from ucfrec_control.screening import ScreeningConfig
@@ -42,6 +43,7 @@ def test_an_early_distractor_tells_of_the_next_reward(tmp_path: Path) -> None:
 def row(distractor: str, score: float, method: str = "dt", seed: int = 0) -> dict[str, object]:
     return {
         "dataset": "d", "method": method, "seed": seed, "distractor": distractor, "score": score,
+        "score_at_one": 2 * score,
     }  # fmt: skip
 
 
@@ -54,6 +56,7 @@ def test_drops_compare_with_the_same_seed_without_distractor() -> None:
     assert found.keys() == {("early", 0), ("stochastic", 0), ("early", 1)}
     early = found["early", 0]
     assert (early["clean"], early["score"], early["drop"]) == (80.0, 20.0, 75.0)
+    assert early["score_at_one"] == 40.0
     assert found["stochastic", 0]["drop"] == -25.0
     assert math.isnan(found["early", 1]["drop"])
 
@@ -90,6 +93,16 @@ def test_cells_are_measured_once_and_screening_is_reported(
         (method, kind, kind != "none") for method in ("dt", "ucf-screened") for kind in kinds
     }
     assert {r["checkpoint"] for r in rows} == {"last"}
+    for r in rows:
+        for value, name in ((0.0, "score"), (1.0, "score_at_one")):
+            told = r["distractor"] != "none" and value
+            asked = [r["target_return"]]
+            (again,) = evaluate_run(
+                Path(r["run"]),
+                episodes=2, seed=1000, targets=asked, checkpoints=("last",), distractor=told,
+            )  # fmt: skip
+            assert again["score"] == r[name]
+            assert again["distractor_fixed_to"] == told
     assert all((r["loss"] == r["loss_at_zero"]) == (r["distractor"] == "none") for r in rows)
     assert len({r["evaluation_seed"] for r in rows}) == 1
     printed, before = capsys.readouterr().out, results.read_text()

@@ -268,7 +268,32 @@ def test_a_benchmark_goes_on_where_it_was(
     assert {r["method"] for r in again} == {"lsdt", "ucf"}
     by_checkpoint = {r["checkpoint"]: r["return"] for r in rows if r["method"] == "lsdt"}
     assert {r["checkpoint"]: r["return"] for r in again[2:]} == by_checkpoint
-    results.write_text("no row\n")
-    capsys.readouterr()
-    assert main(arguments) == 2
-    assert "control.jsonl, line 1, is no result row" in capsys.readouterr().err
+    (tmp_path / "hopper_medium-made.hdf5").rename(tmp_path / "hopper_medium-own.hdf5")
+    own = ["--file", "hopper_medium-own", "--method", "lsdt", "--seeds", "2"]
+    assert main([*arguments, *own]) == 0
+    more = [json.loads(line) for line in results.read_text().splitlines()][len(again) :]
+    assert sorted((r["dataset"], r["method"], r["seed"]) for r in more) == [
+        ("hopper_medium-own", "lsdt", seed) for seed in (0, 0, 1, 1)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--method", "nope"], "no method nope in this table; it has bc, bc-10"),
+        (["--seeds", "0"], "--seeds is 0"),
+        (["--file", "nowhere"], "nowhere.hdf5 does not exist"),
+        (["--results", "{rows}"], "rows.jsonl, line 1, is no result row"),
+    ],
+)
+def test_what_no_benchmark_can_be_of_is_refused(
+    tmp_path: Path, options: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_hdf5(tmp_path / "hopper_medium-zoo.hdf5", hopper_like((30, 8, 25)))
+    rows = tmp_path / "rows.jsonl"
+    rows.write_text("no row\n")
+    given = ["benchmark", str(tmp_path), "--out", str(tmp_path / "runs")]
+    given += ["--file", "hopper_medium-zoo"] if "--file" not in options else []
+    assert main([*given, *(str(rows) if o == "{rows}" else o for o in options)]) == 2
+    printed = capsys.readouterr().err.strip().splitlines()
+    assert says in printed[-1]

@@ -1,11 +1,12 @@
 """Every learner on the zoo files (Tables 1 and 3), and sweeps over UCF's settings (resumable)."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from ucfrec.config import Config, resolve_config
+from ucfrec.errors import InputError
 from ucfrec.grid import Row, run_grid
 from ucfrec.results import config_hash, provenance
 from ucfrec.store import EpisodeStore
@@ -164,8 +165,9 @@ def benchmark(
     name: str,
     workers: int,
     table: str = MAIN,
+    methods: Sequence[str] = (),
 ) -> list[Row]:
-    """Train and judge whatever has no row in `results` yet; returns all rows of the table.
+    """Train and judge whatever has no row in `results` yet; returns all rows asked for.
 
     Args:
         data: folder of the HDF5 files.
@@ -174,20 +176,39 @@ def benchmark(
         name: of the budget, for the rows.
         workers: processes, of one thread each.
         table: a key of `TABLES`.
+        methods: rows of the table; empty for all.
 
     Raises:
-        InputError: a file is missing, `results` holds something else, or cells failed.
+        InputError: a file is missing, a method is none of the table's, `results` holds something
+            else, or cells failed.
     """
-    cells = list(_cells(data, folder, budget, name, table))
+    cells = list(_cells(data, folder, budget, name, table, chosen(TABLES[table], methods)))
     return run_grid(cells, _measure, _keys, results, workers, f"benchmark {table}")
 
 
-def _cells(data: Path, folder: Path, budget: Budget, name: str, table: str) -> Iterator[Cell]:
+def chosen(known: Iterable[str], asked: Sequence[str]) -> list[str]:
+    """What of `known` was asked for, or all of it where nothing was, in the order of `known`.
+
+    Raises:
+        InputError: something else was asked for.
+    """
+    known = list(known)
+    if unknown := [name for name in asked if name not in known]:
+        raise InputError(f"no method {', '.join(unknown)} in this table; it has {', '.join(known)}")
+    return [name for name in known if name in asked or not asked]
+
+
+def _cells(
+    data: Path, folder: Path, budget: Budget, name: str, table: str, methods: Sequence[str]
+) -> Iterator[Cell]:
+    # One method of two sweeps is one run: trained once, judged for the rows of each.
+    runs = folder / name / (MAIN if table == MAIN else "sweeps")
     for file in budget.files:
         store = zoo_store(data, folder / "stores", file)
-        for method, (learner, own) in TABLES[table].items():
+        for method in methods:
+            learner, own = TABLES[table][method]
             for seed in range(budget.seeds):
-                run = folder / name / table / file / f"{method}-{seed}"
+                run = runs / file / f"{method}-{seed}"
                 yield Cell(table, method, learner, own, file, store, run, seed, budget, name)
 
 

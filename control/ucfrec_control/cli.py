@@ -116,6 +116,9 @@ def _evaluate(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--checkpoint", choices=["both", "best", "last"], default="both")
     parser.add_argument(
+        "--distractor", type=float, default=0.0, help="what distractors are fixed to (0)"
+    )
+    parser.add_argument(
         "--video", type=Path, metavar="MP4", help="show an episode: FILE.mp4, or folder for frames"
     )
     parser.add_argument("--json", type=Path, help="write the result rows here")
@@ -129,17 +132,31 @@ def _benchmark(parser: argparse.ArgumentParser) -> None:
         choices=["main", "lambda", "gate", "band", "augmentation"],
         help="every learner (main), or a sweep over UCF's settings",
     )
-    parser.add_argument("--budget", default="small", choices=["small", "full"])
+    _budget_options(parser)
     _grid_outputs(parser, "control")
 
 
 def _robustness(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--budget", default="small", choices=["small", "full"])
+    _budget_options(parser)
     _grid_options(parser, "control_robustness")
 
 
 def _screen_all(parser: argparse.ArgumentParser) -> None:
     _grid_options(parser, "control_screening")
+
+
+def _budget_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--budget", default="small", choices=["small", "full"])
+    parser.add_argument(
+        "--file",
+        action="append",
+        default=[],
+        help="of the data folder, without its ending; repeatable (the budget's)",
+    )
+    parser.add_argument(
+        "--method", action="append", default=[], help="row of the table; repeatable (all)"
+    )
+    parser.add_argument("--seeds", type=int, help="how many, from 0 (the budget's)")
 
 
 def _grid_options(parser: argparse.ArgumentParser, results: str) -> None:

@@ -16,7 +16,7 @@ from ucfrec.files import write_json
 from ucfrec.results import format_rows, provenance
 from ucfrec.run import describe_run
 from ucfrec.store import EpisodeStore
-from ucfrec_control.benchmark import BUDGETS, MAIN, SWEEPS, benchmark
+from ucfrec_control.benchmark import BUDGETS, MAIN, SWEEPS, Budget, benchmark
 from ucfrec_control.collect import SHOWN as COLLECTED
 from ucfrec_control.collect import CollectConfig, collect
 from ucfrec_control.d4rl import read_d4rl, write_d4rl
@@ -131,6 +131,7 @@ def run_evaluate(options: argparse.Namespace) -> None:
             env_id=options.env,
             targets=options.target,
             checkpoints=CHECKPOINTS if options.checkpoint == "both" else (options.checkpoint,),
+            distractor=options.distractor,
         )
     print(format_rows([_shown(row) for row in rows], SHOWN))
     for warning in dict.fromkeys(text for row in rows for text in row["warnings"]):
@@ -149,6 +150,7 @@ def _record(options: argparse.Namespace) -> None:
         checkpoint="best" if options.checkpoint == "best" else "last",
         env_id=options.env,
         target=next(iter(options.target), None),
+        distractor=options.distractor,
     )
     print(f"{options.video}: an episode of return {earned:.1f}\n")
 
@@ -159,13 +161,23 @@ def run_benchmark(options: argparse.Namespace) -> None:
         options.data,
         options.out,
         options.results,
-        (BUDGETS if options.table == MAIN else SWEEPS)[options.budget],
+        _budget(BUDGETS if options.table == MAIN else SWEEPS, options),
         options.budget,
         options.workers,
         options.table,
+        options.method,
     )
     print(format_rows([_shown(row) for row in rows], SHOWN))
     print(f"\nrows: {options.results}")
+
+
+def _budget(known: Mapping[str, Budget], options: argparse.Namespace) -> Budget:
+    """The budget asked for, with the files and seeds asked for."""
+    budget = known[options.budget]
+    seeds = budget.seeds if options.seeds is None else options.seeds
+    if seeds < 1:
+        raise InputError(f"--seeds is {seeds}; at least one is needed")
+    return dataclasses.replace(budget, files=tuple(options.file) or budget.files, seeds=seeds)
 
 
 def run_robustness(options: argparse.Namespace) -> None:
@@ -174,9 +186,10 @@ def run_robustness(options: argparse.Namespace) -> None:
         options.data,
         options.out,
         options.results,
-        ROBUSTNESS_BUDGETS[options.budget],
+        _budget(ROBUSTNESS_BUDGETS, options),
         options.budget,
         options.workers,
+        options.method,
     )
     print(
         f"{format_rows(drops(rows), SHOWN_DROPS)}\n\n{format_rows(loss_rises(rows), SHOWN_LOSSES)}"

@@ -34,11 +34,12 @@ def evaluate_run(
     env_id: str | None = None,
     targets: Sequence[float] = (),
     checkpoints: Sequence[str] = CHECKPOINTS,
+    distractor: float = 0.0,
 ) -> list[dict[str, Any]]:
     """One result row for each checkpoint and target return.
 
-    All rows play the same starts. A policy trained with distractors sees them fixed to 0. IQL and
-    CQL have a last checkpoint only, and are asked for no return.
+    All rows play the same starts. A policy trained with distractors sees them fixed. IQL and CQL
+    have a last checkpoint only, and are asked for no return.
 
     Args:
         run: a run folder on a control store.
@@ -46,6 +47,7 @@ def evaluate_run(
         seed: of the environments and the bootstrap.
         env_id: None for the environment of the data.
         targets: returns to ask for; empty for those of the preset.
+        distractor: what every distractor is fixed to (Appendix G.4: 0).
 
     Raises:
         InputError: the run is not on a control store, or keeps none of `checkpoints`, or its
@@ -58,7 +60,7 @@ def evaluate_run(
         trained = load_run(run, checkpoint)
         world = world_of(trained, env_id)
         rows += [
-            _row(trained, world, target, episodes, seed) | {"checkpoint": checkpoint}
+            _row(trained, world, target, episodes, seed, distractor) | {"checkpoint": checkpoint}
             for target in targets_of(trained, world, targets)
         ]
     return [row | {"run": str(run)} for row in rows]
@@ -106,16 +108,21 @@ def world_of(trained: Trained, env_id: str | None) -> str:
 
 
 def open_world(
-    trained: Trained, env_id: str, count: int, wrappers: Sequence[Wrap] = (), **settings: Any
+    trained: Trained,
+    env_id: str,
+    count: int,
+    wrappers: Sequence[Wrap] = (),
+    distractor: float = 0.0,
+    **settings: Any,
 ) -> VectorEnv[Any, Any, Any]:
-    """`count` environments as the data has them, distractors fixed to 0.
+    """`count` environments as the data has them, every distractor fixed to `distractor`.
 
     Raises:
         InputError: `env_id` cannot be made, or is not of the sizes that the policy was trained on.
     """
     record, dataset = trained.record, trained.record["dataset"]
     own = dataset.get("env_settings", {}) if env_id == dataset["env_id"] else {}
-    appended = [0.0] * len(dataset.get("distractors", []))
+    appended = [distractor] * len(dataset.get("distractors", []))
     env = make_env(env_id, count, appended, {**own, **settings}, wrappers)
     shown = int(np.prod(env.single_observation_space.shape or ()))
     sizes = (shown, *(env.single_action_space.shape or ()))
@@ -150,10 +157,12 @@ def targets_of(
     return find_preset(task.name, find_kind(dataset["dataset"]), learner).targets
 
 
-def _row(trained: Trained, env_id: str, target: Any, episodes: int, seed: int) -> dict[str, Any]:
+def _row(
+    trained: Trained, env_id: str, target: Any, episodes: int, seed: int, distractor: float
+) -> dict[str, Any]:
     record, dataset = trained.record, trained.record["dataset"]
     task = require_task(env_id, dataset["dataset"])
-    env = open_world(trained, env_id, min(episodes, SIDE_BY_SIDE))
+    env = open_world(trained, env_id, min(episodes, SIDE_BY_SIDE), distractor=distractor)
     try:
         actor = trained.actor(env.num_envs, target)
         played = rollout(env, actor, episodes, seed, describe=f"{trained.name} in {env_id}")
@@ -178,6 +187,7 @@ def _row(trained: Trained, env_id: str, target: Any, episodes: int, seed: int) -
         "best_step": record["policy"]["best_step"],
         "validation_loss": record["policy"].get("best_validation"),
         "distractors": dataset.get("distractors", []),
+        "distractor_fixed_to": distractor,
         "lambda_mask": record["config"]["policy"].get("lambda_mask"),
         "config_hash": config_hash(record["config"]),
         "fingerprint": record["fingerprint"],

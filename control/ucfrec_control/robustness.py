@@ -1,7 +1,8 @@
 """What a distractor costs the learners that were trained with it (Figures 3 and 4, Appendix G.4).
 
 Every learner is trained on the plain data and on the same data with a distractor in its states, and
-judged where the distractor is fixed to 0.
+judged where the distractor is fixed to 0. Two such trainings differ by their luck too; what one
+policy earns where it is fixed to 1 instead tells of the distractor alone.
 """
 
 import json
@@ -21,7 +22,7 @@ from ucfrec.store import EpisodeStore
 from ucfrec.trained import TrainedPolicy
 from ucfrec_control.benchmark import BUDGETS as SCORE_BUDGETS
 from ucfrec_control.benchmark import METHODS as LEARNERS
-from ucfrec_control.benchmark import Budget
+from ucfrec_control.benchmark import Budget, chosen
 from ucfrec_control.distractor import CLEAN, DISTRACTORS, zoo_store
 from ucfrec_control.evaluate import evaluate_run
 from ucfrec_control.screening_table import verdicts
@@ -42,7 +43,7 @@ BUDGETS = {
     ),
     "full": SCORE_BUDGETS["full"],
 }
-SHOWN = ("dataset", "method", "seed", "distractor", "clean", "score", "drop")
+SHOWN = ("dataset", "method", "seed", "distractor", "clean", "score", "drop", "score_at_one")
 SHOWN_LOSSES = ("dataset", "method", "seed", "distractor", "loss", "loss_at_zero", "rise")
 _LOSS_BATCHES, _LOSS_BATCH = 8, 512
 
@@ -67,9 +68,15 @@ class Cell:
 
 
 def robustness(
-    data: Path, folder: Path, results: Path, budget: Budget, name: str, workers: int
+    data: Path,
+    folder: Path,
+    results: Path,
+    budget: Budget,
+    name: str,
+    workers: int,
+    methods: Sequence[str] = (),
 ) -> list[Row]:
-    """Train and judge whatever has no row in `results` yet; returns all rows of the budget.
+    """Train and judge whatever has no row in `results` yet; returns all rows asked for.
 
     Args:
         data: folder of the HDF5 files.
@@ -77,19 +84,23 @@ def robustness(
         results: JSON lines.
         name: of the budget, for the rows.
         workers: processes, of one thread each.
+        methods: of `METHODS`; empty for all.
 
     Raises:
-        InputError: a file is missing, `results` holds something else, or cells failed.
+        InputError: a file is missing, a method is unknown, `results` holds something else, or cells
+            failed.
     """
-    cells = list(_cells(data, folder, budget, name))
+    cells = list(_cells(data, folder, budget, name, chosen(METHODS, methods)))
     return run_grid(cells, _measure, _keys, results, workers, "robustness")
 
 
-def _cells(data: Path, folder: Path, budget: Budget, name: str) -> Iterator[Cell]:
+def _cells(
+    data: Path, folder: Path, budget: Budget, name: str, methods: Sequence[str]
+) -> Iterator[Cell]:
     for file in budget.files:
         for distractor in DISTRACTORS:
             store = zoo_store(data, folder / "stores", file, distractor)
-            for method in METHODS:
+            for method in methods:
                 for seed in range(budget.seeds):
                     run = folder / f"robustness-{name}" / file / distractor / f"{method}-{seed}"
                     yield Cell(file, distractor, method, seed, store, run, budget, name)
@@ -121,13 +132,18 @@ def _measure(cell: Cell) -> list[Row]:
     record = train_control(store, cell.run, config, screened=cell.method == SCREENED)
     # The last checkpoint: the best on validation was chosen where the distractor still tells. Every
     # method plays the same starts, with and without distractor.
-    (row,) = evaluate_run(
-        cell.run,
-        episodes=cell.budget.episodes,
-        seed=1000 + cell.seed,
-        targets=preset_of(dataset_of(store), config.policy_name).targets[:1],
-        checkpoints=("last",),
-    )
+    judged = [
+        evaluate_run(
+            cell.run,
+            episodes=cell.budget.episodes,
+            seed=1000 + cell.seed,
+            targets=preset_of(dataset_of(store), config.policy_name).targets[:1],
+            checkpoints=("last",),
+            distractor=value,
+        )[0]
+        for value in ((0.0,) if cell.distractor == CLEAN else (0.0, 1.0))
+    ]
+    row = {**judged[0], "score_at_one": judged[-1]["score"]}
     if cell.method == SCREENED:
         row["screening"] = verdicts(record["screening"], store)
     losses = held_out_losses(TrainedPolicy.load(cell.run, "last"), store)
@@ -159,21 +175,23 @@ def held_out_losses(trained: TrainedPolicy, store: EpisodeStore) -> Row:
 def drops(rows: Sequence[Mapping[str, Any]]) -> list[Row]:
     """What every distractor took from a method, where a dataset and seed has a clean row too.
 
-    `clean` and `score` are the normalised scores without and with the distractor, `drop` the share
-    of `clean` that is lost, in percent: negative where nothing was lost, NaN where `clean` is not
-    above 0. Of rows that say the same, the last counts.
+    `clean` and `score` are the normalised scores without and with the distractor, which is fixed to
+    0, `drop` the share of `clean` that is lost, in percent: negative where nothing was lost, NaN
+    where `clean` is not above 0. `score_at_one` is what the policy of `score` earns, of the same
+    starts, where it is fixed to 1. Of rows that say the same, the last counts.
 
     Args:
         rows: what `robustness` returns, of one budget.
     """
-    scores = {(r["dataset"], r["method"], r["seed"], r["distractor"]): r["score"] for r in rows}
+    last = {(r["dataset"], r["method"], r["seed"], r["distractor"]): r for r in rows}
     found = []
-    for (dataset, method, seed, distractor), score in scores.items():
-        clean = scores.get((dataset, method, seed, CLEAN))
-        if distractor == CLEAN or clean is None:
+    for (dataset, method, seed, distractor), row in last.items():
+        plain = last.get((dataset, method, seed, CLEAN))
+        if distractor == CLEAN or plain is None:
             continue
+        clean, score = plain["score"], row["score"]
         lost = 100 * (clean - score) / clean if clean > 0 else float("nan")
-        values = (dataset, method, seed, distractor, clean, score, lost)
+        values = (dataset, method, seed, distractor, clean, score, lost, row["score_at_one"])
         found.append(dict(zip(SHOWN, values, strict=True)))
     return found
 

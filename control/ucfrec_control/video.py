@@ -27,7 +27,14 @@ _VIDEO = ".mp4"
 
 
 def record_episode(
-    run: Path, out: Path, *, seed: int, checkpoint: str, env_id: str | None, target: float | None
+    run: Path,
+    out: Path,
+    *,
+    seed: int,
+    checkpoint: str,
+    env_id: str | None,
+    target: float | None,
+    distractor: float = 0.0,
 ) -> float:
     """Play one episode, which starts as the first that `evaluate_run` plays, and keep its frames.
 
@@ -36,6 +43,7 @@ def record_episode(
         out: `NAME.mp4`, or a folder for `frame-00000.png`, …; the first frame is the start. Appears
             when the episode has ended.
         target: return to ask for; None for the preset's first.
+        distractor: what every distractor is fixed to.
 
     Returns:
         The return of the episode.
@@ -55,7 +63,9 @@ def record_episode(
     with (_video if out.suffix == _VIDEO else _frames)(out) as take:
         with _drawing(world):
             recorder = partial(_Recorder, take=take)
-            env = open_world(trained, world, 1, [recorder], render_mode="rgb_array")
+            env = open_world(
+                trained, world, 1, [recorder], distractor=distractor, render_mode="rgb_array"
+            )
         try:
             played = rollout(env, trained.actor(1, asked), 1, seed, describe="episode to look at")
         finally:

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from tests.control_files import hopper_like, write_hdf5
+from ucfrec.errors import InputError
 from ucfrec.events import read_scalars
 from ucfrec.files import read_json
 from ucfrec.store import EpisodeStore
@@ -54,7 +55,8 @@ def heights(axes: object) -> dict[tuple[int, str], float]:
 
 def test_bars_are_as_high_as_the_drops_of_their_rows() -> None:
     rows = [
-        {"dataset": "d", "method": m, "distractor": k, "seed": s, "score": 50.0 - 7 * i * j - s}
+        {"dataset": "d", "method": m, "distractor": k, "seed": s}
+        | {"score": 50.0 - 7 * i * j - s, "score_at_one": None}
         for i, m in enumerate(("dt", "ucf", "ucf-screened"))
         for j, k in enumerate(("none", "deterministic", "early"))
         for s in range(3)
@@ -154,12 +156,30 @@ def test_curves_are_means_over_seeds(runs: Path) -> None:
     (axes,) = plots.lambda_curves(rows).axes
     np.testing.assert_allclose(axes.lines[0].get_ydata(), [0.5, 1.5, 10.5])
     assert [text.get_text() for text in axes.get_xticklabels()] == ["0", "0.1", "1"]
+    rows = [
+        {"method": "ucf", "target_return": target, "seed": seed, "return": target / 2 + seed}
+        for target in (2000.0, 1000.0)
+        for seed in (0, 1)
+    ]
+    (axes,) = plots.return_curves(rows).axes
+    earned, as_asked = axes.lines
+    np.testing.assert_array_equal(earned.get_xydata(), [[1000, 500.5], [2000, 1000.5]])
+    np.testing.assert_array_equal(as_asked.get_xydata(), [[0, 0], [2000, 2000]])
+
+
+def test_json_that_is_no_list_of_rows_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "x.json").write_text("{}")
+    with pytest.raises(InputError, match=r"x\.json holds no list of rows"):
+        make_figures([], [tmp_path / "x.json"], tmp_path)
 
 
 def test_one_command_draws_what_it_can_and_names_what_is_missing(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     results, out = tmp_path / "rows.jsonl", tmp_path / "figures"
+    evaluated = tmp_path / "evaluated.json"
+    asked = ["--target", "1000", "--target", "3000", "--episodes", "1", "--json", str(evaluated)]
+    assert main(["evaluate", str(runs / "tangent"), *asked]) == 0
     common = {"dataset": "d", "seed": 0, "checkpoint": "last"}
     rows = [
         common | {"method": "ucf", "budget": "small", "lambda_mask": value, "score": value}
@@ -170,11 +190,13 @@ def test_one_command_draws_what_it_can_and_names_what_is_missing(
     record = read_json(tmp_path / "copied" / "tangent" / "run.json")
     record["store"] = str(tmp_path / "gone")
     (tmp_path / "copied" / "tangent" / "run.json").write_text(json.dumps(record))
-    arguments = ["figures", "--runs", str(tmp_path / "copied"), "--results", str(results)]
+    arguments = ["figures", "--runs", str(tmp_path / "copied")]
+    arguments += ["--results", str(results), str(evaluated)]
     assert main([*arguments, "--out", str(out)]) == 0
     printed = capsys.readouterr()
     names = {"lambda-small", "moves-faithful", "states-faithful", "acceptance-faithful"}
     names |= {"attention-faithful", "moves-tangent", "training-hopper_medium-made"}
+    names |= {"returns-hopper_medium-made"}
     assert {path.name for path in out.iterdir()} == {
         f"{name}.{kind}" for name in names for kind in ("png", "svg")
     }

@@ -181,7 +181,7 @@ def _figures(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--runs", nargs="*", type=Path, default=[], metavar="RUN", help="runs, or folders of runs"
     )
-    parser.add_argument("--results", nargs="*", type=Path, default=[], metavar="JSONL")
+    parser.add_argument("--results", nargs="*", type=Path, default=[], metavar="ROWS")
     parser.add_argument("--out", type=Path, required=True, metavar="FOLDER")
 
 

@@ -31,6 +31,8 @@ NEEDS = {
     "acceptance": _COPIES,
     "attention": "a run of ucf among --runs (`ucfrec-control train --policy ucf`)",
     "training": "a run among --runs (`ucfrec-control train`)",
+    "returns": "rows of one dataset with two returns asked for or more among --results "
+    "(`ucfrec-control evaluate --target … --target … --json`)",
     "lambda": "rows of ucf with two weights of the mask loss or more among --results",
     "robustness-scores": "rows of `ucfrec-control robustness` among --results",
     "robustness-drops": "such rows with and without a distractor",
@@ -77,7 +79,7 @@ def make_figures(
 
     Args:
         runs: run folders of `ucfrec-control`, or folders that hold some at any depth.
-        results: JSON lines of `benchmark` and `robustness`.
+        results: JSON lines of `benchmark` and `robustness`, and JSON of `evaluate`.
 
     Returns:
         The files written, and a line for each figure that lacks its data.
@@ -86,7 +88,7 @@ def make_figures(
         InputError: a file of `results` holds something else.
     """
     found = _told_apart([run for folder in runs for run in _runs(folder)])
-    rows = [row for path in results for row in read_rows(path)]
+    rows = [row for path in results for row in _rows(path)]
     plans = [*_of_runs(found), *_of_rows(rows)]
     made: list[Path] = []
     missing = [f"{k}: needs {w}" for k, w in NEEDS.items() if k not in {p.kind for p in plans}]
@@ -97,6 +99,17 @@ def make_figures(
         except InputError as error:
             missing.append(f"{name}: {error}")
     return made, missing
+
+
+def _rows(path: Path) -> list[Row]:
+    if path.suffix != ".json":
+        return read_rows(path)
+    found = read_json(path)
+    if not isinstance(found, list) or not all(isinstance(row, dict) for row in found):
+        raise InputError(
+            f"{path} holds no list of rows; `ucfrec-control evaluate --json` makes one"
+        )
+    return found
 
 
 def _runs(folder: Path) -> Iterator[_Run]:
@@ -180,9 +193,18 @@ def _training(runs: Sequence[_Run]) -> Figure:
 
 
 def _of_rows(rows: Sequence[Row]) -> Iterator[_Plan]:
-    distracted = [row for row in rows if "distractor" in row]
-    for budget, dataset in dict.fromkeys((row["budget"], row["dataset"]) for row in distracted):
-        there = [r for r in distracted if (r["budget"], r["dataset"]) == (budget, dataset)]
+    yield from _of_robustness([row for row in rows if "distractor" in row])
+    yield from _of_targets([row for row in rows if _of_evaluate(row)])
+    swept = [row for row in rows if _of_lambda(row)]
+    for budget in dict.fromkeys(row.get("budget", "") for row in swept):
+        there = [row for row in swept if row.get("budget", "") == budget]
+        if len({row["lambda_mask"] for row in there}) > 1:
+            yield _Plan("lambda", budget or "rows", partial(plots.lambda_curves, there))
+
+
+def _of_robustness(rows: Sequence[Row]) -> Iterator[_Plan]:
+    for budget, dataset in dict.fromkeys((row["budget"], row["dataset"]) for row in rows):
+        there = [r for r in rows if (r["budget"], r["dataset"]) == (budget, dataset)]
         about, bars = f"{budget}-{dataset}", plots.robustness_bars
         score = partial(bars, there, "score", "normalised score", dataset)
         yield _Plan("robustness-scores", about, score)
@@ -192,11 +214,23 @@ def _of_rows(rows: Sequence[Row]) -> Iterator[_Plan]:
         if rises := loss_rises(there):
             rise = partial(bars, rises, "rise", "rise of the action loss (%)", dataset)
             yield _Plan("robustness-losses", about, rise)
-    swept = [row for row in rows if _of_lambda(row)]
-    for budget in dict.fromkeys(row.get("budget", "") for row in swept):
-        there = [row for row in swept if row.get("budget", "") == budget]
-        if len({row["lambda_mask"] for row in there}) > 1:
-            yield _Plan("lambda", budget or "rows", partial(plots.lambda_curves, there))
+
+
+def _of_targets(rows: Sequence[Row]) -> Iterator[_Plan]:
+    """Of the methods that were asked for more than one return."""
+    targets: dict[tuple[str, str], set[float]] = {}
+    for row in rows:
+        targets.setdefault((row["dataset"], row["method"]), set()).add(row["target_return"])
+    rows = [row for row in rows if len(targets[row["dataset"], row["method"]]) > 1]
+    for dataset in dict.fromkeys(row["dataset"] for row in rows):
+        there = [row for row in rows if row["dataset"] == dataset]
+        yield _Plan("returns", dataset, partial(plots.return_curves, there, dataset))
+
+
+def _of_evaluate(row: Row) -> bool:
+    """Whether `row` is of no table, and of a policy that is asked for returns."""
+    whole = "budget" not in row and row.get("checkpoint") == "last" and not row.get("distractors")
+    return whole and row.get("target_return") is not None
 
 
 def _of_lambda(row: Row) -> bool:

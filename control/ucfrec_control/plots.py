@@ -135,6 +135,34 @@ def lambda_curves(rows: Sequence[Row], title: str = "") -> Figure:
 
 
 @styled
+def return_curves(rows: Sequence[Row], title: str = "") -> Figure:
+    """Return earned over return asked for, a line a method: mean over seeds, lowest to highest
+    around it. On the dashed line, what is asked for is earned.
+
+    Args:
+        rows: result rows that differ in `method`, `target_return` and `seed`.
+    """
+    figure, axes = _figure(COLUMN, 2.5, title)
+    earned = _grouped(rows, ("method", "target_return"), "return")
+    for method, color in colors(sorted({row["method"] for row in rows})).items():
+        targets = sorted(target for other, target in earned if other == method)
+        found = [earned[method, target] for target in targets]
+        axes.plot(targets, list(map(np.mean, found)), "o-", color=color, label=label(method))
+        axes.fill_between(
+            targets, list(map(min, found)), list(map(max, found)), color=color, alpha=0.2, lw=0
+        )
+    asked, top = [row["target_return"] for row in rows], axes.get_ylim()[1]
+    axes.plot([0, max(asked)], [0, max(asked)], "--", color="black", linewidth=0.9)
+    axes.set_xlim(0, 1.03 * max(asked))
+    axes.set_ylim(0, 1.1 * top)
+    axes.set_xlabel("return asked for")
+    axes.set_ylabel("return earned")
+    axes.grid(True)
+    _legend_below(figure, axes, 4)
+    return figure
+
+
+@styled
 def robustness_bars(rows: Sequence[Row], value: str, ylabel: str, title: str = "") -> Figure:
     """Bars of one dataset: methods side by side, a bar a distractor (Figures 3 and 4).
 

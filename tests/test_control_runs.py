@@ -21,6 +21,7 @@ from ucfrec_control.cli import main
 from ucfrec_control.d4rl import read_d4rl
 from ucfrec_control.distractor import add_distractor
 from ucfrec_control.environments import make_env, mismatches
+from ucfrec_control.evaluate import evaluate_run
 from ucfrec_control.presets import find_preset
 from ucfrec_control.scores import TASKS
 
@@ -66,9 +67,20 @@ def test_evaluate_writes_last_and_best_apart(
         assert {"mujoco", "gymnasium", "torch"} <= row["versions"].keys()
         trained = read_json(folder / "store-run" / "run.json")["policy"]
         assert row["validation_loss"] == trained["best_validation"] > 0
+        assert min(row["wall_time_s"], row["train_wall_time_s"]) > 0
+        assert row["config"]["policy_name"] == "dt"
     printed = capsys.readouterr()
     assert "hopper_medium-made" in printed.out
     assert "warning" not in printed.err
+
+
+def test_the_best_checkpoint_is_played_whichever_step_it_is_of(folder: Path) -> None:
+    """Asked for together with the last, it may be the same; it earns what it earns alone."""
+    run = folder / "store-run"
+    both = evaluate_run(run, episodes=2, seed=0, targets=(3600.0,))
+    (best,) = evaluate_run(run, episodes=2, seed=0, targets=(3600.0,), checkpoints=("best",))
+    assert [row["checkpoint"] for row in both] == ["last", "best"]
+    assert both[1]["return"] == best["return"]
 
 
 def test_another_environment_version_warns(

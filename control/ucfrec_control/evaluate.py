@@ -1,5 +1,6 @@
 """What a trained policy earns in its environment, on D4RL's scale."""
 
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -55,9 +56,14 @@ def evaluate_run(
     """
     if episodes < 1:
         raise InputError(f"{episodes} episodes were asked for; at least one is needed")
-    rows = []
+    rows: list[dict[str, Any]] = []
     for checkpoint in _kept(run, checkpoints):
         trained = load_run(run, checkpoint)
+        learned = trained.record["policy"]
+        if rows and learned["best_step"] == learned["steps"]:
+            # The best checkpoint is the last: the same weights would play the same episodes.
+            rows += [{**row, "checkpoint": checkpoint} for row in rows]
+            continue
         world = world_of(trained, env_id)
         rows += [
             _row(trained, world, target, episodes, seed, distractor) | {"checkpoint": checkpoint}
@@ -162,12 +168,14 @@ def _row(
 ) -> dict[str, Any]:
     record, dataset = trained.record, trained.record["dataset"]
     task = require_task(env_id, dataset["dataset"])
+    began = time.perf_counter()
     env = open_world(trained, env_id, min(episodes, SIDE_BY_SIDE), distractor=distractor)
     try:
         actor = trained.actor(env.num_envs, target)
         played = rollout(env, actor, episodes, seed, describe=f"{trained.name} in {env_id}")
     finally:
         env.close()
+    seconds = time.perf_counter() - began
     low, high = task.score(bootstrap_interval(played.returns, seed))
     return {
         "dataset": dataset["dataset"],
@@ -186,11 +194,15 @@ def _row(
         "steps": record["policy"]["steps"],
         "best_step": record["policy"]["best_step"],
         "validation_loss": record["policy"].get("best_validation"),
+        "acceptance": record.get("augmentation", {}).get("acceptance"),
         "distractors": dataset.get("distractors", []),
         "distractor_fixed_to": distractor,
         "lambda_mask": record["config"]["policy"].get("lambda_mask"),
+        "config": record["config"],
         "config_hash": config_hash(record["config"]),
         "fingerprint": record["fingerprint"],
         "dataset_versions": dataset["versions"],
         "warnings": mismatches(dataset, env_id),
+        "train_wall_time_s": record["wall_time_s"],
+        "wall_time_s": seconds,
     }

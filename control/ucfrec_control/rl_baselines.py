@@ -127,7 +127,7 @@ def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dic
             "dataset": dict(store.meta["source"]),
             "versions": versions((*PACKAGES, "d3rlpy")),
             "threads": torch.get_num_threads(),
-            "seconds": perf_counter() - begun,
+            "wall_time_s": perf_counter() - begun,
         }
         write_json(scratch / RUN, record)
     return record

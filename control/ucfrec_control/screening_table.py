@@ -1,5 +1,6 @@
 """Whether screening flags distractors, and nothing else, on every file (resumable)."""
 
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -65,12 +66,15 @@ def _keys(cell: Cell) -> Row:
 
 def _measure(cell: Cell) -> list[Row]:
     store = EpisodeStore.open(cell.store)
+    began = time.perf_counter()
     report = asdict(screen(store, cell.config, SEED))
     return [
         {
             "screening": verdicts(report, store),
             "reward_r2": report["reward_r2"],
             "transitions": report["transitions"],
+            "config": asdict(cell.config),
+            "wall_time_s": time.perf_counter() - began,
             **provenance(PACKAGES),
         }
     ]

@@ -30,6 +30,7 @@ from ucfrec_control.scores import find_task
 from ucfrec_control.screening import ScreeningConfig, describe_screening, screen
 from ucfrec_control.screening_table import SHOWN as SHOWN_SCREENING
 from ucfrec_control.screening_table import screening_rows, screening_table
+from ucfrec_control.tables import over_seeds, score_table
 from ucfrec_control.train import dataset_of, preset_of, train_control
 from ucfrec_control.trajectories import PACKAGES, Trajectories
 from ucfrec_control.video import record_episode
@@ -168,6 +169,10 @@ def run_benchmark(options: argparse.Namespace) -> None:
         options.method,
     )
     print(format_rows([_shown(row) for row in rows], SHOWN))
+    for checkpoint in CHECKPOINTS:
+        table = score_table(rows, checkpoint)
+        print(f"\nscores of the {checkpoint} checkpoint, mean ± standard deviation over seeds")
+        print(format_rows(table, list(table[0])))
     print(f"\nrows: {options.results}")
 
 
@@ -191,10 +196,10 @@ def run_robustness(options: argparse.Namespace) -> None:
         options.workers,
         options.method,
     )
-    print(
-        f"{format_rows(drops(rows), SHOWN_DROPS)}\n\n{format_rows(loss_rises(rows), SHOWN_LOSSES)}"
-    )
-    print(f"\n{format_rows(screening_rows(rows), SHOWN_SCREENING)}\n\nrows: {options.results}")
+    by = ("dataset", "distractor", "method")
+    for found, values in ((drops(rows), SHOWN_DROPS), (loss_rises(rows), SHOWN_LOSSES)):
+        print(f"{format_rows(over_seeds(found, by, values), (*by, *values))}\n")
+    print(f"{format_rows(screening_rows(rows), SHOWN_SCREENING)}\n\nrows: {options.results}")
 
 
 def run_figures(options: argparse.Namespace) -> None:

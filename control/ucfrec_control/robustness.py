@@ -43,8 +43,8 @@ BUDGETS = {
     ),
     "full": SCORE_BUDGETS["full"],
 }
-SHOWN = ("dataset", "method", "seed", "distractor", "clean", "score", "drop", "score_at_one")
-SHOWN_LOSSES = ("dataset", "method", "seed", "distractor", "loss", "loss_at_zero", "rise")
+SHOWN = ("clean", "score", "drop", "score_at_one")
+SHOWN_LOSSES = ("loss", "loss_at_zero", "rise")
 _LOSS_BATCHES, _LOSS_BATCH = 8, 512
 
 
@@ -185,14 +185,17 @@ def drops(rows: Sequence[Mapping[str, Any]]) -> list[Row]:
     """
     last = {(r["dataset"], r["method"], r["seed"], r["distractor"]): r for r in rows}
     found = []
-    for (dataset, method, seed, distractor), row in last.items():
-        plain = last.get((dataset, method, seed, CLEAN))
-        if distractor == CLEAN or plain is None:
+    for key, row in last.items():
+        plain = last.get((*key[:-1], CLEAN))
+        if row["distractor"] == CLEAN or plain is None:
             continue
         clean, score = plain["score"], row["score"]
         lost = 100 * (clean - score) / clean if clean > 0 else float("nan")
-        values = (dataset, method, seed, distractor, clean, score, lost, row["score_at_one"])
-        found.append(dict(zip(SHOWN, values, strict=True)))
+        values = (clean, score, lost, row["score_at_one"])
+        found.append(
+            {name: row[name] for name in ("dataset", "method", "seed", "distractor")}
+            | dict(zip(SHOWN, values, strict=True))
+        )
     return found
 
 

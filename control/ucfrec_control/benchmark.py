@@ -28,11 +28,15 @@ METHODS: Methods = {
     "dc": ("dc", ()),
     "lsdt": ("lsdt", ()),
     "ucf": ("ucf", ()),
+    "ucf-w-time": ("ucf", ("policy.max_timestep=1000",)),
     "ucf-wo-count": ("ucf", ("augment.copies=0",)),
     "ucf-wo-arch": ("dt", ("augment.copies=1",)),
 }
-"""Learner and settings by the name of the table's row; the last two are Table 3's ablations. UCF's
-preset tells its policy no time; `dt-wo-time` says what that alone does for DT."""
+"""Learner and settings by the name of the table's row; the last two are Table 3's ablations.
+
+UCF's preset tells its policy no time, DT's does; `ucf-w-time` and `dt-wo-time` are the other way
+round.
+"""
 
 _FAITHFUL, _NOISE = "csg.kind=faithful", "csg.kind=noise"
 _NO_GATE = "augment.epsilon_r=1e9"

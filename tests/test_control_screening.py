@@ -1,5 +1,6 @@
 """Screening finds what causes nothing, keeps what causes something, and intervenes on it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,9 +25,9 @@ from ucfrec_control.trajectories import Trajectories
 QUICK = ScreeningConfig(hidden=64, shared_steps=400, own_steps=200)
 
 
-def planted(out: Path, trajectories: int = 60, length: int = 40) -> EpisodeStore:
+def planted(out: Path, trajectories: int = 60, length: int = 40, jolt: float = 0.0) -> EpisodeStore:
     """Five dimensions: 0 drives 1, 1 drives 0 and the reward, 2 the reward alone, 3 measures the
-    reward, 4 is noise. 3 and 4 cause nothing."""
+    reward, 4 is noise. 3 and 4 cause nothing. In 0.3% of the steps 1 is jolted by `jolt`."""
     rng = np.random.default_rng(0)
     shape = (trajectories, length)
     states, actions = np.zeros((*shape, 5)), rng.uniform(-1, 1, (*shape, 1))
@@ -36,6 +37,8 @@ def planted(out: Path, trajectories: int = 60, length: int = 40) -> EpisodeStore
         x, y = states[:, t, 0], states[:, t, 1]
         states[:, t + 1, 0] = 0.8 * x + 0.5 * np.tanh(y) + 0.2 * actions[:, t, 0]
         states[:, t + 1, 1] = 0.7 * y - 0.6 * x + 0.3 * rng.normal(size=trajectories)
+        if jolt:
+            states[:, t + 1, 1] += jolt * (rng.random(trajectories) < 0.003)
     rewards = states[:, :, 1] + np.abs(states[:, :, 2]) + 0.3 * actions[:, :, 0]
     states[:, :, 3] = rewards > np.median(rewards)
     return Trajectories(
@@ -60,6 +63,13 @@ def test_what_causes_nothing_is_flagged_and_nothing_else(tmp_path: Path) -> None
     assert abs(by_dimension[3].effect) < 0.03
     assert by_dimension[3].reward_effect < 0.01
     assert screen(store, QUICK, seed=0) == report
+
+
+def test_a_few_violent_steps_do_not_decide(tmp_path: Path) -> None:
+    store = planted(tmp_path / "store", jolt=40.0)
+    assert screen(store, QUICK, seed=0).flagged == (3, 4)
+    # What they would decide: that nothing helps to predict what is jolted.
+    assert 0 in screen(store, replace(QUICK, capped=0.0), seed=0).flagged
 
 
 def test_too_few_trajectories_are_refused(tmp_path: Path) -> None:

@@ -6,7 +6,8 @@ reward nor the rest of the next state is no cause of anything (assumption A3, mi
 Both halves are judged on held-out trajectories. For the next state the reward is given as well: a
 dimension that measures the reward, as distractors do, then has nothing to add, however imperfect
 the predictors are. For the reward that way out is barred, so help must be worth a share of the
-reward's whole variance; a measurement of it explains no more than the predictor's own error.
+reward's whole variance; a measurement of it explains no more than the predictor's own error. The
+largest errors of the next state are capped: a few falls must not decide.
 """
 
 from collections.abc import Callable, Sequence
@@ -43,8 +44,11 @@ class ScreeningConfig:
     batch_size: int = 256
     learning_rate: float = 3e-3
     max_transitions: int = 100_000
-    min_effect: float = 0.02
+    min_effect: float = 0.01
     """Least share of a next dimension's unexplained variance that counts as help."""
+    capped: float = 0.005
+    """Share of the largest squared errors of a next dimension that count as the largest below:
+    where a body falls, one step in a thousand may make up half of their sum."""
     min_reward_effect: float = 0.01
     """Least share of the reward's variance that counts as help."""
     level: float = 0.01
@@ -269,8 +273,9 @@ def _report(
     most_helped = gain.fill_diagonal_(-torch.inf).topk(min(_HELPED, size - 1)).indices
     found = []
     for j in range(size):
-        without = next_errors[j, :, most_helped[j]]  # (B, helped)
-        saved = (without - next_errors[-1, :, most_helped[j]]) / without.mean(0).clamp(min=1e-12)
+        pair = next_errors[[j, -1]][:, :, most_helped[j]]  # (2, B, helped)
+        without, with_it = pair.minimum(pair.flatten(0, 1).quantile(1 - config.capped, dim=0))
+        saved = (without - with_it) / without.mean(0).clamp(min=1e-12)
         effect, p_value = float(saved.mean()), _p_value(saved.mean(1), data.episodes[rows])
         more = reward_errors[j] - reward_errors[-1]
         reward_effect = float(more.mean()) / max(variance, 1e-12)

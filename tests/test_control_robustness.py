@@ -74,7 +74,7 @@ def test_cells_are_measured_once_and_screening_is_reported(
     columns["observations"][:, 4] = 0.0  # a constant causes nothing
     file, out = write_hdf5(tmp_path / f"{FILE}.hdf5", columns), tmp_path / "out"
     # Begun here, where screening may be made quick, and gone on with by the command.
-    quickest = ScreeningConfig(hidden=8, shared_steps=20, own_steps=10)
+    quickest = ScreeningConfig(hidden=8, shared_steps=100, own_steps=50)
     monkeypatch.setattr("ucfrec_control.train.ScreeningConfig", lambda: quickest)
     clean = read_d4rl(file).write_store(out / "stores" / FILE)
     distracted = add_distractor(clean, out / "stores" / f"{FILE}-deterministic")

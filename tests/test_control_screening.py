@@ -118,7 +118,7 @@ def test_overlays_join_in_order(tmp_path: Path) -> None:
 def test_training_with_screening_records_and_resumes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    quickest = ScreeningConfig(hidden=8, shared_steps=20, own_steps=10)
+    quickest = ScreeningConfig(hidden=8, shared_steps=100, own_steps=50)
     monkeypatch.setattr("ucfrec_control.train.ScreeningConfig", lambda: quickest)
     columns = hopper_like((20, 30) * 12)
     columns["observations"][:, 4] = 0.0  # a constant causes nothing
@@ -138,7 +138,7 @@ def test_training_with_screening_records_and_resumes(
 def test_every_file_is_screened_plain_and_distracted_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    quickest = ScreeningConfig(hidden=8, shared_steps=20, own_steps=10)
+    quickest = ScreeningConfig(hidden=8, shared_steps=100, own_steps=50)
     monkeypatch.setattr(screening_table, "ScreeningConfig", lambda: quickest)
     budget = {"full": Budget(("hopper_medium-made",), 1, 1, ())}
     monkeypatch.setattr(screening_table, "BUDGETS", budget)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ucfrec_control.tables import over_seeds, score_table
+from ucfrec_control.tables import against_first, over_seeds, score_table
 
 
 def test_a_table_of_scores_has_the_spread_over_seeds_and_a_mean_where_nothing_is_missing() -> None:
@@ -37,3 +37,16 @@ def test_what_was_not_measured_is_a_dash() -> None:
     assert [row["other"] for row in found] == ["4", "–"]
     mean, _, deviation = found[0]["score"].partition(" ± ")
     assert (float(mean), float(deviation)) == (2.0, pytest.approx(2**0.5, abs=0.05))
+
+
+def test_methods_are_compared_seed_by_seed() -> None:
+    scores = {"none": (10.0, 50.0, 90.0), "copies": (13.0, 51.0), "lonely": (1.0,)}
+    rows = [
+        {"dataset": "a", "method": method, "seed": seed, "score": score}
+        for method, seeds in scores.items()
+        for seed, score in enumerate(seeds)
+    ]
+    # Of 3 and 1: their deviation √2 over √2.
+    assert against_first(rows, ("score",)) == [
+        {"dataset": "a", "method": "copies", "score": "+2 ± 1"}
+    ]

@@ -30,7 +30,7 @@ from ucfrec_control.scores import find_task
 from ucfrec_control.screening import ScreeningConfig, describe_screening, screen
 from ucfrec_control.screening_table import SHOWN as SHOWN_SCREENING
 from ucfrec_control.screening_table import screening_rows, screening_table
-from ucfrec_control.tables import over_seeds, score_table
+from ucfrec_control.tables import against_first, over_seeds, score_table
 from ucfrec_control.train import dataset_of, preset_of, train_control
 from ucfrec_control.trajectories import PACKAGES, Trajectories
 from ucfrec_control.video import record_episode
@@ -173,6 +173,14 @@ def run_benchmark(options: argparse.Namespace) -> None:
         table = score_table(rows, checkpoint)
         print(f"\nscores of the {checkpoint} checkpoint, mean ± standard deviation over seeds")
         print(format_rows(table, list(table[0])))
+    last = [row for row in rows if row["checkpoint"] == "last"]
+    by, values = ("dataset", "method"), ("score", "validation_loss")
+    shown = (*values, "acceptance")
+    print("\nlast checkpoint, mean ± standard deviation over seeds")
+    print(format_rows(over_seeds(last, by, shown), (*by, *shown)))
+    if options.table != MAIN:
+        print(f"\nless {last[0]['method']} of the same seed, mean ± standard error")
+        print(format_rows(against_first(last, values), (*by, *values)))
     print(f"\nrows: {options.results}")
 
 

@@ -41,6 +41,33 @@ def over_seeds(rows: Sequence[Row], by: Sequence[str], values: Sequence[str]) ->
     ]
 
 
+def against_first(rows: Sequence[Row], values: Sequence[str]) -> list[Row]:
+    """A line a dataset and later method: by how much its `values` differ from the first method's of
+    the same seed, mean ± standard error over the seeds that both have.
+
+    Args:
+        rows: of one checkpoint.
+    """
+    known = {(row["dataset"], row["method"], row["seed"]): row for row in rows}
+    first = rows[0]["method"]
+    lines = []
+    for dataset, method in dict.fromkeys((row["dataset"], row["method"]) for row in rows):
+        pairs = [
+            (row, known[dataset, first, seed])
+            for (own, name, seed), row in known.items()
+            if (own, name) == (dataset, method) and (dataset, first, seed) in known
+        ]
+        if method == first or len(pairs) < 2:
+            continue
+        line: Row = {"dataset": dataset, "method": method}
+        for name in values:
+            differences = [row[name] - other[name] for row, other in pairs]
+            error = np.std(differences, ddof=1) / len(pairs) ** 0.5
+            line[name] = f"{np.mean(differences):+.3g} ± {error:.2g}"
+        lines.append(line)
+    return lines
+
+
 def spread(values: Sequence[float]) -> str:
     """Mean ± standard deviation of a sample, of one value the value alone, of none a dash."""
     if not values:

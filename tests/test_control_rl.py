@@ -6,11 +6,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from tqdm import tqdm
 
 from tests.control_files import hopper_like, write_hdf5
 from ucfrec.errors import InputError
+from ucfrec.events import read_scalars
 from ucfrec.files import read_json
 from ucfrec.store import EpisodeStore
+from ucfrec_control import rl_baselines
 from ucfrec_control.benchmark import TABLES, Budget, benchmark
 from ucfrec_control.cli import main
 from ucfrec_control.d4rl import read_d4rl
@@ -28,6 +31,44 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> EpisodeStore:
     folder = tmp_path_factory.mktemp("rl")
     file = write_hdf5(folder / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
     return read_d4rl(file).write_store(folder / "store")
+
+
+class _Stops(tqdm):  # type: ignore[type-arg]
+    """A bar during whose fifth step the user interrupts."""
+
+    seen = 0
+
+    def update(self, n: float | None = 1) -> bool | None:
+        self.seen += 1
+        if self.seen == 5:
+            raise KeyboardInterrupt
+        return super().update(n)
+
+
+@pytest.mark.parametrize("algorithm", ["iql", "cql"])
+def test_a_training_that_was_interrupted_ends_as_one_left_alone(
+    store: EpisodeStore,
+    tmp_path: Path,
+    algorithm: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config = rl_config(dataset_of(store), algorithm, steps=7, batch_size=16)
+    monkeypatch.setattr(rl_baselines, "CHECKPOINT_EVERY", 2)
+    train_rl(store, tmp_path / "alone", config, 0)
+    with monkeypatch.context() as interrupted:
+        interrupted.setattr(rl_baselines, "tqdm", _Stops)
+        with pytest.raises(KeyboardInterrupt):
+            train_rl(store, tmp_path / "interrupted", config, 0)
+    with pytest.raises(InputError, match="does not exist"):
+        evaluate_run(tmp_path / "interrupted", episodes=2, seed=0)
+    assert torch.load(tmp_path / "interrupted" / "checkpoint.pt", weights_only=True)["step"] == 4
+    train_rl(store, tmp_path / "interrupted", config, 0)
+    actors = [tmp_path / run / "actor.safetensors" for run in ("alone", "interrupted")]
+    assert actors[0].read_bytes() == actors[1].read_bytes()
+    alone, interrupted = (read_scalars(tmp_path / run) for run in ("alone", "interrupted"))
+    for loss in ("actor_loss", "critic_loss"):
+        assert list(alone[loss]) == [2, 4, 6, 7]
+        assert alone[loss] == interrupted[loss]
 
 
 @pytest.mark.parametrize("algorithm", ["iql", "cql"])

@@ -4,13 +4,16 @@ import json
 import math
 import os
 import signal
+import stat
 import time
 from pathlib import Path
 
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ucfrec.checkpoint import save_tensors
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_file, atomic_folder, read_json, write_json
 
@@ -146,3 +149,15 @@ def test_reading_what_is_not_there_or_not_json(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"a\.json is not JSON") as caught:
             read_json(tmp_path / "a.json")
         assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("mask", [0o022, 0o027])
+def test_whoever_may_read_a_record_may_read_its_tensors(tmp_path: Path, mask: int) -> None:
+    before = os.umask(mask)
+    try:
+        write_json(tmp_path / "record.json", {})
+        save_tensors(tmp_path / "weights.safetensors", {"w": torch.ones(2)}, {})
+    finally:
+        os.umask(before)
+    modes = {stat.S_IMODE(path.stat().st_mode) for path in tmp_path.iterdir()}
+    assert modes == {0o666 & ~mask}

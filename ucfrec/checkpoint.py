@@ -23,8 +23,12 @@ def save_tensors(path: Path, tensors: dict[str, Tensor], about: dict[str, Any]) 
     """
     plain = {name: tensor.detach().contiguous().cpu() for name, tensor in tensors.items()}
     with atomic_file(path) as scratch:
+        scratch.touch()
+        mode = scratch.stat().st_mode
         try:
             save_file(plain, scratch, metadata={"about": json.dumps(about)})
+            # safetensors makes files that nobody else may read; runs are shared like other outputs.
+            scratch.chmod(mode)
         except SafetensorError as error:
             raise InputError(
                 f"{path} cannot be written ({error}); make room and give the same command again"

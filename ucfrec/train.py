@@ -10,14 +10,12 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from tensorboardX.event_file_writer import EventsWriter
-from tensorboardX.proto.event_pb2 import Event, SessionLog
-from tensorboardX.proto.summary_pb2 import Summary
 from torch import Tensor, nn
 from tqdm import tqdm
 
 from ucfrec.checkpoint import load_tensors, load_training, load_weights, save_tensors, save_training
 from ucfrec.errors import InputError
+from ucfrec.events import Events
 
 Batch = TypeVar("Batch")
 
@@ -98,7 +96,7 @@ def fit(
     if last.exists():
         counters.update(load_training(last, module, optimizer))
     step = int(counters["step"])
-    clock, events = _Clock(step, counters["seconds"]), _Events(folder, step)
+    clock, events = _Clock(step, counters["seconds"]), Events(folder, step)
     bar = tqdm(total=config.steps, initial=step, desc=describe, unit="step", disable=None)
     while step < config.steps and not 0 < config.patience <= counters["stale"]:
         step += 1
@@ -188,26 +186,6 @@ class _Clock:
 
     def total(self) -> float:
         return time.perf_counter() - self._began
-
-
-class _Events:
-    """TensorBoard scalars, on disk when `add` returns: what a killed run logged is not lost."""
-
-    def __init__(self, folder: Path, start: int) -> None:
-        # The names that tensorboardX gives differ by the second only; two runs must not share one.
-        self._writer = EventsWriter(str(folder / "events"), f".{start:09d}")
-        if start:  # what was logged after the checkpoint will be logged again
-            log = SessionLog(status=SessionLog.START)
-            self._writer.write_event(Event(wall_time=time.time(), step=start + 1, session_log=log))
-
-    def add(self, step: int, scalars: Mapping[str, float]) -> None:
-        values = [Summary.Value(tag=name, simple_value=x) for name, x in scalars.items()]
-        summary = Summary(value=values)
-        self._writer.write_event(Event(wall_time=time.time(), step=step, summary=summary))
-        self._writer.flush()
-
-    def close(self) -> None:
-        self._writer.close()
 
 
 def _learning_rate(config: LoopConfig, step: int) -> float:

@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+from tqdm import tqdm
 
 from ucfrec import schema
 from ucfrec.checkpoint import load_tensors, load_weights, save_tensors
 from ucfrec.errors import InputError
-from ucfrec.files import atomic_folder, read_json, write_json
-from ucfrec.results import versions
+from ucfrec.events import Events
+from ucfrec.files import atomic_file, atomic_folder, read_json, write_json
+from ucfrec.results import command_line, versions
 from ucfrec.rollout import BoolArray, FloatArray, IntArray
 from ucfrec.store import EpisodeStore
 from ucfrec.trained import RUN
@@ -23,7 +25,9 @@ from ucfrec_control.scores import find_kind, find_task
 from ucfrec_control.trajectories import PACKAGES
 
 ALGORITHMS = ("iql", "cql")
-_ACTOR = "actor.safetensors"
+CHECKPOINT_EVERY = 5000
+"""Steps between checkpoints and log lines."""
+_ACTOR, _CHECKPOINT = "actor.safetensors", "checkpoint.pt"
 _HOPPER_NARROW = ("medium", "medium-replay", "mixed")
 
 
@@ -89,48 +93,97 @@ def plain_config(config: RLConfig, seed: int) -> dict[str, Any]:
 
 
 def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dict[str, Any]:
-    """Train on the training trajectories; returns the record of the run.
+    """Train on the training trajectories, or go on from the checkpoint in `out`; returns the record
+    of the run.
 
-    The run folder appears when training has ended; one that exists is read, not repeated.
+    A finished run is read, not repeated. One that was killed and is started again ends with the
+    same actor as one left alone (same machine and device).
 
     Raises:
         InputError: d3rlpy is not installed, or `out` is of another configuration or other data.
     """
-    plain, fingerprint = plain_config(config, seed), store.meta["fingerprint"]
-    if (out / RUN).exists():
-        record: dict[str, Any] = read_json(out / RUN)
-        if (record["config"], record["fingerprint"]) != (plain, fingerprint):
-            raise InputError(f"{out} was trained otherwise; remove it or name another run folder")
-        return record
     d3rlpy = _d3rlpy()
+    if not (out / RUN).exists():
+        _begin(store, out, config, seed)
+    record: dict[str, Any] = read_json(out / RUN)
+    asked = (plain_config(config, seed), store.meta["fingerprint"])
+    if (record["config"], record["fingerprint"]) != asked:
+        raise InputError(f"{out} was trained otherwise; remove it or name another run folder")
+    if "policy" in record:
+        return record
+    begun = perf_counter()
     d3rlpy.seed(seed)
     train = store.split("train")
     mean, std = train.state_statistics
-    begun = perf_counter()
-    with atomic_folder(out) as scratch:
-        learner = _learner(config, "cuda:0" if torch.cuda.is_available() else "cpu:0")
-        learner.fit(
-            _dataset(d3rlpy, train, mean.numpy(), std.numpy()),
-            n_steps=config.steps,
-            n_steps_per_epoch=config.steps,
+    dataset = _dataset(d3rlpy, train, mean.numpy(), std.numpy())
+    learner = _learner(config, "cuda:0" if torch.cuda.is_available() else "cpu:0")
+    step, seconds = _resume(out / _CHECKPOINT, learner, dataset)
+    events = Events(out, step)
+    bar = tqdm(total=config.steps, initial=step, desc=config.algorithm, unit="step", disable=None)
+    while step < config.steps:
+        if step:  # a seed of its own after each checkpoint: no generator's state need be kept
+            d3rlpy.seed(seed + step)
+        steps = min(CHECKPOINT_EVERY, config.steps - step)
+        ((_, losses),) = learner.fit(
+            dataset,
+            n_steps=steps,
+            n_steps_per_epoch=steps,
             logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
             show_progress=False,
+            callback=lambda *_: bar.update(),
         )
-        actor = learner.impl.modules.policy.state_dict()
-        save_tensors(scratch / _ACTOR, {**actor, "state.mean": mean, "state.std": std}, {})
-        record = {
-            "config": plain,
-            "seed": seed,
-            "sizes": {"state": store.state_size, "action": learner.action_size},
-            "policy": {"steps": config.steps, "best_step": None},
-            "fingerprint": fingerprint,
-            "dataset": dict(store.meta["source"]),
-            "versions": versions((*PACKAGES, "d3rlpy")),
-            "threads": torch.get_num_threads(),
-            "wall_time_s": perf_counter() - begun,
-        }
-        write_json(scratch / RUN, record)
+        step += steps
+        events.add(step, losses)
+        _save(out / _CHECKPOINT, learner, step, seconds + perf_counter() - begun)
+    bar.close()
+    events.close()
+    actor = learner.impl.modules.policy.state_dict()
+    save_tensors(out / _ACTOR, {**actor, "state.mean": mean, "state.std": std}, {})
+    record["policy"] = {"steps": config.steps, "best_step": None}
+    record["wall_time_s"] = seconds + perf_counter() - begun
+    write_json(out / RUN, record)
+    (out / _CHECKPOINT).unlink(missing_ok=True)
     return record
+
+
+def _begin(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> None:
+    record = {
+        "command": command_line(),
+        "config": plain_config(config, seed),
+        "seed": seed,
+        "sizes": {"state": store.state_size, "action": store.meta["columns"][schema.ACTION][0]},
+        "fingerprint": store.meta["fingerprint"],
+        "dataset": dict(store.meta["source"]),
+        "versions": versions((*PACKAGES, "d3rlpy")),
+        "threads": torch.get_num_threads(),
+        "wall_time_s": 0.0,
+    }
+    with atomic_folder(out) as scratch:
+        write_json(scratch / RUN, record)
+
+
+def _resume(path: Path, learner: Any, dataset: Any) -> tuple[int, float]:
+    """Put the checkpoint at `path`, if any, into `learner`; its step and the seconds spent."""
+    if not path.exists():
+        return 0, 0.0
+    checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    learner.build_with_dataset(dataset)
+    for name, part in _parts(learner).items():
+        part.load_state_dict(checkpoint["parts"][name])
+    learner.set_grad_step(checkpoint["step"])
+    return checkpoint["step"], checkpoint["seconds"]
+
+
+def _save(path: Path, learner: Any, step: int, seconds: float) -> None:
+    parts = {name: part.state_dict() for name, part in _parts(learner).items()}
+    with atomic_file(path) as scratch:
+        torch.save({"step": step, "seconds": seconds, "parts": parts}, scratch)
+
+
+def _parts(learner: Any) -> Mapping[str, Any]:
+    """Every network and optimizer of a learner, by name."""
+    parts: Mapping[str, Any] = learner.impl.modules.create_checkpointer("cpu:0").modules
+    return parts
 
 
 def _dataset(
@@ -221,7 +274,8 @@ def _d3rlpy() -> Any:
         raise InputError(
             "IQL and CQL need d3rlpy, which is not installed; install ucfrec[control,rl]"
         ) from None
-    # What it says of every training, on stdout, is not what was asked for.
-    level = structlog.make_filtering_bound_logger(logging.WARNING)
+    # What it says of every training, on stdout, is not what was asked for; nor is its warning that
+    # networks exist already, which after a checkpoint they must.
+    level = structlog.make_filtering_bound_logger(logging.ERROR)
     structlog.configure(wrapper_class=level)
     return d3rlpy

@@ -67,22 +67,25 @@ def test_cells_are_measured_once_and_screening_is_reported(
     settings = (*TINY, "crm.epochs=1")
     monkeypatch.setattr(robustness, "BUDGETS", {"small": Budget((FILE,), 1, 2, settings)})
     monkeypatch.setattr("ucfrec_control.commands.ROBUSTNESS_BUDGETS", robustness.BUDGETS)
-    monkeypatch.setattr(robustness, "METHODS", ("dt", "ucf-screened"))
+    methods = ("dt", *robustness.SCREENED)
+    monkeypatch.setattr(robustness, "METHODS", methods)
     kinds = {kind: robustness.DISTRACTORS[kind] for kind in ("none", "deterministic")}
     monkeypatch.setattr(robustness, "DISTRACTORS", kinds)
     columns = hopper_like((30, 8, 25) * 8)
     columns["observations"][:, 4] = 0.0  # a constant causes nothing
+    columns["rewards"] = columns["observations"][:, 0]
     file, out = write_hdf5(tmp_path / f"{FILE}.hdf5", columns), tmp_path / "out"
     # Begun here, where screening may be made quick, and gone on with by the command.
-    quickest = ScreeningConfig(hidden=8, shared_steps=100, own_steps=50)
+    quickest = ScreeningConfig(hidden=32, shared_steps=200, own_steps=100)
     monkeypatch.setattr("ucfrec_control.train.ScreeningConfig", lambda: quickest)
     clean = read_d4rl(file).write_store(out / "stores" / FILE)
     distracted = add_distractor(clean, out / "stores" / f"{FILE}-deterministic")
     tables = preset_of(dataset_of(clean), "ucf").tables
     for kind, store in (("none", clean), ("deterministic", distracted)):
         config = resolve_config("ucf", None, settings, 0, tables)
-        run = out / "robustness-small" / FILE / kind / "ucf-screened-0"
-        train_control(store, run, config, screened=True)
+        for method, screening in robustness.SCREENED.items():
+            run = out / "robustness-small" / FILE / kind / f"{method}-0"
+            train_control(store, run, config, screening=screening)
 
     results = tmp_path / "rows.jsonl"
     arguments = ["robustness", "--data", str(tmp_path), "--out", str(out)]
@@ -90,7 +93,7 @@ def test_cells_are_measured_once_and_screening_is_reported(
     assert main(arguments) == 0
     rows = [json.loads(line) for line in results.read_text().splitlines()]
     assert {(r["method"], r["distractor"], len(r["distractors"])) for r in rows} == {
-        (method, kind, kind != "none") for method in ("dt", "ucf-screened") for kind in kinds
+        (method, kind, kind != "none") for method in methods for kind in kinds
     }
     assert {r["checkpoint"] for r in rows} == {"last"}
     for r in rows:
@@ -103,7 +106,10 @@ def test_cells_are_measured_once_and_screening_is_reported(
             )  # fmt: skip
             assert again["score"] == r[name]
             assert again["distractor_fixed_to"] == told
-    assert all((r["loss"] == r["loss_at_zero"]) == (r["distractor"] == "none") for r in rows)
+    for r in rows:
+        blind = r["distractor"] == "none" or r["method"] == "ucf-dropped"
+        assert (r["loss"] == r["loss_at_zero"]) == blind
+        assert not blind or r["score"] == r["score_at_one"]
     assert len({r["evaluation_seed"] for r in rows}) == 1
     printed, before = capsys.readouterr().out, results.read_text()
     for dropped in drops(rows):
@@ -121,7 +127,7 @@ def test_cells_are_measured_once_and_screening_is_reported(
     assert screened["none"]["flagged"] == "-"
     report = next(r for r in rows if "screening" in r and r["distractors"])["screening"]
     assert [d["dimension"] for d in report if d["distractor"]] == [11]
-    assert screened["deterministic"]["flagged"] == report[11]["flagged"]
+    assert screened["deterministic"]["flagged"] is report[11]["flagged"] is True
     assert screened["deterministic"]["effect"] == report[11]["effect"]
     assert main(arguments) == 0
     assert results.read_text() == before
@@ -132,5 +138,5 @@ def test_every_budget_is_a_configuration_of_every_method() -> None:
     assert len(robustness.BUDGETS["full"].files) == 9
     for budget in robustness.BUDGETS.values():
         for method in robustness.METHODS:
-            policy, own = robustness.LEARNERS[method.replace("ucf-screened", "ucf")]
+            policy, own = robustness.LEARNERS["ucf" if method in robustness.SCREENED else method]
             resolve_config(policy, None, [*budget.settings, *own])

@@ -186,7 +186,10 @@ def test_a_run_records_where_its_data_is_from(folder: Path) -> None:
         (["evaluate", "{run}", "--env", "Nope-v1"], "Nope-v1 cannot be made"),
         (["evaluate", "{run}", "--env", "Walker2d-v5"], "sizes (17, 6)"),
         (["evaluate", "{run}", "--episodes", "0"], "at least one"),
-        (["train", "{store}", "--out", "{run}", "--policy", "dt", "--screen"], "without --screen"),
+        (
+            ["train", "{store}", "--out", "{run}", "--policy", "dt", "--screen", "drop"],
+            "without --screen",
+        ),
     ],
 )
 def test_what_cannot_be_used_is_refused_in_one_line(

@@ -10,6 +10,9 @@ import torch
 from tests.control_files import hopper_like, write_hdf5
 from tests.support import data_folder
 from ucfrec import schema
+from ucfrec.checkpoint import load_tensors
+from ucfrec.config import resolve_config
+from ucfrec.confounder import with_observations
 from ucfrec.errors import InputError
 from ucfrec.files import read_json
 from ucfrec.grid import read_rows
@@ -18,8 +21,10 @@ from ucfrec_control import screening_table
 from ucfrec_control.benchmark import Budget
 from ucfrec_control.cli import main
 from ucfrec_control.d4rl import read_d4rl
+from ucfrec_control.diagnostics import store_of
 from ucfrec_control.distractor import add_distractor
 from ucfrec_control.screening import ScreeningConfig, interventions, screen
+from ucfrec_control.train import train_control
 from ucfrec_control.trajectories import Trajectories
 
 QUICK = ScreeningConfig(hidden=64, shared_steps=400, own_steps=200)
@@ -116,23 +121,63 @@ def test_overlays_join_in_order(tmp_path: Path) -> None:
 
 
 def test_training_with_screening_records_and_resumes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     quickest = ScreeningConfig(hidden=8, shared_steps=100, own_steps=50)
     monkeypatch.setattr("ucfrec_control.train.ScreeningConfig", lambda: quickest)
     columns = hopper_like((20, 30) * 12)
+    columns["rewards"] = columns["observations"][:, 0]
     columns["observations"][:, 4] = 0.0  # a constant causes nothing
     file = write_hdf5(tmp_path / "hopper.hdf5", columns)
     store, run = str(tmp_path / "store"), str(tmp_path / "run")
     assert main(["prepare", str(file), "--out", store]) == 0
-    arguments = ["train", store, "--out", run, "--policy", "bc", "--screen"]
+    arguments = ["train", store, "--out", run, "--policy", "bc", "--screen", "copies"]
     arguments += ["--set", "train.steps=2", "--set", "policy.dim=8"]
     assert main(arguments) == 0
     record = read_json(Path(run) / "run.json")
-    assert 4 in record["dataset"]["screened"]
+    assert 4 in (flagged := record["dataset"]["screened"])
+    said = ", ".join(map(str, flagged))
+    assert f"dimensions that cause nothing: {said}\n" in capsys.readouterr().out
     assert len(record["screening"]["dimensions"]) == 11
     assert main(arguments) == 0
     assert read_json(Path(run) / "run.json")["screening"] == record["screening"]
+
+
+def test_screening_that_finds_no_cause_at_all_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    quickest = ScreeningConfig(hidden=8, shared_steps=100, own_steps=50)
+    monkeypatch.setattr("ucfrec_control.train.ScreeningConfig", lambda: quickest)
+    noise = read_d4rl(write_hdf5(tmp_path / "hopper.hdf5", hopper_like((30,) * 60)))
+    store = noise.write_store(tmp_path / "store")
+    config = resolve_config("dt", None, ["train.steps=2"])
+    with pytest.raises(InputError, match="no cause of anything among the 11 state dimensions"):
+        train_control(store, tmp_path / "run", config, screening="drop")
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_is_dropped_might_never_have_been_logged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ucfrec_control.train.ScreeningConfig", lambda: QUICK)
+    store = planted(tmp_path / "store")
+    logged = store.step_values(schema.OBSERVATION, *store.all_steps())[:, :3]
+    never = with_observations(store, tmp_path / "never", logged, {})
+    config = resolve_config("ucf", None, ["train.steps=4", "policy.dim=8", "crm.epochs=1"])
+    record = train_control(store, tmp_path / "dropped", config, screening="drop")
+    assert record["dataset"]["unseen"] == [3, 4]
+    assert record["sizes"]["state"] == 3
+    train_control(never, tmp_path / "plain", config)
+    for name in ("crm/cvae/last", "overlay", "policy/last"):
+        kept, other = (tmp_path / run / f"{name}.safetensors" for run in ("dropped", "plain"))
+        assert load_tensors(kept)[0].keys() == load_tensors(other)[0].keys()
+        for key, value in load_tensors(kept)[0].items():
+            assert torch.equal(value, load_tensors(other)[0][key]), (name, key)
+    again = train_control(store, tmp_path / "dropped", config, screening="drop")
+    assert (again["dataset"], again["policy"]) == (record["dataset"], record["policy"])
+    with pytest.raises(InputError, match="was begun with --screen drop"):
+        train_control(store, tmp_path / "dropped", config, screening="copies")
+    assert store_of(tmp_path / "dropped").state_size == 3
 
 
 def test_every_file_is_screened_plain_and_distracted_once(

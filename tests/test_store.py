@@ -318,6 +318,24 @@ def test_views_see_their_episodes_only(folder: Path, shard_steps: int) -> None:
     assert walked[1].tolist() == [*range(LENGTHS[4]), *range(LENGTHS[6])]
 
 
+@pytest.mark.parametrize("shard_steps", SHARDS)
+@pytest.mark.parametrize("items", [True, False])
+def test_a_view_leaves_out_some_of_what_was_observed(
+    folder: Path, items: bool, shard_steps: int
+) -> None:
+    episodes = random_episodes(LENGTHS, observation=3, items=items)
+    store = write_store(folder / "store", episodes, some_states() if items else None, shard_steps)
+    view = store.select(np.array([6, 2, 4])).without_observed([1])
+    assert (view.observation_size, view.state_size) == (2, store.state_size - 1)
+    for part in (view, view.select(np.array([2, 0]))):
+        seen, whole = (every_window(each, 4) for each in (part, store.select(part.episode_ids)))
+        # What is observed comes last in a state.
+        assert torch.equal(seen.states[..., :-2], whole.states[..., :-3])
+        assert torch.equal(seen.states[..., -2:], whole.states[..., [-3, -1]])
+        assert same(replace(seen, states=whole.states), whole)
+    assert store.observation_size == 3
+
+
 def test_splits_part_the_episodes(folder: Path) -> None:
     episodes = random_episodes(LENGTHS * 4)
     store = write_store(folder / "store", episodes, shard_steps=6)

@@ -1,6 +1,6 @@
 """EpisodeStore: every episode, on disk, opened for nothing and gathered in windows."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -165,6 +165,20 @@ class EpisodeStore:
         whole[np.repeat(starts, base.lengths) + steps] = values
         base._columns = {**self._columns, schema.RETURN_TO_GO: _Column([whole])}
         return base
+
+    def without_observed(self, dimensions: Sequence[int]) -> "EpisodeStore":
+        """This view without some of the numbers that were observed; no copies.
+
+        Args:
+            dimensions: of the logged observation.
+        """
+        kept = np.setdiff1d(np.arange(self.observation_size), dimensions)
+        whole = self._column(schema.OBSERVATION).take(np.arange(self.meta["n_steps"]))[:, kept]
+        columns = {**self.meta["columns"], schema.OBSERVATION: [len(kept)]}
+        view = EpisodeStore(self.path, {**self.meta, "columns": columns})
+        view._selection = self.episode_ids
+        view._columns = {**self._columns, schema.OBSERVATION: _Column([whole])}
+        return view
 
     # What they hold.
 

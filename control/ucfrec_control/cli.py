@@ -98,7 +98,9 @@ def _screen(parser: argparse.ArgumentParser) -> None:
 def _train(parser: argparse.ArgumentParser) -> None:
     train_options(parser)
     parser.add_argument(
-        "--screen", action="store_true", help="add copies that intervene on screened dimensions"
+        "--screen",
+        choices=["copies", "drop"],
+        help="screen the state: intervene on what causes nothing, or leave it out",
     )
 
 

@@ -31,7 +31,7 @@ from ucfrec_control.screening import ScreeningConfig, describe_screening, screen
 from ucfrec_control.screening_table import SHOWN as SHOWN_SCREENING
 from ucfrec_control.screening_table import screening_rows, screening_table
 from ucfrec_control.tables import against_first, over_seeds, score_table
-from ucfrec_control.train import dataset_of, preset_of, train_control
+from ucfrec_control.train import SCREENINGS, dataset_of, preset_of, train_control
 from ucfrec_control.trajectories import PACKAGES, Trajectories
 from ucfrec_control.video import record_episode
 
@@ -114,8 +114,11 @@ def run_train(options: argparse.Namespace) -> None:
     config = resolve_config(
         options.policy, options.config, options.set, options.seed, preset.tables
     )
-    record = train_control(store, options.out, config, screened=options.screen)
+    record = train_control(store, options.out, config, screening=options.screen)
     print(describe_run(record))
+    if options.screen:
+        found = ", ".join(map(str, record["dataset"][SCREENINGS[options.screen]])) or "none"
+        print(f"screening     dimensions that cause nothing: {found}")
     print(f"\nrun: {options.out}; TensorBoard reads it too")
 
 

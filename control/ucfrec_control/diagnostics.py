@@ -22,6 +22,7 @@ from ucfrec.run import training_views
 from ucfrec.store import EpisodeStore
 from ucfrec.trained import RUN, TrainedPolicy
 from ucfrec.windows import Overlay, Transitions
+from ucfrec_control.train import as_seen
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -34,7 +35,7 @@ _ROUNDING = 1e-5
 
 
 def store_of(run: Path) -> EpisodeStore:
-    """The store that a run was trained on.
+    """What a run was trained on.
 
     Raises:
         InputError: it is no longer where it was, or has changed.
@@ -43,7 +44,7 @@ def store_of(run: Path) -> EpisodeStore:
     store = EpisodeStore.open(record["store"])
     if store.meta["fingerprint"] != record["fingerprint"]:
         raise InputError(f"{store.path} is no longer the store that {run} was trained on")
-    return store
+    return as_seen(store, record["dataset"])
 
 
 def has_copies(run: Path) -> bool:

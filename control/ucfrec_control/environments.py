@@ -26,6 +26,7 @@ def make_env(
     env_id: str,
     count: int,
     appended: Sequence[float] = (),
+    unseen: Sequence[int] = (),
     settings: Mapping[str, Any] | None = None,
     wrappers: Sequence[Wrap] = (),
 ) -> VectorEnv[Any, Any, Any]:
@@ -36,6 +37,7 @@ def make_env(
 
     Args:
         appended: constants after every observation, where a policy was trained with distractors.
+        unseen: dimensions of that observation which are left out.
         settings: arguments of the environment.
         wrappers: around each of them.
 
@@ -48,6 +50,8 @@ def make_env(
         wrappers = [GoalObservations, *wrappers]
     if len(appended):
         wrappers.append(partial(AppendedConstants, constants=appended))
+    if len(unseen):
+        wrappers.append(partial(WithoutDimensions, unseen=unseen))
     try:
         with warnings.catch_warnings():
             # D4RL's data is of v4: the version is old on purpose.
@@ -82,6 +86,23 @@ class AppendedConstants(gymnasium.ObservationWrapper[Any, Any, Any]):
     def observation(self, observation: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """(O,) to (O + constants,)."""
         return np.append(observation, self._constants)
+
+
+class WithoutDimensions(gymnasium.ObservationWrapper[Any, Any, Any]):
+    """Leaves some numbers of every observation out."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any], unseen: Sequence[int]) -> None:
+        super().__init__(env)
+        space = env.observation_space
+        assert isinstance(space, Box)
+        self._kept = np.setdiff1d(np.arange(len(space.low)), unseen)
+        self.observation_space = Box(
+            space.low[self._kept], space.high[self._kept], dtype=np.float64
+        )
+
+    def observation(self, observation: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """(O,) to (O − unseen,)."""
+        return observation[self._kept]
 
 
 def mismatches(dataset: Mapping[str, Any], env_id: str) -> list[str]:

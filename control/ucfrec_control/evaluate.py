@@ -18,6 +18,7 @@ from ucfrec_control.environments import SIDE_BY_SIDE, Wrap, make_env, mismatches
 from ucfrec_control.presets import find_preset
 from ucfrec_control.rl_baselines import RLPolicy, is_rl
 from ucfrec_control.scores import find_kind, require_task
+from ucfrec_control.train import UNSEEN
 
 Trained = TrainedPolicy | RLPolicy
 CHECKPOINTS = ("last", "best")
@@ -129,7 +130,8 @@ def open_world(
     record, dataset = trained.record, trained.record["dataset"]
     own = dataset.get("env_settings", {}) if env_id == dataset["env_id"] else {}
     appended = [distractor] * len(dataset.get("distractors", []))
-    env = make_env(env_id, count, appended, {**own, **settings}, wrappers)
+    unseen = dataset.get(UNSEEN, [])
+    env = make_env(env_id, count, appended, unseen, {**own, **settings}, wrappers)
     shown = int(np.prod(env.single_observation_space.shape or ()))
     sizes = (shown, *(env.single_action_space.shape or ()))
     wanted = (record["sizes"]["state"], record["sizes"]["action"])
@@ -143,9 +145,10 @@ def open_world(
 
 
 def method_of(record: Mapping[str, Any]) -> str:
-    """Name of what the run of `record` trained, interventions on screened dimensions included."""
+    """Name of what the run of `record` trained, with what was done about screened dimensions."""
     name = record["config"]["policy_name"] if is_rl(record) else learner_of(record)
-    return name + ("-screened" if record["dataset"].get("screened") else "")
+    done = {"screened": "-screened", UNSEEN: "-dropped"}
+    return name + "".join(ending for key, ending in done.items() if record["dataset"].get(key))
 
 
 def targets_of(

@@ -26,12 +26,13 @@ from ucfrec_control.benchmark import Budget, chosen
 from ucfrec_control.distractor import CLEAN, DISTRACTORS, zoo_store
 from ucfrec_control.evaluate import evaluate_run
 from ucfrec_control.screening_table import verdicts
-from ucfrec_control.train import dataset_of, preset_of, train_control
+from ucfrec_control.train import UNSEEN, as_seen, dataset_of, preset_of, train_control
 from ucfrec_control.trajectories import PACKAGES
 
-SCREENED = "ucf-screened"
-METHODS = ("dt", "dc", "lsdt", "ucf", "ucf-wo-count", "ucf-wo-arch", SCREENED)
-"""Rows of `ucfrec_control.benchmark`, and UCF with copies that intervene on what is flagged."""
+SCREENED = {"ucf-screened": "copies", "ucf-dropped": "drop"}
+"""UCF with copies that intervene on what screening flags, and UCF that is not shown it."""
+METHODS = ("dt", "dc", "lsdt", "ucf", "ucf-wo-count", "ucf-wo-arch", *SCREENED)
+"""Rows of `ucfrec_control.benchmark`, and those."""
 
 BUDGETS = {
     # As the benchmark's, with fewer seeds and steps and half the history; no method and no
@@ -64,7 +65,7 @@ class Cell:
     @property
     def learner(self) -> str:
         """The row of `ucfrec_control.benchmark` that is trained."""
-        return "ucf" if self.method == SCREENED else self.method
+        return "ucf" if self.method in SCREENED else self.method
 
 
 def robustness(
@@ -129,7 +130,7 @@ def _config(cell: Cell) -> Config:
 
 def _measure(cell: Cell) -> list[Row]:
     store, config = EpisodeStore.open(cell.store), _config(cell)
-    record = train_control(store, cell.run, config, screened=cell.method == SCREENED)
+    record = train_control(store, cell.run, config, screening=SCREENED.get(cell.method))
     # The last checkpoint: the best on validation was chosen where the distractor still tells. Every
     # method plays the same starts, with and without distractor.
     judged = [
@@ -144,7 +145,7 @@ def _measure(cell: Cell) -> list[Row]:
         for value in ((0.0,) if cell.distractor == CLEAN else (0.0, 1.0))
     ]
     row = {**judged[0], "score_at_one": judged[-1]["score"]}
-    if cell.method == SCREENED:
+    if cell.method in SCREENED:
         row["screening"] = verdicts(record["screening"], store)
     losses = held_out_losses(TrainedPolicy.load(cell.run, "last"), store)
     return [row | losses | provenance(PACKAGES)]
@@ -157,9 +158,12 @@ def held_out_losses(trained: TrainedPolicy, store: EpisodeStore) -> Row:
 
     Unlike scores, these do not vary with how episodes happen to end.
     """
-    _, validation = training_views(store)
+    dataset = trained.record["dataset"]
+    _, validation = training_views(as_seen(store, dataset))
     generator = np.random.default_rng(0)
-    dimensions = [each["dimension"] for each in store.meta["source"].get("distractors", [])]
+    unseen = dataset.get(UNSEEN, [])
+    added = [each["dimension"] for each in dataset.get("distractors", [])]
+    dimensions = [d - sum(u < d for u in unseen) for d in added if d not in unseen]
     losses = []
     for _ in range(_LOSS_BATCHES):
         steps = validation.draw_steps(generator, _LOSS_BATCH)

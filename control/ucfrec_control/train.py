@@ -17,6 +17,11 @@ from ucfrec_control.scores import find_kind, find_task
 from ucfrec_control.screening import ScreeningConfig, interventions, screen
 from ucfrec_control.trajectories import PACKAGES
 
+UNSEEN = "unseen"
+SCREENINGS = {"copies": "screened", "drop": UNSEEN}
+"""What is done about dimensions that cause nothing, and where a run's record of its dataset lists
+those that it was done to."""
+
 
 def dataset_of(store: EpisodeStore) -> Mapping[str, Any]:
     """Where the trajectories of `store` come from.
@@ -36,33 +41,51 @@ def preset_of(dataset: Mapping[str, Any], policy: str) -> Preset:
     return find_preset(task.name if task else "", find_kind(dataset["dataset"]), policy)
 
 
+def as_seen(store: EpisodeStore, dataset: Mapping[str, Any]) -> EpisodeStore:
+    """What a policy sees of `store`, `dataset` being that of its run's record."""
+    unseen = dataset.get(UNSEEN)
+    return store.without_observed(unseen) if unseen else store
+
+
 def train_control(
-    store: EpisodeStore, out: Path, config: Config, *, screened: bool = False
+    store: EpisodeStore, out: Path, config: Config, *, screening: str | None = None
 ) -> dict[str, Any]:
     """`ucfrec.run.train_run` on a control store.
 
     Args:
-        screened: screen the state's dimensions and add copies that intervene on those which cause
-            nothing.
+        screening: screen the state's dimensions, and of those which cause nothing add copies that
+            intervene on them ("copies"), or train as if they were not there ("drop").
 
     Raises:
-        InputError: as `train_run`, or the store is not a control store.
+        InputError: as `train_run`, the store is not a control store, or screening finds nothing in
+            the state that causes anything.
     """
     dataset, copies = dict(dataset_of(store)), None
     about: dict[str, Any] = {"dataset": dataset, "versions": versions(PACKAGES)}
     begun = read_json(out / RUN) if (out / RUN).exists() else None
-    if begun is not None and ("screening" in begun) != screened:
+    if begun is not None and (before := _screening_of(begun["dataset"])) != screening:
         raise InputError(
-            f"{out} was begun {'with' if 'screening' in begun else 'without'} --screen; name "
+            f"{out} was begun {f'with --screen {before}' if before else 'without --screen'}; name "
             "another run folder, or give the same options to resume"
         )
-    if screened:
+    if screening:
+        key = SCREENINGS[screening]
         if begun is None:
             report = screen(store, ScreeningConfig(), config.seed)
             about["screening"] = asdict(report)
-            dataset["screened"] = list(report.flagged)
+            dataset[key] = list(report.flagged)
+            if len(report.flagged) == len(report.dimensions):
+                raise InputError(
+                    f"{store.path}: screening found no cause of anything among the "
+                    f"{len(report.flagged)} state dimensions; {report.transitions:,} transitions "
+                    "are too few, or too noisy, to tell: train without --screen"
+                )
         else:
             dataset = begun["dataset"]
-        if dataset["screened"]:
-            copies = interventions(training_views(store)[0], dataset["screened"], config.seed)
-    return train_run(store, out, config, about, copies)
+        if screening == "copies" and dataset[key]:
+            copies = interventions(training_views(store)[0], dataset[key], config.seed)
+    return train_run(as_seen(store, dataset), out, config, about, copies)
+
+
+def _screening_of(dataset: Mapping[str, Any]) -> str | None:
+    return next((name for name, key in SCREENINGS.items() if key in dataset), None)

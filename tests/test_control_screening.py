@@ -135,7 +135,8 @@ def test_training_with_screening_records_and_resumes(
     arguments += ["--set", "train.steps=2", "--set", "policy.dim=8"]
     assert main(arguments) == 0
     record = read_json(Path(run) / "run.json")
-    assert 4 in (flagged := record["dataset"]["screened"])
+    flagged = record["dataset"]["screened"]
+    assert 4 in flagged
     said = ", ".join(map(str, flagged))
     assert f"dimensions that cause nothing: {said}\n" in capsys.readouterr().out
     assert len(record["screening"]["dimensions"]) == 11

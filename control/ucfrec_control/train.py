@@ -65,8 +65,8 @@ def train_control(
     begun = read_json(out / RUN) if (out / RUN).exists() else None
     if begun is not None and (before := _screening_of(begun["dataset"])) != screening:
         raise InputError(
-            f"{out} was begun with{f' --screen {before}' if before else 'out --screen'}; name another "
-            "run folder, or give the same options to resume"
+            f"{out} was begun with{f' --screen {before}' if before else 'out --screen'}; name "
+            "another run folder, or give the same options to resume"
         )
     if screening:
         key = SCREENINGS[screening]

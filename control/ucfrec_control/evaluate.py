@@ -18,7 +18,7 @@ from ucfrec_control.environments import SIDE_BY_SIDE, Wrap, make_env, mismatches
 from ucfrec_control.presets import find_preset
 from ucfrec_control.rl_baselines import RLPolicy, is_rl
 from ucfrec_control.scores import find_kind, require_task
-from ucfrec_control.train import UNSEEN
+from ucfrec_control.train import SCREENINGS, UNSEEN
 
 Trained = TrainedPolicy | RLPolicy
 CHECKPOINTS = ("last", "best")
@@ -147,7 +147,7 @@ def open_world(
 def method_of(record: Mapping[str, Any]) -> str:
     """Name of what the run of `record` trained, with what was done about screened dimensions."""
     name = record["config"]["policy_name"] if is_rl(record) else learner_of(record)
-    done = {"screened": "-screened", UNSEEN: "-dropped"}
+    done = {SCREENINGS["copies"]: "-screened", SCREENINGS["drop"]: "-dropped"}
     return name + "".join(ending for key, ending in done.items() if record["dataset"].get(key))
 
 

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from tests.kuai_reference import OneUser
+from tests.support.kuai_reference import OneUser
 from ucfrec.files import atomic_file
-from ucfrec.results import provenance
-from ucfrec_simulators.kuairand import kuairand
+from ucfrec.provenance import provenance
+from ucfrec_simulators.kuai.kuairand import kuairand
 
 RESULTS = Path(__file__).parent / "results" / "kuai_speed.jsonl"
 USERS = 4096

@@ -16,11 +16,11 @@ from typing import Any
 
 import torch
 
-from ucfrec.config import resolve_config
+from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files import atomic_file
-from ucfrec.results import provenance
-from ucfrec.run import train_run
-from ucfrec.store import EpisodeStore
+from ucfrec.provenance import provenance
+from ucfrec.runs.config import resolve_config
+from ucfrec.runs.run import train_run
 
 RESULTS = Path(__file__).parent / "results" / "policy_settings.jsonl"
 DEMO_SIZE = ("policy.dim=64", "policy.context=10", "train.learning_rate=1e-3", "augment.copies=0")

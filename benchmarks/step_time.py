@@ -14,11 +14,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ucfrec.config import POLICIES, resolve_config
+from ucfrec.episodes.windows import Windows
 from ucfrec.files import atomic_file
-from ucfrec.policy import SequencePolicy
-from ucfrec.results import provenance
-from ucfrec.windows import Windows
+from ucfrec.policies.base import SequencePolicy
+from ucfrec.policies.registry import POLICIES
+from ucfrec.provenance import provenance
+from ucfrec.runs.config import resolve_config
 
 RESULTS = Path(__file__).parent / "results" / "step_time.jsonl"
 SIZES = {"state": 91, "action": 27, "items": 0}

@@ -1,7 +1,6 @@
 """Settings of every test: one thread, and the same examples every time."""
 
 from collections.abc import Iterator
-from importlib.util import find_spec
 
 import pytest
 import torch
@@ -9,11 +8,6 @@ from hypothesis import settings
 
 settings.register_profile("ucfrec", deadline=None, derandomize=True, database=None, max_examples=40)
 settings.load_profile("ucfrec")
-
-
-# The control adapter's tests need its extra.
-CONTROL = ("h5py", "matplotlib", "minari", "mujoco")
-collect_ignore_glob = [] if all(map(find_spec, CONTROL)) else ["test_control_*.py"]
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -13,9 +13,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ucfrec.checkpoint import save_tensors
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_file, atomic_folder, read_json, write_json
+from ucfrec.fitting.checkpoint import save_tensors
 
 
 def names(folder: Path) -> list[str]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ucfrec.cli import build_parser
+from ucfrec.commands.cli import UCFREC, build_parser
 
 README = Path(__file__).parent.parent / "README.md"
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", README.read_text(encoding="utf-8"), flags=re.DOTALL)
@@ -31,7 +31,8 @@ def test_the_python_example_runs(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("command", commands())
 def test_the_commands_parse(command: str) -> None:
-    build_parser().parse_args(shlex.split(command)[1:])
+    words = shlex.split(command)[1:]
+    build_parser(UCFREC, words).parse_args(words)
 
 
 def test_the_walk_through_has_its_commands() -> None:

@@ -3,8 +3,8 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ucfrec.estimator import UCF
-    from ucfrec.store import EpisodeStore
+    from ucfrec.episodes.store import EpisodeStore
+    from ucfrec.recommender import UCF
 
 __version__ = "0.1.0"
 __all__ = ["UCF", "EpisodeStore", "__version__"]
@@ -13,11 +13,11 @@ __all__ = ["UCF", "EpisodeStore", "__version__"]
 def __getattr__(name: str) -> Any:
     # Importing torch takes a second; `ucfrec --help` does without.
     if name == "EpisodeStore":
-        from ucfrec.store import EpisodeStore
+        from ucfrec.episodes.store import EpisodeStore
 
         return EpisodeStore
     if name == "UCF":
-        from ucfrec.estimator import UCF
+        from ucfrec.recommender import UCF
 
         return UCF
     raise AttributeError(f"module 'ucfrec' has no attribute {name!r}")

@@ -13,8 +13,8 @@ from typing import Any
 
 from gymnasium.vector import VectorEnv
 
+from ucfrec.acting.rollout import Actor
 from ucfrec.errors import InputError
-from ucfrec.rollout import Actor
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Built-in behavior policies that worlds share; each is an `ucfrec.rollout.Actor`."""
+"""Built-in behavior policies that worlds share; each is an `ucfrec.acting.rollout.Actor`."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -9,7 +9,7 @@ from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 from scipy.special import ndtr, ndtri
 
-from ucfrec.rollout import FORBIDDEN, Actor, BoolArray, FloatArray, IntArray
+from ucfrec.acting.rollout import FORBIDDEN, Actor, BoolArray, FloatArray, IntArray
 
 Actions = npt.NDArray[Any]
 

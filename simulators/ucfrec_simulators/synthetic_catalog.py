@@ -9,11 +9,11 @@ import pyarrow as pa
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
+from ucfrec.acting.rollout import Actor, BoolArray, FloatArray, IntArray
 from ucfrec.errors import InputError
 from ucfrec.plugins import Simulator
-from ucfrec.rollout import Actor, BoolArray, FloatArray, IntArray
 from ucfrec_simulators.behaviors import Memoryless, SessionMixture, Uniform
-from ucfrec_simulators.sessions import AnyArray, SessionsEnv, draw_categories
+from ucfrec_simulators.session_env import AnyArray, SessionsEnv, draw_categories
 
 CLUSTERS: Final = 8
 FACTORS: Final = 4

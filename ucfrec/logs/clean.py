@@ -12,7 +12,7 @@ import duckdb
 
 from ucfrec import schema
 from ucfrec.errors import InputError
-from ucfrec.logs.files import (
+from ucfrec.logs.binding import (
     MAX_FLOAT,
     Table,
     bind,

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from ucfrec.errors import InputError
-from ucfrec.logs.files import bind, is_integer, is_number, is_vector, open_tables, wrong_type
+from ucfrec.logs.binding import bind, is_integer, is_number, is_vector, open_tables, wrong_type
 from ucfrec.logs.mapping import FeatureTable, log_files
 
 CATEGORIES: Final = 200

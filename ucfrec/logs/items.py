@@ -10,9 +10,9 @@ from scipy import sparse
 from sklearn.utils.extmath import randomized_svd
 
 from ucfrec import schema
+from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.states import ItemStates
-from ucfrec.store import ITEM_STATES, EpisodeStore
 
 IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float32]

@@ -18,14 +18,15 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from ucfrec import schema
+from ucfrec.episodes.store import ITEM_STATES
+from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder
+from ucfrec.logs.binding import explained, text
 from ucfrec.logs.clean import CleanLog, engine, read_log
 from ucfrec.logs.features import encode_features, load_features
-from ucfrec.logs.files import explained, text
 from ucfrec.logs.items import write_item_states
 from ucfrec.logs.mapping import LogMapping, log_files
-from ucfrec.logs.report import build_report, drop_counts, require_variety
 from ucfrec.logs.sessions import (
     EPISODE_USERS,
     ID_TABLES,
@@ -39,8 +40,7 @@ from ucfrec.logs.sessions import (
     ordered_steps,
     split_bounds,
 )
-from ucfrec.store import ITEM_STATES
-from ucfrec.store_writer import StoreWriter
+from ucfrec.logs.summary import build_report, drop_counts, require_variety
 
 BATCH_ROWS: Final = 2**17
 

@@ -6,8 +6,8 @@ from typing import Final
 
 from ucfrec import schema
 from ucfrec.errors import InputError
+from ucfrec.logs.binding import text
 from ucfrec.logs.clean import CleanLog
-from ucfrec.logs.files import text
 
 ITEMS_FILE: Final = "items.parquet"
 USERS_FILE: Final = "users.parquet"

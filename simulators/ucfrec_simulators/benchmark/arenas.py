@@ -7,19 +7,19 @@ from typing import Final
 
 import pyarrow as pa
 
-from ucfrec.evaluate import World
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.evaluation.evaluate import World
+from ucfrec.evaluation.simulated_store import simulated_store
 from ucfrec.logs.mapping import Dataset, LogMapping, log_files
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.plugins import load_plugin
 from ucfrec.schema import SESSION_ID
-from ucfrec.simulated import simulated_store
-from ucfrec.store import EpisodeStore
-from ucfrec_simulators.completion import complete
 from ucfrec_simulators.folders import data_folder
-from ucfrec_simulators.kuai import EXITS
-from ucfrec_simulators.kuai_logs import cut_by_exit, window, write_log
-from ucfrec_simulators.kuairand import read_tags
-from ucfrec_simulators.kuairec import read_categories
+from ucfrec_simulators.kuai.completion import complete
+from ucfrec_simulators.kuai.environment import EXITS
+from ucfrec_simulators.kuai.kuairand import read_tags
+from ucfrec_simulators.kuai.kuairec import read_categories
+from ucfrec_simulators.kuai.logs import cut_by_exit, window, write_log
 
 _LOG_SEED: Final = 0
 # Midnight in China. The column `date` will not do: it changes as much as an hour too early.

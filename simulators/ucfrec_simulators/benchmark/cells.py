@@ -6,14 +6,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from ucfrec.config import Config, resolve_config
-from ucfrec.evaluate import World, evaluate_behavior, evaluate_policy
-from ucfrec.grid import Row
-from ucfrec.results import config_hash
-from ucfrec.run import train_run
-from ucfrec.store import EpisodeStore
-from ucfrec.trained import TrainedPolicy
-from ucfrec_simulators.badge import BadgedWorld
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.evaluation.evaluate import World, evaluate_behavior, evaluate_policy
+from ucfrec.provenance import config_hash
+from ucfrec.reporting.grid import Row
+from ucfrec.runs.config import Config, resolve_config
+from ucfrec.runs.run import train_run
+from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec_simulators.distractor import BadgedWorld
 
 CHECKPOINTS: Final = ("best", "last")
 JUDGED, VALIDATED = 1_000_000, 2_000_000
@@ -25,7 +25,7 @@ class Method:
     """A row of a table."""
 
     policy: str
-    """Key of `ucfrec.config.POLICIES`."""
+    """Key of `ucfrec.policies.registry.POLICIES`."""
     settings: tuple[str, ...] = ()
     conditioned: bool = True
     """Whether it is asked for a return."""

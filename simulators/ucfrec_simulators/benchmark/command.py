@@ -6,22 +6,12 @@ from pathlib import Path
 from typing import Final
 
 from ucfrec.errors import InputError
-from ucfrec.grid import Row, run_grid
 from ucfrec.plugins import Benchmark
+from ucfrec.reporting.grid import Row, run_grid
 from ucfrec_simulators.benchmark.cells import keys, measure
 from ucfrec_simulators.benchmark.plan import BUDGETS, Plan
-from ucfrec_simulators.benchmark.plots import (
-    plot_badge,
-    plot_methods,
-    plot_sweeps,
-    plot_targets,
-)
-from ucfrec_simulators.benchmark.tables import (
-    badge_table,
-    method_table,
-    sweep_table,
-    target_table,
-)
+from ucfrec_simulators.benchmark.plots import plot_badge, plot_methods, plot_sweeps, plot_targets
+from ucfrec_simulators.benchmark.tables import badge_table, method_table, sweep_table, target_table
 
 TABLES: Final = ("main", "badge", "sweeps")
 

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Final
 
 from ucfrec import schema
-from ucfrec.results import config_hash
-from ucfrec.store import EpisodeStore
-from ucfrec_simulators.badge import OFF, ON, BadgedWorld, plant_badge
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.provenance import config_hash
 from ucfrec_simulators.benchmark.arenas import ARENAS, Arena
 from ucfrec_simulators.benchmark.cells import METHODS, Cell, Judging, Method
+from ucfrec_simulators.distractor import OFF, ON, BadgedWorld, plant_badge
 from ucfrec_simulators.folders import data_folder
 
 
@@ -24,7 +24,7 @@ class Budget:
     settings: tuple[str, ...]
     """Of all methods, over their defaults."""
     cuts: Mapping[str, tuple[str, ...]]
-    """Of single learners, by key of `ucfrec.config.POLICIES`."""
+    """Of single learners, by key of `ucfrec.policies.registry.POLICIES`."""
     judging: Judging
     sweep_seeds: int
     """Of the sweeps and of the badge."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ucfrec.files import atomic_file
-from ucfrec.grid import Row
+from ucfrec.reporting.grid import Row
 from ucfrec_simulators.benchmark.tables import BADGES, grouped
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ucfrec.grid import Row
+from ucfrec.reporting.grid import Row
 
 BADGES: Final = (None, 0.0, 1.0)
 """How a row's badge was shown: there was none, never, always."""

@@ -1,0 +1,1 @@
+"""Tables of every learner on the control files."""

@@ -1,0 +1,74 @@
+"""`ucfrec-control evaluate`: normalised scores of trained policies."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from ucfrec.errors import InputError
+from ucfrec.files import write_json
+from ucfrec.provenance import format_rows, provenance
+from ucfrec_control.commands.options import shown_score
+from ucfrec_control.data.trajectories import PACKAGES
+from ucfrec_control.learners.evaluate import CHECKPOINTS, SHOWN, evaluate_run
+from ucfrec_control.learners.video import record_episode
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """What `evaluate` takes."""
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
+    parser.add_argument("--env", help="environment (that of the data)")
+    parser.add_argument("--episodes", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--target",
+        type=float,
+        action="append",
+        default=[],
+        help="return asked of an episode; repeatable (the preset's)",
+    )
+    parser.add_argument("--checkpoint", choices=["both", "best", "last"], default="both")
+    parser.add_argument(
+        "--distractor", type=float, default=0.0, help="what distractors are fixed to (0)"
+    )
+    parser.add_argument(
+        "--video", type=Path, metavar="MP4", help="show an episode: FILE.mp4, or folder for frames"
+    )
+    parser.add_argument("--json", type=Path, help="write the result rows here")
+
+
+def run(options: argparse.Namespace) -> None:
+    """`ucfrec-control evaluate`."""
+    if options.video is not None:
+        _record(options)
+    rows: list[dict[str, Any]] = []
+    for run in options.runs:
+        rows += evaluate_run(
+            run,
+            episodes=options.episodes,
+            seed=options.seed,
+            env_id=options.env,
+            targets=options.target,
+            checkpoints=CHECKPOINTS if options.checkpoint == "both" else (options.checkpoint,),
+            distractor=options.distractor,
+        )
+    print(format_rows([shown_score(row) for row in rows], SHOWN))
+    for warning in dict.fromkeys(text for row in rows for text in row["warnings"]):
+        print(f"warning: {warning}", file=sys.stderr)
+    if options.json is not None:
+        write_json(options.json, [row | provenance(PACKAGES) for row in rows])
+
+
+def _record(options: argparse.Namespace) -> None:
+    if len(options.runs) != 1:
+        raise InputError(f"--video shows one run; {len(options.runs)} were given")
+    earned = record_episode(
+        options.runs[0],
+        options.video,
+        seed=options.seed,
+        checkpoint="best" if options.checkpoint == "best" else "last",
+        env_id=options.env,
+        target=next(iter(options.target), None),
+        distractor=options.distractor,
+    )
+    print(f"{options.video}: an episode of return {earned:.1f}\n")

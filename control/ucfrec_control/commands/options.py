@@ -1,0 +1,95 @@
+"""Options that several commands share, and what they stand for."""
+
+import argparse
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ucfrec.errors import InputError
+from ucfrec_control.benchmark.plan import Budget
+from ucfrec_control.data.d4rl import read_d4rl
+from ucfrec_control.data.minari import is_minari, read_minari
+from ucfrec_control.data.trajectories import Trajectories
+from ucfrec_control.worlds.scores import find_task
+
+
+def source_options(parser: argparse.ArgumentParser) -> None:
+    """A dataset that is read."""
+    parser.add_argument(
+        "source", metavar="SOURCE", help="HDF5 file, Minari identifier, or folder of one"
+    )
+    parser.add_argument("--env", help="environment that the data is of, if it does not say so")
+    parser.add_argument("--download", action="store_true", help="let Minari fetch the dataset")
+
+
+def budget_options(parser: argparse.ArgumentParser) -> None:
+    """What of a benchmark is measured."""
+    parser.add_argument("--budget", default="small", choices=["small", "full"])
+    parser.add_argument(
+        "--file",
+        action="append",
+        default=[],
+        help="of the data folder, without its ending; repeatable (the budget's)",
+    )
+    parser.add_argument(
+        "--method", action="append", default=[], help="row of the table; repeatable (all)"
+    )
+    parser.add_argument("--seeds", type=int, help="how many, from 0 (the budget's)")
+
+
+def grid_options(parser: argparse.ArgumentParser, results: str) -> None:
+    """Data and outputs of a benchmark."""
+    parser.add_argument(
+        "--data", type=Path, required=True, metavar="FOLDER", help="of the HDF5 files"
+    )
+    grid_outputs(parser, results)
+
+
+def grid_outputs(parser: argparse.ArgumentParser, results: str) -> None:
+    """Where a benchmark keeps its runs and rows."""
+    parser.add_argument("--out", type=Path, default=Path("runs/control"), help="stores and runs")
+    parser.add_argument(
+        "--results",
+        type=Path,
+        default=Path(f"benchmarks/results/{results}.jsonl"),
+        metavar="JSONL",
+    )
+    parser.add_argument("--workers", type=int, default=1, help="processes of one thread each (1)")
+
+
+def read_source(options: argparse.Namespace) -> Trajectories:
+    """The trajectories that `source_options` name."""
+    if is_minari(options.source):
+        return read_minari(options.source, options.env, options.download)
+    return read_d4rl(Path(options.source), options.env)
+
+
+def describe_source(trajectories: Trajectories) -> str:
+    """What a dataset holds, and what of it was dropped."""
+    source, returns = trajectories.source, trajectories.returns
+    task = find_task(source["env_id"], source["dataset"])
+    score = f", normalised {task.score(returns.mean()):.2f}" if task else ""
+    dropped = [f"{count} {what.replace('_', ' ')}" for what, count in source["dropped"].items()]
+    return (
+        f"{source['dataset']}: {len(returns)} trajectories, {len(trajectories.rewards)} steps, "
+        f"environment {source['env_id'] or 'unknown'}\n"
+        f"mean return {returns.mean():.3f}{score}; dropped: {', '.join(dropped)}"
+    )
+
+
+def budget_given(known: Mapping[str, Budget], options: argparse.Namespace) -> Budget:
+    """The budget asked for, with the files and seeds asked for."""
+    budget = known[options.budget]
+    seeds = budget.seeds if options.seeds is None else options.seeds
+    if seeds < 1:
+        raise InputError(f"--seeds is {seeds}; at least one is needed")
+    return dataclasses.replace(budget, files=tuple(options.file) or budget.files, seeds=seeds)
+
+
+def shown_score(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row of `evaluate_run` with its score, interval and target as text."""
+    interval = f"{row['score']:.1f} [{row['score_low']:.1f}, {row['score_high']:.1f}]"
+    asked = "none" if row["target_return"] is None else f"{row['target_return']:g}"
+    earned = f"{row['return']:.1f}"
+    return {**row, "score": interval, "target_return": asked, "return": earned}

@@ -1,0 +1,26 @@
+"""`ucfrec-control screen`: which state dimensions cause anything."""
+
+import argparse
+import dataclasses
+from pathlib import Path
+
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.files import write_json
+from ucfrec.provenance import provenance
+from ucfrec_control.data.trajectories import PACKAGES
+from ucfrec_control.learners.screening import ScreeningConfig, describe_screening, screen
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """What `screen` takes."""
+    parser.add_argument("store", type=Path, metavar="STORE")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path, help="write the report here")
+
+
+def run(options: argparse.Namespace) -> None:
+    """`ucfrec-control screen`."""
+    report = screen(EpisodeStore.open(options.store), ScreeningConfig(), options.seed)
+    print(describe_screening(report))
+    if options.json is not None:
+        write_json(options.json, dataclasses.asdict(report) | provenance(PACKAGES))

@@ -1,0 +1,38 @@
+"""`ucfrec-control train`: train a policy on a store; resumes."""
+
+import argparse
+
+import torch
+
+from ucfrec.commands.train import add_options as train_options
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.runs.config import resolve_config
+from ucfrec.runs.run import describe_run
+from ucfrec_control.learners.train import SCREENINGS, dataset_of, preset_of, train_control
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """What `train` takes."""
+    train_options(parser)
+    parser.add_argument(
+        "--screen",
+        choices=["copies", "drop"],
+        help="screen the state: intervene on what causes nothing, or leave it out",
+    )
+
+
+def run(options: argparse.Namespace) -> None:
+    """`ucfrec-control train`."""
+    if options.threads is not None:
+        torch.set_num_threads(options.threads)
+    store = EpisodeStore.open(options.store)
+    preset = preset_of(dataset_of(store), options.policy)
+    config = resolve_config(
+        options.policy, options.config, options.set, options.seed, preset.tables
+    )
+    record = train_control(store, options.out, config, screening=options.screen)
+    print(describe_run(record))
+    if options.screen:
+        found = ", ".join(map(str, record["dataset"][SCREENINGS[options.screen]])) or "none"
+        print(f"screening     dimensions that cause nothing: {found}")
+    print(f"\nrun: {options.out}; TensorBoard reads it too")

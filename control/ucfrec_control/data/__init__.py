@@ -1,0 +1,1 @@
+"""Trajectories: reading, writing and collecting them."""

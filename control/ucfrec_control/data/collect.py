@@ -1,0 +1,293 @@
+"""Datasets by D4RL's protocol (Fu et al., 2020, section 5), from a SAC learner of one's own."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium.vector import VectorEnv
+from tqdm import tqdm
+
+from ucfrec.acting.rollout import Actor, BoolArray, FloatArray, IntArray, Step, rollout
+from ucfrec.errors import InputError
+from ucfrec.files import read_json, write_json
+from ucfrec.provenance import provenance
+from ucfrec_control.data.d4rl import write_d4rl
+from ucfrec_control.data.sac import SacConfig, SacLearner, seed_all
+from ucfrec_control.data.trajectories import PACKAGES, Trajectories
+from ucfrec_control.worlds.environments import SIDE_BY_SIDE, make_env
+
+SHOWN: Final = ("dataset", "trajectories", "steps", "mean_return")
+
+
+@dataclass(frozen=True)
+class CollectConfig:
+    """What is trained and how much is rolled out."""
+
+    steps: int = 1_000_000
+    """Training steps, rounded up to whole episodes."""
+    every: int = 10_000
+    """Steps between evaluations; each also keeps the policy and a checkpoint to resume from."""
+    episodes: int = 20
+    """Episodes of an evaluation."""
+    fraction: float = 1 / 3
+    """Of the way from the random policy's return to the expert's, where `medium` is taken."""
+    size: int = 1_000_000
+    """Steps rolled out of `medium` and of `expert`, rounded up to whole episodes."""
+    sac: SacConfig = field(default_factory=SacConfig)
+
+
+def collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[dict[str, Any]]:
+    """Train SAC and write `medium`, `medium-replay`, `expert` and `medium-expert` to `out`.
+
+    *expert* is the evaluated policy with the highest return, *medium* the first whose return is at
+    least random + `fraction` · (expert − random): on the scale where the random policy has 0, as in
+    D4RL's scores, since a share of a negative return would mean nothing. Evaluations and rollouts
+    sample the policy, as training does. `medium-replay` is every training step up to the medium
+    policy; `medium-expert` is the two files one after the other. The training's own record and
+    checkpoints stay in `out/training`: given the same command again, an interrupted training goes
+    on from the last evaluation, to the same numbers. `out/MANIFEST.json` is written last.
+
+    Returns:
+        One row a dataset.
+
+    Raises:
+        InputError: `out` is complete already or of another configuration, the environment cannot be
+            made or has no step limit, or the learner never beat the random policy.
+    """
+    _check(config)
+    if (out / "MANIFEST.json").exists():
+        raise InputError(f"{out} is complete already; remove it or name another output folder")
+    training = _train(env_id, out / "training", seed, config)
+    medium, expert = _choose(training.evaluations, training.random_return, config.fraction)
+    parts = {
+        "medium": _roll_out(training, medium, env_id, seed, config.size),
+        "medium-replay": _replay(training, medium, env_id),
+        "expert": _roll_out(training, expert, env_id, seed, config.size),
+    }
+    parts["medium-expert"] = _joined(parts["medium"], parts["expert"])
+    recorded = {
+        "env_id": env_id,
+        "algorithm": "SAC",
+        "seed": seed,
+        "fraction": config.fraction,
+        "random_return": training.random_return,
+        "medium_return": training.evaluations[medium]["return"],
+        "medium_steps": training.evaluations[medium]["steps"],
+        "expert_return": training.evaluations[expert]["return"],
+        "expert_steps": training.evaluations[expert]["steps"],
+    }
+    return _write(out, parts, recorded)
+
+
+def _write(
+    out: Path, parts: Mapping[str, Trajectories], recorded: Mapping[str, Any]
+) -> list[dict[str, Any]]:
+    """One file a dataset, and the manifest; returns a row a dataset."""
+    made = provenance((*PACKAGES, "stable-baselines3"))
+    task = recorded["env_id"].split("/")[-1].rsplit("-v", 1)[0].lower()
+    rows = []
+    for kind, trajectories in parts.items():
+        name = f"{task}_{kind}-sac"
+        row = {
+            "file": f"{name}.hdf5",
+            "dataset": name,
+            "trajectories": len(trajectories.lengths),
+            "steps": len(trajectories.rewards),
+            "mean_return": float(trajectories.returns.mean()),
+        }
+        metadata = {**recorded, **row, "versions": json.dumps(made["versions"])}
+        write_d4rl(trajectories, out / f"{name}.hdf5", metadata)
+        rows.append(row)
+    write_json(out / "MANIFEST.json", {**made, **recorded, "files": rows})
+    return rows
+
+
+def _check(config: CollectConfig) -> None:
+    if min(config.steps, config.every, config.episodes, config.size) < 1:
+        raise InputError("steps, steps between evaluations, episodes and size are at least 1")
+    if config.steps <= config.sac.learning_starts:
+        raise InputError(
+            f"{config.steps} steps are uniform play only; learning starts after "
+            f"{config.sac.learning_starts}"
+        )
+    if not 0 < config.fraction < 1:
+        raise InputError(f"the fraction is {config.fraction}; it lies between 0 and 1")
+
+
+def _claim(file: Path, described: Mapping[str, Any]) -> None:
+    """Make the folder of `file` this collection's, or see that it is."""
+    if not file.exists():
+        write_json(file, described)
+    elif read_json(file) != described:
+        raise InputError(
+            f"{file.parent} was begun with other settings; repeat those of {file.name}, or name "
+            "another output folder"
+        )
+
+
+@dataclass(frozen=True)
+class _Training:
+    learner: SacLearner
+    folder: Path
+    random_return: float
+    evaluations: list[dict[str, Any]]
+    """`steps` and mean `return` of every policy kept."""
+
+    def policy(self, index: int) -> Path:
+        return self.folder / f"policy-{index:04d}.safetensors"
+
+    @property
+    def checkpoint(self) -> Path:
+        return self.folder / "checkpoint.safetensors"
+
+
+def _train(env_id: str, folder: Path, seed: int, config: CollectConfig) -> _Training:
+    env = make_env(env_id, 1)
+    limit = gymnasium.spec(env_id).max_episode_steps
+    if limit is None:
+        raise InputError(f"{env_id} has no step limit, so its episodes may never end")
+    learner = SacLearner(env, seed, config.steps + limit, config.sac)
+    _claim(folder / "config.json", {"env": env_id, "seed": seed, **asdict(config)})
+    judged = make_env(env_id, min(config.episodes, SIDE_BY_SIDE))
+    random_return = _mean_return(judged, _Uniform(judged, seed), config.episodes, (seed, 2))
+    training = _Training(learner, folder, random_return, [])
+    if training.checkpoint.exists():
+        training.evaluations.extend(learner.load(training.checkpoint)["evaluations"])
+    with tqdm(
+        total=config.steps, initial=learner.steps, desc="train SAC", unit="step", disable=None
+    ) as bar:
+        while learner.steps < config.steps:
+            began = learner.steps
+            learner.play_episode(bar)
+            due = learner.steps // config.every > began // config.every
+            if due or learner.steps >= config.steps:
+                _evaluate(training, judged, seed, config.episodes)
+                bar.set_postfix({"return": f"{training.evaluations[-1]['return']:.1f}"})
+    env.close()
+    judged.close()
+    return training
+
+
+def _evaluate(training: _Training, env: VectorEnv[Any, Any, Any], seed: int, episodes: int) -> None:
+    """Judge and keep the present policy, and checkpoint the learner."""
+    learner, index = training.learner, len(training.evaluations)
+    earned = _mean_return(env, learner, episodes, (seed, 3, index))
+    training.evaluations.append({"steps": learner.steps, "return": earned})
+    learner.save_policy(training.policy(index), training.evaluations[-1])
+    learner.save(training.checkpoint, {"evaluations": training.evaluations})
+
+
+def _mean_return(
+    env: VectorEnv[Any, Any, Any],
+    actor: Actor,
+    episodes: int,
+    key: tuple[int, ...],
+) -> float:
+    played = rollout(env, actor, episodes, seed_all(*key), describe="evaluate")
+    return float(played.returns.mean())
+
+
+class _Uniform:
+    """Uniformly random actions."""
+
+    def __init__(self, env: VectorEnv[Any, Any, Any], seed: int) -> None:
+        self._space = env.action_space
+        self._space.seed(seed)
+
+    def begin(self, rows: IntArray) -> None:
+        """Nothing is carried from step to step."""
+
+    def act(self, observations: FloatArray, live: BoolArray) -> tuple[npt.NDArray[Any], None]:
+        """Draw (N, A) actions."""
+        return self._space.sample(), None
+
+    def observe(self, actions: npt.NDArray[Any], rewards: FloatArray) -> None:
+        """Nothing is carried from step to step."""
+
+
+def _choose(
+    evaluations: list[dict[str, Any]], random_return: float, fraction: float
+) -> tuple[int, int]:
+    """Positions of the medium and the expert policy."""
+    returns = np.array([row["return"] for row in evaluations])
+    expert = int(returns.argmax())
+    if returns[expert] <= random_return:
+        raise InputError(
+            f"the best policy earns {returns[expert]:.1f}, random play {random_return:.1f}; train "
+            "for more --steps into another folder"
+        )
+    wanted = random_return + fraction * (returns[expert] - random_return)
+    return int((returns >= wanted).argmax()), expert
+
+
+def _replay(training: _Training, medium: int, env_id: str) -> Trajectories:
+    replay = training.learner.replay(training.evaluations[medium]["steps"])
+    ends = np.flatnonzero(replay["terminals"] | replay["timeouts"])
+    return Trajectories(
+        observations=replay["observations"],
+        actions=replay["actions"],
+        rewards=replay["rewards"],
+        lengths=np.diff(ends, prepend=-1),
+        terminated=replay["terminals"][ends],
+        final_observations=replay["next_observations"][ends],
+        source=_source(env_id),
+    )
+
+
+def _roll_out(training: _Training, index: int, env_id: str, seed: int, size: int) -> Trajectories:
+    """Whole episodes of a kept policy, at least `size` steps.
+
+    They are played in rounds of a fixed number of episodes, so that short ones are not preferred.
+    """
+    training.learner.load_policy(training.policy(index))
+    # Few steps need few episodes at once: a thousand steps is these tasks' usual limit.
+    env = make_env(env_id, min(SIDE_BY_SIDE, max(1, size // 1000)))
+    rounds: list[Trajectories] = []
+    with tqdm(total=size, desc=f"roll out policy {index}", unit="step", disable=None) as bar:
+        while sum(len(part.rewards) for part in rounds) < size:
+            key = seed_all(seed, 4, index, len(rounds))
+            steps: list[Step] = []
+            rollout(env, training.learner, env.num_envs, key, steps.append, describe="episodes")
+            rounds.append(_by_episode(steps, env_id))
+            bar.update(len(rounds[-1].rewards))
+    env.close()
+    return _joined(*rounds)
+
+
+def _by_episode(steps: list[Step], env_id: str) -> Trajectories:
+    """Steps of episodes played side by side, brought into the order of the episodes."""
+
+    def column(name: str) -> npt.NDArray[Any]:
+        return np.concatenate([getattr(step, name) for step in steps])
+
+    order = np.argsort(column("episodes"), kind="stable")
+    terminated, truncated = column("terminated")[order], column("truncated")[order]
+    ends = np.flatnonzero(terminated | truncated)
+    return Trajectories(
+        observations=column("observations")[order].astype(np.float32),
+        actions=column("actions")[order].astype(np.float32),
+        rewards=column("rewards")[order].astype(np.float32),
+        lengths=np.diff(ends, prepend=-1),
+        terminated=terminated[ends],
+        final_observations=column("next_observations")[order][ends].astype(np.float32),
+        source=_source(env_id),
+    )
+
+
+def _joined(*parts: Trajectories) -> Trajectories:
+    """Trajectories one after the other."""
+
+    def column(name: str) -> Any:
+        return np.concatenate([getattr(part, name) for part in parts])
+
+    names = ("observations", "actions", "rewards", "lengths", "terminated", "final_observations")
+    return Trajectories(**{name: column(name) for name in names}, source=parts[0].source)
+
+
+def _source(env_id: str) -> dict[str, Any]:
+    return {"where": f"episodes of {env_id}", "env_id": env_id}

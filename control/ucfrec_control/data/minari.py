@@ -1,0 +1,210 @@
+"""Minari datasets, local or downloaded by Minari itself, both ways."""
+
+import os
+import re
+import shutil
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import minari
+import numpy as np
+import numpy.typing as npt
+from minari.data_collector import EpisodeBuffer
+from minari.dataset.minari_storage import MinariStorage
+
+from ucfrec.errors import InputError
+from ucfrec_control.data.trajectories import Trajectories
+from ucfrec_control.worlds.antmaze import antmaze_settings, is_antmaze
+from ucfrec_control.worlds.scores import dataset_name
+
+_IDENTIFIER = re.compile(r"([\w./-]+/)?[\w-]+-v\d+")
+
+
+def is_minari(source: str) -> bool:
+    """Whether `source` is a Minari identifier (`mujoco/hopper/medium-v0`) or dataset folder."""
+    folder = Path(source)
+    return (folder / "data").is_dir() or (
+        not folder.exists() and _IDENTIFIER.fullmatch(source) is not None
+    )
+
+
+def read_minari(source: str, env_id: str | None = None, download: bool = False) -> Trajectories:
+    """Read a Minari dataset.
+
+    Episodes that neither terminated nor were truncated are unfinished and are dropped. Of
+    goal observations, the position and the rest stay, in D4RL's order, and the goal goes.
+
+    Args:
+        source: identifier, or folder of a dataset.
+        env_id: environment that the data is of; None takes the dataset's own word.
+        download: fetch the dataset with Minari if it is not here.
+
+    Raises:
+        InputError: there is no such dataset, or it is damaged, or its observations are no vectors.
+    """
+    dataset = _load(source, download)
+    try:
+        episodes = list(dataset.iterate_episodes())
+    except (OSError, KeyError, ValueError, RuntimeError) as error:
+        raise InputError(f"{source}: an episode cannot be read ({error}); fetch it again") from None
+    whole = [e for e in episodes if len(e) and (e.terminations[-1] or e.truncations[-1])]
+    observations = [_vectors(e.observations, source) for e in whole]
+    for episode, seen in zip(whole, observations, strict=True):
+        if len(seen) != len(episode) + 1:
+            raise InputError(
+                f"{source}: episode {episode.id} has {len(seen)} observations for {len(episode)} "
+                "steps instead of one more"
+            )
+    spec = dataset.env_spec
+    return Trajectories(
+        observations=_joined([seen[:-1] for seen in observations]),
+        actions=_joined([_vectors(e.actions, source) for e in whole]),
+        rewards=_joined([e.rewards for e in whole]).reshape(-1),
+        lengths=np.array([len(e) for e in whole], dtype=np.int64),
+        terminated=np.array([bool(e.terminations[-1]) for e in whole]),
+        final_observations=_joined([seen[-1:] for seen in observations]),
+        source={
+            "where": source,
+            "format": "minari",
+            "dataset": dataset_name(dataset.id),
+            "env_id": env_id or (spec.id if spec is not None else None),
+            "env_settings": {} if env_id or spec is None else _settings(spec),
+            "versions": _made_with(dataset.storage.metadata),
+            "dropped": {
+                "unfinished_steps": sum(map(len, episodes)) - sum(map(len, whole)),
+                "one_step_trajectories": 0,
+            },
+        },
+    )
+
+
+def write_minari(trajectories: Trajectories, identifier: str, env_id: str | None = None) -> Path:
+    """Write a local Minari dataset; returns its folder.
+
+    Minari keeps the observation after an episode's last action; where the source did not tell it,
+    the last one known is repeated, and the description says so.
+
+    Raises:
+        InputError: `identifier` is not one, is taken, or the environment is not known here.
+    """
+    if _IDENTIFIER.fullmatch(identifier) is None:
+        raise InputError(f"{identifier!r} is no Minari identifier, such as mujoco/hopper/medium-v0")
+    folder = _root() / identifier
+    if folder.exists():
+        raise InputError(f"{folder} exists already; remove it or name another dataset")
+    env = env_id or trajectories.source["env_id"]
+    requirements = [
+        f"{name}=={version}" for name, version in trajectories.source["versions"].items()
+    ]
+    told = trajectories.final_observations is not None
+    spec = _spec(env)
+    try:
+        with warnings.catch_warnings():
+            # Minari asks for authors and evaluation environments, which are not ours to name.
+            warnings.filterwarnings("ignore", category=UserWarning, module="minari")
+            minari.create_dataset_from_buffers(
+                identifier,
+                _buffers(trajectories),
+                env=spec,
+                observation_space=_box(trajectories.observations.shape[1]),
+                action_space=_box(trajectories.actions.shape[1]),
+                description=f"Converted by ucfrec from {trajectories.source['where']}."
+                + ("" if told else " Final observations are unknown and repeat the last one."),
+                requirements=requirements,
+            )
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    return folder
+
+
+def _buffers(trajectories: Trajectories) -> list[EpisodeBuffer]:
+    finals = trajectories.final_observations
+    buffers, start = [], 0
+    for number, length in enumerate(trajectories.lengths):
+        rows = slice(start, start + length)
+        seen = trajectories.observations[rows]
+        ended = np.zeros(length, dtype=bool)
+        ended[-1] = True
+        terminated = bool(trajectories.terminated[number])
+        buffers.append(
+            EpisodeBuffer(
+                id=number,
+                observations=np.vstack([seen, seen[-1:] if finals is None else finals[number]]),
+                actions=trajectories.actions[rows],
+                rewards=trajectories.rewards[rows].tolist(),
+                terminations=(ended & terminated).tolist(),
+                truncations=(ended & (not terminated)).tolist(),
+                infos={},
+            )
+        )
+        start += length
+    return buffers
+
+
+def _load(source: str, download: bool) -> minari.MinariDataset:
+    folder = Path(source) if (Path(source) / "data").is_dir() else _root() / source
+    try:
+        if download and not folder.is_dir():
+            minari.download_dataset(source)
+        if not folder.is_dir():
+            raise InputError(
+                f"the Minari dataset {source} is not in {_root()}; fetch it with --download"
+            )
+        stated = MinariStorage.read_raw_metadata(folder / "data")
+        if not {"observation_space", "action_space"} <= stated.keys():
+            # Minari would import and start whatever environment the file names.
+            raise InputError(f"{source}: its metadata states no observation and action space")
+        return minari.MinariDataset(folder / "data")
+    except InputError:
+        raise
+    except Exception as error:  # Minari and its downloads raise whatever they like
+        message = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"the Minari dataset {source} cannot be opened ({message})") from None
+
+
+def _root() -> Path:
+    """Where Minari keeps its datasets."""
+    return Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets")
+
+
+def _spec(env_id: str | None) -> gymnasium.envs.registration.EnvSpec | None:
+    if env_id is None:
+        return None
+    if is_antmaze(env_id):
+        antmaze_settings(env_id)
+    try:
+        return gymnasium.spec(env_id)
+    except gymnasium.error.Error as error:
+        raise InputError(f"the environment {env_id} is not known here ({error})") from None
+
+
+def _settings(spec: gymnasium.envs.registration.EnvSpec) -> dict[str, Any]:
+    """What else than its name makes the environment, as the maze of AntMaze."""
+    return {name: value for name, value in spec.kwargs.items() if name != "render_mode"}
+
+
+def _box(size: int) -> gymnasium.spaces.Box:
+    return gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+
+
+def _vectors(values: Any, source: str) -> npt.NDArray[Any]:
+    if isinstance(values, Mapping) and {"achieved_goal", "observation"} <= values.keys():
+        values = np.concatenate([values["achieved_goal"], values["observation"]], axis=1)
+    if not isinstance(values, np.ndarray) or values.ndim != 2:
+        raise InputError(f"{source}: its observations or actions are no vectors")
+    return values
+
+
+def _joined(parts: list[npt.NDArray[Any]]) -> npt.NDArray[np.float32]:
+    return np.concatenate(parts or [np.zeros((0, 0))]).astype(np.float32)
+
+
+def _made_with(metadata: Mapping[str, Any]) -> dict[str, str]:
+    stated = [str(text).partition("==") for text in metadata.get("requirements", [])]
+    return {"minari": str(metadata["minari_version"])} | {
+        name: version for name, equal, version in stated if equal
+    }

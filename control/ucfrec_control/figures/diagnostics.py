@@ -1,0 +1,206 @@
+"""What a finished run's edits and attention look like: read back, nothing is trained."""
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from ucfrec.counterfactual.augment import accept, sample_transitions
+from ucfrec.counterfactual.generators import (
+    CounterfactualStateGenerator,
+    TangentGenerator,
+    make_generator,
+)
+from ucfrec.counterfactual.reward_model import CausalRewardModel
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Overlay, Transitions
+from ucfrec.errors import InputError
+from ucfrec.files import read_json
+from ucfrec.fitting.checkpoint import load_tensors, load_weights
+from ucfrec.policies.ucf import UCFPolicy
+from ucfrec.runs.config import Config, config_from_dict
+from ucfrec.runs.run import training_views
+from ucfrec.runs.trained_policy import RUN, TrainedPolicy
+from ucfrec_control.learners.train import as_seen
+
+FloatArray = npt.NDArray[np.float64]
+
+_REPORT = "augmentation.json"
+_PROPOSALS = 4096
+_WINDOWS = 512
+_POINTS = 3000
+_ROUNDING = 1e-5
+"""Of a move's length in float32: what the generator scales to a bound is within it."""
+
+
+def store_of(run: Path) -> EpisodeStore:
+    """What a run was trained on.
+
+    Raises:
+        InputError: it is no longer where it was, or has changed.
+    """
+    record = read_json(run / RUN)
+    store = EpisodeStore.open(record["store"])
+    if store.meta["fingerprint"] != record["fingerprint"]:
+        raise InputError(f"{store.path} is no longer the store that {run} was trained on")
+    return as_seen(store, record["dataset"])
+
+
+def has_copies(run: Path) -> bool:
+    """Whether counterfactual copies were made for a run."""
+    return (run / _REPORT).exists()
+
+
+def edited_states(run: Path, seed: int = 0) -> tuple[FloatArray, FloatArray]:
+    """Factual states and their edits, (M, S) each, aligned and in standard deviations from the
+    training mean; at most 3,000 drawn from a run's counterfactual copies.
+
+    Raises:
+        InputError: the run made no copies, or its store is gone.
+    """
+    _augmentation(run)
+    store, overlay = store_of(run), Overlay.load(run / "overlay.safetensors")
+    rng, edits = np.random.default_rng(seed), len(overlay.edit_step)
+    rows = rng.choice(edits, min(edits, _POINTS), replace=False)
+    episodes = overlay.copy_source[overlay.edit_copy[rows]]
+    factual = store.windows(episodes, overlay.edit_step[rows], 1).states[:, 0]
+    mean, std = training_views(store)[0].state_statistics
+    # What never varies was never edited.
+    varies = std > 0
+    scaled = [
+        ((states - mean) / std)[:, varies].double().numpy()
+        for states in (factual, torch.from_numpy(overlay.edit_state[rows]))
+    ]
+    return scaled[0], scaled[1]
+
+
+@dataclass(frozen=True)
+class Editing:
+    """What a run's edits were made with, on steps drawn from its training episodes."""
+
+    crm: CausalRewardModel
+    generator: TangentGenerator | CounterfactualStateGenerator
+    factual: Transitions
+    epsilon_r: float
+    """Tolerance of the reward gate, in reward units."""
+
+    @classmethod
+    def of(cls, run: Path, seed: int = 0) -> "Editing":
+        """Read back the models of `run`, and draw 4,096 of the steps that it could have edited.
+
+        Raises:
+            InputError: the run made no copies, or its models or its store are gone.
+        """
+        record = read_json(run / RUN)
+        report, config = _augmentation(run), config_from_dict(record["config"])
+        train = training_views(store_of(run))[0]
+        sizes = record["sizes"]
+        crm = CausalRewardModel(sizes["state"], sizes["action"], config.crm)
+        weights = run / "crm" / "cvae" / "best.safetensors"
+        load_weights(weights, crm, load_tensors(weights)[0])
+        crm.eval().requires_grad_(False)
+        fitted = sample_transitions(
+            train, max(config.crm.max_transitions, config.csg.max_transitions), config.seed
+        )
+        high = fitted.rewards >= fitted.rewards.quantile(config.augment.reward_quantile)
+        rows = np.random.default_rng(seed).permutation(np.flatnonzero(high.numpy()))[:_PROPOSALS]
+        factual = _at(fitted, torch.from_numpy(rows))
+        return cls(crm, _generator(run, fitted, crm, config), factual, report["epsilon_r"])
+
+    def acceptance(self, band: tuple[float, float], seed: int = 0) -> float:
+        """Share of proposals under `band` (ρ_low, ρ_high) that pass both gates of Eq. 4 and move
+        by ρ_low or more.
+
+        The tangent generator proposes moves of this band; the faithful network proposes what it
+        learned to, whatever the band.
+        """
+        generator = self.generator
+        if isinstance(generator, TangentGenerator):
+            generator = copy.copy(generator)
+            generator.band = band
+        factual = self.factual
+        random = torch.Generator().manual_seed(seed)
+        with torch.no_grad():
+            z = self.crm.abduct(factual.states, factual.actions, factual.rewards)
+            proposed = generator.propose(factual.states, factual.actions, z, random)
+            passed = accept(self.crm, factual, z, proposed, self.epsilon_r, band[1] + _ROUNDING)
+            length = self.crm.moves(factual.states, proposed).norm(dim=1)
+        return float((passed & (length >= band[0] - _ROUNDING)).float().mean())
+
+
+def acceptance_grid(run: Path, lows: Sequence[float], highs: Sequence[float]) -> FloatArray:
+    """(lows, highs) acceptance under every band; NaN where ρ_low is not below ρ_high.
+
+    Raises:
+        InputError: as `Editing.of`.
+    """
+    editing = Editing.of(run)
+    return np.array(
+        [[editing.acceptance((a, b)) if a < b else np.nan for b in highs] for a in lows]
+    )
+
+
+def move_histogram(run: Path) -> tuple[list[float], list[int], tuple[float, float]]:
+    """Edges, counts and the band (ρ_low, ρ_high) of a run's accepted edits, by ‖Δ‖₂.
+
+    Raises:
+        InputError: the run made no copies.
+    """
+    moves = _augmentation(run)["moves"]
+    low, high = read_json(run / RUN)["config"]["csg"]["band"]
+    return moves["histogram_edges"], moves["histogram_counts"], (low, high)
+
+
+def attention(run: Path, seed: int = 0) -> FloatArray:
+    """(K, 3, K) attention of a UCF run from s_t to R, s and a of every step.
+
+    The mean over heads and over full windows of validation episodes; a row sums to one.
+
+    Raises:
+        InputError: the learner is not UCF, no episode fills a window, or the store is gone.
+    """
+    trained = TrainedPolicy.load(run)
+    if not isinstance(trained.policy, UCFPolicy):
+        raise InputError(f"{run} is of {trained.name}; attention is drawn of ucf")
+    view, k = training_views(store_of(run))[1], trained.policy.config.context
+    episodes, ends = view.all_steps()
+    full = np.flatnonzero(ends >= k - 1)
+    if len(full) == 0:
+        raise InputError(f"{run}: no validation episode has {k} steps, as many as a window")
+    rows = np.random.default_rng(seed).choice(full, min(len(full), _WINDOWS), replace=False)
+    windows = view.windows(episodes[rows], ends[rows], k)
+    with torch.no_grad():
+        weights = trained.policy.attend(trained.policy.normalized(windows))[1]
+    # (B, H, K, 3K), tokens in the order R_0, s_0, a_0, R_1, …
+    mean = weights.double().mean(dim=(0, 1)).view(k, k, 3).transpose(1, 2)
+    return np.asarray(mean)
+
+
+def _augmentation(run: Path) -> Mapping[str, Any]:
+    if not has_copies(run):
+        raise InputError(f"{run} has no edited copies; train it with augment.copies of 1 or more")
+    found: Mapping[str, Any] = read_json(run / _REPORT)
+    return found
+
+
+def _generator(
+    run: Path, fitted: Transitions, crm: CausalRewardModel, config: Config
+) -> TangentGenerator | CounterfactualStateGenerator:
+    if config.csg.kind == "faithful":
+        network = CounterfactualStateGenerator(crm, config.csg)
+        weights = run / "csg" / "best.safetensors"
+        load_weights(weights, network, load_tensors(weights)[0])
+        return network.eval()
+    # Nothing of the tangent generator is learned but covariances, the same for the same seed.
+    made = make_generator(fitted, crm, config.csg, run / "csg", config.seed)
+    assert isinstance(made, TangentGenerator)
+    return made
+
+
+def _at(steps: Transitions, rows: torch.Tensor) -> Transitions:
+    return Transitions(*(getattr(steps, f)[rows] for f in steps.__dataclass_fields__))

@@ -1,0 +1,243 @@
+"""`ucfrec-control figures`: every figure that stored runs and result rows have the data for."""
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from ucfrec.errors import InputError
+from ucfrec.files import read_json
+from ucfrec.fitting.tensorboard import read_scalars
+from ucfrec.provenance import config_hash
+from ucfrec.reporting.grid import Row, read_rows
+from ucfrec.runs.trained_policy import RUN
+from ucfrec_control.benchmark.robustness import drops, loss_rises
+from ucfrec_control.figures import diagnostics, plots
+from ucfrec_control.figures.figure_style import label, save
+from ucfrec_control.learners.evaluate import method_of
+
+LOWS = (0.0, 0.1, 0.2, 0.3, 0.4)
+HIGHS = (0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
+"""ρ_low and ρ_high of the acceptance heatmap."""
+
+_COPIES = "a run with edited copies among --runs (`ucfrec-control train --policy ucf`)"
+NEEDS = {
+    "moves": _COPIES,
+    "states": _COPIES,
+    "acceptance": _COPIES,
+    "attention": "a run of ucf among --runs (`ucfrec-control train --policy ucf`)",
+    "training": "a run among --runs (`ucfrec-control train`)",
+    "returns": "rows of one dataset with two returns asked for or more among --results "
+    "(`ucfrec-control evaluate --target … --target … --json`)",
+    "lambda": "rows of ucf with two weights of the mask loss or more among --results",
+    "robustness-scores": "rows of `ucfrec-control robustness` among --results",
+    "robustness-drops": "such rows with and without a distractor",
+    "robustness-losses": "such rows with a distractor",
+}
+"""What every kind of figure is made of."""
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """A figure that there seems to be data for."""
+
+    kind: str
+    about: str
+    draw: Callable[[], Figure]
+    """Raises InputError where some of the data is missing after all."""
+
+
+@dataclass(frozen=True)
+class _Run:
+    path: Path
+    name: str
+    """Its path below the folder that was given, the parts joined."""
+    group: str
+    """The same of the folder it lies in; of runs given by themselves, the dataset."""
+    method: str
+    """Runs of one group that have it in common differ in their seed only."""
+    policy: str
+    settings: str
+    """Hash of the data and of all that a training is told but the seed."""
+    about: str
+
+    @property
+    def title(self) -> str:
+        return f"{label(self.method)} on {self.about}"
+
+
+def make_figures(
+    runs: Sequence[Path], results: Sequence[Path], out: Path
+) -> tuple[list[Path], list[str]]:
+    """Draw all figures into `out`, as PNG and SVG.
+
+    Where runs differ in their seed only, edits and attention are drawn of the first.
+
+    Args:
+        runs: run folders of `ucfrec-control`, or folders that hold some at any depth.
+        results: JSON lines of `benchmark` and `robustness`, and JSON of `evaluate`.
+
+    Returns:
+        The files written, and a line for each figure that lacks its data.
+
+    Raises:
+        InputError: a file of `results` holds something else.
+    """
+    found = _told_apart([run for folder in runs for run in _runs(folder)])
+    rows = [row for path in results for row in _rows(path)]
+    plans = [*_of_runs(found), *_of_rows(rows)]
+    made: list[Path] = []
+    missing = [f"{k}: needs {w}" for k, w in NEEDS.items() if k not in {p.kind for p in plans}]
+    for plan in plans:
+        name = f"{plan.kind}-{plan.about}"
+        try:
+            made += save(plan.draw(), out, name)
+        except InputError as error:
+            missing.append(f"{name}: {error}")
+    return made, missing
+
+
+def _rows(path: Path) -> list[Row]:
+    if path.suffix != ".json":
+        return read_rows(path)
+    found = read_json(path)
+    if not isinstance(found, list) or not all(isinstance(row, dict) for row in found):
+        raise InputError(
+            f"{path} holds no list of rows; `ucfrec-control evaluate --json` makes one"
+        )
+    return found
+
+
+def _runs(folder: Path) -> Iterator[_Run]:
+    for file in sorted(folder.rglob(RUN)):
+        record, path = read_json(file), file.parent
+        if "dataset" not in record:
+            continue
+        below, dataset, config = path.relative_to(folder), record["dataset"], record["config"]
+        distracted = " with a distractor" if dataset.get("distractors") else ""
+        yield _Run(
+            path=path,
+            name="-".join(below.parts) or path.resolve().name,
+            group="-".join(below.parent.parts) or dataset["dataset"],
+            method=method_of(record),
+            policy=config["policy_name"],
+            settings=config_hash({**config, "seed": None, "data": record["fingerprint"]}),
+            about=f"{dataset['dataset']}{distracted}",
+        )
+
+
+def _told_apart(runs: Sequence[_Run]) -> list[_Run]:
+    """The runs, of which those with other settings go by their folder's name, less the seed."""
+    settings: dict[tuple[str, str], set[str]] = {}
+    for run in runs:
+        settings.setdefault((run.group, run.method), set()).add(run.settings)
+    return [
+        replace(run, method=re.sub(r"-\d+$", "", run.path.resolve().name))
+        if len(settings[run.group, run.method]) > 1
+        else run
+        for run in runs
+    ]
+
+
+def _of_runs(runs: Sequence[_Run]) -> Iterator[_Plan]:
+    for run in _first(runs, lambda run: (run.group, run.method)):
+        if diagnostics.has_copies(run.path):
+            yield _Plan("moves", run.name, partial(_moves, run))
+            yield _Plan("states", run.name, partial(_states, run))
+            yield _Plan("acceptance", run.name, partial(_acceptance, run))
+        if run.policy == "ucf":
+            yield _Plan("attention", run.name, partial(_attention, run))
+    for run in _first(runs, lambda run: run.group):
+        there = [other for other in runs if other.group == run.group]
+        yield _Plan("training", run.group, partial(_training, there))
+
+
+def _first(runs: Iterable[_Run], key: Callable[[_Run], Any]) -> Iterable[_Run]:
+    first: dict[Any, _Run] = {}
+    for run in runs:
+        first.setdefault(key(run), run)
+    return first.values()
+
+
+def _moves(run: _Run) -> Figure:
+    return plots.move_histogram(*diagnostics.move_histogram(run.path), run.title)
+
+
+def _states(run: _Run) -> Figure:
+    return plots.state_overlay(*diagnostics.edited_states(run.path), run.title)
+
+
+def _acceptance(run: _Run) -> Figure:
+    band = diagnostics.move_histogram(run.path)[2]
+    shares = diagnostics.acceptance_grid(run.path, LOWS, HIGHS)
+    return plots.acceptance_heatmap(LOWS, HIGHS, shares, band, run.title)
+
+
+def _attention(run: _Run) -> Figure:
+    return plots.attention_map(diagnostics.attention(run.path), run.title)
+
+
+def _training(runs: Sequence[_Run]) -> Figure:
+    curves: dict[str, list[Mapping[int, float]]] = {}
+    for run in runs:
+        logged = read_scalars(run.path / "policy").get("validation_loss", {})
+        if logged:
+            curves.setdefault(run.method, []).append(logged)
+    if not curves:
+        raise InputError(f"{runs[0].path.parent}: no run has logged a validation loss yet")
+    return plots.training_curves(curves, "validation loss of the action", runs[0].group)
+
+
+def _of_rows(rows: Sequence[Row]) -> Iterator[_Plan]:
+    yield from _of_robustness([row for row in rows if "distractor" in row])
+    yield from _of_targets([row for row in rows if _of_evaluate(row)])
+    swept = [row for row in rows if _of_lambda(row)]
+    for budget in dict.fromkeys(row.get("budget", "") for row in swept):
+        there = [row for row in swept if row.get("budget", "") == budget]
+        if len({row["lambda_mask"] for row in there}) > 1:
+            yield _Plan("lambda", budget or "rows", partial(plots.lambda_curves, there))
+
+
+def _of_robustness(rows: Sequence[Row]) -> Iterator[_Plan]:
+    for budget, dataset in dict.fromkeys((row["budget"], row["dataset"]) for row in rows):
+        there = [r for r in rows if (r["budget"], r["dataset"]) == (budget, dataset)]
+        about, bars = f"{budget}-{dataset}", plots.robustness_bars
+        score = partial(bars, there, "score", "normalised score", dataset)
+        yield _Plan("robustness-scores", about, score)
+        if lost := drops(there):
+            drop = partial(bars, lost, "drop", "loss (% of the clean score)", dataset)
+            yield _Plan("robustness-drops", about, drop)
+        if rises := loss_rises(there):
+            rise = partial(bars, rises, "rise", "rise of the action loss (%)", dataset)
+            yield _Plan("robustness-losses", about, rise)
+
+
+def _of_targets(rows: Sequence[Row]) -> Iterator[_Plan]:
+    """Of the methods that were asked for more than one return."""
+    targets: dict[tuple[str, str], set[float]] = {}
+    for row in rows:
+        targets.setdefault((row["dataset"], row["method"]), set()).add(row["target_return"])
+    rows = [row for row in rows if len(targets[row["dataset"], row["method"]]) > 1]
+    for dataset in dict.fromkeys(row["dataset"] for row in rows):
+        there = [row for row in rows if row["dataset"] == dataset]
+        yield _Plan("returns", dataset, partial(plots.return_curves, there, dataset))
+
+
+def _of_evaluate(row: Row) -> bool:
+    """Whether `row` is of no table, and of a policy that is asked for returns."""
+    whole = "budget" not in row and row.get("checkpoint") == "last" and not row.get("distractors")
+    return whole and row.get("target_return") is not None
+
+
+def _of_lambda(row: Row) -> bool:
+    """Whether `row` is UCF's, complete but for its λ."""
+    whole = row.get("method") == "ucf" or str(row.get("method")).startswith("ucf-lambda")
+    whole = whole and row.get("table", "lambda") == "lambda"
+    clean = "distractor" not in row and not row.get("distractors")
+    return (
+        whole and clean and row.get("lambda_mask") is not None and row.get("checkpoint") == "last"
+    )

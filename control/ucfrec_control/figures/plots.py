@@ -1,0 +1,269 @@
+"""Rows and arrays to figures: every function returns one matplotlib Figure."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.colors import PowerNorm
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from ucfrec_control.figures.figure_style import COLUMN, EDITED, FACTUAL, PAGE, colors, label, styled
+
+FloatArray = npt.NDArray[np.float64]
+Row = Mapping[str, Any]
+
+
+@styled
+def move_histogram(
+    edges: Sequence[float], counts: Sequence[int], band: tuple[float, float], title: str = ""
+) -> Figure:
+    """Accepted edits by the length of their move, with the band (Figures 5 and 6, left)."""
+    figure, axes = _figure(COLUMN, 2.1, title)
+    shares = 100 * np.asarray(counts) / max(1, sum(counts))
+    axes.bar(edges[:-1], shares, np.diff(edges), align="edge", color=FACTUAL, edgecolor="white")
+    for bound, name in zip(band, (r"$\rho_\mathrm{low}$", r"$\rho_\mathrm{high}$"), strict=True):
+        axes.axvline(bound, color="black", linestyle="--", linewidth=0.9)
+        axes.annotate(
+            name, (bound, 1), (2, -2), xycoords=("data", "axes fraction"), va="top",
+            textcoords="offset points",
+        )  # fmt: skip
+    axes.set_xlim(0, 1.12 * max(edges[-1], band[1]))
+    axes.set_ylim(0, 1.18 * max(shares.max(), 1e-9))
+    axes.set_xlabel(r"length of the move $\|\Delta\|_2$ (standard deviations)")
+    axes.set_ylabel("accepted edits (%)")
+    return figure
+
+
+@styled
+def acceptance_heatmap(
+    lows: Sequence[float],
+    highs: Sequence[float],
+    acceptance: FloatArray,
+    band: tuple[float, float],
+    title: str = "",
+) -> Figure:
+    """Share of accepted proposals under every band; the run's own is outlined (Figures 5 and 6).
+
+    Args:
+        acceptance: (lows, highs) from 0 to 1, NaN where there is no such band.
+    """
+    figure, axes = _figure(COLUMN, 2.6, title)
+    image = axes.imshow(100 * acceptance, vmin=0, vmax=100, origin="lower", aspect="auto")
+    axes.spines[["left", "bottom"]].set_visible(False)
+    dark = colormaps[image.get_cmap().name]
+    for (row, column), share in np.ndenumerate(acceptance):
+        if np.isfinite(share):
+            bright = np.mean(dark(share)[:3]) > 0.5
+            axes.text(
+                column, row, f"{100 * share:.0f}", ha="center", va="center",
+                color="black" if bright else "white",
+            )  # fmt: skip
+        if (lows[row], highs[column]) == tuple(band):
+            axes.add_patch(
+                Rectangle((column - 0.5, row - 0.5), 1, 1, fill=False, edgecolor=EDITED, lw=2)
+            )
+    axes.set_xticks(range(len(highs)), [f"{value:g}" for value in highs])
+    axes.set_yticks(range(len(lows)), [f"{value:g}" for value in lows])
+    axes.tick_params(length=0)
+    axes.set_xlabel(r"$\rho_\mathrm{high}$ (standard deviations)")
+    axes.set_ylabel(r"$\rho_\mathrm{low}$ (standard deviations)")
+    figure.colorbar(image, ax=axes, label="acceptance (%)", shrink=0.9)
+    return figure
+
+
+@styled
+def state_overlay(factual: FloatArray, edited: FloatArray, title: str = "") -> Figure:
+    """Factual and edited states in the factual ones' first two principal components (Figures 5, 6).
+
+    Args:
+        factual: (M, S) in standard deviations.
+        edited: the same states after their edits.
+    """
+    figure, axes = _figure(COLUMN, 2.9, title)
+    centre = factual.mean(axis=0)
+    _, spread, directions = np.linalg.svd(factual - centre, full_matrices=False)
+    explained = 100 * spread**2 / (spread**2).sum()
+    for states, name, color, marker in (
+        (factual, "logged", FACTUAL, "o"),
+        (edited, "edited", EDITED, "x"),
+    ):
+        # Drawn as pixels in the SVG too: thousands of points make it slow to open.
+        x, y = ((states - centre) @ directions[:2].T).T
+        width = 0.5 if marker == "x" else 0
+        axes.scatter(
+            x, y, s=7, c=color, marker=marker, lw=width, alpha=0.45, label=name, rasterized=True
+        )
+    legend = axes.legend(loc="best", markerscale=2, handletextpad=0.2)
+    for handle in legend.legend_handles:
+        if handle is not None:
+            handle.set_alpha(1)
+    axes.set_xlabel(f"first component ({explained[0]:.0f}% of the variance)")
+    axes.set_ylabel(f"second component ({explained[1]:.0f}%)")
+    axes.grid(True)
+    return figure
+
+
+@styled
+def lambda_curves(rows: Sequence[Row], title: str = "") -> Figure:
+    """Normalised score over λ, a line a dataset, mean ± standard deviation over seeds (Figure 2).
+
+    Args:
+        rows: result rows that differ in `dataset`, `lambda_mask` and `seed`.
+    """
+    figure, axes = _figure(COLUMN, 2.5, title)
+    places = sorted({row["lambda_mask"] for row in rows})
+    scores = _grouped(rows, ("dataset", "lambda_mask"), "score")
+    datasets = sorted({row["dataset"] for row in rows})
+    for dataset, color in colors(datasets).items():
+        at = [i for i, value in enumerate(places) if (dataset, value) in scores]
+        found = [scores[dataset, places[i]] for i in at]
+        mean, std = (np.array([f(values) for values in found]) for f in (np.mean, np.std))
+        axes.plot(at, mean, "o-", color=color, label=dataset)
+        axes.fill_between(at, mean - std, mean + std, color=color, alpha=0.2, linewidth=0)
+    # Places stand apart evenly: 0 has no place on a logarithmic axis.
+    axes.set_xticks(range(len(places)), [f"{value:g}" for value in places])
+    axes.set_xlabel(r"weight of the mask loss $\lambda$")
+    axes.set_ylabel("normalised score")
+    axes.grid(True, axis="y")
+    _legend_below(figure, axes, 2)
+    return figure
+
+
+@styled
+def return_curves(rows: Sequence[Row], title: str = "") -> Figure:
+    """Return earned over return asked for, a line a method: mean over seeds, lowest to highest
+    around it. On the dashed line, what is asked for is earned.
+
+    Args:
+        rows: result rows that differ in `method`, `target_return` and `seed`.
+    """
+    figure, axes = _figure(COLUMN, 2.5, title)
+    earned = _grouped(rows, ("method", "target_return"), "return")
+    for method, color in colors(sorted({row["method"] for row in rows})).items():
+        targets = sorted(target for other, target in earned if other == method)
+        found = [earned[method, target] for target in targets]
+        axes.plot(targets, list(map(np.mean, found)), "o-", color=color, label=label(method))
+        axes.fill_between(
+            targets, list(map(min, found)), list(map(max, found)), color=color, alpha=0.2, lw=0
+        )
+    asked, top = [row["target_return"] for row in rows], axes.get_ylim()[1]
+    axes.plot([0, max(asked)], [0, max(asked)], "--", color="black", linewidth=0.9)
+    axes.set_xlim(0, 1.03 * max(asked))
+    axes.set_ylim(0, 1.1 * top)
+    axes.set_xlabel("return asked for")
+    axes.set_ylabel("return earned")
+    axes.grid(True)
+    _legend_below(figure, axes, 4)
+    return figure
+
+
+@styled
+def robustness_bars(rows: Sequence[Row], value: str, ylabel: str, title: str = "") -> Figure:
+    """Bars of one dataset: methods side by side, a bar a distractor (Figures 3 and 4).
+
+    A bar is the mean over seeds, its line the standard deviation over them.
+
+    Args:
+        rows: with `method`, `distractor`, `seed` and `value`, in the order to be drawn.
+    """
+    figure, axes = _figure(PAGE, 2.4, title)
+    found = _grouped(rows, ("method", "distractor"), value)
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    kinds = list(dict.fromkeys(row["distractor"] for row in rows))
+    width = 0.84 / len(kinds)
+    for number, (kind, color) in enumerate(colors(kinds).items()):
+        there = [i for i, method in enumerate(methods) if (method, kind) in found]
+        values = [found[methods[i], kind] for i in there]
+        spread = [np.std(v) if len(v) > 1 else np.nan for v in values]
+        left = (number - (len(kinds) - 1) / 2) * width
+        axes.bar(
+            np.array(there) + left, [np.mean(v) for v in values], 0.92 * width, yerr=spread,
+            color=color, label=label(kind), error_kw={"elinewidth": 0.9, "capsize": 1.5},
+        )  # fmt: skip
+    axes.axhline(0, color="black", linewidth=0.8)
+    axes.set_xticks(range(len(methods)), [label(method) for method in methods])
+    axes.tick_params(axis="x", length=0)
+    axes.set_ylabel(ylabel)
+    axes.grid(True, axis="y")
+    _legend_below(figure, axes, len(kinds))
+    return figure
+
+
+@styled
+def training_curves(
+    curves: Mapping[str, Sequence[Mapping[int, float]]], ylabel: str, title: str = ""
+) -> Figure:
+    """A value over training steps, a line a method: mean over seeds, lowest to highest around it.
+
+    Args:
+        curves: for each method, {step: value} of each seed; steps that not all seeds have are left
+            out.
+    """
+    figure, axes = _figure(COLUMN, 2.5, title)
+    for method, color in colors(curves).items():
+        steps = sorted(set.intersection(*(set(seed) for seed in curves[method])))
+        values = np.array([[seed[step] for step in steps] for seed in curves[method]])
+        axes.plot(steps, values.mean(axis=0), color=color, label=label(method))
+        axes.fill_between(
+            steps, values.min(axis=0), values.max(axis=0), color=color, alpha=0.2, linewidth=0
+        )
+    axes.set_xlim(left=0)
+    axes.set_xlabel("training step")
+    axes.set_ylabel(ylabel)
+    axes.grid(True)
+    _legend_below(figure, axes, 4)
+    return figure
+
+
+@styled
+def attention_map(weights: FloatArray, title: str = "") -> Figure:
+    """How much the state token of every step of a window attends to every earlier token.
+
+    Args:
+        weights: (K, 3, K): a row for each querying step, then returns-to-go, states and actions of
+            each step.
+    """
+    figure = Figure(figsize=(PAGE, 2.5))
+    figure.suptitle(title, fontsize=8)
+    panels = figure.subplots(1, 3, sharex=True, sharey=True)
+    k, modalities = len(weights), ("returns-to-go", "states", "actions")
+    ago = np.arange(k) - (k - 1)
+    # A root scale: nearly all attention may lie on a few tokens.
+    scale = PowerNorm(0.5, 0, float(weights.max()))
+    for number, (axes, name) in enumerate(zip(panels, modalities, strict=True)):
+        # What a row cannot see is left white; actions are seen one step late.
+        hidden = np.arange(k)[None, :] > np.arange(k)[:, None] - (name == "actions")
+        shown = np.where(hidden, np.nan, weights[:, number])
+        box = (ago[0] - 0.5, 0.5, 0.5, ago[0] - 0.5)
+        image = axes.imshow(shown, norm=scale, extent=box)
+        axes.set_title(f"{name}: {100 * weights[-1, number].sum():.0f}% of step 0")
+        axes.set_xlabel("step attended to (0 is now)")
+    panels[0].set_ylabel("acting step")
+    figure.colorbar(image, ax=panels, label="attention", shrink=0.85)
+    return figure
+
+
+def _figure(width: float, height: float, title: str) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(width, height))
+    figure.suptitle(title, fontsize=8)
+    return figure, figure.subplots()
+
+
+def _legend_below(figure: Figure, axes: Axes, columns: int) -> None:
+    figure.legend(
+        *axes.get_legend_handles_labels(), loc="outside lower center", ncols=columns,
+        handlelength=1.4, columnspacing=1.2,
+    )  # fmt: skip
+
+
+def _grouped(rows: Sequence[Row], names: Sequence[str], value: str) -> dict[Any, list[float]]:
+    """Values by their rows' `names`; of a seed that comes twice, the last counts."""
+    latest: dict[Any, dict[int, float]] = defaultdict(dict)
+    for row in rows:
+        latest[tuple(row[name] for name in names)][row["seed"]] = row[value]
+    return {key: list(seeds.values()) for key, seeds in latest.items()}

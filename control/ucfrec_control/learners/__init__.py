@@ -1,0 +1,1 @@
+"""Training, screening and judging on a control store."""

@@ -1,0 +1,211 @@
+"""What a trained policy earns in its environment, on D4RL's scale."""
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import VectorEnv
+
+from ucfrec.acting.rollout import rollout
+from ucfrec.errors import InputError
+from ucfrec.evaluation.metrics import bootstrap_interval
+from ucfrec.files import read_json
+from ucfrec.provenance import config_hash
+from ucfrec.runs.trained_policy import RUN, TrainedPolicy, learner_of
+from ucfrec_control.learners.presets import find_preset
+from ucfrec_control.learners.rl_baselines import RLPolicy, is_rl
+from ucfrec_control.learners.train import SCREENINGS, UNSEEN
+from ucfrec_control.worlds.environments import SIDE_BY_SIDE, Wrap, make_env, mismatches
+from ucfrec_control.worlds.scores import find_kind, require_task
+
+Trained = TrainedPolicy | RLPolicy
+CHECKPOINTS = ("last", "best")
+SHOWN = (
+    *("dataset", "method", "seed", "checkpoint", "target_return", "score", "return", "episodes"),
+    "validation_loss",
+)
+
+
+def evaluate_run(
+    run: Path,
+    *,
+    episodes: int,
+    seed: int,
+    env_id: str | None = None,
+    targets: Sequence[float] = (),
+    checkpoints: Sequence[str] = CHECKPOINTS,
+    distractor: float = 0.0,
+) -> list[dict[str, Any]]:
+    """One result row for each checkpoint and target return.
+
+    All rows play the same starts. A policy trained with distractors sees them fixed. IQL and CQL
+    have a last checkpoint only, and are asked for no return.
+
+    Args:
+        run: a run folder on a control store.
+        episodes: episodes a row.
+        seed: of the environments and the bootstrap.
+        env_id: None for the environment of the data.
+        targets: returns to ask for; empty for those of the preset.
+        distractor: what every distractor is fixed to (Appendix G.4: 0).
+
+    Raises:
+        InputError: the run is not on a control store, or keeps none of `checkpoints`, or its
+            environment cannot be told or made.
+    """
+    if episodes < 1:
+        raise InputError(f"{episodes} episodes were asked for; at least one is needed")
+    rows: list[dict[str, Any]] = []
+    for checkpoint in _kept(run, checkpoints):
+        trained = load_run(run, checkpoint)
+        learned = trained.record["policy"]
+        if rows and learned["best_step"] == learned["steps"]:
+            # The best checkpoint is the last: the same weights would play the same episodes.
+            rows += [{**row, "checkpoint": checkpoint} for row in rows]
+            continue
+        world = world_of(trained, env_id)
+        rows += [
+            _row(trained, world, target, episodes, seed, distractor) | {"checkpoint": checkpoint}
+            for target in targets_of(trained, world, targets)
+        ]
+    return [row | {"run": str(run)} for row in rows]
+
+
+def _kept(run: Path, checkpoints: Sequence[str]) -> Sequence[str]:
+    return ("last",) if _is_rl_run(run) and "last" in checkpoints else checkpoints
+
+
+def _is_rl_run(run: Path) -> bool:
+    return (run / RUN).exists() and is_rl(read_json(run / RUN))
+
+
+def load_run(run: Path, checkpoint: str) -> Trained:
+    """The policy of a run on a control store.
+
+    Raises:
+        InputError: it is no such run, or has no such checkpoint.
+    """
+    rl = _is_rl_run(run)
+    if rl and checkpoint != "last":
+        raise InputError(
+            f"{run} is of IQL or CQL, which keep their last checkpoint only; ask for --checkpoint "
+            "last"
+        )
+    trained = RLPolicy(run) if rl else TrainedPolicy.load(run, checkpoint)
+    if trained.record.get("dataset") is None:
+        raise InputError(f"{run} is not a run of `ucfrec-control train`; `ucfrec` judges it")
+    return trained
+
+
+def world_of(trained: Trained, env_id: str | None) -> str:
+    """The environment asked for, or that of the data.
+
+    Raises:
+        InputError: neither is known.
+    """
+    dataset = trained.record["dataset"]
+    world: str | None = env_id or dataset["env_id"]
+    if world is None:
+        raise InputError(
+            f"the data of {dataset['dataset']} does not tell the environment; name it with --env"
+        )
+    return world
+
+
+def open_world(
+    trained: Trained,
+    env_id: str,
+    count: int,
+    wrappers: Sequence[Wrap] = (),
+    distractor: float = 0.0,
+    **settings: Any,
+) -> VectorEnv[Any, Any, Any]:
+    """`count` environments as the data has them, every distractor fixed to `distractor`.
+
+    Raises:
+        InputError: `env_id` cannot be made, or is not of the sizes that the policy was trained on.
+    """
+    record, dataset = trained.record, trained.record["dataset"]
+    own = dataset.get("env_settings", {}) if env_id == dataset["env_id"] else {}
+    appended = [distractor] * len(dataset.get("distractors", []))
+    unseen = dataset.get(UNSEEN, [])
+    env = make_env(env_id, count, appended, unseen, {**own, **settings}, wrappers)
+    shown = int(np.prod(env.single_observation_space.shape or ()))
+    sizes = (shown, *(env.single_action_space.shape or ()))
+    wanted = (record["sizes"]["state"], record["sizes"]["action"])
+    if sizes != wanted:
+        env.close()
+        raise InputError(
+            f"observations and actions of {env_id} have sizes {sizes}, the policy was trained "
+            f"on {wanted}"
+        )
+    return env
+
+
+def method_of(record: Mapping[str, Any]) -> str:
+    """Name of what the run of `record` trained, with what was done about screened dimensions."""
+    name = record["config"]["policy_name"] if is_rl(record) else learner_of(record)
+    done = {SCREENINGS["copies"]: "-screened", SCREENINGS["drop"]: "-dropped"}
+    return name + "".join(ending for key, ending in done.items() if record["dataset"].get(key))
+
+
+def targets_of(
+    trained: Trained, env_id: str, asked: Sequence[float] = ()
+) -> Sequence[float | None]:
+    """The targets asked for, or those of the preset."""
+    if isinstance(trained, RLPolicy):
+        return (None,)
+    if asked:
+        return asked
+    dataset, learner = trained.record["dataset"], trained.record["config"]["policy_name"]
+    task = require_task(env_id, dataset["dataset"])
+    if learner == "bc":
+        return (trained.target_return(1.0),)
+    return find_preset(task.name, find_kind(dataset["dataset"]), learner).targets
+
+
+def _row(
+    trained: Trained, env_id: str, target: Any, episodes: int, seed: int, distractor: float
+) -> dict[str, Any]:
+    record, dataset = trained.record, trained.record["dataset"]
+    task = require_task(env_id, dataset["dataset"])
+    began = time.perf_counter()
+    env = open_world(trained, env_id, min(episodes, SIDE_BY_SIDE), distractor=distractor)
+    try:
+        actor = trained.actor(env.num_envs, target)
+        played = rollout(env, actor, episodes, seed, describe=f"{trained.name} in {env_id}")
+    finally:
+        env.close()
+    seconds = time.perf_counter() - began
+    low, high = task.score(bootstrap_interval(played.returns, seed))
+    return {
+        "dataset": dataset["dataset"],
+        "method": method_of(record),
+        "seed": record["seed"],
+        "target_return": target,
+        "score": float(task.score(played.returns.mean())),
+        "score_low": float(low),
+        "score_high": float(high),
+        "score_std": float(task.score(played.returns).std()),
+        "return": float(played.returns.mean()),
+        "length": float(played.lengths.mean()),
+        "episodes": episodes,
+        "evaluation_seed": seed,
+        "env_id": env_id,
+        "steps": record["policy"]["steps"],
+        "best_step": record["policy"]["best_step"],
+        "validation_loss": record["policy"].get("best_validation"),
+        "acceptance": record.get("augmentation", {}).get("acceptance"),
+        "distractors": dataset.get("distractors", []),
+        "distractor_fixed_to": distractor,
+        "lambda_mask": record["config"]["policy"].get("lambda_mask"),
+        "config": record["config"],
+        "config_hash": config_hash(record["config"]),
+        "fingerprint": record["fingerprint"],
+        "dataset_versions": dataset["versions"],
+        "warnings": mismatches(dataset, env_id),
+        "train_wall_time_s": record["wall_time_s"],
+        "wall_time_s": seconds,
+    }

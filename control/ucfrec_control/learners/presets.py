@@ -1,0 +1,38 @@
+"""Settings and target returns per task, kind of dataset and learner: `presets.toml`."""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Preset:
+    """What the rules that hold for a run add up to."""
+
+    tables: Mapping[str, Mapping[str, Any]]
+    """Configuration by table, as in TOML."""
+    targets: tuple[float, ...]
+    """Returns to ask of an episode; empty for a task that no rule knows."""
+
+
+def find_preset(task: str, kind: str, policy: str) -> Preset:
+    """The preset of a learner on one kind of dataset of a task.
+
+    Args:
+        task: name of a `ucfrec_control.worlds.scores.Task`; "" for none.
+        kind: as `ucfrec_control.worlds.scores.find_kind` tells it.
+        policy: a key of `ucfrec.policies.registry.POLICIES`.
+    """
+    here = {"task": task, "kind": kind, "policy": policy}
+    tables: dict[str, dict[str, Any]] = {}
+    targets: list[float] = []
+    text = files("ucfrec_control.learners").joinpath("presets.toml").read_text(encoding="utf-8")
+    for rule in tomllib.loads(text)["rule"]:
+        if any(rule.get(key, value) != value for key, value in here.items()):
+            continue
+        for table, values in rule.get("set", {}).items():
+            tables[table] = tables.get(table, {}) | values
+        targets = rule.get("targets", targets)
+    return Preset(tables, tuple(targets))

@@ -1,0 +1,281 @@
+"""IQL and CQL of d3rlpy (extra `rl`) on control stores, with CORL's settings (reference §3)."""
+
+import logging
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from tqdm import tqdm
+
+from ucfrec import schema
+from ucfrec.acting.rollout import BoolArray, FloatArray, IntArray
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.files import atomic_file, atomic_folder, read_json, write_json
+from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
+from ucfrec.fitting.tensorboard import Events
+from ucfrec.provenance import command_line, versions
+from ucfrec.runs.trained_policy import RUN
+from ucfrec_control.data.trajectories import PACKAGES
+from ucfrec_control.worlds.scores import find_kind, find_task
+
+ALGORITHMS = ("iql", "cql")
+CHECKPOINT_EVERY = 5000
+"""Steps between checkpoints and log lines."""
+_ACTOR, _CHECKPOINT = "actor.safetensors", "checkpoint.pt"
+_HOPPER_NARROW = ("medium", "medium-replay", "mixed")
+
+
+@dataclass(frozen=True)
+class RLConfig:
+    """All that decides a training, with its data."""
+
+    algorithm: str
+    steps: int
+    task: str
+    kind: str
+    batch_size: int = 256
+
+
+class RLPolicy:
+    """An actor read back from its run folder; plays without a target return."""
+
+    def __init__(self, run: Path) -> None:
+        """Raises:
+        InputError: `run` is unfinished, or d3rlpy is not installed.
+        """
+        self.record: dict[str, Any] = read_json(run / RUN)
+        self.name: str = self.record["config"]["policy_name"]
+        tensors, _ = load_tensors(run / _ACTOR)
+        self._mean, self._std = (tensors.pop(f"state.{name}").numpy() for name in ("mean", "std"))
+        self._learner = _learner(RLConfig(**self.record["config"]["policy"]))
+        sizes = self.record["sizes"]
+        self._learner.create_impl((sizes["state"],), sizes["action"])
+        load_weights(run / _ACTOR, self._learner.impl.modules.policy, tensors)
+
+    def actor(self, episodes: int, target_return: float | None) -> "RLPolicy":
+        """Itself: it remembers nothing, and asks for nothing."""
+        return self
+
+    def begin(self, rows: IntArray) -> None:
+        """See `ucfrec.acting.rollout.Actor`."""
+
+    def act(self, observations: FloatArray, live: BoolArray) -> tuple[npt.NDArray[Any], None]:
+        """The policy's mean actions."""
+        return self._learner.predict(_normalised(observations, self._mean, self._std)), None
+
+    def observe(self, actions: npt.NDArray[Any], rewards: FloatArray) -> None:
+        """See `ucfrec.acting.rollout.Actor`."""
+
+
+def is_rl(record: Mapping[str, Any]) -> bool:
+    """Whether `record` is of a run of `train_rl`."""
+    return record["config"]["policy_name"] in ALGORITHMS
+
+
+def rl_config(
+    dataset: Mapping[str, Any], algorithm: str, steps: int, batch_size: int = 256
+) -> RLConfig:
+    """The settings for the data that `ucfrec_control.learners.train.dataset_of` describes."""
+    task = find_task(dataset["env_id"], dataset["dataset"])
+    kind = find_kind(dataset["dataset"])
+    return RLConfig(algorithm, steps, task.name if task else "", kind, batch_size)
+
+
+def plain_config(config: RLConfig, seed: int) -> dict[str, Any]:
+    """`config` as a run's record has it."""
+    return {"policy_name": config.algorithm, "policy": asdict(config), "seed": seed}
+
+
+def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dict[str, Any]:
+    """Train on the training trajectories, or go on from the checkpoint in `out`; returns the record
+    of the run.
+
+    A finished run is read, not repeated. One that was killed and is started again ends with the
+    same actor as one left alone (same machine and device).
+
+    Raises:
+        InputError: d3rlpy is not installed, or `out` is of another configuration or other data.
+    """
+    d3rlpy = _d3rlpy()
+    if not (out / RUN).exists():
+        _begin(store, out, config, seed)
+    record: dict[str, Any] = read_json(out / RUN)
+    asked = (plain_config(config, seed), store.meta["fingerprint"])
+    if (record["config"], record["fingerprint"]) != asked:
+        raise InputError(f"{out} was trained otherwise; remove it or name another run folder")
+    if "policy" in record:
+        return record
+    begun = perf_counter()
+    d3rlpy.seed(seed)
+    train = store.split("train")
+    mean, std = train.state_statistics
+    dataset = _dataset(d3rlpy, train, mean.numpy(), std.numpy())
+    learner = _learner(config, "cuda:0" if torch.cuda.is_available() else "cpu:0")
+    step, seconds = _resume(out / _CHECKPOINT, learner, dataset)
+    events = Events(out, step)
+    bar = tqdm(total=config.steps, initial=step, desc=config.algorithm, unit="step", disable=None)
+    while step < config.steps:
+        if step:  # a seed of its own after each checkpoint: no generator's state need be kept
+            d3rlpy.seed(seed + step)
+        steps = min(CHECKPOINT_EVERY, config.steps - step)
+        ((_, losses),) = learner.fit(
+            dataset,
+            n_steps=steps,
+            n_steps_per_epoch=steps,
+            logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
+            show_progress=False,
+            callback=lambda *_: bar.update(),
+        )
+        step += steps
+        events.add(step, losses)
+        _save(out / _CHECKPOINT, learner, step, seconds + perf_counter() - begun)
+    bar.close()
+    events.close()
+    actor = learner.impl.modules.policy.state_dict()
+    save_tensors(out / _ACTOR, {**actor, "state.mean": mean, "state.std": std}, {})
+    record["policy"] = {"steps": config.steps, "best_step": None}
+    record["wall_time_s"] = seconds + perf_counter() - begun
+    write_json(out / RUN, record)
+    (out / _CHECKPOINT).unlink(missing_ok=True)
+    return record
+
+
+def _begin(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> None:
+    record = {
+        "command": command_line(),
+        "config": plain_config(config, seed),
+        "seed": seed,
+        "sizes": {"state": store.state_size, "action": store.meta["columns"][schema.ACTION][0]},
+        "fingerprint": store.meta["fingerprint"],
+        "dataset": dict(store.meta["source"]),
+        "versions": versions((*PACKAGES, "d3rlpy")),
+        "threads": torch.get_num_threads(),
+        "wall_time_s": 0.0,
+    }
+    with atomic_folder(out) as scratch:
+        write_json(scratch / RUN, record)
+
+
+def _resume(path: Path, learner: Any, dataset: Any) -> tuple[int, float]:
+    """Put the checkpoint at `path`, if any, into `learner`; its step and the seconds spent."""
+    if not path.exists():
+        return 0, 0.0
+    checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    learner.build_with_dataset(dataset)
+    for name, part in _parts(learner).items():
+        part.load_state_dict(checkpoint["parts"][name])
+    learner.set_grad_step(checkpoint["step"])
+    return checkpoint["step"], checkpoint["seconds"]
+
+
+def _save(path: Path, learner: Any, step: int, seconds: float) -> None:
+    parts = {name: part.state_dict() for name, part in _parts(learner).items()}
+    with atomic_file(path) as scratch:
+        torch.save({"step": step, "seconds": seconds, "parts": parts}, scratch)
+
+
+def _parts(learner: Any) -> Mapping[str, Any]:
+    """Every network and optimizer of a learner, by name."""
+    parts: Mapping[str, Any] = learner.impl.modules.create_checkpointer("cpu:0").modules
+    return parts
+
+
+def _dataset(
+    d3rlpy: Any, train: EpisodeStore, mean: npt.NDArray[Any], std: npt.NDArray[Any]
+) -> Any:
+    episodes, steps = train.all_steps()
+    last = steps == train.lengths[episodes] - 1
+    terminated = train.episode_values(schema.TERMINATED).astype(bool)[episodes]
+    observations = train.step_values(schema.OBSERVATION, episodes, steps)
+    return d3rlpy.dataset.MDPDataset(
+        _normalised(observations, mean, std),
+        train.step_values(schema.ACTION, episodes, steps),
+        train.step_values(schema.REWARD, episodes, steps),
+        terminals=(last & terminated).astype(np.float32),
+        timeouts=(last & ~terminated).astype(np.float32),
+        action_space=d3rlpy.ActionSpace.CONTINUOUS,
+    )
+
+
+def _learner(config: RLConfig, device: str = "cpu:0") -> Any:
+    d3rlpy = _d3rlpy()
+    make = {"iql": _iql, "cql": _cql}[config.algorithm]
+    return make(d3rlpy, config).create(device=device)
+
+
+def _iql(d3rlpy: Any, config: RLConfig) -> Any:
+    layers = d3rlpy.models.VectorEncoderFactory([256, 256])
+    cosine = d3rlpy.optimizers.CosineAnnealingLRFactory(T_max=config.steps)
+    settings: dict[str, Any] = {"expectile": 0.7, "weight_temp": 3.0, "tau": 0.005}
+    scaler = None
+    if config.task == "antmaze":
+        settings |= {"expectile": 0.9, "weight_temp": 10.0}
+        scaler = d3rlpy.preprocessing.ConstantShiftRewardScaler(-1.0)
+    elif config.task == "hopper" and config.kind == "medium-expert":
+        settings |= {"expectile": 0.5, "weight_temp": 6.0}
+    elif config.task == "hopper" and config.kind in _HOPPER_NARROW:
+        settings |= {"tau": 0.001}
+        scaler = d3rlpy.preprocessing.ReturnBasedRewardScaler(multiplier=1000.0)
+    return d3rlpy.algos.IQLConfig(
+        batch_size=config.batch_size,
+        max_weight=100.0,
+        reward_scaler=scaler,
+        actor_optim_factory=d3rlpy.optimizers.AdamFactory(lr_scheduler_factory=cosine),
+        actor_encoder_factory=layers,
+        critic_encoder_factory=layers,
+        value_encoder_factory=layers,
+        **settings,
+    )
+
+
+def _cql(d3rlpy: Any, config: RLConfig) -> Any:
+    layers = d3rlpy.models.VectorEncoderFactory([256, 256, 256])
+    settings: dict[str, Any] = {
+        "actor_learning_rate": 3e-5,
+        "conservative_weight": 10.0,
+        "alpha_learning_rate": 0.0,
+    }
+    if config.task == "antmaze":
+        settings = {
+            "actor_learning_rate": 1e-4,
+            "conservative_weight": 5.0,
+            "alpha_threshold": 0.8,
+            "max_q_backup": True,
+            "reward_scaler": d3rlpy.preprocessing.ConstantShiftRewardScaler(-5.0, 10.0, True),
+        }
+    return d3rlpy.algos.CQLConfig(
+        batch_size=config.batch_size,
+        critic_learning_rate=3e-4,
+        n_action_samples=10,
+        actor_encoder_factory=layers,
+        critic_encoder_factory=layers,
+        **settings,
+    )
+
+
+def _normalised(
+    states: npt.NDArray[Any], mean: npt.NDArray[Any], std: npt.NDArray[Any]
+) -> FloatArray:
+    normalised: FloatArray = ((states - mean) / (std + 1e-6)).astype(np.float32)
+    return normalised
+
+
+def _d3rlpy() -> Any:
+    try:
+        import d3rlpy
+        import structlog
+    except ImportError:
+        raise InputError(
+            "IQL and CQL need d3rlpy, which is not installed; install ucfrec[control,rl]"
+        ) from None
+    # What it says of every training, on stdout, is not what was asked for; nor is its warning that
+    # networks exist already, which after a checkpoint they must.
+    level = structlog.make_filtering_bound_logger(logging.ERROR)
+    structlog.configure(wrapper_class=level)
+    return d3rlpy

@@ -1,0 +1,352 @@
+"""Causal screening: which state dimensions cause nothing, and copies that intervene on them.
+
+A dimension that, once the other dimensions and the action are known, helps predict neither the
+reward nor the rest of the next state is no cause of anything (assumption A3, minimality).
+
+Both halves are judged on held-out trajectories. For the next state the reward is given as well: a
+dimension that measures the reward, as distractors do, then has nothing to add, however imperfect
+the predictors are. For the reward that way out is barred, so help must be worth a share of the
+reward's whole variance; a measurement of it explains no more than the predictor's own error. The
+largest errors of the next state are capped: a few falls must not decide.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from scipy import stats
+from torch import Tensor, nn
+
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import IntArray, Overlay
+from ucfrec.errors import InputError
+from ucfrec.runs.run import training_views
+
+_HELD_OUT_EVERY = 5
+_CLIP = 10.0
+_CHUNK = 1024
+_HELPED = 3
+
+
+@dataclass(frozen=True)
+class ScreeningConfig:
+    """Predictors, and how much help counts."""
+
+    hidden: int = 192
+    shared_steps: int = 3000
+    """Updates of one predictor that serves every missing dimension."""
+    own_steps: int = 1000
+    """Updates of a copy of it for each missing dimension; without them a dimension that is nearly
+    a function of others seems to help."""
+    batch_size: int = 256
+    learning_rate: float = 3e-3
+    max_transitions: int = 100_000
+    min_effect: float = 0.01
+    """Least share of a next dimension's unexplained variance that counts as help."""
+    capped: float = 0.005
+    """Share of the largest squared errors of a next dimension that count as the largest below:
+    where a body falls, one step in a thousand may make up half of their sum."""
+    min_reward_effect: float = 0.01
+    """Least share of the reward's variance that counts as help."""
+    level: float = 0.01
+    """Level of the tests, over held-out trajectories."""
+
+
+@dataclass(frozen=True)
+class DimensionReport:
+    """What one state dimension adds to the others and the action."""
+
+    dimension: int
+    effect: float
+    """Share it explains of what the others leave unexplained of the next dimensions it helps most
+    (partial R², their mean), the reward given."""
+    helps: tuple[int, ...]
+    """Those dimensions, most helped first, chosen on fitted trajectories."""
+    p_value: float
+    """Of no help there, one-sided, over held-out trajectories."""
+    reward_effect: float
+    """Share it explains of the reward's variance."""
+    reward_p_value: float
+    causes: bool
+    """Whether either help counts."""
+
+
+@dataclass(frozen=True)
+class ScreeningReport:
+    """The verdict on every dimension."""
+
+    dimensions: tuple[DimensionReport, ...]
+    reward_r2: float
+    """Held-out R² of the reward with all dimensions known."""
+    transitions: int
+
+    @property
+    def flagged(self) -> tuple[int, ...]:
+        """Dimensions that cause nothing."""
+        return tuple(d.dimension for d in self.dimensions if not d.causes)
+
+
+def screen(store: EpisodeStore, config: ScreeningConfig, seed: int) -> ScreeningReport:
+    """Judge every dimension of the observed states, on the training episodes of `store`.
+
+    Raises:
+        InputError: states are made of items, or there are too few trajectories to hold some out.
+    """
+    train, _ = training_views(store)
+    if store.has_items:
+        raise InputError(f"{store.path} is of item logs; screening is for observed states")
+    data = _Transitions.of(train, config.max_transitions, seed)
+    if len(np.unique(data.episodes[data.held_out])) < 3:
+        raise InputError(
+            f"{store.path} has {train.n_episodes} training trajectories with two steps or more; "
+            f"screening needs at least {3 * _HELD_OUT_EVERY}"
+        )
+    torch.manual_seed(seed)
+    pair = _fitted(data, config)
+    seen = np.flatnonzero(~data.held_out)
+    sample = np.random.default_rng(seed).choice(seen, min(len(seen), 4 * _CHUNK), replace=False)
+    fitted_errors, _ = _errors(pair, data, np.sort(sample))
+    next_errors, reward_errors = _errors(pair, data, np.flatnonzero(data.held_out))
+    return _report(data, fitted_errors, next_errors, reward_errors, config)
+
+
+@dataclass(frozen=True)
+class _Transitions:
+    """Standardised steps that have a successor."""
+
+    states: Tensor
+    """(N, S)."""
+    actions: Tensor
+    rewards: Tensor
+    """(N, 1)."""
+    changes: Tensor
+    """(N, S) of the state until the next step."""
+    episodes: IntArray
+    held_out: Any
+    """(N,) bool."""
+
+    @classmethod
+    def of(cls, view: EpisodeStore, most: int, seed: int) -> "_Transitions":
+        episodes, steps = view.all_steps()
+        inner = np.flatnonzero(steps < view.lengths[episodes] - 1)
+        if len(inner) > most:
+            inner = np.sort(np.random.default_rng(seed).choice(inner, most, replace=False))
+        found = view.transitions(episodes[inner], steps[inner])
+        mean, std = view.state_statistics
+        states = (found.states - mean) / torch.where(std > 1e-6, std, 1.0)
+        following = (found.next_states - mean) / torch.where(std > 1e-6, std, 1.0)
+        return cls(
+            states=states.clamp(-_CLIP, _CLIP),
+            actions=_standardised(found.actions),
+            rewards=_standardised(found.rewards.unsqueeze(1)),
+            changes=_standardised(following - states),
+            episodes=episodes[inner],
+            held_out=episodes[inner] % _HELD_OUT_EVERY == _HELD_OUT_EVERY // 2,
+        )
+
+
+def _standardised(values: Tensor) -> Tensor:
+    std, mean = torch.std_mean(values, dim=0)
+    return ((values - mean) / torch.where(std > 1e-6, std, 1.0)).clamp(-_CLIP, _CLIP)
+
+
+class _Predictors(nn.Module):
+    """M perceptrons of one shape, side by side."""
+
+    def __init__(self, sizes: Sequence[int], count: int = 1) -> None:
+        super().__init__()
+        self.sizes = sizes
+        pairs = list(pairwise(sizes))
+        self.weights = nn.ParameterList(torch.randn(count, i, o) / i**0.5 for i, o in pairs)
+        self.biases = nn.ParameterList(torch.zeros(count, 1, o) for _, o in pairs)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """(M, B, in) to (M, B, out)."""
+        hidden = inputs
+        for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            hidden = torch.baddbmm(bias, nn.functional.silu(hidden) if layer else hidden, weight)
+        return hidden
+
+    def repeated(self, count: int) -> "_Predictors":
+        """`count` copies of a single perceptron."""
+        copies = _Predictors(self.sizes, count)
+        with torch.no_grad():
+            for copy, original in zip(copies.parameters(), self.parameters(), strict=True):
+                copy.copy_(original.expand_as(copy))
+        return copies
+
+
+class _Pair(nn.Module):
+    """Predictors of the next state, the reward given, and of the reward, dimensions missing."""
+
+    def __init__(self, next_state: _Predictors, reward: _Predictors) -> None:
+        super().__init__()
+        self.next_state, self.reward = next_state, reward
+
+    def errors(self, data: _Transitions, rows: Tensor, missing: Tensor) -> tuple[Tensor, Tensor]:
+        """Squared errors (M, B, S) and (M, B); `missing`, (M, 1 or B, S), is 1 where unseen."""
+        missing = missing.expand(-1, len(rows), -1)
+
+        def spread(values: Tensor) -> Tensor:
+            return values[rows].expand(len(missing), -1, -1)
+
+        inputs = torch.cat([data.states[rows] * (1 - missing), missing, spread(data.actions)], 2)
+        with_reward = torch.cat([inputs, spread(data.rewards)], 2)
+        next_errors = (self.next_state(with_reward) - data.changes[rows]).square()
+        return next_errors, (self.reward(inputs) - data.rewards[rows]).square().squeeze(2)
+
+
+def _absences(size: int) -> Tensor:
+    """(S + 1, S): row j misses dimension j, the last row none."""
+    return torch.cat([torch.eye(size), torch.zeros(1, size)])
+
+
+def _fitted(data: _Transitions, config: ScreeningConfig) -> _Pair:
+    """S + 1 pairs of predictors, one for each row of `_absences`."""
+    size, width = data.states.shape[1], config.hidden
+    inputs = 2 * size + data.actions.shape[1]
+    pair = _Pair(
+        _Predictors((inputs + 1, width, width, size)), _Predictors((inputs, width, width, 1))
+    )
+    absences = _absences(size)
+
+    def some_missing() -> Tensor:
+        # A third of the rows miss nothing, so that the complete predictor is not the worst trained.
+        drawn = torch.randint(3 * size // 2 + 1, (config.batch_size,)).clamp(max=size)
+        return absences[drawn].unsqueeze(0)
+
+    _optimise(pair, data, some_missing, config.shared_steps, config.learning_rate, config)
+    pair = _Pair(pair.next_state.repeated(size + 1), pair.reward.repeated(size + 1))
+    own = absences.unsqueeze(1)
+    _optimise(pair, data, lambda: own, config.own_steps, config.learning_rate / 3, config)
+    return pair
+
+
+def _optimise(
+    pair: _Pair,
+    data: _Transitions,
+    missing: Callable[[], Tensor],
+    steps: int,
+    learning_rate: float,
+    config: ScreeningConfig,
+) -> None:
+    rows = torch.from_numpy(np.flatnonzero(~data.held_out))
+    optimizer = torch.optim.Adam(pair.parameters(), lr=learning_rate)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, learning_rate, steps)
+    for _ in range(steps):
+        absent = missing()
+        batch = rows[torch.randint(len(rows), (config.batch_size,))]
+        next_errors, reward_errors = pair.errors(data, batch, absent)
+        # A missing dimension's own future is no part of the rest.
+        loss = (next_errors * (1 - absent)).mean((1, 2)).sum() + reward_errors.mean(1).sum()
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+        schedule.step()
+
+
+@torch.no_grad()
+def _errors(pair: _Pair, data: _Transitions, rows: IntArray) -> tuple[Tensor, Tensor]:
+    """Squared errors at `rows`: (S + 1, B, S) and (S + 1, B)."""
+    absent = _absences(data.states.shape[1]).unsqueeze(1)
+    chunks = torch.split(torch.from_numpy(rows), _CHUNK)
+    parts = [pair.errors(data, chunk, absent) for chunk in chunks]
+    next_errors, reward_errors = zip(*parts, strict=True)
+    return torch.cat(next_errors, 1), torch.cat(reward_errors, 1)
+
+
+def _report(
+    data: _Transitions,
+    fitted_errors: Tensor,
+    next_errors: Tensor,
+    reward_errors: Tensor,
+    config: ScreeningConfig,
+) -> ScreeningReport:
+    size = data.states.shape[1]
+    rows = np.flatnonzero(data.held_out)
+    variance = float(data.rewards[torch.from_numpy(rows)].var())
+    fitted = fitted_errors.mean(1)
+    gain = 1 - fitted[-1] / fitted[:-1].clamp(min=1e-12)  # (S, S)
+    most_helped = gain.fill_diagonal_(-torch.inf).topk(min(_HELPED, size - 1)).indices
+    found = []
+    for j in range(size):
+        pair = next_errors[[j, -1]][:, :, most_helped[j]]  # (2, B, helped)
+        without, with_it = pair.minimum(pair.flatten(0, 1).quantile(1 - config.capped, dim=0))
+        saved = (without - with_it) / without.mean(0).clamp(min=1e-12)
+        effect, p_value = float(saved.mean()), _p_value(saved.mean(1), data.episodes[rows])
+        more = reward_errors[j] - reward_errors[-1]
+        reward_effect = float(more.mean()) / max(variance, 1e-12)
+        reward_p_value = _p_value(more, data.episodes[rows])
+        causes = (effect >= config.min_effect and p_value < config.level) or (
+            reward_effect >= config.min_reward_effect and reward_p_value < config.level
+        )
+        found.append(
+            DimensionReport(
+                dimension=j,
+                effect=effect,
+                helps=tuple(most_helped[j].tolist()),
+                p_value=p_value,
+                reward_effect=reward_effect,
+                reward_p_value=reward_p_value,
+                causes=causes,
+            )
+        )
+    r2 = 1 - float(reward_errors[-1].mean()) / max(variance, 1e-12)
+    return ScreeningReport(tuple(found), r2, len(data.states))
+
+
+def _p_value(differences: Tensor, episodes: IntArray) -> float:
+    """Of a mean of at most 0, one-sided, where whole trajectories (not steps) are independent."""
+    _, cluster = np.unique(episodes, return_inverse=True)
+    counts = np.bincount(cluster)
+    values = differences.double().numpy()
+    residual = np.bincount(cluster, values) - counts * values.mean()
+    # Cluster-robust standard error of the mean.
+    error = np.sqrt((residual**2).sum() * len(counts) / (len(counts) - 1)) / len(values)
+    return float(stats.t.sf(values.mean() / max(error, 1e-300), len(counts) - 1))
+
+
+def interventions(
+    view: EpisodeStore, dimensions: Sequence[int], seed: int, copies: int = 2
+) -> Overlay:
+    """Copies of every episode of `view` under do(d ~ marginal), d being `dimensions`.
+
+    Values are drawn, jointly, from the steps of the view. Copies 0, 2, … draw once an episode, as
+    an intervention that stays put; copies 1, 3, … at every step.
+
+    Args:
+        view: a view without an overlay.
+    """
+    rng = np.random.default_rng(seed)
+    episodes, steps = view.all_steps()
+    states = view.windows(episodes, steps, 1).states[:, 0].numpy()
+    edited = []
+    for copy in range(copies):
+        by_episode = rng.integers(len(steps), size=view.n_episodes)[episodes]
+        drawn = by_episode if copy % 2 == 0 else rng.integers(len(steps), size=len(steps))
+        changed = states.copy()
+        changed[:, list(dimensions)] = states[drawn][:, list(dimensions)]
+        edited.append(changed)
+    numbers = np.arange(copies)[:, None] * view.n_episodes + episodes
+    return Overlay(
+        copy_source=np.tile(view.episode_ids, copies),
+        edit_copy=numbers.reshape(-1),
+        edit_step=np.tile(steps, copies),
+        edit_state=np.concatenate(edited),
+    )
+
+
+def describe_screening(report: ScreeningReport) -> str:
+    """The verdicts as a table."""
+    lines = [f"{report.transitions:,} transitions, reward R² {report.reward_r2:.4f}", ""]
+    lines.append("dimension  next state        p     reward        p  causes")
+    lines += [
+        f"{d.dimension:>9}  {d.effect:>10.4f}  {d.p_value:>7.1g}  "
+        f"{d.reward_effect:>9.5f}  {d.reward_p_value:>7.1g}  {'yes' if d.causes else 'NOTHING'}"
+        for d in report.dimensions
+    ]
+    flagged = ", ".join(map(str, report.flagged)) or "none"
+    return "\n".join([*lines, "", f"dimensions that cause nothing: {flagged}"])

@@ -1,0 +1,148 @@
+"""An episode to look at: a video, or a folder of frames."""
+
+import os
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from functools import partial
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from matplotlib.image import imsave
+
+from ucfrec.acting.rollout import rollout
+from ucfrec.errors import InputError
+from ucfrec.files import atomic_file, atomic_folder
+from ucfrec_control.learners.evaluate import load_run, open_world, targets_of, world_of
+
+Frame = npt.NDArray[np.uint8]
+"""(height, width, 3)."""
+Take = Callable[[Frame, float], None]
+"""Of a frame, and how many of them are a second of the world."""
+_VIDEO = ".mp4"
+
+
+def record_episode(
+    run: Path,
+    out: Path,
+    *,
+    seed: int,
+    checkpoint: str,
+    env_id: str | None,
+    target: float | None,
+    distractor: float = 0.0,
+) -> float:
+    """Play one episode, which starts as the first that `evaluate_run` plays, and keep its frames.
+
+    Args:
+        run: a run folder on a control store.
+        out: `NAME.mp4`, or a folder for `frame-00000.png`, …; the first frame is the start. Appears
+            when the episode has ended.
+        target: return to ask for; None for the preset's first.
+        distractor: what every distractor is fixed to.
+
+    Returns:
+        The return of the episode.
+
+    Raises:
+        InputError: as `evaluate_run`, or `out` exists, or nothing can be drawn here.
+    """
+    if out.suffix not in ("", _VIDEO):
+        raise InputError(f"{out} names neither an {_VIDEO} nor, with a dot, a folder for frames")
+    if out.exists():
+        raise InputError(f"{out} exists already; remove it or name another with --video")
+    trained = load_run(run, checkpoint)
+    world = world_of(trained, env_id)
+    asked: Any = targets_of(trained, world, () if target is None else (target,))[0]
+    if not os.environ.get("DISPLAY"):
+        os.environ.setdefault("MUJOCO_GL", "egl")
+    with (_video if out.suffix == _VIDEO else _frames)(out) as take:
+        with _drawing(world):
+            recorder = partial(_Recorder, take=take)
+            env = open_world(
+                trained, world, 1, [recorder], distractor=distractor, render_mode="rgb_array"
+            )
+        try:
+            played = rollout(env, trained.actor(1, asked), 1, seed, describe="episode to look at")
+        finally:
+            env.close()
+    return float(played.returns[0])
+
+
+class _Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Hands every frame of the first episode to `take`."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any], take: Take) -> None:
+        super().__init__(env)
+        self._take = take
+        self._ended = False
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        shown = super().reset(**options)
+        self._show()
+        return shown
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        outcome = super().step(action)
+        self._show()
+        self._ended = outcome[2] or outcome[3]
+        return outcome
+
+    def _show(self) -> None:
+        if not self._ended:
+            with _drawing(str(self.spec.id) if self.spec else "the environment"):
+                frame = self.env.render()
+            self._take(np.asarray(frame), self.metadata["render_fps"])
+
+
+@contextmanager
+def _drawing(world: str) -> Iterator[None]:
+    """Whatever goes wrong with OpenGL, which raises all sorts of errors, in one line."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except InputError:
+        raise
+    except Exception as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(
+            f"{world} cannot be drawn here ({reason}); install OpenGL (libegl1, or libosmesa6) and "
+            "set MUJOCO_GL to egl, or osmesa"
+        ) from error
+
+
+@contextmanager
+def _frames(out: Path) -> Iterator[Take]:
+    with atomic_folder(out) as scratch:
+        number = count()
+        yield lambda frame, _: imsave(scratch / f"frame-{next(number):05d}.png", frame)
+
+
+@contextmanager
+def _video(out: Path) -> Iterator[Take]:
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        raise InputError(
+            f"{out} needs imageio-ffmpeg, which is not installed; install ucfrec[control,video], "
+            "or name a folder for frames"
+        ) from None
+    with atomic_file(out) as scratch, ExitStack() as stack:
+        writers: list[Any] = []
+
+        def take(frame: Frame, fps: float) -> None:
+            if not writers:
+                size = (frame.shape[1], frame.shape[0])
+                writer = imageio_ffmpeg.write_frames(
+                    str(scratch), size, fps=fps, output_params=["-f", "mp4"]
+                )
+                writer.send(None)
+                writers.append(stack.enter_context(closing(writer)))
+            writers[0].send(np.ascontiguousarray(frame))
+
+        yield take

@@ -1,0 +1,120 @@
+"""The KuaiRand world: users whose clicks are filled in from the rows of an evaluation window.
+
+`python -m ucfrec_simulators.kuai.kuairand STORE VIDEO_FEATURES_BASIC --out FOLDER` makes its files
+from a store of that window.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pyarrow.parquet as pq
+
+from ucfrec import schema
+from ucfrec.acting.rollout import FloatArray
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.plugins import Simulator
+from ucfrec_simulators.behaviors import Uniform
+from ucfrec_simulators.folders import data_folder
+from ucfrec_simulators.kuai.completion import ITEMS_FILE, USERS_FILE, Completed, complete
+from ucfrec_simulators.kuai.environment import EXITS, REGIMES, ExitRule, KuaiEnv, Regime, oracle
+from ucfrec_simulators.kuai.kuairec import parse_tags, read_columns
+
+SOURCE: Final = "https://kuairand.com (data/video_features_basic_*)"
+MAKE_IT: Final = "make them with `python -m ucfrec_simulators.kuai.kuairand`, or name their folder"
+
+
+def kuairand(
+    num_envs: int,
+    folder: Path | None = None,
+    exit_rule: ExitRule = EXITS["easyrl4rec-kuairand"],
+    regime: Regime = REGIMES["FB"],
+) -> KuaiEnv:
+    """The world of all users × all videos that KuaiRand describes; the reward is the probability of
+    a click.
+
+    Args:
+        folder: what `ucfrec_simulators.kuai.completion.complete` wrote; None for `kuairand-world`
+            in the data folder.
+
+    Raises:
+        InputError: a file is missing.
+    """
+    folder = folder or data_folder("kuairand-world")
+    for name in (USERS_FILE, ITEMS_FILE):
+        if not (folder / name).is_file():
+            raise InputError(f"{folder / name} is missing; {MAKE_IT}")
+    users, items = pq.read_table(folder / USERS_FILE), pq.read_table(folder / ITEMS_FILE)
+    user_vectors, item_vectors = (_matrix(table) for table in (users, items))
+    return KuaiEnv(
+        num_envs,
+        Completed(user_vectors, item_vectors),
+        items["tags"].to_pylist(),
+        exit_rule,
+        regime,
+        np.asarray(users[schema.USER_ID]),
+        np.asarray(items[schema.ITEM_ID]),
+    )
+
+
+def _matrix(table: "pq.Table") -> FloatArray:
+    vectors = table["vector"].combine_chunks()
+    return np.asarray(vectors.flatten()).reshape(len(vectors), -1)
+
+
+def read_tags(path: Path) -> dict[int, tuple[int, ...]]:
+    """Tags of each video of a `video_features_basic` file; a video may have none.
+
+    Raises:
+        InputError: it is not the official file.
+    """
+    table = read_columns(path, ["video_id", "tag"], SOURCE)
+    tags = table["tag"].fillna("").astype(str)
+    return {video: parse_tags(own) for video, own in zip(table["video_id"], tags, strict=True)}
+
+
+def simulator(regime: str) -> Simulator:
+    """The world under one regime, for the command line."""
+    return Simulator(
+        summary=f"KuaiRand's users and videos, click probabilities filled in; regime {regime}",
+        make=partial(kuairand, regime=REGIMES[regime]),
+        behaviors={"random": Uniform, "oracle": oracle},
+        feedback="is_click",
+    )
+
+
+SIMULATOR: Final = simulator("FB")
+SIMULATOR_NX_0: Final = simulator("NX_0")
+SIMULATOR_NX_10: Final = simulator("NX_10")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Make the world's files; returns the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m ucfrec_simulators.kuai.kuairand")
+    parser.add_argument("store", type=Path, help="store of the evaluation window, reward is_click")
+    parser.add_argument("video_features_basic", type=Path, help="the official file, for the tags")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the world")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args(arguments)
+    try:
+        tags = read_tags(options.video_features_basic)
+        report = complete(EpisodeStore.open(options.store), tags, options.out, seed=options.seed)
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    print(
+        f"{options.out}: {report.users} users × {report.items} items from {report.rows} rows; on "
+        f"{report.held_out_rows} later rows AUC {report.auc:.3f}, log loss {report.log_loss:.4f} "
+        f"(everybody alike {report.base_log_loss:.4f}), calibration error "
+        f"{report.calibration_error:.3f}"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,102 @@
+"""The KuaiRec world: users who watched nearly every video of `small_matrix`."""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pandas as pd
+
+from ucfrec.errors import InputError
+from ucfrec.plugins import Simulator
+from ucfrec_simulators.behaviors import Uniform
+from ucfrec_simulators.folders import data_folder
+from ucfrec_simulators.kuai.environment import EXITS, REGIMES, ExitRule, KuaiEnv, Regime, oracle
+
+REWARD_CAP: Final = 5.0
+CATEGORIES: Final = "item_categories.csv"
+SOURCE: Final = "https://kuairec.com (KuaiRec.zip, folder data)"
+
+
+def kuairec(
+    num_envs: int,
+    folder: Path | None = None,
+    exit_rule: ExitRule = EXITS["easyrl4rec-kuairec"],
+    regime: Regime = REGIMES["FB"],
+) -> KuaiEnv:
+    """The world of 1,411 users × 3,327 videos.
+
+    The reward is the raw `watch_ratio`, clipped at 5; the 0.4% of pairs that were never observed
+    pay 0.
+
+    Args:
+        folder: holds `small_matrix.csv` and `item_categories.csv`; None for `kuairec` in the data
+            folder.
+
+    Raises:
+        InputError: a file is missing or is not the official one, or a video has no categories.
+    """
+    folder = folder or data_folder("kuairec")
+    watched = read_columns(
+        folder / "small_matrix.csv", ["user_id", "video_id", "watch_ratio"], SOURCE
+    )
+    users, rows = np.unique(watched["user_id"].to_numpy(), return_inverse=True)
+    items, columns = np.unique(watched["video_id"].to_numpy(), return_inverse=True)
+    rewards = np.zeros((len(users), len(items)), dtype=np.float32)
+    paid = np.nan_to_num(watched["watch_ratio"].to_numpy(), nan=0.0)
+    rewards[rows, columns] = np.clip(paid, 0.0, REWARD_CAP)
+    categories = read_categories(folder)
+    missing = [item for item in items if item not in categories]
+    if missing:
+        raise InputError(
+            f"{folder / CATEGORIES} lacks {len(missing)} videos such as {missing[0]}; see {SOURCE}"
+        )
+    tags = [categories[item] for item in items]
+    return KuaiEnv(num_envs, rewards, tags, exit_rule, regime, users, items)
+
+
+def read_categories(folder: Path) -> dict[int, tuple[int, ...]]:
+    """Categories of every video of the official `item_categories.csv` in `folder`.
+
+    Raises:
+        InputError: it is missing or is not the official file.
+    """
+    table = read_columns(folder / CATEGORIES, ["video_id", "feat"], SOURCE)
+    feats = (parse_tags(text.strip("[]")) for text in table["feat"])
+    return dict(zip(table["video_id"], feats, strict=True))
+
+
+def read_columns(path: Path, columns: Sequence[str], source: str) -> pd.DataFrame:
+    """Columns of a CSV file.
+
+    Raises:
+        InputError: it is missing or lacks a column.
+    """
+    try:
+        return pd.read_csv(path, usecols=list(columns))
+    except FileNotFoundError:
+        raise InputError(f"{path} is missing; get it from {source}, or name its folder") from None
+    except ValueError as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"{path} is not the official file ({reason}); see {source}") from None
+
+
+def parse_tags(text: str) -> tuple[int, ...]:
+    """Numbers between commas: "27, 9" is (27, 9)."""
+    return tuple(int(tag) for tag in text.split(",") if tag.strip())
+
+
+def simulator(regime: str) -> Simulator:
+    """The world under one regime, for the command line."""
+    return Simulator(
+        summary=f"KuaiRec's fully observed users and videos, watch ratio up to 5; regime {regime}",
+        make=partial(kuairec, regime=REGIMES[regime]),
+        behaviors={"random": Uniform, "oracle": oracle},
+        feedback="watch_ratio",
+    )
+
+
+SIMULATOR: Final = simulator("FB")
+SIMULATOR_NX_0: Final = simulator("NX_0")
+SIMULATOR_NX_10: Final = simulator("NX_10")

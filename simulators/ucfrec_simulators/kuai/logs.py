@@ -1,0 +1,62 @@
+"""Kuaishou logs as the public experiments use them: windows apart, sessions cut by an exit rule."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from ucfrec.errors import InputError
+from ucfrec.files import atomic_file
+from ucfrec.schema import SESSION_ID
+from ucfrec_simulators.kuai.environment import ExitRule
+from ucfrec_simulators.kuai.exit_cuts import sessions_by_exit
+
+USER, VIDEO = "user_id", "video_id"
+
+
+def window(files: Sequence[Path], time: str, where: str) -> pa.Table:
+    """Rows of a window of the logs: each (user, video, time) once, by user and time.
+
+    Args:
+        files: Parquet or CSV, of the same columns.
+        time: the column of times.
+        where: SQL condition.
+
+    Raises:
+        InputError: no row is in the window.
+    """
+    names = ", ".join("'" + str(file).replace("'", "''") + "'" for file in files)
+    read = "read_parquet" if files[0].suffix == ".parquet" else "read_csv"
+    key = f"{USER}, {VIDEO}, {time}"
+    rows = (
+        duckdb.connect()
+        .sql(
+            f"SELECT * FROM {read}([{names}]) WHERE {where} "
+            f"QUALIFY row_number() OVER (PARTITION BY {key}) = 1 ORDER BY {USER}, {time}, {VIDEO}"
+        )
+        .to_arrow_table()
+    )
+    if not rows.num_rows:
+        raise InputError(f"{files[0]}: no row has {where}; are these the official logs?")
+    return rows
+
+
+def cut_by_exit(rows: pa.Table, tags: Mapping[int, Sequence[int]], exit_rule: ExitRule) -> pa.Table:
+    """The rows of `window` with a `session_id`: a session ends where the user would have left.
+
+    Args:
+        tags: of each video; one without any need not be there.
+    """
+    videos, numbers = np.unique(np.asarray(rows[VIDEO]), return_inverse=True)
+    own: list[Sequence[int]] = [tags.get(int(video), ()) for video in videos]
+    sessions = sessions_by_exit(np.asarray(rows[USER]), numbers, own, exit_rule)
+    return rows.append_column(SESSION_ID, pa.array(sessions))
+
+
+def write_log(rows: pa.Table, path: Path) -> None:
+    """Write rows as Parquet, atomically."""
+    with atomic_file(path) as scratch:
+        pq.write_table(rows, scratch)

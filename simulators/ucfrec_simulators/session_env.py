@@ -1,0 +1,171 @@
+"""What every world here shares: sessions side by side, each replaced in the step it ends in."""
+
+from abc import ABC, abstractmethod
+from typing import Any, SupportsFloat, cast
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from ucfrec.acting.rollout import BoolArray, FloatArray, IntArray
+from ucfrec.errors import InputError
+
+AnyArray = npt.NDArray[Any]
+
+
+def draw_categories(
+    probabilities: npt.NDArray[np.floating[Any]], uniforms: npt.NDArray[np.float64]
+) -> IntArray:
+    """Sample one category a row by inverting the cumulative distribution.
+
+    Args:
+        probabilities: (M, K), rows proportional to probabilities.
+        uniforms: (M,) on [0, 1).
+
+    Returns:
+        (M,) categories, 0 to K − 1.
+    """
+    cumulative = np.cumsum(probabilities, axis=1, dtype=np.float64)
+    chosen: IntArray = np.argmax(cumulative > uniforms[:, None] * cumulative[:, -1:], axis=1)
+    return chosen
+
+
+class SessionsEnv(VectorEnv[FloatArray, AnyArray, AnyArray], ABC):
+    """N sessions played at once with `AutoresetMode.SAME_STEP`.
+
+    A step that ends a session returns the first observation of its successor, and the ended
+    session's own in `info["final_obs"]` and `info["final_info"]`, as `SyncVectorEnv` does. All
+    randomness comes from the one generator that `reset(seed=…)` seeds.
+
+    Raises:
+        InputError: `num_envs` is not positive; or, on a step, actions of the wrong shape, not
+            finite, or unknown.
+    """
+
+    def __init__(
+        self,
+        num_envs: int,
+        single_observation_space: spaces.Box,
+        single_action_space: spaces.Box | spaces.Discrete,
+    ) -> None:
+        if num_envs < 1:
+            raise InputError(f"num_envs is {num_envs}; at least one session must be played")
+        self.num_envs = num_envs
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        self.single_observation_space = single_observation_space
+        self.single_action_space = single_action_space
+        self.observation_space = batch_space(single_observation_space, num_envs)
+        self.action_space = batch_space(single_action_space, num_envs)
+        self._started = False
+
+    @abstractmethod
+    def _begin(self, rows: IntArray) -> None:
+        """Start new sessions in `rows`."""
+
+    @abstractmethod
+    def _play(self, actions: AnyArray) -> tuple[FloatArray, BoolArray, BoolArray]:
+        """Advance every session by a step: rewards, terminated and truncated, each (N,)."""
+
+    @abstractmethod
+    def _observe(self) -> FloatArray:
+        """Observations (N, O), an array of their own."""
+
+    @abstractmethod
+    def _describe(self) -> dict[str, AnyArray]:
+        """What `info` says of every session, arrays of N rows of their own."""
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[FloatArray, dict[str, Any]]:
+        """Start all sessions afresh: observations (N, O) and info."""
+        super().reset(seed=seed, options=options)
+        self._begin(np.arange(self.num_envs))
+        self._started = True
+        return self._observe(), self._info(np.ones(self.num_envs, dtype=np.bool_))
+
+    def step(
+        self, actions: AnyArray
+    ) -> tuple[FloatArray, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
+        """Play one action a session: observations, rewards, terminated, truncated, info."""
+        if not self._started:
+            raise ResetNeeded("call reset before the first step")
+        rewards, terminated, truncated = self._play(self._checked(actions))
+        ended = terminated | truncated
+        final = {}
+        if ended.any():
+            # Gymnasium's convention is an object array that holds an observation or None.
+            final_obs = np.full(self.num_envs, None, dtype=object)
+            rows = np.flatnonzero(ended)
+            for row, last in zip(rows, self._observe()[rows], strict=True):
+                final_obs[row] = last
+            final = {
+                "final_obs": final_obs,
+                "_final_obs": ended,
+                "final_info": self._info(ended),
+                "_final_info": ended,
+            }
+            self._begin(rows)
+        everywhere = np.ones(self.num_envs, dtype=np.bool_)
+        return self._observe(), rewards, terminated, truncated, self._info(everywhere) | final
+
+    def _info(self, rows: BoolArray) -> dict[str, AnyArray]:
+        described = self._describe()
+        return described | {f"_{key}": rows.copy() for key in described}
+
+    def _checked(self, actions: AnyArray) -> AnyArray:
+        space = self.action_space
+        actions = np.asarray(actions)
+        if actions.shape != space.shape:
+            raise InputError(
+                f"{type(self).__name__} takes actions of shape {space.shape}, got {actions.shape}"
+            )
+        if isinstance(space, spaces.MultiDiscrete):
+            if not np.issubdtype(actions.dtype, np.integer) or not space.contains(
+                actions.astype(space.dtype)
+            ):
+                raise InputError(
+                    f"{type(self).__name__} takes whole numbers from 0 to {space.nvec[0] - 1}"
+                )
+            return actions.astype(np.int64)
+        if not np.isfinite(actions).all():
+            raise InputError(f"{type(self).__name__} was given actions that are not finite")
+        return actions.astype(np.float32, copy=False)
+
+
+class SingleSession(gymnasium.Env[FloatArray, AnyArray]):
+    """One session at a time: the plain Gymnasium view of a world of one."""
+
+    def __init__(self, world: VectorEnv[FloatArray, AnyArray, AnyArray]) -> None:
+        if world.num_envs != 1:
+            raise InputError(f"SingleSession needs a world of one session, got {world.num_envs}")
+        self._world = world
+        self.observation_space = world.single_observation_space
+        self.action_space = world.single_action_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[FloatArray, dict[str, Any]]:
+        """Start a session: observation (O,) and info."""
+        super().reset(seed=seed, options=options)
+        observations, infos = self._world.reset(seed=seed, options=options)
+        return observations[0], _first(infos)
+
+    def step(
+        self, action: AnyArray
+    ) -> tuple[FloatArray, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Play one action: observation (O,), reward, terminated, truncated, info."""
+        observations, rewards, terminated, truncated, infos = self._world.step(
+            np.asarray(action)[None]
+        )
+        ended = bool(terminated[0] | truncated[0])
+        observation = cast(FloatArray, infos["final_obs"][0]) if ended else observations[0]
+        info = _first(infos["final_info"] if ended else infos)
+        return observation, float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info
+
+
+def _first(infos: dict[str, Any]) -> dict[str, Any]:
+    return {key: value[0] for key, value in infos.items() if not key.startswith("_")}

@@ -1,0 +1,1 @@
+"""Worlds of pages and shoppers: VirtualTaobao and one of our own."""

@@ -1,0 +1,96 @@
+"""VirtualTaobao with the exit rule of CIRS (Gao et al., TOIS 2023): sameness ends a session."""
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector.utils import batch_space
+
+from ucfrec.acting.rollout import BoolArray, FloatArray, IntArray
+from ucfrec.plugins import Simulator
+from ucfrec_simulators.behaviors import Uniform
+from ucfrec_simulators.folders import data_folder
+from ucfrec_simulators.session_env import AnyArray
+from ucfrec_simulators.taobao import ddpg
+from ucfrec_simulators.taobao.environment import (
+    ACTION_DIM,
+    MAX_CLICKS,
+    PAGE_INDICES,
+    USER_BITS,
+    best_constant_actor,
+    zero_actor,
+)
+from ucfrec_simulators.taobao.virtual import VirtualTaobao, mixture
+
+WINDOW: Final = 5
+THRESHOLD: Final = 3.0
+MAX_TURN: Final = 50
+
+
+class CirsTaobao(VirtualTaobao):
+    """The published users and clicks; the user leaves when a page is ranked much as one before.
+
+    A session terminates in the step whose action is within a Euclidean distance of `threshold` of
+    one of the `window` − 1 actions before it, and is truncated after `max_turn` pages; the leave
+    network has no say.
+
+    Observation (118,): 88 user bits, all zero from the second page on, when the last action (27,
+    zero on the first page) stands in their place; clicks on the last page, its index, and pages
+    turned.
+
+    Args:
+        folder, num_envs: as of `VirtualTaobao`.
+        window, threshold, max_turn: published values.
+    """
+
+    def __init__(
+        self,
+        folder: Path | str,
+        num_envs: int = 1,
+        window: int = WINDOW,
+        threshold: float = THRESHOLD,
+        max_turn: int = MAX_TURN,
+    ) -> None:
+        super().__init__(folder, num_envs)
+        self._threshold, self._max_turn = threshold, max_turn
+        # What was never played is infinitely far from everything.
+        self._recent = np.full((num_envs, window - 1, ACTION_DIM), np.inf, dtype=np.float32)
+        limits = np.array([MAX_CLICKS, PAGE_INDICES - 1, max_turn], dtype=np.float32)
+        high = np.concatenate([np.ones(USER_BITS + ACTION_DIM, dtype=np.float32), limits])
+        low = np.zeros_like(high)
+        low[USER_BITS : USER_BITS + ACTION_DIM] = -1
+        self.single_observation_space = spaces.Box(low, high, dtype=np.float32)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+
+    def _begin(self, rows: IntArray) -> None:
+        super()._begin(rows)
+        self._recent[rows] = np.inf
+
+    def _play(self, actions: AnyArray) -> tuple[FloatArray, BoolArray, BoolArray]:
+        clicks, _, _ = super()._play(actions)
+        distances = np.linalg.norm(self._recent - actions[:, None], axis=-1)
+        bored = np.asarray((distances <= self._threshold).any(axis=1))
+        self._recent = np.concatenate([self._recent[:, 1:], actions[:, None]], axis=1)
+        return clicks, bored, np.asarray((self._pages >= self._max_turn) & ~bored)
+
+    def _observe(self) -> FloatArray:
+        begun = self._pages[:, None] > 0
+        users = np.where(begun, 0, self._users)
+        actions = np.where(begun, self._recent[:, -1], 0)
+        counts = np.concatenate([self._last, self._pages[:, None]], axis=1)
+        return np.concatenate([users, actions, counts], axis=1, dtype=np.float32)
+
+
+SIMULATOR: Final = Simulator(
+    summary="VirtualTB-v0 with the exit rule of CIRS: pages ranked alike end the session",
+    make=lambda num_envs, folder: CirsTaobao(folder or data_folder("virtualtaobao"), num_envs),
+    behaviors={
+        "random": Uniform,
+        "zero": zero_actor,
+        "best-constant": best_constant_actor,
+        "mixture": mixture,
+        **ddpg.BEHAVIORS,
+    },
+    feedback="clicks",
+)

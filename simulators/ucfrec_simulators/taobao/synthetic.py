@@ -1,0 +1,148 @@
+"""A Taobao world with nothing to download, whose best action is known: regret is exact."""
+
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium.vector import VectorEnv
+
+from ucfrec.acting.rollout import FloatArray, IntArray
+from ucfrec.plugins import Simulator
+from ucfrec_simulators.behaviors import Blend, Rule, SessionMixture, Uniform
+from ucfrec_simulators.session_env import AnyArray, draw_categories
+from ucfrec_simulators.taobao import ddpg
+from ucfrec_simulators.taobao.environment import (
+    ACTION_DIM,
+    ATTRIBUTES,
+    LONGEST_SESSION,
+    MAX_CLICKS,
+    PAGE_INDICES,
+    USER_BITS,
+    TaobaoEnv,
+    best_constant_actor,
+    default_action,
+    split_observations,
+    taobao,
+    zero_actor,
+)
+
+BEST_CLICK_PROBABILITY: Final = 0.9
+TOLERANCE: Final = 0.1
+"""Mean squared distance from the best action at which the click probability is a quarter."""
+
+
+class SyntheticTaobao(TaobaoEnv):
+    """The spaces and interface of `VirtualTaobao` over a built-in user model.
+
+    The best action of user u on page k is a*(u, k) = 0.9 tanh(b + Σ_g W_g[u_g] + d k / (k + 4)): a
+    taste common to all, one for each of the eleven attributes, and a drift as pages are turned.
+    Each of a page's ten items is clicked with probability p = 0.9 / (1 + ‖a − a*‖² / (27 · 0.1))²,
+    so clicks are Binomial(10, p), p is largest at a* alone, and a* lies inside the box: always
+    playing it is optimal, since actions do not move the session's length. Lengths are log-normal
+    about a median that the attributes set, rounded up, at most 100. The page index is uniform and
+    means nothing.
+
+    Args:
+        num_envs: sessions side by side, N.
+        world_seed: draws the users' tastes; one world, whatever `reset` is seeded with.
+    """
+
+    def __init__(self, num_envs: int = 1, world_seed: int = 0) -> None:
+        super().__init__(num_envs)
+        world = np.random.default_rng([world_seed, 21])
+        per_attribute = 1 / np.sqrt(len(ATTRIBUTES))
+        self._common = world.normal(0, 0.45, ACTION_DIM)
+        self._tastes = world.normal(0, 0.35 * per_attribute, (USER_BITS, ACTION_DIM))
+        self._drift = world.normal(0, 0.25, ACTION_DIM)
+        self._patience = world.normal(0, 0.4 * per_attribute, USER_BITS)
+        self._popularity = [world.dirichlet(np.full(size, 2.0)) for size in ATTRIBUTES]
+
+    def sample_users(
+        self, count: int, generator: np.random.Generator
+    ) -> tuple[FloatArray, IntArray]:
+        """Draw users and how many pages they turn: (M, 88) one-hot bits, (M,) at least 1."""
+        uniforms = generator.random((count, len(ATTRIBUTES)))
+        users = np.concatenate(
+            [
+                np.eye(len(shares), dtype=np.float32)[
+                    draw_categories(np.tile(shares, (count, 1)), uniform)
+                ]
+                for shares, uniform in zip(self._popularity, uniforms.T, strict=True)
+            ],
+            axis=1,
+        )
+        logarithm = 1.5 + users @ self._patience + generator.normal(0, 1.0, count)
+        return users, np.clip(np.ceil(np.exp(logarithm)), 1, LONGEST_SESSION).astype(np.int64)
+
+    def best_actions(self, users: FloatArray, pages: AnyArray) -> FloatArray:
+        """a* (M, 27) of users (M, 88) on pages (M,)."""
+        share = np.asarray(pages, dtype=np.float64) / (np.asarray(pages) + 4.0)
+        taste = self._common + users @ self._tastes + share[:, None] * self._drift
+        return (0.9 * np.tanh(taste)).astype(np.float32)
+
+    def optimal_actions(self, observations: FloatArray) -> FloatArray:
+        """a* (M, 27) for observations (M, 91)."""
+        return self.best_actions(*split_observations(observations))
+
+    def expected_clicks(
+        self, users: FloatArray, pages: AnyArray, actions: FloatArray
+    ) -> npt.NDArray[np.float64]:
+        """Expected clicks (M,) of users (M, 88) on pages (M,) ranked by actions (M, 27)."""
+        return MAX_CLICKS * self._click_probability(users, pages, actions)
+
+    def _respond(
+        self, users: FloatArray, pages: IntArray, actions: FloatArray
+    ) -> tuple[IntArray, IntArray]:
+        clicks = self.np_random.binomial(MAX_CLICKS, self._click_probability(users, pages, actions))
+        return clicks, self.np_random.integers(PAGE_INDICES, size=len(users))
+
+    def _click_probability(
+        self, users: FloatArray, pages: AnyArray, actions: FloatArray
+    ) -> npt.NDArray[np.float64]:
+        miss = actions.astype(np.float64) - self.best_actions(users, pages)
+        distance = np.square(miss).mean(axis=1)
+        return np.asarray(BEST_CLICK_PROBABILITY / (1 + distance / TOLERANCE) ** 2)
+
+
+QUALITIES: Final = ((0.1, 0.2, 0.25), (0.4, 0.2, 0.25), (0.7, 0.2, 0.20), (0.95, 0.2, 0.10))
+"""Blends of the mixture: share of the optimum, noise, share of sessions."""
+
+
+def optimal(env: VectorEnv[Any, Any, Any], seed: int) -> Rule:
+    """a* always."""
+    world = taobao(env)
+    assert isinstance(world, SyntheticTaobao)
+    return Rule(world.optimal_actions)
+
+
+def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
+    """A logging policy of mediocre mean quality and wide variance between sessions.
+
+    A fifth of the sessions get uniform actions, the others a noisy blend of an untuned constant
+    and the user's best action (`QUALITIES`).
+    """
+    best, default = optimal(env, seed), default_action()
+    blends = [Blend(best, default, quality, noise, seed) for quality, noise, _ in QUALITIES]
+    return SessionMixture(
+        [Uniform(env, seed), *blends], [0.2, *(share for _, _, share in QUALITIES)], seed
+    )
+
+
+def _make(num_envs: int, folder: Path | None) -> SyntheticTaobao:
+    return SyntheticTaobao(num_envs)
+
+
+SIMULATOR: Final = Simulator(
+    summary="built-in shoppers with a known best action: 27 ranking weights a page, 0-10 clicks",
+    make=_make,
+    behaviors={
+        "random": Uniform,
+        "zero": zero_actor,
+        "best-constant": best_constant_actor,
+        "mixture": mixture,
+        "optimal": optimal,
+        **ddpg.BEHAVIORS,
+    },
+    feedback="clicks",
+)

@@ -1,0 +1,169 @@
+"""VirtualTB-v0 (Shi et al., AAAI 2019) with its three published networks, many sessions at once."""
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from gymnasium.vector import VectorEnv
+from torch import nn
+
+from ucfrec.acting.rollout import FloatArray, IntArray
+from ucfrec.errors import InputError
+from ucfrec.plugins import Simulator
+from ucfrec_simulators.behaviors import Blend, SessionMixture, Uniform
+from ucfrec_simulators.folders import data_folder
+from ucfrec_simulators.session_env import AnyArray, draw_categories
+from ucfrec_simulators.taobao import ddpg
+from ucfrec_simulators.taobao.environment import (
+    ACTION_DIM,
+    ATTRIBUTES,
+    LONGEST_SESSION,
+    MAX_CLICKS,
+    PAGE_INDICES,
+    USER_BITS,
+    TaobaoEnv,
+    best_constant_actor,
+    default_action,
+    zero_actor,
+)
+
+SOURCE: Final = "https://github.com/eyounx/VirtualTaobao (virtualTB/data)"
+NOISE_DIM: Final = 128
+CLICK_LEVELS: Final = MAX_CLICKS + 1
+
+
+class VirtualTaobao(TaobaoEnv):
+    """The published simulator's dynamics, N sessions in one forward pass.
+
+    As in the original, a user is drawn from the generator network fed with uniform noise, each
+    attribute sampled from its softmax; the length of the session is sampled from the leave network
+    and is at least one page; clicks and page index are sampled from the two softmaxes of the action
+    network fed with user, pages turned before, and action. Actions are taken as they come, not
+    clipped. One thing differs: the observation that ends a session still shows its own user and
+    last clicks (in `info["final_obs"]`), where the original shows the next user.
+
+    Each start of M sessions draws (M, 128) noise, (M, 11) attribute and (M,) length uniforms, each
+    step (N, 2) click and page-index uniforms, all from `np_random` in that order.
+
+    Args:
+        folder: holds `generator_model.pt`, `leave_model.pt` and `action_model.pt`.
+        num_envs: sessions side by side, N.
+
+    Raises:
+        InputError: a network is missing or is not the published one.
+    """
+
+    def __init__(self, folder: Path | str, num_envs: int = 1) -> None:
+        super().__init__(num_envs)
+        folder = Path(folder)
+        self._generator_model = _load(folder / "generator_model.pt", NOISE_DIM, 128, USER_BITS)
+        self._leave_model = _load(
+            folder / "leave_model.pt", USER_BITS, 128, 256, LONGEST_SESSION + 1
+        )
+        self._action_model = _load(
+            folder / "action_model.pt",
+            USER_BITS + 1 + ACTION_DIM,
+            128,
+            256,
+            CLICK_LEVELS + PAGE_INDICES,
+        )
+
+    def sample_users(
+        self, count: int, generator: np.random.Generator
+    ) -> tuple[FloatArray, IntArray]:
+        """Draw users and how many pages they turn: (M, 88) one-hot bits, (M,) at least 1."""
+        noise = torch.from_numpy(generator.random((count, NOISE_DIM), dtype=np.float32))
+        uniforms = generator.random((count, len(ATTRIBUTES)))
+        with torch.inference_mode():
+            groups = self._generator_model(noise).split(ATTRIBUTES, dim=1)
+            users = np.concatenate(
+                [
+                    np.eye(size, dtype=np.float32)[draw_categories(_softmax(logits), uniform)]
+                    for size, logits, uniform in zip(ATTRIBUTES, groups, uniforms.T, strict=True)
+                ],
+                axis=1,
+            )
+            stay = _softmax(self._leave_model(torch.from_numpy(users)))
+        # The original checks for the end after a page, so a drawn length of 0 plays one page.
+        return users, np.maximum(draw_categories(stay, generator.random(count)), 1)
+
+    def expected_clicks(
+        self, users: FloatArray, pages: AnyArray, actions: FloatArray
+    ) -> npt.NDArray[np.float64]:
+        """Expected clicks (M,) of users (M, 88) on pages (M,) ranked by actions (M, 27)."""
+        clicks, _ = self._distributions(users, pages, actions)
+        return clicks.astype(np.float64) @ np.arange(CLICK_LEVELS, dtype=np.float64)
+
+    def _respond(
+        self, users: FloatArray, pages: IntArray, actions: FloatArray
+    ) -> tuple[IntArray, IntArray]:
+        clicks, indices = self._distributions(users, pages, actions)
+        uniforms = self.np_random.random((len(users), 2))
+        return draw_categories(clicks, uniforms[:, 0]), draw_categories(indices, uniforms[:, 1])
+
+    def _distributions(
+        self, users: FloatArray, pages: AnyArray, actions: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        page = np.asarray(pages, dtype=np.float32)[:, None]
+        inputs = np.concatenate([users, page, actions], axis=1, dtype=np.float32)
+        with torch.inference_mode():
+            logits = self._action_model(torch.from_numpy(inputs))
+            return _softmax(logits[:, :CLICK_LEVELS]), _softmax(logits[:, CLICK_LEVELS:])
+
+
+def _softmax(logits: torch.Tensor) -> FloatArray:
+    probabilities: FloatArray = logits.softmax(1).numpy()
+    return probabilities
+
+
+def _load(path: Path, *sizes: int) -> nn.Sequential:
+    """Read a published state dict into Linear layers of `sizes` with LeakyReLU between."""
+    layers: list[nn.Module] = []
+    for inputs, outputs in pairwise(sizes):
+        layers += [nn.Linear(inputs, outputs), nn.LeakyReLU()]
+    network = nn.Sequential(*layers[:-1])
+    remedy = f"put the file from {SOURCE} there, or name the folder that has it"
+    if not path.is_file():
+        raise InputError(f"{path} is missing; {remedy}")
+    try:
+        network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
+    except Exception as error:
+        # torch documents no closed set of errors for a file that is not a state dict.
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise InputError(f"{path} is not the published network ({reason}); {remedy}") from None
+    return network.eval().requires_grad_(False)
+
+
+QUALITIES: Final = ((0.1, 0.3, 0.30), (0.4, 0.3, 0.20), (0.7, 0.4, 0.15), (0.9, 0.4, 0.10))
+"""Blends of the mixture: share of the best constant, noise, share of sessions."""
+
+
+def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
+    """A logging policy of mediocre mean quality and wide variance between sessions.
+
+    A quarter of the sessions get uniform actions, the others a blend of an untuned constant and the
+    best constant (`QUALITIES`).
+    """
+    # What is blended belongs to the policy: the seed moves its draws, not its quality.
+    good, default = best_constant_actor(env, 0), default_action()
+    blends = [Blend(good, default, quality, noise, seed) for quality, noise, _ in QUALITIES]
+    return SessionMixture(
+        [Uniform(env, seed), *blends], [0.25, *(share for _, _, share in QUALITIES)], seed
+    )
+
+
+SIMULATOR: Final = Simulator(
+    summary="VirtualTB-v0 from its published networks: 27 ranking weights a page, 0-10 clicks",
+    make=lambda num_envs, folder: VirtualTaobao(folder or data_folder("virtualtaobao"), num_envs),
+    behaviors={
+        "random": Uniform,
+        "zero": zero_actor,
+        "best-constant": best_constant_actor,
+        "mixture": mixture,
+        **ddpg.BEHAVIORS,
+    },
+    feedback="clicks",
+)

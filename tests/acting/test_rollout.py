@@ -1,0 +1,101 @@
+"""Rollouts and metrics against plain bookkeeping."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from ucfrec.acting.rollout import BoolArray, Episodes, FloatArray, IntArray, Step, rollout
+from ucfrec.errors import InputError
+from ucfrec.evaluation.metrics import bootstrap_interval, session_metrics
+
+
+class Countdown(gym.Env[FloatArray, int]):
+    """Episode e of environment i lasts as long as its seeded draw; the reward is the step."""
+
+    observation_space = gym.spaces.Box(0, 1000, (2,), np.float32)
+    action_space = gym.spaces.Discrete(3)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[FloatArray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.length = int(self.np_random.integers(1, 9))
+        self.step_number = 0
+        return self._observation(), {}
+
+    def step(self, action: int) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
+        self.step_number += 1
+        done = self.step_number >= self.length
+        return self._observation(), float(self.step_number), done, False, {}
+
+    def _observation(self) -> FloatArray:
+        return np.array([self.length, self.step_number], dtype=np.float32)
+
+
+class Recorder:
+    """An actor that notes what it is told."""
+
+    def __init__(self, n: int) -> None:
+        self.steps = np.zeros(n, dtype=np.int64)
+
+    def begin(self, rows: IntArray) -> None:
+        self.steps[rows] = 0
+
+    def act(self, observations: FloatArray, live: BoolArray) -> tuple[IntArray, None]:
+        np.testing.assert_array_equal(observations[:, 1], self.steps)
+        return np.zeros(len(observations), dtype=np.int64), None
+
+    def observe(self, actions: IntArray, rewards: FloatArray) -> None:
+        self.steps += 1
+
+
+def environments(n: int) -> SyncVectorEnv:
+    return SyncVectorEnv([Countdown] * n, autoreset_mode=AutoresetMode.SAME_STEP)
+
+
+@pytest.mark.parametrize(("n", "episodes"), [(4, 4), (3, 11), (5, 2)])
+def test_every_episode_is_played_once_by_the_environment_it_belongs_to(
+    n: int, episodes: int
+) -> None:
+    seen: list[Step] = []
+    played = rollout(environments(n), Recorder(n), episodes, seed=3, on_step=seen.append)
+    expected = {}
+    for i in range(n):
+        env = Countdown()
+        env.reset(seed=3 + i)
+        for episode in range(i, episodes, n):
+            expected[episode] = env.length
+            env.reset()
+    lengths = np.array([expected[episode] for episode in range(episodes)])
+    np.testing.assert_array_equal(played.lengths, lengths)
+    np.testing.assert_array_equal(played.returns, lengths * (lengths + 1) / 2)
+    assert sum(len(step.rows) for step in seen) == lengths.sum()
+    assert all(np.array_equal(step.episodes % n, step.rows) for step in seen)
+
+
+def test_an_environment_that_resets_late_is_refused() -> None:
+    late = SyncVectorEnv([Countdown], autoreset_mode=AutoresetMode.NEXT_STEP)
+    with pytest.raises(InputError, match="SAME_STEP"):
+        rollout(late, Recorder(1), 1, seed=0)
+
+
+def test_pooled_and_episode_averages_differ_as_defined() -> None:
+    metrics = session_metrics(Episodes(np.array([10.0, 1.0]), np.array([10, 1])), seed=0)
+    assert metrics.R_cum == 5.5
+    assert metrics.R_avg_pooled == 1.0
+    assert metrics.R_avg_episode == 1.0
+    metrics = session_metrics(Episodes(np.array([10.0, 3.0]), np.array([10, 1])), seed=0)
+    assert metrics.R_avg_pooled == pytest.approx(13 / 11)
+    assert metrics.R_avg_episode == 2.0
+
+
+def test_bootstrap_interval_is_the_normal_one_for_many_episodes() -> None:
+    values = np.random.default_rng(0).normal(3.0, 2.0, size=4000)
+    low, high = bootstrap_interval(values, seed=1)
+    error = 1.96 * values.std() / np.sqrt(len(values))
+    assert low == pytest.approx(values.mean() - error, abs=0.01)
+    assert high == pytest.approx(values.mean() + error, abs=0.01)
+    assert bootstrap_interval(values, seed=1) == (low, high)

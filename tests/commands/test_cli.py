@@ -1,0 +1,302 @@
+"""The command line as a stranger meets it: small logs, real commands, clear refusals."""
+
+import json
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from torch import Tensor
+
+from ucfrec.acting.policy_actor import PolicyActor
+from ucfrec.acting.rollout import rollout
+from ucfrec.commands.cli import main
+from ucfrec.evaluation.evaluate import World
+from ucfrec.plugins import load_plugin
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+TINY = [
+    "train.steps=40",
+    "train.validate_every=20",
+    "policy.dim=16",
+    "policy.context=5",
+    "crm.epochs=1",
+    "csg.epochs=1",
+]
+
+
+def settings(*more: str) -> list[str]:
+    return [argument for setting in (*TINY, *more) for argument in ("--set", setting)]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Logs of both kinds, their stores, and a run on the catalogue."""
+    folder = tmp_path_factory.mktemp("cli")
+    for world in ("synthetic-taobao", "synthetic-catalog"):
+        logs, store = folder / f"{world}-logs", folder / f"{world}-store"
+        assert main(["collect", "--env", world, "--sessions", "300", "--out", str(logs)]) == 0
+        sessions = str(logs / "sessions.parquet")
+        feedback = load_plugin("simulators", world).feedback
+        assert main(["prepare", sessions, "--out", str(store), "--reward", feedback]) == 0
+        run = str(folder / f"{world}-run")
+        assert main(["train", str(store), "--out", run, *settings()]) == 0
+    return folder
+
+
+def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line that a refused command prints."""
+    capsys.readouterr()
+    assert main(arguments) == 2
+    printed = capsys.readouterr().err.strip()
+    assert "\n" not in printed
+    return printed
+
+
+def test_help_answers_at_once() -> None:
+    def seconds() -> float:
+        began = time.perf_counter()
+        subprocess.run(
+            [sys.executable, "-m", "ucfrec.commands.cli", "--help"], check=True, stdout=-3
+        )
+        return time.perf_counter() - began
+
+    assert min(seconds() for _ in range(3)) < 0.5
+
+
+@pytest.mark.parametrize("world", ["synthetic-taobao", "synthetic-catalog"])
+def test_evaluate_writes_the_rows_it_prints(
+    folder: Path, world: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "rows.json"
+    run = str(folder / f"{world}-run")
+    arguments = ["evaluate", run, "--env", world, "--episodes", "40", "--seed", "7"]
+    arguments += ["--behavior", "random", "--json", str(out)]
+    assert main(arguments) == 0
+    rows = json.loads(out.read_text())
+    assert [row["policy"] for row in rows] == ["ucf", "random"]
+    for row in rows:
+        assert row["world"] == world
+        assert (row["episodes"], row["seed"]) == (40, 7)
+        assert row["R_cum_low"] <= row["R_cum"] <= row["R_cum_high"]
+        assert row["R_avg_pooled"] * row["length"] == pytest.approx(row["R_cum"])
+    assert "R_avg_episode" in capsys.readouterr().out
+    first = out.read_text()
+    assert main(arguments) == 0
+    again = json.loads(out.read_text())
+    assert [r["R_cum"] for r in again] == [r["R_cum"] for r in json.loads(first)]
+
+
+def test_recommend_ranks_for_known_and_new_users(folder: Path, tmp_path: Path) -> None:
+    logs = folder / "synthetic-catalog-logs" / "sessions.parquet"
+    log = pd.read_parquet(logs)
+    stranger = log[log.user_id == log.user_id.iloc[0]].assign(user_id=10**6)
+    pd.concat([log, stranger]).to_parquet(tmp_path / "log.parquet")
+    arguments = ["recommend", str(folder / "synthetic-catalog-run"), str(tmp_path / "log.parquet")]
+    out = tmp_path / "top.parquet"
+    assert main([*arguments, "--k", "7", "--out", str(out)]) == 0
+    top = pd.read_parquet(out)
+    assert list(top.columns) == ["user_id", "rank", "item_id", "score"]
+    assert set(top.user_id) == {*log.user_id, 10**6}
+    assert (top.groupby("user_id")["rank"].apply(list).map(lambda r: r == [*range(1, 8)])).all()
+    assert (top.groupby("user_id").score.diff().dropna() <= 0).all()
+    assert not top.duplicated(["user_id", "item_id"]).any()
+    seen = set(zip(log.user_id, log.item_id, strict=True))
+    assert not seen & set(zip(top.user_id, top.item_id, strict=True))
+    assert main([*arguments, "--k", "7", "--keep-seen", "--out", str(out)]) == 0
+    kept = pd.read_parquet(out)
+    assert seen & set(zip(kept.user_id, kept.item_id, strict=True))
+
+
+def test_recommend_refuses_unknown_items(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = pd.read_parquet(folder / "synthetic-catalog-logs" / "sessions.parquet").head(50)
+    log["item_id"] = np.where(np.arange(50) == 3, 987654, log.item_id)
+    log.to_parquet(tmp_path / "log.parquet")
+    arguments = ["recommend", str(folder / "synthetic-catalog-run"), str(tmp_path / "log.parquet")]
+    arguments += ["--out", str(tmp_path / "top.parquet")]
+    printed = refused(arguments, capsys)
+    assert "987654" in printed
+    assert "1 rows have an item_id" in printed
+    assert "--skip-unknown" in printed
+    assert not (tmp_path / "top.parquet").exists()
+    assert main([*arguments, "--skip-unknown"]) == 0
+
+
+@pytest.fixture(scope="module")
+def catalog(folder: Path) -> tuple[str, Path]:
+    """The catalogue's run and its logs."""
+    return str(folder / "synthetic-catalog-run"), folder / "synthetic-catalog-logs/sessions.parquet"
+
+
+def test_score_tells_the_probability_of_every_choice(
+    catalog: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, logs = catalog
+    log = pd.read_parquet(logs)
+    log.loc[log.index[:3], "item_id"] = 987654
+    log.to_parquet(tmp_path / "log.parquet")
+    out = tmp_path / "scores.parquet"
+    assert main(["score", run, str(tmp_path / "log.parquet"), "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"dropped: unknown_item +3 ", printed)
+    scores = pd.read_parquet(out)
+    assert f"{len(log) - 3:,} rows" in printed
+    assert len(scores) == len(log) - 3
+    columns = "user_id session timestamp item_id reward propensity probability rank greedy_item_id"
+    assert list(scores.columns) == columns.split()
+    assert scores.session.nunique() == log[3:].session_id.nunique()
+    assert scores.probability.between(0, 1, inclusive="neither").all()
+
+
+@pytest.mark.parametrize("choice", [[], ["--greedy"]])
+def test_ope_writes_the_rows_it_prints(
+    catalog: tuple[str, Path], choice: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, logs = catalog
+    out = tmp_path / "rows.json"
+    arguments = ["ope", run, str(logs), *choice, "--seed", "3", "--json", str(out)]
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out
+    rows = {row["estimator"]: row for row in json.loads(out.read_text())}
+    weighted = {"IPS", "SNIPS", "PDIS", "DR"} & set(rows)
+    assert set(rows) - weighted == {"logged", "DM", "FQE"}
+    assert weighted or choice
+    log = pd.read_parquet(logs)
+    assert rows["logged"]["R_cum"] == pytest.approx(log.is_click.sum() / 300)
+    for row in rows.values():
+        assert row["R_cum_low"] <= row["R_cum"] <= row["R_cum_high"]
+        assert (row["sessions"], row["steps"], row["seed"]) == (300, len(log), 3)
+        assert (row["run"], row["checkpoint"]) == (run, "best")
+        assert row["fingerprint"]
+        assert row["command"]
+    # Three hundred sessions are too few, and it says so.
+    assert all(f"warning: {line}" in printed for line in rows["logged"]["warnings"])
+    assert "session" in " ".join(rows["logged"]["warnings"])
+    assert main(arguments) == 0
+    assert {row["estimator"]: row for row in json.loads(out.read_text())} == rows
+
+
+class SoftmaxActor(PolicyActor):
+    """Draws items from the policy's probabilities: what `ope` judges, played."""
+
+    def _best(self, scores: Tensor) -> Tensor:
+        return torch.multinomial(scores.softmax(-1), 1)[:, 0]
+
+
+def test_ope_tells_from_uniform_logs_what_playing_tells(
+    catalog: tuple[str, Path], tmp_path: Path
+) -> None:
+    run, _ = catalog
+    collected = ["--behavior", "random", "--sessions", "3000", "--out", str(tmp_path / "logs")]
+    assert main(["collect", "--env", "synthetic-catalog", *collected]) == 0
+    out = tmp_path / "rows.json"
+    assert main(["ope", run, str(tmp_path / "logs/sessions.parquet"), "--json", str(out)]) == 0
+    rows = {row["estimator"]: row for row in json.loads(out.read_text())}
+    torch.manual_seed(0)
+    trained = TrainedPolicy.load(Path(run))
+    target = trained.target_return(1.0)
+    size = trained.record["observation_size"]
+    numbers = (trained.item_states, trained.item_ids, trained.user_ids)
+    actor = SoftmaxActor(trained.policy, 512, target, size, *numbers)
+    env = World("synthetic-catalog", None).simulator().make(512, None)
+    returns = rollout(env, actor, 2000, seed=0).returns
+    truth, error = returns.mean(), returns.std() / 2000**0.5
+    assert abs(truth - rows["logged"]["R_cum"]) > 3 * error
+    for name in ("IPS", "SNIPS", "PDIS", "DR"):
+        row = rows[name]
+        assert row["R_cum_low"] - 2 * error < truth < row["R_cum_high"] + 2 * error, name
+    widths = {name: row["R_cum_high"] - row["R_cum_low"] for name, row in rows.items()}
+    assert widths["DR"] < widths["PDIS"] < widths["IPS"]
+    assert rows["DR"]["overlap"] == pytest.approx(1, abs=0.05)
+
+
+def test_ope_without_propensities_has_only_models(
+    catalog: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, logs = catalog
+    log = pd.read_parquet(logs)
+    strange = log.tail(2).assign(item_id=987654)
+    without = pd.concat([log, strange]).drop(columns="propensity")
+    without.to_parquet(tmp_path / "without.parquet")
+    log.assign(propensity=log.propensity.where(log.index != 5)).to_parquet(tmp_path / "one.parquet")
+    for name, missing in (("without", len(log)), ("one", 1)):
+        out = tmp_path / f"{name}.json"
+        assert main(["ope", run, str(tmp_path / f"{name}.parquet"), "--json", str(out)]) == 0
+        rows = json.loads(out.read_text())
+        assert [row["estimator"] for row in rows] == ["logged", "DM", "FQE"]
+        assert rows[0]["overlap"] is None
+        printed = capsys.readouterr().out
+        assert f"warning: {missing:,} of {len(log):,} steps have no propensity" in printed
+        assert ("warning: 2 rows show items" in printed) is (name == "without")
+
+
+def test_score_and_ope_refuse_what_they_cannot_use(
+    folder: Path, catalog: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, logs = catalog
+    log = pd.read_parquet(logs)
+    density, other, blind = (str(tmp_path / f"{name}.parquet") for name in "abc")
+    log.assign(propensity=1.5).to_parquet(density)
+    log.assign(item_id=log.item_id + 10_000).to_parquet(other)
+    log.drop(columns="observation").to_parquet(blind)
+    out = str(tmp_path / "out")
+    assert "not a density" in refused(["ope", run, density, "--json", out], capsys)
+    for command in (["score", run, "--out", out], ["ope", run, "--json", out]):
+        assert "item is none of the store's" in refused([*command, other], capsys)
+        assert "trained with observations of 16 numbers" in refused([*command, blind], capsys)
+        vectors = str(folder / "synthetic-taobao-run")
+        assert "are vectors" in refused([command[0], vectors, *command[2:], str(logs)], capsys)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_run_of_another_store_or_configuration_is_refused(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = str(folder / "synthetic-catalog-run")
+    other = str(folder / "synthetic-taobao-store")
+    assert "another store" in refused(["train", other, "--out", run, *settings()], capsys)
+    store = str(folder / "synthetic-catalog-store")
+    changed = ["train", store, "--out", run, *settings("train.batch_size=8")]
+    assert "batch_size is 64 there, 8 here" in refused(changed, capsys)
+    assert main(["train", store, "--out", run, *settings()]) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["train", "nowhere", "--out", "run"], "nowhere is not an episode store"),
+        (["evaluate", "nowhere", "--env", "synthetic-taobao"], "nowhere is not a run folder"),
+        (["evaluate", "--env", "synthetic-taobao"], "name a run folder"),
+        (["evaluate", "--env", "taobao", "--behavior", "random"], "no simulator is called"),
+        (
+            ["evaluate", "--env", "synthetic-taobao", "--behavior", "best"],
+            "it has .*optimal",
+        ),
+        (["prepare", "nowhere.parquet", "--out", "store"], "nowhere.parquet does not exist"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_in_one_line(
+    arguments: list[str],
+    says: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    printed = refused(arguments, capsys)
+    assert re.search(says, printed), printed
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_policy_is_not_played_in_a_world_it_does_not_fit(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["evaluate", str(folder / "synthetic-catalog-run"), "--env", "synthetic-taobao"]
+    assert "which the policy was not trained on" in refused(arguments, capsys)

@@ -1,0 +1,114 @@
+"""Every table's cells are what their names say, and %BC goes through the benchmark."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.support.control_files import hopper_like, write_hdf5
+from ucfrec.runs.config import Config, resolve_config
+from ucfrec_control.benchmark import robustness
+from ucfrec_control.benchmark.plan import BUDGETS, MAIN, METHODS, SWEEPS, TABLES, Budget, benchmark
+from ucfrec_control.learners.evaluate import load_run
+from ucfrec_control.learners.presets import find_preset
+from ucfrec_control.learners.rl_baselines import ALGORITHMS
+from ucfrec_control.worlds.scores import find_kind, require_task
+
+
+def resolved(table: str, budget: Budget, file: str) -> dict[str, Config]:
+    """Configuration of every row of a table that the core trains."""
+    task, kind = require_task(file).name, find_kind(file)
+    return {
+        method: resolve_config(
+            learner,
+            None,
+            [*budget.settings_of(learner), *own],
+            0,
+            find_preset(task, kind, learner).tables,
+        )
+        for method, (learner, own) in TABLES[table].items()
+        if learner not in ALGORITHMS
+    }
+
+
+@pytest.mark.parametrize("size", ["small", "full"])
+@pytest.mark.parametrize("table", TABLES)
+def test_every_row_of_every_table_is_a_configuration_of_its_own(table: str, size: str) -> None:
+    budget = (BUDGETS if table == MAIN else SWEEPS)[size]
+    for file in budget.files:
+        configs = resolved(table, budget, file)
+        assert len(set(map(repr, configs.values()))) == len(configs)
+        for config in configs.values():
+            assert config.train.warmup_steps < config.train.steps
+
+
+def test_rows_have_the_settings_that_they_are_named_after() -> None:
+    budget = SWEEPS["full"]
+    file = budget.files[0]
+    for name, config in resolved("lambda", budget, file).items():
+        assert config.policy.lambda_mask == float(name.removeprefix("ucf-lambda-"))
+    for table in ("gate", "band", "augmentation"):
+        for name, config in resolved(table, budget, file).items():
+            kind = next((k for k in ("faithful", "noise") if name.startswith(k)), "tangent")
+            assert config.csg.kind == kind
+            assert (config.augment.epsilon_r == 1e9) == name.endswith("wo-gate")
+            assert (config.augment.copies == 0) == name.endswith("wo-count")
+            assert (config.csg.band[0] == 0) == name.endswith("wo-lower")
+            assert (config.csg.lambda_band == 0) == name.endswith("wo-band")
+            assert (config.augment.edits_per_copy == 1) == ("algorithm-5" in name)
+    main = resolved(MAIN, BUDGETS["full"], file)
+    assert (main["ucf"].augment.copies > 0, main["dt"].augment.copies) == (True, 0)
+    assert main["ucf-wo-arch"].policy_name == "dt"
+    assert main["ucf-wo-arch"].augment.copies > 0
+    assert [main[m].policy.best_share for m in ("bc", "bc-10", "bc-25")] == [1.0, 0.1, 0.25]
+
+
+def test_a_method_of_two_sweeps_is_one_configuration() -> None:
+    """They share their runs."""
+    for budget in SWEEPS.values():
+        for file in budget.files:
+            named: dict[str, Config] = {}
+            for table in TABLES.keys() - {MAIN}:
+                for method, config in resolved(table, budget, file).items():
+                    assert named.setdefault(method, config) == config
+
+
+def test_robustness_trains_rows_of_the_benchmark() -> None:
+    learners = {"ucf" if m in robustness.SCREENED else m for m in robustness.METHODS}
+    assert learners <= METHODS.keys()
+    for budget in robustness.BUDGETS.values():
+        for file in budget.files:
+            assert learners <= resolved(MAIN, budget, file).keys()
+
+
+def test_the_best_trajectories_are_cloned_and_judged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Good trajectories act one way and the others the other way: who clones which is seen."""
+    columns = hopper_like((30, 8, 25, 20) * 10)
+    ends = np.flatnonzero(columns["terminals"] | columns["timeouts"])
+    lengths = np.diff(ends, prepend=-1)
+    good = np.arange(len(lengths)) % 5 == 0
+    columns["rewards"][:] = np.repeat(np.where(good, 5.0, 1.0) / lengths, lengths)
+    columns["actions"][:] = np.repeat(np.where(good, 0.8, -0.8), lengths)[:, None]
+    write_hdf5(tmp_path / "hopper_medium-made.hdf5", columns)
+    rows = {m: METHODS[m] for m in ("bc", "bc-10", "bc-25")}
+    monkeypatch.setitem(TABLES, MAIN, rows)
+    settings = ("train.steps=50", "train.warmup_steps=5", "train.learning_rate=1e-2")
+    settings += ("train.validate_every=25", "policy.dim=16")
+    budget = Budget(("hopper_medium-made",), 1, 2, settings)
+    results = tmp_path / "rows.jsonl"
+    found = benchmark(tmp_path, tmp_path / "runs", results, budget, "tiny", 1)
+    assert [(row["method"], row["checkpoint"]) for row in found] == [
+        (method, checkpoint) for method in rows for checkpoint in ("last", "best")
+    ]
+    assert "benchmark main: 3 cells, 3 of them left to measure" in capfd.readouterr().err
+    seen = np.random.default_rng(0).normal(size=(20, 11)).astype(np.float32)
+    chosen = {}
+    for method in rows:
+        run = tmp_path / "runs" / "tiny" / MAIN / "hopper_medium-made" / f"{method}-0"
+        actor = load_run(run, "last").actor(len(seen), 1.0)
+        actor.begin(np.arange(len(seen)))
+        chosen[method] = actor.act(seen, np.ones(len(seen), dtype=bool))[0].mean()
+    # One in five is good: all of the best 10%, four fifths of the best 25%.
+    assert chosen["bc"] < -0.2 < 0.2 < chosen["bc-25"] < chosen["bc-10"]

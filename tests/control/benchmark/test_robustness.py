@@ -1,0 +1,142 @@
+"""Robustness to distractors: what is measured, resumed and derived."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.support.control_files import hopper_like, write_hdf5
+from ucfrec import schema
+from ucfrec.runs.config import resolve_config
+from ucfrec_control.benchmark import robustness
+from ucfrec_control.benchmark.plan import Budget
+from ucfrec_control.benchmark.robustness import drops, loss_rises
+from ucfrec_control.benchmark.screening_table import screening_rows
+from ucfrec_control.cli import main
+from ucfrec_control.data.d4rl import read_d4rl
+from ucfrec_control.data.distractor import add_distractor
+from ucfrec_control.figures.figures import make_figures
+from ucfrec_control.learners.evaluate import evaluate_run
+from ucfrec_control.learners.screening import ScreeningConfig
+from ucfrec_control.learners.train import dataset_of, preset_of, train_control
+
+TINY = ("train.steps=4", "train.validate_every=2", "policy.dim=16", "policy.context=5")
+FILE = "hopper_medium-made"
+
+
+def test_an_early_distractor_tells_of_the_next_reward(tmp_path: Path) -> None:
+    file = write_hdf5(tmp_path / f"{FILE}.hdf5", hopper_like((30, 8, 25, 1, 2)))
+    store = read_d4rl(file).write_store(tmp_path / "store")
+    seen = add_distractor(store, tmp_path / "early", early=True)
+    assert seen.meta["source"]["distractors"][0]["early"]
+    every = store.step_values(schema.REWARD, *store.all_steps())
+    for episode, length in enumerate(store.lengths):
+        steps = np.arange(length)
+        rewards = store.step_values(schema.REWARD, np.full(length, episode), steps)
+        told = np.append(rewards[1:], rewards[-1]) > np.median(every)
+        bit = seen.step_values(schema.OBSERVATION, np.full(length, episode), steps)[:, -1]
+        np.testing.assert_array_equal(bit, told)
+
+
+def row(distractor: str, score: float, method: str = "dt", seed: int = 0) -> dict[str, object]:
+    return {
+        "dataset": "d", "method": method, "seed": seed, "distractor": distractor, "score": score,
+        "score_at_one": 2 * score,
+    }  # fmt: skip
+
+
+def test_drops_compare_with_the_same_seed_without_distractor() -> None:
+    rows = [
+        row("none", 50.0), row("none", 80.0), row("early", 20.0), row("stochastic", 100.0),
+        row("none", -1.0, seed=1), row("early", 5.0, seed=1), row("early", 5.0, method="dc"),
+    ]  # fmt: skip
+    found = {(d["distractor"], d["seed"]): d for d in drops(rows)}
+    assert found.keys() == {("early", 0), ("stochastic", 0), ("early", 1)}
+    early = found["early", 0]
+    assert (early["clean"], early["score"], early["drop"]) == (80.0, 20.0, 75.0)
+    assert early["score_at_one"] == 40.0
+    assert found["stochastic", 0]["drop"] == -25.0
+    assert math.isnan(found["early", 1]["drop"])
+
+
+def test_cells_are_measured_once_and_screening_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = (*TINY, "crm.epochs=1")
+    monkeypatch.setattr(robustness, "BUDGETS", {"small": Budget((FILE,), 1, 2, settings)})
+    monkeypatch.setattr("ucfrec_control.commands.robustness.ROBUSTNESS_BUDGETS", robustness.BUDGETS)
+    methods = ("dt", *robustness.SCREENED)
+    monkeypatch.setattr(robustness, "METHODS", methods)
+    kinds = {kind: robustness.DISTRACTORS[kind] for kind in ("none", "deterministic")}
+    monkeypatch.setattr(robustness, "DISTRACTORS", kinds)
+    columns = hopper_like((30, 8, 25) * 8)
+    columns["observations"][:, 4] = 0.0  # a constant causes nothing
+    columns["rewards"] = columns["observations"][:, 0]
+    file, out = write_hdf5(tmp_path / f"{FILE}.hdf5", columns), tmp_path / "out"
+    # Begun here, where screening may be made quick, and gone on with by the command.
+    quickest = ScreeningConfig(hidden=32, shared_steps=200, own_steps=100)
+    monkeypatch.setattr("ucfrec_control.learners.train.ScreeningConfig", lambda: quickest)
+    clean = read_d4rl(file).write_store(out / "stores" / FILE)
+    distracted = add_distractor(clean, out / "stores" / f"{FILE}-deterministic")
+    tables = preset_of(dataset_of(clean), "ucf").tables
+    for kind, store in (("none", clean), ("deterministic", distracted)):
+        config = resolve_config("ucf", None, settings, 0, tables)
+        for method, screening in robustness.SCREENED.items():
+            run = out / "robustness-small" / FILE / kind / f"{method}-0"
+            train_control(store, run, config, screening=screening)
+
+    results = tmp_path / "rows.jsonl"
+    arguments = ["robustness", "--data", str(tmp_path), "--out", str(out)]
+    arguments += ["--results", str(results)]
+    assert main(arguments) == 0
+    rows = [json.loads(line) for line in results.read_text().splitlines()]
+    assert {(r["method"], r["distractor"], len(r["distractors"])) for r in rows} == {
+        (method, kind, kind != "none") for method in methods for kind in kinds
+    }
+    assert {r["checkpoint"] for r in rows} == {"last"}
+    for r in rows:
+        for value, name in ((0.0, "score"), (1.0, "score_at_one")):
+            told = r["distractor"] != "none" and value
+            asked = [r["target_return"]]
+            (again,) = evaluate_run(
+                Path(r["run"]),
+                episodes=2, seed=1000, targets=asked, checkpoints=("last",), distractor=told,
+            )  # fmt: skip
+            assert again["score"] == r[name]
+            assert again["distractor_fixed_to"] == told
+    for r in rows:
+        blind = r["distractor"] == "none" or r["method"] == "ucf-dropped"
+        assert (r["loss"] == r["loss_at_zero"]) == blind
+        assert not blind or r["score"] == r["score_at_one"]
+    assert len({r["evaluation_seed"] for r in rows}) == 1
+    printed, before = capsys.readouterr().out, results.read_text()
+    for dropped in drops(rows):
+        assert f"{dropped['drop']:.3g}" in printed
+    rises = loss_rises(rows)
+    assert {r["distractor"] for r in rises} == {"deterministic"}
+    for r in rises:
+        assert r["loss"] * (1 + r["rise"] / 100) == pytest.approx(r["loss_at_zero"])
+        assert f"{r['loss_at_zero']:.3g}" in printed
+    made, _ = make_figures([], [results], tmp_path / "figures")
+    kinds = ("scores", "drops", "losses")
+    assert {p.stem for p in made} == {f"robustness-{kind}-small-{FILE}" for kind in kinds}
+    screened = {r["distractor"]: r for r in screening_rows(rows)}
+    assert 4 in screened["none"]["true_flagged"]
+    assert screened["none"]["flagged"] == "-"
+    report = next(r for r in rows if "screening" in r and r["distractors"])["screening"]
+    assert [d["dimension"] for d in report if d["distractor"]] == [11]
+    assert screened["deterministic"]["flagged"] is report[11]["flagged"] is True
+    assert screened["deterministic"]["effect"] == report[11]["effect"]
+    assert main(arguments) == 0
+    assert results.read_text() == before
+
+
+def test_every_budget_is_a_configuration_of_every_method() -> None:
+    assert set(robustness.BUDGETS) == {"small", "full"}
+    assert len(robustness.BUDGETS["full"].files) == 9
+    for budget in robustness.BUDGETS.values():
+        for method in robustness.METHODS:
+            policy, own = robustness.LEARNERS["ucf" if method in robustness.SCREENED else method]
+            resolve_config(policy, None, [*budget.settings, *own])

@@ -1,0 +1,52 @@
+"""Printed tables of the control benchmarks are what their rows say."""
+
+import pytest
+
+from ucfrec_control.benchmark.tables import against_first, over_seeds, score_table
+
+
+def test_a_table_of_scores_has_the_spread_over_seeds_and_a_mean_where_nothing_is_missing() -> None:
+    scores = {
+        ("dt", "a"): (10.0, 20.0), ("dt", "b"): (40.0, 50.0), ("iql", "a"): (30.0,),
+    }  # fmt: skip
+    rows = [
+        {"method": method, "dataset": dataset, "seed": seed, "score": score + shift}
+        | {"checkpoint": checkpoint, "best_step": None if method == "iql" else 7}
+        for (method, dataset), seeds in scores.items()
+        for seed, score in enumerate(seeds)
+        for checkpoint, shift in (("last", 0.0), ("best", 1.0))
+        if method != "iql" or checkpoint == "last"
+    ]
+    dt, iql = score_table(rows, "last")
+    # Of 10 and 20 the sample's deviation is 10 / √2.
+    assert dt == {"method": "dt", "a": "15 ± 7.1", "b": "45 ± 7.1", "mean": "30"}
+    assert iql == {"method": "iql", "a": "30", "b": "–", "mean": "–"}
+    best_dt, best_iql = score_table(rows, "best")
+    assert best_dt["mean"] == "31"
+    assert best_iql == iql
+
+
+def test_what_was_not_measured_is_a_dash() -> None:
+    rows = [
+        {"method": "dt", "seed": 0, "score": 1.0, "other": None},
+        {"method": "dc", "seed": 0, "score": 5.0, "other": None},
+        {"method": "dt", "seed": 1, "score": 3.0, "other": 4.0},
+    ]
+    found = over_seeds(rows, ("method",), ("score", "other"))
+    assert [row["method"] for row in found] == ["dt", "dc"]
+    assert [row["other"] for row in found] == ["4", "–"]
+    mean, _, deviation = found[0]["score"].partition(" ± ")
+    assert (float(mean), float(deviation)) == (2.0, pytest.approx(2**0.5, abs=0.05))
+
+
+def test_methods_are_compared_seed_by_seed() -> None:
+    scores = {"none": (10.0, 50.0, 90.0), "copies": (13.0, 51.0), "lonely": (1.0,)}
+    rows = [
+        {"dataset": "a", "method": method, "seed": seed, "score": score}
+        for method, seeds in scores.items()
+        for seed, score in enumerate(seeds)
+    ]
+    # Of 3 and 1: their deviation √2 over √2.
+    assert against_first(rows, ("score",)) == [
+        {"dataset": "a", "method": "copies", "score": "+2 ± 1"}
+    ]

@@ -1,0 +1,184 @@
+"""Datasets collected by D4RL's protocol: what is in the files, and that a seed decides it."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from tqdm import tqdm
+
+from ucfrec.errors import InputError
+
+pytest.importorskip("mujoco", reason="needs ucfrec[control]")
+pytest.importorskip("stable_baselines3", reason="needs ucfrec[collect]")
+
+from ucfrec_control.cli import main
+from ucfrec_control.data import collect as module
+from ucfrec_control.data.collect import CollectConfig, collect
+from ucfrec_control.data.d4rl import read_d4rl
+from ucfrec_control.data.sac import SacConfig, SacLearner
+from ucfrec_control.data.trajectories import Trajectories
+from ucfrec_control.worlds.scores import find_kind
+
+ENV = "InvertedPendulum-v5"
+CONFIG = CollectConfig(
+    steps=360,
+    every=90,
+    episodes=20,
+    size=400,
+    fraction=0.5,
+    sac=SacConfig(learning_starts=60, batch_size=64, hidden=32, learning_rate=3e-3),
+)
+NAMES = ("medium", "medium-replay", "expert", "medium-expert")
+FIELDS = ("observations", "actions", "rewards", "lengths", "terminated", "final_observations")
+
+
+def read(folder: Path, kind: str) -> Trajectories:
+    return read_d4rl(folder / f"invertedpendulum_{kind}-sac.hdf5")
+
+
+def assert_equal(first: Trajectories, second: Trajectories) -> None:
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)
+
+
+@pytest.fixture(scope="module")
+def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("collected") / "out"
+    collect(ENV, folder, 3, CONFIG)
+    return folder
+
+
+def test_medium_is_the_first_policy_past_the_threshold(collected: Path) -> None:
+    said = json.loads((collected / "MANIFEST.json").read_text())
+    learner = SacLearner(module.make_env(ENV, 1), 3, 10, CONFIG.sac)
+    files = sorted((collected / "training").glob("policy-*.safetensors"))
+    about = [learner.load_policy(file) for file in files]
+    assert said["expert_return"] == max(row["return"] for row in about)
+    threshold = 0.5 * (said["random_return"] + said["expert_return"])
+    before = [row["return"] for row in about if row["steps"] < said["medium_steps"]]
+    assert said["medium_return"] >= threshold > max(before, default=-np.inf)
+    assert said["expert_return"] > said["random_return"]
+
+
+def test_replay_is_every_training_step_up_to_medium(collected: Path) -> None:
+    said = json.loads((collected / "MANIFEST.json").read_text())
+    replay = read(collected, "medium-replay")
+    assert len(replay.rewards) == replay.lengths.sum() == said["medium_steps"]
+    # The first steps are uniform, over the pendulum's own range of ±3.
+    warm = replay.actions[: CONFIG.sac.learning_starts]
+    assert 2.5 < np.abs(warm).max() <= 3
+    assert abs(warm.mean()) < 4 * np.sqrt(3 / len(warm))
+
+
+def test_recorded_steps_are_what_the_environment_does(collected: Path) -> None:
+    env = module.make_env(ENV, 1).envs[0].unwrapped
+    env.reset(seed=0)
+    for kind in ("medium-replay", "expert"):
+        data = read(collected, kind)
+        assert data.final_observations is not None
+        start = 0
+        for index, length in enumerate(data.lengths[:5]):
+            states = data.observations[start : start + length]
+            after = np.vstack([states[1:], data.final_observations[index : index + 1]])
+            for state, action, then in zip(states, data.actions[start:], after, strict=False):
+                env.set_state(state[:2].astype(np.float64), state[2:].astype(np.float64))
+                stepped, *_ = env.step(action)
+                np.testing.assert_allclose(stepped, then, atol=1e-4)
+            # It fell, unless it stood to the last of a thousand steps.
+            assert data.terminated[index] == (abs(after[-1, 1]) > 0.2) == (length < 1000)
+            start += length
+
+
+def test_files_say_what_they_are(collected: Path) -> None:
+    said = json.loads((collected / "MANIFEST.json").read_text())
+    assert [find_kind(row["dataset"]) for row in said["files"]] == list(NAMES)
+    for kind, row in zip(NAMES, said["files"], strict=True):
+        data = read(collected, kind)
+        assert data.source["env_id"] == ENV
+        assert data.source["versions"] == said["versions"]
+        assert data.source["dropped"]["unfinished_steps"] == 0
+        assert (len(data.rewards), len(data.lengths)) == (row["steps"], row["trajectories"])
+        assert data.returns.mean() == pytest.approx(row["mean_return"])
+        with h5py.File(collected / row["file"]) as file:
+            assert file["metadata/seed"][()] == 3
+            assert file["metadata/expert_return"][()] == said["expert_return"]
+            ends = file["terminals"][:] | file["timeouts"][:]
+            inside = np.flatnonzero(~ends)
+            following = file["next_observations"][:]
+            np.testing.assert_array_equal(following[inside], file["observations"][:][inside + 1])
+    medium, expert, both = (read(collected, kind) for kind in ("medium", "expert", "medium-expert"))
+    assert min(len(medium.rewards), len(expert.rewards)) >= CONFIG.size
+    for name in FIELDS:
+        joined = np.concatenate([getattr(medium, name), getattr(expert, name)])
+        np.testing.assert_array_equal(getattr(both, name), joined)
+
+
+def test_an_episode_cut_by_the_step_limit_is_a_timeout() -> None:
+    learner = SacLearner(module.make_env("Pendulum-v1", 1), 0, 1000, SacConfig())
+    for _ in range(2):
+        learner.play_episode(tqdm(disable=True))
+    replay = learner.replay(learner.steps)
+    assert np.flatnonzero(replay["timeouts"]).tolist() == [199, 399]
+    assert not replay["terminals"].any()
+    assert 1.9 < np.abs(replay["actions"]).max() <= 2
+    # What the last action led to is the old episode's; what follows is a new start.
+    states, after = replay["observations"], replay["next_observations"]
+    goes_on = (after[:-1] == states[1:]).all(axis=1)
+    assert np.flatnonzero(~goes_on).tolist() == [199]
+    turned = np.arctan2(after[:, 1], after[:, 0]) - np.arctan2(states[:, 1], states[:, 0])
+    wrapped = (turned + np.pi) % (2 * np.pi) - np.pi
+    np.testing.assert_allclose(wrapped, after[:, 2] * 0.05, atol=1e-4)
+
+
+@pytest.mark.parametrize("fraction", [0.1, 1 / 3, 0.9])
+def test_the_threshold_lies_between_random_and_expert_also_below_zero(fraction: float) -> None:
+    returns = [-1200.0, -900.0, -1100.0, -300.0, -200.0, -600.0]
+    rows = [{"return": value} for value in returns]
+    medium, expert = module._choose(rows, -1250.0, fraction)
+    assert expert == 4
+    assert [(value + 1250) / 1050 >= fraction for value in returns].index(True) == medium
+    with pytest.raises(InputError, match=r"random play -100\.0; train for more"):
+        module._choose(rows, -100.0, fraction)
+
+
+def test_an_interrupted_collection_ends_as_an_uninterrupted_one(
+    collected: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    evaluations = 0
+    judge = module._evaluate
+
+    def interrupted(*given: object) -> None:
+        nonlocal evaluations
+        evaluations += 1
+        if evaluations == 3:
+            raise KeyboardInterrupt
+        judge(*given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(module, "_evaluate", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        collect(ENV, tmp_path / "out", 3, CONFIG)
+    assert not list((tmp_path / "out").glob("*.hdf5"))
+    collect(ENV, tmp_path / "out", 3, CONFIG)
+    assert evaluations == 5
+    for kind in NAMES:
+        assert_equal(read(collected, kind), read(tmp_path / "out", kind))
+
+
+def test_bad_input_is_refused(collected: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="complete already"):
+        collect(ENV, collected, 3, CONFIG)
+    with pytest.raises(InputError, match="fraction is 1"):
+        collect(ENV, tmp_path / "out", 3, dataclasses.replace(CONFIG, fraction=1))
+    with pytest.raises(InputError, match="learning starts after 60"):
+        collect(ENV, tmp_path / "out", 3, dataclasses.replace(CONFIG, steps=60))
+    with pytest.raises(InputError, match="actions in a box"):
+        collect("CartPole-v1", tmp_path / "cart", 3, CONFIG)
+    assert main(["collect", "--env", "Nowhere-v0", "--out", str(tmp_path / "no")]) == 2
+    assert list(tmp_path.iterdir()) == []
+    (collected / "MANIFEST.json").rename(tmp_path / "MANIFEST.json")
+    with pytest.raises(InputError, match="begun with other settings"):
+        collect(ENV, collected, 4, CONFIG)
+    (tmp_path / "MANIFEST.json").rename(collected / "MANIFEST.json")

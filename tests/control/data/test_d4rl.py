@@ -1,0 +1,296 @@
+"""D4RL and Minari files to stores: quirks, refusals, and nothing lost between the formats."""
+
+import json
+import warnings
+from pathlib import Path
+
+import h5py
+import minari
+import numpy as np
+import pytest
+from gymnasium import spaces
+from minari.data_collector import EpisodeBuffer
+
+from tests.support.control_files import Columns, hopper_like, write_hdf5
+from tests.support.real_data import data_folder
+from ucfrec import schema
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec_control.cli import main
+from ucfrec_control.data.d4rl import read_d4rl, write_d4rl
+from ucfrec_control.data.minari import is_minari, read_minari, write_minari
+from ucfrec_control.worlds.scores import find_kind, require_task
+
+LENGTHS = (4, 1, 6, 3)
+
+
+@pytest.fixture(autouse=True)
+def minari_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path / "minari"
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder))
+    return folder
+
+
+def test_trajectories_become_episodes(tmp_path: Path) -> None:
+    columns = hopper_like(LENGTHS)
+    trajectories = read_d4rl(write_hdf5(tmp_path / "hopper_medium.hdf5", columns))
+    store = trajectories.write_store(tmp_path / "store")
+    assert store.lengths.tolist() == list(LENGTHS)
+    assert store.episode_values(schema.TERMINATED).tolist() == [1, 0, 1, 0]
+    window = store.windows(np.array([2]), np.array([3]), 4)
+    np.testing.assert_array_equal(window.states[0], columns["observations"][5:9])
+    np.testing.assert_array_equal(window.actions[0], columns["actions"][5:9])
+    np.testing.assert_array_equal(window.rewards[0], columns["rewards"][5:9])
+    np.testing.assert_allclose(store.returns[2], columns["rewards"][5:11].sum(), rtol=1e-5)
+    assert store.meta["source"]["env_id"] == "Hopper-v5"
+
+
+def test_doubles_and_float_flags_read_as_singles_and_bools(tmp_path: Path) -> None:
+    """medium-replay has float64; AntMaze stores its flags as floats."""
+    columns = hopper_like(LENGTHS)
+    plain = read_d4rl(write_hdf5(tmp_path / "a.hdf5", columns))
+    wide = {name: values.astype(np.float64) for name, values in columns.items()}
+    read = read_d4rl(write_hdf5(tmp_path / "b.hdf5", wide))
+    assert read.observations.dtype == read.rewards.dtype == np.float32
+    assert read.terminated.dtype == bool
+    first, second = (t.write_store(tmp_path / f"s{i}") for i, t in enumerate((plain, read)))
+    assert first.meta["fingerprint"] == second.meta["fingerprint"]
+
+
+def test_an_unfinished_last_trajectory_is_dropped_and_counted(tmp_path: Path) -> None:
+    columns = hopper_like(LENGTHS)
+    columns["terminals"][-1] = columns["timeouts"][-1] = False
+    columns["infos/final_observations"] = columns["infos/final_observations"][:-1]
+    read = read_d4rl(write_hdf5(tmp_path / "a.hdf5", columns))
+    assert read.lengths.tolist() == [4, 1, 6]
+    assert len(read.observations) == 11
+    assert read.source["dropped"]["unfinished_steps"] == 3
+
+
+def test_steps_on_the_goal_are_dropped_of_antmaze_alone(tmp_path: Path) -> None:
+    columns = hopper_like(LENGTHS)
+    n = len(columns["rewards"])
+    ant = {
+        **columns,
+        "observations": np.zeros((n, 29), np.float32),
+        "actions": np.zeros((n, 8), np.float32),
+    }
+    del ant["next_observations"], ant["infos/final_observations"]
+    read = read_d4rl(write_hdf5(tmp_path / "antmaze-umaze-v2.hdf5", ant, env_id=None))
+    assert read.lengths.tolist() == [4, 6, 3]
+    assert read.source["dropped"]["one_step_trajectories"] == 1
+    assert read.source["env_id"] == "d4rl/antmaze-umaze-v2"
+    assert read.final_observations is None
+    kept = np.delete(columns["rewards"], 4)
+    np.testing.assert_array_equal(read.rewards, kept)
+    assert len(read_d4rl(write_hdf5(tmp_path / "hopper.hdf5", columns)).lengths) == 4
+
+
+def test_ends_are_derived_where_timeouts_are_missing(tmp_path: Path) -> None:
+    columns = hopper_like(LENGTHS)
+    # What comes after the last row is not known, so it is no timeout.
+    columns["terminals"][-1] = True
+    whole = read_d4rl(write_hdf5(tmp_path / "a.hdf5", columns))
+    del columns["timeouts"]
+    derived = read_d4rl(write_hdf5(tmp_path / "b.hdf5", columns))
+    assert derived.lengths.tolist() == whole.lengths.tolist()
+    assert derived.terminated.tolist() == whole.terminated.tolist()
+    np.testing.assert_array_equal(derived.final_observations, columns["infos/final_observations"])
+    del columns["next_observations"]
+    with pytest.raises(InputError, match="neither timeouts nor next_observations"):
+        read_d4rl(write_hdf5(tmp_path / "c.hdf5", columns))
+
+
+def test_d4rl_files_are_of_v4_environments(tmp_path: Path) -> None:
+    file = write_hdf5(tmp_path / "hopper_medium_expert-v2.hdf5", hopper_like(), env_id=None)
+    assert read_d4rl(file).source["env_id"] == "Hopper-v4"
+    assert read_d4rl(file, env_id="Hopper-v5").source["env_id"] == "Hopper-v5"
+    unknown = write_hdf5(tmp_path / "mine.hdf5", hopper_like(), env_id=None)
+    assert read_d4rl(unknown).source["env_id"] is None
+    assert find_kind("hopper_medium_expert-v2") == "medium-expert"
+    assert find_kind("mujoco/hopper/medium-v0") == "medium"
+
+
+def broken(columns: Columns, how: str) -> Columns:
+    if how == "no rewards":
+        del columns["rewards"]
+    elif how == "short actions":
+        columns["actions"] = columns["actions"][:-2]
+    elif how == "flat observations":
+        columns["observations"] = columns["observations"][:, 0]
+    elif how == "narrow successors":
+        columns["next_observations"] = columns["next_observations"][:, :10]
+    elif how == "odd flags":
+        columns["terminals"] = columns["terminals"] + 2.0
+    elif how == "not a number":
+        columns["observations"][3, 1] = np.nan
+    elif how == "text":
+        columns["rewards"] = np.array([b"one"] * len(columns["rewards"]))
+    elif how == "no end":
+        columns["terminals"][:] = columns["timeouts"][:] = False
+        del columns["infos/final_observations"]
+    elif how == "finals":
+        del columns["next_observations"]
+        columns["infos/final_observations"] = columns["infos/final_observations"][1:]
+    else:
+        for name in ("observations", "next_observations", "infos/final_observations"):
+            columns[name] = columns[name][:, :5]
+    return columns
+
+
+@pytest.mark.parametrize(
+    ("how", "says"),
+    [
+        ("no rewards", "has no rewards"),
+        ("short actions", "actions have 12 rows, rewards have 14"),
+        ("flat observations", "observations have shape"),
+        ("narrow successors", "next_observations have 10 columns, observations have 11"),
+        ("odd flags", "14 of its terminals are neither 0 nor 1"),
+        ("not a number", "1 numbers of its observations are not finite"),
+        ("text", "rewards holds .*, not numbers"),
+        ("no end", "no trajectory ends in it"),
+        ("finals", "has 3 rows for 4 trajectories"),
+        ("another task", r"sizes \(5, 3\), those of hopper are \(11, 3\)"),
+    ],
+)
+def test_what_is_not_of_the_layout_is_refused(
+    tmp_path: Path, how: str, says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = write_hdf5(tmp_path / "hopper.hdf5", broken(hopper_like(LENGTHS), how))
+    with pytest.raises(InputError, match=says) as refusal:
+        read_d4rl(file)
+    assert str(file) in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+    assert main(["prepare", str(file), "--out", str(tmp_path / "store")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "store").exists()
+
+
+@pytest.mark.parametrize("keep", [0, 100, 3000])
+def test_truncated_files_are_refused(tmp_path: Path, keep: int) -> None:
+    file = write_hdf5(tmp_path / "hopper.hdf5", hopper_like())
+    file.write_bytes(file.read_bytes()[:keep])
+    with pytest.raises(InputError, match=r"hopper\.hdf5 is damaged or not HDF5"):
+        read_d4rl(file)
+
+
+def test_a_damaged_column_is_refused(tmp_path: Path) -> None:
+    trajectories = read_d4rl(write_hdf5(tmp_path / "a.hdf5", hopper_like((50, 60))))
+    file = tmp_path / "hopper.hdf5"
+    write_d4rl(trajectories, file)
+    with h5py.File(file) as opened:
+        chunk = opened["observations"].id.get_chunk_info(0)
+    content = bytearray(file.read_bytes())
+    content[chunk.byte_offset : chunk.byte_offset + chunk.size] = bytes(chunk.size)
+    file.write_bytes(content)
+    with pytest.raises(InputError, match=r"hopper\.hdf5"):
+        read_d4rl(file)
+
+
+def test_both_formats_make_equal_stores(tmp_path: Path, minari_folder: Path) -> None:
+    """HDF5 → Minari → HDF5, each to a store."""
+    file = write_hdf5(tmp_path / "hopper_medium.hdf5", hopper_like(LENGTHS))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert main(["convert", str(file), "hopper/mine-v0"]) == 0
+    assert main(["convert", "hopper/mine-v0", str(tmp_path / "back.hdf5")]) == 0
+    sources = [str(file), "hopper/mine-v0", str(tmp_path / "back.hdf5")]
+    sources += [str(minari_folder / "hopper" / "mine-v0")]
+    stores = []
+    for number, source in enumerate(sources):
+        assert main(["prepare", source, "--out", str(tmp_path / f"store{number}")]) == 0
+        stores.append(EpisodeStore.open(tmp_path / f"store{number}"))
+    assert len({store.meta["fingerprint"] for store in stores}) == 1
+    assert {store.meta["source"]["env_id"] for store in stores} == {"Hopper-v5"}
+    assert [store.meta["source"]["format"] for store in stores] == ["d4rl", "minari"] * 2
+    first, last = read_d4rl(file), read_d4rl(tmp_path / "back.hdf5")
+    np.testing.assert_array_equal(first.final_observations, last.final_observations)
+
+
+def test_minari_refusals(tmp_path: Path, minari_folder: Path) -> None:
+    trajectories = read_d4rl(write_hdf5(tmp_path / "hopper.hdf5", hopper_like()))
+    with pytest.raises(InputError, match="fetch it with --download"):
+        read_minari("mujoco/hopper/medium-v0")
+    with pytest.raises(InputError, match="no Minari identifier"):
+        write_minari(trajectories, "no identifier")
+    folder = write_minari(trajectories, "hopper/mine-v0")
+    with pytest.raises(InputError, match="exists already"):
+        write_minari(trajectories, "hopper/mine-v0")
+    metadata = json.loads((folder / "data" / "metadata.json").read_text())
+    del metadata["observation_space"]
+    stated = (folder / "data" / "metadata.json").read_text()
+    (folder / "data" / "metadata.json").write_text(json.dumps(metadata))
+    for source in (str(folder), "hopper/mine-v0"):
+        with pytest.raises(InputError, match="states no observation and action space"):
+            read_minari(source)
+    (folder / "data" / "metadata.json").write_text(stated)
+    (folder / "data" / "main_data.hdf5").write_bytes(b"nothing")
+    with pytest.raises(InputError, match="an episode cannot be read"):
+        read_minari("hopper/mine-v0")
+    (folder / "data" / "metadata.json").write_text(stated[:20])
+    with pytest.raises(InputError, match="cannot be opened"):
+        read_minari("hopper/mine-v0")
+    assert is_minari("mujoco/hopper/medium-v0")
+    assert not is_minari("hopper_medium-v2.hdf5")
+
+
+def test_minari_goals_are_left_out_and_unfinished_episodes_dropped(minari_folder: Path) -> None:
+    """As D4RL has AntMaze: position, then the rest, without the goal."""
+    box = {"dtype": np.float64, "low": -9.0, "high": 9.0}
+    sizes = {"observation": 27, "achieved_goal": 2, "desired_goal": 2}
+    rng = np.random.default_rng(0)
+    seen = [{k: rng.uniform(size=(5, n)) for k, n in sizes.items()} for _ in range(2)]
+    buffers = [
+        EpisodeBuffer(
+            observations=observations,
+            actions=rng.uniform(size=(4, 8)),
+            rewards=[0.0, 0.0, 0.0, 1.0],
+            terminations=[False] * 4,
+            truncations=[False, False, False, ends],
+            infos={},
+        )
+        for observations, ends in zip(seen, (True, False), strict=True)
+    ]
+    boxes = {name: spaces.Box(shape=(n,), **box) for name, n in sizes.items()}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        minari.create_dataset_from_buffers(
+            "antmaze/made-v0",
+            buffers,
+            observation_space=spaces.Dict(boxes),
+            action_space=spaces.Box(shape=(8,), **box),
+        )
+    read = read_minari("antmaze/made-v0", env_id="AntMaze_UMaze-v4")
+    wanted = np.hstack([seen[0]["achieved_goal"], seen[0]["observation"]]).astype(np.float32)
+    np.testing.assert_array_equal(read.observations, wanted[:4])
+    np.testing.assert_array_equal(read.final_observations, wanted[4:])
+    assert read.lengths.tolist() == [4]
+    assert read.source["dropped"]["unfinished_steps"] == 4
+
+
+def test_scores_are_d4rls() -> None:
+    assert require_task("HalfCheetah-v5").score(12135.0) == 100
+    assert require_task(None, "walker2d_mixed-zoo").score([1.629008, 4592.3]).tolist() == [0, 100]
+    with pytest.raises(InputError, match="no reference returns are known for Ant-v5"):
+        require_task("Ant-v5")
+
+
+@pytest.mark.realdata
+def test_the_nine_files_score_what_their_manifest_states() -> None:
+    folder = data_folder("control")
+    files = json.loads((folder / "MANIFEST.json").read_text())["files"]
+    assert len(files) == 9
+    for stated in files:
+        trajectories = read_d4rl(folder / stated["file"])
+        task = require_task(trajectories.source["env_id"])
+        returns = trajectories.returns
+        assert trajectories.source["env_id"] == stated["env_id"]
+        assert trajectories.source["versions"]["mujoco"] == "4.0.0"
+        assert len(returns) == stated["trajectories"]
+        assert len(trajectories.rewards) == stated["transitions"]
+        assert returns.mean() == pytest.approx(stated["return_mean"], abs=6e-4)
+        assert task.score(returns.mean()) == pytest.approx(stated["normalised_mean"], abs=6e-4)
+        assert task.score(returns.max()) == pytest.approx(stated["normalised_max"], abs=6e-4)
+        assert trajectories.terminated.mean() == pytest.approx(
+            stated["terminated_fraction"], abs=6e-5
+        )

@@ -1,0 +1,242 @@
+"""Figures show what the stored numbers say, and name what is missing."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.support.control_files import hopper_like, write_hdf5
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Overlay
+from ucfrec.errors import InputError
+from ucfrec.files import read_json
+from ucfrec.fitting.tensorboard import read_scalars
+from ucfrec_control.benchmark.robustness import drops
+from ucfrec_control.cli import main
+from ucfrec_control.figures import diagnostics, plots
+from ucfrec_control.figures.figures import HIGHS, LOWS, NEEDS, make_figures
+
+KINDS = ("tangent", "faithful")
+SETTINGS = {
+    "train.steps": "4", "train.validate_every": "2", "policy.dim": "16", "policy.context": "5",
+    "crm.epochs": "3", "csg.epochs": "2", "csg.lambda_band": "1.0", "augment.epsilon_r": "1.0",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of UCF with each generator, and one of behaviour cloning with two seeds."""
+    folder = tmp_path_factory.mktemp("figures")
+    file = write_hdf5(folder / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
+    store = str(folder / "store")
+    assert main(["prepare", str(file), "--out", store]) == 0
+    options = [a for key, value in SETTINGS.items() for a in ("--set", f"{key}={value}")]
+    for kind in KINDS:
+        out = ["--out", str(folder / "runs" / kind), "--set", f"csg.kind={kind}"]
+        assert main(["train", store, *out, *options]) == 0
+    for seed in ("0", "1"):
+        out = ["--out", str(folder / "runs" / f"bc-{seed}"), "--policy", "bc", "--seed", seed]
+        assert main(["train", store, *out, *options[:8]]) == 0
+    return folder / "runs"
+
+
+def heights(axes: object) -> dict[tuple[int, str], float]:
+    """Of bars, by the number of their group and their kind."""
+    return {
+        (round(bar.get_x() + bar.get_width() / 2), container.get_label()): bar.get_height()
+        for container in axes.containers  # type: ignore[attr-defined]
+        if hasattr(container, "patches")
+        for bar in container.patches
+    }
+
+
+def test_bars_are_as_high_as_the_drops_of_their_rows() -> None:
+    rows = [
+        {"dataset": "d", "method": m, "distractor": k, "seed": s}
+        | {"score": 50.0 - 7 * i * j - s, "score_at_one": None}
+        for i, m in enumerate(("dt", "ucf", "ucf-screened"))
+        for j, k in enumerate(("none", "deterministic", "early"))
+        for s in range(3)
+    ]
+    lost = drops(rows)
+    (axes,) = plots.robustness_bars(lost, "drop", "loss (%)").axes
+    drawn = heights(axes)
+    assert len(drawn) == 6
+    names = [text.get_text() for text in axes.get_xticklabels()]
+    assert names == ["DT", "UCF", "UCF, screened"]
+    for (group, kind), height in drawn.items():
+        method = ("dt", "ucf", "ucf-screened")[group]
+        own = [r["drop"] for r in lost if (r["method"], r["distractor"]) == (method, kind)]
+        assert height == pytest.approx(sum(own) / 3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_cell_of_the_heatmap_is_the_share_that_passes_both_gates(runs: Path, kind: str) -> None:
+    editing = diagnostics.Editing.of(runs / kind)
+    shares = diagnostics.acceptance_grid(runs / kind, LOWS, HIGHS)
+    (axes, _) = plots.acceptance_heatmap(LOWS, HIGHS, shares, (0.2, 0.5)).axes
+    low, high = LOWS.index(0.2), HIGHS.index(0.5)
+    cell = axes.images[0].get_array()[low, high]
+    crm, steps = editing.crm, editing.factual
+    z = crm.abduct(steps.states, steps.actions, steps.rewards)
+    random = torch.Generator().manual_seed(0)
+    proposed = editing.generator.propose(steps.states, steps.actions, z, random)
+    lengths = ((proposed - steps.states) / crm.state_std).square().sum(1).sqrt().numpy()
+    off = (crm.predict(proposed, steps.actions, z) - steps.rewards).abs().numpy()
+    within = (lengths >= 0.2 - 1e-5) & (lengths <= 0.5 + 1e-5)
+    passed = 100 * (within & (off <= editing.epsilon_r)).mean()
+    assert 5 < passed < 100
+    assert cell == pytest.approx(passed)
+    impossible = np.greater_equal.outer(LOWS, HIGHS)
+    np.testing.assert_array_equal(np.isnan(shares), impossible)
+    if kind == "faithful":  # one network, whatever the band: a wider one takes no fewer
+        assert (np.diff(shares, axis=1)[~np.isnan(np.diff(shares, axis=1))] >= 0).all()
+        assert (np.diff(shares, axis=0)[~np.isnan(np.diff(shares, axis=0))] <= 0).all()
+
+
+def test_the_histogram_counts_the_moves_of_the_copies(runs: Path) -> None:
+    run = runs / "tangent"
+    store, overlay = (
+        EpisodeStore.open(runs.parent / "store"),
+        Overlay.load(run / "overlay.safetensors"),
+    )
+    at = overlay.copy_source[overlay.edit_copy], overlay.edit_step
+    factual = store.windows(*at, 1).states[:, 0]
+    std = store.split("train").state_statistics[1]
+    lengths = ((torch.from_numpy(overlay.edit_state) - factual) / std).norm(dim=1).numpy()
+    edges, counts, band = diagnostics.move_histogram(run)
+    assert band == (0.2, 0.5)
+    assert sum(counts) == len(lengths)
+    (axes,) = plots.move_histogram(edges, counts, band).axes
+    shares = np.array([bar.get_height() for bar in axes.patches])
+    expected = 100 * np.histogram(lengths, np.asarray(edges) + 1e-6)[0] / len(lengths)
+    assert shares.sum() == pytest.approx(100)
+    # A move at an edge may round into the next bin.
+    assert np.abs(shares - expected).max() <= 2 * 100 / len(lengths)
+
+
+def test_the_overlay_shows_the_widest_direction_first(runs: Path) -> None:
+    factual, edited = diagnostics.edited_states(runs / "tangent")
+    assert 0.19 < np.linalg.norm(edited - factual, axis=1).mean() < 0.5
+    (axes,) = plots.state_overlay(factual, edited).axes
+    points = np.asarray(axes.collections[0].get_offsets())
+    widest = np.linalg.eigvalsh(np.cov(factual.T))[::-1]
+    np.testing.assert_allclose(points.var(axis=0, ddof=1), widest[:2], rtol=1e-6)
+
+
+def test_rows_of_the_attention_map_sum_to_one_and_see_no_future(runs: Path) -> None:
+    weights = diagnostics.attention(runs / "tangent")
+    assert weights.shape == (5, 3, 5)
+    np.testing.assert_allclose(weights.sum(axis=(1, 2)), 1, atol=1e-5)
+    later = np.triu(np.ones((5, 5), dtype=bool), 1)
+    for modality, also_now in ((0, False), (1, False), (2, True)):
+        unseen = later | (np.eye(5, dtype=bool) & also_now)
+        assert (weights[:, modality][unseen] == 0).all()
+        assert (weights[:, modality][~unseen] > 0).all()
+    panels = plots.attention_map(weights).axes[:3]
+    drawn = sum(panel.images[0].get_array().filled(0.0) for panel in panels)
+    np.testing.assert_allclose(np.sum(drawn, axis=1), 1, atol=1e-5)
+
+
+def test_curves_are_means_over_seeds(runs: Path) -> None:
+    logged = [read_scalars(runs / f"bc-{s}" / "policy")["validation_loss"] for s in (0, 1)]
+    (axes,) = plots.training_curves({"bc": logged}, "loss").axes
+    (line,) = axes.lines
+    assert list(line.get_xdata()) == [2, 4]
+    wanted = [(logged[0][step] + logged[1][step]) / 2 for step in (2, 4)]
+    np.testing.assert_allclose(line.get_ydata(), wanted)
+    rows = [
+        {"dataset": "d", "lambda_mask": value, "seed": seed, "score": 10 * value + seed}
+        for value in (1.0, 0.0, 0.1)
+        for seed in (0, 1)
+    ]
+    (axes,) = plots.lambda_curves(rows).axes
+    np.testing.assert_allclose(axes.lines[0].get_ydata(), [0.5, 1.5, 10.5])
+    assert [text.get_text() for text in axes.get_xticklabels()] == ["0", "0.1", "1"]
+    rows = [
+        {"method": "ucf", "target_return": target, "seed": seed, "return": target / 2 + seed}
+        for target in (2000.0, 1000.0)
+        for seed in (0, 1)
+    ]
+    (axes,) = plots.return_curves(rows).axes
+    earned, as_asked = axes.lines
+    np.testing.assert_array_equal(earned.get_xydata(), [[1000, 500.5], [2000, 1000.5]])
+    np.testing.assert_array_equal(as_asked.get_xydata(), [[0, 0], [2000, 2000]])
+
+
+def test_json_that_is_no_list_of_rows_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "x.json").write_text("{}")
+    with pytest.raises(InputError, match=r"x\.json holds no list of rows"):
+        make_figures([], [tmp_path / "x.json"], tmp_path)
+
+
+def test_one_command_draws_what_it_can_and_names_what_is_missing(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results, out = tmp_path / "rows.jsonl", tmp_path / "figures"
+    evaluated = tmp_path / "evaluated.json"
+    asked = ["--target", "1000", "--target", "3000", "--episodes", "1", "--json", str(evaluated)]
+    assert main(["evaluate", str(runs / "tangent"), *asked]) == 0
+    common = {"dataset": "d", "seed": 0, "checkpoint": "last"}
+    rows = [
+        common | {"method": "ucf", "budget": "small", "lambda_mask": value, "score": value}
+        for value in (0.0, 0.1)
+    ]
+    results.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    shutil.copytree(runs, tmp_path / "copied")
+    record = read_json(tmp_path / "copied" / "tangent" / "run.json")
+    record["store"] = str(tmp_path / "gone")
+    (tmp_path / "copied" / "tangent" / "run.json").write_text(json.dumps(record))
+    arguments = ["figures", "--runs", str(tmp_path / "copied")]
+    arguments += ["--results", str(results), str(evaluated)]
+    assert main([*arguments, "--out", str(out)]) == 0
+    printed = capsys.readouterr()
+    names = {"lambda-small", "moves-faithful", "states-faithful", "acceptance-faithful"}
+    names |= {"attention-faithful", "moves-tangent", "training-hopper_medium-made"}
+    names |= {"returns-hopper_medium-made"}
+    assert {path.name for path in out.iterdir()} == {
+        f"{name}.{kind}" for name in names for kind in ("png", "svg")
+    }
+    assert all(f"{name}.svg" in printed.out for name in names)
+    assert (out / "lambda-small.png").read_bytes()[:4] == b"\x89PNG"
+    assert "missing: robustness-scores: needs rows of `ucfrec-control robustness`" in printed.err
+    made, missing = make_figures([], [], out)
+    assert made == []
+    assert {line.partition(":")[0] for line in missing} == set(NEEDS)
+    made, missing = make_figures([tmp_path / "copied" / "tangent"], [], out)
+    assert [path.stem for path in made[::2]] == ["moves-tangent", "training-hopper_medium-made"]
+    gone = [line for line in missing if str(tmp_path / "gone") in line]
+    assert {line.partition(":")[0] for line in gone} == {
+        "states-tangent",
+        "acceptance-tangent",
+        "attention-tangent",
+    }
+
+
+def test_runs_with_other_settings_are_no_seeds_of_one_another(runs: Path, tmp_path: Path) -> None:
+    """As in a sweep of the benchmark; runs of IQL among them have no losses to show."""
+    folder = tmp_path / "gate" / "hopper"
+    for kind in KINDS:
+        for seed in ("0", "1"):
+            shutil.copytree(runs / kind, folder / f"{kind}-{seed}")
+            record = read_json(runs / kind / "run.json") | {"store": str(tmp_path / "gone")}
+            (folder / f"{kind}-{seed}" / "run.json").write_text(json.dumps(record))
+    (folder / "iql-0").mkdir()
+    config = {"policy_name": "iql", "policy": {}, "seed": 0}
+    (folder / "iql-0" / "run.json").write_text(json.dumps(record | {"config": config}))
+    made, missing = make_figures([tmp_path], [], tmp_path / "figures")
+    first = {f"gate-hopper-{kind}-0" for kind in KINDS}
+    assert {path.stem for path in made} == {
+        "training-gate-hopper",
+        *(f"moves-{name}" for name in first),
+    }
+    needs_store = {line.partition(":")[0] for line in missing if "gone" in line}
+    assert needs_store == {
+        f"{figure}-{name}" for figure in ("states", "acceptance", "attention") for name in first
+    }
+    drawn = (tmp_path / "figures" / "training-gate-hopper.svg").read_text()
+    assert all(f"<!-- {kind} -->" in drawn for kind in KINDS)
+    assert "iql" not in drawn

@@ -1,0 +1,120 @@
+"""IQL and CQL of d3rlpy: what they read, that they resume, and rows like everybody else's."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+import torch
+from tqdm import tqdm
+
+from tests.support.control_files import hopper_like, write_hdf5
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.files import read_json
+from ucfrec.fitting.tensorboard import read_scalars
+from ucfrec_control.benchmark.plan import TABLES, Budget, benchmark
+from ucfrec_control.cli import main
+from ucfrec_control.data.d4rl import read_d4rl
+from ucfrec_control.learners import rl_baselines
+from ucfrec_control.learners.evaluate import evaluate_run
+from ucfrec_control.learners.rl_baselines import rl_config, train_rl
+from ucfrec_control.learners.train import dataset_of
+
+pytest.importorskip("d3rlpy", reason="the extra rl is not installed")
+pytest.importorskip("mujoco", reason="the extra control is not installed")
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> EpisodeStore:
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("rl")
+    file = write_hdf5(folder / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
+    return read_d4rl(file).write_store(folder / "store")
+
+
+class _Stops(tqdm):  # type: ignore[type-arg]
+    """A bar during whose fifth step the user interrupts."""
+
+    seen = 0
+
+    def update(self, n: float | None = 1) -> bool | None:
+        self.seen += 1
+        if self.seen == 5:
+            raise KeyboardInterrupt
+        return super().update(n)
+
+
+@pytest.mark.parametrize("algorithm", ["iql", "cql"])
+def test_a_training_that_was_interrupted_ends_as_one_left_alone(
+    store: EpisodeStore,
+    tmp_path: Path,
+    algorithm: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config = rl_config(dataset_of(store), algorithm, steps=7, batch_size=16)
+    monkeypatch.setattr(rl_baselines, "CHECKPOINT_EVERY", 2)
+    train_rl(store, tmp_path / "alone", config, 0)
+    with monkeypatch.context() as interrupted:
+        interrupted.setattr(rl_baselines, "tqdm", _Stops)
+        with pytest.raises(KeyboardInterrupt):
+            train_rl(store, tmp_path / "interrupted", config, 0)
+    with pytest.raises(InputError, match="does not exist"):
+        evaluate_run(tmp_path / "interrupted", episodes=2, seed=0)
+    assert torch.load(tmp_path / "interrupted" / "checkpoint.pt", weights_only=True)["step"] == 4
+    train_rl(store, tmp_path / "interrupted", config, 0)
+    actors = [tmp_path / run / "actor.safetensors" for run in ("alone", "interrupted")]
+    assert actors[0].read_bytes() == actors[1].read_bytes()
+    alone, interrupted = (read_scalars(tmp_path / run) for run in ("alone", "interrupted"))
+    for loss in ("actor_loss", "critic_loss"):
+        assert list(alone[loss]) == [2, 4, 6, 7]
+        assert alone[loss] == interrupted[loss]
+
+
+@pytest.mark.parametrize("algorithm", ["iql", "cql"])
+def test_equal_seeds_train_equal_actors_that_are_judged_as_others_are(
+    store: EpisodeStore, tmp_path: Path, algorithm: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = rl_config(dataset_of(store), algorithm, steps=4)
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        train_rl(store, tmp_path / name, config, seed)
+    a, b, c = ((tmp_path / name / "actor.safetensors").read_bytes() for name in "abc")
+    assert a == b != c
+    (row,) = evaluate_run(tmp_path / "a", episodes=2, seed=0)
+    assert (row["method"], row["checkpoint"], row["target_return"]) == (algorithm, "last", None)
+    assert row["fingerprint"] == store.meta["fingerprint"]
+    capsys.readouterr()
+    asked = ["evaluate", str(tmp_path / "a"), "--episodes", "2"]
+    assert main(asked) == 0
+    assert main([*asked, "--checkpoint", "best"]) == 2
+    assert "keep their last checkpoint only" in capsys.readouterr().err
+
+
+def test_a_finished_run_is_read_and_another_configuration_refused(
+    store: EpisodeStore, tmp_path: Path
+) -> None:
+    config = rl_config(dataset_of(store), "iql", steps=2)
+    record = train_rl(store, tmp_path / "run", config, 0)
+    assert train_rl(store, tmp_path / "run", config, 0) == record
+    assert read_json(tmp_path / "run" / "run.json") == record
+    with pytest.raises(InputError, match="trained otherwise"):
+        train_rl(store, tmp_path / "run", config, 1)
+
+
+def test_the_benchmark_finds_its_rl_rows_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
+    monkeypatch.setitem(TABLES, "main", {"iql": ("iql", ())})
+    budget = Budget(("hopper_medium-made",), 1, 2, (), rl_steps=2)
+    results = tmp_path / "rows.jsonl"
+    (row,) = benchmark(tmp_path, tmp_path / "runs", results, budget, "tiny", 1)
+    assert (row["table"], row["method"]) == ("main", "iql")
+    assert benchmark(tmp_path, tmp_path / "runs", results, budget, "tiny", 1) == [row]
+    assert len(results.read_text().splitlines()) == 1
+    assert json.loads(results.read_text()) == row
+    printed = capfd.readouterr()
+    assert "1 cells, 1 of them left" in printed.err
+    assert "1 cells, 0 of them left" in printed.err
+    # Neither here nor in the workers does d3rlpy tell of its trainings.
+    assert "[info" not in re.sub(r"\x1b\[[\d;]*m", "", printed.out)

@@ -1,0 +1,316 @@
+"""Control runs end to end: presets, training, normalised scores, distractors, refusals."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.support.control_files import hopper_like, write_hdf5
+from tests.support.real_data import data_folder
+from ucfrec import schema
+from ucfrec.acting.rollout import rollout
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.files import read_json
+from ucfrec.policies.registry import POLICIES
+from ucfrec.runs.config import resolve_config
+from ucfrec_control.benchmark.plan import BUDGETS, METHODS, TABLES, Budget
+from ucfrec_control.cli import main
+from ucfrec_control.data.d4rl import read_d4rl
+from ucfrec_control.data.distractor import add_distractor
+from ucfrec_control.learners.evaluate import evaluate_run
+from ucfrec_control.learners.presets import find_preset
+from ucfrec_control.worlds.environments import make_env, mismatches
+from ucfrec_control.worlds.scores import TASKS
+
+TINY = ["train.steps=4", "train.validate_every=2", "policy.dim=16", "policy.context=5"]
+SETTINGS = [argument for setting in TINY for argument in ("--set", setting)]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small store of a made-up Hopper dataset, one with a distractor, and a run on each."""
+    folder = tmp_path_factory.mktemp("control")
+    file = write_hdf5(folder / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
+    assert main(["prepare", str(file), "--out", str(folder / "store")]) == 0
+    store, distracted = str(folder / "store"), str(folder / "distracted")
+    assert main(["distract", store, "--out", distracted, "--flip", "0.15"]) == 0
+    for data, policy in ((store, "dt"), (distracted, "dc")):
+        run = ["--out", f"{data}-run", "--policy", policy]
+        assert main(["train", data, *run, *SETTINGS, "--seed", "3"]) == 0
+    return folder
+
+
+def test_every_twentieth_trajectory_is_for_validation(folder: Path) -> None:
+    splits = EpisodeStore.open(folder / "store").episode_values(schema.SPLIT)
+    assert np.flatnonzero(splits).tolist() == [10]
+
+
+def test_evaluate_writes_last_and_best_apart(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "rows.json"
+    arguments = ["evaluate", str(folder / "store-run"), "--episodes", "3", "--json", str(out)]
+    assert main(arguments) == 0
+    rows = json.loads(out.read_text())
+    assert [(r["checkpoint"], r["target_return"]) for r in rows] == [
+        (checkpoint, target) for checkpoint in ("last", "best") for target in (3600, 1800)
+    ]
+    for row in rows:
+        assert (row["dataset"], row["method"], row["seed"]) == ("hopper_medium-made", "dt", 3)
+        assert (row["episodes"], row["env_id"]) == (3, "Hopper-v5")
+        scored = 100 * (row["return"] + 20.272305) / (3234.3 + 20.272305)
+        assert row["score"] == pytest.approx(scored)
+        assert row["score_low"] <= row["score"] <= row["score_high"]
+        assert {"mujoco", "gymnasium", "torch"} <= row["versions"].keys()
+        trained = read_json(folder / "store-run" / "run.json")["policy"]
+        assert row["validation_loss"] == trained["best_validation"] > 0
+        assert min(row["wall_time_s"], row["train_wall_time_s"]) > 0
+        assert row["config"]["policy_name"] == "dt"
+    printed = capsys.readouterr()
+    assert "hopper_medium-made" in printed.out
+    assert "warning" not in printed.err
+
+
+def test_the_best_checkpoint_is_played_whichever_step_it_is_of(folder: Path) -> None:
+    """Asked for together with the last, it may be the same; it earns what it earns alone."""
+    run = folder / "store-run"
+    both = evaluate_run(run, episodes=2, seed=0, targets=(3600.0,))
+    (best,) = evaluate_run(run, episodes=2, seed=0, targets=(3600.0,), checkpoints=("best",))
+    assert [row["checkpoint"] for row in both] == ["last", "best"]
+    assert both[1]["return"] == best["return"]
+
+
+def test_another_environment_version_warns(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = ["evaluate", str(folder / "store-run"), "--checkpoint", "last", "--episodes", "1"]
+    assert main([*run, "--target", "100", "--env", "Hopper-v4"]) == 0
+    said = capsys.readouterr().err
+    assert "warning: the data is of Hopper-v5, it is judged in Hopper-v4" in said
+    made = {"env_id": "Hopper-v5", "versions": {"mujoco": "2.1.0"}}
+    (told,) = mismatches(made, "Hopper-v5")
+    assert told.startswith("the data was made with mujoco 2.1.0, here is ")
+
+
+def test_a_distractor_is_the_reward_bit_and_nothing_else_changes(
+    folder: Path, tmp_path: Path
+) -> None:
+    store = EpisodeStore.open(folder / "store")
+    episodes, steps = store.all_steps()
+    rewards = store.step_values(schema.REWARD, episodes, steps)
+    bit = (rewards > np.median(rewards)).astype(np.float32)
+    for flip, agreement in ((0.0, 1.0), (0.15, 0.85)):
+        other = add_distractor(store, tmp_path / str(flip), flip, seed=1)
+        seen = other.step_values(schema.OBSERVATION, episodes, steps)
+        before = store.step_values(schema.OBSERVATION, episodes, steps)
+        np.testing.assert_array_equal(seen[:, :-1], before)
+        assert (seen[:, -1] == bit).mean() == pytest.approx(agreement, abs=0.05)
+        for name in (schema.SPLIT, schema.TERMINATED):
+            np.testing.assert_array_equal(other.episode_values(name), store.episode_values(name))
+        np.testing.assert_array_equal(other.returns, store.returns)
+        again = add_distractor(store, tmp_path / f"{flip}-again", flip, seed=1)
+        assert again.meta["fingerprint"] == other.meta["fingerprint"]
+    with pytest.raises(InputError, match=r"lies in \[0, 1\]"):
+        add_distractor(store, tmp_path / "x", flip=1.5)
+
+
+def test_a_policy_with_a_distractor_is_judged_at_zero(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "rows.json"
+    run = str(folder / "distracted-run")
+    arguments = ["evaluate", run, "--checkpoint", "last", "--episodes", "2", "--target", "900"]
+    assert main([*arguments, "--json", str(out)]) == 0
+    (row,) = json.loads(out.read_text())
+    assert row["distractors"] == [{"dimension": 11, "flip": 0.15, "seed": 0, "early": False}]
+    env = make_env("Hopper-v5", 2, [0.0])
+    seen = []
+
+    class Still:
+        def begin(self, rows: object) -> None:
+            pass
+
+        def act(self, observations: object, live: object) -> tuple[object, None]:
+            seen.append(np.array(observations))
+            return np.zeros((2, 3), dtype=np.float32), None
+
+        def observe(self, actions: object, rewards: object) -> None:
+            pass
+
+    rollout(env, Still(), 4, seed=0)  # type: ignore[arg-type]
+    assert {observation.shape for observation in seen} == {(2, 12)}
+    assert all((observation[:, 11] == 0).all() for observation in seen)
+
+
+def test_presets_are_configurations_with_targets() -> None:
+    kinds = ("medium", "medium-replay", "medium-expert", "mixed", "diverse", "")
+    for policy in POLICIES:
+        for task in TASKS:
+            for kind in kinds:
+                preset = find_preset(task.name, kind, policy)
+                resolve_config(policy, presets=preset.tables)
+                assert preset.targets
+    dc = resolve_config("dc", presets=find_preset("hopper", "medium", "dc").tables)
+    assert (dc.policy.context, dc.policy.dim, dc.train.learning_rate) == (8, 256, 1e-4)
+    dc = resolve_config("dc", presets=find_preset("walker2d", "medium", "dc").tables)
+    assert (dc.policy.context, dc.policy.dim, dc.train.learning_rate) == (20, 128, 1e-3)
+    assert dc.policy.return_scale == 1000
+    assert find_preset("halfcheetah", "medium", "dt").targets == (12000, 6000)
+    assert find_preset("walker2d", "mixed", "lsdt").targets == (10000,)
+
+
+def test_settings_win_over_presets(tmp_path: Path) -> None:
+    file = tmp_path / "x.toml"
+    file.write_text("[train]\nsteps = 7\nwarmup_steps = 3\n")
+    presets = {"train": {"steps": 5, "warmup_steps": 5, "learning_rate": 0.5}}
+    config = resolve_config("dt", file, ["train.warmup_steps=2"], presets=presets)
+    assert (config.train.steps, config.train.warmup_steps) == (7, 2)
+    assert config.train.learning_rate == 0.5
+
+
+def test_a_run_records_where_its_data_is_from(folder: Path) -> None:
+    record = read_json(folder / "store-run" / "run.json")
+    assert record["dataset"]["env_id"] == "Hopper-v5"
+    assert record["config"]["train"]["warmup_steps"] == 10_000
+    assert "mujoco" in record["versions"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["prepare", "nowhere.hdf5", "--out", "s"], "nowhere.hdf5 does not exist"),
+        (["prepare", "mujoco/hopper/expert-v9", "--out", "s"], "--download"),
+        (["train", "nowhere", "--out", "run"], "nowhere is not an episode store"),
+        (["evaluate", "nowhere"], "nowhere is not a run folder"),
+        (["evaluate", "{run}", "--env", "Nope-v1"], "Nope-v1 cannot be made"),
+        (["evaluate", "{run}", "--env", "Walker2d-v5"], "sizes (17, 6)"),
+        (["evaluate", "{run}", "--episodes", "0"], "at least one"),
+        (
+            ["train", "{store}", "--out", "{run}", "--policy", "dt", "--screen", "drop"],
+            "without --screen",
+        ),
+    ],
+)
+def test_what_cannot_be_used_is_refused_in_one_line(
+    folder: Path,
+    arguments: list[str],
+    says: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    paths = {"{run}": str(folder / "store-run"), "{store}": str(folder / "store")}
+    assert main([paths.get(argument, argument) for argument in arguments]) == 2
+    printed = capsys.readouterr().err.strip().splitlines()
+    assert says in printed[-1]
+    assert len(printed) == 1
+
+
+def test_help_needs_none_of_the_extras() -> None:
+    code = (
+        "import sys; from ucfrec.commands.cli import build_parser;"
+        "from ucfrec_control.cli import CONTROL; build_parser(CONTROL, []);"
+        "assert not {'torch', 'mujoco', 'minari', 'h5py'} & sys.modules.keys()"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.realdata
+def test_a_clone_of_a_zoo_file_hops(tmp_path: Path) -> None:
+    """Behaviour cloning, minutes less than a real run, is well above what falls at once."""
+    file = data_folder("control") / "hopper_medium-zoo.hdf5"
+    read_d4rl(file).write_store(tmp_path / "store")
+    settings = ["train.steps=300", "train.warmup_steps=20", "train.learning_rate=2e-3"]
+    settings += ["train.batch_size=256", "train.validate_every=300"]
+    options = [argument for setting in settings for argument in ("--set", setting)]
+    run = str(tmp_path / "run")
+    assert main(["train", str(tmp_path / "store"), "--out", run, "--policy", "bc", *options]) == 0
+    out = tmp_path / "rows.json"
+    assert main(["evaluate", run, "--checkpoint", "last", "--json", str(out)]) == 0
+    (row,) = json.loads(out.read_text())
+    assert row["episodes"] == 20
+    assert row["score"] > 15
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("file", BUDGETS["full"].files)
+def test_each_zoo_file_trains_ucf_that_its_environment_judges(tmp_path: Path, file: str) -> None:
+    data, store, run = data_folder("control") / f"{file}.hdf5", tmp_path / "store", tmp_path / "run"
+    assert main(["prepare", str(data), "--out", str(store)]) == 0
+    quick = [*SETTINGS, "--set", "crm.epochs=1"]
+    assert main(["train", str(store), "--out", str(run), "--policy", "ucf", *quick]) == 0
+    assert read_json(run / "run.json")["augmentation"]["acceptance"] > 0.5
+    out = tmp_path / "rows.json"
+    asked = ["--episodes", "2", "--checkpoint", "last", "--json", str(out)]
+    assert main(["evaluate", str(run), *asked]) == 0
+    rows = json.loads(out.read_text())
+    assert len(rows) == 2  # one for each of the preset's targets
+    for row in rows:
+        assert (row["dataset"], row["warnings"]) == (file, [])
+        assert row["score_low"] <= row["score"] <= row["score_high"] < 20  # it has learned nothing
+
+
+def test_a_benchmark_goes_on_where_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
+    settings = (*TINY, "policy.dim=32", "crm.epochs=1", "csg.epochs=1")
+    monkeypatch.setitem(BUDGETS, "small", Budget(("hopper_medium-made",), 1, 2, settings))
+    monkeypatch.setitem(TABLES, "main", {m: METHODS[m] for m in ("lsdt", "ucf")})
+    results = tmp_path / "control.jsonl"
+    arguments = ["benchmark", str(tmp_path), "--out", str(tmp_path / "runs")]
+    arguments += ["--results", str(results)]
+    assert main(arguments) == 0
+    rows = [json.loads(line) for line in results.read_text().splitlines()]
+    assert sorted((r["method"], r["checkpoint"]) for r in rows) == [
+        (method, checkpoint) for method in ("lsdt", "ucf") for checkpoint in ("best", "last")
+    ]
+    for row in rows:
+        assert (row["dataset"], row["budget"], row["episodes"]) == (
+            "hopper_medium-made",
+            "small",
+            2,
+        )
+        assert {"score", "seed", "env_id", "versions", "commit", "command"} <= row.keys()
+    before = results.read_text()
+    assert main(arguments) == 0
+    assert results.read_text() == before
+    results.write_text("".join(f"{json.dumps(r)}\n" for r in rows if r["method"] == "ucf"))
+    assert main(arguments) == 0
+    again = [json.loads(line) for line in results.read_text().splitlines()]
+    assert {r["method"] for r in again} == {"lsdt", "ucf"}
+    by_checkpoint = {r["checkpoint"]: r["return"] for r in rows if r["method"] == "lsdt"}
+    assert {r["checkpoint"]: r["return"] for r in again[2:]} == by_checkpoint
+    (tmp_path / "hopper_medium-made.hdf5").rename(tmp_path / "hopper_medium-own.hdf5")
+    own = ["--file", "hopper_medium-own", "--method", "lsdt", "--seeds", "2"]
+    assert main([*arguments, *own]) == 0
+    more = [json.loads(line) for line in results.read_text().splitlines()][len(again) :]
+    assert sorted((r["dataset"], r["method"], r["seed"]) for r in more) == [
+        ("hopper_medium-own", "lsdt", seed) for seed in (0, 0, 1, 1)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--method", "nope"], "no method nope in this table; it has bc, bc-10"),
+        (["--seeds", "0"], "--seeds is 0"),
+        (["--file", "nowhere"], "nowhere.hdf5 does not exist"),
+        (["--results", "{rows}"], "rows.jsonl, line 1, is no result row"),
+    ],
+)
+def test_what_no_benchmark_can_be_of_is_refused(
+    tmp_path: Path, options: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_hdf5(tmp_path / "hopper_medium-zoo.hdf5", hopper_like((30, 8, 25)))
+    rows = tmp_path / "rows.jsonl"
+    rows.write_text("no row\n")
+    given = ["benchmark", str(tmp_path), "--out", str(tmp_path / "runs")]
+    given += ["--file", "hopper_medium-zoo"] if "--file" not in options else []
+    assert main([*given, *(str(rows) if o == "{rows}" else o for o in options)]) == 2
+    printed = capsys.readouterr().err.strip().splitlines()
+    assert says in printed[-1]

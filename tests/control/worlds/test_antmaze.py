@@ -1,0 +1,269 @@
+"""AntMaze: D4RL's vectors, D4RL's world, success times a hundred."""
+
+import json
+import sys
+import warnings
+from importlib.util import find_spec
+from pathlib import Path
+
+import gymnasium
+import minari
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+from minari.data_collector import EpisodeBuffer
+
+from tests.support.control_files import hopper_like, write_hdf5
+from ucfrec.acting.rollout import rollout
+from ucfrec.errors import InputError
+from ucfrec_control.cli import main
+from ucfrec_control.data.d4rl import read_d4rl
+from ucfrec_control.data.minari import read_minari
+from ucfrec_control.learners.evaluate import load_run, open_world
+from ucfrec_control.worlds.antmaze import antmaze_settings
+from ucfrec_control.worlds.environments import make_env, mismatches
+from ucfrec_control.worlds.scores import find_kind, require_task
+
+needs_robotics = pytest.mark.skipif(
+    find_spec("gymnasium_robotics") is None, reason="the extra antmaze is not installed"
+)
+REBUILT = "d4rl/antmaze-umaze-v2"
+WORLDS = (REBUILT, "AntMaze_UMaze-v4")
+TINY = ("train.steps=2", "train.validate_every=2", "policy.dim=16", "policy.context=5")
+
+D4RL_MAZES = {
+    "umaze": "##### #S..# ###.# #G..# #####",
+    "medium": "######## #S.##..# #..#...# ##...### #..#...# #.#..#.# #...#.G# ########",
+    "large": (
+        "############ #S...#.....# #.##.#.#.#.# #......#...# #.####.###.# #..#.#.....# "
+        "##.#.#.#.### #..#...#.G.# ############"
+    ),
+}
+
+
+def simulated(env: gymnasium.vector.SyncVectorEnv) -> npt.NDArray[np.float64]:
+    """What D4RL shows of every environment: qpos, then qvel of the ant."""
+    seen = []
+    for one in env.envs:
+        data = one.unwrapped.ant_env.data  # type: ignore[attr-defined]
+        position = data.qpos[:2] - getattr(one.unwrapped, "origin", 0.0)
+        seen.append(np.concatenate([position, data.qpos[2:15], data.qvel[:14]]))
+    return np.array(seen)
+
+
+def ant_columns(lengths: tuple[int, ...]) -> dict[str, npt.NDArray[np.float32]]:
+    """A D4RL AntMaze file's: floats throughout, no successors."""
+    columns = hopper_like(lengths)
+    rng, n = np.random.default_rng(0), sum(lengths)
+    return {
+        "observations": rng.normal(size=(n, 29)).astype(np.float32),
+        "actions": rng.uniform(-1, 1, size=(n, 8)).astype(np.float32),
+        "rewards": columns["terminals"].astype(np.float32),
+        "terminals": columns["terminals"].astype(np.float32),
+        "timeouts": columns["timeouts"].astype(np.float32),
+    }
+
+
+@needs_robotics
+@pytest.mark.parametrize("env_id", WORLDS)
+def test_observations_are_laid_out_as_the_adapter_stores_them(env_id: str, tmp_path: Path) -> None:
+    env = make_env(env_id, 2)
+    assert isinstance(env, gymnasium.vector.SyncVectorEnv)
+    rng = np.random.default_rng(0)
+    shown, d4rl, actions = [env.reset(seed=0)[0]], [simulated(env)], []
+    for _ in range(6):
+        actions.append(rng.uniform(-1, 1, (2, 8)).astype(np.float32))
+        shown.append(env.step(actions[-1])[0])
+        d4rl.append(simulated(env))
+    env.close()
+    ends = np.arange(12) % 6 == 5
+    columns = {
+        "observations": np.concatenate(np.array(d4rl)[:-1].swapaxes(0, 1)),
+        "actions": np.concatenate(np.array(actions).swapaxes(0, 1)),
+        "rewards": np.zeros(12),
+        "terminals": np.zeros(12),
+        "timeouts": ends.astype(float),
+    }
+    file = write_hdf5(tmp_path / "antmaze-umaze-v2.hdf5", columns, env_id=None)
+    store = read_d4rl(file).write_store(tmp_path / "store")
+    stored = store.windows(np.arange(2), np.full(2, 5), 6).states.numpy()
+    np.testing.assert_array_equal(stored, np.array(shown)[:-1].swapaxes(0, 1).astype(np.float32))
+    assert np.ptp(stored, axis=1).min() > 0
+
+
+@needs_robotics
+@pytest.mark.parametrize(("maze", "limit"), [("umaze", 700), ("medium", 1000), ("large", 1000)])
+def test_the_rebuilt_maze_is_where_d4rl_has_it(maze: str, limit: int) -> None:
+    env_id = f"d4rl/antmaze-{maze}-v2"
+    env = make_env(env_id, 1)
+    assert isinstance(env, gymnasium.vector.SyncVectorEnv)
+    world = env.envs[0].unwrapped
+    model = world.ant_env.model  # type: ignore[attr-defined]
+    # D4RL: the cell of row i and column j is at (4j − 4, 4i − 4), so that the start is at (0, 0).
+    cells = {
+        (4 * j - 4, 4 * i - 4): cell
+        for i, row in enumerate(D4RL_MAZES[maze].split())
+        for j, cell in enumerate(row)
+    }
+    wanted = {at for at, cell in cells.items() if cell == "#"}
+    names = [model.geom(i).name for i in range(model.ngeom)]
+    blocks = [i for i, name in enumerate(names) if name.startswith("block")]
+    found = model.geom_pos[blocks, :2] - world.origin  # type: ignore[attr-defined]
+    assert {(round(x), round(y)) for x, y in found} == wanted
+    assert gymnasium.spec(env_id).max_episode_steps == limit
+    assert (model.opt.timestep, set(model.actuator_gear[:, 0])) == (0.02, {30.0})
+    starts, goals = [], []
+    for seed in range(30):
+        starts.append(env.reset(seed=seed)[0][0, :2])
+        goals.append(world.goal - world.origin)  # type: ignore[attr-defined]
+    env.close()
+    (goal,) = (at for at, cell in cells.items() if cell == "G")
+    off = np.array(goals) - goal
+    assert off.min() >= 0
+    assert off.max() <= 1.5
+    assert np.ptp(off, axis=0).min() > 1
+    assert 0.05 < np.abs(starts).max() <= 0.1
+
+
+class Teleported:
+    """Stands still until step 3, when every second ant is put on its goal."""
+
+    def __init__(self, env: gymnasium.vector.SyncVectorEnv) -> None:
+        self._env = env
+        self._steps = 0
+
+    def begin(self, rows: object) -> None:
+        pass
+
+    def act(self, observations: object, live: object) -> tuple[npt.NDArray[np.float32], None]:
+        self._steps += 1
+        if self._steps == 3:
+            for one in self._env.envs[::2]:
+                world = one.unwrapped
+                ant = world.ant_env  # type: ignore[attr-defined]
+                there = np.concatenate([world.goal, ant.data.qpos[2:]])  # type: ignore[attr-defined]
+                ant.set_state(there, ant.data.qvel)
+        return np.zeros((self._env.num_envs, 8), dtype=np.float32), None
+
+    def observe(self, actions: object, rewards: object) -> None:
+        pass
+
+
+@needs_robotics
+@pytest.mark.parametrize("env_id", WORLDS)
+def test_a_success_ends_the_episode_and_scores_a_hundred(env_id: str) -> None:
+    env = make_env(env_id, 4, settings={"max_episode_steps": 8})
+    assert isinstance(env, gymnasium.vector.SyncVectorEnv)
+    played = rollout(env, Teleported(env), 4, seed=0)
+    env.close()
+    assert played.returns.tolist() == [1, 0, 1, 0]
+    assert played.lengths.tolist() == [3, 8, 3, 8]
+    assert require_task(env_id).score(played.returns).tolist() == [100, 0, 100, 0]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("antmaze")
+    file = write_hdf5(folder / "antmaze-umaze-v2.hdf5", ant_columns((9, 1, 8) * 12), env_id=None)
+    read_d4rl(file).write_store(folder / "store")
+    settings = [argument for setting in TINY for argument in ("--set", setting)]
+    where = ["--out", str(folder / "run"), "--policy", "dt"]
+    assert main(["train", str(folder / "store"), *where, *settings]) == 0
+    return folder / "run"
+
+
+@needs_robotics
+def test_runs_on_d4rl_files_are_judged_in_d4rls_world(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "rows.json"
+    asked = ["evaluate", str(run), "--checkpoint", "last", "--target", "1", "--episodes", "1"]
+    assert main([*asked, "--json", str(out)]) == 0
+    said = capsys.readouterr()
+    assert "0.0 [0.0, 0.0]" in said.out
+    assert f"warning: {REBUILT} is rebuilt" in said.err
+    (row,) = json.loads(out.read_text())
+    assert (row["env_id"], row["length"], row["score"]) == (REBUILT, 700, 0)
+    assert main([*asked, "--env", "AntMaze_UMaze-v5"]) == 2
+    assert "have sizes (107, 8)" in capsys.readouterr().err
+
+
+@needs_robotics
+def test_minari_mazes_are_those_of_the_data(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    antmaze_settings("AntMaze_UMaze-v4")
+    maze = [[1] * 5, [1, "g", 0, 0, 1], [1, 1, 1, 0, 1], [1, "r", 0, 0, 1], [1] * 5]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        env = gymnasium.make("AntMaze_UMaze-v4", maze_map=maze, continuing_task=True)
+        seen = [env.reset(seed=0)[0]]
+        seen += [env.step(np.zeros(8))[0] for _ in range(3)]
+        buffer = EpisodeBuffer(
+            observations={name: np.array([s[name] for s in seen]) for name in seen[0]},
+            actions=np.zeros((3, 8)),
+            rewards=[0.0] * 3,
+            terminations=[False] * 3,
+            truncations=[False, False, True],
+            infos={},
+        )
+        minari.create_dataset_from_buffers(
+            "D4RL/antmaze/umaze-v1", [buffer], env=env, requirements=["gymnasium-robotics==1.2.0"]
+        )
+        env.close()
+    trajectories = read_minari("D4RL/antmaze/umaze-v1")
+    source = trajectories.source
+    assert (source["env_id"], source["env_settings"]["maze_map"]) == ("AntMaze_UMaze-v4", maze)
+    assert any("gymnasium-robotics 1.2.0" in text for text in mismatches(source, source["env_id"]))
+    policy = load_run(run, "last")
+    policy.record["dataset"].update(source)
+    world = open_world(policy, source["env_id"], 1)
+    starts = [world.reset(seed=seed)[0][0] for seed in range(5)]
+    np.testing.assert_array_equal(starts[0], trajectories.observations[0])
+    # The cell of "r", three rows down at the left, whatever the seed.
+    assert np.abs(np.array(starts)[:, :2] - (-4, -4)).max() <= 1
+    world.close()
+
+
+def test_names_of_d4rl_tell_its_worlds() -> None:
+    task = require_task("antmaze")
+    for name, maze in {
+        "antmaze-umaze-v2": "umaze",
+        "antmaze-umaze-diverse-v2": "umaze",
+        "antmaze-medium-play-v2": "medium",
+        "antmaze-large-diverse-v2": "large",
+        "Ant_maze_u-maze_noisy_multistart_False_multigoal_False_sparse_fixed": "umaze",
+        "Ant_maze_big-maze_noisy_multistart_True_multigoal_True_sparse_fixed": "medium",
+        "Ant_maze_hardest-maze_noisy_multistart_True_multigoal_True_sparse_fixed": "large",
+    }.items():
+        assert require_task(name) == task
+        assert task.d4rl_env(name) == f"d4rl/antmaze-{maze}-v2"
+    assert task.d4rl_env("antmaze-mine") is None
+    assert find_kind("antmaze-medium-diverse-v2") == "diverse"
+
+
+def test_without_gymnasium_robotics_one_line_says_what_to_install(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "gymnasium_robotics", None)
+    assert main(["evaluate", str(run)]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert f"{REBUILT} needs gymnasium-robotics" in line
+    assert "install ucfrec[control,antmaze]" in line
+    with pytest.raises(InputError, match="needs gymnasium-robotics"):
+        make_env("AntMaze_UMaze-v4", 1)
+
+
+@needs_robotics
+def test_d4rl_files_keep_their_world_in_minari(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    file = write_hdf5(tmp_path / "antmaze-umaze-v2.hdf5", ant_columns((9, 8)), env_id=None)
+    assert main(["convert", str(file), "antmaze/mine-v0"]) == 0
+    read = read_minari("antmaze/mine-v0")
+    assert (read.source["env_id"], read.source["env_settings"]) == (REBUILT, {"maze": "umaze"})
+    np.testing.assert_array_equal(read.observations, read_d4rl(file).observations)

@@ -1,0 +1,168 @@
+"""Edits keep the true reward; the default generator's are varied, the paper's are not."""
+
+import copy
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tests.support.planted import CONSTANT, f, fitted, planted
+from tests.support.real_data import data_folder
+from ucfrec.counterfactual.augment import accept
+from ucfrec.counterfactual.edit_statistics import MoveReport, MoveStatistics
+from ucfrec.counterfactual.generators import CSGConfig, Generator, make_generator
+from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, fit_crm
+from ucfrec.episodes.windows import Transitions
+from ucfrec.errors import InputError
+
+TANGENT = CSGConfig()
+FAITHFUL = CSGConfig(kind="faithful", epochs=12)
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> None:
+    torch.set_num_threads(1)
+
+
+def made(config: CSGConfig, folder: Path) -> Generator:
+    return make_generator(planted(20_000, 0).transitions, fitted()[0], config, folder, seed=0)
+
+
+def proposed(
+    generator: Generator, crm: CausalRewardModel, at: Transitions, seed: int = 0
+) -> tuple[Tensor, Tensor]:
+    """Counterfactual states, and which of them pass both gates in float64."""
+    with torch.no_grad():
+        z = crm.abduct(at.states, at.actions, at.rewards)
+    edited = generator.propose(at.states, at.actions, z, torch.Generator().manual_seed(seed))
+    assert edited.dtype == torch.float32
+    exact = copy.deepcopy(crm).double()
+    s, a, r = at.states.double(), at.actions.double(), at.rewards.double()
+    factual = replace(at, states=s, actions=a, rewards=r)
+    with torch.no_grad():
+        z = exact.abduct(s, a, r)
+        passed = accept(exact, factual, z, edited.double(), 0.1 * float(crm.reward_std), 0.5)
+    return edited, passed
+
+
+def moves(crm: CausalRewardModel, at: Transitions, edited: Tensor) -> MoveReport:
+    statistics = MoveStatistics(at.states.shape[1])
+    statistics.add(crm.moves(at.states, edited))
+    return statistics.report(0.5, int((crm.state_std > 0).sum()))
+
+
+@pytest.mark.parametrize("config", [TANGENT, FAITHFUL], ids=lambda config: config.kind)
+def test_accepted_edits_keep_the_true_reward(config: CSGConfig, tmp_path: Path) -> None:
+    crm, _ = fitted()
+    at = planted(4_000, 2).transitions
+    edited, passed = proposed(made(config, tmp_path), crm, at)
+    assert passed.float().mean() >= 0.8
+    # r − f(s, a) is the disturbance u, the same for both.
+    true_change = (f(edited, at.actions) - f(at.states, at.actions)).abs()
+    kept = true_change[passed] <= 0.1 * crm.reward_std
+    assert kept.float().mean() >= 0.9
+    assert torch.equal(edited[:, CONSTANT], at.states[:, CONSTANT])
+
+
+def test_tangent_moves_stay_on_the_level_set_and_in_the_band(tmp_path: Path) -> None:
+    crm, _ = fitted()
+    at = planted(4_000, 2).transitions
+    edited, _ = proposed(made(TANGENT, tmp_path), crm, at)
+    with torch.no_grad():
+        z = crm.abduct(at.states, at.actions, at.rewards)
+        drift = crm.predict(edited, at.actions, z) - crm.predict(at.states, at.actions, z)
+    assert (drift.abs() / crm.reward_std).quantile(0.99) < 0.01
+    report = moves(crm, at, edited)
+    assert report.length_quantiles["0.05"] > 0.18
+    assert report.histogram_counts[-1] > 0
+    assert report.mean_move_ratio < 0.1
+    # The level set takes one of the six dimensions that vary.
+    assert 3.5 < report.effective_rank < 6
+
+
+def test_proposals_are_the_seeds(tmp_path: Path) -> None:
+    crm, _ = fitted()
+    at = planted(200, 2).transitions
+    first, again = made(TANGENT, tmp_path), made(TANGENT, tmp_path)
+    assert torch.equal(proposed(first, crm, at)[0], proposed(again, crm, at)[0])
+    assert not torch.equal(proposed(first, crm, at)[0], proposed(first, crm, at, seed=1)[0])
+
+
+def test_few_states_and_no_shape_at_all(tmp_path: Path) -> None:
+    crm, _ = fitted()
+    at = planted(3, 0).transitions
+    generator = make_generator(at, crm, TANGENT, tmp_path, seed=0)
+    assert proposed(generator, crm, at)[0].isfinite().all()
+    assert len(proposed(generator, crm, planted(0, 0).transitions)[0]) == 0
+
+
+def test_an_unknown_kind_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"csg\.kind is 'magic'"):
+        made(CSGConfig(kind="magic"), tmp_path)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def hopper(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[CausalRewardModel, Transitions, Transitions]:
+    import h5py
+
+    torch.set_num_threads(1)
+    with h5py.File(data_folder("control") / "hopper_medium-expert-zoo.hdf5") as file:
+        s, a, r = (
+            torch.from_numpy(np.asarray(file[name], dtype=np.float32))
+            for name in ("observations", "actions", "rewards")
+        )
+        episode = np.cumsum(np.asarray(file["terminals"]) | np.asarray(file["timeouts"]))
+    held_out = torch.from_numpy(episode % 10 == 0)
+
+    def some(which: Tensor) -> Transitions:
+        rows = torch.nonzero(which)[::3, 0]
+        last = torch.zeros(len(rows), dtype=torch.bool)
+        return Transitions(s[rows], a[rows], r[rows], torch.zeros_like(s[rows]), last)
+
+    train, rest = some(~held_out), some(held_out)
+    config = CRMConfig(epochs=8, learning_rate=1e-3)
+    crm, _ = fit_crm(train, rest, config, tmp_path_factory.mktemp("hopper"), seed=0)
+    return crm, train, rest
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(
+    ("config", "varied"),
+    [(TANGENT, True), (CSGConfig(kind="faithful", epochs=8), False)],
+    ids=["tangent", "faithful"],
+)
+def test_edit_collapse_on_hopper(
+    hopper: tuple[CausalRewardModel, Transitions, Transitions],
+    config: CSGConfig,
+    varied: bool,
+    tmp_path: Path,
+) -> None:
+    crm, train, at = hopper
+    edited, passed = proposed(make_generator(train, crm, config, tmp_path, seed=0), crm, at)
+    report = moves(crm, Transitions(*(v[passed] for v in vars(at).values())), edited[passed])
+    assert passed.float().mean() >= 0.8
+    if varied:
+        assert report.mean_move_ratio <= 0.3
+        assert report.effective_rank > 5
+    else:
+        assert report.mean_move_ratio > 0.5
+
+
+def test_noise_fills_the_band_in_every_direction_and_spares_what_never_varies(
+    tmp_path: Path,
+) -> None:
+    crm, _ = fitted()
+    at = planted(2000, 1).transitions
+    edited, _ = proposed(made(CSGConfig(kind="noise"), tmp_path), crm, at)
+    moves = crm.moves(at.states, edited)
+    length = moves.norm(dim=1)
+    assert 0.199 < length.min() < 0.21
+    assert 0.49 < length.max() < 0.501
+    assert (moves[:, CONSTANT] == 0).all()
+    varying = moves[:, crm.state_std > 0]
+    assert varying.mean(0).abs().max() < 0.03

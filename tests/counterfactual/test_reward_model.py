@@ -1,0 +1,130 @@
+"""The reward model finds the planted disturbance, and says so when there is none."""
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch.distributions import Normal, kl_divergence
+
+from tests.support.planted import ACTION, CONSTANT, FIT, STATE, affine_correlation, fitted, planted
+from ucfrec.counterfactual.reward_model import (
+    CausalRewardModel,
+    CRMConfig,
+    Posterior,
+    fit_crm,
+    kl_to_prior,
+)
+from ucfrec.errors import InputError
+
+QUICK = CRMConfig(epochs=1, hidden=32, latent_dim=3, learning_rate=1e-3)
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> None:
+    torch.set_num_threads(1)
+
+
+def test_the_planted_disturbance_is_abduced() -> None:
+    crm, report = fitted()
+    unseen = planted(4_000, 2)
+    t = unseen.transitions
+    with torch.no_grad():
+        z = crm.abduct(t.states, t.actions, t.rewards)
+        predicted = crm.predict(t.states, t.actions, z)
+    assert affine_correlation(z, unseen.disturbance) >= 0.9
+    assert (predicted - t.rewards).abs().quantile(0.95) <= 2 * report.delta["0.95"]
+
+
+def test_the_report_tells_what_z_is_worth() -> None:
+    _, report = fitted()
+    assert report.z_share == pytest.approx(0.3, abs=0.06)
+    assert report.r2_without_z == pytest.approx(0.7, abs=0.06)
+    assert report.r2 > 0.98
+    assert report.active_dimensions >= 1
+    assert report.z_leak < 0.1
+    assert list(report.delta.values()) == sorted(report.delta.values())
+    assert report.warning == ""
+    assert json.loads(json.dumps(asdict(report)))["train_transitions"] == 20_000
+
+
+def test_the_plain_autoencoder_leaks_and_is_told_on(tmp_path: Path) -> None:
+    train, held_out = planted(8_000, 0).transitions, planted(4_000, 1).transitions
+    plain = replace(FIT, mean_first=False, epochs=15)
+    _, report = fit_crm(train, held_out, plain, tmp_path, seed=0)
+    assert report.z_share > 0.5
+    assert report.warning.startswith("latent leak")
+
+
+def test_a_reward_without_disturbance_collapses_and_is_told_on(tmp_path: Path) -> None:
+    train, held_out = planted(8_000, 0, share=0).transitions, planted(2_000, 1, share=0).transitions
+    train = replace(train, rewards=train.states[:, 0] - train.actions[:, 1])
+    held_out = replace(held_out, rewards=held_out.states[:, 0] - held_out.actions[:, 1])
+    config = replace(FIT, epochs=8, hidden=64)
+    _, report = fit_crm(train, held_out, config, tmp_path, seed=0)
+    assert report.z_share < 0.01
+    assert "collapse" in report.warning
+
+
+def test_equal_rewards_and_empty_splits_are_refused(tmp_path: Path) -> None:
+    some = planted(300, 0).transitions
+    flat = replace(some, rewards=torch.full((300,), 0.1))
+    none = planted(0, 0).transitions
+    with pytest.raises(InputError, match=r"all 300 training rewards equal 0\.1"):
+        fit_crm(flat, some, QUICK, tmp_path, seed=0)
+    with pytest.raises(InputError, match="no held-out transitions"):
+        fit_crm(some, none, QUICK, tmp_path, seed=0)
+    with pytest.raises(InputError, match="no training transitions"):
+        fit_crm(none, some, QUICK, tmp_path, seed=0)
+    assert not list(tmp_path.iterdir())
+
+
+def test_dimensions_that_never_vary_are_inert(tmp_path: Path) -> None:
+    train = planted(2_000, 0).transitions
+    crm, _ = fit_crm(train, planted(500, 1).transitions, QUICK, tmp_path, seed=0)
+    assert crm.state_std[CONSTANT] == 0
+    normalised = crm.normalised_states(train.states)
+    assert normalised[:, CONSTANT].abs().max() < 1e-6
+    torch.testing.assert_close(
+        normalised.std(0)[:CONSTANT], torch.ones(CONSTANT), rtol=0.01, atol=0
+    )
+    shifted = train.states + torch.eye(STATE)[CONSTANT]
+    assert crm.moves(train.states, shifted)[:, CONSTANT].isinf().all()
+
+
+def test_one_seed_one_model_and_a_finished_run_is_not_repeated(tmp_path: Path) -> None:
+    train, held_out = planted(2_000, 0).transitions, planted(500, 1).transitions
+    config = replace(QUICK, max_transitions=1_500)
+
+    def weights(folder: str, seed: int) -> torch.Tensor:
+        crm, report = fit_crm(train, held_out, config, tmp_path / folder, seed)
+        assert report.train_transitions == 1_500
+        return torch.cat([value.flatten() for value in crm.state_dict().values()])
+
+    first = weights("a", 0)
+    assert torch.equal(first, weights("b", 0))
+    assert torch.equal(first, weights("a", 0))
+    assert not torch.equal(first, weights("c", 1))
+
+
+def test_the_elbo_is_equation_2() -> None:
+    torch.manual_seed(0)
+    crm = CausalRewardModel(STATE, ACTION, QUICK).double()
+    s, a, r = (
+        torch.randn(5, STATE).double(),
+        torch.randn(5, ACTION).double(),
+        torch.randn(5).double(),
+    )
+    noise = torch.randn(5, 3).double()
+    q = crm.encode(s, a, r)
+    assert torch.equal(crm.abduct(s, a, r), q.mean)
+    posterior = Normal(q.mean, (0.5 * q.log_variance).exp())
+    z = q.mean + posterior.stddev * noise
+    elbo = crm.elbo(s, a, r, noise)
+    likelihood = Normal(crm.predict(s, a, z), QUICK.decoder_std)
+    expected = likelihood.log_prob(r)  # type: ignore[no-untyped-call]
+    torch.testing.assert_close(elbo.log_likelihood, expected)
+    kl = kl_divergence(posterior, Normal(torch.zeros(()).double(), 1.0))
+    torch.testing.assert_close(elbo.kl, kl.sum(-1))
+    torch.testing.assert_close(kl_to_prior(Posterior(q.mean, q.log_variance)), kl)

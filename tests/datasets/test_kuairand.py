@@ -1,0 +1,173 @@
+"""KuaiRand: official file names of all releases, and the real rows."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.support.real_data import data_folder
+from ucfrec import schema
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare, validate
+from ucfrec.plugins import load_plugin
+from ucfrec_datasets.kuairand import DATASET
+
+KEYS = ["user_id", "video_id", "time_ms"]
+
+
+def real_log() -> tuple[Path, pd.DataFrame]:
+    folder = data_folder("kuairand")
+    return folder, pd.read_parquet(next(folder.glob("log_*.parquet")))
+
+
+def official(folder: Path, suffix: str, parts: dict[str, int]) -> None:
+    """Small CSV files in the official schema, cut into as many parts as the release has."""
+    generator = np.random.default_rng(0)
+    rows, videos, users = 300, 30, 20
+    feedback = [
+        "is_click",
+        "is_like",
+        "is_follow",
+        "is_comment",
+        "is_forward",
+        "is_hate",
+        "long_view",
+    ]
+    log = {
+        "user_id": generator.integers(users, size=rows),
+        "video_id": generator.integers(videos, size=rows),
+        "date": 20220410,
+        "hourmin": 1200,
+        "time_ms": 1_649_500_000_000 + generator.integers(10**9, size=rows),
+        **{name: generator.integers(2, size=rows) for name in feedback},
+        "play_time_ms": generator.integers(9000, size=rows),
+        "duration_ms": generator.integers(1, 9000, size=rows),
+        "profile_stay_time": 0,
+        "comment_stay_time": 0,
+        "is_profile_enter": 0,
+        "is_rand": 0,
+        "tab": 1,
+    }
+    ids = np.arange(videos)
+    basic = {
+        "video_id": ids,
+        "author_id": ids,
+        "video_type": "NORMAL",
+        "upload_dt": "2022-04-10",
+        "upload_type": np.where(ids % 2, "Web", "LongImport"),
+        "visible_status": 0.0,
+        "video_duration": 1000.0 * ids,
+        "server_width": 720.0,
+        "server_height": 1280.0,
+        "music_id": ids,
+        "music_type": 9.0,
+        "tag": [f"{i % 3},{i % 5}" if i % 7 else None for i in ids],
+    }
+    people = {"user_id": np.arange(users), "user_active_degree": "full_active"}
+    numbers = "is_lowactive_period is_live_streamer is_video_author follow_user_num fans_user_num "
+    numbers += "friend_user_num register_days"
+    names = numbers.split() + [f"onehot_feat{i}" for i in range(18)]
+    people |= {name: generator.integers(5, size=users) for name in names}
+    tables = {
+        f"log_random_4_22_to_5_08_{suffix}": {**log, "time_ms": log["time_ms"] + 1, "is_rand": 1},
+        f"log_standard_4_08_to_4_21_{suffix}": log,
+        f"log_standard_4_22_to_5_08_{suffix}": {**log, "time_ms": log["time_ms"] + 10**9},
+        f"user_features_{suffix}": people,
+        f"video_features_basic_{suffix}": basic,
+    }
+    for name, columns in tables.items():
+        frame = pd.DataFrame(columns)
+        count = next((n for start, n in parts.items() if name.startswith(start)), 1)
+        for number, piece in enumerate(np.array_split(np.arange(len(frame)), count), 1):
+            ending = f"_part{number}" if count > 1 else ""
+            frame.iloc[piece].to_csv(folder / f"{name}{ending}.csv", index=False)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "parts"),
+    [("pure", {}), ("1k", {}), ("27k", {"log_standard": 2, "video_features_basic": 3})],
+)
+def test_official_files_of_every_release(
+    tmp_path: Path, suffix: str, parts: dict[str, int]
+) -> None:
+    source = tmp_path / "data"
+    source.mkdir()
+    official(source, suffix, parts)
+    files, mapping = DATASET.resolve([source], LogMapping())
+    assert len(files) == (5 if parts else 3)
+    (basic,) = mapping.item_features
+    assert len(basic.files) == (3 if parts else 1)
+    report = prepare(files, mapping, tmp_path / "store", PrepareOptions(embedding_size=8))
+    assert report["rows_read"] == 900
+    assert report["reward"] == "is_click"
+    store = EpisodeStore.open(tmp_path / "store")
+    randomly = store.step_values(schema.IS_RANDOM, *store.all_steps())
+    assert 250 < randomly.sum() <= 300
+    assert store.item_states.embeddings.shape == (30, 8)
+    assert (store.item_states.embeddings.norm(dim=1) > 0).all()
+    assert store.item_states.user_features.shape[1] >= 20
+
+
+def test_files_may_be_named_one_by_one(tmp_path: Path) -> None:
+    official(tmp_path, "pure", {})
+    name = "log_standard_4_08_to_4_21_pure.csv"
+    files, mapping = DATASET.resolve([tmp_path / name], LogMapping(reward="long_view"))
+    assert files == (tmp_path / name,)
+    assert mapping.reward == "long_view"
+    assert len(mapping.item_features) == len(mapping.user_features) == 1
+    with pytest.raises(InputError, match=r"no KuaiRand log among 1 file"):
+        DATASET.resolve([tmp_path / "user_features_pure.csv"], LogMapping())
+
+
+def test_the_statistics_are_joined_only_when_named(tmp_path: Path) -> None:
+    official(tmp_path, "pure", {})
+    statistics = tmp_path / "video_features_statistic_pure.csv"
+    pd.DataFrame({"video_id": [1]}).to_csv(statistics, index=False)
+    assert len(DATASET.resolve([tmp_path], LogMapping())[1].item_features) == 1
+    assert len(DATASET.resolve([tmp_path, statistics], LogMapping())[1].item_features) == 2
+
+
+def test_it_is_announced() -> None:
+    assert load_plugin("datasets", "kuairand") is not None
+
+
+@pytest.mark.realdata
+def test_duplicates_are_those_an_independent_count_finds() -> None:
+    folder, log = real_log()
+    files, mapping = DATASET.resolve([folder], LogMapping())
+    report = validate(files, mapping)
+    duplicates = int(log.duplicated(KEYS).sum())
+    assert duplicates == 2979
+    assert report["dropped"] == {**dict.fromkeys(report["dropped"], 0), "duplicate": duplicates}
+    assert report["rows_read"] == len(log) == 94_784
+    assert report["users"] == log["user_id"].nunique()
+    assert report["items"] == log["video_id"].nunique()
+
+
+@pytest.mark.realdata
+def test_the_real_log_in_shuffled_order_gives_the_same_store(tmp_path: Path) -> None:
+    folder, log = real_log()
+    _, mapping = DATASET.resolve([folder], LogMapping())
+    log.sample(frac=1, random_state=0).to_csv(tmp_path / "log_standard_x.csv", index=False)
+    for name, source in (("a", folder), ("b", tmp_path / "log_standard_x.csv")):
+        files, _ = DATASET.resolve([source], LogMapping())
+        prepare(files, mapping, tmp_path / name, PrepareOptions(embedding_size=8))
+    stores = [EpisodeStore.open(tmp_path / name) for name in "ab"]
+    assert stores[0].meta["fingerprint"] == stores[1].meta["fingerprint"]
+    assert stores[0].item_states.embeddings.equal(stores[1].item_states.embeddings)
+
+
+@pytest.mark.realdata
+def test_videos_of_unknown_length_earn_no_watch_ratio(tmp_path: Path) -> None:
+    folder, log = real_log()
+    files, mapping = DATASET.resolve([folder], LogMapping())
+    reward = "least(play_time_ms / duration_ms, 5)"
+    report = validate(files, mapping, PrepareOptions(reward=reward))
+    kept = log.drop_duplicates(KEYS)
+    known = kept[kept["duration_ms"] > 0]
+    assert report["dropped"]["reward_not_finite"] == len(kept) - len(known)
+    ratio = np.minimum(known["play_time_ms"] / known["duration_ms"], 5)
+    assert report["reward_statistics"]["mean"] == pytest.approx(ratio.mean(), rel=1e-3)

@@ -1,0 +1,157 @@
+"""KuaiRec: files generated in the official schema, dirt included, as logs and as a world."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.evaluation.evaluate import World, evaluate_behavior
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare
+from ucfrec_datasets.kuairec import DATASET
+from ucfrec_simulators.kuai.kuairec import SIMULATOR, SIMULATOR_NX_10, kuairec
+
+USERS, VIDEOS, JUDGED_USERS, JUDGED_VIDEOS = 12, 40, 8, 25
+
+
+def matrix(pairs: np.ndarray, rng: np.random.Generator) -> pd.DataFrame:
+    """Rows of big_matrix or small_matrix for (user, video) pairs."""
+    seconds = np.sort(1_594_000_000 + rng.uniform(0, 9e5, len(pairs))).round(3)
+    moments = pd.to_datetime(seconds, unit="s")
+    play, duration = rng.integers(0, 30_000, len(pairs)), rng.integers(2_000, 30_000, len(pairs))
+    return pd.DataFrame(
+        {
+            "user_id": pairs[:, 0],
+            "video_id": pairs[:, 1],
+            "play_duration": play,
+            "video_duration": duration,
+            "time": moments.strftime("%Y-%m-%d %H:%M:%S.%f"),
+            "date": moments.strftime("%Y%m%d").astype(int),
+            "timestamp": seconds,
+            "watch_ratio": play / duration,
+        }
+    )
+
+
+def official(folder: Path) -> Path:
+    """All files, as their authors wrote them: NaN times, repeated rows, lists as text."""
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    pairs = np.stack([rng.integers(USERS, size=900), rng.integers(VIDEOS, size=900)], axis=1)
+    big = matrix(pairs, rng)
+    pd.concat([big, big.iloc[100:130]]).to_csv(folder / "big_matrix.csv", index=False)
+    every = np.array([(u, v) for u in range(JUDGED_USERS) for v in range(5, 5 + JUDGED_VIDEOS)])
+    small = matrix(every[rng.permutation(len(every))[:-3]], rng)
+    untimed = small.sample(20, random_state=0).index
+    small.loc[untimed, ["time", "date", "timestamp"]] = np.nan
+    small.to_csv(folder / "small_matrix.csv", index=False)
+    tags = [sorted(rng.choice(31, size=rng.integers(1, 5), replace=False)) for _ in range(VIDEOS)]
+    feat = [str([int(tag) for tag in own]) for own in tags]
+    categories = pd.DataFrame({"video_id": range(VIDEOS), "feat": feat})
+    categories.to_csv(folder / "item_categories.csv", index=False)
+    people = {"user_id": range(USERS), "user_active_degree": "full_active"}
+    for name in ("is_lowactive_period", "is_live_streamer", "is_video_author"):
+        people[name] = rng.integers(2, size=USERS)
+    for name in ("follow_user_num", "fans_user_num", "friend_user_num", "register_days"):
+        people |= {name: rng.integers(500, size=USERS), f"{name}_range": "(0,500]"}
+    people |= {f"onehot_feat{i}": rng.integers(3, size=USERS).astype(float) for i in range(18)}
+    users = pd.DataFrame(people)
+    users.loc[3, "onehot_feat4"] = np.nan
+    users.to_csv(folder / "user_features.csv", index=False)
+    social = pd.DataFrame({"user_id": [1], "friend_list": ["[2, 3]"]})
+    social.to_csv(folder / "social_network.csv", index=False)
+    daily = pd.DataFrame(
+        [
+            {
+                "video_id": video,
+                "date": 20200705 + day,
+                "author_id": video // 3,
+                "video_type": "NORMAL",
+                "upload_dt": f"2020-03-{1 + video % 28:02d}",
+                "upload_type": "LongImport" if video % 2 else "Web",
+                "visible_status": "public",
+                "video_duration": 1000.0 * video if video % 5 else np.nan,
+                "video_width": 720,
+                "video_height": 1280 if video % 3 else 400,
+                "music_id": video,
+                "video_tag_id": video % 4,
+                "video_tag_name": "tag",
+                "show_cnt": day,
+            }
+            for day in range(3)
+            for video in range(VIDEOS)
+        ]
+    )
+    daily.to_csv(folder / "item_daily_features.csv", index=False)
+    return folder
+
+
+def test_a_folder_means_the_training_matrix(tmp_path: Path) -> None:
+    folder = official(tmp_path / "data")
+    files, mapping = DATASET.resolve([folder], LogMapping())
+    assert [file.name for file in files] == ["big_matrix.csv"]
+    report = prepare(files, mapping, tmp_path / "store", PrepareOptions(embedding_size=8))
+    assert report["rows_read"] == 930
+    assert report["dropped"]["duplicate"] == 30
+    store = EpisodeStore.open(tmp_path / "store")
+    assert store.n_steps == 900
+    assert 50 < store.n_episodes < 900
+    rewards = store.step_values("reward", *store.all_steps())
+    assert rewards.max() <= 5
+    assert store.item_states.embeddings.shape == (VIDEOS, 8)
+    assert store.item_states.user_features.shape[0] == USERS
+
+
+def test_rows_without_a_time_are_dropped_and_counted(tmp_path: Path) -> None:
+    folder = official(tmp_path / "data")
+    files, mapping = DATASET.resolve([folder / "small_matrix.csv"], LogMapping())
+    report = prepare(files, mapping, tmp_path / "store", PrepareOptions(embedding_size=4))
+    assert report["rows_read"] == JUDGED_USERS * JUDGED_VIDEOS - 3
+    assert report["dropped"]["null_key"] == 20
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    folder = official(tmp_path / "data")
+    with pytest.raises(InputError, match="no KuaiRec log among 1 file"):
+        DATASET.resolve([folder / "user_features.csv"], LogMapping())
+
+
+def test_the_world_is_the_observed_matrix(tmp_path: Path) -> None:
+    folder = official(tmp_path / "data")
+    env = kuairec(1, folder)
+    small = pd.read_csv(folder / "small_matrix.csv")
+    assert env.rewards.shape == (JUDGED_USERS, JUDGED_VIDEOS)
+    wanted = small.pivot_table(index="user_id", columns="video_id", values="watch_ratio")
+    every = np.indices(env.rewards.shape)
+    np.testing.assert_allclose(
+        env.rewards[every[0], every[1]], wanted.clip(0, 5).fillna(0), rtol=1e-6
+    )
+    assert (env.rewards[every[0], every[1]] == 5).any()
+    np.testing.assert_array_equal(env.item_ids, np.arange(5, 5 + JUDGED_VIDEOS))
+    feat = pd.read_csv(folder / "item_categories.csv").set_index("video_id")["feat"]
+    assert [str(list(own)) for own in env.tags] == feat.loc[env.item_ids].tolist()
+
+
+def test_it_is_played_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = official(tmp_path / "data")
+    monkeypatch.setattr(World, "simulator", lambda self: SIMULATOR)
+    rows = {b: evaluate_behavior(World("kuairec", folder), b, 50, 0) for b in ("random", "oracle")}
+    assert rows["oracle"]["R_cum"] > 2 * rows["random"]["R_cum"]
+    assert SIMULATOR_NX_10.make(3, folder).regime.steps == 10
+
+
+def test_missing_and_foreign_files_are_named(tmp_path: Path) -> None:
+    folder = official(tmp_path / "data")
+    categories = pd.read_csv(folder / "item_categories.csv")
+    categories.iloc[:10].to_csv(folder / "item_categories.csv", index=False)
+    with pytest.raises(InputError, match=r"item_categories\.csv lacks 20 videos such as 10"):
+        kuairec(1, folder)
+    (folder / "small_matrix.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(InputError, match=r"small_matrix\.csv is not the official file"):
+        kuairec(1, folder)
+    (folder / "small_matrix.csv").unlink()
+    with pytest.raises(InputError, match=r"small_matrix\.csv is missing; get it from"):
+        kuairec(1, folder)

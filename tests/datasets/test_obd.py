@@ -1,0 +1,129 @@
+"""Open Bandit Dataset: official file names, and two real policies judged by each other's logs."""
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+import pytest
+
+from tests.support.real_data import data_folder
+from ucfrec import schema
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.evaluation.metrics import bootstrap_interval
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.prepare import prepare
+from ucfrec.off_policy.estimators import LoggedSteps, estimate, overlap, warnings
+from ucfrec.plugins import load_plugin
+from ucfrec_datasets.obd import DATASET
+
+ITEMS, POSITIONS, ROWS = 6, 3, 400
+MIDNIGHT = 1_574_553_600_000
+"""2019-11-24 UTC, in milliseconds."""
+KINDS = ["81ce123cbb5bd8ce818f60fb3586bba5", "cef3390ed299c09874189c387777674a"]
+
+
+def official(folder: Path) -> pd.DataFrame:
+    """A small campaign as the release has it: `all.csv` and `item_context.csv`."""
+    rng = np.random.default_rng(0)
+    times = MIDNIGHT + np.sort(rng.integers(10**8, size=ROWS))
+    log = pd.DataFrame({"timestamp": pd.to_datetime(times, unit="ms", utc=True).astype(str)})
+    log["item_id"] = rng.integers(ITEMS, size=ROWS)
+    log["position"] = 1 + rng.integers(POSITIONS, size=ROWS)
+    log["click"] = rng.integers(2, size=ROWS)
+    log["propensity_score"] = 1 / ITEMS
+    for n in range(4):
+        log[f"user_feature_{n}"] = rng.choice(KINDS, size=ROWS)
+    for item in range(ITEMS):
+        log[f"user-item_affinity_{item}"] = 0.0
+    context = pd.DataFrame({"item_id": np.arange(ITEMS), "item_feature_0": rng.normal(size=ITEMS)})
+    for n in (1, 2, 3):
+        context[f"item_feature_{n}"] = rng.choice(KINDS, size=ITEMS)
+    log.to_csv(folder / "all.csv")
+    context.to_csv(folder / "item_context.csv")
+    return log
+
+
+@pytest.mark.parametrize("name", ["", "all.csv"])
+def test_official_files(tmp_path: Path, name: str) -> None:
+    source = tmp_path / "all"
+    source.mkdir()
+    log = official(source)
+    files, mapping = DATASET.resolve([source / name], LogMapping())
+    assert files == (source / "all.csv",)
+    report = prepare(files, mapping, tmp_path / "store")
+    assert report["reward"] == "click"
+    assert report["episodes"] == report["steps"] == ROWS
+    assert report["users"] == len(log.filter(like="user_feature").drop_duplicates())
+    store = EpisodeStore.open(tmp_path / "store")
+    assert store.item_states.user_features.shape[1] > 0
+    steps = store.all_steps()
+    np.testing.assert_allclose(store.step_values(schema.PROPENSITY, *steps), 1 / ITEMS)
+    times = np.sort(store.step_values(schema.TIMESTAMP, *steps))
+    assert MIDNIGHT <= times[0] < times[-1] < MIDNIGHT + 10**8
+    began = pd.Timestamp(log.timestamp[0]) - pd.Timestamp("2019-11-24", tz="UTC")
+    assert times[0] - MIDNIGHT == began // pd.Timedelta(milliseconds=1)
+    shown_at = store.step_values(schema.OBSERVATION, *steps)
+    np.testing.assert_array_equal(shown_at.sum(0), np.bincount(log.position)[1:])
+    assert (shown_at.sum(1) == 1).all()
+
+
+def test_features_alone_are_refused(tmp_path: Path) -> None:
+    official(tmp_path)
+    with pytest.raises(InputError, match="holds features, no impressions"):
+        DATASET.resolve([tmp_path / "item_context.csv"], LogMapping())
+
+
+def test_it_is_announced() -> None:
+    assert load_plugin("datasets", "obd") is DATASET
+
+
+def real(policy: str) -> tuple[Path, pd.DataFrame]:
+    path = data_folder("obd") / f"{policy}_all.parquet"
+    return path, pd.read_parquet(path)
+
+
+def shares(log: pd.DataFrame) -> npt.NDArray[np.float64]:
+    """(position, item) how often each item was shown there."""
+    counts = np.zeros((POSITIONS, 80))
+    np.add.at(counts, (log.position - 1, log.item_id), 1)
+    return np.asarray(counts / counts.sum(1, keepdims=True))
+
+
+@pytest.mark.realdata
+def test_every_real_impression_is_a_session_with_its_propensity(tmp_path: Path) -> None:
+    path, log = real("random")
+    files, mapping = DATASET.resolve([path], LogMapping())
+    assert len(mapping.item_features) == 1
+    report = prepare(files, mapping, tmp_path / "store")
+    assert report["steps"] == report["episodes"] == len(log) == 10_000
+    assert (report["items"], report["users"], report["unknown_propensities"]) == (80, 240, 0)
+    assert report["reward_statistics"]["mean"] == pytest.approx(log.click.mean())
+    store = EpisodeStore.open(tmp_path / "store")
+    np.testing.assert_allclose(store.step_values(schema.PROPENSITY, *store.all_steps()), 1 / 80)
+
+
+@pytest.mark.realdata
+def test_random_logs_tell_what_thompson_sampling_earns() -> None:
+    """The policy of the bts logs, taken as its shares of items by position, judged by the random
+    logs; the truth is the click rate of the bts logs, 42 clicks in 10,000, itself uncertain."""
+    _, random = real("random")
+    _, bts = real("bts")
+    steps = LoggedSteps(
+        session=np.arange(len(random)),
+        reward=random.click.to_numpy(dtype=np.float64),
+        propensity=random.propensity_score.to_numpy(),
+        target=shares(bts)[random.position - 1, random.item_id],
+    )
+    found = estimate(steps, seed=0)
+    earned = bts.click.to_numpy(dtype=np.float64)
+    for name in ("IPS", "SNIPS"):
+        assert found[name].low < earned.mean() < found[name].high
+        # With 38 clicks to weigh, it is no more certain than the logs of bts themselves.
+        low, high = bootstrap_interval(earned, seed=0)
+        assert found[name].high - found[name].low > high - low
+    assert found["PDIS"].value == found["IPS"].value  # one step a session
+    assert 1000 < found["IPS"].effective_sessions < 5000
+    assert overlap(steps) == pytest.approx(1, abs=0.05)
+    assert warnings(steps, found) == []

@@ -1,0 +1,243 @@
+"""States in training and in acting are one thing, and know nothing of what comes after."""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from tests.support.episodes import (
+    DIM,
+    N_ITEMS,
+    Logged,
+    random_episodes,
+    some_states,
+    state_before,
+    write_store,
+)
+from ucfrec.episodes.states import ItemStates, SessionStates
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+
+lengths_of_episodes = st.lists(st.integers(1, 12), min_size=1, max_size=7)
+
+
+def acted(episodes: list[Logged], states: ItemStates, rows: int) -> list[Tensor]:
+    """(T, S) states of each episode, played `rows` at a time as `rollout` plays them: row i plays
+    episodes i, i + rows, …, and starts the next while the others are under way."""
+    sessions = SessionStates(states, rows)
+    seen: list[list[Tensor]] = [[] for _ in episodes]
+    playing, step = list(range(rows)), [0] * rows
+    sessions.begin(np.arange(rows))
+    size = episodes[0].observations.shape[1]
+    while any(number < len(episodes) for number in playing):
+        live = [row for row in range(rows) if playing[row] < len(episodes)]
+        observations = torch.full((rows, size), 5.0)
+        # Rows that play nothing any more are fed nonsense.
+        items, rewards = np.full(rows, 1), np.full(rows, 2.0)
+        for row in live:
+            logged = episodes[playing[row]]
+            sessions.users[row] = logged.user
+            observations[row] = torch.from_numpy(logged.observations[step[row]])
+            items[row], rewards[row] = logged.items[step[row]], logged.rewards[step[row]]
+        current = sessions.current(observations)
+        for row in live:
+            seen[playing[row]].append(current[row])
+        sessions.record(torch.from_numpy(items), torch.from_numpy(rewards))
+        ended = []
+        for row in live:
+            step[row] += 1
+            if step[row] == len(episodes[playing[row]]):
+                playing[row], step[row] = playing[row] + rows, 0
+                ended.append(row)
+        sessions.begin(np.array(ended, dtype=np.int64))
+    return [torch.stack(states_of_one) for states_of_one in seen]
+
+
+@given(
+    lengths=lengths_of_episodes,
+    rows=st.integers(1, 9),
+    length=st.integers(1, 9),
+    window=st.integers(1, 5),
+    users=st.integers(0, 2),
+    observation=st.integers(0, 3),
+    seed=st.integers(0, 99),
+)
+def test_training_and_acting_agree_to_the_last_bit(
+    lengths: list[int],
+    rows: int,
+    length: int,
+    window: int,
+    users: int,
+    observation: int,
+    seed: int,
+) -> None:
+    episodes = random_episodes(lengths, seed, observation)
+    rng = np.random.default_rng(seed)
+    for episode in episodes:  # rewards with all their digits, as an environment gives them
+        episode.rewards = rng.normal(0.5, 2.0, size=len(episode)).tolist()
+    states = some_states(users, window, seed)
+    with tempfile.TemporaryDirectory() as name:
+        store = write_store(Path(name) / "store", episodes, states, shard_steps=7)
+        windows = store.windows(*store.all_steps(), length)
+        moved = store.transitions(*store.all_steps())
+    played = torch.cat(acted(episodes, states, rows))
+    assert torch.equal(windows.states[:, -1], played)
+    assert torch.equal(moved.states, played)
+    for back in range(1, length):
+        inside = windows.mask[:, -1 - back]
+        ends = torch.nonzero(inside).squeeze(1)
+        assert torch.equal(windows.states[ends, -1 - back], played[ends - back])
+
+
+@pytest.mark.parametrize("batch", [1, 3, 7, 8, 17, 64, 1000])
+def test_bits_do_not_depend_on_the_batch(batch: int) -> None:
+    """Vectorised kernels end in a remainder; no row may notice where it stands."""
+    generator = torch.Generator().manual_seed(0)
+    states = some_states(users=2, window=4)
+    items = torch.randint(-1, N_ITEMS, (1000, 4), generator=generator)
+    rewards = torch.randn(1000, 4, generator=generator)
+    steps = torch.randint(5000, (1000,), generator=generator)
+    users = torch.randint(-1, 5, (1000,), generator=generator)
+    seen = torch.randn(1000, 3, generator=generator)
+    whole = states.build(items, rewards, steps, users, seen)
+    parts = [
+        states.build(items[i], rewards[i], steps[i], users[i], seen[i])
+        for i in torch.arange(1000).split(batch)
+    ]
+    assert torch.equal(torch.cat(parts), whole)
+
+
+@given(
+    length=st.integers(1, 15),
+    window=st.integers(1, 6),
+    observation=st.integers(0, 2),
+    seed=st.integers(0, 99),
+    data=st.data(),
+)
+def test_nothing_of_a_step_or_after_enters_its_state(
+    length: int, window: int, observation: int, seed: int, data: st.DataObject
+) -> None:
+    step = data.draw(st.integers(0, length - 1))
+    factual, other = (random_episodes([length], seed, observation)[0] for _ in range(2))
+    rng = np.random.default_rng(seed)
+    other.items[step:] = rng.integers(N_ITEMS, size=length - step).tolist()
+    other.rewards[step:] = (
+        np.array(other.rewards[step:]) + rng.normal(size=length - step)
+    ).tolist()
+    other.observations[step + 1 :] += 1.0
+    states = some_states(2, window)
+    seen = []
+    for episode in (factual, other):
+        # A neighbour on either side, to catch a gather that runs over.
+        with tempfile.TemporaryDirectory() as name:
+            neighbour = random_episodes([2], seed + len(seen) + 1, observation)[0]
+            store = write_store(Path(name) / "store", [neighbour, episode, neighbour], states)
+            seen.append(store.windows(np.array([1]), np.array([step]), 4).states)
+    assert torch.equal(seen[0], seen[1])
+    played = [acted([episode], states, 1)[0][step] for episode in (factual, other)]
+    assert torch.equal(played[0], played[1])
+    assert torch.equal(played[0], seen[0][0, -1])
+
+
+def test_what_was_just_shown_and_earned_does_enter() -> None:
+    states = some_states()
+    sessions = SessionStates(states, 3)
+    fresh = sessions.current(torch.zeros(3, 0))
+    assert not fresh.any()
+    sessions.record(torch.tensor([4, 4, 5]), torch.tensor([1.0, 2.0, 1.0]))
+    after = sessions.current(torch.zeros(3, 0))
+    assert torch.equal(after[:, :DIM], states.embeddings[[4, 4, 5]])
+    assert torch.equal(after[:, 2 * DIM : 3 * DIM], states.embeddings[[4, 4, 5]])
+    assert after[:, 3 * DIM].tolist() == [0.5, 0.75, 0.5]  # of rewards from −1 to 3
+    assert torch.equal(after[:, 3 * DIM + 1], torch.full((3,), 2.0).log())
+
+
+@given(st.integers(1, 12), st.integers(1, 5), st.integers(0, 99))
+def test_acting_follows_the_documented_formula(length: int, window: int, seed: int) -> None:
+    states = some_states(2, window, seed)
+    episodes = random_episodes([length], seed)
+    played = acted(episodes, states, 1)[0]
+    expected = [state_before(episodes[0], step, states) for step in range(length)]
+    np.testing.assert_allclose(played, expected, rtol=1e-5, atol=1e-6)
+    assert played.shape == (length, states.size + 2)
+    assert played.dtype == torch.float32
+
+
+def test_rewards_out_of_range_count_as_no_or_full_liking() -> None:
+    states = some_states(low=0.0, high=1.0)
+    sessions = SessionStates(states, 4)
+    sessions.record(torch.tensor([1, 1, 1, 1]), torch.tensor([-7.0, 0.0, 1.0, 99.0]))
+    seen = sessions.current(torch.zeros(4, 0))
+    assert torch.equal(seen[0], seen[1])
+    assert torch.equal(seen[2], seen[3])
+    assert not seen[0, DIM : 2 * DIM].any()
+    assert torch.equal(seen[3, DIM : 2 * DIM], states.embeddings[1])
+
+
+def test_an_unknown_user_has_zero_features() -> None:
+    states = some_states(users=2)
+    sessions = SessionStates(states, 3)
+    assert sessions.users.tolist() == [-1, -1, -1]
+    sessions.users[1] = 4
+    seen = sessions.current(torch.zeros(3, 0))
+    features = slice(states.size - 2, states.size)
+    assert not seen[[0, 2], features].any()
+    assert torch.equal(seen[1, features], states.user_features[4])
+
+
+def test_a_session_that_begins_afresh_forgets() -> None:
+    sessions = SessionStates(some_states(), 2)
+    for _ in range(3):
+        sessions.record(torch.tensor([1, 2]), torch.tensor([1.0, 1.0]))
+    before = sessions.current(torch.zeros(2, 0))
+    sessions.begin(np.array([1]))
+    after = sessions.current(torch.zeros(2, 0))
+    assert torch.equal(after[0], before[0])
+    assert not after[1].any()
+
+
+def test_rewards_of_another_type_give_the_same_states() -> None:
+    states = some_states()
+    rewards = torch.rand(4, dtype=torch.float64)
+    seen = []
+    for given_rewards in (rewards, rewards.float()):
+        sessions = SessionStates(states, 4)
+        sessions.record(torch.arange(4), given_rewards)
+        seen.append(sessions.current(torch.zeros(4, 0)))
+    assert seen[0].dtype == torch.float32
+    assert torch.equal(seen[0], seen[1])
+
+
+@pytest.mark.parametrize("users", [0, 3])
+def test_states_come_back_from_their_file(tmp_path: Path, users: int) -> None:
+    states = some_states(users, window=4)
+    states.save(tmp_path / "states.safetensors")
+    read = ItemStates.load(tmp_path / "states.safetensors")
+    assert (read.window, read.decay) == (states.window, states.decay)
+    assert (read.reward_low, read.reward_high) == (states.reward_low, states.reward_high)
+    assert read.size == states.size == 3 * DIM + 2 + users
+    episodes = random_episodes([6, 3])
+    for a, b in zip(acted(episodes, states, 2), acted(episodes, read, 2), strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize(("low", "high"), [(1.0, 1.0), (2.0, 1.0), (float("nan"), 1.0)])
+def test_rewards_that_tell_nothing_apart_are_refused(low: float, high: float) -> None:
+    with pytest.raises(InputError, match="reward_low must be below reward_high"):
+        some_states(low=low, high=high)
+
+
+def test_a_damaged_file_of_states_is_named(tmp_path: Path) -> None:
+    store = write_store(tmp_path / "store", random_episodes([3, 2]), some_states())
+    path = tmp_path / "store" / "item_states.safetensors"
+    path.write_bytes(path.read_bytes()[:-5])
+    with pytest.raises(InputError, match=r"item_states\.safetensors is damaged"):
+        EpisodeStore.open(store.path).windows(np.array([0]), np.array([0]), 2)
+    path.unlink()
+    with pytest.raises(InputError, match=r"item_states\.safetensors does not exist"):
+        EpisodeStore.open(store.path).windows(np.array([0]), np.array([0]), 2)

@@ -1,0 +1,100 @@
+"""Coverage, diversity, novelty and dominance against plain loops, and what must never hold."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ucfrec.acting.rollout import Step, rollout
+from ucfrec.evaluation.diversity import (
+    Recommended,
+    coverage,
+    coverage_per_turn,
+    diversity,
+    dominance,
+    dominant_tags,
+    novelty,
+    tag_jaccard,
+)
+from ucfrec_simulators.behaviors import Uniform
+from ucfrec_simulators.synthetic_catalog import SyntheticCatalog
+
+N, TAGS, USERS = 12, 5, 9
+
+
+def world(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    lengths = rng.integers(1, 7, size=rng.integers(1, 8))
+    episodes = np.repeat(np.arange(len(lengths)), lengths)
+    items = rng.integers(N, size=len(episodes))
+    return episodes, items, rng.random((N, TAGS)) < 0.4
+
+
+@given(st.integers(0, 999))
+def test_diversity_is_that_of_a_plain_loop(seed: int) -> None:
+    episodes, items, incidence = world(seed)
+
+    def jaccard(a: int, b: int) -> float:
+        one, other = set(np.flatnonzero(incidence[a])), set(np.flatnonzero(incidence[b]))
+        return 1.0 if a == b else len(one & other) / max(len(one | other), 1)
+
+    own = []
+    for episode in np.unique(episodes):
+        shown = items[episodes == episode].tolist()
+        pairs = [1 - jaccard(a, b) for a, b in combinations(shown, 2)]
+        own.append(np.mean(pairs) if pairs else 1.0)
+    assert diversity(episodes, items, tag_jaccard(incidence)) == pytest.approx(np.mean(own))
+
+
+@given(st.integers(0, 999))
+def test_all_are_in_range_and_blind_to_order(seed: int) -> None:
+    episodes, items, incidence = world(seed)
+    order = np.lexsort([np.random.default_rng(seed).random(len(items)), episodes])
+    value = diversity(episodes, items, tag_jaccard(incidence))
+    assert 0 <= value <= 1
+    assert value == pytest.approx(diversity(episodes, items[order], tag_jaccard(incidence)))
+    assert 0 < coverage(items, N) <= coverage_per_turn(items) * len(items) / N + 1e-12 <= 1 + 1e-12
+    popularity = np.bincount(items, minlength=N) / USERS
+    assert novelty(items, popularity) == pytest.approx(novelty(items[::-1], popularity))
+    dominant = dominant_tags(incidence, np.bincount(items, minlength=N))
+    assert 0 <= dominance(items, incidence, dominant) <= 1
+
+
+def test_extremes() -> None:
+    episodes, same, apart = np.zeros(4, dtype=np.int64), np.full(4, 3), np.arange(4)
+    incidence = np.eye(4, dtype=bool)
+    assert diversity(episodes, same, tag_jaccard(incidence)) == 0.0
+    assert diversity(episodes, apart, tag_jaccard(incidence)) == 1.0
+    assert coverage_per_turn(same) == 0.25
+    assert coverage(apart, 8) == 0.5
+
+
+def test_rare_items_are_novel_and_unseen_ones_as_the_rarest() -> None:
+    popularity = np.array([0.5, 0.1, 0.0])
+    assert novelty(np.array([0]), popularity) == pytest.approx(np.log(2))
+    assert novelty(np.array([2]), popularity) == novelty(np.array([1]), popularity)
+    assert novelty(np.array([0, 1]), popularity) == pytest.approx(-np.log([0.5, 0.1]).mean())
+
+
+def test_the_dominant_tags_cover_at_most_their_share() -> None:
+    incidence = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0]], dtype=bool)
+    dominant = dominant_tags(incidence, np.array([50, 20, 20, 10]), share=0.8)
+    # Counts 60, 30, 20 of 110: the first covers 0.55, both 0.82.
+    assert dominant.tolist() == [True, False, False]
+    assert dominance(np.array([0, 1, 2, 3]), incidence, dominant) == 0.5
+
+
+def test_a_rollout_is_recorded_in_order() -> None:
+    env, recommended, steps = SyntheticCatalog(7), Recommended(), list[Step]()
+
+    def note(step: Step) -> None:
+        steps.append(step)
+        recommended.record(step)
+
+    played = rollout(env, Uniform(env, 0), 20, 0, note)
+    episodes, items = recommended.sessions()
+    np.testing.assert_array_equal(np.bincount(episodes), played.lengths)
+    shown = [s.actions[s.episodes == 8][0] for s in steps if (s.episodes == 8).any()]
+    np.testing.assert_array_equal(items[episodes == 8], shown)

@@ -1,0 +1,344 @@
+"""The training loop: resumes to the bit, stops in time, keeps the best, says what it did."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tests.support import killed_training
+from ucfrec.errors import InputError
+from ucfrec.fitting.checkpoint import load_tensors, save_training
+from ucfrec.fitting.loop import Fit, LoopConfig, fit
+from ucfrec.fitting.tensorboard import read_scalars
+
+ROOT = Path(__file__).parents[2]
+FAST = LoopConfig(steps=12, batch_size=4, learning_rate=0.1, warmup_steps=0, validate_every=2)
+
+
+def draw(generator: np.random.Generator) -> Tensor:
+    return torch.from_numpy(generator.normal(size=(4, 3)).astype(np.float32))
+
+
+def squared(module: nn.Module) -> Callable[[Tensor], tuple[Tensor, dict[str, Tensor]]]:
+    def loss(batch: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        value = (module(batch) - batch.sum(1, keepdim=True)).square().mean()
+        return value, {"mine": value.detach()}
+
+    return loss
+
+
+def linear() -> nn.Module:
+    torch.manual_seed(0)
+    return nn.Linear(3, 1)
+
+
+def weights(module: nn.Module) -> list[Tensor]:
+    return [p.detach().clone() for p in module.parameters()]
+
+
+def equal(a: list[Tensor], b: list[Tensor]) -> bool:
+    return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
+
+
+# Resuming.
+
+
+@pytest.fixture(scope="module")
+def left_alone(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Fit]:
+    folder = tmp_path_factory.mktemp("left_alone")
+    return folder, killed_training.train(folder)
+
+
+@pytest.fixture(scope="module")
+def killed_often(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Path, dict[str, Any]]]:
+    folders = [tmp_path_factory.mktemp("killed") for _ in range(2)]
+    script = subprocess.run(
+        [sys.executable, ROOT / "tests" / "support" / "killed_training.py", "1", *folders],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert script.returncode == 0, script.stderr
+    return list(zip(folders, json.loads(script.stdout), strict=True))
+
+
+@pytest.mark.parametrize("name", ["best.safetensors", "last.safetensors"])
+def test_killed_training_ends_as_if_left_alone(
+    left_alone: tuple[Path, Fit], killed_often: list[tuple[Path, dict[str, Any]]], name: str
+) -> None:
+    calm, calm_fit = left_alone
+    expected, _ = load_tensors(calm / name)
+    for folder, ended in killed_often:
+        assert ended["killed"] >= 3
+        for key in ("steps", "best_step", "best_validation"):
+            assert ended[key] == getattr(calm_fit, key)
+        tensors, _ = load_tensors(folder / name)
+        assert tensors.keys() == expected.keys()
+        for key, tensor in tensors.items():
+            assert torch.equal(tensor, expected[key]), key
+
+
+def test_every_validation_of_a_killed_training_is_logged(
+    left_alone: tuple[Path, Fit], killed_often: list[tuple[Path, dict[str, Any]]]
+) -> None:
+    every = range(killed_training.EVERY, killed_training.STEPS + 1, killed_training.EVERY)
+    expected = read_scalars(left_alone[0])["validation_loss"]
+    assert list(expected) == list(every)
+    for folder, _ in killed_often:
+        assert read_scalars(folder)["validation_loss"] == expected
+
+
+def test_a_longer_training_goes_on_where_a_shorter_one_ended(tmp_path: Path) -> None:
+    whole, parts = killed_training.module(), killed_training.module()
+    batch = killed_training.batch
+    for module, name, lengths in ((whole, "whole", [12]), (parts, "parts", [4, 6, 12])):
+        for steps in lengths:
+            config = LoopConfig(steps=steps, batch_size=8, learning_rate=0.05, validate_every=2)
+
+            def loss(xy: tuple[Tensor, Tensor], module: nn.Module = module) -> Any:
+                return (module(xy[0]) - xy[1]).square().mean(), {}
+
+            fit(module, lambda g: batch(g, 8), loss, config, tmp_path / name, seed=1)
+    assert equal(weights(whole), weights(parts))
+
+
+def test_a_finished_training_is_not_repeated(tmp_path: Path) -> None:
+    first = linear()
+    fitted = fit(first, draw, squared(first), FAST, tmp_path, seed=1)
+
+    def nothing(generator: np.random.Generator) -> Tensor:
+        raise AssertionError("nothing is left to learn")
+
+    again = linear()
+    refitted = fit(again, nothing, squared(again), FAST, tmp_path, seed=1)
+    assert equal(weights(first), weights(again))
+    assert (refitted.steps, refitted.best_step) == (fitted.steps, fitted.best_step) == (12, 12)
+
+
+def test_seeds_draw_other_batches(tmp_path: Path) -> None:
+    ends = []
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        module = linear()
+        fit(module, draw, squared(module), FAST, tmp_path / name, seed=seed)
+        ends.append(weights(module))
+    assert equal(ends[0], ends[1])
+    assert not equal(ends[0], ends[2])
+
+
+@pytest.mark.parametrize("other", [nn.Linear(4, 1), nn.Linear(3, 1, bias=False)])
+def test_weights_of_another_architecture_are_named(tmp_path: Path, other: nn.Module) -> None:
+    module = linear()
+    save_training(tmp_path / "last.safetensors", other, torch.optim.AdamW(other.parameters()), {})
+    with pytest.raises(InputError, match=r"last\.safetensors holds weights of another"):
+        fit(module, draw, squared(module), FAST, tmp_path, seed=1)
+
+
+# Validation, patience, the best.
+
+
+def validated(
+    folder: Path, losses: list[float], config: LoopConfig
+) -> tuple[Fit, nn.Module, list[list[Tensor]]]:
+    """Train with validation losses that are given; also the weights at each validation."""
+    module, seen = linear(), []
+
+    def validate() -> float:
+        assert not module.training
+        assert not torch.is_grad_enabled()
+        seen.append(weights(module))
+        return losses[len(seen) - 1]
+
+    return (
+        fit(module, draw, squared(module), config, folder, seed=1, validate=validate),
+        module,
+        seen,
+    )
+
+
+def test_the_best_weights_come_back(tmp_path: Path) -> None:
+    fitted, module, seen = validated(tmp_path, [3.0, 1.0, 2.0, 1.0, 4.0, 2.0], FAST)
+    assert (fitted.steps, fitted.best_step, fitted.best_validation) == (12, 4, 1.0)
+    assert len(seen) == 6
+    assert equal(weights(module), seen[1])
+    assert not equal(seen[1], seen[5])
+    assert not module.training
+    last, _ = load_tensors(tmp_path / "last.safetensors")
+    assert equal([last["weight"], last["bias"]], seen[5])
+
+
+@pytest.mark.parametrize(
+    ("patience", "steps", "best"), [(0, 16, 14), (1, 6, 4), (2, 8, 4), (3, 16, 14)]
+)
+def test_patience_stops_early(tmp_path: Path, patience: int, steps: int, best: int) -> None:
+    config = LoopConfig(
+        steps=16, batch_size=4, learning_rate=0.1, validate_every=2, patience=patience
+    )
+    losses = [3.0, 2.0, 2.0, 2.5, 1.9, 2.0, 1.0, 1.5]
+    fitted, module, seen = validated(tmp_path, losses, config)
+    assert (fitted.steps, fitted.best_step) == (steps, best)
+    assert equal(weights(module), seen[best // 2 - 1])
+    # Started again, it is as patient as it was: nothing more is learnt.
+    again, module, seen = validated(tmp_path, [], config)
+    assert (again.steps, again.best_step, seen) == (steps, best, [])
+
+
+def test_without_validation_the_last_weights_count(tmp_path: Path) -> None:
+    module = linear()
+    fitted = fit(module, draw, squared(module), FAST, tmp_path, seed=1)
+    assert fitted.best_step == fitted.steps == 12
+    assert math.isnan(fitted.best_validation)
+    best, _ = load_tensors(tmp_path / "best.safetensors")
+    last, _ = load_tensors(tmp_path / "last.safetensors")
+    assert torch.equal(best["weight"], last["weight"])
+    assert torch.equal(best["weight"], module.weight)  # type: ignore[arg-type]
+
+
+def test_the_last_step_is_validated_even_if_it_is_odd(tmp_path: Path) -> None:
+    config = LoopConfig(steps=5, batch_size=4, validate_every=2)
+    fitted, _, seen = validated(tmp_path, [3.0, 2.0, 1.0], config)
+    assert (fitted.steps, fitted.best_step, len(seen)) == (5, 5, 3)
+
+
+# What is learnt.
+
+
+def test_the_loss_goes_down_in_training_mode(tmp_path: Path) -> None:
+    module = nn.Sequential(nn.Linear(3, 1), nn.Dropout(0.0))
+    modes = []
+
+    def loss(batch: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        modes.append(module.training)
+        return squared(module)(batch)
+
+    config = LoopConfig(
+        steps=300, batch_size=4, learning_rate=0.05, warmup_steps=10, validate_every=50
+    )
+    fit(module, draw, loss, config, tmp_path, seed=1, validate=lambda: 0.0)
+    assert modes == [True] * 300
+    logged = read_scalars(tmp_path)["mine"]
+    assert logged[300] < 0.05 * logged[50] or logged[300] < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("cosine", "rates"),
+    [
+        (False, [0.02, 0.04, 0.06, 0.08, 0.1, 0.1, 0.1]),
+        (True, [0.02, 0.04, 0.06, 0.08, 0.1, 0.05, 0.0]),
+    ],
+    ids=["constant", "cosine"],
+)
+def test_steps_are_adamw_with_warm_up_and_clipping(
+    tmp_path: Path, cosine: bool, rates: list[float]
+) -> None:
+    """Against the same steps written out with torch's optimizer."""
+    config = LoopConfig(
+        steps=7,
+        batch_size=4,
+        learning_rate=0.1,
+        weight_decay=0.2,
+        warmup_steps=5,
+        cosine=cosine,
+        clip_norm=0.3,
+        validate_every=3,
+    )
+    batches: list[Tensor] = []
+
+    def remembered(generator: np.random.Generator) -> Tensor:
+        batches.append(draw(generator))
+        return batches[-1]
+
+    module = linear()
+    fit(module, remembered, squared(module), config, tmp_path, seed=1)
+
+    twin = linear()
+    optimizer = torch.optim.AdamW(twin.parameters(), weight_decay=0.2)
+    for rate, batch in zip(rates, batches, strict=True):
+        optimizer.param_groups[0]["lr"] = rate
+        optimizer.zero_grad()
+        squared(twin)(batch)[0].backward()
+        norm = math.sqrt(sum(float(p.grad.square().sum()) for p in twin.parameters()))
+        for parameter in twin.parameters():
+            parameter.grad *= min(1.0, 0.3 / norm)
+        optimizer.step()
+    for a, b in zip(weights(module), weights(twin), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6)
+    assert len({tuple(batch.flatten().tolist()) for batch in batches}) == 7
+
+
+# When it goes wrong.
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_loss_that_is_not_finite_is_named(tmp_path: Path, bad: float) -> None:
+    module, calls = linear(), []
+
+    def loss(batch: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        calls.append(1)
+        value, scalars = squared(module)(batch)
+        return value * (bad if len(calls) > 4 else 1.0), scalars
+
+    with pytest.raises(InputError, match=r"critic: the loss is (nan|inf) at step 6") as caught:
+        fit(module, draw, loss, FAST, tmp_path, seed=1, describe="critic")
+    assert "\n" not in str(caught.value)
+    kept, about = load_tensors(tmp_path / "last.safetensors")
+    assert about["step"] == 4
+    assert all(torch.isfinite(tensor).all() for tensor in kept.values())
+
+
+def test_a_validation_loss_that_is_never_finite_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="validation loss is nan"):
+        validated(tmp_path, [math.nan] * 6, FAST)
+
+
+# What is logged.
+
+
+def test_every_validation_is_logged(tmp_path: Path) -> None:
+    losses = [3.0, 1.0, 2.0, 1.0, 4.0, 2.0]
+    validated(tmp_path, losses, FAST)
+    logged = read_scalars(tmp_path)
+    every = [2, 4, 6, 8, 10, 12]
+    tags = {"mine", "loss", "gradient_norm", "samples_per_second", "waiting_for_data"}
+    assert logged.keys() == {*tags, "validation_loss"}
+    for tag, values in logged.items():
+        assert list(values) == every, tag
+        assert all(math.isfinite(value) for value in values.values()), tag
+    assert list(logged["validation_loss"].values()) == losses
+    assert logged["mine"] == logged["loss"]
+
+
+@pytest.mark.parametrize("slow", ["draw", "loss"])
+def test_speed_and_waiting_are_measured(tmp_path: Path, slow: str) -> None:
+    module, pause = linear(), 0.01
+
+    def slow_draw(generator: np.random.Generator) -> Tensor:
+        time.sleep(pause if slow == "draw" else 0)
+        return draw(generator)
+
+    def slow_loss(batch: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        time.sleep(pause if slow == "loss" else 0)
+        return squared(module)(batch)
+
+    def validate() -> float:
+        time.sleep(0.4)  # counts as neither
+        return 0.0
+
+    config = LoopConfig(steps=15, batch_size=64, validate_every=5)
+    fit(module, slow_draw, slow_loss, config, tmp_path, seed=1, validate=validate)
+    logged = read_scalars(tmp_path)
+    for step in (10, 15):  # the first steps also import and allocate
+        assert 0 <= logged["waiting_for_data"][step] <= 1
+        assert (logged["waiting_for_data"][step] > 0.5) == (slow == "draw")
+        # Each step takes a pause at least; five steps and no validation in the time that counts.
+        assert 5 * 64 / (5 * pause + 0.4) < logged["samples_per_second"][step] <= 64 / pause

@@ -1,0 +1,185 @@
+"""Item embeddings: what they see, what they say, and of whom."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.logs.items import item_embeddings, write_item_states
+from ucfrec.logs.mapping import FeatureTable, LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare
+
+START = 1_700_000_000_000
+ROWS = 4000
+SPLIT = PrepareOptions(split=(START + 3000, START + 3500), embedding_size=8)
+
+
+def make_log(seed: int = 0) -> pd.DataFrame:
+    """One row a millisecond; user u likes items of group u % 3, items 27 to 29 come late."""
+    generator = np.random.default_rng(seed)
+    user, item = generator.integers(90, size=ROWS), generator.integers(27, size=ROWS)
+    item = np.where((np.arange(ROWS) > 3100) & (item < 9), 27 + item % 3, item)
+    likes = generator.random(ROWS) < np.where(user % 3 == item % 3, 0.9, 0.1)
+    return pd.DataFrame(
+        {
+            "user_id": user,
+            "item_id": item,
+            "timestamp": START + np.arange(ROWS),
+            "reward": likes.astype(float),
+        }
+    )
+
+
+def catalogue() -> pd.DataFrame:
+    return pd.DataFrame(
+        {
+            "item_id": np.arange(32),
+            "group": [f"g{i % 3}" for i in range(32)],
+            "tags": [f"t{i % 3}|t{i % 5}" if i else None for i in range(32)],
+            "price": np.where(np.arange(32) == 4, np.nan, np.arange(32.0)),
+            "same": 1.0,
+            "day": pd.date_range("2024-01-01", periods=32),
+        }
+    )
+
+
+COLUMNS = ("group", "string_split(tags, '|')", "price", "same", "day")
+
+
+def learn(
+    folder: Path, log: pd.DataFrame, features: bool = True, items: pd.DataFrame | None = None
+) -> EpisodeStore:
+    folder.mkdir()
+    log.to_parquet(folder / "log.parquet", index=False)
+    (catalogue() if items is None else items).to_parquet(folder / "items.parquet", index=False)
+    people = {"user_id": np.arange(95), "age": np.arange(95.0), "sex": np.arange(95) % 2 == 0}
+    pd.DataFrame(people).to_csv(folder / "users.csv", index=False)
+    mapping = LogMapping(
+        item_features=(FeatureTable((folder / "items.parquet",), "item_id", COLUMNS),),
+        user_features=(FeatureTable((folder / "users.csv",), "user_id"),),
+    )
+    prepare([folder / "log.parquet"], mapping if features else LogMapping(), folder / "s", SPLIT)
+    return EpisodeStore.open(folder / "s")
+
+
+def similarity(embeddings: torch.Tensor) -> np.ndarray:
+    unit = torch.nn.functional.normalize(embeddings, dim=1)
+    return (unit @ unit.T).numpy()
+
+
+@pytest.mark.parametrize("features", [False, True])
+def test_embeddings_see_the_training_window_only(tmp_path: Path, features: bool) -> None:
+    log = make_log()
+    later = log.copy()
+    rest = log["timestamp"] >= START + 3000
+    later.loc[rest, "reward"] = 1 - later.loc[rest, "reward"]
+    later.loc[rest, "user_id"] = later.loc[rest, "user_id"].to_numpy()[::-1]
+    # Other late items: they may be listed or not, and show up or not.
+    later.loc[rest & (later["item_id"] == 29), "item_id"] = 28
+    states = [
+        learn(tmp_path / "a", log, features).item_states,
+        learn(tmp_path / "b", later, features, catalogue()[:31]).item_states,
+    ]
+    assert states[0].embeddings[:29].equal(states[1].embeddings[:29])
+    assert states[0].user_features.equal(states[1].user_features)
+    assert states[0].reward_high == states[1].reward_high
+    log.loc[0, "reward"] = 1 - log.loc[0, "reward"]
+    changed = learn(tmp_path / "c", log, features).item_states
+    assert not states[0].embeddings[:29].equal(changed.embeddings[:29])
+
+
+@pytest.mark.parametrize("features", [False, True])
+def test_items_liked_by_the_same_users_are_near(tmp_path: Path, features: bool) -> None:
+    states = learn(tmp_path / "a", make_log(), features).item_states
+    assert states.embeddings.shape == (32 if features else 30, 8)
+    assert states.embeddings.norm(dim=1).max() <= 1 + 1e-6
+    near = similarity(states.embeddings[:27])
+    group = np.arange(27) % 3
+    same = group[:, None] == group
+    off = ~np.eye(27, dtype=bool)
+    assert near[same & off].mean() > near[~same].mean() + 0.4
+
+
+def test_cold_items_are_placed_by_their_features_or_not_at_all(tmp_path: Path) -> None:
+    warm = learn(tmp_path / "a", make_log()).item_states.embeddings
+    near = similarity(warm)[:, :27]
+    for cold in (27, 28, 29, 31):
+        of_group = near[cold, np.arange(27) % 3 == cold % 3].mean()
+        assert of_group > near[cold, np.arange(27) % 3 != cold % 3].mean() + 0.3
+    without = learn(tmp_path / "b", make_log(), features=False).item_states.embeddings
+    assert without[27:].abs().max() == 0
+
+
+def test_user_features_are_standardised_by_users_of_the_training_window(tmp_path: Path) -> None:
+    features = learn(tmp_path / "a", make_log()).item_states.user_features
+    assert features.shape == (95, 3)
+    known = features[:90]
+    torch.testing.assert_close(known.std(dim=0, correction=0), torch.ones(3))
+    assert known.mean(dim=0).abs().max() < 1e-6
+    assert len(features[:, 1].unique()) == 2
+
+
+def test_reward_scale_of_the_training_window(tmp_path: Path) -> None:
+    log = make_log()
+    log.loc[5, "reward"] = 50.0
+    log.loc[3500, "reward"] = -7.0
+    states = learn(tmp_path / "a", log).item_states
+    train = log["reward"][:3000]
+    assert states.reward_low == 0.0
+    assert states.reward_high == pytest.approx(train.mean() + 2 * train.std(ddof=0))
+
+
+def test_equal_rewards_in_the_training_window_are_an_error(tmp_path: Path) -> None:
+    log = make_log()
+    log.loc[log["timestamp"] < START + 3000, "reward"] = 1.0
+    with pytest.raises(InputError, match=r"all 3000 rewards of the training window equal 1"):
+        learn(tmp_path / "a", log)
+    assert not (tmp_path / "a" / "s").exists()
+
+
+def test_the_same_log_gives_the_same_bits(tmp_path: Path) -> None:
+    log = make_log()
+    first = learn(tmp_path / "a", log).item_states.embeddings
+    again = learn(tmp_path / "b", log.sample(frac=1, random_state=0)).item_states.embeddings
+    assert first.equal(again)
+
+
+def test_few_users_or_items_give_few_dimensions() -> None:
+    zero = np.zeros(4, dtype=np.int64)
+    ones = np.ones(4)
+    assert item_embeddings(zero, np.array([0, 1, 0, 1]), ones, n_items=3).shape == (3, 1)
+    assert item_embeddings(np.arange(4), zero, ones, n_items=1).shape == (1, 1)
+
+
+def test_states_can_be_written_without_features(tmp_path: Path) -> None:
+    store = learn(tmp_path / "a", make_log(), features=False)
+    states = write_item_states(store.path, None, None, 30, 90, 4)
+    assert ItemStates.load(store.path / "item_states.safetensors").embeddings.equal(
+        states.embeddings
+    )
+    assert store.split("train").windows(np.arange(2), np.zeros(2, int), 3).states.shape[-1] == (
+        store.state_size
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda items: pd.concat([items, items[:3]]), r"3 of 35 rows repeat a item_id"),
+        (lambda items: items.drop(columns="price"), r"no column 'price' \(item_id feature\)"),
+        (lambda items: items.rename(columns={"item_id": "iid"}), r"no column 'item_id'"),
+        (
+            lambda items: items.assign(group=[{"a": 1}] * 32),
+            r"item_id feature \(group\) is STRUCT.*cast it",
+        ),
+    ],
+)
+def test_bad_features_are_one_clear_error(tmp_path: Path, change, message: str) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(InputError, match=message):
+        learn(tmp_path / "a", make_log(), items=change(catalogue()))
+    assert not (tmp_path / "a" / "s").exists()

@@ -1,0 +1,208 @@
+"""Scores of logged choices: probabilities, and what the policy would see when acting."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from torch import Tensor
+
+from tests.recommending.test_recommend import SETTINGS, random_log
+from ucfrec import UCF, EpisodeStore
+from ucfrec.acting.policy_actor import PolicyActor
+from ucfrec.episodes.windows import Windows
+from ucfrec.errors import InputError
+from ucfrec.logs import LogMapping, PrepareOptions, prepare
+from ucfrec.off_policy.evaluate import logged_steps, step_features
+from ucfrec.off_policy.score import LoggedSessions, logged_sessions, score, scored_steps
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+TARGET = 7.5
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run, and the logs to score: other sessions, some of a user the run never saw."""
+    folder = tmp_path_factory.mktemp("score")
+    log = random_log().sample(frac=1, random_state=1)
+    log.iloc[:1000].to_parquet(folder / "train.parquet")
+    options = PrepareOptions(reward="reward", session_by="gap", gap_minutes=20)
+    prepare([folder / "train.parquet"], LogMapping(), folder / "store", options)
+    UCF(settings=SETTINGS).fit(EpisodeStore.open(folder / "store"), folder / "run")
+    rest = log.iloc[1000:].assign(propensity=1 / 30)
+    rest["user_id"] = np.where(rest.user_id == 5, 10**6, rest.user_id)
+    rest.to_parquet(folder / "rest.parquet")
+    return folder
+
+
+@pytest.fixture
+def trained(folder: Path) -> TrainedPolicy:
+    return TrainedPolicy.load(folder / "run")
+
+
+@pytest.fixture
+def logged(folder: Path, trained: TrainedPolicy) -> Iterator[LoggedSessions]:
+    with logged_sessions(
+        folder / "run", trained, [folder / "rest.parquet"], LogMapping()
+    ) as logged:
+        yield logged
+
+
+class Replay(PolicyActor):
+    """Plays what it is told, and keeps what it would have thought of every item."""
+
+    def __init__(self, trained: TrainedPolicy, items: list[int]) -> None:
+        observed = trained.record["observation_size"]
+        super().__init__(trained.policy, 1, TARGET, observed, trained.item_states)
+        self.items, self.thought = iter(items), list[Tensor]()
+
+    def _best(self, scores: Tensor) -> Tensor:
+        self.thought.append(scores[0].softmax(-1))
+        return torch.tensor([next(self.items)])
+
+
+def test_scores_are_those_of_an_actor_that_replays_the_session(
+    folder: Path, trained: TrainedPolicy, logged: LoggedSessions
+) -> None:
+    frame = pd.concat(score(trained, logged, TARGET))
+    assert trained.item_ids is not None
+    numbers = {item: number for number, item in enumerate(trained.item_ids)}
+    assert frame.session.nunique() > 300
+    longest = frame.groupby("session").size().nlargest(10).index
+    for session in longest:
+        rows = frame[frame.session == session]
+        items = [numbers[item] for item in rows.item_id]
+        actor = Replay(trained, items)
+        actor.begin(np.array([0]))
+        for item, reward in zip(items, rows.reward, strict=True):
+            actor.act(np.zeros((1, 0), dtype=np.float32), np.array([True]))
+            actor.observe(np.array([item]), np.array([reward], dtype=np.float32))
+        thought = torch.stack(actor.thought).numpy()
+        chosen = thought[np.arange(len(items)), items]
+        np.testing.assert_allclose(rows.probability, chosen, rtol=1e-4)
+        np.testing.assert_array_equal(rows["rank"], 1 + (thought > chosen[:, None]).sum(1))
+        np.testing.assert_array_equal(rows.greedy_item_id, trained.item_ids[thought.argmax(1)])
+
+
+def test_rows_are_those_of_the_log_in_its_sessions(
+    folder: Path, trained: TrainedPolicy, logged: LoggedSessions
+) -> None:
+    frame = pd.concat(score(trained, logged, TARGET), ignore_index=True)
+    log = pd.read_parquet(folder / "rest.parquet").sort_values(["user_id", "timestamp"])
+    for name in ("user_id", "item_id", "timestamp", "reward"):
+        np.testing.assert_array_equal(frame[name], log[name])
+    np.testing.assert_allclose(frame.propensity, 1 / 30)
+    gaps = (log.timestamp.diff() > 20 * 60_000) | (log.user_id.diff() != 0)
+    np.testing.assert_array_equal(frame.session, gaps.cumsum() - 1)
+    assert 10**6 in set(frame.user_id)
+    assert ((frame["rank"] == 1) == (frame.greedy_item_id == frame.item_id)).all()
+
+
+def test_probabilities_over_all_items_sum_to_one(
+    trained: TrainedPolicy, logged: LoggedSessions
+) -> None:
+    seen = 0
+    for batch in scored_steps(trained, logged.store, TARGET):
+        total = batch.log_probabilities.double().exp().sum(1)
+        np.testing.assert_allclose(total, 1, atol=1e-5)
+        seen += len(total)
+    assert seen == logged.store.n_steps
+
+
+def test_nothing_of_the_step_or_after_it_is_looked_at(
+    folder: Path, trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    """Rewards and items from a step on, changed: it is scored as before."""
+    log = pd.read_parquet(folder / "rest.parquet").sort_values(["user_id", "timestamp"])
+    gaps = (log.timestamp.diff() > 20 * 60_000) | (log.user_id.diff() != 0)
+    session = gaps.cumsum()
+    later = log.groupby(session).cumcount() >= 1
+    changed = log.assign(
+        reward=np.where(later, 1 - log.reward, log.reward),
+        item_id=np.where(later, (log.item_id + 7) % 30, log.item_id),
+    )
+    changed.to_parquet(tmp_path / "changed.parquet")
+    thought = []
+    for file in (folder / "rest.parquet", tmp_path / "changed.parquet"):
+        with logged_sessions(folder / "run", trained, [file], LogMapping()) as logged:
+            _, steps = logged.store.all_steps()
+            batches = scored_steps(trained, logged.store, TARGET)
+            thought.append(torch.cat([b.log_probabilities for b in batches]).numpy()[steps <= 1])
+    np.testing.assert_allclose(*thought, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("greedy", [False, True])
+def test_models_are_asked_about_what_the_policy_would_show(
+    trained: TrainedPolicy, logged: LoggedSessions, greedy: bool
+) -> None:
+    frame = pd.concat(score(trained, logged, TARGET))
+    steps = logged_steps(trained, logged.store, TARGET, greedy, seed=0)
+    certain = (frame.greedy_item_id == frame.item_id).astype(float)
+    np.testing.assert_allclose(steps.target, certain if greedy else frame.probability, rtol=1e-5)
+    np.testing.assert_array_equal(steps.session, frame.session)
+    assert steps.model is not None
+    if greedy:
+        # Where the policy would show the logged item, q and v ask the same.
+        same = certain.to_numpy() == 1
+        np.testing.assert_allclose(steps.model.q[same], steps.model.v[same], rtol=1e-3, atol=1e-5)
+        assert not np.allclose(steps.model.q, steps.model.v, atol=1e-3)
+
+
+def test_features_at_the_policy_are_the_mean_over_its_items(
+    trained: TrainedPolicy, logged: LoggedSessions
+) -> None:
+    batch = next(scored_steps(trained, logged.store, TARGET))
+    _, _, at_policy = step_features(trained, batch, greedy=False)
+    probabilities = batch.log_probabilities.exp().numpy()
+    mean = np.zeros(at_policy.shape)
+    for item in range(probabilities.shape[1]):
+        shown = replace(batch.windows, actions=torch.full_like(batch.windows.actions, item))
+        target, of_item, _ = step_features(trained, replace(batch, windows=shown), greedy=False)
+        np.testing.assert_allclose(target, probabilities[:, item], rtol=1e-6)
+        mean += probabilities[:, item, None] * of_item
+    np.testing.assert_allclose(at_policy, mean, rtol=1e-4, atol=1e-5)
+
+
+def test_items_the_run_does_not_know_are_counted(folder: Path, tmp_path: Path) -> None:
+    log = pd.read_parquet(folder / "rest.parquet")
+    strange = log.head(4).assign(item_id=[991, 992, 993, 993])
+    pd.concat([log, strange]).to_parquet(tmp_path / "log.parquet")
+    trained = TrainedPolicy.load(folder / "run")
+    files = [tmp_path / "log.parquet"]
+    with logged_sessions(folder / "run", trained, files, LogMapping()) as logged:
+        assert logged.report["dropped"]["unknown_item"] == 4
+        assert sum(map(len, score(trained, logged, TARGET))) == len(log)
+    strange.to_parquet(tmp_path / "log.parquet")
+    with (
+        pytest.raises(InputError, match=r"no row is left \(4 rows: item is none of the store's"),
+        logged_sessions(folder / "run", trained, files, LogMapping()),
+    ):
+        pass
+
+
+def test_ids_may_be_text_where_the_run_has_integers(
+    folder: Path, trained: TrainedPolicy, logged: LoggedSessions, tmp_path: Path
+) -> None:
+    log = pd.read_parquet(folder / "rest.parquet")
+    text = log.assign(user_id=log.user_id.map("{}".format), item_id=log.item_id.map("{}".format))
+    text.loc[text.index[0], "user_id"] = "somebody"
+    text.to_parquet(tmp_path / "log.parquet")
+    files = [tmp_path / "log.parquet"]
+    with logged_sessions(folder / "run", trained, files, LogMapping()) as other:
+        there = other.store.step_values("item", *other.store.all_steps())
+        assert len(there) == len(log)
+        assert sorted(there) == sorted(logged.store.step_values("item", *logged.store.all_steps()))
+        assert other.users[-1] == "somebody"
+
+
+def test_log_probabilities_ask_for_more(trained: TrainedPolicy, logged: LoggedSessions) -> None:
+    """Two ways of asking for the same: in the returns-to-go, and beyond them."""
+    windows = logged.store.windows(np.arange(5), np.zeros(5, dtype=np.int64), 4)
+    asked = Windows(**(vars(windows) | {"returns_to_go": windows.mask * 3.0}))
+    more = 3.0 - windows.returns_to_go[:, -1:]
+    torch.testing.assert_close(
+        trained.log_probabilities(asked, 0.0), trained.log_probabilities(windows, more)
+    )

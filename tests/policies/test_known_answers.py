@@ -1,0 +1,106 @@
+"""Known answers, of every learner: planted preferences are learned, and noise teaches nothing."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
+from ucfrec.policies.registry import POLICIES
+from ucfrec.runs.config import resolve_config
+from ucfrec.runs.run import train_run
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+KINDS, STEPS, SESSIONS = 4, 3, 500
+KNOWS_NOBODY = ("popular",)
+SEES_NO_STATE = ("sasrec", "item-knn")
+ITEMS_ONLY = ("item-knn",)
+SETTINGS = [
+    "train.steps=80",
+    "train.validate_every=80",
+    "train.learning_rate=0.005",
+    "train.warmup_steps=0",
+    "train.batch_size=64",
+    "policy.context=3",
+    "policy.dim=16",
+    "augment.copies=0",
+]
+EXTRA = {
+    "dt4rec": ["policy.layers=1", "policy.negatives=1"],
+    "edt4rec": ["policy.cql_steps=30"],
+    "lsdt": ["policy.kernel_groups=4"],
+}
+
+
+def store(folder: Path, seed: int, noise: bool, items: bool) -> tuple[EpisodeStore, np.ndarray]:
+    """Sessions of users of four kinds, seen in the observation, and what each prefers.
+
+    Half of what was logged is what the user's kind prefers, which pays 1; the rest is arbitrary and
+    pays nothing. As noise, logged actions and rewards have nothing to do with the user, and the
+    answer is the action that was logged last, which nothing tells beforehand.
+    """
+    rng = np.random.default_rng([seed, noise, items])
+    kinds = rng.integers(KINDS, size=SESSIONS)
+    observed = np.eye(KINDS, dtype=np.float32)[kinds].repeat(STEPS, axis=0)
+    random = rng.integers(KINDS, size=SESSIONS * STEPS)
+    hit = rng.random(SESSIONS * STEPS) < 0.5
+    played = random if noise else np.where(hit, kinds.repeat(STEPS), random)
+    pays = (rng.integers(2, size=len(played)) if noise else played == kinds.repeat(STEPS)).astype(
+        np.float32
+    )
+    columns = {"reward": pays, "observation": observed}
+    if items:
+        columns["item"] = played
+    else:
+        columns["action"] = directions()[played] + 0.05 * rng.normal(size=(len(played), 2))
+    EpisodeStore.write(folder, columns, np.full(SESSIONS, STEPS))
+    if items:
+        ItemStates(torch.eye(KINDS), torch.zeros(0, 0), 0.0, 1.0).save(folder / ITEM_STATES)
+    return EpisodeStore.open(folder), played[STEPS - 1 :: STEPS] if noise else kinds
+
+
+def directions() -> np.ndarray:
+    """What each kind prefers where actions are vectors, (4, 2): the corners of a square."""
+    return np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]], dtype=np.float32) * 0.8
+
+
+def chosen(run: Path, given: EpisodeStore, items: bool) -> np.ndarray:
+    """Which kind's preference every session gets when all is asked for, in its last step."""
+    trained = TrainedPolicy.load(run)
+    episodes = np.arange(given.n_episodes)
+    windows = given.windows(episodes, np.full(len(episodes), STEPS - 1), 3)
+    asked = torch.arange(STEPS, 0, -1).float().expand(len(episodes), STEPS)
+    windows = type(windows)(**{**windows.__dict__, "returns_to_go": asked})
+    with torch.no_grad():
+        answer = trained.policy.act(windows)
+    if items:
+        return answer.argmax(-1).numpy()
+    apart = np.linalg.norm(answer.numpy()[:, None] - directions(), axis=-1)
+    return np.asarray(apart.argmin(1))
+
+
+@pytest.mark.parametrize(
+    ("noise", "items"),
+    [(False, True), (False, False), (True, True)],
+    ids=["planted-items", "planted-vectors", "noise-items"],
+)
+@pytest.mark.parametrize("name", POLICIES)
+def test_planted_preferences_are_learned_and_noise_is_not(
+    name: str, noise: bool, items: bool, tmp_path: Path
+) -> None:
+    if name in ITEMS_ONLY and not items:
+        pytest.skip("recommends items only")
+    given, _ = store(tmp_path / "train", 0, noise, items)
+    fresh, answers = store(tmp_path / "fresh", 1, noise, items)
+    config = resolve_config(name, None, [*SETTINGS, *EXTRA.get(name, [])])
+    train_run(given, tmp_path / "run", config)
+    right = float((chosen(tmp_path / "run", fresh, items) == answers).mean())
+    if noise or name in KNOWS_NOBODY:
+        assert abs(right - 1 / KINDS) < 0.1
+    elif name in SEES_NO_STATE:
+        # Two actions before tell the kind for certain only where both are what it prefers.
+        assert right > 0.5
+    else:
+        assert right > 0.9

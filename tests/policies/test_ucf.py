@@ -1,0 +1,279 @@
+"""Invariants of the architectures: what must never move a prediction, and what must."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from ucfrec.episodes.windows import Windows
+from ucfrec.errors import InputError
+from ucfrec.policies.base import SequencePolicy, interleave
+from ucfrec.policies.bc import BCConfig, BCPolicy
+from ucfrec.policies.dc import DCConfig, DCPolicy
+from ucfrec.policies.dt import DTConfig, DTPolicy
+from ucfrec.policies.losses import parent_targets
+from ucfrec.policies.lsdt import LSDTConfig, LSDTPolicy
+from ucfrec.policies.ucf import UCFConfig, UCFPolicy
+
+B, K, S, A, ITEMS = 3, 7, 5, 2, 11
+VECTORS = {"state": S, "action": A, "items": 0}
+CATALOG = {"state": S, "action": 4, "items": ITEMS}
+SMALL = {"context": K, "dim": 16}
+
+
+def build(name: str, sizes: dict[str, int]) -> SequencePolicy:
+    torch.manual_seed(0)
+    policy: SequencePolicy
+    if name == "ucf":
+        policy = UCFPolicy(UCFConfig(**SMALL), sizes)
+    elif name == "dt":
+        policy = DTPolicy(DTConfig(**SMALL), sizes)
+    elif name == "dc":
+        policy = DCPolicy(DCConfig(**SMALL), sizes)
+    elif name == "lsdt":
+        policy = LSDTPolicy(LSDTConfig(**SMALL, kernel_groups=4), sizes)
+    else:
+        policy = BCPolicy(BCConfig(**SMALL), sizes)
+    if sizes["items"]:
+        policy.head.start_from(torch.randn(ITEMS, 4), torch.rand(ITEMS))
+    for parameter in policy.parameters():
+        parameter.data += 0.1 * torch.randn_like(parameter)
+    return policy.eval()
+
+
+def random_windows(sizes: dict[str, int], padding: tuple[int, ...] = (0, 2, 5)) -> Windows:
+    generator = torch.Generator().manual_seed(1)
+    mask = torch.arange(K) >= torch.tensor(padding).unsqueeze(1)
+    if sizes["items"]:
+        actions = torch.randint(ITEMS, (B, K), generator=generator)
+    else:
+        actions = torch.rand(B, K, A, generator=generator) * 2 - 1
+    return Windows(
+        states=torch.randn(B, K, S, generator=generator),
+        actions=actions,
+        rewards=torch.rand(B, K, generator=generator),
+        returns_to_go=torch.rand(B, K, generator=generator),
+        timesteps=(torch.arange(K) - torch.tensor(padding).unsqueeze(1)).clamp(min=0),
+        mask=mask,
+    )
+
+
+def other(values: Tensor) -> Tensor:
+    """Something else of the same kind."""
+    return (values + 1) % ITEMS if values.dtype == torch.int64 else values + 3.0
+
+
+def predictions(policy: SequencePolicy, windows: Windows) -> Tensor:
+    with torch.no_grad():
+        return policy.head.predict(policy.features(policy.normalized(windows)))
+
+
+both_heads = pytest.mark.parametrize("sizes", [VECTORS, CATALOG], ids=["vectors", "items"])
+sequence = pytest.mark.parametrize("name", ["ucf", "dt", "dc", "lsdt"])
+
+
+@both_heads
+@pytest.mark.parametrize("name", ["ucf", "dt", "dc", "lsdt", "bc"])
+@pytest.mark.parametrize("t", [2, 5])
+def test_neither_the_action_nor_the_future_moves_its_prediction(
+    name: str, sizes: dict[str, int], t: int
+) -> None:
+    policy, windows = build(name, sizes), random_windows(sizes)
+    changed = {}
+    for field in ("states", "actions", "rewards", "returns_to_go"):
+        values = getattr(windows, field).clone()
+        first = t if field in ("actions", "rewards") else t + 1
+        values[:, first:] = other(values[:, first:])
+        changed[field] = values
+    before, after = predictions(policy, windows), predictions(policy, replace(windows, **changed))
+    assert torch.equal(before[:, : t + 1], after[:, : t + 1])
+    assert not torch.equal(before[:, t + 1 :], after[:, t + 1 :])
+
+
+@both_heads
+@sequence
+@pytest.mark.parametrize("field", ["states", "actions", "returns_to_go"])
+def test_the_past_moves_a_prediction(name: str, sizes: dict[str, int], field: str) -> None:
+    policy, windows = build(name, sizes), random_windows(sizes)
+    values = getattr(windows, field).clone()
+    values[:, 5] = other(values[:, 5])
+    changed = predictions(policy, replace(windows, **{field: values}))
+    assert not torch.equal(predictions(policy, windows)[:, -1], changed[:, -1])
+
+
+@both_heads
+@sequence
+def test_no_less_is_asked_for_than_the_logs_had(name: str, sizes: dict[str, int]) -> None:
+    policy, windows = build(name, sizes), random_windows(sizes)
+
+    def asked(returns_to_go: float) -> Tensor:
+        values = torch.full_like(windows.returns_to_go, returns_to_go)
+        return predictions(policy, replace(windows, returns_to_go=values))
+
+    policy.lowest_return_to_go.fill_(-0.5)
+    assert torch.equal(asked(-40.0), asked(-0.5))
+    assert not torch.equal(asked(0.0), asked(-0.5))
+
+
+@both_heads
+@sequence
+def test_padding_is_inert(name: str, sizes: dict[str, int]) -> None:
+    policy, windows = build(name, sizes), random_windows(sizes)
+    changed = {"timesteps": windows.timesteps.masked_fill(~windows.mask, 3)}
+    for field in ("states", "actions", "returns_to_go"):
+        values = getattr(windows, field)
+        mask = windows.mask.view(B, K, *[1] * (values.ndim - 2))
+        changed[field] = torch.where(mask, values, other(values))
+    dirty = replace(windows, **changed)
+    here = windows.mask
+    assert torch.equal(predictions(policy, windows)[here], predictions(policy, dirty)[here])
+    assert torch.equal(policy.loss(windows)[0], policy.loss(dirty)[0])
+
+
+@both_heads
+@sequence
+def test_padding_is_as_if_the_window_were_shorter(name: str, sizes: dict[str, int]) -> None:
+    policy, windows = build(name, sizes), random_windows(sizes, padding=(4, 4, 4))
+    fields = ("states", "actions", "rewards", "returns_to_go", "timesteps", "mask")
+    short = Windows(**{field: getattr(windows, field)[:, 4:] for field in fields})
+    torch.testing.assert_close(
+        predictions(policy, windows)[:, 4:], predictions(policy, short), rtol=1e-5, atol=1e-5
+    )
+
+
+def test_attention_rows_sum_to_one_and_see_only_what_is_revealed() -> None:
+    policy = build("ucf", VECTORS)
+    assert isinstance(policy, UCFPolicy)
+    windows = random_windows(VECTORS)
+    _, attention = policy.attend(windows)
+    assert attention.shape == (B, 2, K, 3 * K)
+    torch.testing.assert_close(attention.sum(-1), torch.ones(B, 2, K))
+    for t in range(K):
+        assert attention[:, :, t, 3 * t + 2 :].abs().max() == 0
+    hidden = ~windows.mask.repeat_interleave(3, dim=1)
+    for b in range(B):
+        valid = windows.mask[b]
+        assert attention[b][:, valid][..., hidden[b]].abs().sum() == 0
+
+
+def test_only_the_predicting_rows_are_computed_and_they_are_the_full_ones() -> None:
+    """The K query rows against a plain attention block over all 3K tokens."""
+    policy = build("ucf", VECTORS)
+    assert isinstance(policy, UCFPolicy)
+    windows = random_windows(VECTORS, padding=(0, 0, 0))
+    tokens = policy.embed(windows, policy.head.embed(windows.actions))
+    returns, states, actions = (
+        stream(token, windows.mask)
+        for stream, token in zip(
+            (policy.return_stream, policy.state_stream, policy.action_stream), tokens, strict=True
+        )
+    )
+    nothing = torch.zeros_like(returns)
+    fused = interleave(
+        policy.fuse_norm(returns + policy.fuse(torch.cat([returns, nothing, nothing], -1))),
+        policy.fuse_norm(states + policy.fuse(torch.cat([returns, states, nothing], -1))),
+        policy.fuse_norm(actions + policy.fuse(torch.cat([returns, states, actions], -1))),
+    )
+    block = policy.attention
+    weights = torch.cat([block.query.weight, block.key_value.weight])
+    biases = torch.cat([block.query.bias, block.key_value.bias])
+    normed = block.norm(fused)
+    attended, _ = torch.nn.functional.multi_head_attention_forward(
+        *[normed.transpose(0, 1)] * 3,
+        embed_dim_to_check=16,
+        num_heads=2,
+        in_proj_weight=weights,
+        in_proj_bias=biases,
+        bias_k=None,
+        bias_v=None,
+        add_zero_attn=False,
+        dropout_p=0.0,
+        out_proj_weight=block.out.weight,
+        out_proj_bias=block.out.bias,
+        training=False,
+        attn_mask=torch.ones(3 * K, 3 * K, dtype=torch.bool).triu(1),
+    )
+    hidden = fused + attended.transpose(0, 1)
+    full = policy.final_norm(hidden + policy.mlp(policy.mlp_norm(hidden)))
+    torch.testing.assert_close(policy.features(windows), full[:, 1::3], rtol=1e-4, atol=1e-5)
+
+
+def trained_attention(lambda_mask: float) -> tuple[Tensor, Tensor]:
+    """Attention after a short training with weight λ, and its target."""
+    torch.manual_seed(0)
+    policy = UCFPolicy(UCFConfig(**SMALL, dropout=0.0, lambda_mask=lambda_mask), VECTORS)
+    windows = random_windows(VECTORS)
+    optimizer = torch.optim.Adam(policy.parameters(), lr=3e-3)
+    for _ in range(150):
+        optimizer.zero_grad()
+        policy.loss(windows)[0].backward()
+        optimizer.step()
+    config = policy.config
+    targets = parent_targets(
+        windows.mask, config.parent_window, config.parent_decay, config.parent_action
+    )
+    _, attention = policy.attend(policy.normalized(windows))
+    return attention.detach().mean(1)[windows.mask], targets[windows.mask]
+
+
+def test_supervision_draws_attention_to_the_parents() -> None:
+    masses, distances = [], []
+    for lambda_mask in (0.0, 0.1, 100.0):
+        attention, targets = trained_attention(lambda_mask)
+        masses.append(float((attention * (targets > 0)).sum(-1).mean()))
+        distances.append(float((attention - targets).abs().sum(-1).mean()))
+    assert masses[0] < masses[1] < masses[2]
+    assert masses[2] > 0.99
+    assert distances[2] < 0.1
+
+
+def test_parameters_of_dt_are_the_official_ones_less_the_unused() -> None:
+    """727,695 for Hopper; its return and state heads and its word table are never used."""
+    policy = DTPolicy(DTConfig(), {"state": 11, "action": 3, "items": 0})
+    unused = (128 * 11 + 11) + (128 + 1) + 128
+    assert sum(p.numel() for p in policy.parameters()) == 727_695 - unused
+
+
+def test_parameters_of_dc_are_the_official_ones() -> None:
+    """535,939 for Hopper, 1,858,307 at d = 256; nothing in them is unused."""
+    sizes = {"state": 11, "action": 3, "items": 0}
+    for dim, official in ((128, 535_939), (256, 1_858_307)):
+        policy = DCPolicy(DCConfig(dim=dim), sizes)
+        assert sum(p.numel() for p in policy.parameters()) == official
+
+
+def test_parameters_of_lsdt_are_the_official_ones_less_the_unused() -> None:
+    """1,134,111 for Hopper; its return and state heads, and the five taps of each of 16 kernels
+    that look ahead and are masked, in three blocks, are never used."""
+    policy = LSDTPolicy(LSDTConfig(), {"state": 11, "action": 3, "items": 0})
+    unused = (128 * 11 + 11) + (128 + 1) + 3 * 16 * 5 * (64 + 1)
+    assert sum(p.numel() for p in policy.parameters()) == 1_134_111 - unused
+
+
+def test_lsdt_refuses_a_width_that_does_not_split() -> None:
+    with pytest.raises(InputError, match=r"policy\.dim is 48; .* 16 kernel_groups"):
+        LSDTPolicy(LSDTConfig(dim=48), VECTORS)
+
+
+@pytest.mark.parametrize("name", ["dt", "dc", "lsdt"])
+@pytest.mark.parametrize(("field", "first"), [("actions", 11), ("states", 10)])
+def test_a_change_at_step_ten_shows_where_the_official_code_shows_it(
+    name: str, field: str, first: int
+) -> None:
+    torch.manual_seed(0)
+    learner = {"dt": DTPolicy, "dc": DCPolicy, "lsdt": LSDTPolicy}[name]
+    policy = learner(learner.Config(), VECTORS).eval()
+    windows = Windows(
+        states=torch.randn(1, 20, S),
+        actions=torch.rand(1, 20, A),
+        rewards=torch.zeros(1, 20),
+        returns_to_go=torch.rand(1, 20),
+        timesteps=torch.arange(20).unsqueeze(0),
+        mask=torch.ones(1, 20, dtype=torch.bool),
+    )
+    values = getattr(windows, field).clone()
+    values[:, 10] += 1.0
+    changed = predictions(policy, replace(windows, **{field: values}))
+    moved = (changed != predictions(policy, windows)).any(-1)[0].nonzero()
+    assert int(moved[0]) == first

@@ -1,0 +1,353 @@
+"""The report: its numbers are the runs', it stands alone, and nothing from outside runs in it."""
+
+import dataclasses
+import json
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tensorboardX import SummaryWriter
+
+from tests.support import killed_run
+from ucfrec.commands.cli import main
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.fitting.tensorboard import read_scalars
+from ucfrec.reporting import charts
+from ucfrec.reporting.page import write_report
+from ucfrec.runs.config import resolve_config
+from ucfrec.runs.run import train_run
+
+VOID = {"meta", "br", "img", "link", "input", "hr"}
+HOSTILE = "</title><script>alert('1')</script><img src=x onerror=\"alert(2)\">&amp;"
+
+
+class Page(HTMLParser):
+    """What a page holds; fails where tags do not match."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.tables: dict[str, dict[str, dict[str, str]]] = {}
+        """{caption: {row: {column: cell}}}"""
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self.raw = path.read_text(encoding="utf-8")
+        self._open: list[str] = []
+        self._rows: list[list[str]] = []
+        self._caption = self._cell = ""
+        self.feed(self.raw)
+        self.close()
+        assert self._open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self._open.append(tag)
+        if tag == "table":
+            self._rows, self._caption = [], ""
+        elif tag == "tr":
+            self._rows.append([])
+        elif tag in ("td", "th"):
+            self._cell = ""
+            assert tag == "td" or dict(attrs)["scope"] in ("row", "col")
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop() == tag
+        if tag in ("td", "th"):
+            self._rows[-1].append(self._cell.strip())
+        elif tag == "table":
+            head, *body = self._rows
+            rows = {row[0]: dict(zip(head[1:], row[1:], strict=True)) for row in body}
+            self.tables[self._caption] = rows
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+        if self._open and self._open[-1] == "caption":
+            self._caption += data
+        self._cell += data
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Runs `ucf` and `dt` on one store and `other` on another; treat as read-only."""
+    folder = tmp_path_factory.mktemp("report")
+    for name, n in (("store", 120), ("other-store", 60)):
+        rng = np.random.default_rng(n)
+        lengths = rng.integers(3, 9, size=n)
+        observation = rng.normal(size=(lengths.sum(), 4))
+        action = rng.uniform(-1, 1, size=(lengths.sum(), 2))
+        reward = observation[:, 0] * action[:, 0] + 0.5 * rng.normal(size=lengths.sum())
+        columns = {"observation": observation, "action": action, "reward": reward}
+        split = np.repeat([0, 1], [n * 3 // 4, n - n * 3 // 4]).astype(np.uint8)
+        EpisodeStore.write(folder / name, columns, lengths, {"split": split})
+    small = [*killed_run.SETTINGS, "train.steps=30"]
+    for run, store, learner in (("ucf", "store", "ucf"), ("dt", "store", "dt"),
+                                ("other", "other-store", "dt")):  # fmt: skip
+        config = resolve_config(learner, None, small, seed=3)
+        train_run(EpisodeStore.open(folder / store), folder / run, config)
+    return folder
+
+
+def page_of(out: Path, *runs: Path, results: tuple[Path, ...] = ()) -> Page:
+    write_report(out, runs, results)
+    return Page(out)
+
+
+def record_of(run: Path) -> dict[str, Any]:
+    record: dict[str, Any] = json.loads((run / "run.json").read_text())
+    return record
+
+
+def rewritten(run: Path, to: Path, **changes: Any) -> Path:
+    """A copy of a run with another record; a change to None takes the field away."""
+    shutil.copytree(run, to)
+    record = {k: v for k, v in (record_of(run) | changes).items() if v is not None}
+    (to / "run.json").write_text(json.dumps(record))
+    return to
+
+
+def row(world: str, policy: str, value: float, **more: Any) -> dict[str, Any]:
+    interval = {"R_cum": value, "R_cum_low": value - 0.5, "R_cum_high": value + 1.5}
+    return {"world": world, "policy": policy, **interval, **more}
+
+
+def number(cell: str) -> float:
+    return float(cell.replace(",", ""))
+
+
+def test_the_numbers_are_those_of_the_record(runs: Path, tmp_path: Path) -> None:
+    tables = page_of(tmp_path / "report.html", runs / "ucf", runs / "dt").tables
+    record, dt = record_of(runs / "ucf"), record_of(runs / "dt")
+    best = tables["Runs"]["best validation loss"]
+    assert number(best["ucf"]) == pytest.approx(record["policy"]["best_validation"], rel=1e-3)
+    assert number(best["dt"]) == pytest.approx(dt["policy"]["best_validation"], rel=1e-3)
+    data = {name: cells["value"] for name, cells in tables["Training data"].items()}
+    train = EpisodeStore.open(runs / "store").split("train")
+    assert number(data["training sessions"]) == train.n_episodes == 90
+    assert number(data["training steps"]) == train.lengths.sum()
+    assert number(data["mean return of a session"]) == pytest.approx(train.returns.mean(), rel=1e-3)
+    for level in (0.5, 0.9, 1.0):
+        quantile = np.quantile(train.returns, level)
+        assert number(data[f"{level:.0%} of returns are at most"]) == pytest.approx(
+            quantile, rel=1e-3
+        )
+    (copies,) = (table for caption, table in tables.items() if "edited copies" in caption)
+    report = record["augmentation"]
+    model, moves = report["reward_model"], report["moves"]
+    expected = {
+        "edited copies": report["copies"],
+        "acceptance (share of proposals)": report["acceptance"],
+        "bound δ + ε_r": report["delta"] + report["epsilon_r"],
+        "share of z in the reward's variance": model["z_share"],
+        "mean-move ratio (1: one shift for all states)": moves["mean_move_ratio"],
+    }
+    for name, value in expected.items():
+        assert number(copies[name]["ucf"]) == pytest.approx(value, rel=1e-3), name
+    active = f"{model['active_dimensions']} of {model['latent_dim']}"
+    assert copies["active latent dimensions"] == {"ucf": active}
+
+
+def test_curves_are_what_was_logged_and_overlaid(runs: Path, tmp_path: Path) -> None:
+    page = page_of(tmp_path / "report.html", runs / "ucf", runs / "dt")
+    table = page.tables["Validation loss (action, held-out steps)"]
+    logged = {name: read_scalars(runs / name / "policy") for name in ("ucf", "dt")}
+    assert len(table) == 6
+    for step, cells in table.items():
+        for name, cell in cells.items():
+            value = logged[name]["validation_loss"][int(step)]
+            assert number(cell) == pytest.approx(value, rel=1e-3)
+    attention = page.tables["Attention mass on the causal parents (1: all of it)"]
+    assert [list(cells) for cells in attention.values()] == [["ucf"]] * 6
+    chart = next(
+        at for at, (_, given) in enumerate(page.elements)
+        if (given.get("aria-label") or "").startswith("Validation loss")
+    )  # fmt: skip
+    drawn = [given for tag, given in page.elements[chart:] if tag == "polyline"][:2]
+    assert len({line["class"] for line in drawn}) == 2
+    heights, values = [], []
+    for line, name in zip(drawn, ("ucf", "dt"), strict=True):
+        points = [tuple(map(float, p.split(","))) for p in str(line["points"]).split()][1:]
+        heights += [y for _, y in points]
+        values += list(logged[name]["validation_loss"].values())
+    # One axis for both: height is the same linear function of the value.
+    assert np.corrcoef(heights, values)[0, 1] == pytest.approx(-1, abs=1e-3)
+
+
+def test_settings_that_differ_are_all_there_and_no_others(runs: Path, tmp_path: Path) -> None:
+    table = page_of(tmp_path / "report.html", runs / "ucf", runs / "dt").tables[
+        "Settings that differ"
+    ]
+    assert table["policy_name"] == {"ucf": "ucf", "dt": "dt"}
+    assert table["augment.copies"] == {"ucf": "1", "dt": "0"}
+    assert all(cells["ucf"] != cells["dt"] for cells in table.values())
+    assert not {name for name in table if name.startswith(("train.", "crm.", "version."))}
+    alone = page_of(tmp_path / "alone.html", runs / "ucf")
+    assert "Settings that differ" not in alone.tables
+
+
+def test_runs_on_other_data_are_not_compared(runs: Path, tmp_path: Path) -> None:
+    page = page_of(tmp_path / "report.html", runs / "ucf", runs / "other")
+    assert page.text.count("Trained on ") == 2
+    assert list(page.tables["Runs"]["seed"]) == ["other"]  # the last such table is other's alone
+    assert "Settings that differ" not in page.tables
+
+
+def test_the_page_stands_alone(runs: Path, tmp_path: Path) -> None:
+    results = tmp_path / "rows.json"
+    results.write_text(json.dumps([row("taobao", "ucf", 3.0)]))
+    page = page_of(tmp_path / "report.html", runs / "ucf", results=(results,))
+    assert not [given for _, given in page.elements if given.keys() & {"src", "href", "xlink:href"}]
+    assert not {tag for tag, _ in page.elements} & {"script", "link", "iframe", "object", "img"}
+    assert "http:" not in page.raw.lower()
+    assert "https:" not in page.raw.lower()
+    assert "url(" not in page.raw
+    assert "@import" not in page.raw
+    policy = next(g for _, g in page.elements if g.get("http-equiv") == "Content-Security-Policy")
+    assert str(policy["content"]).startswith("default-src 'none'")
+    for tag, attributes in page.elements:
+        if tag == "svg":
+            assert attributes.get("aria-label") or attributes.get("aria-hidden") == "true"
+
+
+def test_names_from_outside_are_shown_and_never_run(runs: Path, tmp_path: Path) -> None:
+    hostile = rewritten(runs / "ucf", tmp_path / HOSTILE.replace("/", "∕"), store=HOSTILE)
+    record = record_of(hostile)
+    record["augmentation"]["warnings"] = [HOSTILE]
+    record["reward"] = HOSTILE
+    (hostile / "run.json").write_text(json.dumps(record))
+    results = tmp_path / "rows.jsonl"
+    results.write_text(json.dumps(row(HOSTILE, HOSTILE, 1.0)) + "\n")
+    page = page_of(tmp_path / "report.html", hostile, results=(results,))
+    tags = {tag for tag, _ in page.elements}
+    assert not tags & {"script", "img"}
+    assert not [name for _, given in page.elements for name in given if name.startswith("on")]
+    assert page.tables["Training data"]["reward"]["value"] == HOSTILE
+    assert page.text.count(HOSTILE) >= 4
+
+
+def test_doubts_come_first(runs: Path, tmp_path: Path) -> None:
+    augmentation = record_of(runs / "ucf")["augmentation"]
+    poor = augmentation | {"bound": 9.0, "verdict": "the bound means nothing", "warnings": ["leak"]}
+    doubtful = rewritten(runs / "ucf", tmp_path / "doubtful", augmentation=poor)
+    page = page_of(tmp_path / "report.html", doubtful)
+    warnings = page.text[: page.text.index("Trained on")]
+    assert "leak" in warnings
+    assert "the bound means nothing" in warnings
+    sound = augmentation | {"bound": 0.1, "verdict": "all is well", "warnings": []}
+    believed = rewritten(runs / "ucf", tmp_path / "believed", augmentation=sound)
+    assert "Warnings" not in page_of(tmp_path / "report.html", believed).text
+
+
+def test_a_killed_run_is_shown_as_far_as_it_got(runs: Path, tmp_path: Path) -> None:
+    fields = {"policy": None, "augmentation": None}
+    killed = rewritten(runs / "ucf", tmp_path / "killed", wall_time_s=0.0, **fields)
+    (events,) = (killed / "policy").glob("events.out.*")
+    events.write_bytes(events.read_bytes()[:-7])
+    page = page_of(tmp_path / "report.html", killed)
+    assert "not finished: logged up to step 25 of 30" in page.text
+    shown = page.tables["Validation loss (action, held-out steps)"]
+    assert list(shown) == ["5", "10", "15", "20", "25"]
+    assert page.tables["Runs"]["best validation loss"] == {"killed": "–"}
+    assert any("edited copies" in caption for caption in page.tables)
+    events.unlink()
+    assert "Nothing is logged yet" in page_of(tmp_path / "report.html", killed).text
+
+
+def test_long_curves_are_thinned_to_their_end(runs: Path, tmp_path: Path) -> None:
+    long = rewritten(runs / "dt", tmp_path / "long")
+    with SummaryWriter(str(long / "policy")) as writer:
+        for step in range(1, 1004):
+            writer.add_scalar("temperature", float("nan") if step == 500 else step / 7, step)
+    table = page_of(tmp_path / "report.html", long).tables["temperature"]
+    assert 100 < len(table) <= 200
+    assert number(table["1003"]["long"]) == pytest.approx(1003 / 7, rel=1e-3)
+    gaps = np.diff([int(step) for step in table])
+    assert gaps.max() - gaps.min() <= 1  # but for the step that was not finite
+
+
+def test_what_policies_earn_comes_by_world_with_intervals(runs: Path, tmp_path: Path) -> None:
+    rows = [
+        row("a", "ucf", 3.25, train_seed=1000, length=7.5, episodes=2000),
+        row("a", "ucf", 2.25, train_seed=1001, length=6.5, episodes=2000),
+        row("a", "random", -1.0, train_seed=None, length=5.5, episodes=2000),
+    ]
+    (tmp_path / "rows.json").write_text(json.dumps(rows))
+    (tmp_path / "more.jsonl").write_text(json.dumps(row("b", "ucf", 8.0)) + "\n")
+    results = (tmp_path / "rows.json", tmp_path / "more.jsonl")
+    page = page_of(tmp_path / "report.html", runs / "dt", results=results)
+    table = page.tables["a: means of episodes"]
+    assert list(table) == ["ucf, train_seed 1000", "ucf, train_seed 1001", "random"]
+    assert table["ucf, train_seed 1000"]["R_cum"] == "3.25 [2.75, 4.75]"
+    assert table["random"] == {
+        "R_cum": "-1 [-1.5, 0.5]", "length": "5.5", "episodes": "2,000", "train_seed": "–",
+    }  # fmt: skip
+    assert list(page.tables["b: means of episodes"]["ucf"]) == ["R_cum"]
+    assert len([tag for tag, given in page.elements if given.get("class") == "bar"]) == 4
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (None, "does not exist"),
+        ("{}", "holds no list of result rows"),
+        ("[1]", "row 1, has no usable world, policy, R_cum"),
+        (json.dumps([row("a", "ucf", 1.0), row("a", "ucf", float("nan"))]), "row 2, has no usable"),
+    ],
+)
+def test_other_files_are_refused(
+    runs: Path, tmp_path: Path, content: str | None, says: str
+) -> None:
+    if content is not None:
+        (tmp_path / "rows.json").write_text(content)
+    with pytest.raises(InputError, match=says):
+        write_report(tmp_path / "report.html", [runs / "dt"], [tmp_path / "rows.json"])
+    assert not (tmp_path / "report.html").exists()
+
+
+def test_a_folder_that_is_no_run_is_named(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "report.html"
+    assert main(["report", str(runs / "dt"), str(runs / "store"), "--out", str(out)]) == 2
+    assert f"{runs / 'store'} is not a run folder" in capsys.readouterr().err
+    assert not out.exists()
+    assert main(["report", str(runs / "dt"), "--out", str(tmp_path)]) == 2
+    assert "is a folder" in capsys.readouterr().err
+    assert main(["report", str(runs / "dt"), "--out", str(out)]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+
+
+VALUES = st.floats(-1e6, 1e6, allow_subnormal=False).map(lambda x: round(x, 4))
+
+
+@given(st.dictionaries(st.integers(1, 10**7).map(float), VALUES, min_size=1, max_size=30))
+def test_every_point_is_drawn_inside_the_axes(curve: dict[float, float]) -> None:
+    chart = charts.line_chart("t", "x", [("run", 0, curve)])
+    points = [tuple(map(float, p.split(","))) for p in chart.lines[0].points.split()]
+    assert len(points) == len(curve) + 1
+    for x, y in points:
+        assert charts.LEFT <= x <= charts.WIDTH - charts.RIGHT
+        assert charts.TOP <= y <= charts.HEIGHT - charts.BOTTOM
+    for ticks in (chart.x_ticks, chart.y_ticks):
+        assert 2 <= len(ticks) <= 7
+        assert len({tick.label for tick in ticks}) == len(ticks)
+
+
+@given(st.lists(st.tuples(VALUES, st.floats(0, 100), st.floats(0, 100)), min_size=1, max_size=8))
+def test_bars_start_at_zero_and_carry_their_interval(
+    rows: list[tuple[float, float, float]],
+) -> None:
+    chart = charts.bar_chart("t", [("p", v, v - below, v + above) for v, below, above in rows])
+    for bar, (value, _, _) in zip(chart.bars, rows, strict=True):
+        end = bar.end if value >= 0 else bar.start
+        assert chart.zero in (bar.start, bar.end)
+        assert bar.low <= end <= bar.high
+        assert dataclasses.astuple(bar)[2] < chart.height

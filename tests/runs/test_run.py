@@ -1,0 +1,140 @@
+"""Runs: resumable at any moment, complete in themselves, honest about what they did."""
+
+import json
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.support import killed_run
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Overlay
+from ucfrec.errors import InputError
+from ucfrec.fitting.checkpoint import load_tensors
+from ucfrec.runs.config import resolve_config
+from ucfrec.runs.run import train_run
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Sessions whose reward is what the action and the state make of it, and some luck."""
+    rng = np.random.default_rng(0)
+    lengths = rng.integers(3, 12, size=150)
+    n = int(lengths.sum())
+    observation, action = rng.normal(size=(n, 4)), rng.uniform(-1, 1, size=(n, 2))
+    reward = observation[:, 0] * action[:, 0] + 0.5 * rng.normal(size=n)
+    split = np.repeat([0, 1], [120, 30]).astype(np.uint8)
+    path = tmp_path_factory.mktemp("store") / "store"
+    columns = {"observation": observation, "action": action, "reward": reward}
+    EpisodeStore.write(path, columns, lengths, {"split": split})
+    return path
+
+
+@pytest.fixture(scope="module")
+def left_alone(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("runs") / "run"
+    killed_run.train(store, run)
+    return run
+
+
+def test_a_run_killed_at_any_moment_ends_as_if_left_alone(
+    store: Path, left_alone: Path, tmp_path: Path
+) -> None:
+    ended = subprocess.run(
+        [sys.executable, ROOT / "tests" / "support" / "killed_run.py", store, tmp_path / "run"],
+        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=900,
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert int(ended.stdout.split()[-1]) >= 3
+    for name in ("overlay", "policy/best", "policy/last"):
+        expected, _ = load_tensors(left_alone / f"{name}.safetensors")
+        tensors, _ = load_tensors(tmp_path / "run" / f"{name}.safetensors")
+        assert tensors.keys() == expected.keys()
+        for key, tensor in tensors.items():
+            assert torch.equal(tensor, expected[key]), f"{name} {key}"
+
+
+def test_the_record_tells_what_was_done(store: Path, left_alone: Path) -> None:
+    record = json.loads((left_alone / "run.json").read_text())
+    assert record["fingerprint"] == EpisodeStore.open(store).meta["fingerprint"]
+    assert record["config"]["train"]["steps"] == 120
+    assert {"command", "seed", "versions", "wall_time_s"} <= record.keys()
+    report = record["augmentation"]
+    assert report["bound"] == pytest.approx(report["delta"] + report["epsilon_r"])
+    assert 0 < report["acceptance"] <= 1
+    assert 0 <= report["moves"]["mean_move_ratio"] <= 1
+    assert 0 <= report["reward_model"]["active_dimensions"] <= 16
+
+
+def test_edits_are_of_training_episodes_only(store: Path, left_alone: Path) -> None:
+    overlay = Overlay.load(left_alone / "overlay.safetensors")
+    training = EpisodeStore.open(store).split("train").episode_ids
+    assert set(overlay.copy_source) <= set(training)
+    assert len(overlay.edit_step) > 0
+
+
+def test_a_run_needs_nothing_but_its_folder(store: Path, left_alone: Path) -> None:
+    trained = TrainedPolicy.load(left_alone)
+    view = EpisodeStore.open(store).split("train")
+    mean, _ = view.state_statistics
+    torch.testing.assert_close(trained.policy.state_mean, mean)
+    returns_to_go = view.step_values("return_to_go", *view.all_steps())
+    assert trained.policy.lowest_return_to_go == returns_to_go.min()
+    assert trained.target_return(1.0) == pytest.approx(view.returns.max())
+    assert trained.target_return(0.5) == pytest.approx(np.median(view.returns), rel=1e-5)
+
+
+def test_without_copies_no_reward_model_is_trained(store: Path, tmp_path: Path) -> None:
+    settings = [*killed_run.SETTINGS, "augment.copies=0", "train.steps=10"]
+    store_ = EpisodeStore.open(store)
+    record = train_run(store_, tmp_path / "run", resolve_config("ucf", None, settings))
+    assert "augmentation" not in record
+    assert not (tmp_path / "run" / "crm").exists()
+    assert TrainedPolicy.load(tmp_path / "run").name == "ucf-no-augmentation"
+
+
+def test_a_store_without_validation_holds_some_training_episodes_out(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    columns = {
+        "observation": rng.normal(size=(200, 3)),
+        "action": rng.uniform(-1, 1, size=(200, 1)),
+        "reward": rng.random(200),
+    }
+    whole = EpisodeStore.write(tmp_path / "store", columns, np.full(40, 5))
+    settings = [*killed_run.SETTINGS, "train.steps=10"]
+    train_run(whole, tmp_path / "run", resolve_config("ucf", None, settings))
+    overlay = Overlay.load(tmp_path / "run" / "overlay.safetensors")
+    assert not set(overlay.copy_source) & {1, 11, 21, 31}
+    single = EpisodeStore.write(
+        tmp_path / "single", {name: values[:5] for name, values in columns.items()}, np.array([5])
+    )
+    with pytest.raises(InputError, match="1 training episodes"):
+        train_run(single, tmp_path / "run-single", resolve_config("ucf"))
+
+
+def test_a_checkpoint_that_cannot_be_written_is_one_clear_error(
+    store: Path, tmp_path: Path
+) -> None:
+    """No file may grow past 20 kB here, as on a disk that is full."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    config = resolve_config("dt", None, ["train.steps=10", "policy.dim=64"])
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+    try:
+        with pytest.raises(InputError, match=r"best\.safetensors cannot be written"):
+            train_run(EpisodeStore.open(store), tmp_path / "run", config)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not list((tmp_path / "run" / "policy").glob("*safetensors*"))
+    train_run(EpisodeStore.open(store), tmp_path / "run", config)
+    assert TrainedPolicy.load(tmp_path / "run").name == "dt"

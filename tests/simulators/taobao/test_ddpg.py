@@ -1,0 +1,186 @@
+"""Logs of a DDPG learner: exact densities, what it learned from is what is logged, it learns."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from ucfrec.acting.rollout import FloatArray, Step, rollout
+from ucfrec.errors import InputError
+from ucfrec.evaluation.collect import collect
+from ucfrec_simulators.behaviors import truncated_normal
+from ucfrec_simulators.synthetic_catalog import SyntheticCatalog
+from ucfrec_simulators.taobao import ddpg
+from ucfrec_simulators.taobao import synthetic as synthetic_taobao
+from ucfrec_simulators.taobao.ddpg import DdpgConfig
+from ucfrec_simulators.taobao.synthetic import SyntheticTaobao
+
+SMALL = DdpgConfig(
+    sessions=300,
+    snapshots=3,
+    warm_up=160,
+    updates=0.1,
+    batch_size=64,
+    buffer_size=20_000,
+    hidden=32,
+)
+
+
+def need_sb3() -> None:
+    pytest.importorskip("stable_baselines3", reason="needs ucfrec[collect]")
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("UCFREC_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def reference_density(actions: FloatArray, mean: FloatArray, scale: float) -> np.ndarray:
+    low, high = (-1 - mean) / scale, (1 - mean) / scale
+    return stats.truncnorm.pdf(actions, low, high, loc=mean, scale=scale).prod(axis=-1)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    mean=st.lists(st.floats(-1, 1, width=32), min_size=1, max_size=5),
+    scale=st.floats(0.05, 2),
+    seed=st.integers(0, 99),
+)
+def test_the_density_is_that_of_a_truncated_normal(
+    mean: list[float], scale: float, seed: int
+) -> None:
+    means = np.tile(np.array(mean, dtype=np.float32), (20, 1))
+    actions, density = truncated_normal(means, scale, np.random.default_rng(seed))
+    assert np.abs(actions).max() <= 1
+    expected = reference_density(actions, means.astype(np.float64), scale)
+    np.testing.assert_allclose(density, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("mean", [0.0, 0.9, -1.0])
+def test_draws_follow_the_density(mean: float) -> None:
+    means = np.full((20_000, 1), mean, dtype=np.float32)
+    actions, density = truncated_normal(means, 0.3, np.random.default_rng(0))
+    law = stats.truncnorm((-1 - mean) / 0.3, (1 - mean) / 0.3, loc=mean, scale=0.3)
+    assert stats.kstest(actions[:, 0], law.cdf).pvalue > 1e-3
+    # The mean of 1 / density is the size of the box exactly where no mass lies on its faces.
+    within = np.abs(actions[:, 0] - mean) < 0.6
+    length = min(1, mean + 0.6) - max(-1, mean - 0.6)
+    assert (within / density).mean() == pytest.approx(length, rel=0.05)
+
+
+def test_what_it_learns_from_is_what_is_logged() -> None:
+    need_sb3()
+    env = SyntheticTaobao(16)
+    learner = ddpg.training(env, 0, SMALL)
+    steps: list[Step] = []
+    rollout(env, learner, 200, 0, steps.append)
+    buffer, high = learner._model.replay_buffer, env.single_observation_space.high
+    # All but the very last step, whose outcome nobody waited for.
+    logged = {
+        name: np.concatenate([getattr(step, name) for step in steps[:-1]])
+        for name in ("observations", "actions", "rewards", "terminated", "next_observations")
+    }
+    learned = len(logged["rewards"])
+    assert buffer.pos == learned > 1000
+    held = {name: getattr(buffer, name)[:learned, 0] for name in ("observations", "actions")}
+    np.testing.assert_allclose(held["observations"] * high, logged["observations"], atol=1e-5)
+    np.testing.assert_array_equal(held["actions"], logged["actions"])
+    np.testing.assert_allclose(buffer.rewards[:learned, 0] * 10, logged["rewards"], atol=1e-5)
+    np.testing.assert_array_equal(buffer.dones[:learned, 0] > 0, logged["terminated"])
+    goes_on = ~logged["terminated"]
+    after = buffer.next_observations[:learned, 0][goes_on] * high
+    np.testing.assert_allclose(after, logged["next_observations"][goes_on], atol=1e-5)
+
+
+class Slope(SyntheticTaobao):
+    """Clicks rise linearly towards one corner of the box: 0.5 to 9.5 a page, 5 by chance."""
+
+    corner = np.where(np.arange(27) % 3 == 0, -1.0, 1.0)
+
+    def _click_probability(self, users: Any, pages: Any, actions: Any) -> Any:
+        return 0.5 + 0.45 * (actions * self.corner).mean(axis=1)
+
+
+def test_it_learns() -> None:
+    need_sb3()
+    config = DdpgConfig(warm_up=3000, updates=1 / 16, batch_size=128, hidden=64)
+    rewards: list[FloatArray] = []
+    env = Slope(128)
+    rollout(env, ddpg.training(env, 0, config), 1500, 0, lambda s: rewards.append(s.rewards))
+    clicks = np.concatenate(rewards)
+    assert clicks[:3000].mean() == pytest.approx(5, abs=0.2)
+    assert clicks[-2000:].mean() > 7
+
+
+def test_a_log_of_the_training_holds_its_densities(tmp_path: Path) -> None:
+    need_sb3()
+    env = SyntheticTaobao(16)
+    actor = ddpg.training(env, 0, SMALL)
+    simulator = synthetic_taobao.SIMULATOR
+    collect(simulator, env, actor, 200, 0, tmp_path / "logs", env_name="e", behavior="b")
+    log = pq.read_table(tmp_path / "logs" / "sessions.parquet").to_pandas()
+    density = log["propensity"].to_numpy()
+    warm = SMALL.warm_up
+    np.testing.assert_allclose(density[:warm], 0.5**27)
+    assert (density[warm:] > 0).all()
+    assert (density[warm:] != np.float32(0.5**27)).all()
+
+
+def test_each_session_is_served_by_one_snapshot() -> None:
+    need_sb3()
+    env = SyntheticTaobao(16)
+    networks = ddpg.snapshots(env, 0, SMALL)
+    steps: list[Step] = []
+    rollout(env, ddpg.snapshot_mixture(env, 0, SMALL), 150, 0, steps.append)
+    episodes = np.concatenate([step.episodes for step in steps])
+    actions = np.concatenate([step.actions for step in steps])
+    observations = np.concatenate([step.observations for step in steps])
+    logged = np.concatenate([step.propensities for step in steps if step.propensities is not None])
+    scaled = observations / env.single_observation_space.high
+    explains = np.stack(
+        [
+            np.isclose(
+                reference_density(actions, ddpg._forward(network, scaled), SMALL.noise),
+                logged,
+                rtol=1e-3,
+            )
+            for network in networks
+        ]
+    )
+    servers = [np.flatnonzero(explains[:, episodes == e].all(axis=1)) for e in range(150)]
+    assert all(len(server) == 1 for server in servers)
+    counts = np.bincount(np.concatenate(servers), minlength=3)
+    assert (np.abs(counts - 50) < 4 * np.sqrt(150 * 2 / 9)).all()
+
+
+def test_a_training_is_kept_and_its_seed_and_world_decide_it(cache: Path) -> None:
+    need_sb3()
+
+    def weights(world: int, seed: int) -> np.ndarray:
+        env = SyntheticTaobao(16, world_seed=world)
+        networks = ddpg.snapshots(env, seed, SMALL)
+        return np.stack([network[4].weight.detach().numpy().copy() for network in networks])
+
+    first = weights(0, 0)
+    (file,) = cache.iterdir()
+    written = file.stat().st_mtime_ns
+    np.testing.assert_array_equal(first, weights(0, 0))
+    assert file.stat().st_mtime_ns == written
+    file.unlink()
+    np.testing.assert_array_equal(first, weights(0, 0))
+    assert not np.array_equal(first[0], first[1])
+    for world, seed in ((0, 1), (1, 0)):
+        assert not np.array_equal(first, weights(world, seed))
+    assert len(list(cache.iterdir())) == 3
+
+
+def test_other_worlds_are_refused() -> None:
+    for make in ddpg.BEHAVIORS.values():
+        with pytest.raises(InputError, match="serves Taobao worlds"):
+            make(SyntheticCatalog(2), 0)

@@ -1,0 +1,224 @@
+"""The worlds whose best policy is known: that it is, and that it is the best."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from ucfrec.acting.rollout import Episodes, Step, rollout
+from ucfrec.errors import InputError
+from ucfrec.plugins import Simulator
+from ucfrec_simulators import synthetic_catalog
+from ucfrec_simulators.session_env import SessionsEnv, SingleSession
+from ucfrec_simulators.synthetic_catalog import SoftmaxGuess, SyntheticCatalog, mixture
+from ucfrec_simulators.taobao import synthetic as synthetic_taobao
+from ucfrec_simulators.taobao.environment import split_observations
+from ucfrec_simulators.taobao.synthetic import SyntheticTaobao
+
+TAOBAO, CATALOG = synthetic_taobao.SIMULATOR, synthetic_catalog.SIMULATOR
+
+
+def played(simulator: Simulator, behavior: str, episodes: int, seed: int = 0) -> Episodes:
+    env = simulator.make(256, None)
+    return rollout(env, simulator.behaviors[behavior](env, seed), episodes, seed)
+
+
+@pytest.mark.parametrize("world", [SyntheticTaobao, SyntheticCatalog])
+def test_gymnasium_accepts_it(world: type[SyntheticTaobao] | type[SyntheticCatalog]) -> None:
+    check_env(SingleSession(world(1)), skip_render_check=True)
+
+
+@pytest.mark.parametrize("simulator", [TAOBAO, CATALOG])
+def test_same_seed_same_numbers_and_another_differs(simulator: Simulator) -> None:
+    first, again, other = (played(simulator, "mixture", 400, seed) for seed in (4, 4, 5))
+    np.testing.assert_array_equal(first.returns, again.returns)
+    assert not np.array_equal(first.returns, other.returns)
+
+
+@pytest.mark.parametrize("world", [SyntheticTaobao(8), SyntheticCatalog(8)])
+def test_an_ended_session_is_replaced_within_the_step(world: SessionsEnv) -> None:
+    before, _ = world.reset(seed=0)
+    world.action_space.seed(0)
+    ends = 0
+    for _ in range(40):
+        after, _, terminated, truncated, info = world.step(world.action_space.sample())
+        ended = terminated | truncated
+        ends += ended.sum()
+        final = info.get("final_obs", np.full(8, None))
+        assert [row is not None for row in final] == ended.tolist()
+        for row in np.flatnonzero(ended):
+            # A session's user never changes; its successor is somebody else.
+            np.testing.assert_array_equal(final[row][:12], before[row][:12])
+            assert not np.array_equal(final[row], after[row])
+        before = after
+    assert ends > 10
+
+
+def taobao_pages(count: int) -> tuple[SyntheticTaobao, np.ndarray, np.ndarray]:
+    env = SyntheticTaobao()
+    users, lengths = env.sample_users(count, np.random.default_rng(8))
+    return env, users, np.random.default_rng(9).integers(0, lengths)
+
+
+def test_no_action_beats_the_optimal_one() -> None:
+    env, users, pages = taobao_pages(300)
+    best = env.best_actions(users, pages)
+    top = env.expected_clicks(users, pages, best)
+    np.testing.assert_allclose(top, 9.0)
+    assert np.abs(best).max() < 1
+    generator = np.random.default_rng(10)
+    for size in (1e-3, 0.1, 1.0):
+        moved = best + size * generator.standard_normal(best.shape).astype(np.float32)
+        assert (env.expected_clicks(users, pages, np.clip(moved, -1, 1)) < top).all()
+    observations = np.column_stack([users, np.zeros((300, 2)), pages]).astype(np.float32)
+    np.testing.assert_array_equal(env.optimal_actions(observations), best)
+    np.testing.assert_array_equal(split_observations(observations)[1], pages)
+
+
+def test_the_optimum_depends_on_user_and_page() -> None:
+    env, users, pages = taobao_pages(300)
+    here = env.best_actions(users, pages)
+    assert np.abs(here - env.best_actions(np.roll(users, 1, axis=0), pages)).mean() > 0.1
+    assert np.abs(here - env.best_actions(users, pages + 10)).mean() > 0.03
+
+
+def test_taobao_behaviors_are_ordered_and_expectations_are_those_played() -> None:
+    rates = {}
+    for behavior in ("random", "zero", "best-constant", "mixture", "optimal"):
+        episodes = played(TAOBAO, behavior, 3000)
+        rates[behavior] = episodes.returns.sum() / episodes.lengths.sum()
+    assert rates["random"] * 3 < rates["zero"] < rates["best-constant"]
+    assert rates["random"] * 3 < rates["mixture"] < rates["best-constant"] / 2
+    assert rates["best-constant"] < rates["optimal"] / 2
+    assert abs(rates["optimal"] - 9.0) < 0.05
+
+
+def test_taobao_sessions_are_about_eight_pages() -> None:
+    _, lengths = SyntheticTaobao().sample_users(20_000, np.random.default_rng(0))
+    assert 6.5 < lengths.mean() < 9
+    assert (lengths.min(), lengths.max()) == (1, 100)
+
+
+@pytest.mark.parametrize("max_turn", [1, 2, 4, 5, 6])
+def test_rotation_is_optimal_by_brute_force(max_turn: int) -> None:
+    env = SyntheticCatalog(
+        1, n_items=6, n_tags=4, n_users=3, boredom_window=3, max_turn=max_turn, world_seed=5
+    )
+    best = np.zeros(3)
+    for items in product(range(6), repeat=max_turn):
+        shown = 0
+        for shown in range(1, max_turn + 1):
+            recent = [env.tags[item] for item in items[max(0, shown - 3) : shown - 1]]
+            if env.tags[items[shown - 1]] in recent:
+                break
+        best = np.maximum(best, env.click_probabilities[:, items[:shown]].sum(axis=1))
+    np.testing.assert_allclose(env.optimal_returns(), best)
+
+
+def test_rotation_earns_its_expected_return() -> None:
+    env = SyntheticCatalog(200)
+    actor = CATALOG.behaviors["optimal"](env, 0)
+    served: list[np.ndarray] = []
+    first_steps: set[int] = set()
+
+    def record(step: Step) -> None:
+        assert step.user_ids is not None
+        fresh = [e not in first_steps for e in step.episodes.tolist()]
+        first_steps.update(step.episodes.tolist())
+        served.append(step.user_ids[fresh])
+
+    episodes = rollout(env, actor, 3000, 3, record)
+    assert (episodes.lengths == env.max_turn).all()
+    luck = episodes.returns.sum() - env.optimal_returns()[np.concatenate(served)].sum()
+    assert abs(luck) < 4 * np.sqrt(0.25 * episodes.lengths.sum())
+
+
+def test_boredom_against_a_plain_reading_of_the_rule() -> None:
+    env = SyntheticCatalog(16, n_tags=5, boredom_window=4, max_turn=7)
+    env.reset(seed=2)
+    generator = np.random.default_rng(0)
+    shown: list[list[int]] = [[] for _ in range(16)]
+    bored_ends = capped_ends = 0
+    for _ in range(400):
+        actions = generator.integers(200, size=16)
+        users = env.users.copy()
+        _, rewards, terminated, truncated, info = env.step(actions)
+        assert set(np.unique(rewards)) <= {0.0, 1.0}
+        for row, history in enumerate(shown):
+            tag = int(env.tags[actions[row]])
+            bored = tag in history[-3:]
+            history.append(tag)
+            assert terminated[row] == bored
+            assert truncated[row] == (len(history) == 7 and not bored)
+            if terminated[row] or truncated[row]:
+                assert info["final_info"]["user_id"][row] == users[row]
+                history.clear()
+            else:
+                assert info["user_id"][row] == users[row]
+        bored_ends += terminated.sum()
+        capped_ends += truncated.sum()
+    assert min(bored_ends, capped_ends) > 20
+
+
+def test_clicks_have_the_stated_probability() -> None:
+    env = SyntheticCatalog(4000, n_users=3)
+    env.reset(seed=0)
+    users = env.users.copy()
+    _, clicks, *_ = env.step(np.full(4000, 17))
+    for user in range(3):
+        chance = env.click_probabilities[user, 17]
+        group = clicks[users == user]
+        assert abs(group.mean() - chance) < 4 * np.sqrt(chance * (1 - chance) / len(group))
+
+
+def test_propensities_are_exact() -> None:
+    env = SyntheticCatalog(20_000, n_items=24, n_users=1)
+    env.reset(seed=0)
+    guess = SoftmaxGuess(env, 0, error=1.0, temperature=0.7, epsilon=0.2, variety=2.0)
+    probabilities = guess.probabilities()
+    np.testing.assert_allclose(probabilities.sum(axis=1), 1.0)
+    chosen, propensity = guess.act(env.reset(seed=0)[0], np.ones(20_000, dtype=bool))
+    np.testing.assert_allclose(propensity, probabilities[0, chosen], rtol=1e-6)
+    shares = np.bincount(chosen, minlength=24) / 20_000
+    sigma = np.sqrt(probabilities[0] * (1 - probabilities[0]) / 20_000)
+    assert (np.abs(shares - probabilities[0]) < 4.5 * sigma).all()
+
+
+def test_the_mixture_reports_the_propensity_of_the_actor_in_charge() -> None:
+    env = SyntheticCatalog(500)
+    observations, _ = env.reset(seed=0)
+    actor = mixture(env, 0)
+    actor.begin(np.arange(500))
+    _, propensity = actor.act(observations, np.ones(500, dtype=bool))
+    assert propensity is not None
+    uniform = actor.component == 0
+    np.testing.assert_allclose(propensity[uniform], 1 / 200)
+    assert propensity[~uniform].mean() > 3 / 200
+    assert np.bincount(actor.component).min() > 50
+
+
+def test_catalog_behaviors_are_ordered() -> None:
+    means = {name: played(CATALOG, name, 3000).returns.mean() for name in CATALOG.behaviors}
+    assert means["random"] * 2 < means["mixture"] < means["popular"] < means["optimal"] - 2
+
+
+def test_items_are_described() -> None:
+    env = SyntheticCatalog(1)
+    table = env.item_features().to_pandas()
+    assert table["item_id"].tolist() == list(range(200))
+    np.testing.assert_array_equal(table.filter(like="tag_").to_numpy().argmax(axis=1), env.tags)
+
+
+def test_bad_input_is_refused() -> None:
+    with pytest.raises(InputError, match="boredom_window"):
+        SyntheticCatalog(1, n_tags=3)
+    with pytest.raises(InputError, match="num_envs"):
+        SyntheticTaobao(0)
+    env = SyntheticCatalog(2)
+    env.reset(seed=0)
+    for wrong in ([0, 200], [-1, 0], [0.5, 1.0]):
+        with pytest.raises(InputError, match="whole numbers from 0 to 199"):
+            env.step(np.array(wrong))
+    with pytest.raises(InputError, match="not SyntheticTaobao"):
+        CATALOG.behaviors["optimal"](SyntheticTaobao(1), 0)

@@ -1,0 +1,106 @@
+"""Trains a small module in processes that are killed at random moments, until one gets to the end.
+
+    python killed_training.py SEED FOLDER...
+
+Prints, for each folder, how many processes were killed and what the last one's loop returned. One
+interpreter imports torch; each life of the training is a fork of it.
+"""
+
+import json
+import os
+import random
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from ucfrec.fitting.loop import Fit, LoopConfig, fit
+
+STEPS, EVERY = 240, 3
+
+
+def module() -> nn.Module:
+    """With dropout and with buffers that training moves."""
+    torch.manual_seed(0)
+    return nn.Sequential(
+        nn.Linear(4, 16), nn.BatchNorm1d(16), nn.ReLU(), nn.Dropout(0.5), nn.Linear(16, 1)
+    )
+
+
+def batch(generator: np.random.Generator, size: int) -> tuple[Tensor, Tensor]:
+    x = torch.from_numpy(generator.normal(size=(size, 4)).astype(np.float32))
+    return x, x.square().sum(1, keepdim=True)
+
+
+def train(folder: Path) -> Fit:
+    net = module()
+    held_out = batch(np.random.default_rng(99), 64)
+
+    def loss(xy: tuple[Tensor, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+        value = F.mse_loss(net(xy[0]), xy[1])
+        return value, {"squared_error": value.detach()}
+
+    def validate() -> float:
+        return float(F.mse_loss(net(held_out[0]), held_out[1]))
+
+    config = LoopConfig(
+        steps=STEPS,
+        batch_size=8,
+        learning_rate=0.05,
+        warmup_steps=50,
+        clip_norm=1.0,
+        validate_every=EVERY,
+    )
+
+    def draw(generator: np.random.Generator) -> tuple[Tensor, Tensor]:
+        time.sleep(0.001)  # so that no machine is done before it is killed a few times
+        return batch(generator, 8)
+
+    return fit(net, draw, loss, config, folder, seed=5, validate=validate)
+
+
+def life(work: Callable[[Path], None], folder: Path, seconds: float) -> bool:
+    """Work on `folder` in a fork that is killed after `seconds`; whether it came to its end."""
+    child = os.fork()
+    if child == 0:
+        try:
+            work(folder)
+            os._exit(0)
+        finally:
+            os._exit(1)
+    time.sleep(seconds)
+    os.kill(child, signal.SIGKILL)
+    status = os.waitpid(child, 0)[1]
+    if os.WIFSIGNALED(status):
+        return False
+    if os.WEXITSTATUS(status):
+        raise SystemExit("training failed")
+    return True
+
+
+def recorded(folder: Path) -> None:
+    (folder / "fit.json").write_text(json.dumps(vars(train(folder))))
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    torch.optim.AdamW(module().parameters()).step()  # imports half of torch: once, not every life
+    moments = random.Random(int(sys.argv[1]))
+    report = []
+    for folder in map(Path, sys.argv[2:]):
+        killed = 0
+        # Lives grow longer, so that a slow machine comes to an end as well.
+        while not life(recorded, folder, moments.uniform(0.0, 0.07) * 1.2**killed):
+            killed += 1
+        report.append({"killed": killed, **json.loads((folder / "fit.json").read_text())})
+    print(json.dumps(report))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,7 @@
+"""`python -m ucfrec` is the command `ucfrec`."""
+
+import sys
+
+from ucfrec.commands.cli import main
+
+sys.exit(main())

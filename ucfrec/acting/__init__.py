@@ -1,0 +1,1 @@
+"""A trained policy acts, session by session."""

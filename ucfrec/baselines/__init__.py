@@ -1,1 +1,0 @@
-"""Other learners, each a sequence policy on the same store, loop and rollout."""

@@ -1,0 +1,24 @@
+"""Frames to Parquet."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from ucfrec.files import atomic_file
+
+
+def write_frames(out: Path, frames: Iterable[pd.DataFrame]) -> int:
+    """Write frames as one Parquet file, atomically; returns the rows."""
+    rows, writer = 0, None
+    with atomic_file(out) as scratch:
+        for frame in frames:
+            table = pa.Table.from_pandas(frame, preserve_index=False)
+            writer = writer or pq.ParquetWriter(scratch, table.schema)
+            writer.write_table(table)
+            rows += len(frame)
+        if writer is not None:
+            writer.close()
+    return rows

@@ -1,0 +1,27 @@
+"""`ucfrec report`: one HTML page about runs."""
+
+import argparse
+from pathlib import Path
+
+from ucfrec.reporting.page import write_report
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """What `report` takes."""
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
+    parser.add_argument(
+        "--results",
+        nargs="+",
+        action="extend",
+        type=Path,
+        default=[],
+        metavar="FILE",
+        help="rows of `ucfrec evaluate --json` or of the demo, JSON or JSON lines",
+    )
+    parser.add_argument("--out", type=Path, default=Path("report.html"), help="(report.html)")
+
+
+def run(options: argparse.Namespace) -> None:
+    """`ucfrec report`."""
+    write_report(options.out, options.runs, options.results)
+    print(f"report: {options.out}; open it in a browser")

@@ -1,0 +1,28 @@
+"""`ucfrec score`: a policy's probability of every logged choice."""
+
+import argparse
+from pathlib import Path
+
+from ucfrec.commands.frames import write_frames
+from ucfrec.commands.options import log_options, logs_given, target_given, target_options
+from ucfrec.logs.summary import format_report
+from ucfrec.off_policy.score import logged_sessions, score
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """What `score` takes."""
+    parser.add_argument("run", type=Path, metavar="RUN")
+    log_options(parser)
+    target_options(parser)
+    parser.add_argument("--out", type=Path, required=True, help="Parquet file")
+
+
+def run(options: argparse.Namespace) -> None:
+    """`ucfrec score`."""
+    files, mapping = logs_given(options)
+    trained = TrainedPolicy.load(options.run, options.checkpoint)
+    with logged_sessions(options.run, trained, files, mapping) as logged:
+        print(format_report(logged.report))
+        rows = write_frames(options.out, score(trained, logged, target_given(options, trained)))
+    print(f"\n{options.out}: {rows:,} rows")

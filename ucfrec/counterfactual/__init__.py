@@ -1,0 +1,1 @@
+"""The causal reward model, the state generators and the edited copies."""

@@ -1,0 +1,255 @@
+"""Counterfactual state generators: other states that would have earned the same reward."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+import torch
+from sklearn.cluster import MiniBatchKMeans
+from torch import Tensor, nn
+
+from ucfrec.counterfactual.reward_model import CausalRewardModel, mlp
+from ucfrec.episodes.windows import Transitions
+from ucfrec.errors import InputError
+from ucfrec.fitting.loop import LoopConfig, fit
+
+_TINY = 1e-12
+
+
+@dataclass(frozen=True)
+class CSGConfig:
+    """Which generator, and how it is made (paper appendix G.2, Table 5)."""
+
+    kind: Literal["tangent", "faithful", "noise"] = "tangent"
+    """`tangent` draws a different edit every time; `faithful` is the paper's network, which learns
+    nearly one shift for all states; `noise` is the control, moves that heed no reward."""
+    band: tuple[float, float] = (0.2, 0.5)
+    """(ρ_low, ρ_high): length of a move, in standard deviations of the states."""
+    reward_quantile: float = 0.3
+    """Steps with a reward below this quantile are not learned from: 0.3 leaves the top 70%."""
+    clusters: int = 32
+    """tangent: regions of the state space, each with its own principal directions."""
+    corrections: int = 3
+    """tangent: Newton steps back onto the level set of the reward."""
+    hidden: int = 256
+    learning_rate: float = 5e-4
+    batch_size: int = 256
+    epochs: int = 40
+    lambda_r: float = 1.0
+    lambda_band: float = 0.1
+    max_transitions: int = 200_000
+    """Most transitions to learn from; of more, that many are drawn."""
+
+
+class Generator(Protocol):
+    """Proposes counterfactual states; the acceptance gate judges them."""
+
+    @property
+    def band(self) -> tuple[float, float]:
+        """(ρ_low, ρ_high): shortest and longest move, in standard deviations of the states."""
+
+    def propose(
+        self, states: Tensor, actions: Tensor, z: Tensor, generator: torch.Generator
+    ) -> Tensor:
+        """States (M, S) that should earn f̂_r(s, a, z) under the same actions and disturbances.
+
+        Args:
+            states: (M, S).
+            actions: (M, A).
+            z: (M, latent_dim) abduced disturbances.
+            generator: where anything random comes from.
+        """
+
+
+class TangentGenerator:
+    """Random moves within the level set of the reward, shaped like the data nearby.
+
+    A move is a draw from the Gaussian of the training states around s, conditioned on the reward
+    staying what it is: ∇f̂_r · Δ = 0. It is scaled to a length drawn from the band, and brought back
+    onto the level set by Newton steps along Σ∇f̂_r, the direction of the data that changes the
+    reward most. Nothing is learned but the covariances Σ.
+    """
+
+    def __init__(
+        self, crm: CausalRewardModel, centres: Tensor, covariances: Tensor, config: CSGConfig
+    ) -> None:
+        """Build from `centres` (C, S) and `covariances` (C, S, S) of normalised states."""
+        self._crm = crm
+        self._centres = centres
+        self._covariances = covariances
+        values, vectors = torch.linalg.eigh(covariances)
+        self._roots = vectors * values.clamp(min=0).sqrt().unsqueeze(-2)
+        self._config = config
+        self.band = config.band
+
+    @torch.no_grad()
+    def propose(
+        self, states: Tensor, actions: Tensor, z: Tensor, generator: torch.Generator
+    ) -> Tensor:
+        """See `Generator.propose`."""
+        low, high = self.band
+        near = torch.cdist(self._crm.normalised_states(states), self._centres).argmin(dim=1)
+        covariance = self._covariances[near]
+        noise = torch.randn(states.shape, generator=generator)
+        length = low + (high - low) * torch.rand(len(states), 1, generator=generator)
+
+        reward, gradient = self._reward(states, actions, z, torch.zeros_like(states))
+        steepest = torch.einsum("mij,mj->mi", covariance, gradient)
+        move = torch.einsum("mij,mj->mi", self._roots[near], noise)
+        move = _scaled(
+            move - steepest * _ratio((gradient * move).sum(1), gradient, steepest), length
+        )
+        for _ in range(self._config.corrections):
+            now, gradient = self._reward(states, actions, z, move)
+            steepest = torch.einsum("mij,mj->mi", covariance, gradient)
+            step = steepest * _ratio(now - reward, gradient, steepest)
+            move = _shortened(move - _shortened(step, length), length)
+        return states + self._crm.state_std * move
+
+    def _reward(
+        self, states: Tensor, actions: Tensor, z: Tensor, move: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """f̂_r(s + σ_s Δ, a, z) (M,) and its gradient with respect to Δ (M, S)."""
+        with torch.enable_grad():
+            move = move.detach().requires_grad_()
+            reward = self._crm.predict(states + self._crm.state_std * move, actions, z)
+            (gradient,) = torch.autograd.grad(reward.sum(), move)
+        return reward.detach(), gradient
+
+
+class CounterfactualStateGenerator(nn.Module):
+    """The paper's generator g_ψ(s, a, z) (Eq. 3, Algorithm 3): one network, one edit a step."""
+
+    def __init__(self, crm: CausalRewardModel, config: CSGConfig) -> None:
+        super().__init__()
+        # Held in a tuple so that the reward model's weights are not taken for the generator's.
+        self._crm = (crm,)
+        self.band = config.band
+        given = crm.state_mean.numel() + crm.action_mean.numel() + crm.config.latent_dim
+        self.network = mlp(given, config.hidden, 3, crm.state_mean.numel())
+
+    def move(self, states: Tensor, actions: Tensor, z: Tensor) -> Tensor:
+        """Δ (M, S) in standard deviations of the states; 0 where those never vary."""
+        (crm,) = self._crm
+        move: Tensor = self.network(torch.cat([crm.given(states, actions), z], dim=-1))
+        return move * (crm.state_std > 0)
+
+    @torch.no_grad()
+    def propose(
+        self, states: Tensor, actions: Tensor, z: Tensor, generator: torch.Generator
+    ) -> Tensor:
+        """See `Generator.propose`; nothing is random here."""
+        return states + self._crm[0].state_std * self.move(states, actions, z)
+
+
+class NoiseGenerator:
+    """Moves in any direction, as long as `TangentGenerator`'s: what heeding the reward adds."""
+
+    def __init__(self, crm: CausalRewardModel, config: CSGConfig) -> None:
+        self._std = crm.state_std
+        self.band = config.band
+
+    def propose(
+        self, states: Tensor, actions: Tensor, z: Tensor, generator: torch.Generator
+    ) -> Tensor:
+        """See `Generator.propose`."""
+        low, high = self.band
+        noise = torch.randn(states.shape, generator=generator) * (self._std > 0)
+        length = low + (high - low) * torch.rand(len(states), 1, generator=generator)
+        return states + self._std * _scaled(noise, length)
+
+
+def make_generator(
+    train: Transitions, crm: CausalRewardModel, config: CSGConfig, folder: Path, seed: int
+) -> Generator:
+    """The generator that `config` names, learned from the steps of `train` with high rewards."""
+    if config.kind == "noise":
+        return NoiseGenerator(crm, config)
+    rng = np.random.default_rng(seed)
+    threshold = np.quantile(train.rewards.numpy(), config.reward_quantile)
+    rows = np.flatnonzero(train.rewards.numpy() >= threshold)
+    chosen = torch.from_numpy(rng.permutation(rows)[: config.max_transitions])
+    if config.kind == "tangent":
+        return _tangent(crm.normalised_states(train.states[chosen]), crm, config, seed)
+    if config.kind == "faithful":
+        s, a, r = train.states[chosen], train.actions[chosen], train.rewards[chosen]
+        return _faithful(s, a, r, crm, config, folder, seed)
+    raise InputError(f"csg.kind is {config.kind!r}; it must be 'tangent', 'faithful' or 'noise'")
+
+
+def _tangent(
+    states: Tensor, crm: CausalRewardModel, config: CSGConfig, seed: int
+) -> TangentGenerator:
+    size = states.shape[1]
+    clusters = max(1, min(config.clusters, len(states) // (8 * size)))
+    fitted = MiniBatchKMeans(clusters, random_state=seed, n_init=1, batch_size=4096)
+    labels = torch.from_numpy(fitted.fit_predict(states.numpy()).astype(np.int64))
+    centres = torch.from_numpy(fitted.cluster_centers_).float()
+    whole = torch.cov(states.T, correction=0).reshape(size, size)
+    covariances = torch.empty(clusters, size, size)
+    for cluster in range(clusters):
+        deviations = states[labels == cluster] - centres[cluster]
+        # A cluster of few states borrows the directions of all.
+        covariances[cluster] = (deviations.T @ deviations + size * whole) / (len(deviations) + size)
+    return TangentGenerator(crm, centres, covariances, config)
+
+
+def _faithful(
+    states: Tensor,
+    actions: Tensor,
+    rewards: Tensor,
+    crm: CausalRewardModel,
+    config: CSGConfig,
+    folder: Path,
+    seed: int,
+) -> CounterfactualStateGenerator:
+    torch.manual_seed(seed)
+    csg = CounterfactualStateGenerator(crm, config)
+    low, high = config.band
+
+    def draw(generator: np.random.Generator) -> Tensor:
+        return torch.from_numpy(generator.integers(len(rewards), size=config.batch_size))
+
+    def loss(rows: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
+        s, a, r = states[rows], actions[rows], rewards[rows]
+        with torch.no_grad():
+            z = crm.abduct(s, a, r)
+        move = csg.move(s, a, z)
+        reward = crm.predict(s + crm.state_std * move, a, z)
+        # In standard deviations of the reward, so that λ means the same for every reward.
+        change = ((reward - r) / crm.reward_std).square().mean()
+        length = move.norm(dim=1)
+        band = ((low - length).relu().square() + (length - high).relu().square()).mean()
+        parts = {"reward_change": change.detach(), "band": band.detach()}
+        return config.lambda_r * change + config.lambda_band * band, parts
+
+    epoch = max(1, len(rewards) // config.batch_size)
+    loop = LoopConfig(
+        steps=config.epochs * epoch,
+        batch_size=config.batch_size,
+        learning_rate=config.learning_rate,
+        weight_decay=0.0,
+        warmup_steps=0,
+        clip_norm=0.0,
+        validate_every=epoch,
+    )
+    crm.requires_grad_(False)
+    fit(csg, draw, loss, loop, folder, seed=seed, describe="state generator")
+    return csg
+
+
+def _ratio(change: Tensor, gradient: Tensor, steepest: Tensor) -> Tensor:
+    """How far (M, 1) to go along `steepest` for the reward to fall by `change` (M,)."""
+    return (change / ((gradient * steepest).sum(1) + _TINY)).unsqueeze(1)
+
+
+def _scaled(move: Tensor, length: Tensor) -> Tensor:
+    scaled: Tensor = move * (length / (move.norm(dim=1, keepdim=True) + _TINY))
+    return scaled
+
+
+def _shortened(move: Tensor, length: Tensor) -> Tensor:
+    factor: Tensor = length / (move.norm(dim=1, keepdim=True) + _TINY)
+    return move * factor.clamp(max=1.0)

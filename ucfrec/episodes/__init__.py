@@ -1,0 +1,1 @@
+"""What the data is: store, windows, states, returns-to-go."""

@@ -1,0 +1,214 @@
+"""Writes an episode store, step by step, in bounded memory."""
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ucfrec import schema
+from ucfrec.episodes.returns import returns_to_go
+from ucfrec.errors import InputError
+from ucfrec.files import write_json
+
+Array = npt.NDArray[Any]
+BoolArray = npt.NDArray[np.bool_]
+
+
+class StoreWriter:
+    """Takes steps in order and lays them down as shards of .npy columns.
+
+    The caller writes into a folder of its own, usually the scratch folder of
+    `ucfrec.files.atomic_folder`, so that a store appears whole or not at all.
+
+    Example: three steps, two episodes::
+
+        writer = StoreWriter(folder)
+        writer.append({"item": items, "reward": rewards}, first=[True, False, True],
+                      episodes={"user": [7, 7, 9], "split": [0, 0, 0]})
+        writer.finish(reward="is_click", source={})
+    """
+
+    def __init__(self, folder: Path, shard_steps: int = 2**24) -> None:
+        self._folder = folder
+        self._shard_steps = shard_steps
+        self._hashes: dict[str, Any] = {}
+        self._shapes: dict[str, list[int]] = {}
+        self._files: dict[str, _NpyFile] = {}
+        self._offsets: list[npt.NDArray[np.int64]] = []
+        self._episode_values: dict[str, list[Array]] = {}
+        self._split_counts = np.zeros((len(schema.SPLITS), 2), dtype=np.int64)
+        self._shards = self._steps_in_shard = self._n_steps = self._n_episodes = 0
+
+    def append(
+        self,
+        steps: Mapping[str, Array],
+        first: npt.NDArray[np.bool_],
+        episodes: Mapping[str, Array],
+    ) -> None:
+        """Add M steps in order.
+
+        Args:
+            steps: step columns of `ucfrec.schema`, each (M,) or, for `action` and `observation`,
+                (M, size). `reward`, and one of `item` and `action`, are required.
+            first: (M,) true at the first step of an episode.
+            episodes: episode columns, each (M,), constant within an episode.
+
+        Raises:
+            InputError: columns differ in length, or rewards are not finite.
+        """
+        first = np.asarray(first, dtype=bool)
+        for name, values in (*steps.items(), *episodes.items()):
+            if len(values) != len(first):
+                raise InputError(f"column {name!r} has {len(values)} steps instead of {len(first)}")
+        rewards = np.asarray(steps[schema.REWARD], dtype=schema.STEP_DTYPES[schema.REWARD])
+        strange = int(np.count_nonzero(~np.isfinite(rewards)))
+        if strange:  # suffix sums would carry it into every return of the shard
+            raise InputError(
+                f"{strange} of {len(first)} rewards are not finite; drop those rows or mend the "
+                "reward expression"
+            )
+        if len(first) == 0:
+            return
+        if self._n_steps == 0 and not first[0]:
+            raise ValueError("the first step of a store begins an episode")
+        starts, begin = np.flatnonzero(first), 0
+        while True:
+            full = begin + self._shard_steps - self._steps_in_shard
+            following = int(np.searchsorted(starts, full))
+            if following == len(starts):
+                break
+            cut = int(starts[following])
+            self._append(*_rows(steps, first, episodes, slice(begin, cut)))
+            self._close_shard()
+            begin = cut
+        self._append(*_rows(steps, first, episodes, slice(begin, None)))
+
+    def _append(
+        self,
+        steps: Mapping[str, Array],
+        first: npt.NDArray[np.bool_],
+        episodes: Mapping[str, Array],
+    ) -> None:
+        starts = np.flatnonzero(first)
+        for name, values in steps.items():
+            column = np.ascontiguousarray(values, dtype=schema.STEP_DTYPES[name])
+            self._shapes.setdefault(name, list(column.shape[1:]))
+            if name not in self._files:
+                self._files[name] = _NpyFile(self._shard / f"{name}.npy", column)
+            self._files[name].append(column)
+            self._hash(name, column)
+        for name, values in episodes.items():
+            column = np.asarray(values)[starts].astype(schema.EPISODE_DTYPES[name])
+            self._episode_values.setdefault(name, []).append(column)
+            self._hash(name, column)
+        self._hash("first", first.view(np.uint8))
+        self._offsets.append(starts + self._steps_in_shard)
+        split = np.asarray(episodes[schema.SPLIT])
+        bins = len(schema.SPLITS)
+        self._split_counts[:, 0] += np.bincount(split[starts], minlength=bins)
+        self._split_counts[:, 1] += np.bincount(split, minlength=bins)
+        self._steps_in_shard += len(first)
+        self._n_steps += len(first)
+        self._n_episodes += len(starts)
+
+    @property
+    def _shard(self) -> Path:
+        folder = self._folder / f"shard-{self._shards:05d}"
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+    def _hash(self, name: str, column: Array) -> None:
+        self._hashes.setdefault(name, hashlib.sha256()).update(column.tobytes())
+
+    def _close_shard(self) -> None:
+        for file in self._files.values():
+            file.close()
+        offsets = np.concatenate([*self._offsets, [self._steps_in_shard]]).astype(np.int64)
+        np.save(self._shard / "offsets.npy", offsets)
+        for name, values in self._episode_values.items():
+            np.save(self._shard / f"{name}.npy", np.concatenate(values))
+        rewards = np.load(self._shard / f"{schema.REWARD}.npy", mmap_mode="r")
+        np.save(self._shard / f"{schema.RETURN_TO_GO}.npy", returns_to_go(rewards, offsets))
+        self._files, self._offsets, self._episode_values = {}, [], {}
+        self._shards += 1
+        self._steps_in_shard = 0
+
+    def finish(
+        self, reward: str, source: Mapping[str, Any], ids: Mapping[str, list[Any]] | None = None
+    ) -> dict[str, Any]:
+        """Close the last shard and write `meta.json`.
+
+        Args:
+            reward: the expression that the rewards were computed by.
+            source: what the store was made from and what was dropped on the way.
+            ids: identifiers (of items, of users) whose order gives the columns their meaning; they
+                enter the fingerprint.
+
+        Returns:
+            The contents of `meta.json`.
+
+        Raises:
+            InputError: no step was appended.
+        """
+        if self._n_steps == 0:
+            raise InputError("no episode is left to store: every row was dropped or none was read")
+        self._close_shard()
+        for name, values in (ids or {}).items():
+            self._hashes[f"ids {name}"] = hashlib.sha256("\n".join(map(str, values)).encode())
+        digests = "".join(f"{k}:{h.hexdigest()};" for k, h in sorted(self._hashes.items()))
+        meta = {
+            "version": schema.STORE_VERSION,
+            "n_steps": self._n_steps,
+            "n_episodes": self._n_episodes,
+            "n_shards": self._shards,
+            "columns": self._shapes,
+            "fingerprint": hashlib.sha256(digests.encode()).hexdigest(),
+            "reward": reward,
+            "splits": {
+                name: {"episodes": int(episodes), "steps": int(steps)}
+                for name, (episodes, steps) in zip(schema.SPLITS, self._split_counts, strict=True)
+            },
+            "source": dict(source),
+        }
+        write_json(self._folder / "meta.json", meta)
+        return meta
+
+
+def _rows(
+    steps: Mapping[str, Array], first: BoolArray, episodes: Mapping[str, Array], rows: slice
+) -> tuple[dict[str, Array], BoolArray, dict[str, Array]]:
+    return (
+        {name: values[rows] for name, values in steps.items()},
+        first[rows],
+        {name: values[rows] for name, values in episodes.items()},
+    )
+
+
+class _NpyFile:
+    """A .npy file that grows; numpy leaves room in the header for the final length."""
+
+    def __init__(self, path: Path, like: Array) -> None:
+        self._file: IO[bytes] = path.open("wb")
+        self._dtype, self._shape = like.dtype, like.shape[1:]
+        self._rows = 0
+        self._write_header()
+
+    def _write_header(self) -> None:
+        header = {
+            "descr": np.lib.format.dtype_to_descr(self._dtype),
+            "fortran_order": False,
+            "shape": (self._rows, *self._shape),
+        }
+        self._file.seek(0)
+        np.lib.format.write_array_header_1_0(self._file, header)
+
+    def append(self, rows: Array) -> None:
+        self._file.write(rows.tobytes())
+        self._rows += len(rows)
+
+    def close(self) -> None:
+        self._write_header()
+        self._file.close()

@@ -1,0 +1,1 @@
+"""Policies judged in simulated worlds."""

@@ -1,0 +1,172 @@
+"""Sessions that a behavior policy plays in a simulator, written as Parquet logs."""
+
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Final, Protocol, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+from gymnasium import spaces
+from gymnasium.vector import VectorEnv
+
+from ucfrec.acting.rollout import Actor, Episodes, Step, rollout
+from ucfrec.errors import InputError
+from ucfrec.files import atomic_folder, write_json
+from ucfrec.plugins import Simulator
+from ucfrec.schema import ACTION, ITEM_ID, OBSERVATION, PROPENSITY, SESSION_ID, TIMESTAMP, USER_ID
+
+EPOCH_MS: Final = 1_704_067_200_000
+"""2024-01-01 00:00 UTC, when the first session starts."""
+SESSION_MS: Final = 60_000
+STEP_MS: Final = 1_000
+ROWS_PER_GROUP: Final = 65_536
+
+
+@runtime_checkable
+class Catalog(Protocol):
+    """A world that describes its items."""
+
+    def item_features(self) -> pa.Table:
+        """One row an item, in the order of their numbers, with `item_id`."""
+
+
+def world_items(env: VectorEnv[Any, Any, Any]) -> npt.NDArray[np.int64]:
+    """What the logs call each item of a world, (n_items,): by its catalogue, or its number."""
+    world = env.unwrapped
+    if isinstance(world, Catalog):
+        return np.asarray(world.item_features()[ITEM_ID], dtype=np.int64)
+    assert isinstance(env.single_action_space, spaces.Discrete)
+    return np.arange(int(env.single_action_space.n))
+
+
+def collect(
+    simulator: Simulator,
+    env: VectorEnv[Any, Any, Any],
+    actor: Actor,
+    sessions: int,
+    seed: int,
+    out: Path,
+    *,
+    env_name: str,
+    behavior: str,
+) -> Episodes:
+    """Play `sessions` sessions and write them as logs that `ucfrec prepare` reads.
+
+    `out` gets `sessions.parquet` (one row a step: user, session, time in ms, item or action,
+    observation, the simulator's feedback, the propensity where it is known; sessions played side by
+    side are interleaved), `items.parquet` if the world describes its items, and `collect.json`,
+    the record of the run. Sessions start a minute apart and their steps follow by the second.
+    Memory stays bounded: rows are written a row group at a time.
+
+    Args:
+        env: a world made by `simulator`.
+        actor: a behavior policy for `env`.
+        env_name, behavior: what the record calls them.
+
+    Returns:
+        Returns and lengths of the sessions, by session id.
+
+    Raises:
+        InputError: `sessions` is not positive, or `out` exists.
+    """
+    if sessions < 1:
+        raise InputError(f"sessions is {sessions}; at least one must be played")
+    with atomic_folder(out) as folder:
+        log = _SessionLog(folder / "sessions.parquet", env, simulator.feedback)
+        played = rollout(env, actor, sessions, seed, log.record, describe="collect")
+        log.close()
+        world = env.unwrapped
+        if isinstance(world, Catalog):
+            pq.write_table(world.item_features(), folder / "items.parquet")
+        write_json(folder / "collect.json", _run_record(played, env_name, behavior, seed))
+    return played
+
+
+class _SessionLog:
+    """Turns steps into Parquet row groups."""
+
+    def __init__(self, path: Path, env: VectorEnv[Any, Any, Any], feedback: str) -> None:
+        self._path, self._feedback = path, feedback
+        discrete = isinstance(env.single_action_space, spaces.Discrete)
+        self._items = world_items(env) if discrete else None
+        self._steps: list[Step] = []
+        self._rows = 0
+        self._played = np.zeros(env.num_envs, dtype=np.int64)
+        self._numbers: list[npt.NDArray[np.int64]] = []
+        self._writer: pq.ParquetWriter | None = None
+
+    def record(self, step: Step) -> None:
+        """Note one step of every live session."""
+        self._steps.append(step)
+        self._numbers.append(self._played[step.rows])
+        self._played[step.rows] = np.where(
+            step.terminated | step.truncated, 0, self._played[step.rows] + 1
+        )
+        self._rows += len(step.rows)
+        if self._rows >= ROWS_PER_GROUP:
+            self._flush()
+
+    def close(self) -> None:
+        """Write what is left and finish the file."""
+        if self._steps:
+            self._flush()
+        if self._writer is not None:
+            self._writer.close()
+
+    def _flush(self) -> None:
+        table = pa.table(self._columns())
+        if self._writer is None:
+            self._writer = pq.ParquetWriter(self._path, table.schema, compression="zstd")
+        self._writer.write_table(table)
+        self._steps, self._numbers, self._rows = [], [], 0
+
+    def _columns(self) -> dict[str, pa.Array]:
+        steps = self._steps
+        session = np.concatenate([step.episodes for step in steps])
+        # One user's sessions may overlap; the odd milliseconds keep their rows apart even so.
+        start = EPOCH_MS + session * SESSION_MS + session % STEP_MS
+        users = [step.episodes if step.user_ids is None else step.user_ids for step in steps]
+        actions = np.concatenate([step.actions for step in steps])
+        columns = {
+            USER_ID: pa.array(np.concatenate(users).astype(np.int64)),
+            SESSION_ID: pa.array(session.astype(np.int64)),
+            TIMESTAMP: pa.array(start + np.concatenate(self._numbers) * STEP_MS),
+            (ACTION if self._items is None else ITEM_ID): (
+                _lists(actions) if self._items is None else pa.array(self._items[actions])
+            ),
+            OBSERVATION: _lists(np.concatenate([step.observations for step in steps])),
+            self._feedback: pa.array(np.concatenate([step.rewards for step in steps])),
+        }
+        known = [step.propensities for step in steps if step.propensities is not None]
+        if len(known) == len(steps):
+            columns[PROPENSITY] = pa.array(np.concatenate(known))
+        return columns
+
+
+def _lists(rows: npt.NDArray[Any]) -> pa.Array:
+    """Rows (M, D) as a list<float> column."""
+    offsets = np.arange(len(rows) + 1, dtype=np.int32) * np.int32(rows.shape[1])
+    return pa.ListArray.from_arrays(offsets, rows.astype(np.float32).ravel())
+
+
+def _run_record(played: Episodes, env_name: str, behavior: str, seed: int) -> Mapping[str, Any]:
+    return {
+        "env": env_name,
+        "behavior": behavior,
+        "seed": seed,
+        "sessions": len(played.returns),
+        "steps": int(played.lengths.sum()),
+        "mean_return": float(played.returns.mean()),
+        "mean_length": float(played.lengths.mean()),
+        "versions": {name: _version(name) for name in ("ucfrec", "gymnasium", "numpy", "torch")},
+    }
+
+
+def _version(distribution: str) -> str:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return "run from a source tree"

@@ -1,0 +1,139 @@
+"""What a policy earns in a simulated world."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from ucfrec import schema
+from ucfrec.acting.rollout import Actor, IntArray, rollout
+from ucfrec.episodes.item_counts import TrainingCounts
+from ucfrec.errors import InputError
+from ucfrec.evaluation.collect import world_items
+from ucfrec.evaluation.diversity import Recommended
+from ucfrec.evaluation.diversity_columns import COLUMNS, variety_columns
+from ucfrec.evaluation.metrics import session_metrics
+from ucfrec.plugins import Simulator, load_plugin
+from ucfrec.provenance import config_hash, provenance
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+SIDE_BY_SIDE = 512
+"""Most episodes played at once."""
+
+
+@dataclass(frozen=True)
+class World:
+    """A simulator by name, with where its weights are."""
+
+    name: str
+    folder: Path | None = None
+
+    def simulator(self) -> Simulator:
+        """Load the simulator that the name stands for."""
+        simulator: Simulator = load_plugin("simulators", self.name)
+        return simulator
+
+
+def evaluate_behavior(world: World, behavior: str, episodes: int, seed: int) -> dict[str, Any]:
+    """One result row for a built-in policy of a world (`random`, `optimal`, …).
+
+    Raises:
+        InputError: the world has no policy of that name.
+    """
+    simulator = world.simulator()
+    if behavior not in simulator.behaviors:
+        known = ", ".join(simulator.behaviors)
+        raise InputError(f"{world.name} has no behavior {behavior!r}; it has {known}")
+    env = simulator.make(min(episodes, SIDE_BY_SIDE), world.folder)
+    actor = simulator.behaviors[behavior](env, seed)
+    return _row(world, behavior, env, actor, episodes, seed)
+
+
+def evaluate_policy(
+    world: World,
+    trained: TrainedPolicy,
+    name: str,
+    episodes: int,
+    seed: int,
+    target_return: float,
+) -> dict[str, Any]:
+    """One result row for a trained policy asked for `target_return` in every episode.
+
+    Raises:
+        InputError: the policy's actions or observations are not this world's.
+    """
+    env = world.simulator().make(min(episodes, SIDE_BY_SIDE), world.folder)
+    numbers = _item_numbers(world, env, trained)
+    actor = trained.actor(env.num_envs, target_return, numbers)
+    row = _row(world, name, env, actor, episodes, seed, trained.counts, numbers)
+    return row | {
+        "target_return": target_return,
+        "train_seed": trained.record["seed"],
+        "fingerprint": trained.record["fingerprint"],
+        "config": config_hash(trained.record["config"]),
+    }
+
+
+def _row(
+    world: World,
+    name: str,
+    env: Any,
+    actor: Actor,
+    episodes: int,
+    seed: int,
+    counts: TrainingCounts | None = None,
+    numbers: IntArray | None = None,
+) -> dict[str, Any]:
+    began = time.perf_counter()
+    recommended, describe = Recommended(), f"{name} in {world.name}"
+    played = rollout(env, actor, episodes, seed, recommended.record, describe)
+    seconds = time.perf_counter() - began
+    variety: Mapping[str, float | None] = dict.fromkeys(COLUMNS)
+    if isinstance(env.single_action_space, spaces.Discrete):
+        variety = variety_columns(env, recommended, counts, numbers)
+    env.close()
+    return {
+        "world": world.name,
+        "policy": name,
+        **asdict(session_metrics(played, seed)),
+        **variety,
+        "seed": seed,
+        "wall_time_s": seconds,
+        "fingerprint": None,
+        "config": None,
+        **provenance(),
+    }
+
+
+def _item_numbers(world: World, env: Any, trained: TrainedPolicy) -> IntArray | None:
+    """The world's number of each item of the policy, −1 where it has none; None for vectors."""
+    space, sizes = env.single_action_space, trained.record["sizes"]
+    observed = int(np.prod(env.single_observation_space.shape))
+    wanted = trained.record["observation_size"]
+    if wanted > observed:
+        raise InputError(
+            f"the policy observes {wanted} numbers, {world.name} shows {observed}; train it on "
+            f"logs of {world.name}"
+        )
+    if not isinstance(space, spaces.Discrete):
+        if sizes["items"] or space.shape != (sizes["action"],):
+            raise _misfit(world, f"vector actions of size {space.shape}")
+        return None
+    known = world_items(env)
+    ids = trained.item_ids
+    if ids is None or ids.dtype.kind not in "iu":
+        raise _misfit(world, f"{len(known)} items with whole numbers as {schema.ITEM_ID}")
+    order = np.argsort(known)
+    at = order[np.minimum(np.searchsorted(known, ids, sorter=order), len(known) - 1)]
+    numbers = np.where(known[at] == ids, at, -1)
+    if (numbers < 0).all():
+        raise _misfit(world, f"items {known.min()} to {known.max()} as {schema.ITEM_ID}")
+    return numbers
+
+
+def _misfit(world: World, takes: str) -> InputError:
+    return InputError(f"{world.name} takes {takes}, which the policy was not trained on")

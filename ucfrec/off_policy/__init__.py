@@ -1,0 +1,1 @@
+"""Policies judged from logs alone."""

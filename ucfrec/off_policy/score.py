@@ -1,0 +1,142 @@
+"""How probable a policy finds every choice of a log."""
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+import pyarrow.parquet as pq
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from ucfrec import schema
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Windows
+from ucfrec.errors import InputError
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare
+from ucfrec.logs.sessions import EPISODE_USERS
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+SESSION, PROBABILITY, RANK, GREEDY = "session", "probability", "rank", "greedy_item_id"
+_STEPS_AT_ONCE = 1024
+_LOGITS_AT_ONCE = 2**24
+
+IntArray = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class LoggedSessions:
+    """Logs as a policy reads them: its items and users, its reward, its sessions."""
+
+    store: EpisodeStore
+    users: npt.NDArray[Any]
+    """(E,) identifier of each session's user."""
+    report: dict[str, Any]
+    """What was read and dropped, for `ucfrec.logs.summary.format_report`."""
+
+
+@dataclass(frozen=True)
+class ScoredSteps:
+    """B logged steps and what the policy makes of them."""
+
+    episodes: IntArray
+    steps: IntArray
+    windows: Windows
+    """The steps and what came before."""
+    log_probabilities: Tensor
+    """(B, n_items) of what the policy would show."""
+
+
+@contextmanager
+def logged_sessions(
+    run: Path, trained: TrainedPolicy, files: Sequence[Path], mapping: LogMapping
+) -> Iterator[LoggedSessions]:
+    """Read logs as the training logs of `run` were read; they lie on disk until the block ends.
+
+    Rows of items that the run does not know are dropped and counted in the report.
+
+    Raises:
+        InputError: the policy's actions are vectors, the logs cannot be used, none of their items
+            is known, or their observations are not those of the training logs.
+    """
+    if trained.item_states is None:
+        raise InputError(
+            f"{run}: the actions of this policy are vectors; it chooses one for certain, so a "
+            "logged action has no probability. Judge it with ucfrec evaluate"
+        )
+    record = trained.record
+    if not record["observation_size"]:
+        mapping = LogMapping({schema.OBSERVATION: ""}).over(mapping)
+    gap_ms = record["session_gap_ms"]
+    # Runs from before `session_by` was recorded tell the gap at least.
+    session_by = record.get("session_by") or (None if gap_ms is None else "gap")
+    options = PrepareOptions(record["reward"], session_by)
+    if gap_ms is not None:
+        options = replace(options, gap_minutes=gap_ms / 60_000)
+    with tempfile.TemporaryDirectory(prefix="ucfrec-") as scratch:
+        folder = Path(scratch) / "store"
+        report = prepare(files, mapping, folder, options, like=run)
+        store = EpisodeStore.open(folder)
+        if store.observation_size != record["observation_size"]:
+            raise InputError(
+                f"the policy was trained with observations of {record['observation_size']} numbers;"
+                f" those of the logs have {store.observation_size}"
+            )
+        users = np.asarray(pq.read_table(folder / EPISODE_USERS).column(schema.USER_ID))
+        yield LoggedSessions(store, users, report)
+
+
+def scored_steps(
+    trained: TrainedPolicy, store: EpisodeStore, target_return: float
+) -> Iterator[ScoredSteps]:
+    """Every step of `store` in order, a batch at a time, as it would be seen when acting: asked for
+    `target_return` less what the session has earned so far."""
+    assert trained.item_ids is not None
+    at_once = max(1, min(_STEPS_AT_ONCE, _LOGITS_AT_ONCE // len(trained.item_ids)))
+    total = store.n_steps
+    with tqdm(total=total, desc="score", unit="step", unit_scale=True, disable=None) as bar:
+        for begin in range(0, total, at_once):
+            episodes, steps = store.locate(np.arange(begin, min(begin + at_once, total)))
+            windows = store.windows(episodes, steps, trained.policy.config.context)
+            # A logged return-to-go is the session's return less what it has earned so far.
+            more = torch.from_numpy(target_return - store.returns[episodes])
+            log_probabilities = trained.log_probabilities(windows, more.unsqueeze(1))
+            yield ScoredSteps(episodes, steps, windows, log_probabilities)
+            bar.update(len(steps))
+
+
+def score(
+    trained: TrainedPolicy, logged: LoggedSessions, target_return: float
+) -> Iterator[pd.DataFrame]:
+    """The policy's probability of every logged choice.
+
+    Yields:
+        Frames, one row a logged step, in order of user, session and time: `user_id`, `session`
+        (number, from 0), `timestamp` (ms), `item_id`, `reward`, `propensity` (where the logs have
+        one), `probability` of the logged item, its `rank` (from 1) among all items, and
+        `greedy_item_id`, the most probable one.
+    """
+    store, item_ids = logged.store, trained.item_ids
+    assert item_ids is not None
+    names = [schema.TIMESTAMP, schema.ITEM_ID, schema.REWARD]
+    names += [schema.PROPENSITY] if schema.PROPENSITY in store.meta["columns"] else []
+    for batch in scored_steps(trained, store, target_return):
+        items = batch.windows.actions[:, -1:]
+        chosen = batch.log_probabilities.gather(1, items)
+        columns = {schema.USER_ID: logged.users[batch.episodes], SESSION: batch.episodes}
+        for name in names:
+            if name == schema.ITEM_ID:
+                columns[name] = item_ids[items[:, 0].numpy()]
+            else:
+                columns[name] = store.step_values(name, batch.episodes, batch.steps)
+        columns[PROBABILITY] = chosen[:, 0].double().exp().numpy()
+        columns[RANK] = 1 + (batch.log_probabilities > chosen).sum(1).numpy()
+        columns[GREEDY] = item_ids[batch.log_probabilities.argmax(1).numpy()]
+        yield pd.DataFrame(columns)

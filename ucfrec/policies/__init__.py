@@ -1,0 +1,1 @@
+"""Every sequence policy: UCF and the baselines."""

@@ -1,0 +1,78 @@
+"""CDT4Rec (Wang et al., SIGIR 2023): a Decision Transformer that also estimates the reward."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from ucfrec import schema
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Windows
+from ucfrec.policies.dt import DTConfig, DTPolicy
+from ucfrec.policies.losses import masked_mean
+
+
+@dataclass(frozen=True)
+class CDT4RecConfig(DTConfig):
+    """Backbone as DT's, which is that of the public code."""
+
+    reward_weight: float = 0.5
+    """Of the reward's squared error, in standard deviations of the training rewards; 0 leaves DT.
+    The public code sums both losses of rewards that it does not standardise."""
+
+
+class CDT4RecPolicy(DTPolicy):
+    """DT with a causal reward estimator on its hidden states.
+
+    The state s_t queries the actions a_0, …, a_t (keys and values); what it finds, with the state,
+    predicts r_t, and the error trains the shared blocks. The public code concatenates the hidden
+    states of a_t and s_t instead, and never trains its reward head.
+    """
+
+    Config = CDT4RecConfig
+    config: CDT4RecConfig
+    reward_mean: Tensor
+    reward_std: Tensor
+
+    def __init__(self, config: CDT4RecConfig, sizes: Mapping[str, int]) -> None:
+        super().__init__(config, sizes)
+        dim = config.dim
+        self.register_buffer("reward_mean", torch.zeros(()))
+        self.register_buffer("reward_std", torch.ones(()))
+        self.attention = nn.MultiheadAttention(dim, config.heads, batch_first=True)
+        self.estimate = nn.Sequential(nn.Linear(2 * dim, dim), nn.ReLU(), nn.Linear(dim, 1))
+
+    def start_from(self, train: EpisodeStore) -> None:
+        """Take over the mean and deviation of the training rewards."""
+        rewards = torch.from_numpy(train.step_values(schema.REWARD, *train.all_steps()))
+        self.reward_mean.copy_(rewards.mean())
+        self.reward_std.copy_(rewards.std(correction=0).clamp(min=1e-6))
+
+    def estimated_rewards(self, hidden: Tensor, mask: Tensor) -> Tensor:
+        """Standardised rewards (B, K) of the actions taken, from hidden tokens (B, 3K, d)."""
+        states, actions = hidden[:, 1::3], hidden[:, 2::3]
+        length = mask.shape[1]
+        later = torch.ones(length, length, dtype=torch.bool, device=mask.device).triu(1)
+        oneself = torch.eye(length, dtype=torch.bool, device=mask.device)
+        hidden_keys = (later | ~mask.unsqueeze(1)) & ~oneself  # (B, K, K)
+        found, _ = self.attention(
+            states,
+            actions,
+            actions,
+            attn_mask=hidden_keys.repeat_interleave(self.config.heads, dim=0),
+            need_weights=False,
+        )
+        return self.estimate(torch.cat([found, states], dim=-1)).squeeze(-1)  # type: ignore[no-any-return]
+
+    def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
+        """Action loss and weighted reward loss over all steps."""
+        mask = windows.mask
+        hidden = self.transform(self.normalized(windows))
+        action_loss = self.head.loss(hidden[:, 1::3][mask], windows.actions[mask])
+        rewards = (windows.rewards - self.reward_mean) / self.reward_std
+        reward_loss = masked_mean((self.estimated_rewards(hidden, mask) - rewards).square(), mask)
+        return action_loss + self.config.reward_weight * reward_loss, {
+            "action_loss": action_loss.detach(),
+            "reward_loss": reward_loss.detach(),
+        }

@@ -1,0 +1,184 @@
+"""Conservative Q-learning (Kumar et al., 2020), and returns-to-go relabelled by what it finds."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from ucfrec import schema
+from ucfrec.counterfactual.reward_model import mlp
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Transitions
+from ucfrec.fitting.loop import LoopConfig, fit
+
+FloatArray = npt.NDArray[np.float32]
+_CHUNK = 4096
+_LOGGED = 100_000
+"""Logged actions that candidates are drawn from, at most."""
+
+
+@dataclass(frozen=True)
+class CQLConfig:
+    """Small, as it only values states; no discount, as returns-to-go have none."""
+
+    steps: int = 2000
+    weight: float = 1.0
+    """α of the conservative term."""
+    hidden: int = 128
+    candidates: int = 20
+    """Actions that stand for all: half of them logged elsewhere, the rest drawn uniformly."""
+    learning_rate: float = 3e-4
+    batch_size: int = 128
+    target_rate: float = 0.01
+    """Share of the network that its target takes over every step."""
+
+
+class ConservativeQ(nn.Module):
+    """Q(s, a) of states and action vectors (items stand as their embeddings), and its target.
+
+    States are standardised, values are in units of the largest absolute training return.
+    """
+
+    state_mean: Tensor
+    state_std: Tensor
+    logged: Tensor
+    every: Tensor | None
+    low: Tensor
+    high: Tensor
+    unit: Tensor
+
+    def __init__(self, store: EpisodeStore, config: CQLConfig) -> None:
+        super().__init__()
+        self.config = config
+        mean, std = store.state_statistics
+        episodes, steps = store.all_steps()
+        kept = np.linspace(0, len(steps) - 1, min(len(steps), _LOGGED)).astype(np.int64)
+        column = schema.ITEM if store.has_items else schema.ACTION
+        logged = torch.from_numpy(store.step_values(column, episodes[kept], steps[kept]))
+        vectors = store.action_vectors(logged.long() if store.has_items else logged)
+        every = store.item_states.embeddings if store.has_items else None
+        self.register_buffer("state_mean", mean)
+        self.register_buffer("state_std", torch.where(std > 1e-6, std, 1.0))
+        self.register_buffer("logged", vectors)
+        self.register_buffer("every", every)
+        self.register_buffer("low", vectors.min(0).values)
+        self.register_buffer("high", vectors.max(0).values)
+        self.register_buffer("unit", torch.tensor(float(np.abs(store.returns).max()) or 1.0))
+        inputs = len(mean) + vectors.shape[1]
+        self.network, self.target = (mlp(inputs, config.hidden, 2, 1) for _ in range(2))
+        self.target.load_state_dict(self.network.state_dict())
+        self.target.requires_grad_(False)
+
+    def q(self, states: Tensor, actions: Tensor, network: nn.Module | None = None) -> Tensor:
+        """(M,) values of (M, S) states and (M, A) actions."""
+        standard = ((states - self.state_mean) / self.state_std).clamp(-10, 10)
+        value: Tensor = (network or self.network)(torch.cat([standard, actions], dim=-1))
+        return value.squeeze(-1)
+
+    def candidates(self, count: int) -> Tensor:
+        """(count, candidates, A) actions that are compared in `count` states."""
+        shape = (count, self.config.candidates // 2)
+        logged = self.logged[torch.randint(len(self.logged), shape)]
+        if self.every is not None:
+            drawn = self.every[torch.randint(len(self.every), shape)]
+        else:
+            low, high = self.low, self.high
+            drawn = low + (high - low) * torch.rand(*shape, len(low))
+        return torch.cat([logged, drawn], dim=1)
+
+    def compared(self, states: Tensor, actions: Tensor, network: nn.Module | None = None) -> Tensor:
+        """(M, C) values of candidate actions (M, C, A) in states (M, S)."""
+        repeated = states.unsqueeze(1).expand(-1, actions.shape[1], -1)
+        flat = self.q(repeated.flatten(0, 1), actions.flatten(0, 1), network)
+        return flat.view(len(states), -1)
+
+    def state_values(self, states: Tensor, network: nn.Module | None = None) -> Tensor:
+        """V̂(s) (M,): the mean of Q under the policy that Q implies, softmax over candidates."""
+        values = self.compared(states, self.candidates(len(states)), network)
+        return (values.softmax(-1) * values).sum(-1)
+
+    def loss(self, batch: Transitions) -> tuple[Tensor, dict[str, Tensor]]:
+        """α (logsumexp_a Q(s, a) − Q(s, a_data)) + ½ TD²; the target network follows."""
+        with torch.no_grad():
+            for slow, fast in zip(self.target.parameters(), self.network.parameters(), strict=True):
+                slow.lerp_(fast, self.config.target_rate)
+            following = self.state_values(batch.next_states, self.target)
+            goal = batch.rewards / self.unit + following.masked_fill(batch.last, 0.0)
+        value = self.q(batch.states, batch.actions)
+        others = self.compared(batch.states, self.candidates(len(value)))
+        everything = torch.cat([others, value.unsqueeze(1)], dim=1).logsumexp(-1)
+        pressed = (everything - value).mean()
+        error = 0.5 * F.mse_loss(value, goal)
+        return self.config.weight * pressed + error, {"td": error.detach()}
+
+
+def relabelled(store: EpisodeStore, config: CQLConfig, folder: Path, seed: int) -> EpisodeStore:
+    """The store with returns-to-go raised to what CQL holds possible (EDT4Rec).
+
+    Backwards through each episode, R_{t−1} = r_{t−1} + max(R_t, V̂(s_t)).
+
+    Args:
+        store: training episodes, no copies.
+        folder: keeps the Q function; resumed from.
+    """
+    torch.manual_seed(seed)
+    network = ConservativeQ(store, config)
+    loop = LoopConfig(
+        steps=config.steps,
+        batch_size=config.batch_size,
+        learning_rate=config.learning_rate,
+        clip_norm=1.0,
+        warmup_steps=0,
+    )
+
+    def draw(generator: np.random.Generator) -> Transitions:
+        return store.transitions(*store.draw_steps(generator, config.batch_size))
+
+    fit(network, draw, network.loss, loop, folder, seed=seed, describe="cql")
+    torch.manual_seed(seed)
+    episodes, steps = store.all_steps()
+    values = np.empty(len(steps), dtype=np.float64)
+    with torch.no_grad():
+        for begin in range(0, len(steps), _CHUNK):
+            part = slice(begin, begin + _CHUNK)
+            states = store.windows(episodes[part], steps[part], 1).states[:, 0]
+            values[part] = (network.state_values(states) * network.unit).numpy()
+    rewards = store.step_values(schema.REWARD, episodes, steps)
+    return store.with_returns_to_go(optimistic_returns(rewards, values, store.lengths))
+
+
+def optimistic_returns(
+    rewards: npt.NDArray[np.floating],
+    values: npt.NDArray[np.float64],
+    lengths: npt.NDArray[np.int64],
+) -> FloatArray:
+    """R_t = r_t + max(R_{t+1}, V_{t+1}) within each episode, R = V = 0 after its end.
+
+    With C_t the rewards before t, R_t + C_t is the largest of V_k + C_k over k > t (V = 0 at the
+    end): a running maximum from the back, here over all episodes at once.
+
+    Example: rewards [1, 0, 0] with values [9, 2, 5] of one episode give [6, 5, 0].
+
+    Args:
+        rewards: (N,) of all episodes, one after the other.
+        values: (N,) V of the state before each step.
+        lengths: (E,).
+    """
+    ends = np.cumsum(lengths)
+    owner = np.repeat(np.arange(len(lengths)), lengths)
+    total = np.cumsum(rewards, dtype=np.float64)
+    before = total - rewards  # C_t, from the first episode on
+    first = before[ends - lengths][owner]
+    # What step t can hope for from t + 1: V_{t+1} + C_{t+1}, or C at the end.
+    following = np.append(values[1:], 0.0)
+    following[ends - 1] = 0.0
+    hope = following + (total - first)
+    # Later episodes come first from the back; a step down between them keeps them apart.
+    step = float(np.ptp(hope)) + 1.0
+    apart = hope - owner * step
+    highest = np.maximum.accumulate(apart[::-1])[::-1] + owner * step
+    return np.asarray(highest - (before - first), dtype=np.float32)

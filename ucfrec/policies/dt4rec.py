@@ -1,0 +1,150 @@
+"""DT4Rec (Zhao et al., WWW 2023): returns as soft buckets, recurrent encoders, contrastive loss."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from ucfrec import schema
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Windows
+from ucfrec.policies.base import TokenEmbedding
+from ucfrec.policies.dt import DTConfig, DTPolicy
+
+
+@dataclass(frozen=True)
+class DT4RecConfig(DTConfig):
+    """Defaults of the public code where it says; the contrastive weight is ours."""
+
+    layers: int = 2
+    heads: int = 8
+    buckets: int = 100
+    """B, of the reward prompt."""
+    recurrent_dropout: float = 0.2
+    negatives: int = 4
+    """Other returns that every window is asked for in the contrastive loss; the paper has 8, each
+    costing a forward pass."""
+    contrastive_weight: float = 0.1
+    """0 leaves the loss of the released code, which has no contrastive part."""
+    temperature: float = 0.07
+
+
+class DT4RecPolicy(DTPolicy):
+    """DT whose tokens come from a reward prompt and from recurrent encoders.
+
+    Contrastive part: the features that predict a step's action must be nearer to that action when
+    asked for the true return than for others. The public code shifts the next return by 0 to 7;
+    ours takes returns of other windows of the batch, which are on the scale of the data. Actions
+    here are one item or one vector, so they are decoded by the shared heads, not by its recurrent
+    decoder, which starts from the encoding of the true action.
+    """
+
+    Config = DT4RecConfig
+    config: DT4RecConfig
+    embed: "PromptedEmbedding"
+
+    def __init__(self, config: DT4RecConfig, sizes: Mapping[str, int]) -> None:
+        super().__init__(config, sizes)
+        self.embed = PromptedEmbedding(config, sizes["state"])
+
+    def start_from(self, train: EpisodeStore) -> None:
+        """Spread the buckets over the training returns-to-go."""
+        returns = torch.from_numpy(train.step_values(schema.RETURN_TO_GO, *train.all_steps()))
+        low, high = returns.min() / self.return_scale, returns.max() / self.return_scale
+        centres = self.embed.embed_return.centres
+        centres.copy_(low + (high - low) * torch.linspace(0, 1, len(centres)))
+
+    def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
+        """Action loss and weighted contrastive loss over all steps."""
+        config, mask = self.config, windows.mask
+        normalized = self.normalized(windows)
+        features = self.features(normalized)
+        action_loss = self.head.loss(features[mask], windows.actions[mask])
+        scalars = {"action_loss": action_loss.detach()}
+        if config.contrastive_weight == 0:
+            return action_loss, scalars
+        contrast = self.contrastive_loss(normalized, features)
+        scalars["contrastive_loss"] = contrast.detach()
+        return action_loss + config.contrastive_weight * contrast, scalars
+
+    def contrastive_loss(self, windows: Windows, features: Tensor) -> Tensor:
+        """InfoNCE over the true return and those of other windows, mean over all steps.
+
+        Args:
+            windows: normalised, B of them.
+            features: (B, K, d) of them.
+        """
+        config, mask = self.config, windows.mask
+        wanted = self.head.embed(windows.actions)[mask]
+        scores = [F.cosine_similarity(features[mask], wanted, dim=-1)]
+        for _ in range(config.negatives):
+            other = torch.randperm(len(mask), device=mask.device)
+            known = mask & mask[other]
+            returns = torch.where(known, windows.returns_to_go[other], windows.returns_to_go)
+            asked = self.features(replace(windows, returns_to_go=returns))
+            score = F.cosine_similarity(asked[mask], wanted, dim=-1)
+            # What was asked for is no negative of itself.
+            same = (returns == windows.returns_to_go)[mask]
+            scores.append(score.masked_fill(same, -torch.inf))
+        logits = torch.stack(scores, dim=-1) / config.temperature  # (M, 1 + negatives)
+        return F.cross_entropy(logits, logits.new_zeros(len(logits), dtype=torch.int64))
+
+
+class PromptedEmbedding(TokenEmbedding):
+    """Tokens: returns by the reward prompt, states and actions by two-layer recurrent networks."""
+
+    embed_return: "RewardPrompt"
+
+    def __init__(self, config: DT4RecConfig, state_size: int) -> None:
+        super().__init__(config, state_size)
+        self.embed_return = RewardPrompt(config)
+        self.states, self.actions = (
+            nn.GRU(config.dim, config.dim, 2, batch_first=True, dropout=config.recurrent_dropout)
+            for _ in range(2)
+        )
+
+    def forward(self, windows: Windows, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Tokens of each modality, (B, K, d), given embedded actions (B, K, d)."""
+        states = _recurrent(self.states, self.embed_state(windows.states), windows.mask)
+        actions = _recurrent(self.actions, actions, windows.mask)
+        last = self.embed_timestep.num_embeddings - 1
+        time = self.embed_timestep(windows.timesteps.clamp(max=last))
+        returns = self.embed_return(windows.returns_to_go.unsqueeze(-1))
+        return self.norm(returns + time), self.norm(states + time), self.norm(actions + time)
+
+
+class RewardPrompt(nn.Module):
+    """A return as a soft mixture of buckets, so that near returns have near embeddings.
+
+    h = LeakyReLU(w R), z = softmax(W h + h), and Σ_b z_b M_b with M_b a linear map of the centre of
+    bucket b.
+    """
+
+    centres: Tensor
+
+    def __init__(self, config: DT4RecConfig) -> None:
+        super().__init__()
+        self.register_buffer("centres", torch.linspace(0, 1, config.buckets))
+        self.weight = nn.Linear(1, config.buckets, bias=False)
+        self.mix = nn.Linear(config.buckets, config.buckets, bias=False)
+        self.embed_centre = nn.Linear(1, config.dim)
+
+    def forward(self, returns: Tensor) -> Tensor:
+        """(B, K, 1) to (B, K, d)."""
+        hidden = F.leaky_relu(self.weight(returns))
+        shares = (self.mix(hidden) + hidden).softmax(-1)  # (B, K, buckets)
+        return shares @ self.embed_centre(self.centres.unsqueeze(-1))  # type: ignore[no-any-return]
+
+
+def _recurrent(network: nn.GRU, inputs: Tensor, mask: Tensor) -> Tensor:
+    """Run over (B, K, d) whose padding is on the left, as if it were on the right."""
+    length = mask.shape[1]
+    padding = (~mask).sum(1, keepdim=True)
+    places = torch.arange(length, device=mask.device)
+
+    def rolled(x: Tensor, by: Tensor) -> Tensor:
+        return x.gather(1, ((places + by) % length).unsqueeze(-1).expand_as(x))
+
+    return rolled(network(rolled(inputs, padding))[0], -padding)

@@ -1,0 +1,132 @@
+"""Long-Short Decision Transformer (Wang et al., 2025): attention beside dynamic convolution."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from ucfrec.episodes.windows import Windows
+from ucfrec.errors import InputError
+from ucfrec.policies.base import PolicyConfig, SequencePolicy, TokenEmbedding, interleave
+
+
+@dataclass(frozen=True)
+class LSDTConfig(PolicyConfig):
+    """Defaults of the official code."""
+
+    dropout: float = 0.25
+    """Behind the mixed branches and the perceptron."""
+    max_timestep: int = 4096
+    layers: int = 3
+    heads: int = 2
+    attention_dropout: float = 0.1
+    kernel_dropout: float = 0.2
+    kernel: int = 6
+    """Tokens that a convolution sees, its own the last."""
+    kernel_groups: int = 16
+    """Groups of neighbouring channels that share a kernel."""
+
+
+class LSDTPolicy(SequencePolicy):
+    """Post-LN blocks: half of the channels attend (long), half are convolved (short), one gate.
+
+    Source: https://github.com/WangJinCheng1998/LONG-SHORT-DECISION-TRANSFORMER, less its unused
+    return and state heads and the five of its eleven taps that its causal mask switches off.
+    Padding is hidden from attention and zero where it is convolved.
+    """
+
+    Config = LSDTConfig
+    config: LSDTConfig
+
+    def __init__(self, config: LSDTConfig, sizes: Mapping[str, int]) -> None:
+        super().__init__(config, sizes)
+        if config.dim % (2 * config.kernel_groups) or config.dim % (2 * config.heads):
+            raise InputError(
+                f"policy.dim is {config.dim}; half of it must split into {config.kernel_groups} "
+                f"kernel_groups and into {config.heads} heads"
+            )
+        self.embed = TokenEmbedding(config, sizes["state"])
+        self.blocks = nn.ModuleList(_Block(config) for _ in range(config.layers))
+        for module in self.blocks.modules():
+            if isinstance(module, nn.Linear):
+                nn.init.xavier_uniform_(module.weight)
+                nn.init.zeros_(module.bias)
+
+    def features(self, windows: Windows) -> Tensor:
+        """(B, K, d) at the s_t tokens."""
+        hidden = interleave(*self.embed(windows, self.head.embed(windows.actions)))
+        there = windows.mask.repeat_interleave(3, dim=1)
+        for block in self.blocks:
+            hidden = block(hidden, there)
+        return hidden[:, 1::3]
+
+
+class _Block(nn.Module):
+    def __init__(self, config: LSDTConfig) -> None:
+        super().__init__()
+        dim = config.dim
+        self.long, self.short = _Attention(config), _DynamicConvolution(config)
+        self.squeeze = nn.Linear(dim, dim // 2)
+        self.gates = nn.ModuleList(nn.Linear(dim // 2, dim // 2) for _ in range(2))
+        self.out = nn.Linear(dim, dim)
+        self.norm = nn.LayerNorm(dim)
+        self.mlp = nn.Sequential(
+            nn.Linear(dim, 4 * dim), nn.GELU(), nn.Linear(4 * dim, dim), nn.Dropout(config.dropout)
+        )
+        self.mlp_norm = nn.LayerNorm(dim)
+        self.dropout = nn.Dropout(config.dropout)
+
+    def forward(self, hidden: Tensor, there: Tensor) -> Tensor:
+        long, short = hidden.chunk(2, dim=-1)
+        both = torch.cat([self.long(long, there), self.short(short, there)], dim=-1)
+        squeezed = F.relu(self.squeeze(both))
+        gate = torch.cat([layer(squeezed) for layer in self.gates], dim=-1).softmax(-1)
+        hidden = self.norm(hidden + self.dropout(self.out(gate * both)))
+        return self.mlp_norm(hidden + self.mlp(hidden))  # type: ignore[no-any-return]
+
+
+class _Attention(nn.Module):
+    def __init__(self, config: LSDTConfig) -> None:
+        super().__init__()
+        self.heads = config.heads
+        self.query_key_value = nn.Linear(config.dim // 2, 3 * (config.dim // 2))
+        self.dropout = nn.Dropout(config.attention_dropout)
+
+    def forward(self, hidden: Tensor, there: Tensor) -> Tensor:
+        batch, tokens, dim = hidden.shape
+        # (B, L, 3c) -> three times (B, H, L, c/H)
+        query, key, value = (
+            x.view(batch, tokens, self.heads, dim // self.heads).transpose(1, 2)
+            for x in self.query_key_value(hidden).chunk(3, dim=-1)
+        )
+        earlier = torch.ones(tokens, tokens, dtype=torch.bool, device=hidden.device).tril()
+        oneself = torch.eye(tokens, dtype=torch.bool, device=hidden.device)
+        visible = ((earlier & there.unsqueeze(1)) | oneself).unsqueeze(1)
+        mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=visible)
+        return self.dropout(mixed.transpose(1, 2).reshape(hidden.shape))  # type: ignore[no-any-return]
+
+
+class _DynamicConvolution(nn.Module):
+    """A causal convolution whose kernel each token makes for itself (Wu et al., 2019)."""
+
+    def __init__(self, config: LSDTConfig) -> None:
+        super().__init__()
+        dim = config.dim // 2
+        self.kernel, self.groups = config.kernel, config.kernel_groups
+        self.gated = nn.Linear(dim, 2 * dim)
+        self.taps = nn.Linear(dim, config.kernel_groups * config.kernel)
+        self.bias = nn.Parameter(torch.zeros(dim))
+        self.out = nn.Linear(dim, dim)
+        self.dropout = nn.Dropout(config.kernel_dropout)
+
+    def forward(self, hidden: Tensor, there: Tensor) -> Tensor:
+        batch, tokens, dim = hidden.shape
+        values = F.glu(self.gated(hidden)).masked_fill(~there.unsqueeze(-1), 0.0)
+        taps = self.dropout(self.taps(values)).view(batch, tokens, self.groups, 1, self.kernel)
+        # (B, 5 + L, c) -> (B, L, c, 6) -> (B, L, groups, c/groups, 6)
+        seen = F.pad(values, (0, 0, self.kernel - 1, 0)).unfold(1, self.kernel, 1)
+        seen = seen.reshape(batch, tokens, self.groups, dim // self.groups, self.kernel)
+        mixed = (seen * taps.softmax(-1)).sum(-1).view(batch, tokens, dim)
+        return self.out(mixed + self.bias)  # type: ignore[no-any-return]

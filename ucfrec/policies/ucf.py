@@ -1,0 +1,172 @@
+"""UCF's hybrid causal architecture (paper section 3.2)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from ucfrec.episodes.windows import Windows
+from ucfrec.policies.base import PolicyConfig, SequencePolicy, TokenEmbedding, interleave
+from ucfrec.policies.losses import mask_loss, masked_mean, parent_targets
+
+
+@dataclass(frozen=True)
+class UCFConfig(PolicyConfig):
+    """UCF's hybrid policy; defaults are the paper's Tables 6 to 8, but for λ and the weight of
+    a_{t−1}, which were chosen on validation episodes (`benchmarks/LOG.md`)."""
+
+    conv_blocks: int = 2
+    heads: int = 2
+    lambda_mask: float = 0.0
+    """λ, weight of the mask loss; any cost return in both worlds where it was swept."""
+    parent_window: int = 2
+    """w, how many earlier states count as parents."""
+    parent_decay: float = 0.6
+    """Weight of s_{t−k} is this to the power k."""
+    parent_action: float = 0.3
+    """Weight of a_{t−1} as a parent."""
+
+
+class UCFPolicy(SequencePolicy):
+    """One convolution stream a modality, one attention block supervised towards causal parents.
+
+    Sources: section 3.2, Appendix G.3, Tables 6 to 8. Only the rows that predict an action (query
+    s_t) pass through the attention block; keys and values are all 3K tokens.
+    """
+
+    Config = UCFConfig
+    augmented = True
+    config: UCFConfig
+
+    def __init__(self, config: UCFConfig, sizes: Mapping[str, int]) -> None:
+        super().__init__(config, sizes)
+        dim = config.dim
+        self.embed = TokenEmbedding(config, sizes["state"])
+        self.return_stream = ConvStream(config)
+        self.state_stream = ConvStream(config)
+        self.action_stream = ConvStream(config)
+        self.fuse = nn.Linear(3 * dim, dim)
+        self.fuse_norm = nn.LayerNorm(dim)
+        self.attention = SupervisedAttention(config)
+        self.mlp_norm = nn.LayerNorm(dim)
+        self.mlp = nn.Sequential(
+            nn.Linear(dim, 4 * dim), nn.GELU(), nn.Linear(4 * dim, dim), nn.Dropout(config.dropout)
+        )
+        self.final_norm = nn.LayerNorm(dim)
+
+    def features(self, windows: Windows) -> Tensor:
+        """(B, K, d) at the s_t tokens."""
+        return self.attend(windows)[0]
+
+    def attend(self, windows: Windows) -> tuple[Tensor, Tensor]:
+        """Features (B, K, d), and the attention (B, H, K, 3K) that they came from."""
+        tokens = self.embed(windows, self.head.embed(windows.actions))
+        streams = (self.return_stream, self.state_stream, self.action_stream)
+        returns, states, actions = (
+            stream(token, windows.mask) for stream, token in zip(streams, tokens, strict=True)
+        )
+        # Concatenating what step t has revealed so far ([R, 0, 0], [R, s, 0], [R, s, a]) and one
+        # linear layer is a running sum of the layer's three blocks.
+        of_return, of_state, of_action = self.fuse.weight.chunk(3, dim=1)
+        revealed = F.linear(returns, of_return, self.fuse.bias)
+        fused_returns = self.fuse_norm(returns + revealed)
+        revealed = revealed + F.linear(states, of_state)
+        fused_states = self.fuse_norm(states + revealed)
+        revealed = revealed + F.linear(actions, of_action)
+        fused_actions = self.fuse_norm(actions + revealed)
+
+        tokens = interleave(fused_returns, fused_states, fused_actions)
+        attended, attention = self.attention(fused_states, tokens, windows.mask)
+        hidden = fused_states + attended
+        hidden = hidden + self.mlp(self.mlp_norm(hidden))
+        return self.final_norm(hidden), attention
+
+    def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
+        """L_action + λ L_mask (Eq. 5, Algorithm 6)."""
+        config, mask = self.config, windows.mask
+        features, attention = self.attend(self.normalized(windows))
+        action_loss = self.head.loss(features[mask], windows.actions[mask])
+        targets = parent_targets(
+            mask, config.parent_window, config.parent_decay, config.parent_action
+        )
+        supervision = mask_loss(attention, targets, mask)
+        on_parents = (attention.mean(1) * (targets > 0)).sum(-1)
+        return action_loss + config.lambda_mask * supervision, {
+            "action_loss": action_loss.detach(),
+            "mask_loss": supervision.detach(),
+            "attention_on_parents": masked_mean(on_parents.detach(), mask),
+        }
+
+
+class ConvStream(nn.Module):
+    """Convolution blocks of one modality (Table 6): x ← LN(x + Dropout(GELU(PW(DW₃(x)))))."""
+
+    def __init__(self, config: UCFConfig) -> None:
+        super().__init__()
+        self.blocks = nn.ModuleList(_ConvBlock(config) for _ in range(config.conv_blocks))
+
+    def forward(self, tokens: Tensor, mask: Tensor) -> Tensor:
+        """(B, K, d) to (B, K, d); padded steps are zeroed before every convolution."""
+        keep = mask.unsqueeze(-1)
+        for block in self.blocks:
+            tokens = block(tokens.masked_fill(~keep, 0.0))
+        return tokens
+
+
+class _ConvBlock(nn.Module):
+    def __init__(self, config: UCFConfig) -> None:
+        super().__init__()
+        dim = config.dim
+        self.depthwise = nn.Conv1d(dim, dim, kernel_size=3, groups=dim)
+        self.pointwise = nn.Linear(dim, dim)
+        self.dropout = nn.Dropout(config.dropout)
+        self.norm = nn.LayerNorm(dim)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        # (B, K, d) -> (B, d, 2 + K) -> (B, K, d): the output at t sees t − 2 to t.
+        local = self.depthwise(F.pad(tokens.transpose(1, 2), (2, 0))).transpose(1, 2)
+        return self.norm(tokens + self.dropout(F.gelu(self.pointwise(local))))  # type: ignore[no-any-return]
+
+
+class SupervisedAttention(nn.Module):
+    """Multi-head attention from the s_t tokens to all tokens revealed by then (Table 7)."""
+
+    def __init__(self, config: UCFConfig) -> None:
+        super().__init__()
+        self.heads = config.heads
+        self.norm = nn.LayerNorm(config.dim)
+        self.query = nn.Linear(config.dim, config.dim)
+        self.key_value = nn.Linear(config.dim, 2 * config.dim)
+        self.out = nn.Linear(config.dim, config.dim)
+        self.dropout = nn.Dropout(config.dropout)
+
+    def forward(self, states: Tensor, tokens: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Attend from `states` (B, K, d) over `tokens` (B, 3K, d).
+
+        Returns:
+            Output (B, K, d), and probabilities (B, H, K, 3K) before dropout; each row sums to one,
+            and a padded row looks at itself only.
+        """
+        batch, length, dim = states.shape
+
+        def split(x: Tensor) -> Tensor:  # (B, L, d) -> (B, H, L, d/H)
+            return x.view(batch, -1, self.heads, dim // self.heads).transpose(1, 2)
+
+        query = split(self.query(self.norm(states)))
+        key, value = map(split, self.key_value(self.norm(tokens)).chunk(2, dim=-1))
+        scores = query @ key.transpose(-2, -1) / (dim // self.heads) ** 0.5  # (B, H, K, 3K)
+        scores = scores.masked_fill(~_visible(mask).unsqueeze(1), -torch.inf)
+        attention = scores.softmax(-1)
+        mixed = (self.dropout(attention) @ value).transpose(1, 2).reshape(batch, length, dim)
+        return self.dropout(self.out(mixed)), attention
+
+
+def _visible(mask: Tensor) -> Tensor:
+    """(B, K, 3K): which tokens the row of s_t may see, those up to s_t that are not padding."""
+    length = mask.shape[1]
+    row = 3 * torch.arange(length, device=mask.device).unsqueeze(1) + 1
+    token = torch.arange(3 * length, device=mask.device)
+    there = mask.repeat_interleave(3, dim=1).unsqueeze(1)
+    return (token <= row) & there | (token == row)

@@ -1,0 +1,1 @@
+"""The next items for users of a log."""

@@ -1,0 +1,1 @@
+"""A run: its configuration, its training and what is read back from it."""

@@ -1,0 +1,141 @@
+"""A trained policy, read back from its run folder."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow.parquet as pq
+import torch
+from torch import Tensor
+
+from ucfrec import schema
+from ucfrec.acting.policy_actor import PolicyActor
+from ucfrec.episodes.item_counts import TrainingCounts
+from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.store import ITEM_STATES
+from ucfrec.episodes.windows import Windows
+from ucfrec.errors import InputError
+from ucfrec.files import read_json
+from ucfrec.fitting.checkpoint import load_tensors, load_weights
+from ucfrec.policies.base import SequencePolicy
+from ucfrec.policies.registry import POLICIES
+from ucfrec.runs.config import config_from_dict
+
+RUN, AUGMENTATION = "run.json", "augmentation.json"
+ITEMS, USERS = "items.parquet", "users.parquet"
+COUNTS = "training_counts.safetensors"
+
+
+@dataclass(frozen=True)
+class TrainedPolicy:
+    """A policy read back from a run folder, with all that acting and recommending need."""
+
+    policy: SequencePolicy
+    record: Mapping[str, Any]
+    item_states: ItemStates | None
+    item_ids: npt.NDArray[Any] | None
+    """(n_items,) identifiers in the logs; None where actions are vectors."""
+    user_ids: npt.NDArray[Any]
+    """(n_users,) identifiers in the logs; empty where there are none."""
+    counts: TrainingCounts | None = None
+    """None where actions are vectors, and of runs from before counts were kept."""
+
+    @classmethod
+    def load(cls, run: Path, checkpoint: str = "best") -> "TrainedPolicy":
+        """Read `best` (on validation) or `last` weights of a run.
+
+        Raises:
+            InputError: `run` is no run folder, or has no checkpoint yet.
+        """
+        record = read_record(run)
+        config = config_from_dict(record["config"])
+        policy = POLICIES[config.policy_name](config.policy, record["sizes"])
+        path = run / "policy" / f"{checkpoint}.safetensors"
+        load_weights(path, policy, _weights(path))
+        policy.eval()
+        states = run / ITEM_STATES
+        return cls(
+            policy,
+            record,
+            ItemStates.load(states) if states.exists() else None,
+            _ids(run / ITEMS, schema.ITEM_ID) if states.exists() else None,
+            _ids(run / USERS, schema.USER_ID),
+            TrainingCounts.load(run / COUNTS) if (run / COUNTS).exists() else None,
+        )
+
+    @property
+    def name(self) -> str:
+        """See `learner_of`."""
+        return learner_of(self.record)
+
+    def target_return(self, quantile: float) -> float:
+        """The `quantile` of training returns, interpolated between those the run recorded."""
+        known = self.record["return_quantiles"]
+        return float(np.interp(quantile, [float(q) for q in known], list(known.values())))
+
+    @torch.no_grad()
+    def log_probabilities(self, windows: Windows, more: Tensor | float) -> Tensor:
+        """(B, n_items) of the item at each window's last step (policies of items).
+
+        Args:
+            more: return asked for beyond the windows' returns-to-go, one number or (B, 1).
+        """
+        asked = (windows.returns_to_go + more).masked_fill(~windows.mask, 0.0)
+        windows = replace(windows, returns_to_go=asked).to(self.policy.state_mean.device)
+        return self.policy.act(windows).log_softmax(-1).cpu()
+
+    def actor(
+        self,
+        episodes: int,
+        target_return: float,
+        item_numbers: npt.NDArray[np.int64] | None = None,
+    ) -> PolicyActor:
+        """An actor for `episodes` environments side by side.
+
+        Args:
+            item_numbers: (n_items,) the environment's number of each item, −1 where it has none;
+                None where they are the `item_ids`.
+        """
+        return PolicyActor(
+            self.policy,
+            episodes,
+            target_return,
+            self.record["observation_size"],
+            self.item_states,
+            self.item_ids if item_numbers is None else item_numbers,
+            self.user_ids,
+        )
+
+
+def read_record(run: Path) -> dict[str, Any]:
+    """What a run, finished or not, has recorded so far.
+
+    Raises:
+        InputError: `run` is no run folder.
+    """
+    if not (run / RUN).exists():
+        raise InputError(f"{run} is not a run folder: it has no {RUN}; train one first")
+    return dict(read_json(run / RUN))
+
+
+def learner_of(record: Mapping[str, Any]) -> str:
+    """The learner of a run's record, and whether it departs from its usual use of edited copies."""
+    config = config_from_dict(record["config"])
+    augmented = config.augment.copies > 0
+    if augmented == POLICIES[config.policy_name].augmented:
+        return config.policy_name
+    return f"{config.policy_name}-{'augmented' if augmented else 'no-augmentation'}"
+
+
+def _weights(path: Path) -> dict[str, Tensor]:
+    tensors, _ = load_tensors(path)
+    return {name: t for name, t in tensors.items() if not name.startswith("optimizer.")}
+
+
+def _ids(path: Path, column: str) -> npt.NDArray[Any]:
+    if not path.exists():
+        return np.empty(0, dtype=np.int64)
+    return np.asarray(pq.read_table(path, columns=[column]).column(column))

@@ -1,4 +1,4 @@
-"""A badge beside every page or item: in the logs it goes with the reward, in the world it is idle.
+"""A distractor beside every page or item: in the logs it goes with the reward, it causes nothing.
 
 It is the first number of the observation, in planted stores and in worlds: policies read as many of
 a world's numbers as their logs had, and KuaiRand's logs have none but this one.
@@ -29,26 +29,28 @@ OFF: Final = 0.0
 ON: Final = 1.0
 
 
-def plant_badge(store: EpisodeStore, out: Path, flip: float = 0.0, seed: int = 0) -> EpisodeStore:
-    """Write `store`, of items or of vector actions, with a badge before every observation.
+def plant_distractor(
+    store: EpisodeStore, out: Path, flip: float = 0.0, seed: int = 0
+) -> EpisodeStore:
+    """Write `store`, of items or of vector actions, with a distractor before every observation.
 
-    `meta["source"]["badge"]` tells its `rate`, the share of steps with it, for `BadgedWorld`.
+    `meta["source"]["distractor"]` has its `rate`, the share of steps with it.
 
     Raises:
         InputError: as `ucfrec.episodes.distractor.reward_bit`, or `out` exists.
     """
-    badge = reward_bit(store, flip, seed)
-    planted = np.column_stack([badge, logged_observations(store)])
-    about = {"flip": flip, "seed": seed, "rate": float(badge.mean())}
-    return with_observations(store, out, planted, {"badge": about})
+    distractor = reward_bit(store, flip, seed)
+    planted = np.column_stack([distractor, logged_observations(store)])
+    about = {"flip": flip, "seed": seed, "rate": float(distractor.mean())}
+    return with_observations(store, out, planted, {"distractor": about})
 
 
-class Badged(VectorWrapper[FloatArray, AnyArray, AnyArray]):
-    """A world whose observation starts with a badge that changes nothing.
+class DistractorEnv(VectorWrapper[FloatArray, AnyArray, AnyArray]):
+    """A world whose observation starts with a distractor that changes nothing.
 
-    Each step's badge is drawn with probability `rate`, whatever else happens, do(d ~ Bernoulli), by
-    a generator of its own: 0 switches it off, 1 on, the training frequency tells a policy confused
-    by the badge from one that merely needs it there at times.
+    Each step's distractor is drawn with probability `rate`, independently of everything else,
+    do(d ~ Bernoulli), by a generator of its own. 0 switches it off, 1 on; the training frequency
+    distinguishes a policy that is misled by it from one that needs it to be on at times.
 
     Raises:
         InputError: `rate` is no probability.
@@ -56,7 +58,7 @@ class Badged(VectorWrapper[FloatArray, AnyArray, AnyArray]):
 
     def __init__(self, env: VectorEnv[FloatArray, AnyArray, AnyArray], rate: float) -> None:
         if not 0 <= rate <= 1:
-            raise InputError(f"the badge is shown with probability {rate}; it lies in [0, 1]")
+            raise InputError(f"the distractor is shown with probability {rate}; it lies in [0, 1]")
         super().__init__(env)
         plain = env.single_observation_space
         assert isinstance(plain, spaces.Box)
@@ -65,7 +67,7 @@ class Badged(VectorWrapper[FloatArray, AnyArray, AnyArray]):
         )
         self.single_observation_space = spaces.Box(low, high, dtype=np.float32)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
-        self._rate, self._badges = rate, np.random.default_rng()
+        self._rate, self._distractors = rate, np.random.default_rng()
 
     def reset(
         self,
@@ -73,10 +75,10 @@ class Badged(VectorWrapper[FloatArray, AnyArray, AnyArray]):
         seed: int | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[FloatArray, dict[str, Any]]:
-        """Start all sessions afresh; `seed` seeds the world and, apart from it, the badges."""
+        """Start all sessions afresh; `seed` seeds the world and, apart from it, the distractors."""
         observations, info = super().reset(seed=seed, options=options)
         if seed is not None:
-            self._badges = np.random.default_rng([seed, 31])
+            self._distractors = np.random.default_rng([seed, 31])
         return self._shown(observations), info
 
     def step(
@@ -92,19 +94,19 @@ class Badged(VectorWrapper[FloatArray, AnyArray, AnyArray]):
         return self._shown(observations), rewards, terminated, truncated, info
 
     def _shown(self, observations: FloatArray) -> FloatArray:
-        badges = self._badges.random(len(observations)) < self._rate
-        return np.column_stack([badges, observations]).astype(np.float32)
+        distractors = self._distractors.random(len(observations)) < self._rate
+        return np.column_stack([distractors, observations]).astype(np.float32)
 
 
 class Unaware:
-    """A behavior policy of the world without the badge, which it does not look at."""
+    """A behavior policy of the world without the distractor, which it does not look at."""
 
     def __init__(self, actor: Actor) -> None:
         self._actor = actor
         self.begin, self.observe = actor.begin, actor.observe
 
     def act(self, observations: FloatArray, live: BoolArray) -> tuple[AnyArray, FloatArray | None]:
-        """Choose by all of the observation but the badge."""
+        """Choose by all of the observation but the distractor."""
         return self._actor.act(observations[:, 1:], live)
 
     def inform(self, info: Mapping[str, Any]) -> None:
@@ -118,33 +120,33 @@ def _unaware(
     env: VectorEnv[Any, Any, Any],
     seed: int,
 ) -> Unaware:
-    assert isinstance(env, Badged)
+    assert isinstance(env, DistractorEnv)
     return Unaware(behavior(env.env, seed))
 
 
-def badged(simulator: Simulator, rate: float) -> Simulator:
-    """The simulator's world with a badge shown with probability `rate`, and its behaviors."""
+def with_distractor(simulator: Simulator, rate: float) -> Simulator:
+    """The simulator's world with a distractor shown with probability `rate`, and its behaviors."""
     shown = {OFF: "off", ON: "always on"}.get(rate, f"drawn with probability {rate:g}")
     return replace(
         simulator,
-        summary=f"{simulator.summary}; with an idle badge, {shown}",
-        make=lambda num_envs, folder: Badged(simulator.make(num_envs, folder), rate),
+        summary=f"{simulator.summary}; with an idle distractor, {shown}",
+        make=lambda num_envs, folder: DistractorEnv(simulator.make(num_envs, folder), rate),
         behaviors={name: partial(_unaware, own) for name, own in simulator.behaviors.items()},
     )
 
 
 @dataclass(frozen=True)
-class BadgedWorld(World):
-    """A named world without a badge, made one with it, for `ucfrec.evaluation.evaluate`."""
+class DistractorWorld(World):
+    """A named world without a distractor, made one with it, for `ucfrec.evaluation.evaluate`."""
 
     rate: float = OFF
 
     def simulator(self) -> Simulator:
-        """Load the simulator that the name stands for, and show the badge in it."""
-        return badged(super().simulator(), self.rate)
+        """Load the simulator that the name stands for, and show the distractor in it."""
+        return with_distractor(super().simulator(), self.rate)
 
 
-SYNTHETIC_TAOBAO: Final = badged(synthetic_taobao.SIMULATOR, OFF)
-SYNTHETIC_TAOBAO_ON: Final = badged(synthetic_taobao.SIMULATOR, ON)
-KUAIRAND: Final = badged(kuairand.SIMULATOR, OFF)
-KUAIRAND_ON: Final = badged(kuairand.SIMULATOR, ON)
+SYNTHETIC_TAOBAO: Final = with_distractor(synthetic_taobao.SIMULATOR, OFF)
+SYNTHETIC_TAOBAO_ON: Final = with_distractor(synthetic_taobao.SIMULATOR, ON)
+KUAIRAND: Final = with_distractor(kuairand.SIMULATOR, OFF)
+KUAIRAND_ON: Final = with_distractor(kuairand.SIMULATOR, ON)

@@ -1,4 +1,4 @@
-"""The badge: planted beside rewards in the logs, idle in the worlds, read where it was trained."""
+"""The distractor: goes with rewards in the logs, causes nothing in the worlds."""
 
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from ucfrec.evaluation.evaluate import World, evaluate_behavior, evaluate_policy
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec_simulators.distractor import Badged, BadgedWorld, plant_badge
+from ucfrec_simulators.distractor import DistractorEnv, DistractorWorld, plant_distractor
 from ucfrec_simulators.kuai.completion import complete
 from ucfrec_simulators.session_env import SingleSession
 
@@ -30,14 +30,14 @@ TINY = ["train.steps=2", "train.validate_every=2", "policy.dim=16", "policy.cont
 @pytest.fixture(scope="module")
 def kuairand_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """KuaiRand-like clicks as a store, `log/store`, and their world, `world`."""
-    folder = tmp_path_factory.mktemp("badge")
+    folder = tmp_path_factory.mktemp("distractor")
     complete(planted_store(folder / "log"), {}, folder / "world", QUICK)
     return folder
 
 
 @pytest.fixture(scope="module")
 def stores(kuairand_folder: Path) -> dict[str, EpisodeStore]:
-    """One store a world, without a badge."""
+    """One store a world, without a distractor."""
     logs, taobao = str(kuairand_folder / "logs"), str(kuairand_folder / "taobao")
     played = ["--env", "synthetic-taobao", "--behavior", "mixture", "--sessions", "300"]
     assert main(["collect", *played, "--out", logs]) == 0
@@ -51,18 +51,18 @@ def stores(kuairand_folder: Path) -> dict[str, EpisodeStore]:
 
 @pytest.mark.parametrize("name", ["synthetic-taobao", "kuairand"])
 @pytest.mark.parametrize(("flip", "agreement"), [(0.0, 1.0), (0.15, 0.85)])
-def test_the_badge_goes_with_the_reward_and_nothing_else_changes(
+def test_the_distractor_goes_with_the_reward_and_nothing_else_changes(
     stores: dict[str, EpisodeStore], tmp_path: Path, name: str, flip: float, agreement: float
 ) -> None:
     store = stores[name]
-    planted = plant_badge(store, tmp_path / "planted", flip, seed=1)
+    planted = plant_distractor(store, tmp_path / "planted", flip, seed=1)
     rewards = store.step_values(schema.REWARD, *store.all_steps())
     high = rewards == 1 if name == "kuairand" else rewards > np.median(rewards)
     observed = planted.step_values(schema.OBSERVATION, *planted.all_steps())
     assert observed.shape[1] == planted.observation_size == store.observation_size + 1
     agreed = float((observed[:, 0] == high).mean())
     assert agreed == 1 if flip == 0 else agreed == pytest.approx(agreement, abs=0.03)
-    assert planted.meta["source"]["badge"]["rate"] == pytest.approx(observed[:, 0].mean())
+    assert planted.meta["source"]["distractor"]["rate"] == pytest.approx(observed[:, 0].mean())
     if store.observation_size:
         before = store.step_values(schema.OBSERVATION, *store.all_steps())
         np.testing.assert_array_equal(observed[:, 1:], before)
@@ -93,7 +93,7 @@ def test_clicks_that_are_the_rule_are_high_and_equal_rewards_are_refused(tmp_pat
 
 
 @pytest.mark.parametrize("name", ["synthetic-taobao", "kuairand"])
-def test_the_badge_causes_nothing(kuairand_folder: Path, name: str) -> None:
+def test_the_distractor_causes_nothing(kuairand_folder: Path, name: str) -> None:
     folder = kuairand_folder / "world"
     plain = World(name, folder).simulator().make(16, folder)
     plain.action_space.seed(3)
@@ -101,10 +101,10 @@ def test_the_badge_causes_nothing(kuairand_folder: Path, name: str) -> None:
     seen, _ = plain.reset(seed=5)
     steps = [plain.step(action) for action in actions]
     for rate in (0.0, 1.0, 0.4):
-        env = BadgedWorld(name, folder, rate).simulator().make(16, folder)
+        env = DistractorWorld(name, folder, rate).simulator().make(16, folder)
         first, _ = env.reset(seed=5)
         np.testing.assert_array_equal(first[:, 1:], seen)
-        badges = [first[:, 0]]
+        distractors = [first[:, 0]]
         for action, (observed, rewards, terminated, truncated, info) in zip(
             actions, steps, strict=True
         ):
@@ -116,13 +116,13 @@ def test_the_badge_causes_nothing(kuairand_folder: Path, name: str) -> None:
                 final = mine[4]["final_obs"][row]
                 np.testing.assert_array_equal(final[1:], info["final_obs"][row])
                 assert final in env.single_observation_space
-            badges.append(mine[0][:, 0])
-        assert np.mean(badges) == pytest.approx(rate, abs=0.08 if 0 < rate < 1 else 0)
+            distractors.append(mine[0][:, 0])
+        assert np.mean(distractors) == pytest.approx(rate, abs=0.08 if 0 < rate < 1 else 0)
     with pytest.raises(InputError, match=r"lies in \[0, 1\]"):
-        Badged(plain, 2.0)
+        DistractorEnv(plain, 2.0)
 
 
-@pytest.mark.parametrize("name", ["synthetic-taobao-badge", "kuairand-badge-on"])
+@pytest.mark.parametrize("name", ["synthetic-taobao-distractor", "kuairand-distractor-on"])
 def test_gymnasium_accepts_it(kuairand_folder: Path, name: str) -> None:
     folder = kuairand_folder / "world"
     world = World(name, folder).simulator().make(1, folder)
@@ -131,27 +131,27 @@ def test_gymnasium_accepts_it(kuairand_folder: Path, name: str) -> None:
 
 def test_behaviors_do_not_look_at_it(kuairand_folder: Path) -> None:
     for name, behavior in (("synthetic-taobao", "optimal"), ("kuairand", "oracle")):
-        worlds = [World(n, kuairand_folder / "world") for n in (name, f"{name}-badge-on")]
-        plain, badge = (evaluate_behavior(w, behavior, 40, 0)["R_cum"] for w in worlds)
-        assert plain == badge
+        worlds = [World(n, kuairand_folder / "world") for n in (name, f"{name}-distractor-on")]
+        plain, distractor = (evaluate_behavior(w, behavior, 40, 0)["R_cum"] for w in worlds)
+        assert plain == distractor
 
 
 @pytest.mark.parametrize("name", ["synthetic-taobao", "kuairand"])
-def test_a_policy_is_shown_the_badge_where_it_was_trained_on_it(
+def test_a_policy_is_shown_the_distractor_where_it_was_trained_on_it(
     stores: dict[str, EpisodeStore], kuairand_folder: Path, tmp_path: Path, name: str
 ) -> None:
-    planted = plant_badge(stores[name], tmp_path / "planted")
+    planted = plant_distractor(stores[name], tmp_path / "planted")
     train_run(planted, tmp_path / "run", resolve_config("bc", overrides=TINY))
     trained = TrainedPolicy.load(tmp_path / "run")
     episodes, steps = planted.all_steps()
     states = planted.windows(episodes, steps, 1).states[:, 0]
-    badge = torch.from_numpy(reward_bit(planted))
-    same = (states == badge.unsqueeze(1)).all(0)
+    distractor = torch.from_numpy(reward_bit(planted))
+    same = (states == distractor.unsqueeze(1)).all(0)
     assert same.sum() == 1
     where = int(same.nonzero())
     folder = kuairand_folder / "world"
     for rate in (0.0, 1.0):
-        world = BadgedWorld(name, folder, rate)
+        world = DistractorWorld(name, folder, rate)
         assert evaluate_policy(world, trained, "bc", 20, 0, 1.0)["episodes"] == 20
         env = world.simulator().make(8, folder)
         ids = np.arange(len(trained.item_ids)) if trained.item_ids is not None else None

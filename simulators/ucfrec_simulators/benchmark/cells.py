@@ -1,4 +1,4 @@
-"""One cell of the tables, a method trained on an arena or a built-in policy, and its rows."""
+"""One cell of the tables, a method trained on a task or a built-in policy, and its rows."""
 
 import json
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from ucfrec.reporting.grid import Row
 from ucfrec.runs.config import Config, resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec_simulators.distractor import BadgedWorld
+from ucfrec_simulators.distractor import DistractorWorld
 
 CHECKPOINTS: Final = ("best", "last")
 JUDGED, VALIDATED = 1_000_000, 2_000_000
@@ -65,9 +65,9 @@ class Judging:
 
 @dataclass(frozen=True)
 class Cell:
-    """What gives the rows of one method, in one arena, from one seed."""
+    """What gives the rows of one method, in one task, from one seed."""
 
-    arena: str
+    task: str
     method: str
     seed: int
     worlds: tuple[World, ...]
@@ -87,7 +87,7 @@ class Cell:
 
 def keys(cell: Cell) -> dict[str, Any]:
     """What tells the cell's rows from others."""
-    own = {"arena": cell.arena, "method": cell.method, "seed": cell.seed}
+    own = {"task": cell.task, "method": cell.method, "seed": cell.seed}
     own |= {"episodes": cell.judging.episodes}
     if cell.store is None:
         return own
@@ -98,7 +98,7 @@ def keys(cell: Cell) -> dict[str, Any]:
 
 
 def measure(cell: Cell) -> list[Row]:
-    """Train where there is something to train, and judge in every world of the arena.
+    """Train where there is something to train, and judge in every world of the task.
 
     The target return of a conditioned method is the one, of a few quantiles of the training
     returns, that earned most in other sessions than those reported.
@@ -122,8 +122,8 @@ def measure(cell: Cell) -> list[Row]:
 
 def _named(row: Row, world: World, checkpoint: str | None) -> Row:
     """The row, its keys those of a benchmark: `seed` is the training's."""
-    badge = world.rate if isinstance(world, BadgedWorld) else None
-    own = {"env": row["world"], "badge": badge, "checkpoint": checkpoint}
+    distractor = world.rate if isinstance(world, DistractorWorld) else None
+    own = {"env": row["world"], "distractor": distractor, "checkpoint": checkpoint}
     return row | own | {"evaluation_seed": row["seed"]}
 
 

@@ -10,10 +10,20 @@ from ucfrec.plugins import Benchmark
 from ucfrec.reporting.grid import Row, run_grid
 from ucfrec_simulators.benchmark.cells import keys, measure
 from ucfrec_simulators.benchmark.plan import BUDGETS, Plan
-from ucfrec_simulators.benchmark.plots import plot_badge, plot_methods, plot_sweeps, plot_targets
-from ucfrec_simulators.benchmark.tables import badge_table, method_table, sweep_table, target_table
+from ucfrec_simulators.benchmark.plots import (
+    plot_distractor,
+    plot_methods,
+    plot_sweeps,
+    plot_targets,
+)
+from ucfrec_simulators.benchmark.tables import (
+    distractor_table,
+    method_table,
+    sweep_table,
+    target_table,
+)
 
-TABLES: Final = ("main", "badge", "sweeps")
+TABLES: Final = ("main", "distractor", "sweeps")
 
 
 def run(budget: str, tables: Sequence[str], out: Path, results: Path, workers: int) -> str:
@@ -47,11 +57,11 @@ _SHOWN: Final[Mapping[str, tuple[_Shown, ...]]] = {
         ("Target returns", target_table, plot_targets),
     ),
     "sweeps": (("Settings of UCF", sweep_table, plot_sweeps),),
-    "badge": (("A badge that causes nothing", badge_table, plot_badge),),
+    "distractor": (("A distractor that causes nothing", distractor_table, plot_distractor),),
 }
 
 BENCHMARK: Final = Benchmark(
-    summary="Table 2 of the paper with floors, its ablations, sweeps of UCF, a planted badge",
+    summary="Table 2 of the paper with floors, its ablations, sweeps of UCF, a planted distractor",
     tables=TABLES,
     run=run,
 )

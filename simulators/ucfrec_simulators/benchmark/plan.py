@@ -8,9 +8,9 @@ from typing import Final
 from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.provenance import config_hash
-from ucfrec_simulators.benchmark.arenas import ARENAS, Arena
 from ucfrec_simulators.benchmark.cells import METHODS, Cell, Judging, Method
-from ucfrec_simulators.distractor import OFF, ON, BadgedWorld, plant_badge
+from ucfrec_simulators.benchmark.tasks import TASKS, BenchmarkTask
+from ucfrec_simulators.distractor import OFF, ON, DistractorWorld, plant_distractor
 from ucfrec_simulators.folders import data_folder
 
 
@@ -27,7 +27,7 @@ class Budget:
     """Of single learners, by key of `ucfrec.policies.registry.POLICIES`."""
     judging: Judging
     sweep_seeds: int
-    """Of the sweeps and of the badge."""
+    """Of the sweeps and of the distractor."""
 
 
 TARGETS: Final = (0.5, 0.9, 0.99, 1.0)
@@ -65,19 +65,19 @@ LAMBDAS: Final = (0.0, 0.05, 0.1, 0.25, 0.5, 1.0)
 BANDS: Final = ((0.05, 0.2), (0.2, 0.5), (0.5, 1.0), (1.0, 2.0))
 GATES: Final = (0.02, 0.1, 0.5, 1e6)
 """ε_r in standard deviations of the rewards; the last one is no gate."""
-BADGE_METHODS: Final = tuple(
+DISTRACTOR_METHODS: Final = tuple(
     name for name, method in METHODS.items() if method.conditioned or name == "bc"
 )
-BADGE_TARGETS: Final = (1.0, 0.99)
+DISTRACTOR_TARGETS: Final = (1.0, 0.99)
 """Quantiles of the training returns: the default target, and one nearer to the logs."""
 MAIN: Final = ("kuairand", "kuairec", "virtual-taobao", "synthetic-catalog")
 SWEPT: Final = ("synthetic-catalog", "synthetic-taobao")
 """Worlds with room: in VirtualTaobao every sequence policy is at the ceiling."""
 _REAL: Final = {"kuairand": "kuairand", "kuairec": "kuairec", "virtual-taobao": "virtualtaobao"}
 """What needs files that are not part of the package, and their folder in the data folder."""
-_KNOWN_BADGES: Final = {"synthetic-taobao": 0, "kuairand": 2}
-"""Where a badge is planted: arena, and which of its worlds judges (of KuaiRand NX_10, whose
-sessions are of one length, so that boredom does not drown the badge)."""
+_KNOWN_DISTRACTORS: Final = {"synthetic-taobao": 0, "kuairand": 2}
+"""Where a distractor is planted: task, and which of its worlds judges (of KuaiRand NX_10, whose
+sessions are of one length, so that boredom does not drown the distractor)."""
 _MEMORYLESS: Final = ("bc", "popular", "crm-greedy")
 
 
@@ -89,24 +89,24 @@ class Plan:
         folder: where logs, stores, worlds and runs are kept.
         """
         self._folder, self._budget = folder, budget
-        self._arenas: dict[str, Arena] = {}
+        self._tasks: dict[str, BenchmarkTask] = {}
 
     def main(self) -> Iterator[Cell]:
         """Table 2, with the floors; Table 3's ablations are rows of it."""
         for name in self._known(MAIN):
-            arena = self._arena(name)
+            task = self._task(name)
             for seed in range(self._budget.seeds):
-                for behavior in arena.behaviors:
-                    yield Cell(name, behavior, seed, arena.worlds, self._budget.judging)
+                for behavior in task.behaviors:
+                    yield Cell(name, behavior, seed, task.worlds, self._budget.judging)
                 for method in METHODS:
-                    yield from self._trained(name, arena, method, METHODS[method], seed)
+                    yield from self._trained(name, task, method, METHODS[method], seed)
 
     def sweeps(self) -> Iterator[Cell]:
         """UCF with other λ, bands and gates; the default stands in the main table."""
         for name in self._known(SWEPT):
-            arena = self._arena(name)
-            arena = replace(arena, worlds=arena.worlds[:1])
-            spread = _reward_spread(arena.store)
+            task = self._task(name)
+            task = replace(task, worlds=task.worlds[:1])
+            spread = _reward_spread(task.store)
             sweeps = {
                 **{f"λ = {x:g}": f"policy.lambda_mask={x}" for x in LAMBDAS},
                 **{f"band {low:g}–{high:g}": f"csg.band=[{low}, {high}]" for low, high in BANDS},
@@ -115,32 +115,32 @@ class Plan:
             for label, setting in sweeps.items():
                 for seed in range(self._budget.sweep_seeds):
                     method = Method("ucf", (setting,))
-                    yield from self._trained(name, arena, f"ucf, {label}", method, seed)
+                    yield from self._trained(name, task, f"ucf, {label}", method, seed)
 
-    def badge(self) -> Iterator[Cell]:
-        """A planted badge: trained without it, and with it and judged with it off and on.
+    def distractor(self) -> Iterator[Cell]:
+        """A planted distractor: trained without it, and with it and judged with it off and on.
 
-        Everybody is asked for the same returns: a target chosen where the badge is off would know
-        of the intervention.
+        Everybody is asked for the same returns: a target chosen where the distractor is off would
+        know of the intervention.
         """
-        asked = [replace(self._budget.judging, quantiles=(q,)) for q in BADGE_TARGETS]
-        for name, at in _KNOWN_BADGES.items():
-            if name not in self._known(_KNOWN_BADGES):
+        asked = [replace(self._budget.judging, quantiles=(q,)) for q in DISTRACTOR_TARGETS]
+        for name, at in _KNOWN_DISTRACTORS.items():
+            if name not in self._known(_KNOWN_DISTRACTORS):
                 continue
-            clean = self._arena(name)
+            clean = self._task(name)
             world = clean.worlds[at]
-            planted = self._folder / "arenas" / name / "badge-store"
+            planted = self._folder / "tasks" / name / "distractor-store"
             if not planted.exists():
-                plant_badge(EpisodeStore.open(clean.store), planted)
-            shown = tuple(BadgedWorld(world.name, world.folder, rate) for rate in (OFF, ON))
-            badged = Arena(planted, shown, ())
+                plant_distractor(EpisodeStore.open(clean.store), planted)
+            shown = tuple(DistractorWorld(world.name, world.folder, rate) for rate in (OFF, ON))
+            distracted = BenchmarkTask(planted, shown, ())
             for seed in range(self._budget.sweep_seeds):
-                for method in BADGE_METHODS:
+                for method in DISTRACTOR_METHODS:
                     given = METHODS[method]
                     for judging in asked:
                         yield from self._trained(name, clean, method, given, seed, judging)
-                        badge = f"{name}, badge"
-                        yield from self._trained(badge, badged, method, given, seed, judging)
+                        with_it = f"{name}, distractor"
+                        yield from self._trained(with_it, distracted, method, given, seed, judging)
 
     def missing(self) -> list[str]:
         """Environments that are left out, for lack of their data."""
@@ -149,27 +149,27 @@ class Plan:
     def _known(self, names: Iterable[str]) -> list[str]:
         return [name for name in names if name not in _REAL or data_folder(_REAL[name]).is_dir()]
 
-    def _arena(self, name: str) -> Arena:
-        if name not in self._arenas:
-            folder = self._folder / "arenas" / name
-            self._arenas[name] = ARENAS[name](folder, self._budget.sessions)
-        return self._arenas[name]
+    def _task(self, name: str) -> BenchmarkTask:
+        if name not in self._tasks:
+            folder = self._folder / "tasks" / name
+            self._tasks[name] = TASKS[name](folder, self._budget.sessions)
+        return self._tasks[name]
 
     def _trained(
         self,
         name: str,
-        arena: Arena,
+        task: BenchmarkTask,
         label: str,
         method: Method,
         seed: int,
         judging: Judging | None = None,
     ) -> Iterator[Cell]:
-        """The cell of a trained method, unless it cannot act in the arena.
+        """The cell of a trained method, unless it cannot act in the task.
 
         Args:
             judging: the budget's unless given.
         """
-        items = EpisodeStore.open(arena.store).has_items
+        items = EpisodeStore.open(task.store).has_items
         if not (items or method.vectors):
             return
         context = _CONTEXT.get(name.partition(",")[0], 10)
@@ -181,9 +181,9 @@ class Plan:
             name,
             label,
             seed,
-            arena.worlds,
+            task.worlds,
             judging or self._budget.judging,
-            arena.store,
+            task.store,
             self._folder / "runs" / name / f"{method.policy}-{named}-{seed}",
             method.policy,
             settings,

@@ -8,13 +8,13 @@ import numpy as np
 
 from ucfrec.files import atomic_file
 from ucfrec.reporting.grid import Row
-from ucfrec_simulators.benchmark.tables import BADGES, grouped
+from ucfrec_simulators.benchmark.tables import DISTRACTOR_RATES, grouped
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 PLAIN, OURS, LIGHT = "#7a8694", "#d55e00", "#56a8e0"
-BADGE_NAMES: Final = ("no badge", "badge off", "badge on")
+DISTRACTOR_NAMES: Final = ("no distractor", "distractor off", "distractor on")
 
 
 def plot_methods(rows: Sequence[Row], folder: Path) -> list[Path]:
@@ -33,13 +33,13 @@ def plot_targets(rows: Sequence[Row], folder: Path) -> list[Path]:
     return [_saved(folder / f"targets-{world}.svg", _lines, own) for world, own in _by_world(asked)]
 
 
-def plot_badge(rows: Sequence[Row], folder: Path) -> list[Path]:
-    """A picture a world in which a badge was planted: returns without it, with it off and on,
+def plot_distractor(rows: Sequence[Row], folder: Path) -> list[Path]:
+    """A picture a world in which a distractor was planted: returns without it, with it off and on,
     where the largest return is asked for."""
     rows = [row for row in rows if row["quantiles"] == [1.0]]
-    told = {row["env"] for row in rows if row["badge"] is not None}
+    told = {row["env"] for row in rows if row["distractor"] is not None}
     return [
-        _saved(folder / f"badge-{world}.svg", _triples, own)
+        _saved(folder / f"distractor-{world}.svg", _triples, own)
         for world, own in _by_world([row for row in rows if row["env"] in told])
     ]
 
@@ -75,8 +75,12 @@ def _lines(axes: "Axes", rows: Sequence[Row]) -> None:
 def _triples(axes: "Axes", rows: Sequence[Row]) -> None:
     named = grouped(rows, "best", lambda row: row["method"])[::-1]
     colors = (PLAIN, OURS, LIGHT)
-    for place, (badge, label) in enumerate(zip(BADGES, BADGE_NAMES, strict=True)):
-        earned = [[row["R_cum"] for row in own if row["badge"] == badge] for _, own in named]
+    for place, (distractor, label) in enumerate(
+        zip(DISTRACTOR_RATES, DISTRACTOR_NAMES, strict=True)
+    ):
+        earned = [
+            [row["R_cum"] for row in own if row["distractor"] == distractor] for _, own in named
+        ]
         means = [np.mean(values) if values else np.nan for values in earned]
         at = np.arange(len(named)) + 0.25 * (1 - place)
         axes.barh(at, means, height=0.25, color=colors[place], label=label)

@@ -7,8 +7,8 @@ import numpy as np
 
 from ucfrec.reporting.grid import Row
 
-BADGES: Final = (None, 0.0, 1.0)
-"""How a row's badge was shown: there was none, never, always."""
+DISTRACTOR_RATES: Final = (None, 0.0, 1.0)
+"""How a row's distractor was shown: there was none, never, always."""
 _SHOWN: Final = ("R_cum", "R_avg_pooled", "R_avg_episode", "length")
 
 
@@ -48,23 +48,28 @@ def target_table(rows: Sequence[Row]) -> str:
     return markdown(("env", "method", "target return", "seeds", "R_cum, validation"), lines)
 
 
-def badge_table(rows: Sequence[Row], checkpoint: str = "best") -> str:
-    """Per target and method: trained without the badge, and with it, judged with it off and on."""
+def distractor_table(rows: Sequence[Row], checkpoint: str = "best") -> str:
+    """Per target and method: trained without the distractor; trained with it, played off and on."""
     lines = []
 
     def key(row: Row) -> tuple[str, float, str]:
         return row["env"], row["quantiles"][0], row["method"]
 
     for (env, asked, method), own in sorted(grouped(rows, checkpoint, key), key=_by_target):
-        of = {rate: {r["seed"]: r["R_cum"] for r in own if r["badge"] == rate} for rate in BADGES}
+        of = {
+            rate: {r["seed"]: r["R_cum"] for r in own if r["distractor"] == rate}
+            for rate in DISTRACTOR_RATES
+        }
         paired = sorted(set.intersection(*(set(values) for values in of.values())))
-        if not paired:  # a world in which no badge was planted
+        if not paired:  # a world in which no distractor was planted
             continue
-        clean, off, on = (np.array([of[rate][seed] for seed in paired]) for rate in BADGES)
+        clean, off, on = (
+            np.array([of[rate][seed] for seed in paired]) for rate in DISTRACTOR_RATES
+        )
         drop = 100 * (1 - off / clean)
         spread = [_mean(values) for values in (clean, off, on, drop)]
         lines.append((env, f"{asked:g}", method, len(paired), *spread))
-    shown = ("no badge", "badge off", "badge on", "drop, %")
+    shown = ("no distractor", "distractor off", "distractor on", "drop, %")
     return markdown(("env", "target quantile", "method", "seeds", *shown), lines)
 
 

@@ -14,11 +14,11 @@ from ucfrec.evaluation.evaluate import World, evaluate_behavior
 from ucfrec.plugins import Benchmark, load_plugin
 from ucfrec.reporting.grid import read_rows
 from ucfrec_simulators.benchmark import plan
-from ucfrec_simulators.benchmark.arenas import kuairand
 from ucfrec_simulators.benchmark.cells import JUDGED, METHODS, Judging
 from ucfrec_simulators.benchmark.plan import BUDGETS, Plan
-from ucfrec_simulators.benchmark.plots import plot_badge, plot_methods, plot_targets
-from ucfrec_simulators.benchmark.tables import badge_table, method_table, target_table
+from ucfrec_simulators.benchmark.plots import plot_distractor, plot_methods, plot_targets
+from ucfrec_simulators.benchmark.tables import distractor_table, method_table, target_table
+from ucfrec_simulators.benchmark.tasks import kuairand
 from ucfrec_simulators.kuai.environment import EXITS
 from ucfrec_simulators.kuai.logs import cut_by_exit, window
 
@@ -73,12 +73,12 @@ def test_every_cell_of_every_table_has_a_configuration(
     monkeypatch.setattr(plan, "MAIN", ("synthetic-taobao", "synthetic-catalog"))
     monkeypatch.setattr(plan, "SWEPT", ("synthetic-taobao",))
     given = Plan(tmp_path, TINY)
-    cells = [*given.main(), *given.sweeps(), *given.badge()]
+    cells = [*given.main(), *given.sweeps(), *given.distractor()]
     trained = [cell for cell in cells if cell.store is not None]
     folders = {(cell.run, cell.config) for cell in trained}
     assert len({run for run, _ in folders}) == len(folders), "a folder for every configuration"
     assert {cell.method for cell in trained} >= {"ucf", "ucf, λ = 0", "ucf, band 1–2"}
-    assert not [c for c in trained if c.arena == "synthetic-taobao" and c.method == "item-knn"]
+    assert not [c for c in trained if c.task == "synthetic-taobao" and c.method == "item-knn"]
     swept = {cell.method: cell.config for cell in given.sweeps()}
     spread = swept["ucf, ε_r = 0.1 σ"].augment.epsilon_r
     rewards = EpisodeStore.open(trained[0].store)  # type: ignore[arg-type]
@@ -86,36 +86,42 @@ def test_every_cell_of_every_table_has_a_configuration(
     assert spread is not None
     assert swept["ucf, ε_r = 0.5 σ"].augment.epsilon_r == pytest.approx(5 * spread)
     assert catalog.std() > 0
-    badges = [cell for cell in given.badge() if cell.arena.endswith("badge")]
-    planted = EpisodeStore.open(badges[0].store)  # type: ignore[arg-type]
+    distractors = [cell for cell in given.distractor() if cell.task.endswith("distractor")]
+    planted = EpisodeStore.open(distractors[0].store)  # type: ignore[arg-type]
     assert planted.observation_size == 92
-    assert [world.rate for world in badges[0].worlds] == [0.0, 1.0]  # type: ignore[attr-defined]
-    assert {cell.judging.quantiles for cell in given.badge()} == {(1.0,), (0.99,)}
+    assert [world.rate for world in distractors[0].worlds] == [0.0, 1.0]  # type: ignore[attr-defined]
+    assert {cell.judging.quantiles for cell in given.distractor()} == {(1.0,), (0.99,)}
 
 
 def test_unknown_tables_are_named(tmp_path: Path) -> None:
     suite: Benchmark = load_plugin("benchmarks", "recommendation")
-    with pytest.raises(InputError, match="tables are main, badge, sweeps"):
+    with pytest.raises(InputError, match="tables are main, distractor, sweeps"):
         suite.run("small", ["table-2"], tmp_path, tmp_path / "rows.jsonl", 1)
 
 
 def test_tables_give_means_spreads_and_paired_drops() -> None:
-    shared = {"env": "w", "method": "m", "checkpoint": "best", "target_return": 3.0, "badge": None}
+    shared = {
+        "env": "w",
+        "method": "m",
+        "checkpoint": "best",
+        "target_return": 3.0,
+        "distractor": None,
+    }
     shared |= {"R_avg_pooled": 0.5, "R_avg_episode": 0.5, "length": 2.0, "coverage": None}
     earned = {None: (10.0, 20.0), 0.0: (5.0, 15.0), 1.0: (8.0, 16.0)}
     rows = [
-        shared | {"seed": s, "R_cum": v, "badge": badge, "validation": {"3": v + s}}
-        for badge, values in earned.items()
+        shared | {"seed": s, "R_cum": v, "distractor": distractor, "validation": {"3": v + s}}
+        for distractor, values in earned.items()
         for s, v in enumerate(values)
     ]
-    clean = [row for row in rows if row["badge"] is None]
+    clean = [row for row in rows if row["distractor"] is None]
     last = clean[0] | {"checkpoint": "last", "R_cum": 99.0}
     assert method_table([*clean, last]).splitlines()[2] == (
         "| w | m | 2 | 15 ± 7.07 | 0.5 ± 0 | 0.5 ± 0 | 2 ± 0 | – | 3 |"
     )
     assert target_table(clean).splitlines()[2] == "| w | m | 3 | 2 | 15.5 ± 7.78 |"
     asked = [row | {"quantiles": [q]} for q in (0.99, 1.0) for row in rows]
-    line, less = badge_table(asked).splitlines()[2:]
+    line, less = distractor_table(asked).splitlines()[2:]
     assert less == line.replace("| 1 |", "| 0.99 |")
     assert line == "| w | 1 | m | 2 | 15 ± 7.07 | 10 ± 7.07 | 12 ± 5.66 | 37.5 ± 17.7 |"
 
@@ -124,16 +130,23 @@ def test_pictures_show_the_means(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     shared = {"env": "w", "checkpoint": "best", "target_return": 3.0, "validation": {"3": 1.0}}
     rows = [
-        shared | {"method": method, "seed": s, "R_cum": s + 1.0, "badge": badge, "quantiles": [1.0]}
+        shared
+        | {
+            "method": method,
+            "seed": s,
+            "R_cum": s + 1.0,
+            "distractor": distractor,
+            "quantiles": [1.0],
+        }
         for method in ("dt", "ucf")
-        for badge in (None, 0.0, 1.0)
+        for distractor in (None, 0.0, 1.0)
         for s in range(2)
     ]
-    clean = [row for row in rows if row["badge"] is None]
+    clean = [row for row in rows if row["distractor"] is None]
     for plot, given, name in (
         (plot_methods, clean, "methods-w.svg"),
         (plot_targets, clean, "targets-w.svg"),
-        (plot_badge, rows, "badge-w.svg"),
+        (plot_distractor, rows, "distractor-w.svg"),
     ):
         (path,) = plot(given, tmp_path)
         assert path == tmp_path / name
@@ -142,7 +155,7 @@ def test_pictures_show_the_means(tmp_path: Path) -> None:
         assert ">dt<" in drawn
         plot(given, tmp_path)
         assert path.read_text() == drawn
-    assert plot_badge(clean, tmp_path) == []
+    assert plot_distractor(clean, tmp_path) == []
 
 
 def test_windows_drop_repeats_and_are_cut(tmp_path: Path) -> None:
@@ -167,7 +180,7 @@ def test_windows_drop_repeats_and_are_cut(tmp_path: Path) -> None:
 @pytest.mark.realdata
 def test_kuairand_learns_before_it_judges(tmp_path: Path) -> None:
     data_folder("kuairand")
-    arena = kuairand(tmp_path, 0)
+    task = kuairand(tmp_path, 0)
     learned, judged = (EpisodeStore.open(tmp_path / name) for name in ("store", "judge"))
     last, first = (
         f(store.step_values("timestamp", *store.all_steps()))
@@ -175,5 +188,5 @@ def test_kuairand_learns_before_it_judges(tmp_path: Path) -> None:
     )
     assert last < first
     assert learned.lengths.max() <= EXITS["easyrl4rec-kuairand"].max_turn
-    row = evaluate_behavior(arena.worlds[2], "random", 50, 0)
+    row = evaluate_behavior(task.worlds[2], "random", 50, 0)
     assert row["length"] == 10

@@ -27,7 +27,7 @@ _APRIL_22, _APRIL_28 = 1_650_556_800_000, 1_651_075_200_000
 
 
 @dataclass(frozen=True)
-class Arena:
+class BenchmarkTask:
     """One environment of the table."""
 
     store: Path
@@ -37,28 +37,28 @@ class Arena:
     """Built-in policies of the worlds that are judged beside."""
 
 
-def virtual_taobao(folder: Path, sessions: int) -> Arena:
+def virtual_taobao(folder: Path, sessions: int) -> BenchmarkTask:
     """The original networks, logged by the mixture of behaviors."""
     world = World("virtual-taobao")
     store = simulated_store(world, folder, sessions, _LOG_SEED)
-    return Arena(store, (world,), ("random", "mixture", "best-constant"))
+    return BenchmarkTask(store, (world,), ("random", "mixture", "best-constant"))
 
 
-def synthetic_taobao(folder: Path, sessions: int) -> Arena:
+def synthetic_taobao(folder: Path, sessions: int) -> BenchmarkTask:
     """Built-in shoppers, logged by the mixture of behaviors; the optimum is known."""
     world = World("synthetic-taobao")
     store = simulated_store(world, folder, sessions, _LOG_SEED)
-    return Arena(store, (world,), ("random", "mixture", "best-constant", "optimal"))
+    return BenchmarkTask(store, (world,), ("random", "mixture", "best-constant", "optimal"))
 
 
-def synthetic_catalog(folder: Path, sessions: int) -> Arena:
+def synthetic_catalog(folder: Path, sessions: int) -> BenchmarkTask:
     """Tagged items and boredom, logged by the mixture of behaviors; the optimum is known."""
     world = World("synthetic-catalog")
     store = simulated_store(world, folder, sessions, _LOG_SEED)
-    return Arena(store, (world,), ("random", "mixture", "optimal"))
+    return BenchmarkTask(store, (world,), ("random", "mixture", "optimal"))
 
 
-def kuairand(folder: Path, sessions: int) -> Arena:
+def kuairand(folder: Path, sessions: int) -> BenchmarkTask:
     """KuaiRand's logs: what came first to learn from, cut by the exit rule; what came after filled
     in to judge.
 
@@ -86,10 +86,10 @@ def kuairand(folder: Path, sessions: int) -> Arena:
             _prepare("kuairand", rows, folder / "log_standard_judge.parquet", features, judged)
         complete(EpisodeStore.open(judged), tags, filled)
     worlds = ("kuairand", "kuairand-nx0", "kuairand-nx10")
-    return Arena(store, tuple(World(name, filled) for name in worlds), ("random", "oracle"))
+    return BenchmarkTask(store, tuple(World(name, filled) for name in worlds), ("random", "oracle"))
 
 
-def kuairec(folder: Path, sessions: int) -> Arena:
+def kuairec(folder: Path, sessions: int) -> BenchmarkTask:
     """KuaiRec: the big matrix to learn from, cut by the exit rule; the small one to judge."""
     source = data_folder("kuairec")
     files = log_files([source])
@@ -101,7 +101,7 @@ def kuairec(folder: Path, sessions: int) -> Arena:
         rows = cut_by_exit(rows, read_categories(source), EXITS["easyrl4rec-kuairec"])
         _prepare("kuairec", rows, folder / "big_matrix_cut.parquet", features, store)
     worlds = ("kuairec", "kuairec-nx0", "kuairec-nx10")
-    return Arena(store, tuple(World(name, source) for name in worlds), ("random", "oracle"))
+    return BenchmarkTask(store, tuple(World(name, source) for name in worlds), ("random", "oracle"))
 
 
 def _prepare(dataset: str, rows: pa.Table, log: Path, features: list[Path], store: Path) -> None:
@@ -113,7 +113,7 @@ def _prepare(dataset: str, rows: pa.Table, log: Path, features: list[Path], stor
     prepare(files, mapping, store, PrepareOptions())
 
 
-ARENAS: Final[Mapping[str, Callable[[Path, int], Arena]]] = {
+TASKS: Final[Mapping[str, Callable[[Path, int], BenchmarkTask]]] = {
     "kuairand": kuairand,
     "kuairec": kuairec,
     "virtual-taobao": virtual_taobao,

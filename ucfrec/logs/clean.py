@@ -79,8 +79,9 @@ def engine(memory_limit: str, folder: Path) -> Iterator[duckdb.DuckDBPyConnectio
 class CleanLog:
     """A log whose rows lie judged in the table `rows` of `connection`, in file order.
 
-    `rows` has the log columns of `columns`, `reward`, `row` (its place in the files) and `reason`,
-    NULL for rows to keep. Those kept are the view `clean`.
+    `rows` has the log columns of `columns`, `reward`, `row` (its place in the files), `reason`
+    (why the row is dropped, NULL for rows to keep) and `conflict` (of duplicates: their reward is
+    another than that of the row kept). The rows kept are the view `clean`.
     """
 
     connection: duckdb.DuckDBPyConnection
@@ -155,7 +156,10 @@ def read_log(
         log = CleanLog(connection, tables, columns, sizes, by)
         connection.execute(_judge(log, known_items))
         connection.execute("DROP TABLE read")
-        connection.execute("CREATE VIEW clean AS SELECT * FROM rows WHERE reason IS NULL")
+        connection.execute(
+            "CREATE VIEW clean AS SELECT * EXCLUDE (reason, conflict) FROM rows "
+            "WHERE reason IS NULL"
+        )
     return log
 
 
@@ -287,15 +291,18 @@ def _judge(log: CleanLog, known_items: Path | None) -> str:
             coalesce(abs({schema.REWARD}) <= {MAX_FLOAT}, false) AS good
             FROM read
         ), ranked AS (
-            SELECT *, row_number() OVER (
+            SELECT *, row_number() OVER w AS rank,
+                first_value({schema.REWARD}) OVER w AS kept_reward
+            FROM faults WINDOW w AS (
                 PARTITION BY fault, {schema.USER_ID}, {log.key}, {schema.TIMESTAMP}
                 ORDER BY {order}
-            ) AS rank FROM faults
+            )
         )
-        SELECT * EXCLUDE (fault, good, rank), CASE
+        SELECT * EXCLUDE (fault, good, rank, kept_reward), CASE
             WHEN fault IS NOT NULL THEN fault
             WHEN rank > 1 THEN 'duplicate'
             WHEN NOT good THEN 'reward_not_finite'
-        END AS reason
+        END AS reason,
+        fault IS NULL AND {schema.REWARD} IS DISTINCT FROM kept_reward AS conflict
         FROM ranked
     """

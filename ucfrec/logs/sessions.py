@@ -90,7 +90,7 @@ def cut_episodes(log: CleanLog, cut: Cut) -> None:
             SELECT *, CAST(sum(first::INT) OVER w AS BIGINT) AS episode
             FROM ended WINDOW w AS (PARTITION BY {user} ORDER BY {order})
         ), measured AS (
-            SELECT * EXCLUDE (ends, began, row, reason),
+            SELECT * EXCLUDE (ends, began, row),
                 count(*) OVER e AS length, bool_or(ends) OVER e AS terminated
             FROM numbered WINDOW e AS (PARTITION BY {user}, episode)
         )

@@ -9,12 +9,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from gymnasium.vector import VectorEnv
-
-from ucfrec.acting.rollout import Actor
 from ucfrec.errors import InputError
+
+if TYPE_CHECKING:
+    from gymnasium.vector import VectorEnv
+
+    from ucfrec.acting.rollout import Actor
 
 
 @dataclass(frozen=True)
@@ -23,10 +25,10 @@ class Simulator:
 
     summary: str
     """One line for `--help`."""
-    make: Callable[[int, Path | None], VectorEnv[Any, Any, Any]]
+    make: "Callable[[int, Path | None], VectorEnv[Any, Any, Any]]"
     """(number of sessions side by side, folder of weights or None) to a vector environment with
     `AutoresetMode.SAME_STEP`."""
-    behaviors: Mapping[str, Callable[[VectorEnv[Any, Any, Any], int], Actor]]
+    behaviors: "Mapping[str, Callable[[VectorEnv[Any, Any, Any], int], Actor]]"
     """Built-in policies by name, each made from (environment, seed): `random`, `mixture`, and
     `optimal` where it is known."""
     feedback: str

@@ -41,9 +41,7 @@ def prepared(
 def counted(values: npt.NDArray[Any], found: dict[str, Any]) -> None:
     """Check bins and quantiles against the values themselves."""
     edges = found["edges"]
-    expected = [
-        ((values >= a) & (values < b)).sum() for a, b in itertools.pairwise(edges)
-    ]
+    expected = [((values >= a) & (values < b)).sum() for a, b in itertools.pairwise(edges)]
     assert found["counts"] == expected
     assert sum(expected) == len(values)
     exact = np.quantile(values, [float(q) for q in found["quantiles"]], method="inverted_cdf")

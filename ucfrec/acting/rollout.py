@@ -7,9 +7,9 @@ from typing import Any, Final, Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
-from tqdm import tqdm
 
 from ucfrec.errors import InputError
+from ucfrec.progress import progress
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
@@ -117,7 +117,7 @@ def rollout(
     actor.begin(np.arange(n))
     episode = np.arange(n)
     live = episode < episodes
-    with tqdm(total=episodes, desc=describe, unit="episode", disable=None) as bar:
+    with progress(episodes, describe, "episodes") as bar:
         while live.any():
             if isinstance(actor, Informed):
                 actor.inform(info)

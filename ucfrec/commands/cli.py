@@ -1,4 +1,8 @@
-"""The command line. A command is imported once it is called."""
+"""The command line. Only the module of the command that is called is imported.
+
+Such a module imports what its command works with inside `run`, so that `--help` answers at once
+and no command loads what only another one needs.
+"""
 
 import argparse
 import errno

@@ -1,12 +1,14 @@
 """Returns-to-go: one definition for training windows and for acting."""
 
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from torch import Tensor
 
-ArrayOrTensor = TypeVar("ArrayOrTensor", npt.NDArray[np.float64], Tensor)
+if TYPE_CHECKING:
+    from torch import Tensor
+
+ArrayOrTensor = TypeVar("ArrayOrTensor", npt.NDArray[np.float64], "Tensor")
 
 
 def remaining_return(total: ArrayOrTensor, earned: ArrayOrTensor) -> ArrayOrTensor:

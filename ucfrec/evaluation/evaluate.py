@@ -2,8 +2,7 @@
 
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -17,25 +16,12 @@ from ucfrec.evaluation.collect import world_items
 from ucfrec.evaluation.diversity import Recommended
 from ucfrec.evaluation.diversity_columns import COLUMNS, variety_columns
 from ucfrec.evaluation.metrics import session_metrics
-from ucfrec.plugins import Simulator, load_plugin
+from ucfrec.evaluation.world import World
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SIDE_BY_SIDE = 512
 """Most episodes played at once."""
-
-
-@dataclass(frozen=True)
-class World:
-    """A simulator by name, with where its weights are."""
-
-    name: str
-    folder: Path | None = None
-
-    def simulator(self) -> Simulator:
-        """Load the simulator that the name stands for."""
-        simulator: Simulator = load_plugin("simulators", self.name)
-        return simulator
 
 
 def evaluate_behavior(world: World, behavior: str, episodes: int, seed: int) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from ucfrec.evaluation.collect import collect
-from ucfrec.evaluation.evaluate import World
+from ucfrec.evaluation.world import World
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.schema import ITEM_ID, SESSION_ID

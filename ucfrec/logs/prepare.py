@@ -18,14 +18,12 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from ucfrec import schema
-from ucfrec.episodes.store import ITEM_STATES
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder
 from ucfrec.logs.binding import explained, text
 from ucfrec.logs.clean import CleanLog, engine, read_log
-from ucfrec.logs.features import encode_features, load_features
-from ucfrec.logs.items import write_item_states
+from ucfrec.logs.feature_tables import load_features
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.sessions import (
     EPISODE_USERS,
@@ -41,6 +39,7 @@ from ucfrec.logs.sessions import (
     split_bounds,
 )
 from ucfrec.logs.summary import build_report, drop_counts, require_variety
+from ucfrec.progress import progress
 
 BATCH_ROWS: Final = 2**17
 
@@ -141,13 +140,13 @@ def prepare(
             explained(log.connection, log.tables, out.parent),
         ):
             writer = StoreWriter(folder)
-            for batch in log.connection.sql(ordered_steps(log)).to_arrow_reader(BATCH_ROWS):
-                _append(writer, batch, log)
+            with progress(report["steps"], "write the store", "steps") as bar:
+                for batch in log.connection.sql(ordered_steps(log)).to_arrow_reader(BATCH_ROWS):
+                    _append(writer, batch, log)
+                    bar.update(len(batch))
             writer.finish(report["reward"], report, _write_ids(log, folder))
-            if log.key == schema.ITEM_ID and like is None:
-                _learn_states(log, folder, features, options.embedding_size)
-            elif log.key == schema.ITEM_ID and like is not None:
-                shutil.copy(like / ITEM_STATES, folder / ITEM_STATES)
+            if log.key == schema.ITEM_ID:
+                _write_states(log, folder, features, options.embedding_size, like)
             if like is not None:
                 _copy(log, episode_users(), folder / EPISODE_USERS)
     return report
@@ -238,25 +237,30 @@ def _episodes(
     session_by = options.session_by or mapping.session_by
     known = None if like is None else like / ITEMS_FILE
     with engine(options.memory_limit, spill) as connection:
-        log = read_log(connection, files, mapping, reward, session_by, known, spill)
-        with explained(connection, log.tables, spill):
-            dropped = drop_counts(log)
-            if like is None:
-                require_variety(log)
-            bounds = split_bounds(log, options.split if like is None else (1.0, 0.0, 0.0))
-            gap_ms = round(options.gap_minutes * 60_000)
-            cut = Cut(log.session_by, gap_ms, options.min_steps, bounds)
-            cut_episodes(log, cut)
-            features = {
-                name: load_features(connection, tables, name, log.id_type(name))
-                for name, tables in (
-                    (schema.USER_ID, mapping.user_features),
-                    (schema.ITEM_ID, mapping.item_features),
-                )
-                if name in log.columns and like is None
-            }
-            number_ids(log, features, like)
-            report = {"reward": reward, **build_report(log, cut, dropped)}
+        with progress(4, "check the logs", "stages") as stage:
+            log = read_log(connection, files, mapping, reward, session_by, known, spill)
+            stage.update()
+            with explained(connection, log.tables, spill):
+                dropped = drop_counts(log)
+                if like is None:
+                    require_variety(log)
+                bounds = split_bounds(log, options.split if like is None else (1.0, 0.0, 0.0))
+                gap_ms = round(options.gap_minutes * 60_000)
+                cut = Cut(log.session_by, gap_ms, options.min_steps, bounds)
+                cut_episodes(log, cut)
+                stage.update()
+                features = {
+                    name: load_features(connection, tables, name, log.id_type(name))
+                    for name, tables in (
+                        (schema.USER_ID, mapping.user_features),
+                        (schema.ITEM_ID, mapping.item_features),
+                    )
+                    if name in log.columns and like is None
+                }
+                number_ids(log, features, like)
+                stage.update()
+                report = {"reward": reward, **build_report(log, cut, dropped)}
+                stage.update()
         yield log, report, features
 
 
@@ -292,7 +296,18 @@ def _copy(log: CleanLog, query: str, file: Path) -> None:
     log.connection.execute(f"COPY ({query}) TO {text(str(file))} (FORMAT parquet)")
 
 
-def _learn_states(log: CleanLog, folder: Path, features: Features, size: int) -> None:
+def _write_states(
+    log: CleanLog, folder: Path, features: Features, size: int, like: Path | None
+) -> None:
+    """Learn how states are made of items, or take it over from the store `like`."""
+    # torch and scikit-learn take seconds: only here, and never to check a log.
+    from ucfrec.episodes.store import ITEM_STATES
+    from ucfrec.logs.features import encode_features
+    from ucfrec.logs.items import write_item_states
+
+    if like is not None:
+        shutil.copy(like / ITEM_STATES, folder / ITEM_STATES)
+        return
     encoded, counts = {}, {}
     for name, table, _ in ID_TABLES:
         (counts[name],) = log.one(f"SELECT count(*) FROM {table}")

@@ -10,11 +10,11 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import VectorEnv
-from tqdm import tqdm
 
 from ucfrec.acting.rollout import Actor, BoolArray, FloatArray, IntArray, Step, rollout
 from ucfrec.errors import InputError
 from ucfrec.files import read_json, write_json
+from ucfrec.progress import progress
 from ucfrec.provenance import provenance
 from ucfrec_control.data.d4rl import write_d4rl
 from ucfrec_control.data.sac import SacConfig, SacLearner, seed_all
@@ -158,16 +158,14 @@ def _train(env_id: str, folder: Path, seed: int, config: CollectConfig) -> _Trai
     training = _Training(learner, folder, random_return, [])
     if training.checkpoint.exists():
         training.evaluations.extend(learner.load(training.checkpoint)["evaluations"])
-    with tqdm(
-        total=config.steps, initial=learner.steps, desc="train SAC", unit="step", disable=None
-    ) as bar:
+    with progress(config.steps, "train SAC", "steps", done=learner.steps) as bar:
         while learner.steps < config.steps:
             began = learner.steps
             learner.play_episode(bar)
             due = learner.steps // config.every > began // config.every
             if due or learner.steps >= config.steps:
                 _evaluate(training, judged, seed, config.episodes)
-                bar.set_postfix({"return": f"{training.evaluations[-1]['return']:.1f}"})
+                bar.update(0, mean_return=training.evaluations[-1]["return"])
     env.close()
     judged.close()
     return training
@@ -248,7 +246,7 @@ def _roll_out(training: _Training, index: int, env_id: str, seed: int, size: int
     # Few steps need few episodes at once: a thousand steps is these tasks' usual limit.
     env = make_env(env_id, min(SIDE_BY_SIDE, max(1, size // 1000)))
     rounds: list[Trajectories] = []
-    with tqdm(total=size, desc=f"roll out policy {index}", unit="step", disable=None) as bar:
+    with progress(size, f"roll out policy {index}", "steps") as bar:
         while sum(len(part.rewards) for part in rounds) < size:
             key = seed_all(seed, 4, index, len(rounds))
             steps: list[Step] = []

@@ -15,11 +15,11 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from gymnasium.vector import VectorEnv
-from tqdm import tqdm
 
 from ucfrec.acting.rollout import BoolArray, FloatArray, IntArray
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, save_tensors
+from ucfrec.progress import Progress
 
 _COLUMNS: Final = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 """Arrays of the replay buffer, each (capacity, 1, …)."""
@@ -63,7 +63,7 @@ class SacLearner:
         """Steps played so far, all of them in the replay buffer."""
         return int(self._buffer.pos)
 
-    def play_episode(self, bar: "tqdm[Any]") -> None:
+    def play_episode(self, bar: Progress) -> None:
         """Play one episode to its end, learning; uniform actions before `learning_starts`."""
         reset_seed = seed_all(self._seed, 1, self.episode)
         generator = np.random.default_rng(reset_seed)

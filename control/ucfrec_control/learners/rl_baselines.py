@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-from tqdm import tqdm
 
 from ucfrec import schema
 from ucfrec.acting.rollout import BoolArray, FloatArray, IntArray
@@ -19,6 +18,7 @@ from ucfrec.errors import InputError
 from ucfrec.files import atomic_file, atomic_folder, read_json, write_json
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
 from ucfrec.fitting.tensorboard import Events
+from ucfrec.progress import progress
 from ucfrec.provenance import command_line, versions
 from ucfrec.runs.trained_policy import RUN
 from ucfrec_control.data.trajectories import PACKAGES
@@ -119,23 +119,22 @@ def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dic
     learner = _learner(config, "cuda:0" if torch.cuda.is_available() else "cpu:0")
     step, seconds = _resume(out / _CHECKPOINT, learner, dataset)
     events = Events(out, step)
-    bar = tqdm(total=config.steps, initial=step, desc=config.algorithm, unit="step", disable=None)
-    while step < config.steps:
-        if step:  # a seed of its own after each checkpoint: no generator's state need be kept
-            d3rlpy.seed(seed + step)
-        steps = min(CHECKPOINT_EVERY, config.steps - step)
-        ((_, losses),) = learner.fit(
-            dataset,
-            n_steps=steps,
-            n_steps_per_epoch=steps,
-            logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
-            show_progress=False,
-            callback=lambda *_: bar.update(),
-        )
-        step += steps
-        events.add(step, losses)
-        _save(out / _CHECKPOINT, learner, step, seconds + perf_counter() - begun)
-    bar.close()
+    with progress(config.steps, config.algorithm, "steps", done=step) as bar:
+        while step < config.steps:
+            if step:  # a seed of its own after each checkpoint: no generator's state need be kept
+                d3rlpy.seed(seed + step)
+            steps = min(CHECKPOINT_EVERY, config.steps - step)
+            ((_, losses),) = learner.fit(
+                dataset,
+                n_steps=steps,
+                n_steps_per_epoch=steps,
+                logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
+                show_progress=False,
+                callback=lambda *_: bar.update(),
+            )
+            step += steps
+            events.add(step, losses)
+            _save(out / _CHECKPOINT, learner, step, seconds + perf_counter() - begun)
     events.close()
     actor = learner.impl.modules.policy.state_dict()
     save_tensors(out / _ACTOR, {**actor, "state.mean": mean, "state.std": std}, {})

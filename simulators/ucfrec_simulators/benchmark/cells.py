@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.evaluation.evaluate import World, evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.world import World
 from ucfrec.provenance import config_hash
 from ucfrec.reporting.grid import Row
 from ucfrec.runs.config import Config, resolve_config

@@ -21,7 +21,8 @@ from ucfrec.acting.rollout import FORBIDDEN, Step, rollout
 from ucfrec.episodes.states import ItemStates
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import collect
-from ucfrec.evaluation.evaluate import World, _item_numbers
+from ucfrec.evaluation.evaluate import _item_numbers
+from ucfrec.evaluation.world import World
 from ucfrec.plugins import Simulator
 from ucfrec.policies.dt import DTConfig, DTPolicy
 from ucfrec_simulators.behaviors import Constant, Uniform

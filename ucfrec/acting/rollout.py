@@ -2,14 +2,16 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.vector import AutoresetMode, VectorEnv
 
 from ucfrec.errors import InputError
 from ucfrec.progress import progress
+
+if TYPE_CHECKING:
+    from gymnasium.vector import VectorEnv
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
@@ -84,7 +86,7 @@ class Episodes:
 
 
 def rollout(
-    env: VectorEnv[Any, Any, Any],
+    env: "VectorEnv[Any, Any, Any]",
     actor: Actor,
     episodes: int,
     seed: int,
@@ -98,8 +100,11 @@ def rollout(
 
     Raises:
         InputError: the environment does not reset within the step (`AutoresetMode.SAME_STEP`), or
-            forbids actions (`FORBIDDEN`) that the actor cannot be told of.
+            forbids actions (`FORBIDDEN`) and the actor has no method `inform`.
     """
+    # Only playing needs gymnasium: scoring logs and recommending do without.
+    from gymnasium.vector import AutoresetMode
+
     if env.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
         raise InputError(
             f"{type(env).__name__} does not reset in the same step; build it with "
@@ -111,8 +116,8 @@ def rollout(
     observations, info = env.reset(seed=seed)
     if FORBIDDEN in info and not isinstance(actor, Informed):
         raise InputError(
-            f"{type(env).__name__} forbids some actions and {type(actor).__name__} cannot be told "
-            "which; give it a method `inform`"
+            f"{type(env).__name__} forbids some actions and {type(actor).__name__} has no "
+            "method `inform` to hear of them; add one"
         )
     actor.begin(np.arange(n))
     episode = np.arange(n)

@@ -7,7 +7,6 @@ from typing import Literal, Protocol
 
 import numpy as np
 import torch
-from sklearn.cluster import MiniBatchKMeans
 from torch import Tensor, nn
 
 from ucfrec.counterfactual.reward_model import CausalRewardModel, mlp
@@ -182,6 +181,9 @@ def make_generator(
 def _tangent(
     states: Tensor, crm: CausalRewardModel, config: CSGConfig, seed: int
 ) -> TangentGenerator:
+    # scikit-learn takes a second and 100 MB, which reading a trained policy need not spend.
+    from sklearn.cluster import MiniBatchKMeans
+
     size = states.shape[1]
     clusters = max(1, min(config.clusters, len(states) // (8 * size)))
     fitted = MiniBatchKMeans(clusters, random_state=seed, n_init=1, batch_size=4096)

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy import sparse
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -51,6 +50,8 @@ class ItemKNNPolicy(SequencePolicy):
 
     def start_from(self, train: EpisodeStore) -> None:
         """Find the neighbours of every item, itself among them."""
+        from scipy import sparse  # reading a trained policy does without
+
         episodes, steps = train.all_steps()
         items = train.step_values(schema.ITEM, episodes, steps)
         rewards = train.step_values(schema.REWARD, episodes, steps)

@@ -50,7 +50,8 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("command", UCFREC.commands)
+# The help of `train` names the learners, which are imported for that.
+@pytest.mark.parametrize("command", sorted(UCFREC.commands.keys() - {"train"}))
 def test_help_needs_no_slow_import(command: str) -> None:
     assert not loaded(command, "--help") & SLOW_TO_IMPORT
 

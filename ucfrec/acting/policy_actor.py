@@ -37,7 +37,7 @@ class PolicyActor:
         """Args:
         policy: in evaluation mode.
         episodes: N, episodes side by side.
-        target_return: return asked of every episode.
+        target_return: of every episode.
         observation_size: how many of the environment's observed numbers the logs had; 0 ignores
             the environment's observation.
         item_states: how states are made of items; None where the observation is the state.

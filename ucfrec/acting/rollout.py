@@ -50,7 +50,7 @@ class Actor(Protocol):
 
 @runtime_checkable
 class Informed(Protocol):
-    """An actor that heeds what the world says beside its observations."""
+    """An actor that uses what the world says beside its observations."""
 
     def inform(self, info: Mapping[str, Any]) -> None:
         """Take note of `info` (see `USER_IDS`, `FORBIDDEN`) before choosing the next actions."""

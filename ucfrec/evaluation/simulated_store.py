@@ -12,7 +12,7 @@ from ucfrec.schema import ITEM_ID, SESSION_ID
 def simulated_store(
     world: World, folder: Path, sessions: int, seed: int, behavior: str = "mixture"
 ) -> Path:
-    """Logs of a behavior policy in `folder/logs` and their store in `folder/store`, unless there.
+    """Play a behavior policy into `folder/logs`, prepare `folder/store`; what exists is kept.
 
     Returns:
         The store.

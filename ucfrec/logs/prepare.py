@@ -1,6 +1,6 @@
 """Logs to episodes: Parquet and CSV files, cleaned, cut into sessions, written as a store.
 
-One SQL pipeline on an embedded DuckDB, out of core: rows are read and judged (`clean`), fall
+One SQL pipeline on an embedded DuckDB, out of core: rows are read and checked (`clean`), fall
 into sessions, and stream sorted into the store.
 """
 

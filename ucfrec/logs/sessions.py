@@ -121,7 +121,7 @@ def number_ids(log: CleanLog, listed: dict[str, list[str]], like: Path | None) -
             continue
         if like is not None:
             source = f"read_parquet({text(str(like / file))}, file_row_number = true)"
-            # Integers there may be text here, or the other way round.
+            # The store's ids may be integers where these are text, or the other way round.
             known = f"TRY_CAST({name} AS {log.id_type(name)}) AS {name}"
             log.connection.execute(
                 f"CREATE TABLE {table} AS SELECT {known}, file_row_number AS number FROM {source}"

@@ -23,16 +23,16 @@ def drop_counts(log: CleanLog) -> dict[str, int]:
     found = dict(log.connection.sql("SELECT reason, count(*) FROM rows GROUP BY reason").fetchall())
     dropped = {reason: int(found.get(reason, 0)) for reason in REASONS}
     if None not in found:
-        told = "; ".join(f"{n} rows: {REASONS[reason]}" for reason, n in dropped.items() if n)
+        reasons = "; ".join(f"{n} rows: {REASONS[reason]}" for reason, n in dropped.items() if n)
         hint = "; is the time in milliseconds?" if dropped["clock_out_of_range"] else ""
         raise InputError(
-            f"{_named(log)}: no row is left ({told}{hint}); correct the mapping or the log"
+            f"{_named(log)}: no row is left ({reasons}{hint}); correct the mapping or the log"
         )
     return dropped
 
 
 def require_variety(log: CleanLog) -> None:
-    """See that there is something to learn.
+    """Check that rewards differ.
 
     Raises:
         InputError: all rewards are equal.

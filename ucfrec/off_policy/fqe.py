@@ -1,4 +1,4 @@
-"""Models of what a policy would earn, each fitted on other sessions than it is asked about.
+"""Models of what a policy would earn, each fitted on other sessions than it predicts.
 
 Fitted Q evaluation is Algorithm 3 of Le, Voloshin & Yue, *Batch Policy Learning under Constraints*
 (ICML 2019), with ridge regression, undiscounted, on sessions that end.
@@ -88,7 +88,7 @@ class _Ridge:
         self._factor: Any = cho_factor(gram)
 
     def fit(self, target: FloatArray) -> Float32Array:
-        """(P,) weights for the target (N,); what stands there for rows not kept is ignored."""
+        """(P,) weights for the target (N,); its values in rows not kept are ignored."""
         kept = np.where(self.keep, target, 0.0).astype(np.float32)
         weights = cho_solve(self._factor, (kept @ self._features).astype(np.float64))
         return np.asarray(weights, dtype=np.float32)

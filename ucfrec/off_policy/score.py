@@ -96,8 +96,10 @@ def logged_sessions(
 def scored_steps(
     trained: TrainedPolicy, store: EpisodeStore, target_return: float
 ) -> Iterator[ScoredSteps]:
-    """Every step of `store` in order, a batch at a time, as it would be seen when acting: asked for
-    `target_return` less what the session has earned so far."""
+    """Every step of `store` in order, a batch at a time, as the policy would see it when acting.
+
+    Its return-to-go is `target_return` less what the session has earned so far.
+    """
     assert trained.item_ids is not None
     at_once = max(1, min(_STEPS_AT_ONCE, _LOGITS_AT_ONCE // len(trained.item_ids)))
     total = store.n_steps

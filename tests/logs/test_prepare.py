@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from safetensors import SafetensorError
 
-from ucfrec import schema
+from ucfrec import progress, schema
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError
@@ -227,6 +227,19 @@ def test_repeated_rows_that_agree_are_no_conflict(tmp_path: Path) -> None:
     report = validate([path], LogMapping())
     assert report["dropped"]["duplicate"] == 20
     assert report["conflicting_duplicates"] == 3
+
+
+def test_a_long_preparation_prints_lines_where_there_is_no_terminal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(progress, "FIRST_LINE", 0)
+    monkeypatch.setattr(progress, "NEXT_LINE", 0)
+    path = write(make_log(), tmp_path / "log.parquet")
+    report = prepare([path], LogMapping(), tmp_path / "store", SMALL)
+    printed = capsys.readouterr().err.splitlines()
+    assert printed[0].startswith("check the logs: 1 of 4 stages (25%), ")
+    steps = report["steps"]
+    assert any(line.startswith(f"write the store: {steps} of {steps} steps") for line in printed)
 
 
 @pytest.mark.parametrize("rows", [2, 30])

@@ -10,8 +10,9 @@ import torch
 
 from ucfrec import UCF, EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.logs import LogMapping, PrepareOptions, prepare, read_histories
-from ucfrec.recommending.recommend import Histories, recommend
+from ucfrec.logs import LogMapping, PrepareOptions, prepare
+from ucfrec.recommending.histories import histories_of_files
+from ucfrec.recommending.recommend import recommend
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SETTINGS = ["train.steps=30", "policy.dim=16", "policy.context=4", "augment.copies=0"]
@@ -45,10 +46,9 @@ def fitted(log: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> tuple
 def test_python_and_files_agree(fitted: tuple[UCF, Path], log: pd.DataFrame) -> None:
     policy, folder = fitted
     from_frame = policy.recommend(log, k=5)
-    read = read_histories([folder / "log.parquet"], LogMapping(), "reward", 1000)
     trained = TrainedPolicy.load(folder / "run")
     target = trained.target_return(1.0)
-    batches = map(Histories.from_batch, read)
+    batches = histories_of_files(trained, [folder / "log.parquet"], LogMapping())
     (from_files,) = recommend(trained, batches, 5, target_return=target)
     pd.testing.assert_frame_equal(from_frame, from_files, check_dtype=False)
 
@@ -106,7 +106,9 @@ def test_a_loaded_policy_is_the_one_saved(
 
 def test_wrong_histories_are_refused(fitted: tuple[UCF, Path], log: pd.DataFrame) -> None:
     policy, _ = fitted
-    with pytest.raises(InputError, match="no column 'reward'; the nearest are"):
+    with pytest.raises(
+        InputError, match=r"no column 'reward' \(for the reward\); nearest: rewards"
+    ):
         policy.recommend(log.rename(columns={"reward": "rewards"}))
     with pytest.raises(InputError, match=r"1 rows have an item_id .* \(1 items: 999\)"):
         policy.recommend(pd.concat([log, log.head(1).assign(item_id=999)]))

@@ -36,7 +36,7 @@ def reward_bit(
         InputError: `flip` is no probability, or all rewards are equal.
     """
     if not 0 <= flip <= 1:
-        raise InputError(f"the probability of a wrong bit is {flip}; give one in [0, 1]")
+        raise InputError(f"the probability of a wrong bit is {flip}; a probability lies in [0, 1]")
     episodes, steps = store.all_steps()
     rewards = store.step_values(schema.REWARD, episodes, steps)
     if rewards.min() == rewards.max():

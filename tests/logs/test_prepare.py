@@ -19,8 +19,9 @@ from ucfrec import progress, schema
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError
+from ucfrec.logs.histories import read_histories
 from ucfrec.logs.mapping import FeatureTable, LogMapping, columns_given, log_files, read_mapping
-from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, read_histories, validate
+from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, validate
 from ucfrec.logs.summary import format_report
 from ucfrec_datasets import generic
 

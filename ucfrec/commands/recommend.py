@@ -9,17 +9,19 @@ from ucfrec.commands.options import log_options, logs_given, target_given, targe
 from ucfrec.progress import Progress, progress
 
 if TYPE_CHECKING:
-    import pyarrow as pa
+    from ucfrec.recommending.histories import Histories
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """What `recommend` takes."""
     parser.add_argument("run", type=Path, metavar="RUN")
     log_options(parser)
-    parser.add_argument("--k", type=int, default=10, help="items a user (10)")
-    parser.add_argument("--keep-seen", action="store_true", help="seen items may come again")
+    parser.add_argument("--k", type=int, default=10, help="items for each user (10)")
     parser.add_argument(
-        "--skip-unknown", action="store_true", help="ignore rows of items the run never saw"
+        "--keep-seen", action="store_true", help="recommend also items that the user has seen"
+    )
+    parser.add_argument(
+        "--skip-unknown", action="store_true", help="ignore rows of items the run does not know"
     )
     target_options(parser)
     parser.add_argument("--out", type=Path, required=True, help="Parquet file")
@@ -28,17 +30,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """`ucfrec recommend`."""
     from ucfrec.commands.frames import write_frames
-    from ucfrec.logs.prepare import read_histories
-    from ucfrec.recommending.recommend import LONGEST_HISTORY, Histories, recommend
+    from ucfrec.recommending.histories import histories_of_files
+    from ucfrec.recommending.recommend import recommend
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     files, mapping = logs_given(options)
     trained = TrainedPolicy.load(options.run, options.checkpoint)
-    read = read_histories(files, mapping, trained.record["reward"], LONGEST_HISTORY)
     with progress(None, "recommend", "users") as bar:
         frames = recommend(
             trained,
-            map(Histories.from_batch, _counted(read, bar)),
+            _counted(histories_of_files(trained, files, mapping), bar),
             options.k,
             target_return=target_given(options, trained),
             filter_seen=not options.keep_seen,
@@ -48,7 +49,7 @@ def run(options: argparse.Namespace) -> None:
     print(f"{options.out}: {rows:,} rows")
 
 
-def _counted(batches: "Iterator[pa.RecordBatch]", bar: Progress) -> "Iterator[pa.RecordBatch]":
+def _counted(batches: "Iterator[Histories]", bar: Progress) -> "Iterator[Histories]":
     for batch in batches:
         yield batch
-        bar.update(len(batch))
+        bar.update(len(batch.users))

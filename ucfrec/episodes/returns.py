@@ -15,7 +15,7 @@ def remaining_return(total: ArrayOrTensor, earned: ArrayOrTensor) -> ArrayOrTens
     """What is left of `total` once `earned` has been collected (undiscounted, γ = 1).
 
     In training, `total` is the episode's return; when acting, it is the target return. Both have
-    the same shape; `earned` sums the rewards strictly before the step.
+    the same shape, any; `earned` sums the rewards strictly before the step.
     """
     return total - earned
 

@@ -56,23 +56,41 @@ def engine(memory_limit: str, folder: Path) -> Iterator[duckdb.DuckDBPyConnectio
         connection = duckdb.connect(str(Path(work) / "rows.duckdb"))
         try:
             connection.execute(f"SET temp_directory = '{work}/spill'")
-            connection.execute("SET enable_progress_bar = false")
-            connection.execute("SET error_on_division_by_zero = false")
             try:
                 connection.execute("SET memory_limit = ?", [memory_limit])
             except duckdb.Error:
                 raise InputError(f"memory_limit {memory_limit!r}: write e.g. 2GB") from None
-            # SQL's own least(x, 5) is 5 where x is NULL, NaN or infinite: a video of unknown length
-            # would count as watched five times. Undefined parts make a reward undefined instead.
-            for name, sign in (("least", "<"), ("greatest", ">")):
-                connection.execute(
-                    f"CREATE TEMP MACRO {name}(a, b) AS CASE WHEN isfinite(a::DOUBLE) AND "
-                    f"isfinite(b::DOUBLE) THEN CASE WHEN a {sign} b THEN a ELSE b END END, "
-                    f"(a, b, c) AS {name}({name}(a, b), c)"
-                )
+            _settle(connection)
             yield connection
         finally:
             connection.close()
+
+
+@contextmanager
+def engine_in_memory() -> Iterator[duckdb.DuckDBPyConnection]:
+    """A DuckDB that never touches the disk."""
+    connection = duckdb.connect(":memory:", config={"temp_directory": ""})
+    try:
+        _settle(connection)
+        yield connection
+    finally:
+        connection.close()
+
+
+def _settle(connection: duckdb.DuckDBPyConnection) -> None:
+    """What expressions mean, the same in every engine and on every machine."""
+    connection.execute("SET enable_progress_bar = false")
+    connection.execute("SET error_on_division_by_zero = false")
+    # Times with a zone are cast to times without one in this zone.
+    connection.execute("SET TimeZone = 'UTC'")
+    # SQL's own least(x, 5) is 5 where x is NULL, NaN or infinite: a video of unknown length
+    # would count as watched five times. Undefined parts make a reward undefined instead.
+    for name, sign in (("least", "<"), ("greatest", ">")):
+        connection.execute(
+            f"CREATE TEMP MACRO {name}(a, b) AS CASE WHEN isfinite(a::DOUBLE) AND "
+            f"isfinite(b::DOUBLE) THEN CASE WHEN a {sign} b THEN a ELSE b END END, "
+            f"(a, b, c) AS {name}({name}(a, b), c)"
+        )
 
 
 @dataclass(frozen=True)
@@ -138,6 +156,19 @@ def read_log(
         InputError: a file, column or type makes the log unusable.
     """
     tables = tuple(open_tables(connection, files))
+    return judge_rows(connection, tables, mapping, reward, session_by, known_items, folder)
+
+
+def judge_rows(
+    connection: duckdb.DuckDBPyConnection,
+    tables: tuple[Table, ...],
+    mapping: LogMapping,
+    reward: str,
+    session_by: str | None,
+    known_items: Path | None,
+    folder: Path,
+) -> CleanLog:
+    """`read_log` of tables that are open already."""
     columns = _present(tables, mapping, session_by)
     selects = [_select(connection, table, mapping, columns, reward) for table in tables]
     with explained(connection, tables, folder):

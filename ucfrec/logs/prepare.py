@@ -169,57 +169,6 @@ def validate(
         return report
 
 
-def read_histories(
-    paths: Sequence[str | Path],
-    mapping: LogMapping,
-    reward: str,
-    last: int,
-    memory_limit: str = "2GB",
-) -> Iterator[pa.RecordBatch]:
-    """What each user of a log was shown, cleaned as `prepare` cleans it.
-
-    Args:
-        paths: log files, folders and globs.
-        reward: scalar SQL expression over their columns.
-        last: how many of each user's most recent rows to give.
-
-    Yields:
-        Batches of users in sorted order: `user_id`; `item_ids`, `rewards` (float32) and
-        `timestamps` (ms), lists of at most `last`, the most recent last; `seen`, all of the user's
-        item_ids, sorted; and, where it is logged, the most recent `observation`.
-
-    Raises:
-        InputError: the input cannot be used.
-    """
-    folder = Path(gettempdir())
-    with engine(memory_limit, folder) as connection:
-        log = read_log(connection, log_files(paths), mapping, reward, "user", None, folder)
-        if log.key != schema.ITEM_ID:
-            raise InputError(f"{log.tables[0].files[0]}: its actions are vectors, not items")
-        drop_counts(log)
-        order = f"ORDER BY {schema.TIMESTAMP}, {schema.ITEM_ID}"
-        lists = ", ".join(
-            f"list({value} {order}) FILTER (WHERE back <= {last}) AS {name}"
-            for name, value in (
-                ("item_ids", schema.ITEM_ID),
-                ("rewards", f"CAST({schema.REWARD} AS FLOAT)"),
-                ("timestamps", schema.TIMESTAMP),
-            )
-        )
-        if schema.OBSERVATION in log.columns:
-            lists += f", any_value({schema.OBSERVATION}) FILTER (WHERE back = 1) AS observation"
-        backwards = f"{schema.TIMESTAMP} DESC, {schema.ITEM_ID} DESC"
-        query = f"""
-            SELECT {schema.USER_ID}, {lists}, list_sort(list(DISTINCT {schema.ITEM_ID})) AS seen
-            FROM (SELECT *, row_number() OVER (
-                PARTITION BY {schema.USER_ID} ORDER BY {backwards}
-            ) AS back FROM clean)
-            GROUP BY {schema.USER_ID} ORDER BY {schema.USER_ID}
-        """
-        with explained(connection, log.tables, folder):
-            yield from connection.sql(query).to_arrow_reader(BATCH_ROWS)
-
-
 Features = dict[str, list[str]]
 """By id column, the DuckDB tables that hold features."""
 

@@ -201,7 +201,7 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
     """A policy with the normalisation and item embeddings of `train`, its weights untrained."""
     torch.manual_seed(config.seed)
     policy = POLICIES[config.policy_name](config.policy, _sizes(train))
-    base = EpisodeStore.select(train, np.arange(len(train.episode_ids)))
+    base = train.without_copies()
     mean, std = base.state_statistics
     policy.state_mean.copy_(mean)
     policy.state_std.copy_(torch.where(std > 1e-6, std, 1.0))

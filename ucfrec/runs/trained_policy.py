@@ -66,6 +66,9 @@ class TrainedPolicy:
             TrainingCounts.load(run / COUNTS) if (run / COUNTS).exists() else None,
         )
 
+    def __repr__(self) -> str:
+        return f"TrainedPolicy({describe_trained(self.record)})"
+
     @property
     def name(self) -> str:
         """See `learner_of`."""
@@ -119,6 +122,18 @@ def read_record(run: Path) -> dict[str, Any]:
     if not (run / RUN).exists():
         raise InputError(f"{run} is not a run folder: it has no {RUN}; train one first")
     return dict(read_json(run / RUN))
+
+
+def describe_trained(record: Mapping[str, Any]) -> str:
+    """The learner of a run's record and what it was trained on, in one line."""
+    facts = [
+        repr(learner_of(record)),
+        f"trained on {record['train_steps']:,} steps",
+        f"{record['train_episodes']:,} episodes",
+    ]
+    if record["sizes"]["items"]:
+        facts.append(f"{record['sizes']['items']:,} items")
+    return ", ".join([*facts, f"reward={record['reward']}"])
 
 
 def learner_of(record: Mapping[str, Any]) -> str:

@@ -34,6 +34,7 @@ UCFREC = Program(
         "collect": "play sessions in a simulator, as Parquet logs",
         "prepare": "logs to an episode store",
         "train": "train a policy on a store; resumes",
+        "settings": "every setting of a training: default, range, meaning",
         "evaluate": "what a policy earns in a simulator",
         "recommend": "the next items for users of a log",
         "score": "a policy's probability of every choice of a log",

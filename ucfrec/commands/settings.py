@@ -1,6 +1,7 @@
 """`ucfrec settings`: every setting with its default, range and meaning."""
 
 import argparse
+import inspect
 import shutil
 import textwrap
 from collections.abc import Iterator, Sequence
@@ -34,24 +35,25 @@ def run(options: argparse.Namespace) -> None:
 
 def settings_text(policy: str, width: int) -> str:
     """Every setting of a training of `policy`, a section a table, in lines of `width` columns."""
-    config = resolve_config(policy)
+    config, width = resolve_config(policy), min(width, _WIDEST)
     tables = {name: list(describe(name, getattr(config, name))) for name in TABLES}
     shown = [_cells(setting) for settings in tables.values() for setting in settings]
     widths = [max(len(row[i]) for row in shown) for i in range(3)]
-    text = [
+    text = textwrap.wrap(
         f"Settings of `ucfrec train --policy {policy}`: --set KEY=VALUE, or a TOML file "
-        "(--config FILE) with a table for each section."
-    ]
+        "(--config FILE) with a table for each section.",
+        width,
+    )
     for name, settings in tables.items():
-        text += ["", f"[{name}]  {_summary(getattr(config, name))}"]
+        text += ["", *textwrap.wrap(f"[{name}]  {_summary(getattr(config, name))}", width)]
         for setting in settings:
-            text += _lines(_cells(setting), widths, min(width, _WIDEST))
+            text += _lines(_cells(setting), widths, width)
     return "\n".join(text)
 
 
 def _summary(table: Any) -> str:
-    """The first line of what a table's class says of itself."""
-    return (type(table).__doc__ or "").partition("\n")[0]
+    """The first paragraph of what a table's class says of itself."""
+    return inspect.cleandoc(type(table).__doc__ or "").partition("\n\n")[0]
 
 
 def _cells(setting: Setting) -> tuple[str, str, str, str]:
@@ -75,9 +77,7 @@ def _lines(cells: Sequence[str], widths: Sequence[int], width: int) -> Iterator[
     beside = len(start) + 2
     if width - beside < _NARROWEST:
         yield start.rstrip()
-        yield from textwrap.wrap(
-            meaning, width, initial_indent=_BENEATH, subsequent_indent=_BENEATH
-        )
+        yield from (_BENEATH + line for line in textwrap.wrap(meaning, width - len(_BENEATH)))
         return
     first, *rest = textwrap.wrap(meaning, width - beside) or [""]
     yield f"{start}  {first}"

@@ -55,7 +55,7 @@ class CSGConfig:
     epochs: Annotated[int, Field(ge=1, le=100_000)] = 40
     """faithful: passes over the transitions."""
     lambda_r: Weight = 1.0
-    """faithful: weight of the squared change of the predicted reward, in its standard deviations."""
+    """faithful: weight of the squared change of the predicted reward, in standard deviations."""
     lambda_band: Weight = 0.1
     """faithful: weight of the squared distance of a move's length from the band."""
     max_transitions: Annotated[int, Field(ge=100, le=10**9)] = 200_000

@@ -18,8 +18,8 @@ class CDT4RecConfig(DTConfig):
     """Settings of CDT4Rec; its backbone is DT's, as in its public code."""
 
     reward_weight: Weight = 0.5
-    """Weight of the reward's squared error, in standard deviations of the training rewards; 0 leaves DT.
-    The public code sums both losses of rewards that it does not standardise."""
+    """Weight of the reward's squared error, in standard deviations of the training rewards; 0
+    leaves DT. The public code sums both losses of rewards that it does not standardise."""
 
 
 class CDT4RecPolicy(DTPolicy):

@@ -33,7 +33,7 @@ class DT4RecConfig(DTConfig):
     """Other returns that every window is asked for in the contrastive loss; the paper has 8, each
     costing a forward pass."""
     contrastive_weight: Weight = 0.1
-    """Weight of the contrastive loss; 0 leaves the loss of the released code, which has no contrastive part."""
+    """Weight of the contrastive loss; 0 leaves the loss of the released code, which has none."""
     temperature: Annotated[float, Field(gt=0, le=1000)] = 0.07
     """Of the contrastive loss: similarities are divided by it."""
 

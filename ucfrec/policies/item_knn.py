@@ -23,7 +23,7 @@ _ROWS = 1024
 
 @settings_table("policy")
 class ItemKNNConfig(PolicyConfig):
-    """Settings of the nearest neighbours; of the others, only `max_timestep` and `context` matter."""
+    """Settings of the nearest neighbours; of the general ones, only `context` matters."""
 
     neighbors: Annotated[int, Field(ge=1, le=1_000_000)] = 100
     """Items with the highest cosines that count for each item; all, of a smaller catalogue."""

@@ -24,7 +24,7 @@ from ucfrec.settings import Share, Weight, settings_table
 
 @settings_table("policy")
 class UCFConfig(PolicyConfig):
-    """UCF's hybrid policy; defaults are the paper's Tables 6 to 8, but for λ and the weight of
+    """Settings of UCF's hybrid policy; defaults are the paper's Tables 6 to 8, but for λ and the weight of
     a_{t−1}, which were chosen on validation episodes (`benchmarks/LOG.md`)."""
 
     conv_blocks: Layers = 2
@@ -32,8 +32,8 @@ class UCFConfig(PolicyConfig):
     heads: Heads = 2
     """Attention heads; they divide `dim`."""
     lambda_mask: Weight = 0.0
-    """λ, weight of the mask loss, which supervises attention. Every value above 0 lowered the return
-    in both worlds where it was swept."""
+    """λ, weight of the mask loss, which supervises attention. Every value above 0 lowered the
+    return in both worlds where it was swept."""
     parent_window: Annotated[int, Field(ge=0, le=4096)] = 2
     """w, how many earlier states count as parents of an action, for the mask loss."""
     parent_decay: Share = 0.6

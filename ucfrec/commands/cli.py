@@ -2,6 +2,7 @@
 
 import argparse
 import errno
+import os
 import signal
 import sys
 from collections.abc import Mapping, Sequence
@@ -64,6 +65,10 @@ def run(program: Program, arguments: Sequence[str] | None) -> int:
         _module(program, options.command).run(options)
     except InputError as error:
         return _failed(options, f"{name}: {error}")
+    except BrokenPipeError:
+        # Whoever read the output, as `head` does, has read enough.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except OSError as error:
         if error.errno != errno.ENOSPC:
             raise

@@ -13,9 +13,7 @@ from ucfrec.runs.run import describe_run, train_run
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """What `train` takes, here and on a sibling's command line."""
-    parser.epilog = (
-        "Every setting with its default, range and meaning: ucfrec settings --policy NAME"
-    )
+    parser.epilog = "every setting, its range and meaning: ucfrec settings --policy NAME"
     parser.add_argument("store", type=Path, metavar="STORE")
     parser.add_argument("--out", type=Path, required=True, metavar="RUN")
     parser.add_argument(

@@ -24,8 +24,8 @@ from ucfrec.settings import Share, Weight, settings_table
 
 @settings_table("policy")
 class UCFConfig(PolicyConfig):
-    """Settings of UCF's hybrid policy; defaults are the paper's Tables 6 to 8, but for λ and the weight of
-    a_{t−1}, which were chosen on validation episodes (`benchmarks/LOG.md`)."""
+    """Settings of UCF's hybrid policy; defaults are the paper's Tables 6 to 8, but for λ and the
+    weight of a_{t−1}, which were chosen on validation episodes (`benchmarks/LOG.md`)."""
 
     conv_blocks: Layers = 2
     """Convolution blocks of each stream (returns-to-go, states, actions)."""

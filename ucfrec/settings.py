@@ -140,6 +140,11 @@ def describe(name: str, table: Any) -> Iterator[Setting]:
         yield Setting(f"{name}.{key}", getattr(table, key), allowed, " ".join(meaning.split()))
 
 
+def is_table(cls: type) -> bool:
+    """Whether `settings_table` made the class itself, not only one that it derives from."""
+    return bool(_fields(cls))
+
+
 def nearest(name: str, known: Sequence[str]) -> str:
     """The known name that was probably meant, or all of them."""
     near = difflib.get_close_matches(name, known, n=1)

@@ -1,7 +1,6 @@
 """Settings of the control adapter: each means something, is read, and has a range."""
 
 import ast
-import re
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path

@@ -18,6 +18,7 @@ from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 MINE = '''
+from dataclasses import dataclass
 from typing import Annotated
 from pydantic import Field
 from torch import nn
@@ -47,12 +48,20 @@ class NotOne:
 
 class Odd(SequencePolicy):
     Config = dict
+
+@dataclass(frozen=True)
+class UncheckedConfig(PolicyConfig):
+    depth: int = 2
+
+class Unchecked(SequencePolicy):
+    Config = UncheckedConfig
 '''
 ENTRY_POINTS = """[ucfrec.policies]
 mine = my_learner:Mine
 dt = my_learner:Mine
 not-one = my_learner:NotOne
 odd = my_learner:Odd
+unchecked = my_learner:Unchecked
 gone = my_learner:Gone
 nowhere = no_such_learner:Mine
 """
@@ -126,6 +135,7 @@ def test_an_installed_learner_is_trained_listed_and_read_back(
     [
         ("not-one", "no class derived from ucfrec.policies.base.SequencePolicy"),
         ("odd", "not derived from ucfrec.policies.base.PolicyConfig"),
+        ("unchecked", "not derived from .* under @ucfrec.settings.settings_table"),
         ("gone", "my_learner:Gone, which cannot be imported"),
         ("nowhere", "no_such_learner:Mine, which cannot be imported"),
         ("min", "there are ucf, dt, .*, mine"),

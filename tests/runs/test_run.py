@@ -143,7 +143,11 @@ SHORT = [*killed_run.SETTINGS, "train.steps=4", "crm.epochs=1"]
 @pytest.mark.parametrize(
     ("policy", "wrong", "says"),
     [
-        ("ucf", ["policy.heads=3"], r"--set policy\.heads=3: policy\.heads is 3; it must divide"),
+        (
+            "ucf",
+            ["policy.heads=3"],
+            r"=3, --set policy\.dim=16: policy\.heads is 3; it must divide",
+        ),
         ("ucf", ["csg.kind=nonsense"], "csg.kind is 'nonsense'"),
         ("ucf", ["train.steps=0"], r"train\.steps is 0; it must be a whole number"),
         ("item-knn", [], "item-knn recommends items; this store's actions are vectors"),

@@ -16,7 +16,7 @@ from ucfrec.policies.base import Context, PolicyConfig
 from ucfrec.policies.cql import CQLConfig, relabelled
 from ucfrec.policies.dt import DTConfig, DTPolicy
 from ucfrec.policies.heads import ItemHead, VectorHead
-from ucfrec.settings import Share, Steps, Weight, settings_table
+from ucfrec.settings import Steps, Weight, settings_table
 
 
 @settings_table("policy")
@@ -27,8 +27,8 @@ class EDT4RecConfig(DTConfig):
     """K, steps of history that a prediction sees."""
     vector_entropy: Annotated[float, Field(ge=-1000, le=1000)] = -1.0
     """β, lowest entropy (nats) for every dimension of a vector action."""
-    item_entropy: Share = 0.3
-    """The same of items, as a share of that of the uniform choice."""
+    item_entropy: Annotated[float, Field(ge=-1000, le=1)] = 0.3
+    """The same of items, as a share of the entropy of the uniform choice; below 0 never binds."""
     multiplier: Annotated[float, Field(gt=0, le=1e6)] = 0.1
     """λ of the entropy constraint before the first step."""
     relabel: bool = True

@@ -56,15 +56,16 @@ def policy_class(name: str) -> "type[SequencePolicy]":
 
 def _checked(name: str, found: object) -> "type[SequencePolicy]":
     from ucfrec.policies.base import PolicyConfig, SequencePolicy
+    from ucfrec.settings import is_table
 
     if not (isinstance(found, type) and issubclass(found, SequencePolicy)):
         raise InputError(
             f"the policy {name!r} is installed as {found!r}, which is no class derived from "
             "ucfrec.policies.base.SequencePolicy"
         )
-    if not issubclass(found.Config, PolicyConfig):
+    if not (issubclass(found.Config, PolicyConfig) and is_table(found.Config)):
         raise InputError(
             f"the policy {name!r} is configured by {found.Config!r}, which is not derived from "
-            "ucfrec.policies.base.PolicyConfig"
+            "ucfrec.policies.base.PolicyConfig under @ucfrec.settings.settings_table"
         )
     return found

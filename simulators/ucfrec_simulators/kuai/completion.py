@@ -118,6 +118,7 @@ class Completed:
         return np.asarray(1 / (1 + np.exp(-logits)))
 
 
+@random_state_kept()
 def complete(
     store: EpisodeStore,
     tags: Mapping[int, tuple[int, ...]],

@@ -14,6 +14,8 @@ from tests.support import killed_run
 from ucfrec.counterfactual.augment import counterfactual_copies
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.evaluation.evaluate import World, evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.simulated_store import simulated_store
 from ucfrec.fitting.loop import LoopConfig, fit
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.registry import BUILT_IN
@@ -110,6 +112,19 @@ def test_a_run_and_reading_it_back(store: EpisodeStore, tmp_path: Path, name: st
         new_policy(store, config)
         train_run(store, tmp_path / "run", config)
         TrainedPolicy.load(tmp_path / "run")
+
+
+@pytest.mark.parametrize("world", ["synthetic-taobao", "synthetic-catalog"])
+def test_collecting_and_judging(world: str, tmp_path: Path) -> None:
+    at = World(world)
+    with unnoticed():
+        simulated_store(at, tmp_path, 60, 0)
+    config = resolve_config("bc", None, {"train.steps": 2, "policy.dim": 8})
+    train_run(EpisodeStore.open(tmp_path / "store"), tmp_path / "run", config)
+    trained = TrainedPolicy.load(tmp_path / "run")
+    with unnoticed():
+        evaluate_policy(at, trained, "bc", 20, 0, 1.0)
+        evaluate_behavior(at, "mixture", 20, 0)
 
 
 def test_the_numbers_of_a_run_do_not_depend_on_the_callers_state(

@@ -17,6 +17,7 @@ from ucfrec.evaluation.collect import world_items
 from ucfrec.evaluation.diversity import Recommended
 from ucfrec.evaluation.diversity_columns import COLUMNS, variety_columns
 from ucfrec.evaluation.metrics import session_metrics
+from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.plugins import Simulator, load_plugin
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -38,6 +39,7 @@ class World:
         return simulator
 
 
+@random_state_kept()
 def evaluate_behavior(world: World, behavior: str, episodes: int, seed: int) -> dict[str, Any]:
     """One result row for a built-in policy of a world (`random`, `optimal`, …).
 
@@ -53,6 +55,7 @@ def evaluate_behavior(world: World, behavior: str, episodes: int, seed: int) -> 
     return _row(world, behavior, env, actor, episodes, seed)
 
 
+@random_state_kept()
 def evaluate_policy(
     world: World,
     trained: TrainedPolicy,

@@ -36,8 +36,8 @@ _CHECKED: Final = ConfigDict(
     use_attribute_docstrings=True,
 )
 
-Steps = Annotated[int, Field(ge=1, le=10**12)]
-"""Updates, rows or episodes: something that is counted and of which there is one at least."""
+Count = Annotated[int, Field(ge=1, le=10**12)]
+"""Of updates, rows or episodes; there is at least one."""
 Width = Annotated[int, Field(ge=1, le=16_384)]
 """Of a network's layer."""
 Weight = Annotated[float, Field(ge=0, le=1e6)]

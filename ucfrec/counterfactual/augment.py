@@ -24,7 +24,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import FloatArray, IntArray, Overlay, Transitions
 from ucfrec.errors import InputError
 from ucfrec.fitting.random_state import random_state_kept
-from ucfrec.settings import Quantile, Steps, settings_table
+from ucfrec.settings import Count, Quantile, settings_table
 
 _CHUNK = 8192
 _DELTA_LEVEL = "0.95"
@@ -47,7 +47,7 @@ class AugmentConfig:
     """Steps with a reward below this quantile are left alone."""
     epsilon_r: Annotated[float, Field(ge=0, le=1e15)] | None = None
     """Tolerance of the gate in reward units; unset, 0.1 × standard deviation of the rewards."""
-    max_steps: Steps = 2_000_000
+    max_steps: Count = 2_000_000
     """Most steps to look at; of a larger store, episodes are drawn."""
 
 

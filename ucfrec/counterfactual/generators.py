@@ -7,7 +7,6 @@ from typing import Annotated, Literal, Protocol
 import numpy as np
 import torch
 from pydantic import Field
-from sklearn.cluster import MiniBatchKMeans
 from torch import Tensor, nn
 
 from ucfrec.counterfactual.reward_model import CausalRewardModel, mlp
@@ -209,6 +208,9 @@ def make_generator(
 def _tangent(
     states: Tensor, crm: CausalRewardModel, config: CSGConfig, seed: int
 ) -> TangentGenerator:
+    # Takes half a second to import; whoever reads settings does without.
+    from sklearn.cluster import MiniBatchKMeans
+
     size = states.shape[1]
     clusters = max(1, min(config.clusters, len(states) // (8 * size)))
     fitted = MiniBatchKMeans(clusters, random_state=seed, n_init=1, batch_size=4096)

@@ -24,7 +24,7 @@ from ucfrec.fitting.checkpoint import (
 )
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.fitting.tensorboard import Events
-from ucfrec.settings import BatchSize, LearningRate, Steps, Weight, WeightDecay, settings_table
+from ucfrec.settings import BatchSize, Count, LearningRate, WeightDecay, settings_table
 
 Batch = TypeVar("Batch")
 
@@ -36,7 +36,7 @@ class LoopConfig:
     Policy defaults are the paper's Table 8; `steps` and the rest are ours.
     """
 
-    steps: Steps = 10_000
+    steps: Count = 10_000
     """Updates in all."""
     batch_size: BatchSize = 64
     """Windows of an update."""
@@ -49,9 +49,9 @@ class LoopConfig:
     training of fewer steps ends before it has risen."""
     cosine: bool = False
     """After the warm-up, fall to 0 at the last step instead of staying constant."""
-    clip_norm: Weight = 0.25
+    clip_norm: Annotated[float, Field(ge=0, le=1e6)] = 0.25
     """Largest gradient norm; 0 clips nothing."""
-    validate_every: Steps = 500
+    validate_every: Count = 500
     """Steps between validations, checkpoints and log lines."""
     patience: Annotated[int, Field(ge=0, le=10**9)] = 0
     """Validations without a better one before stopping early; 0 never stops early."""

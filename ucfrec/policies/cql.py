@@ -16,7 +16,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Transitions
 from ucfrec.fitting.loop import LoopConfig, fit
 from ucfrec.fitting.random_state import random_state_kept
-from ucfrec.settings import BatchSize, LearningRate, Steps, Weight, Width, settings_table
+from ucfrec.settings import BatchSize, Count, LearningRate, Weight, Width, settings_table
 
 FloatArray = npt.NDArray[np.float32]
 _CHUNK = 4096
@@ -28,7 +28,7 @@ _LOGGED = 100_000
 class CQLConfig:
     """Small, as it only values states; no discount, as returns-to-go have none."""
 
-    steps: Steps = 2000
+    steps: Count = 2000
     """Updates of the network."""
     weight: Weight = 1.0
     """α of the conservative term."""

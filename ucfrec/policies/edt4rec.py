@@ -16,7 +16,7 @@ from ucfrec.policies.base import Context, PolicyConfig
 from ucfrec.policies.cql import CQLConfig, relabelled
 from ucfrec.policies.dt import DTConfig, DTPolicy
 from ucfrec.policies.heads import ItemHead, VectorHead
-from ucfrec.settings import Steps, Weight, settings_table
+from ucfrec.settings import Count, Weight, settings_table
 
 
 @settings_table("policy")
@@ -33,7 +33,7 @@ class EDT4RecConfig(DTConfig):
     """λ of the entropy constraint before the first step."""
     relabel: bool = True
     """Raise returns-to-go to what CQL says was within reach."""
-    cql_steps: Steps = 2000
+    cql_steps: Count = 2000
     """Updates of CQL's network, where returns-to-go are raised."""
     cql_weight: Weight = 1.0
     """α, how strongly CQL presses unseen actions down."""

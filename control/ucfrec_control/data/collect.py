@@ -18,7 +18,7 @@ from ucfrec.errors import InputError
 from ucfrec.files import read_json, write_json
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.provenance import provenance
-from ucfrec.settings import Steps, require, settings_table
+from ucfrec.settings import Count, require, settings_table
 from ucfrec_control.data.d4rl import write_d4rl
 from ucfrec_control.data.sac import SacConfig, SacLearner, seed_all
 from ucfrec_control.data.trajectories import PACKAGES, Trajectories
@@ -31,15 +31,15 @@ SHOWN: Final = ("dataset", "trajectories", "steps", "mean_return")
 class CollectConfig:
     """What is trained and how much is rolled out."""
 
-    steps: Steps = 1_000_000
+    steps: Count = 1_000_000
     """Training steps, rounded up to whole episodes."""
-    every: Steps = 10_000
+    every: Count = 10_000
     """Steps between evaluations; each also keeps the policy and a checkpoint to resume from."""
-    episodes: Steps = 20
+    episodes: Count = 20
     """Episodes of an evaluation."""
     fraction: Annotated[float, Field(gt=0, lt=1)] = 1 / 3
     """Of the way from the random policy's return to the expert's, where `medium` is taken."""
-    size: Steps = 1_000_000
+    size: Count = 1_000_000
     """Steps rolled out of `medium` and of `expert`, rounded up to whole episodes."""
     sac: SacConfig = field(default_factory=SacConfig)
     """The learner."""

@@ -22,7 +22,7 @@ from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.fitting.tensorboard import Events
 from ucfrec.provenance import command_line, versions
 from ucfrec.runs.trained_policy import RUN
-from ucfrec.settings import BatchSize, Steps, settings_table
+from ucfrec.settings import BatchSize, Count, settings_table
 from ucfrec_control.data.trajectories import PACKAGES
 from ucfrec_control.worlds.scores import find_kind, find_task
 
@@ -39,7 +39,7 @@ class RLConfig:
 
     algorithm: Literal["iql", "cql"]
     """Of d3rlpy."""
-    steps: Steps
+    steps: Count
     """Updates in all."""
     task: str
     """Name of a `ucfrec_control.worlds.scores.Task`, or "": decides CORL's settings."""

@@ -26,7 +26,7 @@ from ucfrec.episodes.windows import IntArray, Overlay
 from ucfrec.errors import InputError
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.runs.run import training_views
-from ucfrec.settings import BatchSize, LearningRate, Share, Steps, Width, settings_table
+from ucfrec.settings import BatchSize, Count, LearningRate, Share, Width, settings_table
 
 _HELD_OUT_EVERY = 5
 _CLIP = 10.0
@@ -40,9 +40,9 @@ class ScreeningConfig:
 
     hidden: Width = 192
     """Width of the two hidden layers of a predictor."""
-    shared_steps: Steps = 3000
+    shared_steps: Count = 3000
     """Updates of one predictor that serves every missing dimension."""
-    own_steps: Steps = 1000
+    own_steps: Count = 1000
     """Updates of a copy of it for each missing dimension; without them a dimension that is nearly
     a function of others seems to help."""
     batch_size: BatchSize = 256

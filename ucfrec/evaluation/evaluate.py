@@ -17,6 +17,7 @@ from ucfrec.evaluation.diversity import Recommended
 from ucfrec.evaluation.diversity_columns import COLUMNS, variety_columns
 from ucfrec.evaluation.metrics import session_metrics
 from ucfrec.evaluation.world import World
+from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -24,6 +25,7 @@ SIDE_BY_SIDE = 512
 """Most episodes played at once."""
 
 
+@random_state_kept()
 def evaluate_behavior(world: World, behavior: str, episodes: int, seed: int) -> dict[str, Any]:
     """One result row for a built-in policy of a world (`random`, `optimal`, …).
 
@@ -39,6 +41,7 @@ def evaluate_behavior(world: World, behavior: str, episodes: int, seed: int) -> 
     return _row(world, behavior, env, actor, episodes, seed)
 
 
+@random_state_kept()
 def evaluate_policy(
     world: World,
     trained: TrainedPolicy,

@@ -20,8 +20,9 @@ from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.files import read_json
 from ucfrec.fitting.checkpoint import load_tensors, load_weights
+from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
-from ucfrec.policies.registry import POLICIES
+from ucfrec.policies.registry import policy_class
 from ucfrec.runs.config import config_from_dict
 
 RUN, AUGMENTATION = "run.json", "augmentation.json"
@@ -52,7 +53,8 @@ class TrainedPolicy:
         """
         record = read_record(run)
         config = config_from_dict(record["config"])
-        policy = POLICIES[config.policy_name](config.policy, record["sizes"])
+        with random_state_kept():
+            policy = policy_class(config.policy_name)(config.policy, record["sizes"])
         path = run / "policy" / f"{checkpoint}.safetensors"
         load_weights(path, policy, _weights(path))
         policy.eval()
@@ -140,7 +142,7 @@ def learner_of(record: Mapping[str, Any]) -> str:
     """The learner of a run's record, and whether it departs from its usual use of edited copies."""
     config = config_from_dict(record["config"])
     augmented = config.augment.copies > 0
-    if augmented == POLICIES[config.policy_name].augmented:
+    if augmented == policy_class(config.policy_name).augmented:
         return config.policy_name
     return f"{config.policy_name}-{'augmented' if augmented else 'no-augmentation'}"
 

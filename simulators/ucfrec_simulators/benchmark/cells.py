@@ -26,7 +26,7 @@ class Method:
     """A row of a table."""
 
     policy: str
-    """Key of `ucfrec.policies.registry.POLICIES`."""
+    """One of `ucfrec.policies.registry.policy_names`."""
     settings: tuple[str, ...] = ()
     conditioned: bool = True
     """Whether it is asked for a return."""

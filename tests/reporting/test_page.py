@@ -17,7 +17,7 @@ from tests.support import killed_run
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.fitting.tensorboard import read_scalars
+from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.reporting import charts
 from ucfrec.reporting.page import write_report
 from ucfrec.runs.config import resolve_config
@@ -158,7 +158,7 @@ def test_the_numbers_are_those_of_the_record(runs: Path, tmp_path: Path) -> None
 def test_curves_are_what_was_logged_and_overlaid(runs: Path, tmp_path: Path) -> None:
     page = page_of(tmp_path / "report.html", runs / "ucf", runs / "dt")
     table = page.tables["Validation loss (action, held-out steps)"]
-    logged = {name: read_scalars(runs / name / "policy") for name in ("ucf", "dt")}
+    logged = {name: read_metrics(runs / name / "policy") for name in ("ucf", "dt")}
     assert len(table) == 6
     for step, cells in table.items():
         for name, cell in cells.items():

@@ -21,7 +21,7 @@ from ucfrec.fitting.checkpoint import (
     save_tensors,
     save_training,
 )
-from ucfrec.fitting.tensorboard import Events
+from ucfrec.fitting.metrics_log import MetricsLog
 
 Batch = TypeVar("Batch")
 
@@ -82,9 +82,9 @@ def fit(
     """Minimise `loss` over batches from `draw`, resuming from `folder` if it holds a checkpoint.
 
     Writes `last.safetensors` (all that resuming needs), `best.safetensors` (weights with the lowest
-    validation loss; the last weights without validation) and TensorBoard events to `folder`. A run
-    killed at any moment and started again ends with the same weights as one left alone (same
-    machine and device).
+    validation loss; the last weights without validation), `metrics.jsonl` and TensorBoard events to
+    `folder`. A run killed at any moment and started again ends with the same weights as an
+    uninterrupted one (same machine and device).
 
     Args:
         module: what is trained, in place; holds the best weights on return.
@@ -102,7 +102,7 @@ def fit(
     if last.exists():
         counters.update(load_training(last, module, optimizer))
     step = int(counters["step"])
-    clock, events = _Clock(step, counters["seconds"]), Events(folder, step)
+    clock, log = _Clock(step, counters["seconds"]), MetricsLog(folder, step)
     bar = tqdm(total=config.steps, initial=step, desc=describe, unit="step", disable=None)
     while step < config.steps and not 0 < config.patience <= counters["stale"]:
         step += 1
@@ -126,13 +126,13 @@ def fit(
             save_tensors(best, module.state_dict(), {"step": step})
         else:
             logged["validation_loss"] = _keep_best(module, validate, counters, step, best, describe)
-        events.add(step, logged)
+        log.add(step, logged)
         bar.set_postfix(loss=f"{logged['loss']:.4g}")
         counters |= {"step": step, "seconds": clock.total()}
         save_training(last, module, optimizer, counters)
         clock.restart(step)
     bar.close()
-    events.close()
+    log.close()
     load_weights(best, module, load_tensors(best)[0])
     module.eval()
     best_validation = math.nan if validate is None else counters["best_validation"]

@@ -14,7 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from ucfrec import __version__
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_file, read_json
-from ucfrec.fitting.tensorboard import read_scalars
+from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.reporting import charts
 from ucfrec.reporting.page_results import read_results, worlds
 from ucfrec.reporting.tables import Table, shown
@@ -99,7 +99,7 @@ def _read_runs(folders: Sequence[Path]) -> list[_Run]:
             copies = read_json(path / AUGMENTATION)
         common = os.path.commonpath([other.parent for other in paths])
         name = str(path.relative_to(common))
-        runs.append(_Run(name, record, copies, read_scalars(path / "policy")))
+        runs.append(_Run(name, record, copies, read_metrics(path / "policy")))
     return runs
 
 

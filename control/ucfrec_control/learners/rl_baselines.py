@@ -18,7 +18,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_file, atomic_folder, read_json, write_json
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
-from ucfrec.fitting.tensorboard import Events
+from ucfrec.fitting.metrics_log import MetricsLog
 from ucfrec.provenance import command_line, versions
 from ucfrec.runs.trained_policy import RUN
 from ucfrec_control.data.trajectories import PACKAGES
@@ -118,7 +118,7 @@ def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dic
     dataset = _dataset(d3rlpy, train, mean.numpy(), std.numpy())
     learner = _learner(config, "cuda:0" if torch.cuda.is_available() else "cpu:0")
     step, seconds = _resume(out / _CHECKPOINT, learner, dataset)
-    events = Events(out, step)
+    log = MetricsLog(out, step)
     bar = tqdm(total=config.steps, initial=step, desc=config.algorithm, unit="step", disable=None)
     while step < config.steps:
         if step:  # a seed of its own after each checkpoint: no generator's state need be kept
@@ -133,10 +133,10 @@ def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dic
             callback=lambda *_: bar.update(),
         )
         step += steps
-        events.add(step, losses)
+        log.add(step, losses)
         _save(out / _CHECKPOINT, learner, step, seconds + perf_counter() - begun)
     bar.close()
-    events.close()
+    log.close()
     actor = learner.impl.modules.policy.state_dict()
     save_tensors(out / _ACTOR, {**actor, "state.mean": mean, "state.std": std}, {})
     record["policy"] = {"steps": config.steps, "best_step": None}

@@ -114,8 +114,7 @@ def test_whatever_lies_there_is_read_as_numbers_or_refused(
     (folder / METRICS).write_bytes(b"\n".join(lines))
     try:
         found: Any = read_metrics(folder)
-    except InputError as error:
-        assert METRICS in str(error)
+    except InputError:
         return
     for name, curve in found.items():
         assert isinstance(name, str)

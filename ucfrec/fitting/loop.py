@@ -1,4 +1,4 @@
-"""The training loop: the only one. Reward model, generator and every policy pass through it."""
+"""The one training loop, of reward model, generator and every policy."""
 
 import math
 import time
@@ -11,7 +11,6 @@ from typing import TypeVar
 import numpy as np
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import (
@@ -22,6 +21,7 @@ from ucfrec.fitting.checkpoint import (
     save_training,
 )
 from ucfrec.fitting.metrics_log import MetricsLog
+from ucfrec.progress import Progress, progress
 
 Batch = TypeVar("Batch")
 
@@ -63,7 +63,7 @@ class Fit:
 def step_generator(seed: int, step: int) -> np.random.Generator:
     """The generator from which everything random of one training step is drawn.
 
-    Step i needs no history: a run resumed at i draws what an uninterrupted one would have.
+    Step i needs no history: a run resumed at i draws the same as an uninterrupted one.
     """
     return np.random.default_rng([seed, step])
 
@@ -103,9 +103,7 @@ def fit(
         counters.update(load_training(last, module, optimizer))
     step = int(counters["step"])
     clock, log = _Clock(step, counters["seconds"]), MetricsLog(folder, step)
-    bar = tqdm(total=config.steps, initial=step, desc=describe, unit="step", disable=None)
-    while step < config.steps and not 0 < config.patience <= counters["stale"]:
-        step += 1
+    for step, shown in _steps(counters, config, describe):
         generator = step_generator(seed, step)
         with clock.waiting():
             batch = draw(generator)
@@ -113,7 +111,6 @@ def fit(
         module.train()
         value, scalars = loss(batch)
         norm = _descend(value, module, optimizer, config, step)
-        bar.update()
         if step % config.validate_every and step != config.steps:
             continue
 
@@ -127,16 +124,27 @@ def fit(
         else:
             logged["validation_loss"] = _keep_best(module, validate, counters, step, best, describe)
         log.add(step, logged)
-        bar.set_postfix(loss=f"{logged['loss']:.4g}")
+        shown.update(0, loss=logged["loss"])
         counters |= {"step": step, "seconds": clock.total()}
         save_training(last, module, optimizer, counters)
         clock.restart(step)
-    bar.close()
     log.close()
     load_weights(best, module, load_tensors(best)[0])
     module.eval()
     best_validation = math.nan if validate is None else counters["best_validation"]
     return Fit(step, int(counters["best_step"]), best_validation, counters["seconds"])
+
+
+def _steps(
+    counters: Mapping[str, float], config: LoopConfig, describe: str
+) -> Iterator[tuple[int, Progress]]:
+    """Number the steps that are left until the end or an early stop, and show how fast they go."""
+    step = int(counters["step"])
+    with progress(config.steps, describe, "steps", step) as shown:
+        while step < config.steps and not 0 < config.patience <= counters["stale"]:
+            step += 1
+            yield step, shown
+            shown.update()
 
 
 def _optimizer(module: nn.Module, config: LoopConfig) -> torch.optim.Optimizer:
@@ -218,7 +226,7 @@ def _keep_best(
     best: Path,
     describe: str,
 ) -> float:
-    """The validation loss; the weights are saved and the counters told if it is the lowest yet."""
+    """Return the validation loss; if it is the lowest yet, save the weights and count from here."""
     module.eval()
     with torch.no_grad():
         loss = validate()

@@ -1,15 +1,21 @@
 """Charts as geometry: what the report's template draws as SVG."""
 
 import math
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-WIDTH, HEIGHT = 440, 240
-"""Of a line chart, in the units of its drawing; bar charts are as wide."""
-LEFT, RIGHT, TOP, BOTTOM = 56, 14, 12, 40
+WIDTH, HEIGHT = 360, 220
+"""Of line charts and histograms, in units of the drawing; bar charts are as wide. About as wide as
+a phone, so that text keeps its size there."""
+LEFT, RIGHT, TOP, BOTTOM = 52, 14, 14, 40
 """Margins around what is plotted."""
-_NAMES = 170
-_ROW = 24
+_NAME, _BAR, _GAP = 15, 18, 8
+"""Height of a line of a bar's name, of the bar, and of the space below it."""
+_NAME_CHARACTERS = 48
+_BAR_MARGIN = 14
+_EDGE_LABELS = 5
+"""Bin edges that a histogram labels, about."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +39,16 @@ class Line:
 
 
 @dataclass(frozen=True)
+class Level:
+    """A value that curves are compared with, drawn across."""
+
+    y: float
+    label: str
+    anchor: str
+    """Where its label stands: `start` or `end` of the axis."""
+
+
+@dataclass(frozen=True)
 class LineChart:
     """Curves over one pair of axes."""
 
@@ -41,15 +57,19 @@ class LineChart:
     x_ticks: tuple[Tick, ...]
     y_ticks: tuple[Tick, ...]
     lines: tuple[Line, ...]
+    levels: tuple[Level, ...]
 
 
 @dataclass(frozen=True)
 class Bar:
-    """A value and its interval, drawn along x."""
+    """A value and its interval, drawn along x under its name."""
 
-    name: str
+    name: tuple[str, ...]
+    """In lines."""
     summary: str
+    top: float
     y: float
+    """Middle of the bar."""
     start: float
     end: float
     low: float
@@ -65,6 +85,29 @@ class BarChart:
     zero: float
     ticks: tuple[Tick, ...]
     bars: tuple[Bar, ...]
+
+
+@dataclass(frozen=True)
+class Column:
+    """One bin of a histogram."""
+
+    summary: str
+    x: float
+    width: float
+    y: float
+    height: float
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """Counts of neighbouring bins, all drawn equally wide."""
+
+    title: str
+    summary: str
+    x_label: str
+    x_ticks: tuple[Tick, ...]
+    y_ticks: tuple[Tick, ...]
+    columns: tuple[Column, ...]
 
 
 class _Scale:
@@ -85,10 +128,17 @@ class _Scale:
         return round(self._start + share * (self._end - self._start), 2)
 
     def ticks(self) -> tuple[Tick, ...]:
-        digits = max(0, -math.floor(math.log10(self._step)))
         first, last = math.ceil(self._low / self._step), round(self._high / self._step)
         values = [i * self._step for i in range(first, last + 1)]
-        return tuple(Tick(self.at(value), f"{value:,.{digits}f}") for value in values)
+        return tuple(Tick(self.at(value), _label(value, self._step)) for value in values)
+
+
+def _label(value: float, step: float) -> str:
+    """A value of an axis whose ticks are `step` apart; in thousands or millions if all are."""
+    for size, unit in ((1e6, "M"), (1e3, "k")):
+        if step >= size and value:
+            return f"{value / size:,.0f}{unit}"
+    return f"{value:,.{max(0, -math.floor(math.log10(step)))}f}"
 
 
 def _round_step(least: float) -> float:
@@ -98,13 +148,27 @@ def _round_step(least: float) -> float:
 
 
 def line_chart(
-    title: str, x_label: str, curves: Sequence[tuple[str, int, Mapping[float, float]]]
+    title: str,
+    x_label: str,
+    curves: Sequence[tuple[str, int, Mapping[float, float]]],
+    levels: Mapping[str, float] | None = None,
 ) -> LineChart:
-    """Curves (name, style, {x: y}) overlaid; each has a point at least, and y is finite."""
+    """Curves (name, style, {x: y}) overlaid; each has a point at least, and y is finite.
+
+    Args:
+        levels: finite values to compare the curves with, by name.
+    """
+    levels = levels or {}
+    values = [value for _, _, curve in curves for value in curve.values()]
     x = _Scale((at for _, _, curve in curves for at in curve), LEFT, WIDTH - RIGHT)
-    y = _Scale((v for _, _, curve in curves for v in curve.values()), HEIGHT - BOTTOM, TOP)
+    y = _Scale([*values, *levels.values()], HEIGHT - BOTTOM, TOP)
     lines = tuple(_line(name, style, curve, x, y) for name, style, curve in curves)
-    return LineChart(title, x_label, x.ticks(), y.ticks(), lines)
+    # Labels at either end do not meet where two levels are close.
+    drawn = tuple(
+        Level(y.at(value), f"{name}: {value:.4g}", ("end", "start")[place % 2])
+        for place, (name, value) in enumerate(levels.items())
+    )
+    return LineChart(title, x_label, x.ticks(), y.ticks(), lines, drawn)
 
 
 def _line(name: str, style: int, curve: Mapping[float, float], x: _Scale, y: _Scale) -> Line:
@@ -120,13 +184,50 @@ def _line(name: str, style: int, curve: Mapping[float, float], x: _Scale, y: _Sc
 
 
 def bar_chart(title: str, bars: Sequence[tuple[str, float, float, float]]) -> BarChart:
-    """Bars (name, value, low, high) one below the other."""
-    x = _Scale([0.0, *(end for bar in bars for end in bar[1:])], _NAMES, WIDTH - RIGHT)
-    drawn = []
-    for row, (name, value, low, high) in enumerate(bars):
+    """Bars (name, value, low, high) one below the other, each under its whole name."""
+    values = [0.0, *(end for bar in bars for end in bar[1:])]
+    x = _Scale(values, _BAR_MARGIN, WIDTH - _BAR_MARGIN)
+    drawn, top = [], float(TOP)
+    for name, value, low, high in bars:
         start, end = sorted((x.at(0), x.at(value)))
         summary = f"{name}: {value:.4g}, 95% interval {low:.4g} to {high:.4g}"
-        y = TOP + _ROW * (row + 0.5)
-        drawn.append(Bar(name, summary, y, start, end, x.at(low), x.at(high)))
-    height = TOP + _ROW * len(bars) + BOTTOM
-    return BarChart(title, height, x.at(0), x.ticks(), tuple(drawn))
+        lines = tuple(textwrap.wrap(name, _NAME_CHARACTERS)) or ("",)
+        y = top + _NAME * len(lines) + _BAR / 2
+        drawn.append(Bar(lines, summary, top, y, start, end, x.at(low), x.at(high)))
+        top = y + _BAR / 2 + _GAP
+    return BarChart(title, top + BOTTOM, x.at(0), x.ticks(), tuple(drawn))
+
+
+def histogram(
+    title: str, x_label: str, edges: Sequence[float], counts: Sequence[float]
+) -> Histogram:
+    """Columns of `counts` (N,) between `edges` (N + 1,), rising.
+
+    Bins are drawn equally wide whatever their edges: bins that widen show a long tail.
+    """
+    y = _Scale([0.0, *counts], HEIGHT - BOTTOM, TOP)
+    width = (WIDTH - LEFT - RIGHT) / len(counts)
+    columns = tuple(
+        Column(
+            f"{_edge(edges[i])} to {_edge(edges[i + 1])}: {count:,.6g}",
+            round(LEFT + i * width, 2),
+            round(width, 2),
+            y.at(count),
+            round(y.at(0) - y.at(count), 2),
+        )
+        for i, count in enumerate(counts)
+    )
+    every = -(-len(edges) // _EDGE_LABELS)
+    labelled = range(0, len(edges), every)
+    ticks = tuple(Tick(round(LEFT + i * width, 2), _edge(edges[i])) for i in labelled)
+    most = max(columns, key=lambda column: column.height)
+    summary = (
+        f"{_edge(edges[0])} to {_edge(edges[-1])} in {len(counts)} bins; most, {most.summary}"
+    )
+    return Histogram(title, summary, x_label, ticks, y.ticks(), columns)
+
+
+def _edge(value: float) -> str:
+    if abs(value) >= 10_000:
+        return f"{value / 1e6:.4g}M" if abs(value) >= 1e6 else f"{value / 1e3:.4g}k"
+    return f"{value:,.0f}" if float(value).is_integer() else f"{value:.3g}"

@@ -4,6 +4,7 @@ import math
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 WIDTH, HEIGHT = 360, 220
 """Of line charts and histograms, in units of the drawing; bar charts are as wide. About as wide as
@@ -14,8 +15,8 @@ _NAME, _BAR, _GAP = 15, 18, 8
 """Height of a line of a bar's name, of the bar, and of the space below it."""
 _NAME_CHARACTERS = 48
 _BAR_MARGIN = 14
-_EDGE_LABELS = 5
-"""Bin edges that a histogram labels, about."""
+_X_LABELS = 6
+"""Labels below a histogram, at most."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,7 @@ class BarChart:
 class Column:
     """One bin of a histogram."""
 
+    name: str
     summary: str
     x: float
     width: float
@@ -199,35 +201,46 @@ def bar_chart(title: str, bars: Sequence[tuple[str, float, float, float]]) -> Ba
 
 
 def histogram(
-    title: str, x_label: str, edges: Sequence[float], counts: Sequence[float]
+    title: str,
+    x_label: str,
+    counts: Sequence[float],
+    edges: Sequence[float] | None = None,
+    values: Sequence[float] | None = None,
 ) -> Histogram:
-    """Columns of `counts` (N,) between `edges` (N + 1,), rising.
+    """Columns of `counts` (N,), all equally wide: bins that widen show a long tail.
 
-    Bins are drawn equally wide whatever their edges: bins that widen show a long tail.
+    Args:
+        edges: (N + 1,) of the bins, rising; the left one belongs to the bin, the right one not.
+        values: (N,) what is counted, where there are no bins.
     """
     y = _Scale([0.0, *counts], HEIGHT - BOTTOM, TOP)
     width = (WIDTH - LEFT - RIGHT) / len(counts)
+    names = [_short(value) for value in values or ()]
+    if edges is not None:
+        names = [f"{_short(low)} to <{_short(high)}" for low, high in pairwise(edges)]
     columns = tuple(
         Column(
-            f"{_edge(edges[i])} to {_edge(edges[i + 1])}: {count:,.6g}",
+            name,
+            f"{name}: {count:,.6g}",
             round(LEFT + i * width, 2),
             round(width, 2),
             y.at(count),
             round(y.at(0) - y.at(count), 2),
         )
-        for i, count in enumerate(counts)
+        for i, (name, count) in enumerate(zip(names, counts, strict=True))
     )
-    every = -(-len(edges) // _EDGE_LABELS)
-    labelled = range(0, len(edges), every)
-    ticks = tuple(Tick(round(LEFT + i * width, 2), _edge(edges[i])) for i in labelled)
+    # Edges are labelled where they lie, values below the middle of their column.
+    labels, shift = (edges, 0.0) if edges is not None else (values or (), width / 2)
+    labelled = range(0, len(labels), -(-len(labels) // _X_LABELS))
+    ticks = tuple(
+        Tick(round(LEFT + i * width + shift, 2), _short(labels[i])) for i in labelled
+    )
     most = max(columns, key=lambda column: column.height)
-    summary = (
-        f"{_edge(edges[0])} to {_edge(edges[-1])} in {len(counts)} bins; most, {most.summary}"
-    )
+    summary = f"{len(counts)} columns from {names[0]} to {names[-1]}; the highest is {most.summary}"
     return Histogram(title, summary, x_label, ticks, y.ticks(), columns)
 
 
-def _edge(value: float) -> str:
+def _short(value: float) -> str:
     if abs(value) >= 10_000:
         return f"{value / 1e6:.4g}M" if abs(value) >= 1e6 else f"{value / 1e3:.4g}k"
     return f"{value:,.0f}" if float(value).is_integer() else f"{value:.3g}"

@@ -1,0 +1,96 @@
+"""Sample recommendations of a run, as the report shows them."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv as csv
+import pyarrow.parquet as pq
+
+from ucfrec import schema
+from ucfrec.errors import InputError
+from ucfrec.files import read_json
+from ucfrec.reporting.tables import Table, shown
+from ucfrec.runs.samples import SAMPLES
+from ucfrec.runs.trained_policy import ITEMS
+
+_FEATURES, _CHARACTERS = 8, 60
+"""Most features of an item that are shown, and characters of one."""
+
+
+def sample_tables(run: Path, features: pa.Table | None) -> tuple[float, list[Table]] | None:
+    """The target return and a table a session; None where a run recorded no samples.
+
+    Args:
+        features: further features of items, one row an item, with their `item_id`.
+    """
+    if not (run / SAMPLES).exists() or not (run / ITEMS).exists():
+        return None
+    samples = read_json(run / SAMPLES)
+    sessions = samples["sessions"]
+    numbers = {n for s in sessions for n in (*s["history"], s["logged"], *s["recommended"])}
+    about = _about(pq.read_table(run / ITEMS), sorted(numbers), features)
+    tables = [_session(place, one, about) for place, one in enumerate(sessions, start=1)]
+    return samples["target_return"], tables
+
+
+def read_features(path: Path) -> pa.Table:
+    """A table of item features with a column `item_id`, Parquet or (by its name) CSV.
+
+    Raises:
+        InputError: the file is missing, is something else, or lacks the column.
+    """
+    try:
+        table = csv.read_csv(path) if path.suffix == ".csv" else pq.read_table(path)
+    except (OSError, pa.ArrowInvalid) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"{path} cannot be read as Parquet or CSV: {reason}") from None
+    if schema.ITEM_ID not in table.column_names:
+        raise InputError(f"{path} has no column {schema.ITEM_ID!r}, so its features fit no item")
+    return table
+
+
+def _about(
+    items: pa.Table, numbers: Sequence[int], features: pa.Table | None
+) -> dict[int, dict[str, str]]:
+    """What is known of each item, by its number: its id, then features by name."""
+    rows = items.take(pa.array(numbers, pa.int64())).to_pylist()
+    more: dict[Any, Mapping[str, Any]] = {}
+    if features is not None:
+        ids = pa.array([row[schema.ITEM_ID] for row in rows])
+        try:
+            found = features.filter(pc.is_in(features[schema.ITEM_ID], value_set=ids))
+        except pa.ArrowInvalid:  # ids of another kind, so none is the same
+            found = features.slice(0, 0)
+        more = {row[schema.ITEM_ID]: row for row in found.to_pylist()}
+    known = {}
+    for number, row in zip(numbers, rows, strict=True):
+        joined = {**row, **more.get(row[schema.ITEM_ID], {})}
+        known[number] = {name: _text(name, value) for name, value in joined.items()}
+    return known
+
+
+def _session(place: int, session: Mapping[str, Any], about: Mapping[int, Mapping[str, str]]) -> Table:
+    lines = [("shown before", item, shown(reward))
+             for item, reward in zip(session["history"], session["rewards"], strict=True)]  # fmt: skip
+    lines.append(("shown next in the log", session["logged"], "–"))
+    for rank, item in enumerate(session["recommended"], start=1):
+        again = " (shown before)" if item in session["history"] else ""
+        lines.append((f"recommended {rank}{again}", item, "–"))
+    names = dict.fromkeys(name for item in about.values() for name in item)
+    columns = list(names)[: 1 + _FEATURES]
+    body = [
+        (what, [*(about[item].get(name, "–") for name in columns), reward])
+        for what, item, reward in lines
+    ]
+    return Table(f"Held-out session {place}", "", [*columns, "reward"], body)
+
+
+def _text(name: str, value: Any) -> str:
+    """A feature in a few characters; a list by its elements."""
+    if name == schema.ITEM_ID:
+        return str(value)
+    text = ", ".join(map(shown, value)) if isinstance(value, list) else shown(value)
+    return text if len(text) <= _CHARACTERS else f"{text[: _CHARACTERS - 1]}…"

@@ -9,12 +9,15 @@ from itertools import pairwise
 WIDTH, HEIGHT = 360, 220
 """Of line charts and histograms, in units of the drawing; bar charts are as wide. About as wide as
 a phone, so that text keeps its size there."""
-LEFT, RIGHT, TOP, BOTTOM = 52, 14, 14, 40
+LEFT, RIGHT, TOP, BOTTOM = 52, 22, 16, 40
 """Margins around what is plotted."""
-_NAME, _BAR, _GAP = 15, 18, 8
+LEFT_OF_BARS = 14
+"""Margin at both sides of a bar chart, whose names stand above their bars."""
+NAME, _BAR, _GAP = 16, 18, 10
 """Height of a line of a bar's name, of the bar, and of the space below it."""
 _NAME_CHARACTERS = 48
-_BAR_MARGIN = 14
+_LABEL = 14
+"""Height of a label."""
 _X_LABELS = 6
 """Labels below a histogram, at most."""
 
@@ -45,8 +48,8 @@ class Level:
 
     y: float
     label: str
-    anchor: str
-    """Where its label stands: `start` or `end` of the axis."""
+    label_y: float
+    """Above the line, or below it where another label stands above."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +133,7 @@ class _Scale:
         return round(self._start + share * (self._end - self._start), 2)
 
     def ticks(self) -> tuple[Tick, ...]:
-        first, last = math.ceil(self._low / self._step), round(self._high / self._step)
+        first, last = round(self._low / self._step), round(self._high / self._step)
         values = [i * self._step for i in range(first, last + 1)]
         return tuple(Tick(self.at(value), _label(value, self._step)) for value in values)
 
@@ -165,12 +168,16 @@ def line_chart(
     x = _Scale((at for _, _, curve in curves for at in curve), LEFT, WIDTH - RIGHT)
     y = _Scale([*values, *levels.values()], HEIGHT - BOTTOM, TOP)
     lines = tuple(_line(name, style, curve, x, y) for name, style, curve in curves)
-    # Labels at either end do not meet where two levels are close.
-    drawn = tuple(
-        Level(y.at(value), f"{name}: {value:.4g}", ("end", "start")[place % 2])
-        for place, (name, value) in enumerate(levels.items())
-    )
-    return LineChart(title, x_label, x.ticks(), y.ticks(), lines, drawn)
+    return LineChart(title, x_label, x.ticks(), y.ticks(), lines, _levels(levels, y))
+
+
+def _levels(levels: Mapping[str, float], y: _Scale) -> tuple[Level, ...]:
+    drawn: list[Level] = []
+    for name, value in sorted(levels.items(), key=lambda level: -level[1]):
+        at = y.at(value)
+        close = drawn and at - drawn[-1].y < _LABEL
+        drawn.append(Level(at, f"{name}: {value:.4g}", at + (_LABEL - 2 if close else -4)))
+    return tuple(drawn)
 
 
 def _line(name: str, style: int, curve: Mapping[float, float], x: _Scale, y: _Scale) -> Line:
@@ -188,13 +195,13 @@ def _line(name: str, style: int, curve: Mapping[float, float], x: _Scale, y: _Sc
 def bar_chart(title: str, bars: Sequence[tuple[str, float, float, float]]) -> BarChart:
     """Bars (name, value, low, high) one below the other, each under its whole name."""
     values = [0.0, *(end for bar in bars for end in bar[1:])]
-    x = _Scale(values, _BAR_MARGIN, WIDTH - _BAR_MARGIN)
+    x = _Scale(values, LEFT_OF_BARS, WIDTH - LEFT_OF_BARS)
     drawn, top = [], float(TOP)
     for name, value, low, high in bars:
         start, end = sorted((x.at(0), x.at(value)))
         summary = f"{name}: {value:.4g}, 95% interval {low:.4g} to {high:.4g}"
         lines = tuple(textwrap.wrap(name, _NAME_CHARACTERS)) or ("",)
-        y = top + _NAME * len(lines) + _BAR / 2
+        y = top + NAME * len(lines) + _BAR / 2
         drawn.append(Bar(lines, summary, top, y, start, end, x.at(low), x.at(high)))
         top = y + _BAR / 2 + _GAP
     return BarChart(title, top + BOTTOM, x.at(0), x.ticks(), tuple(drawn))
@@ -232,9 +239,7 @@ def histogram(
     # Edges are labelled where they lie, values below the middle of their column.
     labels, shift = (edges, 0.0) if edges is not None else (values or (), width / 2)
     labelled = range(0, len(labels), -(-len(labels) // _X_LABELS))
-    ticks = tuple(
-        Tick(round(LEFT + i * width + shift, 2), _short(labels[i])) for i in labelled
-    )
+    ticks = tuple(Tick(round(LEFT + i * width + shift, 2), _short(labels[i])) for i in labelled)
     most = max(columns, key=lambda column: column.height)
     summary = f"{len(counts)} columns from {names[0]} to {names[-1]}; the highest is {most.summary}"
     return Histogram(title, summary, x_label, ticks, y.ticks(), columns)

@@ -55,15 +55,18 @@ def data_quality(record: Mapping[str, Any]) -> DataQuality:
 
 
 def _dropped(dropped: Mapping[str, int], read: int) -> Table:
-    reasons = {**REASONS, "short_episode": "its session, or the piece of it in one split, is too short"}
+    reasons = {
+        **REASONS,
+        "short_episode": "its session, or the piece of it in one split, is too short",
+    }
     body = [
         (
-            reason.replace("_", " "),
-            [shown(rows), f"{rows / read:.2%}" if read else "–", reasons.get(reason, "")],
+            f"{reason.replace('_', ' ')}: {reasons.get(reason, 'dropped')}",
+            [shown(rows), f"{rows / read:.2%}" if read else "–"],
         )
         for reason, rows in dropped.items()
     ]
-    return Table("Rows dropped, by reason", "", ["rows", "share of rows read", "meaning"], body)
+    return Table("Rows dropped, by reason", "", ["rows", "share of rows read"], body)
 
 
 def _quantiles(found: Mapping[str, Mapping[str, Any]]) -> Table | None:

@@ -91,7 +91,7 @@ def _finite(value: Any) -> bool:
 
 
 def _estimates(rows: Sequence[Row]) -> list[Estimates]:
-    """Rows of one file by the `ucfrec ope` that wrote them: each begins with the logged sessions."""
+    """Rows of one file by the `ucfrec ope` that wrote them, each beginning with `logged`."""
     groups: list[list[Row]] = []
     for row in rows:
         if row["estimator"] == LOGGED or not groups:

@@ -72,9 +72,11 @@ def _about(
     return known
 
 
-def _session(place: int, session: Mapping[str, Any], about: Mapping[int, Mapping[str, str]]) -> Table:
-    lines = [("shown before", item, shown(reward))
-             for item, reward in zip(session["history"], session["rewards"], strict=True)]  # fmt: skip
+def _session(
+    place: int, session: Mapping[str, Any], about: Mapping[int, Mapping[str, str]]
+) -> Table:
+    earned = zip(session["history"], session["rewards"], strict=True)
+    lines = [("shown before", item, shown(reward)) for item, reward in earned]
     lines.append(("shown next in the log", session["logged"], "–"))
     for rank, item in enumerate(session["recommended"], start=1):
         again = " (shown before)" if item in session["history"] else ""

@@ -104,7 +104,8 @@ def _best(world: str, best: _Earned, others: Sequence[_Earned]) -> str:
     said += " an episode."
     close = [one for one in others if not best.above(one)]
     if close:
-        return f"{said} Its interval overlaps that of {_listed(close)}: which of them earns more is open."
+        said += f" Its interval overlaps that of {_listed(close)}:"
+        return f"{said} which of them earns more is open."
     return f"{said} Its interval lies above those of the others, the next being {others[0]}."
 
 

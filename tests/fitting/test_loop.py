@@ -1,8 +1,10 @@
 """The training loop: resumes to the bit, stops in time, keeps the best, says what it did."""
 
+import dataclasses
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 import time
@@ -316,6 +318,21 @@ def test_every_validation_is_logged(tmp_path: Path) -> None:
         assert all(math.isfinite(value) for value in values.values()), tag
     assert list(logged["validation_loss"].values()) == losses
     assert logged["mine"] == logged["loss"]
+
+
+def test_without_a_terminal_a_line_says_how_far_it_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ucfrec.progress.FIRST_LINE", 0.0)
+    monkeypatch.setattr("ucfrec.progress.NEXT_LINE", 0.0)
+    module = linear()
+    fit(module, draw, squared(module), FAST, tmp_path, seed=1, describe="critic")
+    lines = capsys.readouterr().err.splitlines()
+    assert any(re.match(r"critic: 6 of 12 steps \(50%\), .* steps/s, .* left", x) for x in lines)
+    assert any("loss " in line for line in lines)
+    longer = dataclasses.replace(FAST, steps=16)
+    fit(module, draw, squared(module), longer, tmp_path, seed=1, describe="critic")
+    assert capsys.readouterr().err.startswith("critic: 13 of 16 steps")
 
 
 @pytest.mark.parametrize("slow", ["draw", "loss"])

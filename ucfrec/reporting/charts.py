@@ -11,6 +11,8 @@ WIDTH, HEIGHT = 360, 220
 a phone, so that text keeps its size there."""
 LEFT, RIGHT, TOP, BOTTOM = 52, 22, 16, 40
 """Margins around what is plotted."""
+BAR_BOTTOM = 26
+"""Of bar charts, whose axis needs no name."""
 LEFT_OF_BARS = 14
 """Margin at both sides of a bar chart, whose names stand above their bars."""
 NAME, _BAR, _GAP = 16, 18, 10
@@ -204,7 +206,7 @@ def bar_chart(title: str, bars: Sequence[tuple[str, float, float, float]]) -> Ba
         y = top + NAME * len(lines) + _BAR / 2
         drawn.append(Bar(lines, summary, top, y, start, end, x.at(low), x.at(high)))
         top = y + _BAR / 2 + _GAP
-    return BarChart(title, top + BOTTOM, x.at(0), x.ticks(), tuple(drawn))
+    return BarChart(title, top + BAR_BOTTOM, x.at(0), x.ticks(), tuple(drawn))
 
 
 def histogram(

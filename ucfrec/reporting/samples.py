@@ -16,11 +16,11 @@ from ucfrec.reporting.tables import Table, shown
 from ucfrec.runs.samples import SAMPLES
 from ucfrec.runs.trained_policy import ITEMS
 
-_FEATURES, _CHARACTERS = 8, 60
-"""Most features of an item that are shown, and characters of one."""
+_CHARACTERS = 120
+"""Most characters of an item's features."""
 
 
-def sample_tables(run: Path, features: pa.Table | None) -> tuple[float, list[Table]] | None:
+def sample_tables(run: Path, features: pa.Table | None) -> tuple[str, list[Table]] | None:
     """The target return and a table a session; None where a run recorded no samples.
 
     Args:
@@ -33,7 +33,7 @@ def sample_tables(run: Path, features: pa.Table | None) -> tuple[float, list[Tab
     numbers = {n for s in sessions for n in (*s["history"], s["logged"], *s["recommended"])}
     about = _about(pq.read_table(run / ITEMS), sorted(numbers), features)
     tables = [_session(place, one, about) for place, one in enumerate(sessions, start=1)]
-    return samples["target_return"], tables
+    return shown(samples["target_return"]), tables
 
 
 def read_features(path: Path) -> pa.Table:
@@ -55,21 +55,33 @@ def read_features(path: Path) -> pa.Table:
 def _about(
     items: pa.Table, numbers: Sequence[int], features: pa.Table | None
 ) -> dict[int, dict[str, str]]:
-    """What is known of each item, by its number: its id, then features by name."""
+    """What is known of each item, by its number: columns of `items`, then its features."""
     rows = items.take(pa.array(numbers, pa.int64())).to_pylist()
-    more: dict[Any, Mapping[str, Any]] = {}
+    known = {
+        number: {name: str(value) for name, value in row.items()}
+        for number, row in zip(numbers, rows, strict=True)
+    }
     if features is not None:
         ids = pa.array([row[schema.ITEM_ID] for row in rows])
         try:
-            found = features.filter(pc.is_in(features[schema.ITEM_ID], value_set=ids))
-        except pa.ArrowInvalid:  # ids of another kind, so none is the same
-            found = features.slice(0, 0)
-        more = {row[schema.ITEM_ID]: row for row in found.to_pylist()}
-    known = {}
-    for number, row in zip(numbers, rows, strict=True):
-        joined = {**row, **more.get(row[schema.ITEM_ID], {})}
-        known[number] = {name: _text(name, value) for name, value in joined.items()}
+            found = features.filter(pc.is_in(features[schema.ITEM_ID], value_set=ids)).to_pylist()
+        except (pa.ArrowInvalid, pa.ArrowNotImplementedError, TypeError):
+            found = []  # ids of another type, so that none is the same
+        described = {row.pop(schema.ITEM_ID): _described(row) for row in found}
+        for number, row in zip(numbers, rows, strict=True):
+            known[number]["features"] = described.get(row[schema.ITEM_ID], "–")
     return known
+
+
+def _described(features: Mapping[str, Any]) -> str:
+    """Features that are neither missing nor zero, in a few words."""
+    parts = []
+    for name, value in features.items():
+        text = ", ".join(map(shown, value)) if isinstance(value, list) else shown(value)
+        if value:
+            parts.append(f"{name} {text}")
+    described = "; ".join(parts) or "–"
+    return described if len(described) <= _CHARACTERS else f"{described[: _CHARACTERS - 1]}…"
 
 
 def _session(
@@ -81,18 +93,8 @@ def _session(
     for rank, item in enumerate(session["recommended"], start=1):
         again = " (shown before)" if item in session["history"] else ""
         lines.append((f"recommended {rank}{again}", item, "–"))
-    names = dict.fromkeys(name for item in about.values() for name in item)
-    columns = list(names)[: 1 + _FEATURES]
+    columns = list(about[session["logged"]])
     body = [
-        (what, [*(about[item].get(name, "–") for name in columns), reward])
-        for what, item, reward in lines
+        (what, [reward, *(about[item][name] for name in columns)]) for what, item, reward in lines
     ]
-    return Table(f"Held-out session {place}", "", [*columns, "reward"], body)
-
-
-def _text(name: str, value: Any) -> str:
-    """A feature in a few characters; a list by its elements."""
-    if name == schema.ITEM_ID:
-        return str(value)
-    text = ", ".join(map(shown, value)) if isinstance(value, list) else shown(value)
-    return text if len(text) <= _CHARACTERS else f"{text[: _CHARACTERS - 1]}…"
+    return Table(f"Held-out session {place}", "", ["reward", *columns], body)

@@ -88,7 +88,8 @@ def demo(out: Path, seed: int, config: DemoConfig) -> list[dict[str, Any]]:
         rows += [learned[world, name] for name in order]
     write_json(out / "results.json", rows)
     runs = [out / world / name for world in WORLDS for name in LEARNERS]
-    write_report(out / "report.html", runs, [out / "results.json"])
+    items = out / "synthetic-catalog" / "logs" / "items.parquet"
+    write_report(out / "report.html", runs, [out / "results.json"], items)
     return rows
 
 

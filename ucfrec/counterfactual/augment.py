@@ -19,7 +19,13 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.counterfactual.edit_statistics import MoveReport, MoveStatistics
 from ucfrec.counterfactual.generators import CSGConfig, Generator, make_generator
-from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, CRMReport, fit_crm
+from ucfrec.counterfactual.reward_model import (
+    CausalRewardModel,
+    CRMConfig,
+    CRMReport,
+    fit_crm,
+    fit_warning,
+)
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import FloatArray, IntArray, Overlay, Transitions
 from ucfrec.errors import InputError
@@ -68,7 +74,7 @@ class AugmentationReport:
     verdict: str
     """In plain words, what the bound is worth."""
     warnings: tuple[str, ...]
-    """Latent collapse or leak, edit collapse; empty if neither."""
+    """A reward model that predicts nothing, latent collapse or leak, edit collapse."""
     reward_model: CRMReport
 
 
@@ -305,7 +311,8 @@ def _report(overlay: Overlay, editor: _Editor, crm_report: CRMReport) -> Augment
     moves = editor.moves()
     delta = crm_report.delta[_DELTA_LEVEL]
     bound = delta + editor.epsilon_r
-    warnings = [crm_report.warning] if crm_report.warning else []
+    of_model = (fit_warning(crm_report.r2_without_z), crm_report.warning)
+    warnings = [warning for warning in of_model if warning]
     if moves.edits and moves.mean_move_ratio > 0.5:
         warnings.append(
             f"edit collapse: {moves.mean_move_ratio:.0%} of the average edit is one shift common "

@@ -20,6 +20,8 @@ from ucfrec.settings import BatchSize, LearningRate, Weight, WeightDecay, Width,
 
 _ACTIVE_NATS = 0.01
 _LEAK = 0.1
+_PREDICTS_NOTHING = 0.02
+"""R² on held-out steps up to which a reward model is as good as none."""
 _QUANTILES = (0.5, 0.9, 0.95, 0.99)
 _CONSTANT = 1e-6
 _VALIDATION_LIMIT = 20_000
@@ -328,6 +330,21 @@ def _report(model: CausalRewardModel, n_train: int, held_out: Transitions) -> CR
         delta={f"{level:g}": float(errors.quantile(level)) for level in _QUANTILES},
     )
     return replace(report, warning=_warning(report))
+
+
+def fit_warning(r2_without_z: float) -> str:
+    """What to say of a reward model that predicts nothing; empty of one that does.
+
+    Args:
+        r2_without_z: `CRMReport.r2_without_z`.
+    """
+    if r2_without_z > _PREDICTS_NOTHING:
+        return ""
+    return (
+        f"the reward model predicts nothing: from state and action its R² on held-out steps is "
+        f"{r2_without_z:.2f} (0 is what the mean reward alone reaches), so an edit that keeps its "
+        "prediction may still change the true reward"
+    )
 
 
 def _warning(report: CRMReport) -> str:

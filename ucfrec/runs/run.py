@@ -24,6 +24,8 @@ from ucfrec.policies.heads import ItemHead
 from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import command_line, versions
 from ucfrec.runs.config import Config, config_from_dict
+from ucfrec.runs.reference_losses import reference_losses
+from ucfrec.runs.samples import SAMPLES, sample_recommendations
 from ucfrec.runs.trained_policy import AUGMENTATION, COUNTS, ITEMS, RUN, USERS
 
 _VALIDATION_BATCHES = 16
@@ -65,7 +67,7 @@ def train_run(
         require_rewards_vary(train)
     policy = new_policy(train, config)
     if not (out / RUN).exists():
-        _begin(store, train, out, config, about or {})
+        _begin(store, train, validation, out, config, about or {})
     record = read_json(out / RUN)
     record["config"] = dataclasses.asdict(config)
     began = time.perf_counter() - record["wall_time_s"]
@@ -96,6 +98,9 @@ def train_run(
     )
     record["policy"] = dataclasses.asdict(fitted)
     record["wall_time_s"] = time.perf_counter() - began
+    if store.has_items:
+        target = max(record["return_quantiles"].values())
+        write_json(out / SAMPLES, sample_recommendations(policy, validation, target))
     write_json(out / RUN, record)
     return dict(record)
 
@@ -117,6 +122,7 @@ def training_views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
 def _begin(
     store: EpisodeStore,
     train: EpisodeStore,
+    validation: EpisodeStore,
     out: Path,
     config: Config,
     about: Mapping[str, Any],
@@ -136,6 +142,7 @@ def _begin(
         "train_steps": train.n_steps,
         "return_quantiles": {str(q): float(np.quantile(train.returns, q)) for q in _QUANTILES},
         "mean_return": float(train.returns.mean()),
+        "data": store.meta["source"],
         "versions": versions(),
         "wall_time_s": 0.0,
         **about,
@@ -145,7 +152,9 @@ def _begin(
             if (store.path / name).exists():
                 shutil.copyfile(store.path / name, scratch / name)
         if store.has_items:
-            TrainingCounts.of(train).save(scratch / COUNTS)
+            counts = TrainingCounts.of(train)
+            counts.save(scratch / COUNTS)
+            record["reference_losses"] = reference_losses(counts, validation)
         write_json(scratch / RUN, record)
 
 

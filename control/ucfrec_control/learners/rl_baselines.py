@@ -17,8 +17,8 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_file, atomic_folder, read_json, write_json
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
+from ucfrec.fitting.metrics_log import MetricsLog
 from ucfrec.fitting.random_state import random_state_kept
-from ucfrec.fitting.tensorboard import Events
 from ucfrec.progress import progress
 from ucfrec.provenance import command_line, versions
 from ucfrec.runs.trained_policy import RUN
@@ -134,7 +134,7 @@ def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dic
         _begin(store, out, config, seed)
     record: dict[str, Any] = read_json(out / RUN)
     step, seconds = _resume(out / _CHECKPOINT, learner, dataset)
-    events = Events(out, step)
+    log = MetricsLog(out, step)
     with progress(config.steps, config.algorithm, "steps", done=step) as bar:
         while step < config.steps:
             if step:  # a seed of its own after each checkpoint: no generator's state need be kept
@@ -149,9 +149,9 @@ def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dic
                 callback=lambda *_: bar.update(),
             )
             step += steps
-            events.add(step, losses)
+            log.add(step, losses)
             _save(out / _CHECKPOINT, learner, step, seconds + perf_counter() - begun)
-    events.close()
+    log.close()
     actor = learner.impl.modules.policy.state_dict()
     save_tensors(out / _ACTOR, {**actor, "state.mean": mean, "state.std": std}, {})
     record["policy"] = {"steps": config.steps, "best_step": None}

@@ -12,7 +12,7 @@ from tests.support.control_files import hopper_like, write_hdf5
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files import read_json
-from ucfrec.fitting.tensorboard import read_scalars
+from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec_control.benchmark.plan import TABLES, Budget, benchmark
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
@@ -64,7 +64,7 @@ def test_a_training_that_was_interrupted_ends_as_one_left_alone(
     train_rl(store, tmp_path / "interrupted", config, 0)
     actors = [tmp_path / run / "actor.safetensors" for run in ("alone", "interrupted")]
     assert actors[0].read_bytes() == actors[1].read_bytes()
-    alone, interrupted = (read_scalars(tmp_path / run) for run in ("alone", "interrupted"))
+    alone, interrupted = (read_metrics(tmp_path / run) for run in ("alone", "interrupted"))
     for loss in ("actor_loss", "critic_loss"):
         assert list(alone[loss]) == [2, 4, 6, 7]
         assert alone[loss] == interrupted[loss]

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from ucfrec.commands.demo_run import DemoConfig, demo
-from ucfrec.provenance import format_rows
+from ucfrec.reporting.tables import format_rows
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

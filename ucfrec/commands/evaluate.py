@@ -7,7 +7,7 @@ from ucfrec.commands.options import target_given, target_options, world_options
 from ucfrec.errors import InputError
 from ucfrec.evaluation.evaluate import World, evaluate_behavior, evaluate_policy
 from ucfrec.files import write_json
-from ucfrec.provenance import format_rows
+from ucfrec.reporting.tables import format_rows
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 

@@ -7,10 +7,11 @@ from typing import Any
 
 from ucfrec.errors import InputError
 from ucfrec.evaluation.diversity_columns import COLUMNS
-from ucfrec.files import read_json
 from ucfrec.reporting import charts
-from ucfrec.reporting.grid import Row, read_rows
+from ucfrec.reporting.evaluation_rows import read_evaluations
 from ucfrec.reporting.tables import Table, shown
+
+Row = dict[str, Any]
 
 _INTERVAL = ("R_cum", "R_cum_low", "R_cum_high")
 _METRICS = ("R_avg_pooled", "R_avg_episode", "length", *COLUMNS, "target_return", "episodes")
@@ -23,12 +24,7 @@ def read_results(path: Path) -> list[Row]:
     Raises:
         InputError: the file is missing or holds something else.
     """
-    if path.suffix == ".jsonl" and path.exists():
-        rows: Any = read_rows(path)
-    else:
-        rows = read_json(path)
-    if not isinstance(rows, list):
-        raise InputError(f"{path} holds no list of result rows; give what `ucfrec evaluate` wrote")
+    rows = read_evaluations(path)
     for number, row in enumerate(rows, start=1):
         known = row if isinstance(row, dict) else {}
         lacking = [name for name in ("world", "policy") if not isinstance(known.get(name), str)]

@@ -17,7 +17,7 @@ from ucfrec.reporting.grid import Row, read_rows
 from ucfrec.runs.trained_policy import RUN
 from ucfrec_control.benchmark.robustness import drops, loss_rises
 from ucfrec_control.figures import diagnostics, plots
-from ucfrec_control.figures.figure_style import label, save
+from ucfrec.reporting.plot_style import label, save
 from ucfrec_control.learners.evaluate import method_of
 
 LOWS = (0.0, 0.1, 0.2, 0.3, 0.4)

@@ -12,7 +12,7 @@ from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from ucfrec_control.figures.figure_style import COLUMN, EDITED, FACTUAL, PAGE, colors, label, styled
+from ucfrec.reporting.plot_style import COLUMN, EDITED, FACTUAL, PAGE, colors, label, styled
 
 FloatArray = npt.NDArray[np.float64]
 Row = Mapping[str, Any]

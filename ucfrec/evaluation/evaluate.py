@@ -61,7 +61,7 @@ def evaluate_policy(
     seed: int,
     target_return: float,
 ) -> dict[str, Any]:
-    """One result row for a trained policy asked for `target_return` in every episode.
+    """One result row for a trained policy with `target_return` in every episode.
 
     Raises:
         InputError: the policy's actions or observations are not this world's.

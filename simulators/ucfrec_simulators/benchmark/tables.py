@@ -45,15 +45,13 @@ def target_table(rows: Sequence[ResultRow]) -> str:
 def distractor_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
     """Per target and method: trained without the distractor; trained with it, played off and on."""
 
-    def key(row: ResultRow) -> tuple[str | None, float, str]:
+    def key(row: ResultRow) -> tuple[str, float, str]:
         # Worlds together, the largest target first; methods stay in their order.
-        return row.world, -float(str(row.conditions["quantiles"])), row.method
+        return str(row.world), -float(str(row.conditions["quantiles"])), row.method
 
     groups = grouped(of_checkpoint(rows, checkpoint), key)
     lines = []
-    for (world, quantile, method), own in sorted(
-        groups.items(), key=lambda g: (str(g[0][0]), g[0][1])
-    ):
+    for (world, quantile, method), own in sorted(groups.items(), key=lambda group: group[0][:2]):
         by_seed = [
             {r.training_seed: r.value for r in own if r.conditions["distractor"] == rate}
             for rate in DISTRACTOR_RATES

@@ -141,7 +141,7 @@ def return_curves(rows: Sequence[Row], title: str = "") -> Figure:
     it. On the dashed line, the target is earned.
 
     Args:
-        rows: lines (`ResultRow.as_line`) that differ in `method`, `target_return` and `training_seed`.
+        rows: lines (`ResultRow.as_line`) that differ in `method`, `target_return` and seed.
     """
     figure, axes = _figure(COLUMN, 2.5, title)
     earned = _by_seed(rows, ("method", "target_return"), "return")

@@ -1,6 +1,6 @@
 """Which policy settings predict held-out actions best: the choice of λ and the weight of a_{t−1}.
 
-    python -m benchmarks.policy_settings --store STORE... --out runs/settings
+    python benchmarks/policy_settings.py --store STORE... --out runs/settings
 
 Trains UCF without copies on each store with each pair of settings and compares the validation
 loss, never a simulator. Appends the rows to results.jsonl in --out, or to --results, and prints a
@@ -49,7 +49,7 @@ def key(cell: Cell) -> RowKey:
         policy="ucf",
         training_seed=0,
         conditions={"lambda_mask": cell.lambda_mask, "parent_action": cell.parent_action},
-        code_version=code_version("ucfrec.runs.run", "ucfrec.policies.ucf"),
+        code_version=code_version(Path(__file__), "ucfrec.runs.run", "ucfrec.policies.ucf"),
         data_fingerprint=EpisodeStore.open(cell.store).meta["fingerprint"],
     )
 
@@ -85,8 +85,11 @@ def main() -> None:
     results = options.results or options.out / "results.jsonl"
     rows = run_grid(cells, Measurement(key, config, measure), results, 2, "policy settings")
     lines = [
-        (row.task, *(f"{row.conditions[n]:g}" for n in ("lambda_mask", "parent_action")))
-        + (f"{row.value:.4f}",)
+        (
+            row.task,
+            *(f"{row.conditions[name]:g}" for name in ("lambda_mask", "parent_action")),
+            f"{row.value:.4f}",
+        )
         for row in rows
     ]
     print(markdown_table(("store", "λ", "weight of a_{t−1}", "validation loss"), lines))

@@ -48,7 +48,7 @@ def read_lines(path: Path) -> list[tuple[int, object]]:
             found.append((number, json.loads(line)))
         except (ValueError, RecursionError):
             raise InputError(
-                f"{path}, line {number}, is no result row; delete the line to measure it again"
+                f"{path}, line {number} is no result row; delete the line to measure it again"
             ) from None
     return found
 

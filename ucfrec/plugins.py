@@ -47,7 +47,7 @@ class Benchmark:
     run: Callable[["BenchmarkRequest"], str]
     """Measures the cells that have no row yet; returns the tables as Markdown."""
     show: Callable[[Sequence[str], Sequence["ResultRow"]], str]
-    """(tables, rows) to those of the tables, as Markdown, that the rows have something for."""
+    """(tables, rows of the suite) to the tables that the rows have something for, as Markdown."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ from ucfrec.commands.grid_options import (
     results_given,
     rows_given,
 )
-from ucfrec.errors import InputError
 from ucfrec.plugins import Benchmark, BenchmarkRequest, load_plugin
 from ucfrec.reporting.grid import chosen
 
@@ -29,10 +28,7 @@ def run(options: argparse.Namespace) -> None:
     suite: Benchmark = load_plugin("benchmarks", options.suite)
     tables, results = chosen(suite.tables, options.table, "table"), results_given(options)
     if options.show_only:
-        shown = suite.show(tables, rows_given(options))
-        if not shown:
-            raise InputError(f"{results} holds no rows of {options.suite}, {', '.join(tables)}")
-        print(shown)
+        print(suite.show(tables, rows_given(options, options.suite, tables)))
         return
     request = BenchmarkRequest(
         budget=options.budget,

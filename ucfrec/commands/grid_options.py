@@ -1,6 +1,7 @@
 """Options that every benchmark takes, of `ucfrec` and of `ucfrec-control`."""
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 from ucfrec.errors import InputError
@@ -50,13 +51,20 @@ def results_given(options: argparse.Namespace) -> Path:
     return given
 
 
-def rows_given(options: argparse.Namespace) -> list[ResultRow]:
+def rows_given(
+    options: argparse.Namespace, suite: str, tables: Sequence[str] = ()
+) -> list[ResultRow]:
     """The rows that `--show-only` is about: of those that measure the same, the last.
+
+    Args:
+        tables: of the suite; empty for all.
 
     Raises:
         InputError: there are none, or the file holds something else.
     """
     path = results_given(options)
-    if rows := latest(read_rows(path)):
+    own = [row for row in latest(read_rows(path)) if row.suite == suite]
+    if rows := [row for row in own if not tables or row.table in tables]:
         return rows
-    raise InputError(f"{path} holds no result rows; name a file that does with --results")
+    wanted = ", ".join([suite, *tables])
+    raise InputError(f"{path} has no rows of {wanted}; name a file that has with --results")

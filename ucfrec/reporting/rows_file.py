@@ -107,7 +107,7 @@ def latest(rows: Sequence[ResultRow]) -> list[ResultRow]:
 
 _SAME: Final = (
     *("suite", "table", "task", "method", "world", "checkpoint"),
-    *("training_seed", "log_seed"),
+    *("training_seed", "log_seed", "evaluation_seed"),
 )
 
 
@@ -139,7 +139,8 @@ def _append(path: Path, values: Sequence[Mapping[str, Any]]) -> None:
     with atomic_file(path) as scratch, scratch.open("wb") as file:
         file.write(before)
         for value in values:
-            file.write(json.dumps(value, allow_nan=False, ensure_ascii=False).encode() + b"\n")
+            line = json.dumps(value, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
+            file.write(line.encode() + b"\n")
         _flush(file)
 
 

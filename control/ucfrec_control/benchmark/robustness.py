@@ -116,7 +116,7 @@ def drops(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
             continue
         clean, score = plain["score"], metrics["score"]
         lost = 100 * (clean - score) / clean if clean > 0 else float("nan")
-        values = (clean, score, lost, metrics["score_at_one"])
+        values = (clean, score, lost, metrics.get("score_at_one"))
         names = ("task", "method", "training_seed", "distractor")
         found.append(dict(zip((*names, *SHOWN), (*pair, distractor, *values), strict=True)))
     return found

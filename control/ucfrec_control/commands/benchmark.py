@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ucfrec.commands.grid_options import results_given, rows_given
-from ucfrec.errors import InputError
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.tables import format_rows
 from ucfrec_control.benchmark.cells import SCORES
@@ -38,10 +37,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """`ucfrec-control benchmark`."""
     if options.show_only:
-        known = rows_given(options)
-        rows = [r for r in known if (r.suite, r.table) == (SCORES, options.table)]
-        if not rows:
-            raise InputError(f"{results_given(options)} holds no rows of table {options.table}")
+        rows = rows_given(options, SCORES, [options.table])
     else:
         rows = benchmark(
             data_given(options),
@@ -60,9 +56,9 @@ def run(options: argparse.Namespace) -> None:
 def _print_tables(rows: Sequence[ResultRow], table: str) -> None:
     print(format_rows([_line(row) for row in rows], _SHOWN))
     for checkpoint in CHECKPOINTS:
-        lines = score_table(rows, checkpoint)
-        print(f"\nscores of the {checkpoint} checkpoint, mean ± standard deviation over seeds")
-        print(format_rows(lines, list(lines[0])))
+        if lines := score_table(rows, checkpoint):
+            print(f"\nscores of the {checkpoint} checkpoint, mean ± standard deviation over seeds")
+            print(format_rows(lines, list(lines[0])))
     last = [row for row in rows if row.checkpoint == "last"]
     by, values = ("task", "method"), ("score", "validation_loss")
     shown = (*values, "acceptance")

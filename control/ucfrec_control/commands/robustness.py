@@ -30,7 +30,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """`ucfrec-control robustness`."""
     if options.show_only:
-        rows = [row for row in rows_given(options) if row.suite == ROBUSTNESS]
+        rows = rows_given(options, ROBUSTNESS)
     else:
         rows = robustness(
             data_given(options),

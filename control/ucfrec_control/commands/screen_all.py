@@ -19,7 +19,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """`ucfrec-control screen-all`."""
     if options.show_only:
-        rows = [row for row in rows_given(options) if row.suite == SCREENING]
+        rows = rows_given(options, SCREENING)
     else:
         files, stores = BUDGETS["full"].files, stores_of(options.out)
         given = (data_given(options), stores, files, results_given(options), options.workers)

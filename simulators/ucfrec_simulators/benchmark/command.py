@@ -10,7 +10,7 @@ from ucfrec.errors import InputError
 from ucfrec.plugins import Benchmark, BenchmarkRequest
 from ucfrec.reporting.grid import run_grid
 from ucfrec.reporting.result_row import ResultRow
-from ucfrec_simulators.benchmark.cells import MEASUREMENT, SUITE
+from ucfrec_simulators.benchmark.cells import MEASUREMENT
 from ucfrec_simulators.benchmark.plan import BUDGETS, Plan
 from ucfrec_simulators.benchmark.plots import (
     plot_distractor,
@@ -58,8 +58,7 @@ def run(request: BenchmarkRequest) -> str:
 
 def show(tables: Sequence[str], rows: Sequence[ResultRow]) -> str:
     """The tables that `rows` have something for, as Markdown; nothing is measured."""
-    own = [row for row in rows if row.suite == SUITE]
-    found = {table: [row for row in own if row.table == table] for table in tables}
+    found = {table: [row for row in rows if row.table == table] for table in tables}
     return "\n\n".join(_shown(table, rows) for table, rows in found.items() if rows)
 
 

@@ -17,7 +17,7 @@ from ucfrec.evaluation.evaluate import World, evaluate_behavior
 from ucfrec.plugins import Benchmark, BenchmarkRequest, load_plugin
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows, read_configurations, read_rows
-from ucfrec_simulators.benchmark import cells, plan, plots
+from ucfrec_simulators.benchmark import plan, plots
 from ucfrec_simulators.benchmark.cells import EvaluationPlan
 from ucfrec_simulators.benchmark.methods import METHODS
 from ucfrec_simulators.benchmark.plan import BUDGETS, Plan
@@ -56,7 +56,7 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     assert "kuairand is left out" in said
     rows = read_rows(results)
     built_in = [(name, None, None) for name in ("random", "mixture", "optimal")]
-    trained = [(n, s, c) for n in some for s in (0, 1) for c in ("best", "last")]
+    trained = [(n, s, c) for s in (0, 1) for n in some for c in ("best", "last")]
     assert [(r.method, r.training_seed, r.checkpoint) for r in rows] == [*built_in, *trained]
     assert {(r.suite, r.table, r.world, r.log_seed) for r in rows} == {
         ("recommendation", "main", "synthetic-catalog", 0)
@@ -81,7 +81,6 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     assert suite.show(["main", "sweeps"], rows) in said
     # Code that a row runs through has changed: trained and played again.
     monkeypatch.setattr(plan, "METHODS", {"popular": METHODS["popular"]})
-    monkeypatch.setattr(cells, "CHECKPOINTS", ("last",))
     monkeypatch.setattr(plan, "code_version", lambda *roots, apart=(): "other")
     suite.run(request)
     again = read_rows(results)[len(rows) :]
@@ -139,12 +138,12 @@ def test_tables_of_rows_at_hand_are_shown_without_measuring(
     path = tmp_path / "rows.jsonl"
     arguments = ["benchmark", "recommendation", "--show-only", "--results", str(path)]
     assert main(arguments) == 2
-    assert "rows.jsonl holds no result rows" in capsys.readouterr().err
+    assert "rows.jsonl has no rows of recommendation, main" in capsys.readouterr().err
     append_rows(path, [result_row(10.0), result_row(20.0), result_row(3.0, training_seed=1)])
     assert main(arguments) == 0
     assert "| w | m | 2 | 11.5 ± 12 |" in capsys.readouterr().out, "the last of a seed counts"
     assert main([*arguments, "--table", "sweeps"]) == 2
-    assert "holds no rows of recommendation, sweeps" in capsys.readouterr().err
+    assert "has no rows of recommendation, sweeps" in capsys.readouterr().err
 
 
 RATES = (None, 0.0, 1.0)
@@ -205,8 +204,8 @@ def test_error_bars_are_those_of_the_tables() -> None:
     figure = pytest.importorskip("matplotlib.figure").Figure()
     axes = figure.add_subplot()
     plots._bars(axes, [result_row(value, training_seed=s) for s, value in enumerate((1.0, 3.0))])
-    (bar,) = (c for c in axes.containers if c.errorbar is not None)
-    ((left, right),) = (segment[:, 0] for segment in bar.errorbar[2][0].get_segments())
+    (spread,) = (c.errorbar[2][0] for c in axes.containers if getattr(c, "errorbar", None))
+    ((left, right),) = (segment[:, 0] for segment in spread.get_segments())
     assert (right - left) / 2 == pytest.approx(2**0.5)
 
 

@@ -37,7 +37,8 @@ def row_of(found: Mapping[str, Any], seed: int, code: str) -> ResultRow:
         code_version=code,
         data_fingerprint=found["fingerprint"],
     )
-    return evaluation_row(found, key, rule="target return: the largest of training")
+    rule = "target return: the largest of training" if trained else None
+    return evaluation_row(found, key, rule=rule)
 
 
 def main() -> None:

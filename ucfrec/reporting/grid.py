@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-import torch
 from tqdm import tqdm
 
 from ucfrec.errors import InputError
@@ -94,7 +93,7 @@ def _measure_all(
     found: dict[str, list[ResultRow]] = {}
     failed: list[str] = []
     spawn = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, spawn, initializer=torch.set_num_threads, initargs=(1,))
+    pool = ProcessPoolExecutor(workers, spawn, initializer=_one_thread)
     waiting: dict[Future[list[ResultRow] | None], str] = {}
     try:
         waiting = {pool.submit(_measure, task): name for name, task in tasks.items()}
@@ -124,6 +123,12 @@ def _measure_all(
     finally:
         pool.shutdown(cancel_futures=True)
     return found, failed
+
+
+def _one_thread() -> None:
+    import torch  # takes a second, and who only shows rows has no need of it
+
+    torch.set_num_threads(1)
 
 
 def _measure(task: _Task[Cell]) -> list[ResultRow] | None:

@@ -64,20 +64,18 @@ def test_drops_compare_with_the_same_seed_without_distractor() -> None:
     assert math.isnan(found["early", 1]["drop"])
 
 
-def test_cells_are_measured_once_and_screening_is_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def begin(tmp_path: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A small table of one file and one distractor, its screened runs begun in `out`."""
     settings = (*TINY, "crm.epochs=1")
     monkeypatch.setattr(robustness, "BUDGETS", {"small": Budget((FILE,), 1, 2, settings)})
     monkeypatch.setattr("ucfrec_control.commands.robustness.ROBUSTNESS_BUDGETS", robustness.BUDGETS)
-    methods = ("dt", *robustness.SCREENED)
-    monkeypatch.setattr(robustness, "METHODS", methods)
+    monkeypatch.setattr(robustness, "METHODS", ("dt", *robustness.SCREENED))
     kinds = {kind: robustness.DISTRACTORS[kind] for kind in ("none", "deterministic")}
     monkeypatch.setattr(robustness, "DISTRACTORS", kinds)
     columns = hopper_like((30, 8, 25) * 8)
     columns["observations"][:, 4] = 0.0  # a constant causes nothing
     columns["rewards"] = columns["observations"][:, 0]
-    file, out = write_hdf5(tmp_path / f"{FILE}.hdf5", columns), tmp_path / "out"
+    file = write_hdf5(tmp_path / f"{FILE}.hdf5", columns)
     # Begun here, where screening may be made quick, and gone on with by the command.
     quickest = ScreeningConfig(hidden=32, shared_steps=200, own_steps=100)
     monkeypatch.setattr("ucfrec_control.learners.train.ScreeningConfig", lambda: quickest)
@@ -89,6 +87,13 @@ def test_cells_are_measured_once_and_screening_is_reported(
         for method, screening in robustness.SCREENED.items():
             train_control(store, run_of(out, kind, method), config, screening=screening)
 
+
+def test_cells_are_measured_once_and_screening_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    begin(tmp_path, out, monkeypatch)
+    methods, kinds = robustness.METHODS, robustness.DISTRACTORS
     results = tmp_path / "rows.jsonl"
     arguments = ["robustness", "--data", str(tmp_path), "--out", str(out)]
     arguments += ["--results", str(results)]
@@ -123,8 +128,8 @@ def test_cells_are_measured_once_and_screening_is_reported(
         assert rise["loss"] * (1 + rise["rise"] / 100) == pytest.approx(rise["loss_at_zero"])
         assert f"{rise['loss']:.4g}" in printed
     made, _ = make_figures([], [results], tmp_path / "figures")
-    kinds = ("scores", "drops", "losses")
-    assert {p.stem for p in made} == {f"robustness-{kind}-small-{FILE}" for kind in kinds}
+    drawn = {f"robustness-{kind}-small-{FILE}" for kind in ("scores", "drops", "losses")}
+    assert {p.stem for p in made} == drawn
     screened = {r["distractor"]: r for r in screening_rows(rows)}
     assert 4 in screened["none"]["true_flagged"]
     assert screened["none"]["flagged"] == NONE

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
 
     from ucfrec.acting.rollout import Actor
+    from ucfrec.reporting.result_row import ResultRow
 
 _ONE_OF: Final = {
     "benchmarks": "benchmark",
@@ -52,9 +53,28 @@ class Benchmark:
     """One line for `--help`."""
     tables: tuple[str, ...]
     """By name, in the order in which they are measured."""
-    run: Callable[[str, Sequence[str], Path, Path, int], str]
-    """(budget, tables, folder of runs, file of result rows, processes) to the tables as Markdown;
-    cells that have rows already are not measured again."""
+    run: Callable[["BenchmarkRequest"], str]
+    """Measures the cells that have no row yet; returns the tables as Markdown."""
+    show: Callable[[Sequence[str], Sequence["ResultRow"]], str]
+    """(tables, rows of the suite) to the tables that the rows have something for, as Markdown."""
+
+
+@dataclass(frozen=True)
+class BenchmarkRequest:
+    """What of a benchmark is measured, and where to."""
+
+    budget: str
+    tables: Sequence[str]
+    out: Path
+    """Folder of logs, stores and runs."""
+    results: Path
+    """File of result rows."""
+    workers: int
+    """Processes."""
+    log_seed: int = 0
+    """Of the logs that are simulated."""
+    evaluation_seed: int | None = None
+    """Of the episodes that are reported; None for the budget's."""
 
 
 def plugin_names(group: str) -> list[str]:

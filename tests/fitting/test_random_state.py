@@ -14,8 +14,9 @@ from tests.support import killed_run
 from ucfrec.counterfactual.augment import counterfactual_copies
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.evaluate import World, evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.simulated_store import simulated_store
+from ucfrec.evaluation.world import World
 from ucfrec.fitting.loop import LoopConfig, fit
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.registry import BUILT_IN

@@ -49,7 +49,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """`ucfrec demo`."""
-    from ucfrec.provenance import format_rows
+    from ucfrec.reporting.tables import format_rows
 
     print(format_rows(demo(options.out, options.seed, DemoConfig())))
     print(f"\nreport: {options.out / 'report.html'}; rows, logs, stores and runs lie beside it")

@@ -24,7 +24,7 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.logs.summary import format_report
     from ucfrec.off_policy.evaluate import judge_off_policy
     from ucfrec.off_policy.score import logged_sessions
-    from ucfrec.provenance import format_rows
+    from ucfrec.reporting.tables import format_rows
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     files, mapping = logs_given(options)

@@ -1,6 +1,5 @@
 """IQL and CQL of d3rlpy: what they read, that they resume, and rows like everybody else's."""
 
-import json
 import re
 from contextlib import nullcontext
 from pathlib import Path
@@ -13,6 +12,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files import read_json
 from ucfrec.fitting.metrics_log import read_metrics
+from ucfrec.reporting.rows_file import read_rows
 from ucfrec_control.benchmark.plan import TABLES, Budget, benchmark
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
@@ -108,10 +108,10 @@ def test_the_benchmark_finds_its_rl_rows_again(
     budget = Budget(("hopper_medium-made",), 1, 2, (), rl_steps=2)
     results = tmp_path / "rows.jsonl"
     (row,) = benchmark(tmp_path, tmp_path / "runs", results, budget, "tiny", 1)
-    assert (row["table"], row["method"]) == ("main", "iql")
+    assert (row.table, row.method, row.checkpoint) == ("main", "iql", "last")
     assert benchmark(tmp_path, tmp_path / "runs", results, budget, "tiny", 1) == [row]
     assert len(results.read_text().splitlines()) == 1
-    assert json.loads(results.read_text()) == row
+    assert read_rows(results) == [row]
     printed = capfd.readouterr()
     assert "1 cells, 1 of them left" in printed.err
     assert "1 cells, 0 of them left" in printed.err

@@ -5,9 +5,10 @@ from pathlib import Path
 
 from ucfrec.commands.frames import write_frames
 from ucfrec.commands.options import log_options, logs_given, target_given, target_options
+from ucfrec.logs.expressions import Expression
 from ucfrec.logs.prepare import read_histories
 from ucfrec.recommending.recommend import LONGEST_HISTORY, Histories, recommend
-from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -27,7 +28,8 @@ def run(options: argparse.Namespace) -> None:
     """`ucfrec recommend`."""
     files, mapping = logs_given(options)
     trained = TrainedPolicy.load(options.run, options.checkpoint)
-    read = read_histories(files, mapping, trained.record["reward"], LONGEST_HISTORY)
+    reward = Expression(trained.record["reward"], str(options.run / RUN))
+    read = read_histories(files, mapping, reward, LONGEST_HISTORY)
     frames = recommend(
         trained,
         map(Histories.from_batch, read),

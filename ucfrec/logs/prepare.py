@@ -16,14 +16,16 @@ from typing import Any, Final
 
 import numpy.typing as npt
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.episodes.store import ITEM_STATES
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder
-from ucfrec.logs.binding import explained, text
-from ucfrec.logs.clean import CleanLog, engine, read_log
+from ucfrec.logs.binding import explained
+from ucfrec.logs.clean import CleanLog, read_log
+from ucfrec.logs.engine import engine
 from ucfrec.logs.features import encode_features, load_features
 from ucfrec.logs.items import write_item_states
 from ucfrec.logs.mapping import LogMapping, log_files
@@ -192,9 +194,9 @@ def read_histories(
     Raises:
         InputError: the input cannot be used.
     """
-    folder = Path(gettempdir())
-    with engine(memory_limit, folder) as connection:
-        log = read_log(connection, log_files(paths), mapping, reward, "user", None, folder)
+    files, folder = log_files(paths), Path(gettempdir())
+    with engine(files, folder, memory_limit) as connection:
+        log = read_log(connection, files, mapping, reward, "user", None, folder)
         if log.key != schema.ITEM_ID:
             raise InputError(f"{log.tables[0].files[0]}: its actions are vectors, not items")
         drop_counts(log)
@@ -237,7 +239,8 @@ def _episodes(
     reward = options.reward or mapping.reward or schema.REWARD
     session_by = options.session_by or mapping.session_by
     known = None if like is None else like / ITEMS_FILE
-    with engine(options.memory_limit, spill) as connection:
+    inputs = (*files, *_further_inputs(mapping, like))
+    with engine(inputs, spill, options.memory_limit) as connection:
         log = read_log(connection, files, mapping, reward, session_by, known, spill)
         with explained(connection, log.tables, spill):
             dropped = drop_counts(log)
@@ -258,6 +261,15 @@ def _episodes(
             number_ids(log, features, like)
             report = {"reward": reward, **build_report(log, cut, dropped)}
         yield log, report, features
+
+
+def _further_inputs(mapping: LogMapping, like: Path | None) -> Iterator[Path]:
+    """Files that are read beside the logs."""
+    if like is not None:
+        yield from (like / file for _, _, file in ID_TABLES)
+        return
+    for table in (*mapping.user_features, *mapping.item_features):
+        yield from log_files(table.files)
 
 
 def _append(writer: StoreWriter, batch: pa.RecordBatch, log: CleanLog) -> None:
@@ -289,7 +301,11 @@ def _write_ids(log: CleanLog, folder: Path) -> dict[str, list[Any]]:
 
 
 def _copy(log: CleanLog, query: str, file: Path) -> None:
-    log.connection.execute(f"COPY ({query}) TO {text(str(file))} (FORMAT parquet)")
+    # Not by DuckDB's COPY: it may write nowhere but in its scratch folder.
+    reader = log.connection.sql(query).to_arrow_reader(BATCH_ROWS)
+    with pq.ParquetWriter(file, reader.schema) as writer:
+        for batch in reader:
+            writer.write_batch(batch)
 
 
 def _learn_states(log: CleanLog, folder: Path, features: Features, size: int) -> None:

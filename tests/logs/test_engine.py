@@ -143,10 +143,11 @@ def test_inputs_are_read(closed: duckdb.DuckDBPyConnection, inputs: list[Path]) 
     assert closed.execute(f"FROM read_csv('{inputs[1]}')").fetchall() == [(1,), (2,)]
 
 
+NAMES = "a [1] b* c? it's é {1,2} x\\y"
+
+
 @pytest.mark.parametrize(
-    "name",
-    ["a.parquet", "[1].parquet", "b*.parquet", "c?.parquet", "it's.parquet", "é 1.parquet"]
-    + ["{1,2}.parquet", "back\\slash.parquet", "a.csv", "[a-z]*.csv", "a.csv.gz"],
+    "name", [*(f"{name}.parquet" for name in NAMES.split()), "a.csv", "[a-z]*.csv", "a.csv.gz"]
 )
 def test_files_of_any_name_are_read_alone(tmp_path: Path, name: str) -> None:
     frame = pd.DataFrame({"x": [1, 2]})
@@ -188,11 +189,11 @@ def test_rows_spill_into_the_scratch_folder_and_vanish(tmp_path: Path) -> None:
     folder.mkdir()
     with engine([], folder, "60MB") as connection:
         connection.execute(
-            "CREATE TABLE t AS SELECT range AS i, md5(range::TEXT) AS s FROM range(2000000)"
+            "CREATE TABLE t AS SELECT range AS i, md5(range::TEXT) AS s FROM range(800000)"
         )
         rows = connection.execute(
             "SELECT i, row_number() OVER (PARTITION BY i % 7 ORDER BY s) FROM t "
-            "ORDER BY s LIMIT 5 OFFSET 1900000"
+            "ORDER BY s LIMIT 5 OFFSET 700000"
         ).fetchall()
         assert len(rows) == 5
         assert [path.parent for path in folder.iterdir()] == [folder]
@@ -200,7 +201,7 @@ def test_rows_spill_into_the_scratch_folder_and_vanish(tmp_path: Path) -> None:
 
 
 def test_a_memory_limit_that_is_none_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="memory_limit 'much': write e.g. 2GB"):  # noqa: SIM117
+    with pytest.raises(InputError, match=r"memory_limit 'much': write e\.g\. 2GB"):  # noqa: SIM117
         with engine([], tmp_path, "much"):
             pass
     assert not list(tmp_path.iterdir())
@@ -212,7 +213,7 @@ def test_hostile_column_names_stay_names(tmp_path: Path) -> None:
     hostile = """x" INTEGER); COPY (SELECT 1) TO 'out'; --"""
     frame = pd.DataFrame(
         {
-            "user_id": range(rows),
+            "user_id": [n % 7 for n in range(rows)],
             "item_id": [n % 5 for n in range(rows)],
             "timestamp": [1_700_000_000_000 + n for n in range(rows)],
             "reward": [n % 3 for n in range(rows)],
@@ -224,7 +225,7 @@ def test_hostile_column_names_stay_names(tmp_path: Path) -> None:
     for reward in (
         "reward * 2",
         f"{quoted}.{quoted} * reward",
-        f"{quoted}['{hostile.replace(chr(39), chr(39) * 2)}'] + reward",
+        f"{quoted}[{text(hostile)}] + reward",
     ):
         options = PrepareOptions(reward=reward)
         assert validate([tmp_path / "log.parquet"], LogMapping(), options)["steps"] == rows

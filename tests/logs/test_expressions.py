@@ -1,5 +1,6 @@
-"""Rewards and mappings are scalar expressions: honest ones are taken, all else is one clear line."""
+"""Rewards and mappings: scalar expressions are accepted, all else is refused in one line."""
 
+import contextlib
 import json
 import shutil
 from collections.abc import Iterator
@@ -10,7 +11,7 @@ import duckdb
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.support.attacks import ATTACKS, attack
@@ -18,7 +19,7 @@ from ucfrec import UCF, EpisodeStore
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
 from ucfrec.logs import FeatureTable, LogMapping, PrepareOptions, prepare, read_histories, validate
-from ucfrec.logs.binding import bind, open_tables
+from ucfrec.logs.binding import Table, bind, open_tables
 from ucfrec.logs.engine import engine
 from ucfrec.logs.expressions import (
     COPYING,
@@ -66,7 +67,7 @@ HONEST = (
     "tag LIKE 'a%' OR tag NOT ILIKE 'B_'",
     "tag LIKE 'a!%' ESCAPE '!'",
     "tag ~ '^[a-z]+$'",
-    "regexp_extract(tag, '([0-9]+)', 1)::INT",
+    "try_cast(regexp_extract(tag, '([0-9]+)', 1) AS INT)",
     "lower(trim(tag))",
     "length(tag)",
     "left(tag, 8)",
@@ -136,29 +137,33 @@ def log_frame() -> pd.DataFrame:
 
 
 @pytest.fixture(scope="module")
-def connection(tmp_path_factory: pytest.TempPathFactory) -> Iterator[duckdb.DuckDBPyConnection]:
-    """An engine over the log `log.parquet` of its scratch folder's parent."""
-    folder = tmp_path_factory.mktemp("expressions")
-    log_frame().to_parquet(folder / "log.parquet")
-    with engine([folder / "log.parquet"], folder) as connection:
-        connection.execute(f"CREATE VIEW log AS FROM read_parquet('{folder / 'log.parquet'}')")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("expressions") / "log.parquet"
+    log_frame().to_parquet(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def connection(log: Path) -> Iterator[duckdb.DuckDBPyConnection]:
+    """An engine with the log as a view."""
+    with engine([log], log.parent) as connection:
+        connection.execute(f"CREATE VIEW log AS FROM read_parquet('{log}')")
         yield connection
 
 
-def log_path(connection: duckdb.DuckDBPyConnection) -> Path:
-    (scratch,) = connection.execute("SELECT current_setting('temp_directory')").fetchall()[0]
-    return Path(scratch).parent.parent / "log.parquet"
+@pytest.fixture(scope="module")
+def table(connection: duckdb.DuckDBPyConnection, log: Path) -> Table:
+    return open_tables(connection, [log])[0]
 
 
 @pytest.mark.parametrize("text", HONEST)
 def test_honest_expressions_are_values_of_a_log(
-    connection: duckdb.DuckDBPyConnection, text: str
+    connection: duckdb.DuckDBPyConnection, table: Table, text: str
 ) -> None:
-    (table,) = open_tables(connection, [log_path(connection)])
     sql, kind = bind(connection, table, "for the test", text)
     relation = connection.sql(f"SELECT {sql} AS x FROM log")
-    assert [str(t) for t in relation.types] == [kind]
-    assert len(relation.fetchall()) == 300
+    assert [str(found) for found in relation.types] == [kind]
+    assert relation.to_arrow_table().shape == (300, 1)
 
 
 @pytest.mark.parametrize(
@@ -203,13 +208,12 @@ def test_columns_are_named_once_in_order(connection: duckdb.DuckDBPyConnection) 
 
 @pytest.mark.parametrize("name", ATTACKS)
 def test_attacks_are_no_scalar_expressions(
-    connection: duckdb.DuckDBPyConnection, name: str, tmp_path: Path
+    connection: duckdb.DuckDBPyConnection, table: Table, name: str, tmp_path: Path
 ) -> None:
     """By the check alone, or, of names that stand for the user and the time, by the columns."""
     out, secret = tmp_path / "out", tmp_path / "secret.txt"
     secret.write_text(SECRET)
     text = attack(name, str(out), str(secret))
-    (table,) = open_tables(connection, [log_path(connection)])
     with pytest.raises(InputError) as caught:
         bind(connection, table, "for the reward", text)
     assert str(caught.value).isprintable()
@@ -264,7 +268,10 @@ def snapshot(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.mark.parametrize("name", [name for name in ATTACKS if name != "half a character"])
+BY_COMMAND = [name for name in ATTACKS if name != "half a character"]  # no argument holds that
+
+
+@pytest.mark.parametrize("name", BY_COMMAND)
 def test_no_way_in_lets_an_attack_through(
     trained: Path,
     name: str,
@@ -274,7 +281,8 @@ def test_no_way_in_lets_an_attack_through(
 ) -> None:
     outside = tmp_path / "outside"
     here = tmp_path / "here"
-    outside.mkdir(), here.mkdir()
+    outside.mkdir()
+    here.mkdir()
     (outside / "secret.txt").write_text(SECRET)
     text = attack(name, str(outside / "out"), str(outside / "secret.txt"))
     shutil.copy(trained / "log.parquet", here / "log.parquet")
@@ -295,7 +303,9 @@ def test_no_way_in_lets_an_attack_through(
         ["score", run, log, "--out", out],
         ["ope", run, log, "--json", out],
     ]
-    for way in ways:
+    # Four of the ten ways each: more than forty attacks come by every way.
+    place = BY_COMMAND.index(name)
+    for way in (ways[(place + step) % len(ways)] for step in (0, 3, 5, 8)):
         capsys.readouterr()
         assert main(way) == 2, way
         printed = capsys.readouterr()
@@ -410,167 +420,31 @@ def test_listed_functions_only_compute(connection: duckdb.DuckDBPyConnection) ->
                 assert all(words.count(p) == 1 for p in parameters), name
 
 
-WORDS = st.sampled_from(
-    [
-        "is_click",
-        "user_id",
-        "reward",
-        "play_ms",
-        "tag",
-        "numbers",
-        "feedback",
-        "clock",
-        "user",
-        "rowid",
-        "1",
-        "2.5",
-        "-1",
-        "1e9",
-        "'a'",
-        "''",
-        "$$x$$",
-        '"is_click"',
-        "NULL",
-        "true",
-        "(",
-        ")",
-        "[",
-        "]",
-        "{",
-        "}",
-        ",",
-        ";",
-        ".",
-        ":",
-        "::",
-        "+",
-        "-",
-        "*",
-        "/",
-        "//",
-        "%",
-        "^",
-        "**",
-        "||",
-        "!",
-        "@",
-        "#",
-        "$1",
-        "?",
-        "=",
-        "<>",
-        "<",
-        ">",
-        "<=",
-        ">=",
-        "&",
-        "|",
-        "~",
-        "~~",
-        "->",
-        "->>",
-        "=>",
-        ":=",
-        "--",
-        "/*",
-        "*/",
-        "'",
-        '"',
-        "$$",
-        "\\",
-        "\n",
-        "SELECT",
-        "FROM",
-        "WHERE",
-        "GROUP",
-        "ORDER",
-        "BY",
-        "LIMIT",
-        "UNION",
-        "WITH",
-        "AS",
-        "VALUES",
-        "TABLE",
-        "DISTINCT",
-        "ALL",
-        "ANY",
-        "EXISTS",
-        "CASE",
-        "WHEN",
-        "THEN",
-        "ELSE",
-        "END",
-        "IN",
-        "NOT",
-        "AND",
-        "OR",
-        "IS",
-        "BETWEEN",
-        "LIKE",
-        "CAST",
-        "TRY_CAST",
-        "TRY",
-        "COALESCE",
-        "EXTRACT",
-        "INTERVAL",
-        "DAY",
-        "DATE",
-        "TIMESTAMP",
-        "AT",
-        "TIME",
-        "ZONE",
-        "OVER",
-        "FILTER",
-        "LAMBDA",
-        "FOR",
-        "COPY",
-        "TO",
-        "ATTACH",
-        "PRAGMA",
-        "SET",
-        "INSTALL",
-        "DEFAULT",
-        "COLUMNS",
-        "STRUCT",
-        "INT",
-        "FLOAT",
-        "VARCHAR",
-        "least(",
-        "abs(",
-        "length(",
-        "sum(",
-        "unnest(",
-        "list_sum(",
-        "read_text(",
-        "concat(",
-        "round(",
-        "epoch_ms(",
-        "len(",
-        "if(",
-        "nullif(",
-        "map(",
-    ]
-)
+SQL_WORDS = """
+    is_click user_id reward play_ms tag numbers feedback clock user rowid 1 2.5 -1 1e9 'a' '' $$x$$
+    "is_click" NULL true ( ) [ ] { } , ; . : :: + - * / // % ^ ** || ! @ # $1 ? = <> < > <= >= & |
+    ~ ~~ -> ->> => := -- /* */ ' " $$ \\ SELECT FROM WHERE GROUP ORDER BY LIMIT UNION WITH AS VALUES
+    TABLE DISTINCT ALL ANY EXISTS CASE WHEN THEN ELSE END IN NOT AND OR IS BETWEEN LIKE CAST
+    TRY_CAST TRY COALESCE EXTRACT INTERVAL DAY DATE TIMESTAMP AT TIME ZONE OVER FILTER LAMBDA FOR COPY TO
+    ATTACH PRAGMA SET INSTALL DEFAULT COLUMNS STRUCT INT FLOAT VARCHAR least( abs( length( sum(
+    unnest( list_sum( read_text( concat( round( epoch_ms( len( if( nullif( map(
+"""
+WORDS = st.sampled_from([*SQL_WORDS.split(), "\n"])
 
 
-@settings(max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=200)
 @given(text=st.one_of(st.lists(WORDS, max_size=12).map(" ".join), st.text(max_size=40)))
 def test_soup_is_refused_or_is_a_value_of_each_row(
-    connection: duckdb.DuckDBPyConnection, text: str
+    connection: duckdb.DuckDBPyConnection, table: Table, text: str
 ) -> None:
-    (table,) = open_tables(connection, [log_path(connection)])
-    try:
+    """No other error than InputError, and none of the engine but for values that do not convert."""
+    with contextlib.suppress(InputError):
         sql, _ = bind(connection, table, "for the test", text)
-    except InputError as error:
-        assert str(error).isprintable() or not text.isprintable()
-        return
-    relation = connection.sql(f"SELECT {sql} AS x FROM log")
-    assert len(relation.columns) == 1
-    try:
-        assert len(relation.fetchall()) == 300
-    except duckdb.Error as error:
-        # Values that do not convert; never a fault of the engine itself.
-        assert not isinstance(error, duckdb.InternalError | duckdb.PermissionException)
+        with contextlib.suppress(
+            duckdb.ConversionException, duckdb.InvalidInputException, duckdb.OutOfRangeException
+        ):
+            values = connection.sql(f"SELECT {sql} AS x FROM log").to_arrow_table()
+            assert values.shape == (300, 1)
 
 
 LEAVES = st.sampled_from(["is_click", "play_ms", "duration_ms", "1", "0.5", "NULL", "reward"])
@@ -587,11 +461,9 @@ def joined(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
     )
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(text=st.recursive(LEAVES, joined, max_leaves=6))
 def test_sums_of_honest_parts_are_accepted(
-    connection: duckdb.DuckDBPyConnection, text: str
+    connection: duckdb.DuckDBPyConnection, table: Table, text: str
 ) -> None:
-    (table,) = open_tables(connection, [log_path(connection)])
     sql, _ = bind(connection, table, "for the test", text)
     assert len(connection.sql(f"SELECT TRY({sql}) FROM log").fetchall()) == 300

@@ -1,11 +1,9 @@
 """The SQL that reads, checks and de-duplicates log rows: shared by `prepare` and `recommend`."""
 
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import duckdb
@@ -17,6 +15,7 @@ from ucfrec.logs.binding import (
     Table,
     bind,
     explained,
+    glob_pattern,
     is_integer,
     is_number,
     is_vector,
@@ -39,58 +38,6 @@ REASONS: Final = {
     "reward_not_finite": "reward is missing, NaN or infinite",
 }
 """Why rows are dropped; each row for the first reason that applies."""
-
-
-@contextmanager
-def engine(memory_limit: str, folder: Path) -> Iterator[duckdb.DuckDBPyConnection]:
-    """A DuckDB that works on disk.
-
-    Args:
-        memory_limit: e.g. "2GB".
-        folder: where it keeps its files until the end.
-
-    Raises:
-        InputError: the limit is not a size.
-    """
-    with TemporaryDirectory(prefix=".ucfrec-", dir=folder) as work:
-        connection = duckdb.connect(str(Path(work) / "rows.duckdb"))
-        try:
-            connection.execute(f"SET temp_directory = '{work}/spill'")
-            try:
-                connection.execute("SET memory_limit = ?", [memory_limit])
-            except duckdb.Error:
-                raise InputError(f"memory_limit {memory_limit!r}: write e.g. 2GB") from None
-            _settle(connection)
-            yield connection
-        finally:
-            connection.close()
-
-
-@contextmanager
-def engine_in_memory() -> Iterator[duckdb.DuckDBPyConnection]:
-    """A DuckDB that never touches the disk."""
-    connection = duckdb.connect(":memory:", config={"temp_directory": ""})
-    try:
-        _settle(connection)
-        yield connection
-    finally:
-        connection.close()
-
-
-def _settle(connection: duckdb.DuckDBPyConnection) -> None:
-    """What expressions mean, the same in every engine and on every machine."""
-    connection.execute("SET enable_progress_bar = false")
-    connection.execute("SET error_on_division_by_zero = false")
-    # Times with a zone are cast to times without one in this zone.
-    connection.execute("SET TimeZone = 'UTC'")
-    # SQL's own least(x, 5) is 5 where x is NULL, NaN or infinite: a video of unknown length
-    # would count as watched five times. Undefined parts make a reward undefined instead.
-    for name, sign in (("least", "<"), ("greatest", ">")):
-        connection.execute(
-            f"CREATE TEMP MACRO {name}(a, b) AS CASE WHEN isfinite(a::DOUBLE) AND "
-            f"isfinite(b::DOUBLE) THEN CASE WHEN a {sign} b THEN a ELSE b END END, "
-            f"(a, b, c) AS {name}({name}(a, b), c)"
-        )
 
 
 @dataclass(frozen=True)
@@ -305,7 +252,8 @@ def _checked(log: CleanLog, known_items: Path | None) -> str:
     )
     unknown = "false"
     if known_items is not None:
-        known = f"SELECT CAST(item_id AS VARCHAR) FROM read_parquet({text(str(known_items))})"
+        source = f"read_parquet({text(glob_pattern(known_items))})"
+        known = f"SELECT CAST(item_id AS VARCHAR) FROM {source}"
         unknown = f"CAST({log.key} AS VARCHAR) NOT IN ({known})"
     latest = int(time.time() * 1000) + DAY_MS
     order = ", ".join(("good DESC", f"{schema.REWARD} DESC", *log.payload))

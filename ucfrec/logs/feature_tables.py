@@ -33,21 +33,22 @@ def load_features(
         for opened in open_tables(connection, log_files(table.files)):
             key, _ = bind(connection, opened, f"key of {kind} features", table.key)
             given = table.columns or tuple(c for c in opened.columns if c != table.key)
-            columns = []
-            for number, column in enumerate(given):
+            columns: list[str] = []
+            for column in given:
                 sql, type_ = bind(connection, opened, f"{kind} feature", column)
                 comparable = _comparable(sql, type_)
                 if comparable is None:
                     wanted = "cast it to a number, text, or a list of either"
                     raise wrong_type(opened, f"{kind} feature", column, type_, wanted)
-                columns.append(f"{comparable} AS f{number}")
+                columns.append(comparable)
             id_sql, first = f"TRY_CAST({key} AS {id_type})", ""
             if table.first_by:
                 by, _ = bind(connection, opened, f"first_by of {kind} features", table.first_by)
                 # Ties go by the features, so that the order of rows does not matter.
-                order = ", ".join([by, *(column.partition(" AS f")[0] for column in columns)])
+                order = ", ".join([by, *columns])
                 first = f" QUALIFY row_number() OVER (PARTITION BY {id_sql} ORDER BY {order}) = 1"
-            selects.append(f"SELECT {id_sql} AS id, {', '.join(columns)} FROM {opened.sql}{first}")
+            named = ", ".join(f"{sql} AS f{number}" for number, sql in enumerate(columns))
+            selects.append(f"SELECT {id_sql} AS id, {named} FROM {opened.sql}{first}")
         connection.execute(
             f"CREATE TABLE {name} AS SELECT * FROM ({' UNION ALL BY NAME '.join(selects)}) "
             "WHERE id IS NOT NULL"

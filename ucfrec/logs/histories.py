@@ -12,7 +12,8 @@ import pyarrow as pa
 from ucfrec import schema
 from ucfrec.errors import InputError
 from ucfrec.logs.binding import Table, explained, quoted
-from ucfrec.logs.clean import REASONS, CleanLog, engine, engine_in_memory, judge_rows, read_log
+from ucfrec.logs.clean import REASONS, CleanLog, judge_rows, read_log
+from ucfrec.logs.engine import engine, engine_in_memory
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.prepare import BATCH_ROWS
 from ucfrec.logs.summary import drop_counts
@@ -60,7 +61,7 @@ def read_histories(
         InputError: the input cannot be used.
     """
     folder, files = Path(gettempdir()), log_files(paths)
-    with engine(memory_limit, folder) as connection:
+    with engine(files, folder, memory_limit) as connection:
         log = read_log(connection, files, mapping, reward, session_by, None, folder)
         drop_counts(log)
         with explained(connection, log.tables, folder):

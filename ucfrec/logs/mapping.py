@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from ucfrec import schema
 from ucfrec.errors import InputError
+from ucfrec.logs.expressions import Expression
 
 SUFFIXES: Final = (".parquet", ".csv", ".csv.gz")
 KEY_COLUMNS: Final = (schema.USER_ID, schema.ITEM_ID, schema.ACTION, schema.TIMESTAMP)
@@ -90,12 +91,12 @@ def columns_given(assignments: Sequence[str]) -> dict[str, str]:
     Raises:
         InputError: one of them has no "=".
     """
-    pairs = {}
+    pairs: dict[str, str] = {}
     for assignment in assignments:
         name, equals, value = assignment.partition("=")
         if not equals:
             raise InputError(f"--column {assignment}: write NAME=COLUMN, e.g. user_id=uid")
-        pairs[name.strip()] = value.strip()
+        pairs[name.strip()] = Expression(value.strip(), "--column")
     return pairs
 
 
@@ -126,18 +127,24 @@ def read_mapping(path: Path) -> LogMapping:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is not TOML: {error}") from None
     try:
+        for name, value in given.get("columns", {}).items():
+            given["columns"][name] = Expression(value, str(path))
+        if "reward" in given:
+            given["reward"] = Expression(given["reward"], str(path))
         for kind in ("item_features", "user_features"):
             tables = (FeatureTable(**table) for table in given.get(kind, []))
             given[kind] = tuple(
                 replace(
                     table,
                     files=tuple(path.parent / file for file in table.files),
-                    columns=tuple(table.columns),
+                    key=Expression(table.key, str(path)),
+                    columns=tuple(Expression(column, str(path)) for column in table.columns),
+                    first_by=Expression(table.first_by, str(path)),
                 )
                 for table in tables
             )
         return LogMapping(**given)
-    except (TypeError, InputError) as error:
+    except (AttributeError, TypeError, InputError) as error:
         raise InputError(f"{path}: {error}") from None
 
 

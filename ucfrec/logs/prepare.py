@@ -16,13 +16,15 @@ from typing import Any, Final
 
 import numpy.typing as npt
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder
-from ucfrec.logs.binding import explained, text
-from ucfrec.logs.clean import CleanLog, engine, read_log
+from ucfrec.logs.binding import explained
+from ucfrec.logs.clean import CleanLog, read_log
+from ucfrec.logs.engine import engine
 from ucfrec.logs.feature_tables import load_features
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.sessions import (
@@ -185,7 +187,8 @@ def _episodes(
     reward = options.reward or mapping.reward or schema.REWARD
     session_by = options.session_by or mapping.session_by
     known = None if like is None else like / ITEMS_FILE
-    with engine(options.memory_limit, spill) as connection:
+    inputs = (*files, *_further_inputs(mapping, like))
+    with engine(inputs, spill, options.memory_limit) as connection:
         with progress(4, "check the logs", "stages") as stage:
             log = read_log(connection, files, mapping, reward, session_by, known, spill)
             stage.update()
@@ -211,6 +214,15 @@ def _episodes(
                 report = {"reward": reward, **build_report(log, cut, dropped)}
                 stage.update()
         yield log, report, features
+
+
+def _further_inputs(mapping: LogMapping, like: Path | None) -> Iterator[Path]:
+    """Files that are read beside the logs."""
+    if like is not None:
+        yield from (like / file for _, _, file in ID_TABLES)
+        return
+    for table in (*mapping.user_features, *mapping.item_features):
+        yield from log_files(table.files)
 
 
 def _append(writer: StoreWriter, batch: pa.RecordBatch, log: CleanLog) -> None:
@@ -242,7 +254,11 @@ def _write_ids(log: CleanLog, folder: Path) -> dict[str, list[Any]]:
 
 
 def _copy(log: CleanLog, query: str, file: Path) -> None:
-    log.connection.execute(f"COPY ({query}) TO {text(str(file))} (FORMAT parquet)")
+    # Not by DuckDB's COPY: it may write nowhere but in its scratch folder.
+    reader = log.connection.sql(query).to_arrow_reader(BATCH_ROWS)
+    with pq.ParquetWriter(file, reader.schema) as writer:
+        for batch in reader:
+            writer.write_batch(batch)
 
 
 def _write_states(

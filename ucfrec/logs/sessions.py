@@ -6,7 +6,7 @@ from typing import Final
 
 from ucfrec import schema
 from ucfrec.errors import InputError
-from ucfrec.logs.binding import text
+from ucfrec.logs.binding import glob_pattern, text
 from ucfrec.logs.clean import CleanLog
 
 ITEMS_FILE: Final = "items.parquet"
@@ -120,7 +120,7 @@ def number_ids(log: CleanLog, listed: dict[str, list[str]], like: Path | None) -
         if name not in log.columns:
             continue
         if like is not None:
-            source = f"read_parquet({text(str(like / file))}, file_row_number = true)"
+            source = f"read_parquet({text(glob_pattern(like / file))}, file_row_number = true)"
             # The store's ids may be integers where these are text, or the other way round.
             known = f"TRY_CAST({name} AS {log.id_type(name)}) AS {name}"
             log.connection.execute(

@@ -18,11 +18,12 @@ from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
+from ucfrec.logs.expressions import Expression
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.logs.sessions import EPISODE_USERS
 from ucfrec.progress import progress
-from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 
 SESSION, PROBABILITY, RANK, GREEDY = "session", "probability", "rank", "greedy_item_id"
 _STEPS_AT_ONCE = 1024
@@ -77,7 +78,7 @@ def logged_sessions(
     gap_ms = record["session_gap_ms"]
     # Runs from before `session_by` was recorded tell the gap at least.
     session_by = record.get("session_by") or (None if gap_ms is None else "gap")
-    options = PrepareOptions(record["reward"], session_by)
+    options = PrepareOptions(Expression(record["reward"], str(run / RUN)), session_by)
     if gap_ms is not None:
         options = replace(options, gap_minutes=gap_ms / 60_000)
     with tempfile.TemporaryDirectory(prefix="ucfrec-") as scratch:

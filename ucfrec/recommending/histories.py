@@ -11,6 +11,7 @@ import pandas as pd
 import pyarrow as pa
 
 from ucfrec import schema
+from ucfrec.logs.expressions import Expression
 from ucfrec.logs.histories import frame_histories, read_histories
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -113,7 +114,7 @@ def histories_of_files(
     batches = read_histories(
         files,
         _columns_used(trained, mapping),
-        trained.record["reward"],
+        _reward(trained),
         LONGEST_HISTORY,
         session_by=_session_by(trained),
     )
@@ -133,11 +134,15 @@ def histories_of_frame(
     batches = frame_histories(
         frame,
         _columns_used(trained, mapping),
-        schema.REWARD if given else trained.record["reward"],
+        schema.REWARD if given else _reward(trained),
         LONGEST_HISTORY,
         session_by=_session_by(trained),
     )
     return map(Histories.from_batch, batches)
+
+
+def _reward(trained: TrainedPolicy) -> Expression:
+    return Expression(trained.record["reward"], "the run's run.json")
 
 
 def _columns_used(trained: TrainedPolicy, mapping: LogMapping) -> LogMapping:

@@ -426,8 +426,8 @@ SQL_WORDS = """
     ~ ~~ -> ->> => := -- /* */ ' " $$ \\ SELECT FROM WHERE GROUP ORDER BY LIMIT UNION WITH AS VALUES
     TABLE DISTINCT ALL ANY EXISTS CASE WHEN THEN ELSE END IN NOT AND OR IS BETWEEN LIKE CAST
     TRY_CAST TRY COALESCE EXTRACT INTERVAL DAY DATE TIMESTAMP AT TIME ZONE OVER FILTER LAMBDA FOR
-    COPY TO ATTACH PRAGMA SET INSTALL DEFAULT COLUMNS STRUCT INT FLOAT VARCHAR least( abs( length( sum(
-    unnest( list_sum( read_text( concat( round( epoch_ms( len( if( nullif( map(
+    COPY TO ATTACH PRAGMA SET INSTALL DEFAULT COLUMNS STRUCT INT FLOAT VARCHAR least( abs( length(
+    sum( unnest( list_sum( read_text( concat( round( epoch_ms( len( if( nullif( map(
 """
 WORDS = st.sampled_from([*SQL_WORDS.split(), "\n"])
 

@@ -14,7 +14,7 @@ from ucfrec import schema
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.histories import frame_histories, read_histories
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 
 LONGEST_HISTORY = 1000
 """Rows of a user that are read at most."""
@@ -142,7 +142,7 @@ def histories_of_frame(
 
 
 def _reward(trained: TrainedPolicy) -> Expression:
-    return Expression(trained.record["reward"], "the run's run.json")
+    return Expression(trained.record["reward"], str(trained.folder / RUN))
 
 
 def _columns_used(trained: TrainedPolicy, mapping: LogMapping) -> LogMapping:

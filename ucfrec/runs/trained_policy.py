@@ -34,6 +34,8 @@ COUNTS = "training_counts.safetensors"
 class TrainedPolicy:
     """A policy read back from a run folder, with all that acting and recommending need."""
 
+    folder: Path
+    """The run folder that it was read from."""
     policy: SequencePolicy
     record: Mapping[str, Any]
     item_states: ItemStates | None
@@ -60,6 +62,7 @@ class TrainedPolicy:
         policy.eval()
         states = run / ITEM_STATES
         return cls(
+            run,
             policy,
             record,
             ItemStates.load(states) if states.exists() else None,

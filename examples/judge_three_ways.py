@@ -26,10 +26,10 @@ from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 WORLD = World("synthetic-catalog")
-SMALL = ["train.steps=800", "train.learning_rate=3e-3", "train.cosine=true"]
+SMALL = ["train.steps=600", "train.learning_rate=3e-3", "train.cosine=true"]
 SMALL += ["train.warmup_steps=50", "policy.dim=32"]
-LEARNERS = {"ucf": [*SMALL, "policy.context=10", "crm.epochs=3"], "bc": SMALL}
-EPISODES, SEED, K = 500, 1000, 10
+LEARNERS = {"ucf": [*SMALL, "policy.context=10", "crm.epochs=2"], "bc": SMALL}
+EPISODES, SEED, K = 400, 1000, 10
 
 
 def train(folder: Path) -> dict[str, Path]:
@@ -37,7 +37,7 @@ def train(folder: Path) -> dict[str, Path]:
 
     Behaviour cloning (`bc`) imitates the logs. UCF is told, in every step, what return is wanted.
     """
-    store = EpisodeStore.open(simulated_store(WORLD, folder, sessions=3000, seed=0))
+    store = EpisodeStore.open(simulated_store(WORLD, folder, sessions=2500, seed=0))
     runs = {}
     for learner, settings in LEARNERS.items():
         runs[learner] = folder / learner
@@ -134,7 +134,7 @@ def main(folder: Path) -> tuple[list[dict[str, object]], pd.DataFrame, pd.DataFr
     env = simulator.make(256, None)
     actor = simulator.behaviors["mixture"](env, SEED)
     about = {"env_name": WORLD.name, "behavior": "mixture"}
-    collect(simulator, env, actor, 1000, SEED, folder / "fresh", **about)
+    collect(simulator, env, actor, 800, SEED, folder / "fresh", **about)
 
     print("2. estimated from new logs")
     estimated = from_logs(runs, folder / "fresh")

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import ucfrec
-from tests.support.markdown import ROOT, Page, anchors, parse
+from tests.support.markdown import ROOT, Page, anchors, parse, run_python
 from ucfrec.commands.cli import UCFREC
 from ucfrec.runs.config import resolve_config
 
@@ -51,9 +51,7 @@ def test_the_python_code_runs(page: str, code: str, tmp_path: Path) -> None:
         pytest.skip("an example; test_examples.py runs it")
     if "Recommender" in code and not hasattr(ucfrec, "Recommender"):
         pytest.skip("before ucfrec.Recommender")
-    ran = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    ran = run_python(code, tmp_path)
     assert ran.returncode == 0, ran.stderr
 
 

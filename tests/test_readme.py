@@ -1,13 +1,11 @@
 """The README's code runs, its commands exist, and it stays short."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 import ucfrec
-from tests.support.markdown import Page, parse
+from tests.support.markdown import Page, parse, run_python
 
 README = Page("README.md")
 
@@ -16,9 +14,7 @@ README = Page("README.md")
 def test_the_python_example_runs(tmp_path: Path) -> None:
     (code,) = README.code("python")
     assert len([line for line in code.splitlines() if line.strip()]) == 10
-    ran = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    ran = run_python(code, tmp_path)
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout.count("rank") == 2
     assert (tmp_path / "my-policy" / "run.json").is_file()

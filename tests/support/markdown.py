@@ -1,8 +1,11 @@
 """Markdown pages of the project: their code blocks, command lines and links."""
 
 import argparse
+import os
 import re
 import shlex
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,6 +57,18 @@ def parse(command: str) -> argparse.Namespace:
     name, *words = shlex.split(command)
     program: Program = PROGRAMS[name]
     return build_parser(program, words).parse_args(words)
+
+
+def run_python(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run code in a process and folder of its own, on one thread."""
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
 
 
 def anchors(text: str) -> set[str]:

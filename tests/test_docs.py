@@ -10,9 +10,7 @@ from pathlib import Path
 
 import pytest
 
-import ucfrec
 from tests.support.markdown import ROOT, Page, anchors, parse, run_python
-from ucfrec.commands.cli import UCFREC
 from ucfrec.runs.config import resolve_config
 
 SITE = [Page(str(path.relative_to(ROOT))) for path in sorted((ROOT / "docs").rglob("*.md"))]
@@ -29,8 +27,6 @@ REPOSITORY = [
 PAGES = [*REPOSITORY, *SITE]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 NAV = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").split("\nnav:")[1].split("\n\n")[0]
-LATER = {"settings"} - set(UCFREC.commands)
-"""Commands that another branch brings."""
 
 
 @pytest.mark.parametrize(
@@ -38,8 +34,6 @@ LATER = {"settings"} - set(UCFREC.commands)
     [(page.name, command) for page in PAGES[1:] for command in page.commands()],
 )
 def test_the_commands_parse(page: str, command: str) -> None:
-    if command.split()[1] in LATER:
-        pytest.skip("no such command yet")
     parse(command)
 
 
@@ -49,8 +43,6 @@ def test_the_commands_parse(page: str, command: str) -> None:
 def test_the_python_code_runs(page: str, code: str, tmp_path: Path) -> None:
     if code.startswith("--8<--"):
         pytest.skip("an example; test_examples.py runs it")
-    if "Recommender" in code and not hasattr(ucfrec, "Recommender"):
-        pytest.skip("before ucfrec.Recommender")
     ran = run_python(code, tmp_path)
     assert ran.returncode == 0, ran.stderr
 

@@ -7,6 +7,8 @@ import pytest
 
 from examples import control_policy, judge_three_ways, logs_to_recommendations
 
+pytestmark = pytest.mark.slow
+
 
 def test_recommendations_beat_the_logs_that_they_were_learned_from(tmp_path: Path) -> None:
     value = logs_to_recommendations.main(tmp_path)

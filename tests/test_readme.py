@@ -4,13 +4,11 @@ from pathlib import Path
 
 import pytest
 
-import ucfrec
 from tests.support.markdown import Page, parse, run_python
 
 README = Page("README.md")
 
 
-@pytest.mark.skipif(not hasattr(ucfrec, "Recommender"), reason="before ucfrec.Recommender")
 def test_the_python_example_runs(tmp_path: Path) -> None:
     (code,) = README.code("python")
     assert len([line for line in code.splitlines() if line.strip()]) == 10

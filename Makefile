@@ -8,7 +8,7 @@ BIN := .venv/bin
 # once. One thread each, or the workers' linear algebra fights over the cores.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
 
-.PHONY: demo test test-slow lint types wheel clean
+.PHONY: demo test test-slow lint types docs wheel clean
 
 demo: .venv/base  ## Set up and run the main job end to end on simulated logs.
 	$(BIN)/ucfrec demo --out demo-out
@@ -26,6 +26,9 @@ lint: .venv/dev  ## Style.
 types: .venv/dev  ## Types, strict.
 	$(BIN)/mypy
 
+docs: .venv/docs  ## Build the pages into build/docs; a broken link or reference fails.
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 wheel: .venv/dev  ## Build the wheel into dist/.
 	$(BIN)/hatchling build -t wheel
 
@@ -36,6 +39,10 @@ wheel: .venv/dev  ## Build the wheel into dist/.
 
 .venv/dev: .venv/base
 	$(BIN)/pip install -q $(PIP_FLAGS) -c constraints.txt -e ".[control,dev]"
+	touch $@
+
+.venv/docs: .venv/base
+	$(BIN)/pip install -q $(PIP_FLAGS) -c constraints.txt -e ".[docs]"
 	touch $@
 
 clean:

@@ -1,0 +1,78 @@
+"""Markdown pages of the project: their code blocks, command lines and links."""
+
+import argparse
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from ucfrec.commands.cli import UCFREC, Program, build_parser
+from ucfrec_control.cli import CONTROL
+
+ROOT = Path(__file__).parents[2]
+PROGRAMS = {program.name: program for program in (UCFREC, CONTROL)}
+_BLOCK = re.compile(r"^( *)```(\w*)[^\n]*\n(.*?)^ *```$", flags=re.DOTALL | re.MULTILINE)
+_LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+
+
+@dataclass(frozen=True)
+class Page:
+    """A Markdown file, by its path from the repository's root."""
+
+    name: str
+
+    @property
+    def text(self) -> str:
+        return (ROOT / self.name).read_text(encoding="utf-8")
+
+    def code(self, language: str) -> list[str]:
+        """Code blocks of a language, without the indentation of the list they stand in."""
+        return [
+            "\n".join(line.removeprefix(indent) for line in code.splitlines())
+            for indent, kind, code in _BLOCK.findall(self.text)
+            if kind == language
+        ]
+
+    def commands(self) -> list[str]:
+        """Command lines of `ucfrec` and `ucfrec-control`, continued lines joined."""
+        shell = "\n".join(self.code("sh")).replace("\\\n", " ")
+        return [
+            line.split("  #")[0] for line in shell.splitlines() if line.split(" ")[0] in PROGRAMS
+        ]
+
+    def links(self) -> Iterator[str]:
+        """Targets of links and pictures that lie in the repository."""
+        prose = _BLOCK.sub("", self.text)
+        for target in _LINK.findall(prose):
+            if not target.startswith(("http://", "https://", "mailto:")):
+                yield target
+
+
+def parse(command: str) -> argparse.Namespace:
+    """Read a command line as the program would; exits if it would refuse it."""
+    name, *words = shlex.split(command)
+    program: Program = PROGRAMS[name]
+    return build_parser(program, words).parse_args(words)
+
+
+def run_python(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run code in a process and folder of its own, on one thread."""
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+
+
+def anchors(text: str) -> set[str]:
+    """Fragments that headings of a page have, as GitHub and MkDocs make them."""
+    prose = _BLOCK.sub("", text)
+    headings = re.findall(r"^#+ (.+)$", prose, flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}

@@ -107,7 +107,7 @@ def test_planted_taste_is_found_by_those_who_look_at_the_user(store: EpisodeStor
     for row in found.values():
         assert set(row.values) == set(MEASURES)
         for name, (low, high) in row.intervals.items():
-            assert low <= row.values[name] <= high
+            assert low - 1e-9 <= row.values[name] <= high + 1e-9
 
 
 def test_nothing_of_the_ranked_step_reaches_a_ranker(store: EpisodeStore) -> None:

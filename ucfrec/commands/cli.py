@@ -41,6 +41,7 @@ UCFREC = Program(
         "train": "train a policy on a store; resumes",
         "settings": "every setting of a training: default, range, meaning",
         "evaluate": "what a policy earns in a simulator",
+        "rank": "how policies rank what users were shown and clicked later",
         "recommend": "the next items for users of a log",
         "score": "a policy's probability of every choice of a log",
         "ope": "what a policy would have earned, from logs alone",

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -10,9 +12,19 @@ from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.fitting.checkpoint import load_tensors, save_tensors
 
-_LIKED = 0.6
+LIKED = 0.6
 """Liking, the reward scaled to [0, 1] as in item states, from which a step counts as positive: the
 normalised watch ratio of the published dominance; a click counts too."""
+
+
+def liked_steps(
+    store: EpisodeStore, episodes: npt.NDArray[np.int64], steps: npt.NDArray[np.int64]
+) -> npt.NDArray[np.bool_]:
+    """Whether each of the steps (N,) was liked: its reward, scaled as in item states, reaches
+    `LIKED`."""
+    states, rewards = store.item_states, store.step_values(schema.REWARD, episodes, steps)
+    liking = (rewards - states.reward_low) / (states.reward_high - states.reward_low)
+    return np.asarray(liking >= LIKED)
 
 
 @dataclass(frozen=True)
@@ -29,12 +41,9 @@ class TrainingCounts:
     @classmethod
     def of(cls, train: EpisodeStore) -> "TrainingCounts":
         """Count the steps of a view of a store of items."""
-        states, steps = train.item_states, train.all_steps()
+        steps, n = train.all_steps(), len(train.item_states.embeddings)
         items = torch.from_numpy(train.step_values(schema.ITEM, *steps)).long()
-        rewards = torch.from_numpy(train.step_values(schema.REWARD, *steps))
-        liking = (rewards - states.reward_low) / (states.reward_high - states.reward_low)
-        n = len(states.embeddings)
-        liked = torch.bincount(items[liking >= _LIKED], minlength=n)
+        liked = torch.bincount(items[liked_steps(train, *steps)], minlength=n)
         return cls(torch.bincount(items, minlength=n), liked, train.n_episodes)
 
     def save(self, path: Path) -> None:

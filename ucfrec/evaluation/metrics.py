@@ -57,11 +57,19 @@ def ratio_intervals(
 
     Resamples in which nothing stands below are left out.
     """
+    ratios = resampled_ratios(above, below, seed)
+    return np.asarray(np.nanquantile(ratios, [(1 - level) / 2, (1 + level) / 2], axis=0).T)
+
+
+def resampled_ratios(
+    above: npt.NDArray[np.float64], below: npt.NDArray[np.float64], seed: int
+) -> npt.NDArray[np.float64]:
+    """Σ above / Σ below of rows (N, C) drawn with replacement, (2000, C); NaN where nothing stands
+    below."""
     generator = np.random.default_rng(seed)
     # Multinomial counts stand for resampled rows: memory stays at N, whatever the resamples.
     share, both = np.full(len(above), 1 / len(above)), np.hstack([above, below])
     sums = np.array([generator.multinomial(len(both), share) @ both for _ in range(_RESAMPLES)])
     numerators, denominators = np.hsplit(sums, 2)
     with np.errstate(invalid="ignore", divide="ignore"):
-        ratios = np.where(denominators > 0, numerators / denominators, np.nan)
-    return np.asarray(np.nanquantile(ratios, [(1 - level) / 2, (1 + level) / 2], axis=0).T)
+        return np.where(denominators > 0, numerators / denominators, np.nan)

@@ -77,7 +77,8 @@ class ItemKNNPolicy(SequencePolicy):
         given = self.cosines[windows.actions] * weights.unsqueeze(-1)  # (B, K, neighbours)
         scores = given.new_zeros(*windows.mask.shape, len(self.cosines))
         scores.scatter_add_(-1, self.neighbors[windows.actions], given)
-        return scores.cumsum(1) - scores
+        # Row t sums the steps before it; its own is not even subtracted, which would round.
+        return F.pad(scores.cumsum(1)[:, :-1], (0, 0, 1, 0))
 
     def _logits(self, windows: Windows) -> Tensor:
         assert isinstance(self.head, ItemHead)

@@ -1,0 +1,158 @@
+"""Next-period ranking: measures agree with a slow reader, baselines are fitted on training rows."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from sklearn.metrics import roc_auc_score
+from torch import Tensor
+
+from ucfrec import schema
+from ucfrec.commands.cli import main
+from ucfrec.episodes.item_counts import TrainingCounts
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.evaluation.ranking import MEASURES, Period, Ranked, Steps, compare, measure, rank_steps
+from ucfrec.evaluation.ranking_baselines import baselines
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare
+
+N_ITEMS, K = 12, 3
+
+
+def value(measured: dict[str, tuple[np.ndarray, np.ndarray]], name: str) -> float:  # type: ignore[type-arg]
+    above, below = measured[name]
+    return float(above.sum() / below.sum())
+
+
+@given(seed=st.integers(0, 10_000), n=st.integers(2, 60), users=st.integers(1, 6))
+def test_measures_are_those_of_a_slow_reader(seed: int, n: int, users: int) -> None:
+    rng = np.random.default_rng(seed)
+    owner = np.sort(rng.integers(users, size=n))
+    items, liked = rng.integers(N_ITEMS, size=n), rng.random(n) < 0.5
+    scores = rng.integers(4, size=(n, N_ITEMS)).astype(float)  # many ties
+    own = scores[np.arange(n), items]
+    ranks = 1 + (scores > own[:, None]).sum(1) + ((scores == own[:, None]).sum(1) - 1) / 2
+    top = np.argsort(-scores, axis=1, kind="stable")[:, :K]
+    measured = measure(Period(owner, items, liked, N_ITEMS), Ranked(ranks, own, top), K)
+
+    hits = [bool(rank <= K) for rank in ranks]
+    assert value(measured, "hit_rate_shown") == pytest.approx(np.mean(hits))
+    gains = [hit / np.log2(1 + rank) for hit, rank in zip(hits, ranks, strict=True)]
+    assert value(measured, "ndcg_shown") == pytest.approx(np.mean(gains))
+    if liked.any():
+        assert value(measured, "hit_rate_liked") == pytest.approx(np.mean(np.array(hits)[liked]))
+        recalls = []
+        for user in np.unique(owner):
+            mine = np.flatnonzero(owner == user)
+            wanted = {int(items[t]) for t in mine if liked[t]}
+            if wanted:
+                recalls.append(len(wanted & set(top[mine[0]].tolist())) / len(wanted))
+        assert value(measured, "recall_liked") == pytest.approx(np.mean(recalls))
+    aucs, weights = [], []
+    for user in np.unique(owner):
+        mine = owner == user
+        if 0 < liked[mine].sum() < mine.sum():
+            aucs.append(roc_auc_score(liked[mine], own[mine]))
+            weights.append(mine.sum())
+    if aucs:
+        assert value(measured, "gauc") == pytest.approx(np.average(aucs, weights=weights))
+    rates = [liked[items == item].mean() for item in top.ravel().tolist() if (items == item).any()]
+    if rates:
+        assert value(measured, "item_rate") == pytest.approx(np.mean(rates))
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> EpisodeStore:
+    """Users who like the items of their own half of the catalogue, all of the time."""
+    folder, rng = tmp_path_factory.mktemp("ranking"), np.random.default_rng(0)
+    n = 6000
+    log = pd.DataFrame({"user_id": rng.integers(60, size=n), "item_id": rng.integers(40, size=n)})
+    log["is_click"] = (log.user_id % 2 == log.item_id % 2) & (rng.random(n) < 0.9)
+    log["timestamp"] = 1_700_000_000_000 + 60_000 * np.arange(n)
+    log.to_parquet(folder / "log.parquet")
+    options = PrepareOptions(reward="is_click", session_by="user")
+    prepare([folder / "log.parquet"], LogMapping(), folder / "store", options)
+    return EpisodeStore.open(folder / "store")
+
+
+class Oracle:
+    """Knows the halves."""
+
+    name = "oracle"
+
+    def scores(self, steps: Steps) -> Tensor:
+        own = torch.from_numpy(steps.users % 2).unsqueeze(1)
+        noise = torch.rand(len(steps.steps), 40, generator=torch.Generator().manual_seed(0))
+        return (torch.arange(40) % 2 == own).float() + 0.1 * noise
+
+
+def test_planted_taste_is_found_by_those_who_look_at_the_user(store: EpisodeStore) -> None:
+    train, test = store.split("train"), store.split("test")
+    rankers = [*baselines(TrainingCounts.of(train), train, seed=0), Oracle()]
+    ranked = {ranker.name: rank_steps(ranker, test, 10) for ranker in rankers}
+    period = Period.of(test, test.episode_values(schema.USER))
+    found = {row.name: row for row in compare(period, ranked, 10, "oracle", seed=0)}
+    assert found["oracle"].values["gauc"] > 0.9
+    for name in ("random", "most shown", "most clicked", "item click rate"):
+        assert found[name].values["gauc"] == pytest.approx(0.5, abs=0.12), name
+        gauc, low, high = found[name].differences["gauc"]
+        assert low <= gauc <= high < 0, name
+    assert found["als"].values["gauc"] > 0.9
+    assert found["item-knn"].values["gauc"] > 0.6
+    assert found["most shown"].coverage == 10 / 40
+    for row in found.values():
+        assert set(row.values) == set(MEASURES)
+        for name, (low, high) in row.intervals.items():
+            assert low - 1e-9 <= row.values[name] <= high + 1e-9
+
+
+def test_nothing_of_the_ranked_step_reaches_a_ranker(store: EpisodeStore) -> None:
+    """Other items and rewards at the last step of every session change no score there."""
+    train, test = store.split("train"), store.split("test")
+    steps = {name: store.step_values(name, *store.all_steps()) for name in (
+        schema.ITEM, schema.REWARD, schema.TIMESTAMP)}  # fmt: skip
+    last = np.cumsum(store.lengths) - 1
+    changed = {name: values.copy() for name, values in steps.items()}
+    changed[schema.ITEM][last] = (changed[schema.ITEM][last] + 7) % 40
+    changed[schema.REWARD][last] = 1 - changed[schema.REWARD][last]
+    at = test.lengths - 1
+    episodes = np.arange(test.n_episodes)
+    for ranker in baselines(TrainingCounts.of(train), train, seed=0)[1:]:
+        users = test.episode_values(schema.USER).astype(np.int64)
+        before = ranker.scores(Steps(test, episodes, at, users))
+        other = _rewritten(store, changed).split("test")
+        after = ranker.scores(Steps(other, episodes, at, users))
+        torch.testing.assert_close(before, after, rtol=0, atol=0)
+
+
+def _rewritten(store: EpisodeStore, steps: dict[str, np.ndarray]) -> EpisodeStore:  # type: ignore[type-arg]
+    names = (schema.USER, schema.SPLIT)
+    episodes = {name: store.episode_values(name) for name in names}
+    return EpisodeStore.from_arrays(
+        steps, store.lengths, episodes=episodes, item_states=store.item_states
+    )
+
+
+def test_the_command_ranks_the_test_split_and_later_logs(
+    store: EpisodeStore, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, out = str(tmp_path / "run"), tmp_path / "rows.json"
+    tiny = ["train.steps=20", "train.validate_every=10", "policy.dim=8", "policy.context=4"]
+    sets = [word for setting in tiny for word in ("--set", setting)]
+    assert main(["train", str(store.path), "--out", run, "--policy", "dt", *sets]) == 0
+    assert main(["rank", run, "--k", "5", "--json", str(out)]) == 0
+    rows = pd.read_json(out)
+    names = ["dt", "random", "most shown", "most clicked", "item click rate", "item-knn", "als"]
+    assert rows.policy.tolist() == names
+    assert (rows.steps == store.split("test").n_steps).all()
+    log = pd.read_parquet(store.path.parent / "log.parquet").tail(600)
+    log.to_parquet(tmp_path / "later.parquet")
+    assert main(["rank", run, str(tmp_path / "later.parquet"), "--k", "5"]) == 0
+    assert "gauc" in capsys.readouterr().out
+    capsys.readouterr()
+    assert main(["rank", str(tmp_path / "later.parquet")]) == 2
+    assert "name a run folder" in capsys.readouterr().err

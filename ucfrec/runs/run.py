@@ -50,8 +50,7 @@ def train_run(
             ones.
 
     Returns:
-        The record in `run.json`: command, configuration, seed, store fingerprint, versions, wall
-        time and what every stage reports.
+        The record in `run.json`: where the run comes from, and what every stage reports.
 
     Raises:
         InputError: `out` is a run on another store or with another configuration, or the store has
@@ -90,9 +89,7 @@ def train_run(
     )
     record["policy"] = dataclasses.asdict(fitted)
     record["wall_time_s"] = time.perf_counter() - began
-    if store.has_items:
-        target = max(record["return_quantiles"].values())
-        write_json(out / SAMPLES, sample_recommendations(policy, validation, target))
+    _write_samples(out, policy, validation, record)
     write_json(out / RUN, record)
     return dict(record)
 
@@ -244,6 +241,15 @@ def _validation(policy: SequencePolicy, validation: EpisodeStore, seed: int) -> 
         return float(torch.stack([policy.action_loss(w.to(device)) for w in windows]).mean())
 
     return loss
+
+
+def _write_samples(
+    out: Path, policy: SequencePolicy, validation: EpisodeStore, record: Mapping[str, Any]
+) -> None:
+    """Keep a few recommendations for the report, at the target return that commands default to."""
+    if validation.has_items:
+        target = max(record["return_quantiles"].values())
+        write_json(out / SAMPLES, sample_recommendations(policy, validation, target))
 
 
 def describe_run(record: Mapping[str, Any]) -> str:

@@ -2,39 +2,73 @@
 
     python benchmarks/demo_seeds.py --out runs/demos --seeds 0 1 2
 
-Writes the raw rows to benchmarks/results/demo.jsonl and prints a table.
+Appends the rows to results.jsonl in --out, or to --results, and prints a table. A seed draws its
+own logs, trainings and episodes.
 """
 
 import argparse
-import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-import numpy as np
+from ucfrec.code_version import code_version, plugin_module
+from ucfrec.commands.demo import BEHAVIORS, LEARNERS, WORLDS, DemoConfig, demo
+from ucfrec.policies.registry import policy_class
+from ucfrec.reporting.evaluation_rows import evaluation_row
+from ucfrec.reporting.result_row import ResultRow, RowKey
+from ucfrec.reporting.rows_file import append_rows, read_rows
+from ucfrec.reporting.tables import markdown_table, mean_and_sd
+from ucfrec.runs.trained_policy import read_record
 
-from ucfrec.commands.demo_run import LEARNERS, WORLDS, DemoConfig, demo
-from ucfrec.files import atomic_file
 
-RESULTS = Path(__file__).parent / "results" / "demo.jsonl"
+def row_of(found: Mapping[str, Any], seed: int, code: str) -> ResultRow:
+    name = found["policy"]
+    trained = name in LEARNERS
+    key = RowKey(
+        suite="demo",
+        table="demo",
+        task=found["world"],
+        method=name,
+        policy=LEARNERS[name][0] if trained else BEHAVIORS[name],
+        training_seed=seed if trained else None,
+        log_seed=seed,
+        evaluation_seed=found["seed"],
+        config_hash=found["config"],
+        code_version=code,
+        data_fingerprint=found["fingerprint"],
+    )
+    rule = "target return: the largest of training" if trained else None
+    return evaluation_row(found, key, rule=rule)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder of the runs; resumed")
+    parser.add_argument("--results", type=Path, help="result rows (results.jsonl in --out)")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     options = parser.parse_args()
+    results = options.results or options.out / "results.jsonl"
+    learners = {policy_class(learner).__module__ for learner, *_ in LEARNERS.values()}
+    simulators = [plugin_module("simulators", world) for world in WORLDS]
+    code = code_version("ucfrec.commands.demo", *sorted(learners), *simulators)
     rows = []
     for seed in options.seeds:
-        rows += demo(options.out / f"seed-{seed}", seed, DemoConfig())
-    with atomic_file(RESULTS) as scratch:
-        scratch.write_text("".join(json.dumps(row) + "\n" for row in rows))
-    print("| world | policy | R_cum, mean ± sd over seeds | each seed |")
-    print("|---|---|---|---|")
+        # Runs of other code are not gone on with.
+        folder = options.out / f"seed-{seed}-{code}"
+        for found in demo(folder, seed, DemoConfig()):
+            row = row_of(found, seed, code)
+            rows.append(row)
+            if not any(row.covers(known) for known in read_rows(results)):
+                run = folder / row.task / row.method
+                config = read_record(run)["config"] if row.config_hash else None
+                append_rows(results, [row], config)
+    lines = []
     for world in WORLDS:
         for policy in ("random", "logging", *LEARNERS, "optimal"):
-            earned = [r["R_cum"] for r in rows if (r["world"], r["policy"]) == (world, policy)]
+            earned = [row.value for row in rows if (row.task, row.method) == (world, policy)]
             each = ", ".join(f"{value:.2f}" for value in earned)
-            spread = np.std(earned, ddof=1) if len(earned) > 1 else 0.0
-            print(f"| {world} | {policy} | {np.mean(earned):.2f} ± {spread:.2f} | {each} |")
+            lines.append((world, policy, mean_and_sd(earned), each))
+    print(markdown_table(("world", "policy", "R_cum, mean ± sd over seeds", "each seed"), lines))
 
 
 if __name__ == "__main__":

@@ -1,13 +1,14 @@
 """A step of 4,096 users in one `kuairand` world against one user in a Python-loop environment.
 
-    python -m benchmarks.kuai_speed --world runs/benchmark/small/arenas/kuairand/world
+    python -m benchmarks.kuai_speed --world FOLDER
 
 Both play the same table, tags and exit rule; the one user under Gymnasium's `SyncVectorEnv`, as the
-many are a vector environment. They take turns. Writes benchmarks/results/kuai_speed.jsonl.
+many are a vector environment. They take turns. FOLDER is the `world` that `ucfrec benchmark
+recommendation` makes in its task folder. Appends a row to runs/kuai_speed/results.jsonl, or to
+--results.
 """
 
 import argparse
-import json
 import time
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,13 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from tests.support.kuai_reference import OneUser
-from ucfrec.files import atomic_file
+from ucfrec.code_version import code_version
 from ucfrec.provenance import provenance
+from ucfrec.reporting.result_row import ResultRow
+from ucfrec.reporting.rows_file import append_rows
 from ucfrec_simulators.kuai.kuairand import kuairand
 
-RESULTS = Path(__file__).parent / "results" / "kuai_speed.jsonl"
+RESULTS = Path("runs/kuai_speed/results.jsonl")
 USERS = 4096
 
 
@@ -38,6 +41,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--world", type=Path, required=True, help="folder of the kuairand world")
     parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--results", type=Path, default=RESULTS, help=f"result rows ({RESULTS})")
     options = parser.parse_args()
     many = kuairand(USERS, options.world)
     one = SyncVectorEnv(
@@ -53,9 +57,19 @@ def main() -> None:
             ratios.append(slow[-1] / fast[-1])
     low, middle, high = np.quantile(ratios, [0.1, 0.5, 0.9])
     print(f"{USERS} users in one world: 1/{middle:.0f} [1/{low:.0f}, 1/{high:.0f}] a user-step")
-    row = {"users": USERS, "ratio": middle, "ratio_low": low, "ratio_high": high}
-    with atomic_file(RESULTS) as scratch:
-        scratch.write_text(json.dumps({**row, "rounds": options.rounds, **provenance()}) + "\n")
+    row = ResultRow(
+        suite="kuai-speed",
+        table="kuai-speed",
+        task="kuairand",
+        method="many users",
+        policy="random",
+        conditions={"users": USERS, "rounds": options.rounds},
+        code_version=code_version(Path(__file__), kuairand.__module__),
+        metric="ratio",
+        metrics={"ratio": middle, "ratio_10": low, "ratio_90": high},
+        **provenance(),
+    )
+    append_rows(options.results, [row])
 
 
 if __name__ == "__main__":

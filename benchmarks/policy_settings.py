@@ -3,72 +3,96 @@
     python benchmarks/policy_settings.py --store STORE... --out runs/settings
 
 Trains UCF without copies on each store with each pair of settings and compares the validation
-loss, never a simulator. Writes benchmarks/results/policy_settings.jsonl and prints a table.
+loss, never a simulator. Appends the rows to results.jsonl in --out, or to --results, and prints a
+table.
 """
 
 import argparse
 import itertools
-import json
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-
+from ucfrec.code_version import code_version
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.files import atomic_file
 from ucfrec.provenance import provenance
-from ucfrec.runs.config import resolve_config
+from ucfrec.reporting.grid import Measurement, run_grid
+from ucfrec.reporting.result_row import ResultRow, RowKey
+from ucfrec.reporting.tables import markdown_table
+from ucfrec.runs.config import Config, resolve_config
 from ucfrec.runs.run import train_run
 
-RESULTS = Path(__file__).parent / "results" / "policy_settings.jsonl"
 DEMO_SIZE = ("policy.dim=64", "policy.context=10", "train.learning_rate=1e-3", "augment.copies=0")
 
 
-def train(store: Path, out: Path, settings: dict[str, float], steps: int) -> dict[str, Any]:
-    torch.set_num_threads(1)
-    given = [f"{name}={value}" for name, value in settings.items()]
-    config = resolve_config("ucf", None, [*DEMO_SIZE, f"train.steps={steps}", *given])
-    name = "-".join(str(value) for value in settings.values())
-    record = train_run(EpisodeStore.open(store), out / store.parent.name / name, config)
-    loss = record["policy"]["best_validation"]
-    keys = ("fingerprint", "seed", "wall_time_s")
-    return {
-        "store": store.parent.name,
-        **settings,
-        "validation_loss": loss,
-        **{key: record[key] for key in keys},
-        **provenance(),
-    }
+@dataclass(frozen=True)
+class Cell:
+    store: Path
+    out: Path
+    lambda_mask: float
+    parent_action: float
+    steps: int
+
+    @property
+    def config(self) -> Config:
+        given = [f"policy.lambda_mask={self.lambda_mask}"]
+        given += [f"policy.parent_action={self.parent_action}", f"train.steps={self.steps}"]
+        return resolve_config("ucf", None, [*DEMO_SIZE, *given])
+
+
+def key(cell: Cell) -> RowKey:
+    return RowKey(
+        suite="policy-settings",
+        table="policy-settings",
+        task=cell.store.parent.name,
+        method="ucf",
+        policy="ucf",
+        training_seed=0,
+        conditions={"lambda_mask": cell.lambda_mask, "parent_action": cell.parent_action},
+        code_version=code_version(Path(__file__), "ucfrec.runs.run", "ucfrec.policies.ucf"),
+        data_fingerprint=EpisodeStore.open(cell.store).meta["fingerprint"],
+    )
+
+
+def config(cell: Cell) -> dict[str, Any]:
+    return asdict(cell.config)
+
+
+def measure(cell: Cell, own: RowKey) -> list[ResultRow]:
+    name = f"{cell.lambda_mask}-{cell.parent_action}-{own.code_version}"
+    folder = cell.out / cell.store.parent.name / name
+    record = train_run(EpisodeStore.open(cell.store), folder, cell.config)
+    loss = {"validation_loss": record["policy"]["best_validation"]}
+    given = {"metric": "validation_loss", "metrics": loss, "wall_time_s": record["wall_time_s"]}
+    return [ResultRow(**vars(own), **given, **provenance())]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--store", type=Path, nargs="+", required=True)
     parser.add_argument("--out", type=Path, required=True, help="folder of the runs; resumed")
+    parser.add_argument("--results", type=Path, help="result rows (results.jsonl in --out)")
     parser.add_argument("--lambda-mask", type=float, nargs="+", default=[0, 0.01, 0.03, 0.1])
     parser.add_argument("--parent-action", type=float, nargs="+", default=[0, 0.3])
     parser.add_argument("--steps", type=int, default=1000)
     options = parser.parse_args()
-    pairs = [
-        {"policy.lambda_mask": weight, "policy.parent_action": action}
-        for weight, action in itertools.product(options.lambda_mask, options.parent_action)
+    pairs = list(itertools.product(options.lambda_mask, options.parent_action))
+    cells = [
+        Cell(store, options.out, weight, action, options.steps)
+        for store in options.store
+        for weight, action in pairs
     ]
-    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
-        jobs = [
-            pool.submit(train, store, options.out, pair, options.steps)
-            for store in options.store
-            for pair in pairs
-        ]
-        rows = [job.result() for job in jobs]
-    with atomic_file(RESULTS) as scratch:
-        scratch.write_text("".join(json.dumps(row) + "\n" for row in rows))
-    print("| store | λ | weight of a_{t−1} | validation loss |")
-    print("|---|---|---|---|")
-    for row in rows:
-        weight, action = row["policy.lambda_mask"], row["policy.parent_action"]
-        print(f"| {row['store']} | {weight} | {action} | {row['validation_loss']:.4f} |")
+    results = options.results or options.out / "results.jsonl"
+    rows = run_grid(cells, Measurement(key, config, measure), results, 2, "policy settings")
+    lines = [
+        (
+            row.task,
+            *(f"{row.conditions[name]:g}" for name in ("lambda_mask", "parent_action")),
+            f"{row.value:.4f}",
+        )
+        for row in rows
+    ]
+    print(markdown_table(("store", "λ", "weight of a_{t−1}", "validation loss"), lines))
 
 
 if __name__ == "__main__":

@@ -2,26 +2,28 @@
 
     python benchmarks/step_time.py --dim 128 --context 20
 
-Writes benchmarks/results/step_time.jsonl and prints a table. Only ratios are kept: the policies
-take turns, so a machine that slows down slows all of them.
+Appends the rows to runs/step_time/results.jsonl, or to --results, and prints a table. Only ratios
+are kept: the policies take turns, so a machine that slows down slows all of them.
 """
 
 import argparse
-import json
 import time
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from ucfrec.code_version import code_version
 from ucfrec.episodes.windows import Windows
-from ucfrec.files import atomic_file
 from ucfrec.policies.base import SequencePolicy
-from ucfrec.policies.registry import POLICIES
+from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import provenance
+from ucfrec.reporting.result_row import ResultRow
+from ucfrec.reporting.rows_file import append_rows
+from ucfrec.reporting.tables import markdown_table
 from ucfrec.runs.config import resolve_config
 
-RESULTS = Path(__file__).parent / "results" / "step_time.jsonl"
+RESULTS = Path("runs/step_time/results.jsonl")
 SIZES = {"state": 91, "action": 27, "items": 0}
 LEARNERS = ("dt", "dc", "lsdt", "ucf", "dt4rec", "cdt4rec", "edt4rec", "sasrec", "bc")
 
@@ -52,6 +54,7 @@ def main() -> None:
     parser.add_argument("--context", type=int, default=20)
     parser.add_argument("--batch", type=int, default=64)
     parser.add_argument("--rounds", type=int, default=20)
+    parser.add_argument("--results", type=Path, default=RESULTS, help=f"result rows ({RESULTS})")
     options = parser.parse_args()
     torch.set_num_threads(1)
     torch.manual_seed(0)
@@ -59,7 +62,7 @@ def main() -> None:
     learners = {}
     for name in LEARNERS:
         settings = [f"policy.dim={options.dim}", f"policy.context={options.context}"]
-        policy = POLICIES[name](resolve_config(name, None, settings).policy, SIZES)
+        policy = policy_class(name)(resolve_config(name, None, settings).policy, SIZES)
         learners[name] = policy, torch.optim.AdamW(policy.parameters(), fused=True)
     seconds: dict[str, list[float]] = {name: [] for name in learners}
     for turn in range(options.rounds + 2):
@@ -67,16 +70,26 @@ def main() -> None:
             taken = step_seconds(policy, optimizer, batch)
             if turn >= 2:
                 seconds[name].append(taken)
-    rows = []
-    print("| policy | time of a step / DT's, median [10%, 90%] |")
-    print("|---|---|")
+    sizes = {name: getattr(options, name) for name in ("dim", "context", "batch", "rounds")}
+    lines = []
     for name in learners:
         low, middle, high = np.quantile(np.divide(seconds[name], seconds["dt"]), [0.1, 0.5, 0.9])
-        print(f"| {name} | {middle:.2f} [{low:.2f}, {high:.2f}] |")
-        row = {"policy": name, "ratio": middle, "ratio_low": low, "ratio_high": high}
-        rows.append({**row, **vars(options), **provenance()})
-    with atomic_file(RESULTS) as scratch:
-        scratch.write_text("".join(json.dumps(row) + "\n" for row in rows))
+        lines.append((name, f"{middle:.2f} [{low:.2f}, {high:.2f}]"))
+        row = ResultRow(
+            suite="step-time",
+            table="step-time",
+            task="random windows",
+            method=name,
+            policy=name,
+            conditions=sizes,
+            code_version=code_version(Path(__file__), policy_class(name).__module__),
+            metric="ratio",
+            metrics={"ratio": middle, "ratio_10": low, "ratio_90": high},
+            wall_time_s=sum(seconds[name]),
+            **provenance(),
+        )
+        append_rows(options.results, [row])
+    print(markdown_table(("policy", "time of a step / DT's, median [10%, 90%]"), lines))
 
 
 if __name__ == "__main__":

@@ -63,3 +63,29 @@ def read_json(path: Path) -> Any:
         raise InputError(f"{path} does not exist") from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is not JSON: {error}") from None
+
+
+@contextmanager
+def file_lock(file: Path, byte: int = 0, wait: bool = True) -> Iterator[bool]:
+    """Hold a lock that processes share by the name of a file, made where it does not exist.
+
+    The system frees it when the process ends, however it ends. A process must not hold two bytes of
+    one file: to close it frees both.
+
+    Args:
+        byte: what is locked; who locks another byte of the file is not in the way.
+        wait: until it is free, or give up at once.
+
+    Yields:
+        Whether the lock is held.
+    """
+    import fcntl  # not on Windows
+
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with file.open("a") as opened:
+        try:
+            fcntl.lockf(opened, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB), 1, byte)
+        except (BlockingIOError, PermissionError):
+            yield False
+        else:
+            yield True

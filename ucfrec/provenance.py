@@ -1,4 +1,4 @@
-"""Result rows: where they came from, and how they are shown."""
+"""Where a result comes from: command, commit, versions, configuration, memory."""
 
 import hashlib
 import json
@@ -6,11 +6,10 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 _PACKAGES = ("ucfrec", "torch", "numpy", "gymnasium")
-_SHOWN = ("world", "policy", "R_cum", "R_avg_pooled", "R_avg_episode", "length", "episodes", "seed")
 
 
 def versions(packages: Sequence[str] = ()) -> dict[str, str]:
@@ -33,13 +32,55 @@ def provenance(packages: Sequence[str] = ()) -> dict[str, Any]:
 
 
 def command_line() -> str:
-    """The command of this process, without the folder that it is installed in."""
-    return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    """The command of this process, with absolute paths cut to their last name.
+
+    So no row says where on one machine something lies.
+    """
+    return " ".join([Path(sys.argv[0]).name, *map(without_folders, sys.argv[1:])])
+
+
+def without_folders(argument: str) -> str:
+    """An argument of a command, an absolute path in it (also after `=`) cut to its last name."""
+    option, equals, value = "", "", argument
+    if not _is_absolute(argument):
+        option, equals, value = argument.rpartition("=")
+    name = PureWindowsPath(value).name
+    return f"{option}{equals}{name}" if name and _is_absolute(value) else argument
+
+
+def _is_absolute(path: str) -> bool:
+    """Whether it names one place on one machine, under whichever system."""
+    rooted = PurePosixPath(path).is_absolute() or PureWindowsPath(path).is_absolute()
+    return rooted or path.startswith("~")
 
 
 def config_hash(config: Mapping[str, Any]) -> str:
-    """A short name for a configuration."""
+    """A short name for a configuration: 12 hexadecimal digits of the SHA-256 of its JSON."""
     return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def reset_peak_memory() -> None:
+    """Let `peak_memory_mib` start again from what is in use now; only Linux can."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return
+
+
+def peak_memory_mib() -> float:
+    """Most resident memory of this process since `reset_peak_memory`, in MiB.
+
+    Where that cannot be reset (not on Linux): since the process began.
+    """
+    status = Path("/proc/self/status")
+    if status.exists():
+        for line in status.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) / 1024
+    import resource  # not on Windows
+
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
 
 
 def _commit() -> str | None:
@@ -47,32 +88,7 @@ def _commit() -> str | None:
     root = Path(__file__).resolve().parent.parent
     if not (root / ".git").exists():
         return None
-    asked = subprocess.run(
+    answer = subprocess.run(
         ["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=False
     )
-    return asked.stdout.strip() or None
-
-
-def format_rows(rows: Sequence[Mapping[str, Any]], shown: Sequence[str] = _SHOWN) -> str:
-    """The columns `shown` of result rows as an aligned table, R_cum with its interval."""
-    body = [[_cell(row, name) for name in shown] for row in rows]
-    table = [list(shown), *body]
-    widths = [max(len(line[i]) for line in table) for i in range(len(shown))]
-    lines = []
-    for line in table:
-        cells = [line[i].ljust(w) if i < 2 else line[i].rjust(w) for i, w in enumerate(widths)]
-        lines.append("  ".join(cells).rstrip())
-    lines.insert(1, "  ".join("-" * width for width in widths))
-    return "\n".join(lines)
-
-
-def _cell(row: Mapping[str, Any], name: str) -> str:
-    value = row[name]
-    if name == "R_cum":
-        return f"{_number(value)} [{_number(row['R_cum_low'])}, {_number(row['R_cum_high'])}]"
-    return _number(value) if isinstance(value, float) else str(value)
-
-
-def _number(value: float) -> str:
-    """Three decimals, or, of click rates and the like, three digits."""
-    return f"{value:.3f}" if value == 0 or abs(value) >= 0.1 else f"{value:#.3g}"
+    return answer.stdout.strip() or None

@@ -1,53 +1,138 @@
 """The benchmark grid: resumed without measuring twice, nothing lost to a failure."""
 
 import json
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from ucfrec.errors import InputError
-from ucfrec.reporting.grid import read_rows, run_grid
+from ucfrec.reporting.grid import Measurement, chosen, run_grid
+from ucfrec.reporting.result_row import ResultRow, RowKey
+from ucfrec.reporting.rows_file import read_configurations, read_rows
+
+Cell = tuple[str, int, str]
+"""A folder for marks, a number, the version of the code."""
 
 
-def _square(cell: tuple[str, int]) -> list[dict[str, Any]]:
-    folder, number = cell
-    marks = Path(folder) / "marks"
-    with marks.open("a") as file:
+def _key(cell: Cell) -> RowKey:
+    return RowKey(
+        suite="s",
+        table="squares",
+        task=str(cell[1]),
+        method="m",
+        policy="p",
+        code_version=cell[2],
+    )
+
+
+def _config(cell: Cell) -> dict[str, Any] | None:
+    return {"number": (cell[1],)} if cell[1] > 1 else None
+
+
+def _square(cell: Cell, key: RowKey) -> list[ResultRow]:
+    folder, number, _ = cell
+    with (Path(folder) / "marks").open("a") as file:
         file.write(f"{number}\n")
     if number < 0:
         raise ValueError("negative")
-    return [{"square": number**2, "sign": sign} for sign in (1, -1)]
+    if number >= 100:
+        time.sleep(0.2)
+    value = {"metric": "square", "metrics": {"square": float(number**2)}}
+    return [ResultRow(**vars(key), **value, checkpoint=name) for name in ("last", "best")]
 
 
-def _keys(cell: tuple[str, int]) -> dict[str, Any]:
-    return {"number": cell[1]}
+HOW = Measurement(_key, _config, _square)
+
+
+def _cells(folder: Path, *numbers: int, code: str = "1") -> list[Cell]:
+    return [(str(folder), number, code) for number in numbers]
+
+
+def _marks(folder: Path) -> list[str]:
+    return sorted((folder / "marks").read_text().split())
 
 
 def test_measures_once_and_returns_rows_in_the_order_of_cells(tmp_path: Path) -> None:
     results = tmp_path / "results" / "rows.jsonl"
-    first = [(str(tmp_path), n) for n in (2, 1)]
-    run_grid(first, _square, _keys, results, 2)
-    cells = [(str(tmp_path), n) for n in (1, 3, 2)]
-    rows = run_grid(cells, _square, _keys, results, 2)
-    assert [(row["number"], row["square"], row["sign"]) for row in rows] == [
-        (n, n**2, sign) for n in (1, 3, 2) for sign in (1, -1)
+    run_grid(_cells(tmp_path, 2, 1), HOW, results, 2)
+    rows = run_grid(_cells(tmp_path, 1, 3, 2, 3), HOW, results, 2)
+    assert [(row.task, row.value, row.checkpoint) for row in rows] == [
+        (str(n), float(n**2), name) for n in (1, 3, 2) for name in ("last", "best")
     ]
-    assert sorted((tmp_path / "marks").read_text().split()) == ["1", "2", "3"]
+    assert _marks(tmp_path) == ["1", "2", "3"]
     assert len(read_rows(results)) == 6
+    assert all(row.peak_memory_mib and row.peak_memory_mib > 10 for row in rows)
+    configurations = read_configurations(results.parent)
+    named = {row.task: configurations.get(str(row.config_hash)) for row in rows}
+    assert named == {"1": None, "2": {"number": [2]}, "3": {"number": [3]}}
+
+
+def test_rows_of_other_code_are_measured_again(tmp_path: Path) -> None:
+    results = tmp_path / "rows.jsonl"
+    run_grid(_cells(tmp_path, 2), HOW, results, 1)
+    rows = run_grid(_cells(tmp_path, 2, code="2"), HOW, results, 1)
+    assert {row.code_version for row in rows} == {"2"}
+    assert _marks(tmp_path) == ["2", "2"]
 
 
 def test_a_failed_cell_costs_only_itself(tmp_path: Path) -> None:
     results = tmp_path / "rows.jsonl"
-    cells = [(str(tmp_path), n) for n in (-1, 5)]
-    told = r"1 of 2 cells failed.*'number': -1.*ValueError: negative"
-    with pytest.raises(InputError, match=told):
-        run_grid(cells, _square, _keys, results, 1)
-    assert {row["number"] for row in read_rows(results)} == {5}
+    says = r"1 of 2 cells failed.*task='-1'.*ValueError: negative"
+    with pytest.raises(InputError, match=says):
+        run_grid(_cells(tmp_path, -1, 5), HOW, results, 1)
+    assert {row.task for row in read_rows(results)} == {"5"}
 
 
-def test_a_line_that_is_no_row_is_named(tmp_path: Path) -> None:
+def test_a_line_that_is_no_row_is_named_before_anything_is_measured(tmp_path: Path) -> None:
     results = tmp_path / "rows.jsonl"
-    results.write_text(json.dumps({"number": 1}) + "\n[broken\n")
-    with pytest.raises(InputError, match="line 2, is no result row"):
-        run_grid([], _square, _keys, results, 1)
+    results.write_text("\n[broken\n")
+    with pytest.raises(InputError, match="line 2 is no result row"):
+        run_grid(_cells(tmp_path, 1), HOW, results, 1)
+    assert not (tmp_path / "marks").exists()
+
+
+_RUN = """
+import json, sys
+from pathlib import Path
+from tests.reporting.test_grid import HOW
+from ucfrec.reporting.grid import run_grid
+if __name__ == "__main__":
+    folder, *numbers = sys.argv[1:]
+    cells = [(folder, int(number), "1") for number in numbers]
+    rows = run_grid(cells, HOW, Path(folder) / "rows.jsonl", 2)
+    print(json.dumps([row.task for row in rows]))
+"""
+
+
+def test_two_processes_on_one_file_share_the_work(tmp_path: Path) -> None:
+    """Every cell is measured by one of them; both return the rows of all."""
+    script = tmp_path / "run.py"
+    script.write_text(_RUN)
+    numbers = [str(number) for number in range(100, 112)]
+    root = str(Path(__file__).parents[2])
+    running = [
+        subprocess.Popen(
+            [sys.executable, str(script), str(tmp_path), *order],
+            stdout=subprocess.PIPE,
+            text=True,
+            env={"PYTHONPATH": root, "PATH": "", "OMP_NUM_THREADS": "1"},
+        )
+        for order in (numbers, numbers[::-1])
+    ]
+    said = [json.loads(process.communicate()[0]) for process in running]
+    assert _marks(tmp_path) == numbers
+    assert said[0] == [n for n in numbers for _ in range(2)]
+    assert said[1] == said[0][::-1]
+    rows = read_rows(tmp_path / "rows.jsonl")
+    assert sorted(row.task for row in rows) == sorted(said[0])
+
+
+def test_what_is_chosen_keeps_its_order() -> None:
+    assert chosen(("a", "b", "c"), ["c", "a"], "method") == ["a", "c"]
+    assert chosen(("a", "b"), [], "method") == ["a", "b"]
+    with pytest.raises(InputError, match="no method is called d; there are a, b"):
+        chosen(("a", "b"), ["d"], "method")

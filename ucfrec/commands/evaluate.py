@@ -5,10 +5,6 @@ from pathlib import Path
 
 from ucfrec.commands.options import target_given, target_options, world_options
 from ucfrec.errors import InputError
-from ucfrec.evaluation.evaluate import World, evaluate_behavior, evaluate_policy
-from ucfrec.files import write_json
-from ucfrec.provenance import format_rows
-from ucfrec.runs.trained_policy import TrainedPolicy
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -20,7 +16,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--behavior",
         action="append",
         default=[],
-        help="a built-in policy to judge beside, e.g. random; repeatable",
+        help="a built-in policy to evaluate beside, e.g. random; repeatable",
     )
     target_options(parser)
     parser.add_argument("--json", type=Path, help="write the result rows here")
@@ -28,6 +24,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """`ucfrec evaluate`."""
+    from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
+    from ucfrec.evaluation.world import World
+    from ucfrec.files import write_json
+    from ucfrec.provenance import without_folders
+    from ucfrec.reporting.tables import format_rows
+    from ucfrec.runs.trained_policy import TrainedPolicy
+
     world = World(options.env, options.env_folder)
     if not options.runs and not options.behavior:
         raise InputError("name a run folder, or a built-in policy with --behavior")
@@ -36,7 +39,7 @@ def run(options: argparse.Namespace) -> None:
         trained = TrainedPolicy.load(run, options.checkpoint)
         target = target_given(options, trained)
         row = evaluate_policy(world, trained, trained.name, options.episodes, options.seed, target)
-        rows.append(row | {"run": str(run), "checkpoint": options.checkpoint})
+        rows.append(row | {"run": without_folders(str(run)), "checkpoint": options.checkpoint})
     rows += [
         evaluate_behavior(world, behavior, options.episodes, options.seed)
         for behavior in options.behavior

@@ -3,8 +3,6 @@
 import argparse
 from pathlib import Path
 
-from ucfrec.reporting.page import write_report
-
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """What `report` takes."""
@@ -29,5 +27,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """`ucfrec report`."""
+    from ucfrec.reporting.page import write_report
+
     write_report(options.out, options.runs, options.results, options.items)
     print(f"report: {options.out}; open it in a browser")

@@ -6,10 +6,11 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
 from ucfrec.errors import InputError
@@ -21,31 +22,38 @@ from ucfrec.fitting.checkpoint import (
     save_training,
 )
 from ucfrec.fitting.metrics_log import MetricsLog
+from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.progress import Progress, progress
+from ucfrec.settings import BatchSize, Count, LearningRate, WeightDecay, settings_table
 
 Batch = TypeVar("Batch")
 
 
-@dataclass(frozen=True)
+@settings_table("train")
 class LoopConfig:
     """How long and how fast to learn.
 
     Policy defaults are the paper's Table 8; `steps` and the rest are ours.
     """
 
-    steps: int = 10_000
-    batch_size: int = 64
-    learning_rate: float = 1e-4
-    weight_decay: float = 1e-4
-    warmup_steps: int = 500
-    """Linear warm-up, then constant or along a cosine."""
+    steps: Count = 10_000
+    """Updates in all."""
+    batch_size: BatchSize = 64
+    """Windows of an update."""
+    learning_rate: LearningRate = 1e-4
+    """Step size of the updates, once warm."""
+    weight_decay: WeightDecay = 1e-4
+    """AdamW's pull of the weights towards 0."""
+    warmup_steps: Annotated[int, Field(ge=0, le=10**12)] = 500
+    """Steps in which the learning rate rises linearly; then it stays, or falls along a cosine. A
+    training of fewer steps ends before it has risen."""
     cosine: bool = False
     """After the warm-up, fall to 0 at the last step instead of staying constant."""
-    clip_norm: float = 0.25
+    clip_norm: Annotated[float, Field(ge=0, le=1e6)] = 0.25
     """Largest gradient norm; 0 clips nothing."""
-    validate_every: int = 500
+    validate_every: Count = 500
     """Steps between validations, checkpoints and log lines."""
-    patience: int = 0
+    patience: Annotated[int, Field(ge=0, le=10**9)] = 0
     """Validations without a better one before stopping early; 0 never stops early."""
 
 
@@ -68,6 +76,7 @@ def step_generator(seed: int, step: int) -> np.random.Generator:
     return np.random.default_rng([seed, step])
 
 
+@random_state_kept()
 def fit(
     module: nn.Module,
     draw: Callable[[np.random.Generator], Batch],
@@ -84,7 +93,7 @@ def fit(
     Writes `last.safetensors` (all that resuming needs), `best.safetensors` (weights with the lowest
     validation loss, else the last), `metrics.jsonl` and TensorBoard events to `folder`. A run
     killed at any moment and started again ends with the same weights as an uninterrupted one (same
-    machine and device).
+    machine and device). The global random state is as before when it returns or raises.
 
     Args:
         module: what is trained, in place; holds the best weights on return.
@@ -113,7 +122,6 @@ def fit(
         norm = _descend(value, module, optimizer, config, step)
         if step % config.validate_every and step != config.steps:
             continue
-
         logged = {"loss": value.item(), "gradient_norm": norm.item(), **clock.rates(step, config)}
         _require_finite(logged["loss"], f"{describe}: the loss", step)
         _require_finite(logged["gradient_norm"], f"{describe}: the gradient", step)

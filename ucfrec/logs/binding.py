@@ -12,10 +12,10 @@ import duckdb
 from safetensors import SafetensorError
 
 from ucfrec.errors import InputError
+from ucfrec.logs.expressions import NotScalarError, columns_of, refused
 
+_MAGIC = re.compile(r"[\[*?]")
 _NAME = re.compile(r"[^\W\d]\w*")
-_SUBQUERY = re.compile(r"\bselect\b", re.IGNORECASE)
-_UNKNOWN_COLUMN = re.compile(r'Referenced column "([^"]+)" not found')
 _CSV_FAULT = re.compile(r"CSV Error on Line: (\d+).*?\n\s*file = ([^\n]+)", re.DOTALL)
 _CSV_COLUMN = re.compile(r'converting column "([^"]+)"\. ([^\n]+)')
 _INTEGER = re.compile(r"U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?")
@@ -41,12 +41,16 @@ class Table:
     @property
     def sql(self) -> str:
         """The table function that reads the files."""
-        # DuckDB takes brackets for a glob.
-        files = ", ".join(text(str(file).replace("[", "[[]")) for file in self.files)
+        files = ", ".join(text(glob_pattern(file)) for file in self.files)
         if self.files[0].suffix == ".parquet":
             return f"read_parquet([{files}])"
         types = ", ".join(f"{text(name)}: {text(kind)}" for name, kind in self.types)
         return f"read_csv([{files}], header = true, types = {{{types}}})"
+
+
+def glob_pattern(file: Path) -> str:
+    """The pattern that DuckDB, which takes every path for one, finds this file alone with."""
+    return _MAGIC.sub(r"[\g<0>]", str(file))
 
 
 def text(value: str) -> str:
@@ -129,19 +133,14 @@ def bind(
         raise InputError(_missing(table, what, given))
     sql = f"({given}\n)"
     like = ", ".join(f"CAST(NULL AS {kind}) AS {quoted(name)}" for name, kind in table.types)
-    # Where conditions admit neither aggregates nor window functions.
-    query = f"DESCRIBE SELECT {sql} AS x FROM (SELECT {like}) WHERE {sql} IS NULL"
     try:
-        if _SUBQUERY.search(given):
-            raise duckdb.ParserException("it has a subquery")
-        described = connection.sql(query).fetchall()
-    except duckdb.Error as error:
-        if unknown := _UNKNOWN_COLUMN.search(str(error)):
-            raise InputError(_missing(table, what, unknown[1])) from None
-        raise InputError(
-            f"{what}: {given!r} is no scalar SQL expression over the columns of {table.files[0]}: "
-            f"{_first_line(error)}"
-        ) from None
+        # Names that are no columns might stand for the user or the time to DuckDB.
+        for name in columns_of(connection, given):
+            if name.casefold() not in names:
+                raise InputError(_missing(table, what, name))
+        described = connection.sql(f"DESCRIBE SELECT {sql} AS x FROM (SELECT {like})").fetchall()
+    except (duckdb.Error, NotScalarError) as error:
+        raise refused(what, given, str(table.files[0]), _first_line(error)) from None
     return sql, str(described[0][1])
 
 

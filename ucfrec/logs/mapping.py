@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from ucfrec import schema
 from ucfrec.errors import InputError
+from ucfrec.logs.expressions import Expression
 
 SUFFIXES: Final = (".parquet", ".csv", ".csv.gz")
 KEY_COLUMNS: Final = (schema.USER_ID, schema.ITEM_ID, schema.ACTION, schema.TIMESTAMP)
@@ -51,9 +52,9 @@ class LogMapping:
     is not named here has its own name in the file; "" says that the log has no such column. Times
     are milliseconds, or dates and timestamps (UTC)."""
     reward: str | None = None
-    """Reward unless another is asked for."""
+    """Reward unless `PrepareOptions` names another."""
     session_by: str | None = None
-    """How the rows fall into sessions unless told otherwise: "session_id", "gap" or "user"."""
+    """How rows make sessions, unless `PrepareOptions` says: "session_id", "gap" or "user"."""
     item_features: tuple[FeatureTable, ...] = ()
     user_features: tuple[FeatureTable, ...] = ()
 
@@ -64,7 +65,7 @@ class LogMapping:
                 raise InputError(f"{name!r} is no log column; those are {', '.join(known)}")
 
     def over(self, defaults: "LogMapping") -> "LogMapping":
-        """This mapping, with `defaults` wherever it says nothing."""
+        """This mapping, with the fields of `defaults` where it leaves them empty."""
         return LogMapping(
             {**defaults.columns, **self.columns},
             self.reward or defaults.reward,
@@ -81,7 +82,7 @@ class Dataset:
     summary: str
     """One line for `--help`."""
     resolve: Callable[[Sequence[str | Path], LogMapping], tuple[tuple[Path, ...], LogMapping]]
-    """(files, folders and globs, what the user says of them) to (log files, full mapping)."""
+    """(files, folders and globs, the user's own mapping) to (log files, full mapping)."""
 
 
 def columns_given(assignments: Sequence[str]) -> dict[str, str]:
@@ -90,12 +91,12 @@ def columns_given(assignments: Sequence[str]) -> dict[str, str]:
     Raises:
         InputError: one of them has no "=".
     """
-    pairs = {}
+    pairs: dict[str, str] = {}
     for assignment in assignments:
         name, equals, value = assignment.partition("=")
         if not equals:
             raise InputError(f"--column {assignment}: write NAME=COLUMN, e.g. user_id=uid")
-        pairs[name.strip()] = value.strip()
+        pairs[name.strip()] = Expression(value.strip(), "--column")
     return pairs
 
 
@@ -117,7 +118,7 @@ def read_mapping(path: Path) -> LogMapping:
         columns = ["ln(1 + price)", "string_split(tags, '|')"]
 
     Raises:
-        InputError: the file is missing, is not TOML, or says something unknown.
+        InputError: the file is missing, is not TOML, or has an unknown field.
     """
     try:
         given: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -126,18 +127,24 @@ def read_mapping(path: Path) -> LogMapping:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is not TOML: {error}") from None
     try:
+        for name, value in given.get("columns", {}).items():
+            given["columns"][name] = Expression(value, str(path))
+        if "reward" in given:
+            given["reward"] = Expression(given["reward"], str(path))
         for kind in ("item_features", "user_features"):
             tables = (FeatureTable(**table) for table in given.get(kind, []))
             given[kind] = tuple(
                 replace(
                     table,
                     files=tuple(path.parent / file for file in table.files),
-                    columns=tuple(table.columns),
+                    key=Expression(table.key, str(path)),
+                    columns=tuple(Expression(column, str(path)) for column in table.columns),
+                    first_by=Expression(table.first_by, str(path)),
                 )
                 for table in tables
             )
         return LogMapping(**given)
-    except (TypeError, InputError) as error:
+    except (AttributeError, TypeError, InputError) as error:
         raise InputError(f"{path}: {error}") from None
 
 

@@ -13,16 +13,17 @@ import pandas as pd
 import pyarrow.parquet as pq
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
+from ucfrec.logs.expressions import Expression
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.logs.sessions import EPISODE_USERS
-from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.progress import progress
+from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 
 SESSION, PROBABILITY, RANK, GREEDY = "session", "probability", "rank", "greedy_item_id"
 _STEPS_AT_ONCE = 1024
@@ -77,7 +78,7 @@ def logged_sessions(
     gap_ms = record["session_gap_ms"]
     # Runs from before `session_by` was recorded tell the gap at least.
     session_by = record.get("session_by") or (None if gap_ms is None else "gap")
-    options = PrepareOptions(record["reward"], session_by)
+    options = PrepareOptions(Expression(record["reward"], str(run / RUN)), session_by)
     if gap_ms is not None:
         options = replace(options, gap_minutes=gap_ms / 60_000)
     with tempfile.TemporaryDirectory(prefix="ucfrec-") as scratch:
@@ -96,12 +97,14 @@ def logged_sessions(
 def scored_steps(
     trained: TrainedPolicy, store: EpisodeStore, target_return: float
 ) -> Iterator[ScoredSteps]:
-    """Every step of `store` in order, a batch at a time, as it would be seen when acting: asked for
-    `target_return` less what the session has earned so far."""
+    """Every step of `store` in order, a batch at a time, as the policy would see it when acting.
+
+    Its return-to-go is `target_return` less what the session has earned so far.
+    """
     assert trained.item_ids is not None
     at_once = max(1, min(_STEPS_AT_ONCE, _LOGITS_AT_ONCE // len(trained.item_ids)))
     total = store.n_steps
-    with tqdm(total=total, desc="score", unit="step", unit_scale=True, disable=None) as bar:
+    with progress(total, "score", "steps") as bar:
         for begin in range(0, total, at_once):
             episodes, steps = store.locate(np.arange(begin, min(begin + at_once, total)))
             windows = store.windows(episodes, steps, trained.policy.config.context)

@@ -3,107 +3,164 @@
 import json
 import multiprocessing
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
-from typing import Any, TypeVar
-
-import torch
-from tqdm import tqdm
+from typing import Any, Generic, TypeVar
 
 from ucfrec.errors import InputError
+from ucfrec.progress import progress
+from ucfrec.provenance import config_hash, peak_memory_mib, reset_peak_memory
+from ucfrec.reporting.result_row import ResultRow, RowKey
+from ucfrec.reporting.rows_file import append_rows, measuring, read_rows
 
 Cell = TypeVar("Cell")
-Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Measurement(Generic[Cell]):
+    """How the cells of a benchmark are measured; its functions are those of modules."""
+
+    key: Callable[[Cell], RowKey]
+    """What tells a cell's rows from all others, but for the hash of its configuration."""
+    config: Callable[[Cell], Mapping[str, Any] | None]
+    """The configuration of the cell's training; None where nothing is trained."""
+    measure: Callable[[Cell, RowKey], list[ResultRow]]
+    """The cell's rows, each with the key given; runs in a process of one thread."""
+
+
+@dataclass(frozen=True)
+class _Task(Generic[Cell]):
+    """A cell on its way to a process."""
+
+    cell: Cell
+    key: RowKey
+    config: Mapping[str, Any] | None
+    how: Measurement[Cell]
+    results: Path
+    wait: bool
 
 
 def run_grid(
     cells: Sequence[Cell],
-    work: Callable[[Cell], list[Row]],
-    keys: Callable[[Cell], Mapping[str, Any]],
+    how: Measurement[Cell],
     results: Path,
     workers: int,
     describe: str = "benchmark",
-) -> list[Row]:
+) -> list[ResultRow]:
     """Measure every cell that has no row in `results` yet; returns the rows of all, in order.
 
     A cell's rows are appended as soon as it is measured, so an interruption loses none. A cell that
-    fails does not stop the others: it is reported when they are done.
+    fails does not stop the others: it is reported when they are done. Cells with the same key are
+    measured once, also where several processes share `results`.
 
     Args:
         cells: picklable.
-        work: measures one cell, in a process of one thread; a function of a module.
-        keys: what tells a cell's rows from all others; merged into them.
-        results: JSON lines; rows of other cells in it are left alone.
+        results: JSON lines; rows of other measurements in it are left alone.
         workers: processes.
 
     Raises:
         InputError: `results` holds something else, or cells failed.
     """
+    tasks: dict[str, _Task[Cell]] = {}
+    for cell in cells:
+        config = _plain(how.config(cell))
+        named = None if config is None else config_hash(config)
+        key = replace(how.key(cell), config_hash=named)
+        tasks.setdefault(str(key), _Task(cell, key, config, how, results, wait=False))
     known = read_rows(results)
-    found = [_matching(known, keys(cell)) for cell in cells]
-    missing = [at for at, rows in enumerate(found) if not rows]
-    failed: list[str] = []
-    left = f"{len(cells)} cells, {len(missing)} of them left to measure"
-    print(f"{describe}: {left}", file=sys.stderr)
+    found = {name: [row for row in known if t.key.covers(row)] for name, t in tasks.items()}
+    missing = [name for name, rows in found.items() if not rows]
+    counted = f"{len(tasks)} cells, {len(missing)} of them left to measure"
+    print(f"{describe}: {counted}", file=sys.stderr)
     if missing:
-        results.parent.mkdir(parents=True, exist_ok=True)
-        spawn = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(workers, spawn, initializer=torch.set_num_threads, initargs=(1,))
-        try:
-            waiting: dict[Future[list[Row]], int] = {
-                pool.submit(work, cells[at]): at for at in missing
-            }
-            for done in tqdm(
-                as_completed(waiting), describe, len(waiting), unit="cell", disable=None
-            ):
-                own = dict(keys(cells[waiting[done]]))
+        measured, failed = _measure_all({name: tasks[name] for name in missing}, workers, describe)
+        found |= measured
+        if failed:
+            raise InputError(
+                f"{len(failed)} of {len(missing)} cells failed; the same command tries them again. "
+                f"The first: {failed[0]}"
+            )
+    return [row for rows in found.values() for row in rows]
+
+
+def _measure_all(
+    tasks: Mapping[str, _Task[Cell]], workers: int, describe: str
+) -> tuple[dict[str, list[ResultRow]], list[str]]:
+    """Rows by the name of their task, and a line for every task that failed."""
+    found: dict[str, list[ResultRow]] = {}
+    failed: list[str] = []
+    spawn = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(workers, spawn, initializer=_one_thread)
+    waiting: dict[Future[list[ResultRow] | None], str] = {}
+    try:
+        waiting = {pool.submit(_measure, task): name for name, task in tasks.items()}
+        # What another process is measuring is waited for at the end.
+        elsewhere: dict[Future[list[ResultRow] | None], str] = {}
+        with progress(len(tasks), describe, "cells") as bar:
+            for done in chain.from_iterable(map(as_completed, (waiting, elsewhere))):
+                name = waiting.get(done) or elsewhere[done]
                 error = done.exception()
-                if error is not None:
-                    failed.append(f"{own}: {type(error).__name__}: {error}")
+                rows = None if error else done.result()
+                if error:
+                    failed.append(f"{tasks[name].key}: {type(error).__name__}: {error}")
+                elif rows is None:
+                    again = replace(tasks[name], wait=True)
+                    elsewhere[pool.submit(_measure, again)] = name
                     continue
-                found[waiting[done]] = [row | own for row in done.result()]
-                append_rows(results, found[waiting[done]])
-        except BaseException:
-            # Whoever stops a benchmark does not wait for its cells, which go on where they were.
-            for child in multiprocessing.active_children():
-                child.terminate()
-            raise
-        finally:
-            pool.shutdown(cancel_futures=True)
-    if failed:
-        raise InputError(
-            f"{len(failed)} of {len(missing)} cells failed; the same command tries them again. "
-            f"The first: {failed[0]}"
-        )
-    return [row for rows in found for row in rows]
+                else:
+                    found[name] = rows
+                bar.update()
+    except BaseException:
+        # Whoever stops a benchmark does not wait for its cells, which go on where they were.
+        for child in multiprocessing.active_children():
+            child.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return found, failed
 
 
-def read_rows(results: Path) -> list[Row]:
-    """Rows of a file of JSON lines; none where it does not exist.
+def _one_thread() -> None:
+    import torch  # takes a second, and who only shows rows has no need of it
+
+    torch.set_num_threads(1)
+
+
+def _measure(task: _Task[Cell]) -> list[ResultRow] | None:
+    """The rows of a cell, measured and kept here unless they are in the file by now; None where
+    another process is measuring it and `wait` is not given."""
+    with measuring(task.results, task.key, task.wait) as held:
+        if not held:
+            return None
+        rows = [row for row in read_rows(task.results) if task.key.covers(row)]
+        if not rows:
+            reset_peak_memory()
+            rows = task.how.measure(task.cell, task.key)
+            peak = peak_memory_mib()
+            rows = [replace(row, peak_memory_mib=peak) for row in rows]
+            append_rows(task.results, rows, task.config)
+        return rows
+
+
+def chosen(known: Iterable[str], wanted: Sequence[str], what: str) -> list[str]:
+    """Which of `known` are wanted, in the order of `known`; all of them where none is named.
+
+    Args:
+        what: they are, for the message: "method", "table".
 
     Raises:
-        InputError: a line is no row.
+        InputError: something else is wanted.
     """
-    rows: list[Row] = []
-    if not results.exists():
-        return rows
-    for number, line in enumerate(results.read_text(encoding="utf-8").splitlines(), start=1):
-        try:
-            rows.append(dict(json.loads(line)))
-        except (ValueError, TypeError):
-            raise InputError(
-                f"{results}, line {number}, is no result row; delete the line to measure it again"
-            ) from None
-    return rows
+    known = list(known)
+    if unknown := [name for name in wanted if name not in known]:
+        raise InputError(f"no {what} is called {', '.join(unknown)}; there are {', '.join(known)}")
+    return [name for name in known if name in wanted or not wanted]
 
 
-def append_rows(results: Path, rows: Sequence[Row]) -> None:
-    """Add rows to a file of JSON lines, in one write."""
-    with results.open("a", encoding="utf-8") as file:
-        file.write("".join(json.dumps(row) + "\n" for row in rows))
-
-
-def _matching(rows: Sequence[Row], wanted: Mapping[str, Any]) -> list[Row]:
-    plain = json.loads(json.dumps(wanted))
-    return [row for row in rows if all(row.get(name) == value for name, value in plain.items())]
+def _plain(config: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+    """A configuration as it is after JSON: with lists for tuples."""
+    plain: Mapping[str, Any] | None = json.loads(json.dumps(config))
+    return plain

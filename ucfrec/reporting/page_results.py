@@ -8,13 +8,13 @@ from typing import Any
 
 from ucfrec.errors import InputError
 from ucfrec.evaluation.diversity_columns import COLUMNS
-from ucfrec.files import read_json
 from ucfrec.off_policy.estimators import LOGGED
 from ucfrec.reporting import charts
-from ucfrec.reporting.grid import read_rows
+from ucfrec.reporting.evaluation_rows import read_evaluations
 from ucfrec.reporting.tables import Table, shown
 
-Row = Mapping[str, Any]
+Row = dict[str, Any]
+
 _INTERVAL = ("R_cum", "R_cum_low", "R_cum_high")
 _METRICS = ("R_avg_pooled", "R_avg_episode", "length", *COLUMNS, "target_return", "episodes")
 _SEEDS = ("seed", "train_seed")
@@ -60,12 +60,7 @@ def read_results(paths: Sequence[Path]) -> Results:
 
 
 def _rows_of(path: Path) -> list[Row]:
-    if path.suffix == ".jsonl" and path.exists():
-        rows: Any = read_rows(path)
-    else:
-        rows = read_json(path)
-    if not isinstance(rows, list):
-        raise InputError(f"{path} holds no list of result rows; give what `ucfrec evaluate` wrote")
+    rows = read_evaluations(path)
     for number, row in enumerate(rows, start=1):
         known = row if isinstance(row, dict) else {}
         texts = ("estimator" if "estimator" in known else "world", "policy")

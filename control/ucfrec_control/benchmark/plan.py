@@ -1,26 +1,14 @@
 """Every learner on the zoo files (Tables 1 and 3), and sweeps over UCF's settings (resumable)."""
 
-import json
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ucfrec.episodes.store import EpisodeStore
-from ucfrec.errors import InputError
-from ucfrec.provenance import config_hash, provenance
-from ucfrec.reporting.grid import Row, run_grid
-from ucfrec.runs.config import Config, resolve_config
+from ucfrec.code_version import code_version
+from ucfrec.reporting.grid import chosen, run_grid
+from ucfrec.reporting.result_row import ResultRow
+from ucfrec_control.benchmark.cells import SCORE_MEASUREMENT, SCORES, Cell, code_of
 from ucfrec_control.data.distractor import zoo_store
-from ucfrec_control.data.trajectories import PACKAGES
-from ucfrec_control.learners.evaluate import evaluate_run
-from ucfrec_control.learners.rl_baselines import (
-    ALGORITHMS,
-    RLConfig,
-    plain_config,
-    rl_config,
-    train_rl,
-)
-from ucfrec_control.learners.train import dataset_of, preset_of, train_control
 
 Methods = dict[str, tuple[str, tuple[str, ...]]]
 METHODS: Methods = {
@@ -104,6 +92,8 @@ class Budget:
     rl_steps: int = 1_000_000
     """Of IQL and CQL, of `rl_batch_size` transitions each."""
     rl_batch_size: int = 256
+    evaluation_seed: int = 1000
+    """Of the episodes that are reported; the same for all training seeds and methods."""
 
     def settings_of(self, learner: str) -> tuple[str, ...]:
         """What the budget sets for a sequence policy or `bc`."""
@@ -151,22 +141,6 @@ SWEEPS = {
 """Of every table but the main one."""
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One training, and the rows it gives."""
-
-    table: str
-    method: str
-    learner: str
-    own: tuple[str, ...]
-    file: str
-    store: Path
-    run: Path
-    seed: int
-    budget: Budget
-    budget_name: str
-
-
 def benchmark(
     data: Path,
     folder: Path,
@@ -176,8 +150,8 @@ def benchmark(
     workers: int,
     table: str = MAIN,
     methods: Sequence[str] = (),
-) -> list[Row]:
-    """Train and judge whatever has no row in `results` yet; returns all rows asked for.
+) -> list[ResultRow]:
+    """Train and evaluate whatever has no row in `results` yet; returns the rows of all cells.
 
     Args:
         data: folder of the HDF5 files.
@@ -192,77 +166,46 @@ def benchmark(
         InputError: a file is missing, a method is none of the table's, `results` holds something
             else, or cells failed.
     """
-    cells = list(_cells(data, folder, budget, name, table, chosen(TABLES[table], methods)))
-    return run_grid(cells, _measure, _keys, results, workers, f"benchmark {table}")
-
-
-def chosen(known: Iterable[str], asked: Sequence[str]) -> list[str]:
-    """What of `known` was asked for, or all of it where nothing was, in the order of `known`.
-
-    Raises:
-        InputError: something else was asked for.
-    """
-    known = list(known)
-    if unknown := [name for name in asked if name not in known]:
-        raise InputError(f"no method {', '.join(unknown)} in this table; it has {', '.join(known)}")
-    return [name for name in known if name in asked or not asked]
+    known = chosen(TABLES[table], methods, "method")
+    cells = list(_cells(data, folder, budget, name, table, known))
+    return run_grid(cells, SCORE_MEASUREMENT, results, workers, f"benchmark {table}")
 
 
 def _cells(
     data: Path, folder: Path, budget: Budget, name: str, table: str, methods: Sequence[str]
 ) -> Iterator[Cell]:
-    # One method of two sweeps is one run: trained once, judged for the rows of each.
+    # One method of two sweeps is one run: trained once, evaluated for the rows of each.
     runs = folder / name / (MAIN if table == MAIN else "sweeps")
     for file in budget.files:
-        store = zoo_store(data, folder / "stores", file)
+        store = zoo_store(data, stores_of(folder), file)
         for method in methods:
             learner, own = TABLES[table][method]
+            code = code_of(learner)
             for seed in range(budget.seeds):
-                run = runs / file / f"{method}-{seed}"
-                yield Cell(table, method, learner, own, file, store, run, seed, budget, name)
+                yield Cell(
+                    suite=SCORES,
+                    table=table,
+                    budget=name,
+                    file=file,
+                    method=method,
+                    learner=learner,
+                    settings=(*budget.settings_of(learner), *own),
+                    store=store,
+                    run=runs / file / run_name(method, code, seed),
+                    seed=seed,
+                    episodes=budget.episodes,
+                    evaluation_seed=budget.evaluation_seed,
+                    code_version=code,
+                    rl_steps=budget.rl_steps,
+                    rl_batch_size=budget.rl_batch_size,
+                )
 
 
-def _keys(cell: Cell) -> Row:
-    store = EpisodeStore.open(cell.store)
-    if cell.learner in ALGORITHMS:
-        config = plain_config(_rl_config(cell, store), cell.seed)
-    else:
-        # As a run's record has it, after JSON.
-        config = json.loads(json.dumps(asdict(_config(cell, store))))
-    return {
-        "table": cell.table,
-        "budget": cell.budget_name,
-        "dataset": cell.file,
-        "method": cell.method,
-        "seed": cell.seed,
-        "episodes": cell.budget.episodes,
-        "config_hash": config_hash(config),
-        "fingerprint": store.meta["fingerprint"],
-    }
+def stores_of(folder: Path) -> Path:
+    """Where the stores are that today's code writes."""
+    return folder / "stores" / code_version(zoo_store.__module__)
 
 
-def _config(cell: Cell, store: EpisodeStore) -> Config:
-    preset = preset_of(dataset_of(store), cell.learner)
-    settings = [*cell.budget.settings_of(cell.learner), *cell.own]
-    return resolve_config(cell.learner, None, settings, cell.seed, preset.tables)
-
-
-def _rl_config(cell: Cell, store: EpisodeStore) -> RLConfig:
-    budget = cell.budget
-    return rl_config(dataset_of(store), cell.learner, budget.rl_steps, budget.rl_batch_size)
-
-
-def _measure(cell: Cell) -> list[Row]:
-    store = EpisodeStore.open(cell.store)
-    if cell.learner in ALGORITHMS:
-        train_rl(store, cell.run, _rl_config(cell, store), cell.seed)
-    else:
-        train_control(store, cell.run, _config(cell, store))
-    # Starts are those of no other seed's training, and the same for every method.
-    rows = evaluate_run(
-        cell.run,
-        episodes=cell.budget.episodes,
-        seed=1000 + cell.seed,
-        targets=preset_of(dataset_of(store), cell.learner).targets[:1],
-    )
-    return [row | provenance(PACKAGES) for row in rows]
+def run_name(method: str, code: str, seed: int) -> str:
+    """The folder of a run: other code does not go on with it."""
+    return f"{method}-{code}-{seed}"

@@ -1,24 +1,28 @@
 """Whether screening flags distractors, and nothing else, on every file (resumable)."""
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
+from ucfrec.code_version import code_version
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.provenance import config_hash, provenance
-from ucfrec.reporting.grid import Row, run_grid
-from ucfrec_control.benchmark.plan import BUDGETS
+from ucfrec.provenance import provenance
+from ucfrec.reporting.grid import Measurement, run_grid
+from ucfrec.reporting.result_row import ResultRow, RowKey
+from ucfrec.reporting.tables import NONE
 from ucfrec_control.data.distractor import DISTRACTORS, zoo_store
 from ucfrec_control.data.trajectories import PACKAGES
 from ucfrec_control.learners.screening import ScreeningConfig, screen
 
 SHOWN = (
-    *("dataset", "distractor", "seed", "flagged", "effect", "reward_effect"),
+    *("task", "distractor", "training_seed", "flagged", "effect", "reward_effect"),
     *("true_flagged", "weakest_true"),
 )
 SEED = 0
+SCREENING: Final = "screening"
+"""The suite."""
 
 
 @dataclass(frozen=True)
@@ -31,56 +35,72 @@ class Cell:
     config: ScreeningConfig
 
 
-def screening_table(data: Path, folder: Path, results: Path, workers: int) -> list[Row]:
+def screening_table(
+    data: Path, stores: Path, files: Sequence[str], results: Path, workers: int
+) -> list[ResultRow]:
     """Screen every file, plain and with each distractor, that has no row in `results` yet.
 
     Args:
-        data: folder of the nine HDF5 files.
-        folder: where stores are kept.
+        data: folder of the HDF5 files.
+        stores: where stores are kept.
+        files: of `data`, without their ending.
         results: JSON lines.
         workers: processes, of one thread each.
 
     Raises:
         InputError: a file is missing, `results` holds something else, or cells failed.
     """
-    cells = list(_cells(data, folder / "stores"))
-    return run_grid(cells, _measure, _keys, results, workers, "screening")
+    cells = [
+        Cell(file, distractor, zoo_store(data, stores, file, distractor), ScreeningConfig())
+        for file in files
+        for distractor in DISTRACTORS
+    ]
+    return run_grid(cells, _MEASUREMENT, results, workers, SCREENING)
 
 
-def _cells(data: Path, stores: Path) -> Iterator[Cell]:
-    for file in BUDGETS["full"].files:
-        for distractor in DISTRACTORS:
-            store = zoo_store(data, stores, file, distractor)
-            yield Cell(file, distractor, store, ScreeningConfig())
+def _key(cell: Cell) -> RowKey:
+    return RowKey(
+        suite=SCREENING,
+        table=SCREENING,
+        task=cell.file,
+        method=SCREENING,
+        policy=SCREENING,
+        training_seed=SEED,
+        conditions={"distractor": cell.distractor},
+        code_version=code_version(__name__),
+        data_fingerprint=EpisodeStore.open(cell.store).meta["fingerprint"],
+    )
 
 
-def _keys(cell: Cell) -> Row:
-    return {
-        "dataset": cell.file,
-        "distractor": cell.distractor,
-        "seed": SEED,
-        "config_hash": config_hash(asdict(cell.config)),
-        "fingerprint": EpisodeStore.open(cell.store).meta["fingerprint"],
-    }
+def _config(cell: Cell) -> dict[str, Any]:
+    return asdict(cell.config)
 
 
-def _measure(cell: Cell) -> list[Row]:
+def _measure(cell: Cell, own: RowKey) -> list[ResultRow]:
     store = EpisodeStore.open(cell.store)
     began = time.perf_counter()
     report = asdict(screen(store, cell.config, SEED))
-    return [
-        {
-            "screening": verdicts(report, store),
+    found = verdicts(report, store)
+    wrong = sum(each["flagged"] and not each["distractor"] for each in found)
+    row = ResultRow(
+        **vars(own),
+        metric="true_flagged",
+        metrics={
+            "true_flagged": float(wrong),
             "reward_r2": report["reward_r2"],
-            "transitions": report["transitions"],
-            "config": asdict(cell.config),
-            "wall_time_s": time.perf_counter() - began,
-            **provenance(PACKAGES),
-        }
-    ]
+            "transitions": float(report["transitions"]),
+        },
+        details={"screening": found},
+        wall_time_s=time.perf_counter() - began,
+        **provenance(PACKAGES),
+    )
+    return [row]
 
 
-def verdicts(report: Mapping[str, Any], store: EpisodeStore) -> list[Row]:
+_MEASUREMENT: Final = Measurement(_key, _config, _measure)
+
+
+def verdicts(report: Mapping[str, Any], store: EpisodeStore) -> list[dict[str, Any]]:
     """What a screening report, as a mapping, says of each dimension of `store`'s states."""
     added = {each["dimension"] for each in store.meta["source"].get("distractors", [])}
     return [
@@ -94,7 +114,7 @@ def verdicts(report: Mapping[str, Any], store: EpisodeStore) -> list[Row]:
     ]
 
 
-def screening_rows(rows: Sequence[Mapping[str, Any]]) -> list[Row]:
+def screening_rows(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
     """For each row with a screening: what was flagged, and how far the verdicts are apart.
 
     `effect` is the distractor's effect on the next state, `reward_effect` that on the reward; of
@@ -102,16 +122,19 @@ def screening_rows(rows: Sequence[Mapping[str, Any]]) -> list[Row]:
     """
     found = []
     for row in rows:
-        if "screening" not in row:
+        verdicts = row.details.get("screening")
+        if verdicts is None:
             continue
-        added = [d for d in row["screening"] if d["distractor"]]
-        true = [d for d in row["screening"] if not d["distractor"]]
+        added = [d for d in verdicts if d["distractor"]]
+        true = [d for d in verdicts if not d["distractor"]]
         found.append(
             {
-                **{name: row[name] for name in ("dataset", "distractor", "seed")},
-                "flagged": all(d["flagged"] for d in added) if added else "-",
-                "effect": added[0]["effect"] if added else "-",
-                "reward_effect": added[0]["reward_effect"] if added else "-",
+                "task": row.task,
+                "distractor": row.conditions["distractor"],
+                "training_seed": row.training_seed,
+                "flagged": all(d["flagged"] for d in added) if added else NONE,
+                "effect": added[0]["effect"] if added else NONE,
+                "reward_effect": added[0]["reward_effect"] if added else NONE,
                 "true_flagged": [d["dimension"] for d in true if d["flagged"]],
                 "weakest_true": min(max(d["effect"], d["reward_effect"]) for d in true),
             }

@@ -1,87 +1,80 @@
 """Result rows of several seeds to the lines of a printed table."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
-from ucfrec.reporting.grid import Row
+from ucfrec.reporting.result_row import ResultRow
+from ucfrec.reporting.statistics import grouped, paired_differences, summary
+from ucfrec.reporting.tables import mean_and_sd, signed_difference
 
 MEAN = "mean"
 
 
-def score_table(rows: Sequence[Row], checkpoint: str) -> list[Row]:
+def score_table(rows: Sequence[ResultRow], checkpoint: str) -> list[dict[str, str]]:
     """A line a method: normalised scores as mean ± standard deviation over seeds, a column a
     dataset, and their mean over datasets where a method has rows of all (Table 1 of the paper).
 
-    Methods without this checkpoint are judged by their last one: IQL and CQL keep no other.
+    Methods without this checkpoint are shown by their last one: IQL and CQL keep no other.
 
     Args:
         rows: what `ucfrec_control.benchmark.plan.benchmark` returns.
         checkpoint: "last" or "best".
     """
-    kept = [row for row in rows if row["checkpoint"] == checkpoint or row["best_step"] is None]
-    scores = _grouped(kept, ("method", "dataset"), "score")
-    datasets = list(dict.fromkeys(row["dataset"] for row in kept))
+    kept = [r for r in rows if r.checkpoint == checkpoint or "best_step" not in r.metrics]
+    scores = {
+        pair: [row.value for row in own]
+        for pair, own in grouped(kept, lambda row: (row.method, row.task)).items()
+    }
+    tasks = list(dict.fromkeys(row.task for row in kept))
     lines = []
-    for method in dict.fromkeys(row["method"] for row in kept):
-        own = [scores.get((method, dataset), []) for dataset in datasets]
-        line = {name: spread(values) for name, values in zip(datasets, own, strict=True)}
-        mean = spread([float(np.mean([np.mean(each) for each in own]))] if all(own) else [])
-        lines.append({"method": method, **line, MEAN: mean})
+    for method in dict.fromkeys(row.method for row in kept):
+        own = [scores.get((method, task), []) for task in tasks]
+        line = {name: mean_and_sd(values) for name, values in zip(tasks, own, strict=True)}
+        of_tasks = [summary(each).mean for each in own]
+        mean = [summary(of_tasks).mean] if all(own) else []
+        lines.append({"method": method, **line, MEAN: mean_and_sd(mean)})
     return lines
 
 
-def over_seeds(rows: Sequence[Row], by: Sequence[str], values: Sequence[str]) -> list[Row]:
-    """A line for each combination of `by`, the `values` as mean ± standard deviation over seeds."""
-    groups = {name: _grouped(rows, by, name) for name in values}
+def over_seeds(
+    lines: Sequence[Mapping[str, Any]], by: Sequence[str], values: Sequence[str]
+) -> list[dict[str, Any]]:
+    """A line for each combination of `by`, the `values` as mean ± standard deviation over seeds.
+
+    Args:
+        lines: as `ResultRow.as_line` makes them; a value may be missing or None.
+    """
+    groups = grouped(lines, lambda line: tuple(line[name] for name in by))
     return [
-        {**dict(zip(by, key, strict=True)), **{n: spread(groups[n][key]) for n in values}}
-        for key in dict.fromkeys(tuple(row[name] for name in by) for row in rows)
+        {
+            **dict(zip(by, key, strict=True)),
+            **{n: mean_and_sd(o[n] for o in own if o.get(n) is not None) for n in values},
+        }
+        for key, own in groups.items()
     ]
 
 
-def against_first(rows: Sequence[Row], values: Sequence[str]) -> list[Row]:
-    """A line a dataset and later method: by how much its `values` differ from the first method's of
-    the same seed, mean ± standard error over the seeds that both have.
+def against_first(rows: Sequence[ResultRow], metrics: Sequence[str]) -> list[dict[str, str]]:
+    """A line a dataset and later method: by how much its `metrics` differ from the first method's
+    of the same seed, mean ± standard error over the seeds that both have.
 
     Args:
         rows: of one checkpoint.
     """
-    known = {(row["dataset"], row["method"], row["seed"]): row for row in rows}
-    first = rows[0]["method"]
+    groups = grouped(rows, lambda row: (row.task, row.method))
+    first = rows[0].method
     lines = []
-    for dataset, method in dict.fromkeys((row["dataset"], row["method"]) for row in rows):
-        pairs = [
-            (row, known[dataset, first, seed])
-            for (own, name, seed), row in known.items()
-            if (own, name) == (dataset, method) and (dataset, first, seed) in known
-        ]
-        if method == first or len(pairs) < 2:
-            continue
-        line: Row = {"dataset": dataset, "method": method}
-        for name in values:
-            differences = [row[name] - other[name] for row, other in pairs]
-            error = np.std(differences, ddof=1) / len(pairs) ** 0.5
-            line[name] = f"{np.mean(differences):+.3g} ± {error:.2g}"
-        lines.append(line)
+    for (task, method), own in groups.items():
+        line = {"task": task, "method": method}
+        for name in metrics:
+            of_first = _by_seed(groups.get((task, first), ()), name)
+            found = summary(paired_differences(_by_seed(own, name), of_first))
+            if found.count > 1:
+                line[name] = signed_difference(found)
+        if method != first and len(line) == 2 + len(metrics):
+            lines.append(line)
     return lines
 
 
-def spread(values: Sequence[float]) -> str:
-    """Mean ± standard deviation of a sample, of one value the value alone, of none a dash."""
-    if not values:
-        return "–"
-    return f"{np.mean(values):.3g}" + (f" ± {np.std(values, ddof=1):.2g}" if values[1:] else "")
-
-
-def _grouped(
-    rows: Sequence[Row], by: Sequence[str], value: str
-) -> dict[tuple[Any, ...], list[float]]:
-    """Known values by their rows' `by`."""
-    groups: dict[tuple[Any, ...], list[float]] = {}
-    for row in rows:
-        known = groups.setdefault(tuple(row[name] for name in by), [])
-        if row[value] is not None:
-            known.append(row[value])
-    return groups
+def _by_seed(rows: Sequence[ResultRow], metric: str) -> dict[int | None, float]:
+    return {row.training_seed: row.metrics[metric] for row in rows if metric in row.metrics}

@@ -1,51 +1,80 @@
 """`ucfrec-control benchmark`: every learner on the zoo files; resumes."""
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
-from ucfrec.provenance import format_rows
-from ucfrec_control.benchmark.plan import BUDGETS, MAIN, SWEEPS, benchmark
+from ucfrec.commands.grid_options import results_given, rows_given
+from ucfrec.reporting.result_row import ResultRow
+from ucfrec.reporting.tables import format_rows
+from ucfrec_control.benchmark.cells import SCORES
+from ucfrec_control.benchmark.plan import BUDGETS, MAIN, SWEEPS, TABLES, benchmark
 from ucfrec_control.benchmark.tables import against_first, over_seeds, score_table
-from ucfrec_control.commands.options import budget_given, budget_options, grid_outputs, shown_score
-from ucfrec_control.learners.evaluate import CHECKPOINTS, SHOWN
+from ucfrec_control.commands.options import (
+    budget_given,
+    budget_options,
+    control_grid_options,
+    data_given,
+)
+from ucfrec_control.learners.evaluate import CHECKPOINTS
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """What `benchmark` takes."""
-    parser.add_argument("data", type=Path, metavar="DATA", help="folder of the HDF5 files")
+    parser.add_argument(
+        "data", nargs="?", type=Path, metavar="DATA", help="folder of the HDF5 files"
+    )
     parser.add_argument(
         "--table",
-        default="main",
-        choices=["main", "lambda", "gate", "band", "augmentation"],
+        default=MAIN,
+        choices=list(TABLES),
         help="every learner (main), or a sweep over UCF's settings",
     )
     budget_options(parser)
-    grid_outputs(parser, "control")
+    control_grid_options(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """`ucfrec-control benchmark`."""
-    rows = benchmark(
-        options.data,
-        options.out,
-        options.results,
-        budget_given(BUDGETS if options.table == MAIN else SWEEPS, options),
-        options.budget,
-        options.workers,
-        options.table,
-        options.method,
-    )
-    print(format_rows([shown_score(row) for row in rows], SHOWN))
+    if options.show_only:
+        rows = rows_given(options, SCORES, [options.table])
+    else:
+        rows = benchmark(
+            data_given(options),
+            options.out,
+            results_given(options),
+            budget_given(BUDGETS if options.table == MAIN else SWEEPS, options),
+            options.budget,
+            options.workers,
+            options.table,
+            options.method,
+        )
+    _print_tables(rows, options.table)
+    print(f"\nrows: {results_given(options)}")
+
+
+def _print_tables(rows: Sequence[ResultRow], table: str) -> None:
+    print(format_rows([_line(row) for row in rows], _SHOWN))
     for checkpoint in CHECKPOINTS:
-        table = score_table(rows, checkpoint)
-        print(f"\nscores of the {checkpoint} checkpoint, mean ± standard deviation over seeds")
-        print(format_rows(table, list(table[0])))
-    last = [row for row in rows if row["checkpoint"] == "last"]
-    by, values = ("dataset", "method"), ("score", "validation_loss")
+        if lines := score_table(rows, checkpoint):
+            print(f"\nscores of the {checkpoint} checkpoint, mean ± standard deviation over seeds")
+            print(format_rows(lines, list(lines[0])))
+    last = [row for row in rows if row.checkpoint == "last"]
+    by, values = ("task", "method"), ("score", "validation_loss")
     shown = (*values, "acceptance")
     print("\nlast checkpoint, mean ± standard deviation over seeds")
-    print(format_rows(over_seeds(last, by, shown), (*by, *shown)))
-    if options.table != MAIN:
-        print(f"\nless {last[0]['method']} of the same seed, mean ± standard error")
+    print(format_rows(over_seeds([row.as_line() for row in last], by, shown), (*by, *shown)))
+    if table != MAIN:
+        print(f"\nless {last[0].method} of the same seed, mean ± standard error")
         print(format_rows(against_first(last, values), (*by, *values)))
-    print(f"\nrows: {options.results}")
+
+
+_SHOWN = (
+    *("task", "method", "training_seed", "checkpoint", "target_return", "score", "return"),
+    *("episodes", "validation_loss"),
+)
+
+
+def _line(row: ResultRow) -> dict[str, object]:
+    """A row as it is printed; what it does not have is a dash."""
+    return dict.fromkeys(_SHOWN) | row.as_line()

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from ucfrec.provenance import format_rows
+from ucfrec.reporting.tables import format_rows
 from ucfrec_control.data.collect import SHOWN as COLLECTED
 from ucfrec_control.data.collect import CollectConfig, collect
 

@@ -7,7 +7,8 @@ from typing import Any
 
 from ucfrec.errors import InputError
 from ucfrec.files import write_json
-from ucfrec.provenance import format_rows, provenance
+from ucfrec.provenance import provenance
+from ucfrec.reporting.tables import format_rows
 from ucfrec_control.commands.options import shown_score
 from ucfrec_control.data.trajectories import PACKAGES
 from ucfrec_control.learners.evaluate import CHECKPOINTS, SHOWN, evaluate_run

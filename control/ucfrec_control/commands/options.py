@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ucfrec.commands.grid_options import evaluation_seed_option, grid_options
 from ucfrec.errors import InputError
 from ucfrec_control.benchmark.plan import Budget
 from ucfrec_control.data.d4rl import read_d4rl
@@ -36,26 +37,29 @@ def budget_options(parser: argparse.ArgumentParser) -> None:
         "--method", action="append", default=[], help="row of the table; repeatable (all)"
     )
     parser.add_argument("--seeds", type=int, help="how many, from 0 (the budget's)")
+    evaluation_seed_option(parser)
 
 
-def grid_options(parser: argparse.ArgumentParser, results: str) -> None:
-    """Data and outputs of a benchmark."""
-    parser.add_argument(
-        "--data", type=Path, required=True, metavar="FOLDER", help="of the HDF5 files"
-    )
-    grid_outputs(parser, results)
+def data_option(parser: argparse.ArgumentParser) -> None:
+    """Where the data of a benchmark is."""
+    parser.add_argument("--data", type=Path, metavar="FOLDER", help="of the HDF5 files")
 
 
-def grid_outputs(parser: argparse.ArgumentParser, results: str) -> None:
+def data_given(options: argparse.Namespace) -> Path:
+    """The folder of the HDF5 files.
+
+    Raises:
+        InputError: none is named.
+    """
+    if options.data is None:
+        raise InputError("name the folder of the HDF5 files, or --show-only for rows at hand")
+    given: Path = options.data
+    return given
+
+
+def control_grid_options(parser: argparse.ArgumentParser) -> None:
     """Where a benchmark keeps its runs and rows."""
-    parser.add_argument("--out", type=Path, default=Path("runs/control"), help="stores and runs")
-    parser.add_argument(
-        "--results",
-        type=Path,
-        default=Path(f"benchmarks/results/{results}.jsonl"),
-        metavar="JSONL",
-    )
-    parser.add_argument("--workers", type=int, default=1, help="processes of one thread each (1)")
+    grid_options(parser, "runs/control", 1)
 
 
 def read_source(options: argparse.Namespace) -> Trajectories:
@@ -79,17 +83,23 @@ def describe_source(trajectories: Trajectories) -> str:
 
 
 def budget_given(known: Mapping[str, Budget], options: argparse.Namespace) -> Budget:
-    """The budget asked for, with the files and seeds asked for."""
+    """The budget that is named, with the files and seeds that are given."""
     budget = known[options.budget]
     seeds = budget.seeds if options.seeds is None else options.seeds
     if seeds < 1:
         raise InputError(f"--seeds is {seeds}; at least one is needed")
-    return dataclasses.replace(budget, files=tuple(options.file) or budget.files, seeds=seeds)
+    evaluation = options.evaluation_seed
+    return dataclasses.replace(
+        budget,
+        files=tuple(options.file) or budget.files,
+        seeds=seeds,
+        evaluation_seed=budget.evaluation_seed if evaluation is None else evaluation,
+    )
 
 
 def shown_score(row: Mapping[str, Any]) -> dict[str, Any]:
     """A row of `evaluate_run` with its score, interval and target as text."""
     interval = f"{row['score']:.1f} [{row['score_low']:.1f}, {row['score_high']:.1f}]"
-    asked = "none" if row["target_return"] is None else f"{row['target_return']:g}"
+    target = "none" if row["target_return"] is None else f"{row['target_return']:g}"
     earned = f"{row['return']:.1f}"
-    return {**row, "score": interval, "target_return": asked, "return": earned}
+    return {**row, "score": interval, "target_return": target, "return": earned}

@@ -2,34 +2,47 @@
 
 import argparse
 
-from ucfrec.provenance import format_rows
+from ucfrec.commands.grid_options import results_given, rows_given
+from ucfrec.reporting.tables import format_rows
+from ucfrec_control.benchmark.cells import ROBUSTNESS
 from ucfrec_control.benchmark.robustness import BUDGETS as ROBUSTNESS_BUDGETS
 from ucfrec_control.benchmark.robustness import SHOWN as SHOWN_DROPS
 from ucfrec_control.benchmark.robustness import SHOWN_LOSSES, drops, loss_rises, robustness
 from ucfrec_control.benchmark.screening_table import SHOWN as SHOWN_SCREENING
 from ucfrec_control.benchmark.screening_table import screening_rows
 from ucfrec_control.benchmark.tables import over_seeds
-from ucfrec_control.commands.options import budget_given, budget_options, grid_options
+from ucfrec_control.commands.options import (
+    budget_given,
+    budget_options,
+    control_grid_options,
+    data_given,
+    data_option,
+)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """What `robustness` takes."""
+    data_option(parser)
     budget_options(parser)
-    grid_options(parser, "control_robustness")
+    control_grid_options(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """`ucfrec-control robustness`."""
-    rows = robustness(
-        options.data,
-        options.out,
-        options.results,
-        budget_given(ROBUSTNESS_BUDGETS, options),
-        options.budget,
-        options.workers,
-        options.method,
-    )
-    by = ("dataset", "distractor", "method")
+    if options.show_only:
+        rows = rows_given(options, ROBUSTNESS)
+    else:
+        rows = robustness(
+            data_given(options),
+            options.out,
+            results_given(options),
+            budget_given(ROBUSTNESS_BUDGETS, options),
+            options.budget,
+            options.workers,
+            options.method,
+        )
+    by = ("task", "distractor", "method")
     for found, values in ((drops(rows), SHOWN_DROPS), (loss_rises(rows), SHOWN_LOSSES)):
         print(f"{format_rows(over_seeds(found, by, values), (*by, *values))}\n")
-    print(f"{format_rows(screening_rows(rows), SHOWN_SCREENING)}\n\nrows: {options.results}")
+    print(format_rows(screening_rows(rows), SHOWN_SCREENING))
+    print(f"\nrows: {results_given(options)}")

@@ -1,19 +1,27 @@
-"""`ucfrec-control screen-all`: screening of every zoo file, distracted; resumes."""
+"""`ucfrec-control screen-all`: screening of every zoo file, plain and with distractors; resumes."""
 
 import argparse
 
-from ucfrec.provenance import format_rows
+from ucfrec.commands.grid_options import results_given, rows_given
+from ucfrec.reporting.tables import format_rows
+from ucfrec_control.benchmark.plan import BUDGETS, stores_of
+from ucfrec_control.benchmark.screening_table import SCREENING, screening_rows, screening_table
 from ucfrec_control.benchmark.screening_table import SHOWN as SHOWN_SCREENING
-from ucfrec_control.benchmark.screening_table import screening_rows, screening_table
-from ucfrec_control.commands.options import grid_options
+from ucfrec_control.commands.options import control_grid_options, data_given, data_option
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """What `screen-all` takes."""
-    grid_options(parser, "control_screening")
+    data_option(parser)
+    control_grid_options(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """`ucfrec-control screen-all`."""
-    rows = screening_table(options.data, options.out, options.results, options.workers)
-    print(f"{format_rows(screening_rows(rows), SHOWN_SCREENING)}\n\nrows: {options.results}")
+    if options.show_only:
+        rows = rows_given(options, SCREENING)
+    else:
+        files, stores = BUDGETS["full"].files, stores_of(options.out)
+        given = (data_given(options), stores, files, results_given(options), options.workers)
+        rows = screening_table(*given)
+    print(f"{format_rows(screening_rows(rows), SHOWN_SCREENING)}\n\nrows: {results_given(options)}")

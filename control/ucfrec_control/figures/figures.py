@@ -13,11 +13,14 @@ from ucfrec.errors import InputError
 from ucfrec.files import read_json
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.provenance import config_hash
-from ucfrec.reporting.grid import Row, read_rows
+from ucfrec.reporting.plot_style import label, save
+from ucfrec.reporting.result_row import ResultRow
+from ucfrec.reporting.statistics import grouped
 from ucfrec.runs.trained_policy import RUN
+from ucfrec_control.benchmark.cells import ROBUSTNESS
 from ucfrec_control.benchmark.robustness import drops, loss_rises
+from ucfrec_control.benchmark.score_rows import EVALUATE, read_scores
 from ucfrec_control.figures import diagnostics, plots
-from ucfrec_control.figures.figure_style import label, save
 from ucfrec_control.learners.evaluate import method_of
 
 LOWS = (0.0, 0.1, 0.2, 0.3, 0.4)
@@ -31,7 +34,7 @@ NEEDS = {
     "acceptance": _COPIES,
     "attention": "a run of ucf among --runs (`ucfrec-control train --policy ucf`)",
     "training": "a run among --runs (`ucfrec-control train`)",
-    "returns": "rows of one dataset with two returns asked for or more among --results "
+    "returns": "rows of one dataset with two target returns or more among --results "
     "(`ucfrec-control evaluate --target … --target … --json`)",
     "lambda": "rows of ucf with two weights of the mask loss or more among --results",
     "robustness-scores": "rows of `ucfrec-control robustness` among --results",
@@ -62,7 +65,7 @@ class _Run:
     """Runs of one group that have it in common differ in their seed only."""
     policy: str
     settings: str
-    """Hash of the data and of all that a training is told but the seed."""
+    """Hash of the data and of all settings of a training but the seed."""
     about: str
 
     @property
@@ -87,8 +90,8 @@ def make_figures(
     Raises:
         InputError: a file of `results` holds something else.
     """
-    found = _told_apart([run for folder in runs for run in _runs(folder)])
-    rows = [row for path in results for row in _rows(path)]
+    found = _distinguished([run for folder in runs for run in _runs(folder)])
+    rows = [row for path in results for row in read_scores(path)]
     plans = [*_of_runs(found), *_of_rows(rows)]
     made: list[Path] = []
     missing = [f"{k}: needs {w}" for k, w in NEEDS.items() if k not in {p.kind for p in plans}]
@@ -99,17 +102,6 @@ def make_figures(
         except InputError as error:
             missing.append(f"{name}: {error}")
     return made, missing
-
-
-def _rows(path: Path) -> list[Row]:
-    if path.suffix != ".json":
-        return read_rows(path)
-    found = read_json(path)
-    if not isinstance(found, list) or not all(isinstance(row, dict) for row in found):
-        raise InputError(
-            f"{path} holds no list of rows; `ucfrec-control evaluate --json` makes one"
-        )
-    return found
 
 
 def _runs(folder: Path) -> Iterator[_Run]:
@@ -130,13 +122,13 @@ def _runs(folder: Path) -> Iterator[_Run]:
         )
 
 
-def _told_apart(runs: Sequence[_Run]) -> list[_Run]:
+def _distinguished(runs: Sequence[_Run]) -> list[_Run]:
     """The runs, of which those with other settings go by their folder's name, less the seed."""
     settings: dict[tuple[str, str], set[str]] = {}
     for run in runs:
         settings.setdefault((run.group, run.method), set()).add(run.settings)
     return [
-        replace(run, method=re.sub(r"-\d+$", "", run.path.resolve().name))
+        replace(run, method=re.sub(r"(-[0-9a-f]{12})?-\d+$", "", run.path.resolve().name))
         if len(settings[run.group, run.method]) > 1
         else run
         for run in runs
@@ -152,8 +144,8 @@ def _of_runs(runs: Sequence[_Run]) -> Iterator[_Plan]:
         if run.policy == "ucf":
             yield _Plan("attention", run.name, partial(_attention, run))
     for run in _first(runs, lambda run: run.group):
-        there = [other for other in runs if other.group == run.group]
-        yield _Plan("training", run.group, partial(_training, there))
+        same = [other for other in runs if other.group == run.group]
+        yield _Plan("training", run.group, partial(_training, same))
 
 
 def _first(runs: Iterable[_Run], key: Callable[[_Run], Any]) -> Iterable[_Run]:
@@ -192,52 +184,49 @@ def _training(runs: Sequence[_Run]) -> Figure:
     return plots.training_curves(curves, "validation loss of the action", runs[0].group)
 
 
-def _of_rows(rows: Sequence[Row]) -> Iterator[_Plan]:
-    yield from _of_robustness([row for row in rows if "distractor" in row])
-    yield from _of_targets([row for row in rows if _of_evaluate(row)])
-    swept = [row for row in rows if _of_lambda(row)]
-    for budget in dict.fromkeys(row.get("budget", "") for row in swept):
-        there = [row for row in swept if row.get("budget", "") == budget]
-        if len({row["lambda_mask"] for row in there}) > 1:
-            yield _Plan("lambda", budget or "rows", partial(plots.lambda_curves, there))
+def _of_rows(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
+    yield from _of_robustness([row for row in rows if row.suite == ROBUSTNESS])
+    yield from _of_targets([row for row in rows if _has_target(row)])
+    swept = [row.as_line() for row in rows if _of_lambda(row)]
+    for budget, own in grouped(swept, lambda line: line.get("budget", "rows")).items():
+        if len({line["lambda_mask"] for line in own}) > 1:
+            yield _Plan("lambda", budget, partial(plots.lambda_curves, own))
 
 
-def _of_robustness(rows: Sequence[Row]) -> Iterator[_Plan]:
-    for budget, dataset in dict.fromkeys((row["budget"], row["dataset"]) for row in rows):
-        there = [r for r in rows if (r["budget"], r["dataset"]) == (budget, dataset)]
-        about, bars = f"{budget}-{dataset}", plots.robustness_bars
-        score = partial(bars, there, "score", "normalised score", dataset)
+def _of_robustness(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
+    groups = grouped(rows, lambda row: (row.conditions["budget"], row.task))
+    for (budget, task), own in groups.items():
+        about, bars = f"{budget}-{task}", plots.robustness_bars
+        lines = [row.as_line() for row in own]
+        score = partial(bars, lines, "score", "normalised score", task)
         yield _Plan("robustness-scores", about, score)
-        if lost := drops(there):
-            drop = partial(bars, lost, "drop", "loss (% of the clean score)", dataset)
+        if lost := drops(own):
+            drop = partial(bars, lost, "drop", "loss (% of the clean score)", task)
             yield _Plan("robustness-drops", about, drop)
-        if rises := loss_rises(there):
-            rise = partial(bars, rises, "rise", "rise of the action loss (%)", dataset)
+        if rises := loss_rises(own):
+            rise = partial(bars, rises, "rise", "rise of the action loss (%)", task)
             yield _Plan("robustness-losses", about, rise)
 
 
-def _of_targets(rows: Sequence[Row]) -> Iterator[_Plan]:
-    """Of the methods that were asked for more than one return."""
-    targets: dict[tuple[str, str], set[float]] = {}
-    for row in rows:
-        targets.setdefault((row["dataset"], row["method"]), set()).add(row["target_return"])
-    rows = [row for row in rows if len(targets[row["dataset"], row["method"]]) > 1]
-    for dataset in dict.fromkeys(row["dataset"] for row in rows):
-        there = [row for row in rows if row["dataset"] == dataset]
-        yield _Plan("returns", dataset, partial(plots.return_curves, there, dataset))
+def _of_targets(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
+    """Of the methods that were given more than one target return."""
+    methods = grouped(rows, lambda row: (row.task, row.method))
+    several = {m for m, own in methods.items() if len({row.target_return for row in own}) > 1}
+    kept = [row for row in rows if (row.task, row.method) in several]
+    for task, own in grouped(kept, lambda row: row.task).items():
+        lines = [row.as_line() for row in own]
+        yield _Plan("returns", task, partial(plots.return_curves, lines, task))
 
 
-def _of_evaluate(row: Row) -> bool:
-    """Whether `row` is of no table, and of a policy that is asked for returns."""
-    whole = "budget" not in row and row.get("checkpoint") == "last" and not row.get("distractors")
-    return whole and row.get("target_return") is not None
+def _has_target(row: ResultRow) -> bool:
+    """Whether `row` is of no table, and of a policy with a target return."""
+    whole = row.suite == EVALUATE and row.checkpoint == "last"
+    return whole and not row.details.get("distractors") and row.target_return is not None
 
 
-def _of_lambda(row: Row) -> bool:
+def _of_lambda(row: ResultRow) -> bool:
     """Whether `row` is UCF's, complete but for its λ."""
-    whole = row.get("method") == "ucf" or str(row.get("method")).startswith("ucf-lambda")
-    whole = whole and row.get("table", "lambda") == "lambda"
-    clean = "distractor" not in row and not row.get("distractors")
-    return (
-        whole and clean and row.get("lambda_mask") is not None and row.get("checkpoint") == "last"
-    )
+    whole = row.method == "ucf" or row.method.startswith("ucf-lambda")
+    of_table = row.table in ("lambda", EVALUATE) and row.checkpoint == "last"
+    clean = not row.details.get("distractors")
+    return whole and of_table and clean and row.conditions.get("lambda_mask") is not None

@@ -12,7 +12,8 @@ from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from ucfrec_control.figures.figure_style import COLUMN, EDITED, FACTUAL, PAGE, colors, label, styled
+from ucfrec.reporting.plot_style import COLUMN, EDITED, FACTUAL, PAGE, colors, label, styled
+from ucfrec.reporting.statistics import summary
 
 FloatArray = npt.NDArray[np.float64]
 Row = Mapping[str, Any]
@@ -113,18 +114,18 @@ def lambda_curves(rows: Sequence[Row], title: str = "") -> Figure:
     """Normalised score over λ, a line a dataset, mean ± standard deviation over seeds (Figure 2).
 
     Args:
-        rows: result rows that differ in `dataset`, `lambda_mask` and `seed`.
+        rows: lines (`ResultRow.as_line`) that differ in `task`, `lambda_mask` and `training_seed`.
     """
     figure, axes = _figure(COLUMN, 2.5, title)
     places = sorted({row["lambda_mask"] for row in rows})
-    scores = _grouped(rows, ("dataset", "lambda_mask"), "score")
-    datasets = sorted({row["dataset"] for row in rows})
+    scores = _by_seed(rows, ("task", "lambda_mask"), "score")
+    datasets = sorted({row["task"] for row in rows})
     for dataset, color in colors(datasets).items():
         at = [i for i, value in enumerate(places) if (dataset, value) in scores]
-        found = [scores[dataset, places[i]] for i in at]
-        mean, std = (np.array([f(values) for values in found]) for f in (np.mean, np.std))
+        found = [summary(scores[dataset, places[i]]) for i in at]
+        mean, sd = (np.array([getattr(each, name) for each in found]) for name in ("mean", "sd"))
         axes.plot(at, mean, "o-", color=color, label=dataset)
-        axes.fill_between(at, mean - std, mean + std, color=color, alpha=0.2, linewidth=0)
+        axes.fill_between(at, mean - sd, mean + sd, color=color, alpha=0.2, linewidth=0)
     # Places stand apart evenly: 0 has no place on a logarithmic axis.
     axes.set_xticks(range(len(places)), [f"{value:g}" for value in places])
     axes.set_xlabel(r"weight of the mask loss $\lambda$")
@@ -136,26 +137,27 @@ def lambda_curves(rows: Sequence[Row], title: str = "") -> Figure:
 
 @styled
 def return_curves(rows: Sequence[Row], title: str = "") -> Figure:
-    """Return earned over return asked for, a line a method: mean over seeds, lowest to highest
-    around it. On the dashed line, what is asked for is earned.
+    """Return earned over target return, a line a method: mean over seeds, lowest to highest around
+    it. On the dashed line, the target is earned.
 
     Args:
-        rows: result rows that differ in `method`, `target_return` and `seed`.
+        rows: lines (`ResultRow.as_line`) that differ in `method`, `target_return` and seed.
     """
     figure, axes = _figure(COLUMN, 2.5, title)
-    earned = _grouped(rows, ("method", "target_return"), "return")
+    earned = _by_seed(rows, ("method", "target_return"), "return")
     for method, color in colors(sorted({row["method"] for row in rows})).items():
-        targets = sorted(target for other, target in earned if other == method)
-        found = [earned[method, target] for target in targets]
-        axes.plot(targets, list(map(np.mean, found)), "o-", color=color, label=label(method))
+        at = sorted(target for other, target in earned if other == method)
+        found = [earned[method, target] for target in at]
+        means = [summary(values).mean for values in found]
+        axes.plot(at, means, "o-", color=color, label=label(method))
         axes.fill_between(
-            targets, list(map(min, found)), list(map(max, found)), color=color, alpha=0.2, lw=0
+            at, list(map(min, found)), list(map(max, found)), color=color, alpha=0.2, lw=0
         )
-    asked, top = [row["target_return"] for row in rows], axes.get_ylim()[1]
-    axes.plot([0, max(asked)], [0, max(asked)], "--", color="black", linewidth=0.9)
-    axes.set_xlim(0, 1.03 * max(asked))
+    targets, top = [row["target_return"] for row in rows], axes.get_ylim()[1]
+    axes.plot([0, max(targets)], [0, max(targets)], "--", color="black", linewidth=0.9)
+    axes.set_xlim(0, 1.03 * max(targets))
     axes.set_ylim(0, 1.1 * top)
-    axes.set_xlabel("return asked for")
+    axes.set_xlabel("target return")
     axes.set_ylabel("return earned")
     axes.grid(True)
     _legend_below(figure, axes, 4)
@@ -169,20 +171,19 @@ def robustness_bars(rows: Sequence[Row], value: str, ylabel: str, title: str = "
     A bar is the mean over seeds, its line the standard deviation over them.
 
     Args:
-        rows: with `method`, `distractor`, `seed` and `value`, in the order to be drawn.
+        rows: with `method`, `distractor`, `training_seed` and `value`, in the order to be drawn.
     """
     figure, axes = _figure(PAGE, 2.4, title)
-    found = _grouped(rows, ("method", "distractor"), value)
+    found = _by_seed(rows, ("method", "distractor"), value)
     methods = list(dict.fromkeys(row["method"] for row in rows))
     kinds = list(dict.fromkeys(row["distractor"] for row in rows))
     width = 0.84 / len(kinds)
     for number, (kind, color) in enumerate(colors(kinds).items()):
-        there = [i for i, method in enumerate(methods) if (method, kind) in found]
-        values = [found[methods[i], kind] for i in there]
-        spread = [np.std(v) if len(v) > 1 else np.nan for v in values]
-        left = (number - (len(kinds) - 1) / 2) * width
+        at = [i for i, method in enumerate(methods) if (method, kind) in found]
+        values = [summary(found[methods[i], kind]) for i in at]
+        spread, left = [v.sd for v in values], (number - (len(kinds) - 1) / 2) * width
         axes.bar(
-            np.array(there) + left, [np.mean(v) for v in values], 0.92 * width, yerr=spread,
+            np.array(at) + left, [v.mean for v in values], 0.92 * width, yerr=spread,
             color=color, label=label(kind), error_kw={"elinewidth": 0.9, "capsize": 1.5},
         )  # fmt: skip
     axes.axhline(0, color="black", linewidth=0.8)
@@ -261,9 +262,9 @@ def _legend_below(figure: Figure, axes: Axes, columns: int) -> None:
     )  # fmt: skip
 
 
-def _grouped(rows: Sequence[Row], names: Sequence[str], value: str) -> dict[Any, list[float]]:
+def _by_seed(rows: Sequence[Row], names: Sequence[str], value: str) -> dict[Any, list[float]]:
     """Values by their rows' `names`; of a seed that comes twice, the last counts."""
     latest: dict[Any, dict[int, float]] = defaultdict(dict)
     for row in rows:
-        latest[tuple(row[name] for name in names)][row["seed"]] = row[value]
+        latest[tuple(row[name] for name in names)][row["training_seed"]] = row[value]
     return {key: list(seeds.values()) for key, seeds in latest.items()}

@@ -12,7 +12,8 @@ from ucfrec.acting.rollout import rollout
 from ucfrec.errors import InputError
 from ucfrec.evaluation.metrics import bootstrap_interval
 from ucfrec.files import read_json
-from ucfrec.provenance import config_hash
+from ucfrec.provenance import config_hash, without_folders
+from ucfrec.reporting.statistics import summary
 from ucfrec.runs.trained_policy import RUN, TrainedPolicy, learner_of
 from ucfrec_control.learners.presets import find_preset
 from ucfrec_control.learners.rl_baselines import RLPolicy, is_rl
@@ -41,22 +42,22 @@ def evaluate_run(
     """One result row for each checkpoint and target return.
 
     All rows play the same starts. A policy trained with distractors sees them fixed. IQL and CQL
-    have a last checkpoint only, and are asked for no return.
+    have a last checkpoint only, and no target return.
 
     Args:
         run: a run folder on a control store.
         episodes: episodes a row.
         seed: of the environments and the bootstrap.
         env_id: None for the environment of the data.
-        targets: returns to ask for; empty for those of the preset.
+        targets: target returns; empty for those of the preset.
         distractor: what every distractor is fixed to (Appendix G.4: 0).
 
     Raises:
         InputError: the run is not on a control store, or keeps none of `checkpoints`, or its
-            environment cannot be told or made.
+            environment is unknown or cannot be made.
     """
     if episodes < 1:
-        raise InputError(f"{episodes} episodes were asked for; at least one is needed")
+        raise InputError(f"--episodes is {episodes}; at least one is needed")
     rows: list[dict[str, Any]] = []
     for checkpoint in _kept(run, checkpoints):
         trained = load_run(run, checkpoint)
@@ -70,7 +71,7 @@ def evaluate_run(
             _row(trained, world, target, episodes, seed, distractor) | {"checkpoint": checkpoint}
             for target in targets_of(trained, world, targets)
         ]
-    return [row | {"run": str(run)} for row in rows]
+    return [row | {"run": without_folders(str(run))} for row in rows]
 
 
 def _kept(run: Path, checkpoints: Sequence[str]) -> Sequence[str]:
@@ -90,17 +91,16 @@ def load_run(run: Path, checkpoint: str) -> Trained:
     rl = _is_rl_run(run)
     if rl and checkpoint != "last":
         raise InputError(
-            f"{run} is of IQL or CQL, which keep their last checkpoint only; ask for --checkpoint "
-            "last"
+            f"{run} is of IQL or CQL, which keep their last checkpoint only; give --checkpoint last"
         )
     trained = RLPolicy(run) if rl else TrainedPolicy.load(run, checkpoint)
     if trained.record.get("dataset") is None:
-        raise InputError(f"{run} is not a run of `ucfrec-control train`; `ucfrec` judges it")
+        raise InputError(f"{run} is not a run of `ucfrec-control train`; evaluate it with `ucfrec`")
     return trained
 
 
 def world_of(trained: Trained, env_id: str | None) -> str:
-    """The environment asked for, or that of the data.
+    """The environment given, or that of the data.
 
     Raises:
         InputError: neither is known.
@@ -109,7 +109,7 @@ def world_of(trained: Trained, env_id: str | None) -> str:
     world: str | None = env_id or dataset["env_id"]
     if world is None:
         raise InputError(
-            f"the data of {dataset['dataset']} does not tell the environment; name it with --env"
+            f"the data of {dataset['dataset']} does not name its environment; give it with --env"
         )
     return world
 
@@ -152,13 +152,13 @@ def method_of(record: Mapping[str, Any]) -> str:
 
 
 def targets_of(
-    trained: Trained, env_id: str, asked: Sequence[float] = ()
+    trained: Trained, env_id: str, given: Sequence[float] = ()
 ) -> Sequence[float | None]:
-    """The targets asked for, or those of the preset."""
+    """The targets given, or those of the preset."""
     if isinstance(trained, RLPolicy):
         return (None,)
-    if asked:
-        return asked
+    if given:
+        return given
     dataset, learner = trained.record["dataset"], trained.record["config"]["policy_name"]
     task = require_task(env_id, dataset["dataset"])
     if learner == "bc":
@@ -188,7 +188,7 @@ def _row(
         "score": float(task.score(played.returns.mean())),
         "score_low": float(low),
         "score_high": float(high),
-        "score_std": float(task.score(played.returns).std()),
+        "score_std": summary(task.score(played.returns)).sd if episodes > 1 else None,
         "return": float(played.returns.mean()),
         "length": float(played.lengths.mean()),
         "episodes": episodes,

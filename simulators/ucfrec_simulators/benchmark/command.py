@@ -1,14 +1,16 @@
 """`ucfrec benchmark recommendation`: every table of it, resumable, cells side by side."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
 from ucfrec.errors import InputError
-from ucfrec.plugins import Benchmark
-from ucfrec.reporting.grid import Row, run_grid
-from ucfrec_simulators.benchmark.cells import keys, measure
+from ucfrec.plugins import Benchmark, BenchmarkRequest
+from ucfrec.reporting.grid import run_grid
+from ucfrec.reporting.result_row import ResultRow
+from ucfrec_simulators.benchmark.cells import MEASUREMENT
 from ucfrec_simulators.benchmark.plan import BUDGETS, Plan
 from ucfrec_simulators.benchmark.plots import (
     plot_distractor,
@@ -26,31 +28,49 @@ from ucfrec_simulators.benchmark.tables import (
 TABLES: Final = ("main", "distractor", "sweeps")
 
 
-def run(budget: str, tables: Sequence[str], out: Path, results: Path, workers: int) -> str:
-    """Measure the cells of `tables` that have no row yet; returns the tables as Markdown.
+def run(request: BenchmarkRequest) -> str:
+    """Measure the cells of the tables that have no row yet; returns the tables as Markdown.
 
     Pictures of them appear in `out/budget/plots` where matplotlib is installed.
 
     Raises:
-        InputError: an unknown budget or table, or cells that failed.
+        InputError: an unknown budget, or cells that failed.
     """
-    if budget not in BUDGETS or not set(tables) <= set(TABLES):
-        raise InputError(f"budgets are {', '.join(BUDGETS)}; tables are {', '.join(TABLES)}")
-    plan = Plan(out / budget, BUDGETS[budget])
+    if request.budget not in BUDGETS:
+        raise InputError(f"no budget is called {request.budget}; there are {', '.join(BUDGETS)}")
+    folder, budget = request.out / request.budget, BUDGETS[request.budget]
+    if request.evaluation_seed is not None:
+        evaluation = replace(budget.evaluation, seed=request.evaluation_seed)
+        budget = replace(budget, evaluation=evaluation)
+    plan = Plan(folder, budget, request.budget, request.log_seed)
     parts = [f"{name} is left out: its files are not in the data folder" for name in plan.missing()]
     plotted = find_spec("matplotlib") is not None
-    for table in tables:
-        cells = list({str(keys(cell)): cell for cell in getattr(plan, table)()}.values())
-        rows = run_grid(cells, measure, keys, results, workers, describe=table)
-        for title, as_table, as_plots in _SHOWN[table]:
-            parts.append(f"## {title}\n\n{as_table(rows)}")
-            if plotted:
-                as_plots(rows, out / budget / "plots")
-    told = f"pictures: {out / budget / 'plots'}" if plotted else "no pictures: install matplotlib"
-    return "\n\n".join([*parts, told])
+    for table in request.tables:
+        cells = list(getattr(plan, table)())
+        rows = run_grid(cells, MEASUREMENT, request.results, request.workers, table)
+        parts.append(_shown(table, rows))
+        if plotted:
+            for _, _, draw in _SHOWN[table]:
+                draw(rows, folder / "plots")
+    pictures = f"pictures: {folder / 'plots'}" if plotted else "no pictures: install matplotlib"
+    return "\n\n".join([*parts, pictures])
 
 
-_Shown = tuple[str, Callable[[Sequence[Row]], str], Callable[[Sequence[Row], Path], list[Path]]]
+def show(tables: Sequence[str], rows: Sequence[ResultRow]) -> str:
+    """The tables that `rows` have something for, as Markdown; nothing is measured."""
+    found = {table: [row for row in rows if row.table == table] for table in tables}
+    return "\n\n".join(_shown(table, rows) for table, rows in found.items() if rows)
+
+
+def _shown(table: str, rows: Sequence[ResultRow]) -> str:
+    return "\n\n".join(f"## {title}\n\n{as_table(rows)}" for title, as_table, _ in _SHOWN[table])
+
+
+_Shown = tuple[
+    str,
+    Callable[[Sequence[ResultRow]], str],
+    Callable[[Sequence[ResultRow], Path], list[Path]],
+]
 _SHOWN: Final[Mapping[str, tuple[_Shown, ...]]] = {
     "main": (
         ("Methods", method_table, plot_methods),
@@ -64,4 +84,5 @@ BENCHMARK: Final = Benchmark(
     summary="Table 2 of the paper with floors, its ablations, sweeps of UCF, a planted distractor",
     tables=TABLES,
     run=run,
+    show=show,
 )

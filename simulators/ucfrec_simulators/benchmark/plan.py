@@ -6,9 +6,14 @@ from pathlib import Path
 from typing import Final
 
 from ucfrec import schema
+from ucfrec.code_version import code_version, plugin_module
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.evaluation.world import World
+from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import config_hash
-from ucfrec_simulators.benchmark.cells import METHODS, Cell, Judging, Method
+from ucfrec_simulators.benchmark import cells, tasks
+from ucfrec_simulators.benchmark.cells import Cell, EvaluationPlan
+from ucfrec_simulators.benchmark.methods import METHODS, Method
 from ucfrec_simulators.benchmark.tasks import TASKS, BenchmarkTask
 from ucfrec_simulators.distractor import OFF, ON, DistractorWorld, plant_distractor
 from ucfrec_simulators.folders import data_folder
@@ -24,8 +29,8 @@ class Budget:
     settings: tuple[str, ...]
     """Of all methods, over their defaults."""
     cuts: Mapping[str, tuple[str, ...]]
-    """Of single learners, by key of `ucfrec.policies.registry.POLICIES`."""
-    judging: Judging
+    """Of single learners, by name (`ucfrec.policies.registry.policy_names`)."""
+    evaluation: EvaluationPlan
     sweep_seeds: int
     """Of the sweeps and of the distractor."""
 
@@ -46,7 +51,7 @@ BUDGETS: Final[Mapping[str, Budget]] = {
             "crm.epochs=8",
         ),
         cuts={"dt4rec": ("policy.negatives=1",), "edt4rec": ("policy.cql_steps=1000",)},
-        judging=Judging(episodes=500, validation_episodes=200, quantiles=TARGETS),
+        evaluation=EvaluationPlan(episodes=500, validation_episodes=200, quantiles=TARGETS),
         sweep_seeds=2,
     ),
     "full": Budget(
@@ -54,7 +59,7 @@ BUDGETS: Final[Mapping[str, Budget]] = {
         sessions=50_000,
         settings=("train.steps=20000", "train.learning_rate=3e-4"),
         cuts={},
-        judging=Judging(episodes=5000, validation_episodes=1000, quantiles=TARGETS),
+        evaluation=EvaluationPlan(episodes=5000, validation_episodes=1000, quantiles=TARGETS),
         sweep_seeds=3,
     ),
 }
@@ -75,31 +80,39 @@ SWEPT: Final = ("synthetic-catalog", "synthetic-taobao")
 """Worlds with room: in VirtualTaobao every sequence policy is at the ceiling."""
 _REAL: Final = {"kuairand": "kuairand", "kuairec": "kuairec", "virtual-taobao": "virtualtaobao"}
 """What needs files that are not part of the package, and their folder in the data folder."""
-_KNOWN_DISTRACTORS: Final = {"synthetic-taobao": 0, "kuairand": 2}
-"""Where a distractor is planted: task, and which of its worlds judges (of KuaiRand NX_10, whose
+_DISTRACTED_WORLDS: Final = {"synthetic-taobao": 0, "kuairand": 2}
+"""Where a distractor is planted: task, and which of its worlds is played (of KuaiRand NX_10, whose
 sessions are of one length, so that boredom does not drown the distractor)."""
+_DISTRACTOR: Final = DistractorWorld.__module__
 _MEMORYLESS: Final = ("bc", "popular", "crm-greedy")
 
 
 class Plan:
     """The cells of every table, for one budget and the data at hand."""
 
-    def __init__(self, folder: Path, budget: Budget) -> None:
+    def __init__(self, folder: Path, budget: Budget, name: str = "", log_seed: int = 0) -> None:
         """Args:
         folder: where logs, stores, worlds and runs are kept.
+        name: of the budget, for the rows.
+        log_seed: of the logs that are simulated.
         """
-        self._folder, self._budget = folder, budget
+        self._folder, self._budget, self._name = folder, budget, name
+        self._log_seed = log_seed
         self._tasks: dict[str, BenchmarkTask] = {}
 
     def main(self) -> Iterator[Cell]:
         """Table 2, with the floors; Table 3's ablations are rows of it."""
         for name in self._known(MAIN):
             task = self._task(name)
+            for behavior in task.behaviors:
+                code = _code(task.worlds)
+                yield Cell(
+                    *("main", self._name, name, behavior, behavior, task.worlds),
+                    *(self._budget.evaluation, code, self._seed_of_logs(name)),
+                )
             for seed in range(self._budget.seeds):
-                for behavior in task.behaviors:
-                    yield Cell(name, behavior, seed, task.worlds, self._budget.judging)
                 for method in METHODS:
-                    yield from self._trained(name, task, method, METHODS[method], seed)
+                    yield from self._trained("main", name, task, method, METHODS[method], seed)
 
     def sweeps(self) -> Iterator[Cell]:
         """UCF with other λ, bands and gates; the default stands in the main table."""
@@ -115,32 +128,32 @@ class Plan:
             for label, setting in sweeps.items():
                 for seed in range(self._budget.sweep_seeds):
                     method = Method("ucf", (setting,))
-                    yield from self._trained(name, task, f"ucf, {label}", method, seed)
+                    yield from self._trained("sweeps", name, task, f"ucf, {label}", method, seed)
 
     def distractor(self) -> Iterator[Cell]:
-        """A planted distractor: trained without it, and with it and judged with it off and on.
+        """A planted distractor: trained without it, and with it and played with it off and on.
 
-        Everybody is asked for the same returns: a target chosen where the distractor is off would
+        Every method is given the same target returns: one chosen where the distractor is off would
         know of the intervention.
         """
-        asked = [replace(self._budget.judging, quantiles=(q,)) for q in DISTRACTOR_TARGETS]
-        for name, at in _KNOWN_DISTRACTORS.items():
-            if name not in self._known(_KNOWN_DISTRACTORS):
+        plans = [replace(self._budget.evaluation, quantiles=(q,)) for q in DISTRACTOR_TARGETS]
+        for name, at in _DISTRACTED_WORLDS.items():
+            if name not in self._known(_DISTRACTED_WORLDS):
                 continue
             clean = self._task(name)
             world = clean.worlds[at]
-            planted = self._folder / "tasks" / name / "distractor-store"
+            planted = clean.store.with_name("distractor-store")
             if not planted.exists():
                 plant_distractor(EpisodeStore.open(clean.store), planted)
             shown = tuple(DistractorWorld(world.name, world.folder, rate) for rate in (OFF, ON))
             distracted = BenchmarkTask(planted, shown, ())
+            both = {name: clean, f"{name}, distractor": distracted}
             for seed in range(self._budget.sweep_seeds):
                 for method in DISTRACTOR_METHODS:
-                    given = METHODS[method]
-                    for judging in asked:
-                        yield from self._trained(name, clean, method, given, seed, judging)
-                        with_it = f"{name}, distractor"
-                        yield from self._trained(with_it, distracted, method, given, seed, judging)
+                    for plan in plans:
+                        for title, task in both.items():
+                            given = (title, task, method, METHODS[method], seed, plan)
+                            yield from self._trained("distractor", *given)
 
     def missing(self) -> list[str]:
         """Environments that are left out, for lack of their data."""
@@ -151,44 +164,70 @@ class Plan:
 
     def _task(self, name: str) -> BenchmarkTask:
         if name not in self._tasks:
-            folder = self._folder / "tasks" / name
-            self._tasks[name] = TASKS[name](folder, self._budget.sessions)
+            # Other code may write other logs: a folder for each.
+            code = code_version(tasks.__name__, *map(_module, tasks.LOGGED.get(name, (name,))))
+            folder = self._folder / "tasks" / f"{name}-{self._log_seed}-{code}"
+            self._tasks[name] = TASKS[name](folder, self._budget.sessions, self._log_seed)
         return self._tasks[name]
+
+    def _seed_of_logs(self, name: str) -> int | None:
+        """None where the logs are given."""
+        return None if name in tasks.LOGGED else self._log_seed
 
     def _trained(
         self,
+        table: str,
         name: str,
         task: BenchmarkTask,
         label: str,
         method: Method,
         seed: int,
-        judging: Judging | None = None,
+        evaluation: EvaluationPlan | None = None,
     ) -> Iterator[Cell]:
         """The cell of a trained method, unless it cannot act in the task.
 
         Args:
-            judging: the budget's unless given.
+            evaluation: the budget's unless given.
         """
-        items = EpisodeStore.open(task.store).has_items
-        if not (items or method.vectors):
+        store = EpisodeStore.open(task.store)
+        if not (store.has_items or method.vectors):
             return
-        context = _CONTEXT.get(name.partition(",")[0], 10)
+        plain = name.partition(",")[0]
+        context = _CONTEXT.get(plain, 10)
         memory = () if method.policy in _MEMORYLESS else (f"policy.context={context}",)
         cuts = self._budget.cuts.get(method.policy, ())
         settings = (*self._budget.settings, *memory, *cuts, *method.settings)
-        named = config_hash({"policy": method.policy, "settings": settings})
+        code = _code(task.worlds, policy_class(method.policy).__module__)
+        given = {"policy": method.policy, "settings": settings}
+        named = config_hash(given | {"code": code, "data": store.meta["fingerprint"]})
         yield Cell(
-            name,
-            label,
-            seed,
-            task.worlds,
-            judging or self._budget.judging,
-            task.store,
-            self._folder / "runs" / name / f"{method.policy}-{named}-{seed}",
-            method.policy,
-            settings,
-            method.conditioned,
+            table=table,
+            budget=self._name,
+            task=name,
+            method=label,
+            policy=method.policy,
+            worlds=task.worlds,
+            evaluation=evaluation or self._budget.evaluation,
+            code_version=code,
+            log_seed=self._seed_of_logs(plain),
+            training_seed=seed,
+            store=task.store,
+            run=self._folder / "runs" / name / f"{method.policy}-{named}-{seed}",
+            settings=settings,
+            conditioned=method.conditioned,
         )
+
+
+def _code(worlds: Iterable[World], *learner: str) -> str:
+    """The version of the code that a cell in `worlds` runs through."""
+    apart = [] if any(isinstance(world, DistractorWorld) for world in worlds) else [_DISTRACTOR]
+    return code_version(
+        cells.__name__, *learner, *(_module(world.name) for world in worlds), apart=apart
+    )
+
+
+def _module(world: str) -> str:
+    return plugin_module("simulators", world)
 
 
 def _reward_spread(store: Path) -> float:

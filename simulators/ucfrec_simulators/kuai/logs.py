@@ -2,14 +2,16 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from tempfile import gettempdir
 
-import duckdb
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_file
+from ucfrec.logs.binding import glob_pattern, text
+from ucfrec.logs.engine import engine
 from ucfrec.schema import SESSION_ID
 from ucfrec_simulators.kuai.environment import ExitRule
 from ucfrec_simulators.kuai.exit_cuts import sessions_by_exit
@@ -28,17 +30,14 @@ def window(files: Sequence[Path], time: str, where: str) -> pa.Table:
     Raises:
         InputError: no row is in the window.
     """
-    names = ", ".join("'" + str(file).replace("'", "''") + "'" for file in files)
+    names = ", ".join(text(glob_pattern(file)) for file in files)
     read = "read_parquet" if files[0].suffix == ".parquet" else "read_csv"
     key = f"{USER}, {VIDEO}, {time}"
-    rows = (
-        duckdb.connect()
-        .sql(
+    with engine(files, Path(gettempdir())) as connection:
+        rows = connection.sql(
             f"SELECT * FROM {read}([{names}]) WHERE {where} "
             f"QUALIFY row_number() OVER (PARTITION BY {key}) = 1 ORDER BY {USER}, {time}, {VIDEO}"
-        )
-        .to_arrow_table()
-    )
+        ).to_arrow_table()
     if not rows.num_rows:
         raise InputError(f"{files[0]}: no row has {where}; are these the official logs?")
     return rows

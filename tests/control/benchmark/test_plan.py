@@ -8,7 +8,17 @@ import pytest
 from tests.support.control_files import hopper_like, write_hdf5
 from ucfrec.runs.config import Config, resolve_config
 from ucfrec_control.benchmark import robustness
-from ucfrec_control.benchmark.plan import BUDGETS, MAIN, METHODS, SWEEPS, TABLES, Budget, benchmark
+from ucfrec_control.benchmark.cells import code_of
+from ucfrec_control.benchmark.plan import (
+    BUDGETS,
+    MAIN,
+    METHODS,
+    SWEEPS,
+    TABLES,
+    Budget,
+    benchmark,
+    run_name,
+)
 from ucfrec_control.learners.evaluate import load_run
 from ucfrec_control.learners.presets import find_preset
 from ucfrec_control.learners.rl_baselines import ALGORITHMS
@@ -81,7 +91,7 @@ def test_robustness_trains_rows_of_the_benchmark() -> None:
             assert learners <= resolved(MAIN, budget, file).keys()
 
 
-def test_the_best_trajectories_are_cloned_and_judged(
+def test_the_best_trajectories_are_cloned_and_evaluated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Good trajectories act one way and the others the other way: who clones which is seen."""
@@ -99,16 +109,23 @@ def test_the_best_trajectories_are_cloned_and_judged(
     budget = Budget(("hopper_medium-made",), 1, 2, settings)
     results = tmp_path / "rows.jsonl"
     found = benchmark(tmp_path, tmp_path / "runs", results, budget, "tiny", 1)
-    assert [(row["method"], row["checkpoint"]) for row in found] == [
+    assert [(row.method, row.checkpoint) for row in found] == [
         (method, checkpoint) for method in rows for checkpoint in ("last", "best")
     ]
     assert "benchmark main: 3 cells, 3 of them left to measure" in capfd.readouterr().err
     seen = np.random.default_rng(0).normal(size=(20, 11)).astype(np.float32)
     chosen = {}
     for method in rows:
-        run = tmp_path / "runs" / "tiny" / MAIN / "hopper_medium-made" / f"{method}-0"
+        runs = tmp_path / "runs" / "tiny" / MAIN / "hopper_medium-made"
+        run = runs / run_name(method, code_of(METHODS[method][0]), 0)
         actor = load_run(run, "last").actor(len(seen), 1.0)
         actor.begin(np.arange(len(seen)))
         chosen[method] = actor.act(seen, np.ones(len(seen), dtype=bool))[0].mean()
     # One in five is good: all of the best 10%, four fifths of the best 25%.
     assert chosen["bc"] < -0.2 < 0.2 < chosen["bc-25"] < chosen["bc-10"]
+
+
+def test_cells_of_one_learner_run_through_the_same_code() -> None:
+    codes = {learner: code_of(learner) for learner in ("ucf", "dt", "iql", "cql")}
+    assert codes["ucf"] != codes["dt"]
+    assert codes["iql"] == codes["cql"] != codes["dt"]

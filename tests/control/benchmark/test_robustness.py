@@ -1,6 +1,5 @@
 """Robustness to distractors: what is measured, resumed and derived."""
 
-import json
 import math
 from pathlib import Path
 
@@ -8,10 +7,14 @@ import numpy as np
 import pytest
 
 from tests.support.control_files import hopper_like, write_hdf5
+from tests.support.result_rows import result_row
 from ucfrec import schema
+from ucfrec.reporting.result_row import ResultRow
+from ucfrec.reporting.rows_file import read_rows
+from ucfrec.reporting.tables import NONE
 from ucfrec.runs.config import resolve_config
 from ucfrec_control.benchmark import robustness
-from ucfrec_control.benchmark.plan import Budget
+from ucfrec_control.benchmark.plan import Budget, run_name, stores_of
 from ucfrec_control.benchmark.robustness import drops, loss_rises
 from ucfrec_control.benchmark.screening_table import screening_rows
 from ucfrec_control.cli import main
@@ -35,16 +38,16 @@ def test_an_early_distractor_tells_of_the_next_reward(tmp_path: Path) -> None:
     for episode, length in enumerate(store.lengths):
         steps = np.arange(length)
         rewards = store.step_values(schema.REWARD, np.full(length, episode), steps)
-        told = np.append(rewards[1:], rewards[-1]) > np.median(every)
+        high = np.append(rewards[1:], rewards[-1]) > np.median(every)
         bit = seen.step_values(schema.OBSERVATION, np.full(length, episode), steps)[:, -1]
-        np.testing.assert_array_equal(bit, told)
+        np.testing.assert_array_equal(bit, high)
 
 
-def row(distractor: str, score: float, method: str = "dt", seed: int = 0) -> dict[str, object]:
-    return {
-        "dataset": "d", "method": method, "seed": seed, "distractor": distractor, "score": score,
-        "score_at_one": 2 * score,
-    }  # fmt: skip
+def row(distractor: str, score: float, method: str = "dt", seed: int = 0) -> ResultRow:
+    return result_row(
+        score, suite="robustness", task="d", method=method, training_seed=seed, metric="score",
+        conditions={"distractor": distractor}, metrics={"score_at_one": 2 * score},
+    )  # fmt: skip
 
 
 def test_drops_compare_with_the_same_seed_without_distractor() -> None:
@@ -52,7 +55,7 @@ def test_drops_compare_with_the_same_seed_without_distractor() -> None:
         row("none", 50.0), row("none", 80.0), row("early", 20.0), row("stochastic", 100.0),
         row("none", -1.0, seed=1), row("early", 5.0, seed=1), row("early", 5.0, method="dc"),
     ]  # fmt: skip
-    found = {(d["distractor"], d["seed"]): d for d in drops(rows)}
+    found = {(d["distractor"], d["training_seed"]): d for d in drops(rows)}
     assert found.keys() == {("early", 0), ("stochastic", 0), ("early", 1)}
     early = found["early", 0]
     assert (early["clean"], early["score"], early["drop"]) == (80.0, 20.0, 75.0)
@@ -61,76 +64,92 @@ def test_drops_compare_with_the_same_seed_without_distractor() -> None:
     assert math.isnan(found["early", 1]["drop"])
 
 
-def test_cells_are_measured_once_and_screening_is_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def begin(tmp_path: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A small table of one file and one distractor, its screened runs begun in `out`."""
     settings = (*TINY, "crm.epochs=1")
     monkeypatch.setattr(robustness, "BUDGETS", {"small": Budget((FILE,), 1, 2, settings)})
     monkeypatch.setattr("ucfrec_control.commands.robustness.ROBUSTNESS_BUDGETS", robustness.BUDGETS)
-    methods = ("dt", *robustness.SCREENED)
-    monkeypatch.setattr(robustness, "METHODS", methods)
+    monkeypatch.setattr(robustness, "METHODS", ("dt", *robustness.SCREENED))
     kinds = {kind: robustness.DISTRACTORS[kind] for kind in ("none", "deterministic")}
     monkeypatch.setattr(robustness, "DISTRACTORS", kinds)
     columns = hopper_like((30, 8, 25) * 8)
     columns["observations"][:, 4] = 0.0  # a constant causes nothing
     columns["rewards"] = columns["observations"][:, 0]
-    file, out = write_hdf5(tmp_path / f"{FILE}.hdf5", columns), tmp_path / "out"
+    file = write_hdf5(tmp_path / f"{FILE}.hdf5", columns)
     # Begun here, where screening may be made quick, and gone on with by the command.
     quickest = ScreeningConfig(hidden=32, shared_steps=200, own_steps=100)
     monkeypatch.setattr("ucfrec_control.learners.train.ScreeningConfig", lambda: quickest)
-    clean = read_d4rl(file).write_store(out / "stores" / FILE)
-    distracted = add_distractor(clean, out / "stores" / f"{FILE}-deterministic")
+    clean = read_d4rl(file).write_store(stores_of(out) / FILE)
+    distracted = add_distractor(clean, stores_of(out) / f"{FILE}-deterministic")
     tables = preset_of(dataset_of(clean), "ucf").tables
     for kind, store in (("none", clean), ("deterministic", distracted)):
         config = resolve_config("ucf", None, settings, 0, tables)
         for method, screening in robustness.SCREENED.items():
-            run = out / "robustness-small" / FILE / kind / f"{method}-0"
-            train_control(store, run, config, screening=screening)
+            train_control(store, run_of(out, kind, method), config, screening=screening)
 
+
+def test_cells_are_measured_once_and_screening_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    begin(tmp_path, out, monkeypatch)
+    methods, kinds = robustness.METHODS, robustness.DISTRACTORS
     results = tmp_path / "rows.jsonl"
     arguments = ["robustness", "--data", str(tmp_path), "--out", str(out)]
     arguments += ["--results", str(results)]
     assert main(arguments) == 0
-    rows = [json.loads(line) for line in results.read_text().splitlines()]
-    assert {(r["method"], r["distractor"], len(r["distractors"])) for r in rows} == {
-        (method, kind, kind != "none") for method in methods for kind in kinds
-    }
-    assert {r["checkpoint"] for r in rows} == {"last"}
+    rows = read_rows(results)
+    kinds_of = {(r.method, r.conditions["distractor"]): r.details.get("distractors") for r in rows}
+    assert kinds_of.keys() == {(method, kind) for method in methods for kind in kinds}
+    assert all(bool(added) == (kind != "none") for (_, kind), added in kinds_of.items())
+    assert {r.checkpoint for r in rows} == {"last"}
     for r in rows:
+        kind = str(r.conditions["distractor"])
         for value, name in ((0.0, "score"), (1.0, "score_at_one")):
-            told = r["distractor"] != "none" and value
-            asked = [r["target_return"]]
+            fixed = value if kind != "none" else 0.0
+            assert r.target_return is not None
             (again,) = evaluate_run(
-                Path(r["run"]),
-                episodes=2, seed=1000, targets=asked, checkpoints=("last",), distractor=told,
+                run_of(out, kind, r.method),
+                episodes=2, seed=1000, targets=[r.target_return], checkpoints=("last",),
+                distractor=fixed,
             )  # fmt: skip
-            assert again["score"] == r[name]
-            assert again["distractor_fixed_to"] == told
-    for r in rows:
-        blind = r["distractor"] == "none" or r["method"] == "ucf-dropped"
-        assert (r["loss"] == r["loss_at_zero"]) == blind
-        assert not blind or r["score"] == r["score_at_one"]
-    assert len({r["evaluation_seed"] for r in rows}) == 1
+            assert again["score"] == r.metrics[name]
+            assert again["distractor_fixed_to"] == fixed
+        blind = kind == "none" or r.method == "ucf-dropped"
+        assert (r.metrics["loss"] == r.metrics["loss_at_zero"]) == blind
+        assert not blind or r.metrics["score"] == r.metrics["score_at_one"]
+    assert {r.evaluation_seed for r in rows} == {1000}
     printed, before = capsys.readouterr().out, results.read_text()
     for dropped in drops(rows):
-        assert f"{dropped['drop']:.3g}" in printed
+        assert f"{dropped['drop']:.4g}" in printed
     rises = loss_rises(rows)
     assert {r["distractor"] for r in rises} == {"deterministic"}
-    for r in rises:
-        assert r["loss"] * (1 + r["rise"] / 100) == pytest.approx(r["loss_at_zero"])
-        assert f"{r['loss_at_zero']:.3g}" in printed
+    for rise in rises:
+        assert rise["loss"] * (1 + rise["rise"] / 100) == pytest.approx(rise["loss_at_zero"])
+        assert f"{rise['loss']:.4g}" in printed
     made, _ = make_figures([], [results], tmp_path / "figures")
-    kinds = ("scores", "drops", "losses")
-    assert {p.stem for p in made} == {f"robustness-{kind}-small-{FILE}" for kind in kinds}
+    drawn = {f"robustness-{kind}-small-{FILE}" for kind in ("scores", "drops", "losses")}
+    assert {p.stem for p in made} == drawn
     screened = {r["distractor"]: r for r in screening_rows(rows)}
     assert 4 in screened["none"]["true_flagged"]
-    assert screened["none"]["flagged"] == "-"
-    report = next(r for r in rows if "screening" in r and r["distractors"])["screening"]
+    assert screened["none"]["flagged"] == NONE
+    details = [r.details for r in rows if r.details.keys() >= {"screening", "distractors"}]
+    report = details[0]["screening"]
     assert [d["dimension"] for d in report if d["distractor"]] == [11]
     assert screened["deterministic"]["flagged"] is report[11]["flagged"] is True
     assert screened["deterministic"]["effect"] == report[11]["effect"]
     assert main(arguments) == 0
     assert results.read_text() == before
+    capsys.readouterr()
+    assert main(["robustness", "--show-only", "--results", str(results)]) == 0
+    assert capsys.readouterr().out == printed
+
+
+def run_of(out: Path, kind: str, method: str) -> Path:
+    """The folder of a run of the command."""
+    learner = "ucf" if method in robustness.SCREENED else method
+    code = robustness.code_of(learner, *robustness._CODE)
+    return out / "robustness-small" / FILE / kind / run_name(method, code, 0)
 
 
 def test_every_budget_is_a_configuration_of_every_method() -> None:

@@ -1,8 +1,17 @@
 """Printed tables of the control benchmarks are what their rows say."""
 
+from typing import Any
+
 import pytest
 
+from tests.support.result_rows import result_row
+from ucfrec.reporting.result_row import ResultRow
 from ucfrec_control.benchmark.tables import against_first, over_seeds, score_table
+
+
+def scored(task: str, method: str, seed: int, score: float, **more: Any) -> ResultRow:
+    fields = {"task": task, "method": method, "training_seed": seed, "checkpoint": "last"}
+    return result_row(score, metric="score", **fields | more)
 
 
 def test_a_table_of_scores_has_the_spread_over_seeds_and_a_mean_where_nothing_is_missing() -> None:
@@ -10,9 +19,15 @@ def test_a_table_of_scores_has_the_spread_over_seeds_and_a_mean_where_nothing_is
         ("dt", "a"): (10.0, 20.0), ("dt", "b"): (40.0, 50.0), ("iql", "a"): (30.0,),
     }  # fmt: skip
     rows = [
-        {"method": method, "dataset": dataset, "seed": seed, "score": score + shift}
-        | {"checkpoint": checkpoint, "best_step": None if method == "iql" else 7}
-        for (method, dataset), seeds in scores.items()
+        scored(
+            task,
+            method,
+            seed,
+            score + shift,
+            checkpoint=checkpoint,
+            metrics={} if method == "iql" else {"best_step": 7.0},
+        )
+        for (method, task), seeds in scores.items()
         for seed, score in enumerate(seeds)
         for checkpoint, shift in (("last", 0.0), ("best", 1.0))
         if method != "iql" or checkpoint == "last"
@@ -29,7 +44,7 @@ def test_a_table_of_scores_has_the_spread_over_seeds_and_a_mean_where_nothing_is
 def test_what_was_not_measured_is_a_dash() -> None:
     rows = [
         {"method": "dt", "seed": 0, "score": 1.0, "other": None},
-        {"method": "dc", "seed": 0, "score": 5.0, "other": None},
+        {"method": "dc", "seed": 0, "score": 5.0},
         {"method": "dt", "seed": 1, "score": 3.0, "other": 4.0},
     ]
     found = over_seeds(rows, ("method",), ("score", "other"))
@@ -42,11 +57,9 @@ def test_what_was_not_measured_is_a_dash() -> None:
 def test_methods_are_compared_seed_by_seed() -> None:
     scores = {"none": (10.0, 50.0, 90.0), "copies": (13.0, 51.0), "lonely": (1.0,)}
     rows = [
-        {"dataset": "a", "method": method, "seed": seed, "score": score}
+        scored("a", method, seed, score)
         for method, seeds in scores.items()
         for seed, score in enumerate(seeds)
     ]
     # Of 3 and 1: their deviation √2 over √2.
-    assert against_first(rows, ("score",)) == [
-        {"dataset": "a", "method": "copies", "score": "+2 ± 1"}
-    ]
+    assert against_first(rows, ("score",)) == [{"task": "a", "method": "copies", "score": "+2 ± 1"}]

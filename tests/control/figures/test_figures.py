@@ -9,11 +9,13 @@ import pytest
 import torch
 
 from tests.support.control_files import hopper_like, write_hdf5
+from tests.support.result_rows import result_row
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay
 from ucfrec.errors import InputError
 from ucfrec.files import read_json
 from ucfrec.fitting.metrics_log import read_metrics
+from ucfrec.reporting.rows_file import append_rows
 from ucfrec_control.benchmark.robustness import drops
 from ucfrec_control.cli import main
 from ucfrec_control.figures import diagnostics, plots
@@ -55,8 +57,15 @@ def heights(axes: object) -> dict[tuple[int, str], float]:
 
 def test_bars_are_as_high_as_the_drops_of_their_rows() -> None:
     rows = [
-        {"dataset": "d", "method": m, "distractor": k, "seed": s}
-        | {"score": 50.0 - 7 * i * j - s, "score_at_one": None}
+        result_row(
+            50.0 - 7 * i * j - s,
+            metric="score",
+            task="d",
+            method=m,
+            training_seed=s,
+            conditions={"distractor": k},
+            metrics={"score_at_one": 0.0},
+        )
         for i, m in enumerate(("dt", "ucf", "ucf-screened"))
         for j, k in enumerate(("none", "deterministic", "early"))
         for s in range(3)
@@ -71,6 +80,10 @@ def test_bars_are_as_high_as_the_drops_of_their_rows() -> None:
         method = ("dt", "ucf", "ucf-screened")[group]
         own = [r["drop"] for r in lost if (r["method"], r["distractor"]) == (method, kind)]
         assert height == pytest.approx(sum(own) / 3)
+    (spread, *_) = (c.errorbar[2][0] for c in axes.containers if getattr(c, "errorbar", None))
+    low, high = spread.get_segments()[0][:, 1]
+    first = [r["drop"] for r in lost if (r["method"], r["distractor"]) == ("dt", "deterministic")]
+    assert (high - low) / 2 == pytest.approx(np.std(first, ddof=1))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -149,7 +162,7 @@ def test_curves_are_means_over_seeds(runs: Path) -> None:
     wanted = [(logged[0][step] + logged[1][step]) / 2 for step in (2, 4)]
     np.testing.assert_allclose(line.get_ydata(), wanted)
     rows = [
-        {"dataset": "d", "lambda_mask": value, "seed": seed, "score": 10 * value + seed}
+        {"task": "d", "lambda_mask": value, "training_seed": seed, "score": 10 * value + seed}
         for value in (1.0, 0.0, 0.1)
         for seed in (0, 1)
     ]
@@ -157,14 +170,19 @@ def test_curves_are_means_over_seeds(runs: Path) -> None:
     np.testing.assert_allclose(axes.lines[0].get_ydata(), [0.5, 1.5, 10.5])
     assert [text.get_text() for text in axes.get_xticklabels()] == ["0", "0.1", "1"]
     rows = [
-        {"method": "ucf", "target_return": target, "seed": seed, "return": target / 2 + seed}
+        {
+            "method": "ucf",
+            "target_return": target,
+            "training_seed": seed,
+            "return": target / 2 + seed,
+        }
         for target in (2000.0, 1000.0)
         for seed in (0, 1)
     ]
     (axes,) = plots.return_curves(rows).axes
-    earned, as_asked = axes.lines
+    earned, as_given = axes.lines
     np.testing.assert_array_equal(earned.get_xydata(), [[1000, 500.5], [2000, 1000.5]])
-    np.testing.assert_array_equal(as_asked.get_xydata(), [[0, 0], [2000, 2000]])
+    np.testing.assert_array_equal(as_given.get_xydata(), [[0, 0], [2000, 2000]])
 
 
 def test_json_that_is_no_list_of_rows_is_refused(tmp_path: Path) -> None:
@@ -173,19 +191,33 @@ def test_json_that_is_no_list_of_rows_is_refused(tmp_path: Path) -> None:
         make_figures([], [tmp_path / "x.json"], tmp_path)
 
 
+@pytest.mark.parametrize("row", ["1", "{}", '{"dataset": "d"}', '{"config": 3}', "null"])
+def test_rows_of_something_else_are_refused(tmp_path: Path, row: str) -> None:
+    (tmp_path / "x.json").write_text(f"[{row}]")
+    with pytest.raises(InputError, match=r"x\.json, row 1, is none of `ucfrec-control evaluate"):
+        make_figures([], [tmp_path / "x.json"], tmp_path)
+
+
 def test_one_command_draws_what_it_can_and_names_what_is_missing(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     results, out = tmp_path / "rows.jsonl", tmp_path / "figures"
     evaluated = tmp_path / "evaluated.json"
-    asked = ["--target", "1000", "--target", "3000", "--episodes", "1", "--json", str(evaluated)]
-    assert main(["evaluate", str(runs / "tangent"), *asked]) == 0
-    common = {"dataset": "d", "seed": 0, "checkpoint": "last"}
+    targets = ["--target", "1000", "--target", "3000", "--episodes", "1", "--json", str(evaluated)]
+    assert main(["evaluate", str(runs / "tangent"), *targets]) == 0
     rows = [
-        common | {"method": "ucf", "budget": "small", "lambda_mask": value, "score": value}
+        result_row(
+            value,
+            metric="score",
+            suite="control",
+            table="lambda",
+            method="ucf",
+            checkpoint="last",
+            conditions={"budget": "small", "lambda_mask": value},
+        )
         for value in (0.0, 0.1)
     ]
-    results.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    append_rows(results, rows)
     shutil.copytree(runs, tmp_path / "copied")
     record = read_json(tmp_path / "copied" / "tangent" / "run.json")
     record["store"] = str(tmp_path / "gone")
@@ -238,5 +270,5 @@ def test_runs_with_other_settings_are_no_seeds_of_one_another(runs: Path, tmp_pa
         f"{figure}-{name}" for figure in ("states", "acceptance", "attention") for name in first
     }
     drawn = (tmp_path / "figures" / "training-gate-hopper.svg").read_text()
-    assert all(f"<!-- {kind} -->" in drawn for kind in KINDS)
+    assert all(f">{kind}<" in drawn for kind in KINDS)
     assert "iql" not in drawn

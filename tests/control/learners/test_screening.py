@@ -15,10 +15,10 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files import read_json
 from ucfrec.fitting.checkpoint import load_tensors
-from ucfrec.reporting.grid import read_rows
+from ucfrec.reporting.rows_file import read_rows
 from ucfrec.runs.config import resolve_config
 from ucfrec_control.benchmark import screening_table
-from ucfrec_control.benchmark.plan import Budget
+from ucfrec_control.benchmark.plan import Budget, stores_of
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.distractor import add_distractor
@@ -187,22 +187,24 @@ def test_every_file_is_screened_plain_and_distracted_once(
     quickest = ScreeningConfig(hidden=8, shared_steps=100, own_steps=50)
     monkeypatch.setattr(screening_table, "ScreeningConfig", lambda: quickest)
     budget = {"full": Budget(("hopper_medium-made",), 1, 1, ())}
-    monkeypatch.setattr(screening_table, "BUDGETS", budget)
+    monkeypatch.setattr("ucfrec_control.commands.screen_all.BUDGETS", budget)
     write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((20, 30) * 12))
     results = tmp_path / "rows.jsonl"
     arguments = ["screen-all", "--data", str(tmp_path), "--out", str(tmp_path / "out")]
     arguments += ["--results", str(results)]
     assert main(arguments) == 0
-    rows = {row["distractor"]: row for row in read_rows(results)}
+    rows = {row.conditions["distractor"]: row for row in read_rows(results)}
     assert rows.keys() == {"none", "deterministic", "stochastic", "early"}
     for kind, row in rows.items():
         name = "hopper_medium-made" + ("" if kind == "none" else f"-{kind}")
-        report = screen(EpisodeStore.open(tmp_path / "out" / "stores" / name), quickest, seed=0)
-        assert tuple(d["dimension"] for d in row["screening"] if d["flagged"]) == report.flagged
-        added = [d["dimension"] for d in row["screening"] if d["distractor"]]
+        report = screen(EpisodeStore.open(stores_of(tmp_path / "out") / name), quickest, seed=0)
+        found = row.details["screening"]
+        assert tuple(d["dimension"] for d in found if d["flagged"]) == report.flagged
+        added = [d["dimension"] for d in found if d["distractor"]]
+        assert row.value == len(set(report.flagged) - set(added))
         assert added == ([] if kind == "none" else [11])
     printed, before = capsys.readouterr().out, results.read_text()
-    assert f"{rows['early']['screening'][11]['effect']:#.3g}" in printed
+    assert f"{rows['early'].details['screening'][11]['effect']:#.3g}" in printed
     assert main(arguments) == 0
     assert results.read_text() == before
 

@@ -15,7 +15,7 @@ from ucfrec.acting.rollout import rollout
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files import read_json
-from ucfrec.policies.registry import POLICIES
+from ucfrec.policies.registry import BUILT_IN
 from ucfrec.runs.config import resolve_config
 from ucfrec_control.benchmark.plan import BUDGETS, METHODS, TABLES, Budget
 from ucfrec_control.cli import main
@@ -146,7 +146,7 @@ def test_a_policy_with_a_distractor_is_judged_at_zero(folder: Path, tmp_path: Pa
 
 def test_presets_are_configurations_with_targets() -> None:
     kinds = ("medium", "medium-replay", "medium-expert", "mixed", "diverse", "")
-    for policy in POLICIES:
+    for policy in BUILT_IN:
         for task in TASKS:
             for kind in kinds:
                 preset = find_preset(task.name, kind, policy)
@@ -270,12 +270,16 @@ def test_a_benchmark_goes_on_where_it_was(
         (method, checkpoint) for method in ("lsdt", "ucf") for checkpoint in ("best", "last")
     ]
     for row in rows:
-        assert (row["dataset"], row["budget"], row["episodes"]) == (
+        assert (row["suite"], row["table"], row["task"]) == (
+            "control",
+            "main",
             "hopper_medium-made",
-            "small",
-            2,
         )
-        assert {"score", "seed", "env_id", "versions", "commit", "command"} <= row.keys()
+        assert row["conditions"].items() >= {"budget": "small", "episodes": 2}.items()
+        assert row["metrics"].keys() >= {"score", "return", "length", "validation_loss"}
+        assert (row["training_seed"], row["evaluation_seed"]) == (0, 1000)
+        assert {"world", "versions", "commit", "command", "code_version"} <= row.keys()
+    assert str(tmp_path) not in results.read_text()
     before = results.read_text()
     assert main(arguments) == 0
     assert results.read_text() == before
@@ -283,24 +287,28 @@ def test_a_benchmark_goes_on_where_it_was(
     assert main(arguments) == 0
     again = [json.loads(line) for line in results.read_text().splitlines()]
     assert {r["method"] for r in again} == {"lsdt", "ucf"}
-    by_checkpoint = {r["checkpoint"]: r["return"] for r in rows if r["method"] == "lsdt"}
-    assert {r["checkpoint"]: r["return"] for r in again[2:]} == by_checkpoint
+    by_checkpoint = {r["checkpoint"]: r["metrics"] for r in rows if r["method"] == "lsdt"}
+    assert {r["checkpoint"]: r["metrics"] for r in again[2:]} == by_checkpoint
+    capsys.readouterr()
+    assert main([*arguments[:1], "--show-only", *arguments[2:]]) == 0
+    assert f"{by_checkpoint['last']['score']:.4g}" in capsys.readouterr().out
     (tmp_path / "hopper_medium-made.hdf5").rename(tmp_path / "hopper_medium-own.hdf5")
     own = ["--file", "hopper_medium-own", "--method", "lsdt", "--seeds", "2"]
     assert main([*arguments, *own]) == 0
     more = [json.loads(line) for line in results.read_text().splitlines()][len(again) :]
-    assert sorted((r["dataset"], r["method"], r["seed"]) for r in more) == [
+    assert sorted((r["task"], r["method"], r["training_seed"]) for r in more) == [
         ("hopper_medium-own", "lsdt", seed) for seed in (0, 0, 1, 1)
     ]
+    assert {r["evaluation_seed"] for r in more} == {1000}
 
 
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["--method", "nope"], "no method nope in this table; it has bc, bc-10"),
+        (["--method", "nope"], "no method is called nope; there are bc, bc-10"),
         (["--seeds", "0"], "--seeds is 0"),
         (["--file", "nowhere"], "nowhere.hdf5 does not exist"),
-        (["--results", "{rows}"], "rows.jsonl, line 1, is no result row"),
+        (["--results", "{rows}"], "rows.jsonl, line 1 is no result row"),
     ],
 )
 def test_what_no_benchmark_can_be_of_is_refused(

@@ -1,5 +1,6 @@
 """The recommendation benchmark: what it measures, what it reuses, and what its tables say."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,13 +9,18 @@ import pyarrow as pa
 import pytest
 
 from tests.support.real_data import data_folder
+from tests.support.result_rows import result_row
+from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.evaluate import World, evaluate_behavior
-from ucfrec.plugins import Benchmark, load_plugin
-from ucfrec.reporting.grid import read_rows
-from ucfrec_simulators.benchmark import plan
-from ucfrec_simulators.benchmark.cells import JUDGED, METHODS, Judging
+from ucfrec.evaluation.evaluate import evaluate_behavior
+from ucfrec.evaluation.world import World
+from ucfrec.plugins import Benchmark, BenchmarkRequest, load_plugin
+from ucfrec.reporting.result_row import ResultRow
+from ucfrec.reporting.rows_file import append_rows, read_configurations, read_rows
+from ucfrec_simulators.benchmark import plan, plots
+from ucfrec_simulators.benchmark.cells import EvaluationPlan
+from ucfrec_simulators.benchmark.methods import METHODS
 from ucfrec_simulators.benchmark.plan import BUDGETS, Plan
 from ucfrec_simulators.benchmark.plots import plot_distractor, plot_methods, plot_targets
 from ucfrec_simulators.benchmark.tables import distractor_table, method_table, target_table
@@ -24,10 +30,10 @@ from ucfrec_simulators.kuai.logs import cut_by_exit, window
 
 TINY = replace(
     BUDGETS["small"],
-    seeds=1,
+    seeds=2,
     sessions=60,
     settings=("policy.dim=8", "train.steps=2", "train.validate_every=2", "crm.epochs=1"),
-    judging=Judging(episodes=8, validation_episodes=4, quantiles=(0.5, 1.0)),
+    evaluation=EvaluationPlan(episodes=8, validation_episodes=4, quantiles=(0.5, 1.0)),
     sweep_seeds=1,
 )
 
@@ -46,24 +52,46 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     monkeypatch.setattr(plan, "METHODS", some)
     suite: Benchmark = load_plugin("benchmarks", "recommendation")
     results = tmp_path / "rows.jsonl"
-    said = suite.run("small", ["main"], tmp_path / "out", results, 1)
+    request = BenchmarkRequest("small", ["main"], tmp_path / "out", results, 1)
+    said = suite.run(request)
     assert "kuairand is left out" in said
     rows = read_rows(results)
-    assert {(r["env"], r["method"], r["checkpoint"]) for r in rows} == {
-        *(("synthetic-catalog", name, None) for name in ("random", "mixture", "optimal")),
-        *(("synthetic-catalog", name, c) for name in ("popular", "dt") for c in ("best", "last")),
+    built_in = [(name, None, None) for name in ("random", "mixture", "optimal")]
+    trained = [(n, s, c) for s in (0, 1) for n in some for c in ("best", "last")]
+    assert [(r.method, r.training_seed, r.checkpoint) for r in rows] == [*built_in, *trained]
+    assert {(r.suite, r.table, r.world, r.log_seed) for r in rows} == {
+        ("recommendation", "main", "synthetic-catalog", 0)
     }
-    played = evaluate_behavior(World("synthetic-catalog"), "optimal", 8, JUDGED)
-    found = next(row for row in rows if row["method"] == "optimal")
-    assert found["R_cum"] == played["R_cum"]
-    assert (found["seed"], found["evaluation_seed"]) == (0, JUDGED)
-    tried = next(row for row in rows if row["method"] == "dt")
-    best = max(tried["validation"], key=lambda target: tried["validation"][target])
-    assert tried["target_return"] == float(best)
-    assert (tmp_path / "out" / "small" / "plots").exists() == ("pictures:" in said)
-    again = suite.run("small", ["main"], tmp_path / "out", results, 1)
-    assert again == said
+    played = evaluate_behavior(World("synthetic-catalog"), "optimal", 8, 1_000_000)
+    found = next(row for row in rows if row.method == "optimal")
+    assert found.value == played["R_cum"]
+    assert found.interval == (played["R_cum_low"], played["R_cum_high"])
+    # Whatever the training seed, the same episodes are reported.
+    assert {row.evaluation_seed for row in rows} == {1_000_000}
+    tried = next(row for row in rows if row.method == "dt")
+    validation = tried.details["validation"]
+    assert tried.target_return == float(max(validation, key=lambda target: validation[target]))
+    configurations = read_configurations(tmp_path)
+    dims = {configurations[str(r.config_hash)]["policy"]["dim"] for r in rows if r.config_hash}
+    assert dims == {8}
+    assert str(tmp_path) not in results.read_text()
+    pictures = tmp_path / "out" / "small" / "plots"
+    assert pictures.exists() == ("pictures:" in said)
+    assert suite.run(request) == said
     assert len(read_rows(results)) == len(rows)
+    assert suite.show(["main", "sweeps"], rows) in said
+    # Code that a row runs through has changed: trained and played again.
+    monkeypatch.setattr(plan, "METHODS", {"popular": METHODS["popular"]})
+    monkeypatch.setattr(plan, "code_version", lambda *roots, apart=(): "other")
+    suite.run(request)
+    again = read_rows(results)[len(rows) :]
+    assert {row.code_version for row in again} == {"other"}
+    assert {row.method for row in again} == {"random", "mixture", "optimal", "popular"}
+    seeds = replace(request, evaluation_seed=5, log_seed=3)
+    suite.run(seeds)
+    last = read_rows(results)[-1]
+    assert (last.evaluation_seed, last.log_seed) == (5, 3)
+    assert last.data_fingerprint != again[-1].data_fingerprint
 
 
 @pytest.mark.usefixtures("no_data")
@@ -73,8 +101,8 @@ def test_every_cell_of_every_table_has_a_configuration(
     monkeypatch.setattr(plan, "MAIN", ("synthetic-taobao", "synthetic-catalog"))
     monkeypatch.setattr(plan, "SWEPT", ("synthetic-taobao",))
     given = Plan(tmp_path, TINY)
-    cells = [*given.main(), *given.sweeps(), *given.distractor()]
-    trained = [cell for cell in cells if cell.store is not None]
+    every = [*given.main(), *given.sweeps(), *given.distractor()]
+    trained = [cell for cell in every if cell.store is not None]
     folders = {(cell.run, cell.config) for cell in trained}
     assert len({run for run, _ in folders}) == len(folders), "a folder for every configuration"
     assert {cell.method for cell in trained} >= {"ucf", "ucf, λ = 0", "ucf, band 1–2"}
@@ -90,72 +118,96 @@ def test_every_cell_of_every_table_has_a_configuration(
     planted = EpisodeStore.open(distractors[0].store)  # type: ignore[arg-type]
     assert planted.observation_size == 92
     assert [world.rate for world in distractors[0].worlds] == [0.0, 1.0]  # type: ignore[attr-defined]
-    assert {cell.judging.quantiles for cell in given.distractor()} == {(1.0,), (0.99,)}
+    assert {cell.evaluation.quantiles for cell in given.distractor()} == {(1.0,), (0.99,)}
 
 
-def test_unknown_tables_are_named(tmp_path: Path) -> None:
+def test_unknown_tables_and_budgets_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["benchmark", "recommendation", "--out", str(tmp_path / "out")]
+    assert main([*arguments, "--table", "table-2"]) == 2
+    assert "no table is called table-2; there are main, distractor" in capsys.readouterr().err
     suite: Benchmark = load_plugin("benchmarks", "recommendation")
-    with pytest.raises(InputError, match="tables are main, distractor, sweeps"):
-        suite.run("small", ["table-2"], tmp_path, tmp_path / "rows.jsonl", 1)
+    with pytest.raises(InputError, match="no budget is called huge"):
+        suite.run(BenchmarkRequest("huge", ["main"], tmp_path, tmp_path / "rows.jsonl", 1))
+    assert not (tmp_path / "out").exists()
+
+
+def test_tables_of_rows_at_hand_are_shown_without_measuring(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "rows.jsonl"
+    arguments = ["benchmark", "recommendation", "--show-only", "--results", str(path)]
+    assert main(arguments) == 2
+    assert "rows.jsonl has no rows of recommendation, main" in capsys.readouterr().err
+    append_rows(path, [result_row(10.0), result_row(20.0), result_row(3.0, training_seed=1)])
+    assert main(arguments) == 0
+    assert "| w | m | 2 | 11.5 ± 12 |" in capsys.readouterr().out, "the last of a seed counts"
+    assert main([*arguments, "--table", "sweeps"]) == 2
+    assert "has no rows of recommendation, sweeps" in capsys.readouterr().err
+
+
+RATES = (None, 0.0, 1.0)
+
+
+def distractor_rows(values: Mapping[float | None, Sequence[float]]) -> list[ResultRow]:
+    """Rows of a method without a distractor, with it off and on: a value a seed."""
+    metrics = {"R_avg_pooled": 0.5, "R_avg_episode": 0.5, "length": 2.0}
+    return [
+        result_row(
+            value,
+            metrics=metrics,
+            training_seed=seed,
+            target_return=3.0,
+            details={"validation": {"3": value + seed}},
+            conditions={"distractor": rate, "quantiles": quantile},
+        )
+        for quantile in ("0.99", "1")
+        for rate, own in values.items()
+        for seed, value in enumerate(own)
+    ]
 
 
 def test_tables_give_means_spreads_and_paired_drops() -> None:
-    shared = {
-        "env": "w",
-        "method": "m",
-        "checkpoint": "best",
-        "target_return": 3.0,
-        "distractor": None,
-    }
-    shared |= {"R_avg_pooled": 0.5, "R_avg_episode": 0.5, "length": 2.0, "coverage": None}
-    earned = {None: (10.0, 20.0), 0.0: (5.0, 15.0), 1.0: (8.0, 16.0)}
-    rows = [
-        shared | {"seed": s, "R_cum": v, "distractor": distractor, "validation": {"3": v + s}}
-        for distractor, values in earned.items()
-        for s, v in enumerate(values)
-    ]
-    clean = [row for row in rows if row["distractor"] is None]
-    last = clean[0] | {"checkpoint": "last", "R_cum": 99.0}
+    every = distractor_rows({None: (10.0, 20.0), 0.0: (5.0, 15.0), 1.0: (8.0, 16.0)})
+    clean = [r for r in every if r.conditions == {"distractor": None, "quantiles": "1"}]
+    last = replace(clean[0], checkpoint="last", metrics={"R_cum": 99.0})
     assert method_table([*clean, last]).splitlines()[2] == (
-        "| w | m | 2 | 15 ± 7.07 | 0.5 ± 0 | 0.5 ± 0 | 2 ± 0 | – | 3 |"
+        "| w | m | 2 | 15 ± 7.1 | 0.5 ± 0 | 0.5 ± 0 | 2 ± 0 | – | 3 |"
     )
-    assert target_table(clean).splitlines()[2] == "| w | m | 3 | 2 | 15.5 ± 7.78 |"
-    asked = [row | {"quantiles": [q]} for q in (0.99, 1.0) for row in rows]
-    line, less = distractor_table(asked).splitlines()[2:]
+    assert target_table(clean).splitlines()[2] == "| w | m | 3 | 2 | 15.5 ± 7.8 |"
+    line, less = distractor_table(every).splitlines()[2:]
     assert less == line.replace("| 1 |", "| 0.99 |")
-    assert line == "| w | 1 | m | 2 | 15 ± 7.07 | 10 ± 7.07 | 12 ± 5.66 | 37.5 ± 17.7 |"
+    assert line == "| w | 1 | m | 2 | 15 ± 7.1 | 10 ± 7.1 | 12 ± 5.7 | 37.5 ± 18 |"
 
 
-def test_pictures_show_the_means(tmp_path: Path) -> None:
+def test_pictures_show_the_means_and_the_spread_of_the_tables(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    shared = {"env": "w", "checkpoint": "best", "target_return": 3.0, "validation": {"3": 1.0}}
-    rows = [
-        shared
-        | {
-            "method": method,
-            "seed": s,
-            "R_cum": s + 1.0,
-            "distractor": distractor,
-            "quantiles": [1.0],
-        }
-        for method in ("dt", "ucf")
-        for distractor in (None, 0.0, 1.0)
-        for s in range(2)
-    ]
-    clean = [row for row in rows if row["distractor"] is None]
+    values = dict.fromkeys(RATES, (1.0, 2.0))
+    rows = [replace(r, method=m) for m in ("dt", "ucf") for r in distractor_rows(values)]
+    clean = [row for row in rows if row.conditions["distractor"] is None]
     for plot, given, name in (
-        (plot_methods, clean, "methods-w.svg"),
-        (plot_targets, clean, "targets-w.svg"),
-        (plot_distractor, rows, "distractor-w.svg"),
+        (plot_methods, clean, "methods-w"),
+        (plot_targets, clean, "targets-w"),
+        (plot_distractor, rows, "distractor-w"),
     ):
-        (path,) = plot(given, tmp_path)
-        assert path == tmp_path / name
-        drawn = path.read_text()
+        made = plot(given, tmp_path)
+        assert made == [tmp_path / f"{name}.png", tmp_path / f"{name}.svg"]
+        drawn = made[1].read_text()
         assert ">ucf<" in drawn
         assert ">dt<" in drawn
         plot(given, tmp_path)
-        assert path.read_text() == drawn
+        assert made[1].read_text() == drawn
     assert plot_distractor(clean, tmp_path) == []
+
+
+def test_error_bars_are_those_of_the_tables() -> None:
+    figure = pytest.importorskip("matplotlib.figure").Figure()
+    axes = figure.add_subplot()
+    plots._bars(axes, [result_row(value, training_seed=s) for s, value in enumerate((1.0, 3.0))])
+    (spread,) = (c.errorbar[2][0] for c in axes.containers if getattr(c, "errorbar", None))
+    ((left, right),) = (segment[:, 0] for segment in spread.get_segments())
+    assert (right - left) / 2 == pytest.approx(2**0.5)
 
 
 def test_windows_drop_repeats_and_are_cut(tmp_path: Path) -> None:
@@ -178,13 +230,13 @@ def test_windows_drop_repeats_and_are_cut(tmp_path: Path) -> None:
 
 
 @pytest.mark.realdata
-def test_kuairand_learns_before_it_judges(tmp_path: Path) -> None:
+def test_kuairand_learns_from_what_came_before_its_worlds(tmp_path: Path) -> None:
     data_folder("kuairand")
-    task = kuairand(tmp_path, 0)
-    learned, judged = (EpisodeStore.open(tmp_path / name) for name in ("store", "judge"))
+    task = kuairand(tmp_path, 0, 0)
+    learned, played = (EpisodeStore.open(tmp_path / name) for name in ("store", "world-store"))
     last, first = (
         f(store.step_values("timestamp", *store.all_steps()))
-        for f, store in ((np.max, learned), (np.min, judged))
+        for f, store in ((np.max, learned), (np.min, played))
     )
     assert last < first
     assert learned.lengths.max() <= EXITS["easyrl4rec-kuairand"].max_turn

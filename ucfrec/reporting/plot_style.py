@@ -1,17 +1,27 @@
-"""One look for all figures: colors that the color-blind tell apart, sizes of a paper's columns."""
+"""One look for all figures: colors that the color-blind tell apart, sizes of a paper's columns.
 
-from collections.abc import Iterable
+Matplotlib (extra `plots`) is imported when a figure is drawn.
+"""
+
+from collections.abc import Callable, Iterable
+from functools import wraps
 from itertools import cycle
 from pathlib import Path
-
-from matplotlib import rc_context
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any, Final, ParamSpec, TypeVar
 
 from ucfrec.files import atomic_file
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+P = ParamSpec("P")
+Drawn = TypeVar("Drawn")
 
 COLUMN, PAGE = 3.4, 7.0
 """Widths of one column and of both, in inches."""
 FACTUAL, EDITED = "#0072B2", "#D55E00"
+PLAIN, OURS, LIGHT = "#8C8C8C", "#D55E00", "#56B4E9"
+"""Of every method but UCF, of UCF, and of a third bar."""
 MAP = "cividis"
 # Okabe and Ito's colors, which stay apart for the color-blind.
 _PALETTE = (
@@ -51,26 +61,37 @@ _LABELS = {
     "none": "no distractor",
 }
 
-styled = rc_context(
-    {
-        "figure.dpi": 200,
-        "figure.constrained_layout.use": True,
-        "font.size": 8,
-        "axes.titlesize": 8,
-        "legend.fontsize": 7,
-        "legend.frameon": False,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.axisbelow": True,
-        "grid.color": "#DDDDDD",
-        "lines.linewidth": 1.3,
-        "lines.markersize": 3.5,
-        "image.cmap": MAP,
-        # The same picture is the same file.
-        "svg.hashsalt": "ucfrec",
-    }
-)
-"""Decorates what draws or saves a figure."""
+_RC: Final[Any] = {
+    "figure.dpi": 200,
+    "figure.constrained_layout.use": True,
+    "font.size": 8,
+    "axes.titlesize": 8,
+    "legend.fontsize": 7,
+    "legend.frameon": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "grid.color": "#DDDDDD",
+    "lines.linewidth": 1.3,
+    "lines.markersize": 3.5,
+    "image.cmap": MAP,
+    # Text stays text, and the same picture is the same file.
+    "svg.fonttype": "none",
+    "svg.hashsalt": "ucfrec",
+}
+
+
+def styled(draw: Callable[P, Drawn]) -> Callable[P, Drawn]:
+    """Decorates what draws or saves a figure."""
+
+    @wraps(draw)
+    def drawn(*args: P.args, **kwargs: P.kwargs) -> Drawn:
+        from matplotlib import rc_context
+
+        with rc_context(_RC):
+            return draw(*args, **kwargs)
+
+    return drawn
 
 
 def label(name: str) -> str:
@@ -87,7 +108,7 @@ def colors(names: Iterable[str]) -> dict[str, str]:
 
 
 @styled
-def save(figure: Figure, folder: Path, name: str) -> list[Path]:
+def save(figure: "Figure", folder: Path, name: str) -> list[Path]:
     """Write `figure` as PNG and SVG; returns the two files."""
     files = []
     for kind in ("png", "svg"):

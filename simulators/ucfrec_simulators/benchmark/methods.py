@@ -1,0 +1,37 @@
+"""The lines of the tables."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row of a table."""
+
+    policy: str
+    """One of `ucfrec.policies.registry.policy_names`."""
+    settings: tuple[str, ...] = ()
+    conditioned: bool = True
+    """Whether it is given a target return."""
+    vectors: bool = True
+    """Whether it also acts where actions are vectors."""
+
+
+METHODS: Final[Mapping[str, Method]] = {
+    "popular": Method("popular", conditioned=False),
+    "item-knn": Method("item-knn", conditioned=False, vectors=False),
+    "sasrec": Method("sasrec", conditioned=False),
+    "bc": Method("bc", conditioned=False),
+    "bc-25": Method("bc", ("policy.best_share=0.25",), conditioned=False),
+    "bc-10": Method("bc", ("policy.best_share=0.1",), conditioned=False),
+    "crm-greedy": Method("crm-greedy", conditioned=False),
+    "dt": Method("dt"),
+    "dt4rec": Method("dt4rec"),
+    "cdt4rec": Method("cdt4rec"),
+    "edt4rec": Method("edt4rec"),
+    "ucf-wo-count": Method("ucf", ("augment.copies=0",)),
+    "ucf-wo-arch": Method("dt", ("augment.copies=1",)),
+    "ucf": Method("ucf"),
+}
+"""By the name in the tables; the two before the last are the ablations of the paper's Table 3."""

@@ -1,0 +1,283 @@
+"""Which SQL a log may be read with: one scalar expression over its columns, and nothing else.
+
+Rewards and column mappings are text from command lines, mapping files, run folders and stores.
+DuckDB would run any of it, so each text is parsed first (DuckDB's own parser, as a tree) and every
+node of the tree must be of a kind listed here.
+"""
+
+import json
+import re
+from typing import TYPE_CHECKING, Any, Final, Self
+
+from ucfrec.errors import InputError
+
+if TYPE_CHECKING:
+    import duckdb
+
+MAX_LENGTH: Final = 4000
+"""Characters of an expression."""
+MAX_NESTING: Final = 100
+"""Levels of an expression: brackets, calls, operators."""
+MAX_SIZE: Final = 20_000
+"""Nodes of an expression as DuckDB evaluates it, arguments that it copies counted every time."""
+_MAX_TREE: Final = 2_000_000
+"""Characters of a tree that is looked at."""
+_MAX_COPIED: Final = 1_000_000
+_SHOWN: Final = 120
+
+_KINDS = "BETWEEN CASE CAST COLUMN_REF COMPARISON CONJUNCTION CONSTANT FUNCTION OPERATOR TYPE"
+_NODES: Final = frozenset(_KINDS.split())
+_OTHER_NODES: Final = {
+    "COLLATE": "a COLLATE",
+    "DEFAULT": "the word DEFAULT",
+    "LAMBDA": "a lambda, a list comprehension or -> (for JSON use ->>)",
+    "PARAMETER": "a parameter ($ or ?)",
+    "POSITIONAL_REFERENCE": "a position (#)",
+    "STAR": "a star or COLUMNS",
+    "SUBQUERY": "a subquery",
+    "WINDOW": "a window function",
+}
+_SCALARS = """
+    BOOLEAN BOOL LOGICAL TINYINT SMALLINT INTEGER BIGINT HUGEINT UTINYINT USMALLINT UINTEGER UBIGINT
+    UHUGEINT INT1 INT2 INT4 INT8 SHORT LONG SIGNED UINT8 UINT16 UINT32 UINT64 FLOAT FLOAT4 FLOAT8
+    DOUBLE DECIMAL VARCHAR TEXT STRING BPCHAR NVARCHAR UUID GUID JSON DATE TIME INTERVAL DATETIME
+    TIMESTAMP TIMESTAMP_S TIMESTAMP_MS TIMESTAMP_US TIMESTAMP_NS TIMESTAMPTZ
+"""
+TYPES: Final = frozenset(_SCALARS.split()) | {"TIMESTAMP WITH TIME ZONE", "LIST"}
+"""Types to cast to, as the parser names them; LIST is any of the others with [] behind it."""
+
+# No function here reads files, settings, the clock or a random number, gives several rows, or makes
+# text much longer than its arguments are (replace, repeat, lpad and format do).
+_MATHS = """
+    abs sign round floor ceil ceiling trunc even sqrt cbrt exp ln log log2 log10 pow power pi mod
+    gcd lcm sin cos tan asin acos atan atan2 sinh cosh tanh degrees radians bit_count
+    isfinite isinf isnan if nullif least greatest
+"""
+_TEXTS = """
+    concat concat_ws length len strlen lower upper trim ltrim rtrim left right substr substring
+    reverse split_part string_split str_split string_split_regex translate starts_with ends_with
+    prefix suffix contains instr position strpos regexp_matches regexp_full_match regexp_extract
+    ascii md5 sha256 strip_accents
+"""
+_TIMES = """
+    epoch epoch_ms epoch_us epoch_ns to_timestamp make_date make_time make_timestamp
+    make_timestamp_ms make_timestamp_ns make_timestamptz strptime try_strptime strftime date_part
+    datepart date_trunc datetrunc date_diff datediff date_sub datesub date_add time_bucket timezone
+    year quarter month week day hour minute second millisecond microsecond dayofweek dayofmonth
+    dayofyear weekday weekofyear isodow isoyear yearweek dayname monthname last_day julian
+    to_years to_quarters to_months to_weeks to_days to_hours to_minutes to_seconds to_milliseconds
+    to_microseconds
+"""
+_LISTS = """
+    list_value list_contains list_has list_has_any list_has_all list_position list_extract
+    list_element array_extract element_at list_slice array_slice list_sum list_avg list_min list_max
+    list_count list_first list_last list_bool_and list_bool_or list_distinct list_unique list_sort
+    list_reverse_sort list_reverse list_concat list_cat list_append list_prepend array_length
+    array_contains array_position array_to_string flatten list_dot_product list_distance
+    list_cosine_similarity cardinality map_extract map_keys map_values struct_extract
+    json_extract json_extract_string json_array_length
+"""
+_OPERATORS = """
+    + - * / // % ^ ** || & | << >> ~ xor @ ^@ @> <@ && ->>
+    ~~ !~~ ~~* !~~* ~~~ like_escape not_like_escape ilike_escape not_ilike_escape
+"""
+FUNCTIONS: Final = frozenset(" ".join((_MATHS, _TEXTS, _TIMES, _LISTS, _OPERATORS)).split())
+"""Functions and, as the parser calls them, operators (~~ is LIKE)."""
+COPYING: Final = frozenset({"least", "greatest", "nullif", "split_part", "array_to_string"})
+"""Macros: DuckDB writes each argument out up to three times, or nine with three arguments."""
+_SIMPLE_CASE: Final = re.compile(r"\bcase\b(?!\s+when\b)", re.IGNORECASE)
+_WHEN: Final = re.compile(r"\bwhen\b", re.IGNORECASE)
+_ALLOWED: Final = (
+    "allowed are columns, literals, operators, casts, CASE, and the functions of "
+    "ucfrec.logs.expressions"
+)
+
+
+class Expression(str):
+    """SQL text that knows where it was written, for messages."""
+
+    origin: str
+
+    def __new__(cls, text: object, origin: str) -> Self:
+        """`text` as it is.
+
+        Args:
+            origin: a file or option.
+
+        Raises:
+            InputError: it is not text.
+        """
+        if not isinstance(text, str):
+            raise InputError(f"{origin}: {_shown(text)} is no text; write a SQL expression")
+        expression = super().__new__(cls, text)
+        expression.origin = origin
+        return expression
+
+
+class NotScalarError(Exception):
+    """Why a text is not a scalar expression that may be evaluated."""
+
+
+def refused(what: str, given: str, over: str, reason: str) -> InputError:
+    """The error for an expression that cannot be used: one line.
+
+    Args:
+        what: what it is for, such as "for the reward".
+        over: whose columns it is over.
+    """
+    origin = f"{given.origin}: " if isinstance(given, Expression) else ""
+    reason = "".join(char if char.isprintable() else " " for char in reason)
+    return InputError(
+        f"{origin}{what.partition(';')[0]}: {_shown(given)} is no scalar SQL expression over the "
+        f"columns of {over}: {reason}"
+    )
+
+
+def columns_of(connection: "duckdb.DuckDBPyConnection", given: str) -> tuple[str, ...]:
+    """Check that `given` is one scalar expression, and name the columns that it reads.
+
+    Nothing of it is evaluated, and columns and types of arguments are not looked up.
+
+    Raises:
+        NotScalarError: it is anything else, too long, too large, or nested too deep.
+    """
+    _require_small(given)
+    # By itself and in the brackets in which it is used: only a text that closes all that it opens,
+    # and opens all that it closes, is the same expression in both.
+    alone, bracketed = _parse(connection, f"{given}\n"), _parse(connection, f"({given}\n)")
+    if alone != bracketed:
+        raise NotScalarError(f"it is not one whole expression; {_ALLOWED}")
+    columns: dict[str, None] = {}
+    if _walk(alone, 0, columns) > MAX_SIZE:
+        raise _too_large()
+    return tuple(columns)
+
+
+def _require_small(given: str) -> None:
+    """Spare the parser what it is slow on: length, deep brackets, and CASE within CASE."""
+    if len(given) > MAX_LENGTH:
+        raise NotScalarError(f"it has {len(given):,} characters; {MAX_LENGTH:,} are allowed")
+    depth = 0
+    for char in given:
+        depth += (char in "([{") - (char in ")]}")
+        if depth > MAX_NESTING:
+            raise _too_deep()
+    # CASE x WHEN … copies x for every WHEN, so that one within the other multiply; an even share
+    # of the WHENs gives the most copies.
+    cases, whens = len(_SIMPLE_CASE.findall(given)), len(_WHEN.findall(given))
+    if cases and (whens / cases) ** cases * len(given) > _MAX_COPIED:
+        raise NotScalarError(
+            f"it has {cases} CASE x WHEN … with {whens} WHEN; write CASE WHEN x = … instead"
+        )
+
+
+def _too_deep() -> NotScalarError:
+    return NotScalarError(f"it is nested more than {MAX_NESTING} levels deep; simplify it")
+
+
+def _too_large() -> NotScalarError:
+    copying = ", ".join(sorted(COPYING))
+    return NotScalarError(f"it is too large; nest fewer of CASE x WHEN, {copying}")
+
+
+def _parse(connection: "duckdb.DuckDBPyConnection", given: str) -> dict[str, Any]:
+    """The tree of the only value that `SELECT given` selects from nothing."""
+    node, value = _select(connection, given)
+    plain, _ = _select(connection, "1")
+    if node != plain or value["alias"]:
+        raise NotScalarError(f"it is more than one expression; {_ALLOWED}")
+    return value
+
+
+def _select(
+    connection: "duckdb.DuckDBPyConnection", given: str
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """`SELECT given` parsed: the query without its value, and the value."""
+    from duckdb import Error
+
+    try:
+        query = "SELECT json_serialize_sql(?)"
+        (told,) = connection.execute(query, [f"SELECT {given}"]).fetchall()[0]
+        if len(told) > _MAX_TREE:
+            raise _too_large()
+        parsed = _without_places(json.loads(told))
+    except RecursionError:
+        raise _too_deep() from None
+    except (Error, UnicodeError) as error:
+        raise NotScalarError(str(error).partition("\n")[0]) from None
+    if parsed["error"]:
+        raise NotScalarError(f"{parsed['error_message'].partition(chr(10))[0]}; {_ALLOWED}")
+    if len(parsed["statements"]) != 1:
+        raise NotScalarError(f"it is several statements; {_ALLOWED}")
+    node = parsed["statements"][0].pop("node")
+    values = node.pop("select_list", [])
+    if len(values) != 1:
+        raise NotScalarError(f"it is more than one expression; {_ALLOWED}")
+    return {**node, "statement": parsed["statements"][0]}, values[0]
+
+
+def _without_places(tree: Any) -> Any:
+    """A tree without the places in the text, so that equal expressions are equal trees."""
+    if isinstance(tree, list):
+        return [_without_places(part) for part in tree]
+    if isinstance(tree, dict):
+        places = ("query_location", "query_location_length")
+        return {key: _without_places(part) for key, part in tree.items() if key not in places}
+    return tree
+
+
+def _walk(tree: Any, depth: int, columns: dict[str, None]) -> int:
+    """Check every node of a tree.
+
+    Args:
+        depth: nodes above it.
+        columns: takes the names of the columns that it reads.
+
+    Returns:
+        Its nodes, those that DuckDB copies counted every time.
+    """
+    if isinstance(tree, list):
+        return sum(_walk(part, depth, columns) for part in tree)
+    if not isinstance(tree, dict):
+        return 0
+    if "class" not in tree:
+        return sum(_walk(part, depth, columns) for part in tree.values())
+    if depth == MAX_NESTING:
+        raise _too_deep()
+    _require_listed(tree)
+    if tree["class"] == "COLUMN_REF":
+        columns[tree["column_names"][0]] = None
+    inner = sum(_walk(part, depth + 1, columns) for part in tree.values())
+    if tree["class"] == "FUNCTION" and tree["function_name"].lower() in COPYING:
+        inner *= 3 ** max(0, len(tree["arguments"]) - 1)
+    return 1 + inner
+
+
+def _require_listed(node: dict[str, Any]) -> None:
+    """See that a node is of a kind that is allowed."""
+    kind = node["class"]
+    if kind not in _NODES:
+        raise NotScalarError(f"it has {_OTHER_NODES.get(kind, f'a {kind.lower()}')}; {_ALLOWED}")
+    if kind == "OPERATOR" and node["type"] == "GROUPING_FUNCTION":
+        raise NotScalarError(f"it calls 'grouping'; {_ALLOWED}")
+    if kind == "TYPE" and (node["type_name"].upper() not in TYPES or _is_qualified(node)):
+        raise NotScalarError(
+            f"it casts to {_shown(node['type_name'])}; cast to numbers, text, BOOLEAN, UUID, JSON, "
+            "dates and times, or lists of those"
+        )
+    if kind == "FUNCTION":
+        name = node["function_name"].lower()
+        if name not in FUNCTIONS or _is_qualified(node):
+            raise NotScalarError(f"it calls {_shown(name)}; {_ALLOWED}")
+        plain = not (node["distinct"] or node["filter"] or node["export_state"])
+        if not plain or node["order_bys"]["orders"] or any(a["name"] for a in node["arguments"]):
+            raise NotScalarError(f"it calls {_shown(name)} as an aggregate or with named arguments")
+
+
+def _is_qualified(node: dict[str, Any]) -> bool:
+    return bool(node["catalog"] or node["schema"] or len(node["qualified_name"]["path"]) != 1)
+
+
+def _shown(given: object) -> str:
+    told = repr(str(given)) if isinstance(given, str) else repr(given)
+    return told if len(told) <= _SHOWN else f"{told[: _SHOWN - 1]}…"

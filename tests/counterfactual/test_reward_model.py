@@ -14,6 +14,7 @@ from ucfrec.counterfactual.reward_model import (
     CRMConfig,
     Posterior,
     fit_crm,
+    fit_warning,
     kl_to_prior,
 )
 from ucfrec.errors import InputError
@@ -65,6 +66,18 @@ def test_a_reward_without_disturbance_collapses_and_is_told_on(tmp_path: Path) -
     _, report = fit_crm(train, held_out, config, tmp_path, seed=0)
     assert report.z_share < 0.01
     assert "collapse" in report.warning
+
+
+def test_a_model_of_rewards_that_nothing_predicts_is_named(tmp_path: Path) -> None:
+    train, held_out = planted(4_000, 0).transitions, planted(4_000, 1).transitions
+    generator = torch.Generator().manual_seed(0)
+    train = replace(train, rewards=torch.randn(4_000, generator=generator))
+    held_out = replace(held_out, rewards=torch.randn(4_000, generator=generator))
+    _, report = fit_crm(train, held_out, replace(FIT, epochs=2, hidden=32), tmp_path, seed=0)
+    assert report.r2_without_z < 0.02
+    assert fit_warning(report.r2_without_z).startswith("the reward model predicts nothing")
+    assert fit_warning(0.021) == ""
+    assert fit_warning(float("nan")) != ""
 
 
 def test_equal_rewards_and_empty_splits_are_refused(tmp_path: Path) -> None:

@@ -91,10 +91,9 @@ def fit(
     """Minimise `loss` over batches from `draw`, resuming from `folder` if it holds a checkpoint.
 
     Writes `last.safetensors` (all that resuming needs), `best.safetensors` (weights with the lowest
-    validation loss; the last weights without validation), `metrics.jsonl` and TensorBoard events to
-    `folder`. A run killed at any moment and started again ends with the same weights as an
-    uninterrupted one (same machine and device). The global random state is as before when it
-    returns or raises.
+    validation loss, else the last), `metrics.jsonl` and TensorBoard events to `folder`. A run
+    killed at any moment and started again ends with the same weights as an uninterrupted one (same
+    machine and device). The global random state is as before when it returns or raises.
 
     Args:
         module: what is trained, in place; holds the best weights on return.
@@ -123,16 +122,11 @@ def fit(
         norm = _descend(value, module, optimizer, config, step)
         if step % config.validate_every and step != config.steps:
             continue
-
         logged = {"loss": value.item(), "gradient_norm": norm.item(), **clock.rates(step, config)}
-        logged |= {name: scalar.item() for name, scalar in scalars.items()}
         _require_finite(logged["loss"], f"{describe}: the loss", step)
         _require_finite(logged["gradient_norm"], f"{describe}: the gradient", step)
-        if validate is None:
-            counters["best_step"] = step
-            save_tensors(best, module.state_dict(), {"step": step})
-        else:
-            logged["validation_loss"] = _keep_best(module, validate, counters, step, best, describe)
+        logged |= {name: scalar.item() for name, scalar in scalars.items()}
+        logged |= _keep_best(module, validate, counters, step, best, describe)
         log.add(step, logged)
         shown.update(0, loss=logged["loss"])
         counters |= {"step": step, "seconds": clock.total()}
@@ -141,8 +135,8 @@ def fit(
     log.close()
     load_weights(best, module, load_tensors(best)[0])
     module.eval()
-    best_validation = math.nan if validate is None else counters["best_validation"]
-    return Fit(step, int(counters["best_step"]), best_validation, counters["seconds"])
+    lowest = math.nan if validate is None else counters["best_validation"]
+    return Fit(step, int(counters["best_step"]), lowest, counters["seconds"])
 
 
 def _steps(
@@ -230,13 +224,21 @@ def _require_finite(value: float, what: str, step: int) -> None:
 
 def _keep_best(
     module: nn.Module,
-    validate: Callable[[], float],
+    validate: Callable[[], float] | None,
     counters: dict[str, float],
     step: int,
     best: Path,
     describe: str,
-) -> float:
-    """Return the validation loss; if it is the lowest yet, save the weights and count from here."""
+) -> dict[str, float]:
+    """Save the weights if their validation loss is the lowest yet, or if there is no validation.
+
+    Returns:
+        The validation loss, to log.
+    """
+    if validate is None:
+        counters["best_step"] = step
+        save_tensors(best, module.state_dict(), {"step": step})
+        return {}
     module.eval()
     with torch.no_grad():
         loss = validate()
@@ -246,4 +248,4 @@ def _keep_best(
         save_tensors(best, module.state_dict(), {"step": step, "validation_loss": loss})
     else:
         counters["stale"] += 1
-    return loss
+    return {"validation_loss": loss}

@@ -127,17 +127,17 @@ def _against(best: _Earned, references: Sequence[_Earned]) -> str:
 
 def _of_estimates(one: Estimates) -> str:
     weighted = [row for row in one.rows if row["estimator"] in WEIGHTED]
-    told = "; ".join(one.warnings)
+    warnings = "; ".join(one.warnings)
     if not weighted:
         models = _listed([f"{row['estimator']} {interval(row)}" for row in one.rows])
-        because = f" ({told})" if told else ""
+        because = f" ({warnings})" if warnings else ""
         said = f"For {one.name}, these logs allow no weighted estimate{because}."
         return f"{said} Models alone say {models}: that supports no conclusion." if models else said
     named = {row["estimator"]: row for row in weighted}
     quoted = named.get("DR") or named.get("SNIPS") or weighted[0]
     figure = f"{quoted['estimator']} estimates {interval(quoted)} a session"
-    if told:
-        return f"For {one.name}, {figure}, which is not to be relied on: {told}."
+    if warnings:
+        return f"For {one.name}, {figure}, which is not to be relied on: {warnings}."
     if one.logged is None:
         return f"For {one.name}, {figure}. What the logged sessions earned is not among the rows."
     return f"For {one.name}, {figure}; the logged sessions earned {interval(one.logged)}. " + (

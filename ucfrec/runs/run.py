@@ -17,7 +17,7 @@ from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.episodes.windows import Overlay, Windows
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder, read_json, write_json
-from ucfrec.fitting.loop import fit
+from ucfrec.fitting.loop import Fit, fit
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
@@ -53,8 +53,7 @@ def train_run(
             ones.
 
     Returns:
-        The record in `run.json`: command, configuration, seed, store fingerprint, versions, wall
-        time and what every stage reports.
+        The record in `run.json`: where the run comes from, and what every stage reports.
 
     Raises:
         InputError: `out` is a run on another store or with another configuration, the store has
@@ -81,12 +80,27 @@ def train_run(
         more_copies = overlay if more_copies is None else overlay.joined(more_copies)
     if more_copies is not None:
         train = train.with_overlay(more_copies)
-    k = policy.config.context
+    fitted = _fit_policy(policy, train, validation, out, config)
+    record["policy"] = dataclasses.asdict(fitted)
+    record["wall_time_s"] = time.perf_counter() - began
+    _write_samples(out, policy, validation, record)
+    write_json(out / RUN, record)
+    return dict(record)
+
+
+def _fit_policy(
+    policy: SequencePolicy,
+    train: EpisodeStore,
+    validation: EpisodeStore,
+    out: Path,
+    config: Config,
+) -> Fit:
+    k, device = policy.config.context, policy.state_mean.device
 
     def draw(generator: np.random.Generator) -> Windows:
         return train.windows(*train.draw_steps(generator, config.train.batch_size), k).to(device)
 
-    fitted = fit(
+    return fit(
         policy,
         draw,
         policy.loss,
@@ -96,13 +110,6 @@ def train_run(
         validate=_validation(policy, validation, config.seed),
         describe=config.policy_name,
     )
-    record["policy"] = dataclasses.asdict(fitted)
-    record["wall_time_s"] = time.perf_counter() - began
-    if store.has_items:
-        target = max(record["return_quantiles"].values())
-        write_json(out / SAMPLES, sample_recommendations(policy, validation, target))
-    write_json(out / RUN, record)
-    return dict(record)
 
 
 def training_views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
@@ -253,6 +260,15 @@ def _validation(policy: SequencePolicy, validation: EpisodeStore, seed: int) -> 
         return float(torch.stack([policy.action_loss(w.to(device)) for w in windows]).mean())
 
     return loss
+
+
+def _write_samples(
+    out: Path, policy: SequencePolicy, validation: EpisodeStore, record: Mapping[str, Any]
+) -> None:
+    """Keep a few recommendations for the report, at the target return that commands default to."""
+    if validation.has_items:
+        target = max(record["return_quantiles"].values())
+        write_json(out / SAMPLES, sample_recommendations(policy, validation, target))
 
 
 def describe_run(record: Mapping[str, Any]) -> str:

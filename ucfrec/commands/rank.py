@@ -15,7 +15,8 @@ from ucfrec.evaluation.ranking_baselines import PolicyRanker, baselines
 from ucfrec.files import write_json
 from ucfrec.logs.summary import format_report
 from ucfrec.off_policy.score import logged_sessions
-from ucfrec.provenance import format_rows, provenance
+from ucfrec.provenance import provenance
+from ucfrec.reporting.tables import format_rows
 from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 
 _SHOWN = ("hit_rate_shown", "hit_rate_liked", "ndcg_liked", "recall_liked", "gauc", "item_rate")

@@ -287,11 +287,11 @@ def test_a_benchmark_goes_on_where_it_was(
     assert main(arguments) == 0
     again = [json.loads(line) for line in results.read_text().splitlines()]
     assert {r["method"] for r in again} == {"lsdt", "ucf"}
-    by_checkpoint = {r["checkpoint"]: r["metrics"] for r in rows if r["method"] == "lsdt"}
-    assert {r["checkpoint"]: r["metrics"] for r in again[2:]} == by_checkpoint
+    earned = {r["checkpoint"]: r["metrics"]["return"] for r in rows if r["method"] == "lsdt"}
+    assert {r["checkpoint"]: r["metrics"]["return"] for r in again[2:]} == earned
     capsys.readouterr()
     assert main([*arguments[:1], "--show-only", *arguments[2:]]) == 0
-    assert f"{by_checkpoint['last']['score']:.4g}" in capsys.readouterr().out
+    assert f"{earned['last']:.3f}" in capsys.readouterr().out
     (tmp_path / "hopper_medium-made.hdf5").rename(tmp_path / "hopper_medium-own.hdf5")
     own = ["--file", "hopper_medium-own", "--method", "lsdt", "--seeds", "2"]
     assert main([*arguments, *own]) == 0

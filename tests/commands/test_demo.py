@@ -16,6 +16,7 @@ TINY = DemoConfig(
 )
 
 
+@pytest.mark.slow
 def test_the_demo_writes_every_row_and_goes_on_where_it_was(tmp_path: Path) -> None:
     rows = demo(tmp_path / "demo", seed=0, config=TINY)
     written = json.loads((tmp_path / "demo" / "results.json").read_text())

@@ -180,6 +180,7 @@ def test_near_returns_have_near_prompts_within_the_hull_of_the_buckets() -> None
     assert (near <= buckets.max(0).values + 1e-5).all()
 
 
+@pytest.mark.slow
 @both_heads
 def test_the_contrast_teaches_to_answer_what_was_asked(sizes: dict[str, int]) -> None:
     windows = random_windows(sizes)
@@ -196,6 +197,7 @@ def test_the_contrast_teaches_to_answer_what_was_asked(sizes: dict[str, int]) ->
     assert contrast(10.0) < 0.85 * contrast(0.0)
 
 
+@pytest.mark.slow
 @both_heads
 def test_the_entropy_constraint_holds_and_its_multiplier_follows(sizes: dict[str, int]) -> None:
     windows = random_windows(sizes)

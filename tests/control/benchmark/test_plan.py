@@ -91,6 +91,7 @@ def test_robustness_trains_rows_of_the_benchmark() -> None:
             assert learners <= resolved(MAIN, budget, file).keys()
 
 
+@pytest.mark.slow
 def test_the_best_trajectories_are_cloned_and_evaluated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -43,6 +43,7 @@ def no_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("UCFREC_DATA", str(tmp_path / "nothing"))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_data")
 def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

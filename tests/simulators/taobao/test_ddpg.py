@@ -107,6 +107,7 @@ class Slope(SyntheticTaobao):
         return 0.5 + 0.45 * (actions * self.corner).mean(axis=1)
 
 
+@pytest.mark.slow
 def test_it_learns() -> None:
     need_sb3()
     config = DdpgConfig(warm_up=3000, updates=1 / 16, batch_size=128, hidden=64)
@@ -132,6 +133,7 @@ def test_a_log_of_the_training_holds_its_densities(tmp_path: Path) -> None:
     assert (density[warm:] != np.float32(0.5**27)).all()
 
 
+@pytest.mark.slow
 def test_each_session_is_served_by_one_snapshot() -> None:
     need_sb3()
     env = SyntheticTaobao(16)
@@ -159,6 +161,7 @@ def test_each_session_is_served_by_one_snapshot() -> None:
     assert (np.abs(counts - 50) < 4 * np.sqrt(150 * 2 / 9)).all()
 
 
+@pytest.mark.slow
 def test_a_training_is_kept_and_its_seed_and_world_decide_it(cache: Path) -> None:
     need_sb3()
 

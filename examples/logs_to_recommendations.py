@@ -13,14 +13,19 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from ucfrec import UCF, EpisodeStore
+from ucfrec import EpisodeStore, Recommender
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.logs.summary import format_report
 
 USERS, VIDEOS, TOPICS = 500, 240, 6
-SETTINGS = ["train.steps=500", "train.learning_rate=3e-3", "train.warmup_steps=50"]
-SETTINGS += ["train.cosine=true", "policy.dim=32", "policy.context=8", "crm.epochs=4"]
+SETTINGS = {
+    "train": {"steps": 500, "learning_rate": 3e-3, "warmup_steps": 50, "cosine": True},
+    "policy": {"dim": 32, "context": 8},
+    "crm": {"epochs": 4},
+}
+COLUMNS = {"user_id": "uid", "item_id": "video", "timestamp": "time_s * 1000"}
+"""What ucfrec calls a column, and how the logs of part 1 express it."""
 
 
 # Part 1: made-up logs.
@@ -71,7 +76,7 @@ def make_logs(folder: Path) -> npt.NDArray[np.float64]:
 def prepare_logs(folder: Path) -> EpisodeStore:
     """Write the store and return it."""
     mapping = LogMapping(
-        columns={"user_id": "uid", "item_id": "video", "timestamp": "time_s * 1000"},
+        columns=COLUMNS,
         item_features=(FeatureTable((folder / "videos.csv",), "video", ("topic",)),),
     )
     options = PrepareOptions(reward="least(play_ms / duration_ms, 1)", session_by="gap")
@@ -82,20 +87,20 @@ def prepare_logs(folder: Path) -> EpisodeStore:
 
 # Part 3: train.
 #
-# `UCF` trains on the training split and keeps the weights with the best validation loss. The run
-# folder can be resumed, and read by every `ucfrec` command. The settings make it small.
+# `Recommender` trains on the training split and keeps the weights with the best validation loss. The
+# run folder can be resumed, and read by every `ucfrec` command. The settings make it small.
 
 
-def train(store: EpisodeStore, folder: Path) -> UCF:
-    """Train a small policy."""
-    return UCF(settings=SETTINGS).fit(store, folder / "run")
+def train(store: EpisodeStore, folder: Path) -> Recommender:
+    """Train a small UCF."""
+    return Recommender("ucf", SETTINGS).fit(store, folder / "run")
 
 
 # Part 4: recommend, and look at what it is worth.
 #
-# A history is one row an interaction, with the reward that it earned. Because we made the users up,
-# we can look up how much of each recommended video they would truly watch. With real logs nobody
-# can: see `judge_three_ways.py` for what can be done then.
+# Histories are rows like those of the logs, one an interaction; the policy knows how its reward is
+# computed from them. Because we made the users up, we can look up how much of each recommended video
+# they would truly watch. With real logs nobody can: `judge_three_ways.py` shows what can be done then.
 
 
 def true_value(frame: pd.DataFrame, appeal: npt.NDArray[np.float64]) -> float:
@@ -111,23 +116,17 @@ def main(folder: Path) -> dict[str, float]:
     policy = train(prepare_logs(folder), folder)
 
     views = pd.read_parquet(folder / "views.parquet")
-    history = pd.DataFrame(
-        {
-            "user_id": views["uid"],
-            "item_id": views["video"],
-            "timestamp": views["time_s"] * 1000,
-            "reward": (views["play_ms"] / views["duration_ms"]).clip(upper=1),
-        }
-    )
-    recommended = policy.recommend(history, k=5)
+    recommended = policy.recommend(views, k=5, mapping=LogMapping(COLUMNS))
     print(recommended.head(5).to_string(index=False), end="\n\n")
 
-    best = history.groupby("item_id")["reward"].mean().nlargest(5).index
-    everyone = history[["user_id"]].drop_duplicates()
+    logged = views.rename(columns={"uid": "user_id", "video": "item_id"})
+    share = (logged["play_ms"] / logged["duration_ms"]).clip(upper=1)
+    best = share.groupby(logged["item_id"]).mean().nlargest(5).index
+    everyone = logged[["user_id"]].drop_duplicates()
     popular = everyone.merge(pd.DataFrame({"item_id": best}), how="cross")
     found = {
         "random": float(appeal.mean()),
-        "logged": true_value(history, appeal),
+        "logged": true_value(logged, appeal),
         "same five for everybody": true_value(popular, appeal),
         "recommended": true_value(recommended, appeal),
     }

@@ -55,9 +55,10 @@ class SettingError(InputError):
     """A value that a table of settings does not take."""
 
     def __init__(self, message: str, *keys: str) -> None:
-        """Args:
-        message: names field, value and what is allowed.
-        keys: the fields concerned, as `table.field`.
+        """
+        Args:
+            message: names field, value and what is allowed.
+            keys: the fields concerned, as `table.field`.
         """
         super().__init__(message)
         self.keys = keys

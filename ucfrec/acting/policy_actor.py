@@ -34,17 +34,18 @@ class PolicyActor:
         item_ids: IntArray | None = None,
         user_ids: npt.NDArray[Any] | None = None,
     ) -> None:
-        """Args:
-        policy: in evaluation mode.
-        episodes: N, episodes side by side.
-        target_return: of every episode.
-        observation_size: how many of the environment's observed numbers the logs had; 0 ignores
-            the environment's observation.
-        item_states: how states are made of items; None where the observation is the state.
-        item_ids: (n_items,) the environment's number of each item of the store; −1 where it has
-            none.
-        user_ids: (n_users,) sorted identifiers in the logs of the store's users; None or text
-            where the environment has other users.
+        """
+        Args:
+            policy: in evaluation mode.
+            episodes: N, episodes side by side.
+            target_return: of every episode.
+            observation_size: how many of the environment's observed numbers the logs had; 0 ignores
+                the environment's observation.
+            item_states: how states are made of items; None where the observation is the state.
+            item_ids: (n_items,) the environment's number of each item of the store; −1 where it has
+                none.
+            user_ids: (n_users,) sorted identifiers in the logs of the store's users; None or text
+                where the environment has other users.
         """
         n, k = episodes, policy.config.context
         self._policy, self._target = policy, float(target_return)

@@ -37,11 +37,12 @@ class Columns:
         arrays: Mapping[str, Array] | None = None,
         item_states: ItemStates | None = None,
     ) -> None:
-        """Args:
-        path: folder of the store.
-        meta: contents of its `meta.json`.
-        arrays: whole columns in memory that stand for those of the folder.
-        item_states: likewise.
+        """
+        Args:
+            path: folder of the store.
+            meta: contents of its `meta.json`.
+            arrays: whole columns in memory that stand for those of the folder.
+            item_states: likewise.
         """
         self.path, self.meta = path, meta
         self._arrays, self._given_states = dict(arrays or {}), item_states

@@ -38,8 +38,9 @@ class D4RLAntMaze(AntMazeEnv):
     """
 
     def __init__(self, maze: str, render_mode: str | None = None) -> None:
-        """Args:
-        maze: `umaze`, `medium` or `large`.
+        """
+        Args:
+            maze: `umaze`, `medium` or `large`.
         """
         walls, self._goal_cell = _MAZES[maze]
         with TemporaryDirectory() as folder:

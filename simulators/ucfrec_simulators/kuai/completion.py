@@ -105,9 +105,10 @@ class Completed:
     """The table, filled in where it is looked at: indexed like an array (`kuai.Rewards`)."""
 
     def __init__(self, users: FloatArray, items: FloatArray) -> None:
-        """Args:
-        users: (n_users, D).
-        items: (n_items, D).
+        """
+        Args:
+            users: (n_users, D).
+            items: (n_items, D).
         """
         self._users, self._items = users, items
         self.shape = (len(users), len(items))

@@ -73,6 +73,8 @@ def _cell(row: Mapping[str, Any], name: str) -> str:
     return _number(value) if isinstance(value, float) else str(value)
 
 
-def _number(value: float) -> str:
-    """Three decimals, or, of click rates and the like, three digits."""
+def _number(value: float | None) -> str:
+    """Three decimals, or, of click rates and the like, three digits; a dash for nothing."""
+    if value is None:
+        return "–"
     return f"{value:.3f}" if value == 0 or abs(value) >= 0.1 else f"{value:#.3g}"

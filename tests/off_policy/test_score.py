@@ -139,7 +139,7 @@ def test_models_are_asked_about_what_the_policy_would_show(
     trained: TrainedPolicy, logged: LoggedSessions, greedy: bool
 ) -> None:
     frame = pd.concat(score(trained, logged, TARGET))
-    steps = logged_steps(trained, logged.store, TARGET, greedy, seed=0)
+    steps = logged_steps(trained, logged, TARGET, greedy, seed=0)
     certain = (frame.greedy_item_id == frame.item_id).astype(float)
     np.testing.assert_allclose(steps.target, certain if greedy else frame.probability, rtol=1e-5)
     np.testing.assert_array_equal(steps.session, frame.session)

@@ -22,7 +22,7 @@ IntArray = npt.NDArray[np.int64]
 
 ENOUGH_TO_TEST: Final = 30
 """Users below which a mean weight is not tested."""
-ENOUGH_USERS: Final = 100
+ENOUGH_USERS: Final = 150
 """Effective users below which no estimate stands: intervals by resampling then fail too often."""
 _SIGNIFICANCE, _TOLERANCE = 0.01, 0.02
 SESSION_PRODUCTS: Final = "session products"

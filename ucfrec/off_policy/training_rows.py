@@ -12,8 +12,8 @@ from ucfrec.errors import InputError
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 MOST_SEEN: Final = 0.05
-"""Share of rows seen in training above which no estimate stands; where clocks are coarse, some rows of
-other logs have the same user, item and time by chance."""
+"""Share of rows seen in training above which no estimate stands. Where clocks are coarse, some rows
+of other logs have the same user, item and time by chance."""
 
 KeyArray = npt.NDArray[np.uint64]
 

@@ -112,10 +112,10 @@ class World:
 
 WORLDS = {
     "bandit": World(users=2000),
-    "ten rows a user": World(users=200, sessions_a_user=10, taste=0.4),
+    "ten rows a user": World(users=300, sessions_a_user=10, taste=0.4),
     "5% reward": World(users=4000, reward=0.05),
     "five-step sessions": World(users=2000, steps=5, distance=0.25),
-    "20 sessions a user": World(users=200, sessions_a_user=20, steps=2, taste=0.4),
+    "20 sessions a user": World(users=300, sessions_a_user=20, steps=2, taste=0.4),
     "heavy tails": World(users=1000, actions=50, distance=2.0),
     "heavy tails, more users": World(users=2500, actions=50, distance=2.0),
     "heavy tails, five steps": World(users=1000, steps=5, distance=1.0),

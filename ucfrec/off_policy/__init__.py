@@ -28,7 +28,7 @@ __all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
-    # scipy and torch take a second to import; `ucfrec --help` does without.
+    # Neither `ucfrec --help` nor users of the array functions wait for torch.
     if name not in _HOMES:
         raise AttributeError(f"module 'ucfrec.off_policy' has no attribute {name!r}")
     return getattr(import_module(f"ucfrec.off_policy.{_HOMES[name]}"), name)

@@ -136,6 +136,7 @@ def _diagnosis_columns(diagnosis: Diagnosis) -> dict[str, Any]:
         "effective_by_step": list(diagnosis.effective_by_step),
         "stops_telling_at": diagnosis.stops_telling_at,
         "weight_tests": [asdict(test) for test in diagnosis.tests],
+        "mean_weight": diagnosis.mean_weight,
         "pareto_tail": diagnosis.tail,
         "bounds": None if diagnosis.bounds is None else list(diagnosis.bounds),
     }

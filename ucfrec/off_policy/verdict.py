@@ -15,7 +15,11 @@ from ucfrec.off_policy.logged_steps import LoggedSteps
 BEST_FIRST: Final = ("DR", "SNPDIS")
 """The estimator that a verdict is about: the first of these that there is."""
 DOMINANT: Final = 0.1
-HEAVY_TAIL: Final = 0.7
+HEAVY_TAIL: Final = 0.5
+"""Pareto shape from which on the variance is infinite, and no interval means anything."""
+FAR_OFF: Final = 0.1
+"""A mean session weight further from 1 shows that the heaviest sessions are missing, or too many,
+though their number may be too small for a test to tell."""
 ENOUGH_REWARDED: Final = 30
 MOST_LEFT_OUT: Final = 0.05
 _DETECTED: Final = 1.96 + 0.84
@@ -143,7 +147,13 @@ def _reasons(diagnosis: Diagnosis) -> list[str]:
             f"{diagnosis.left_out / diagnosis.sessions:.0%} of the sessions have a step without "
             f"propensity (above {MOST_LEFT_OUT:.0%}), and may differ from the rest"
         )
-    said += _failed_tests(diagnosis)
+    failed, mean = _failed_tests(diagnosis), diagnosis.mean_weight
+    said += failed
+    if not failed and mean is not None and abs(mean - 1) > FAR_OFF:
+        said.append(
+            f"the mean session weight is {mean:.2f} where 1 is expected: by chance, sessions that "
+            f"the policy would often have are too {'rare' if mean < 1 else 'many'}; give more logs"
+        )
     if not diagnosis.rewarded_users:
         said.append("no session has both weight and reward: the logs say nothing of what is earned")
     elif diagnosis.rewarded_users < ENOUGH_REWARDED:

@@ -64,24 +64,8 @@ def judge_off_policy(
     steps = logged_steps(trained, logged, target_return, greedy, seed, discount)
     found, diagnosis = estimate(steps, seed), diagnose(steps)
     seen = share_seen(trained, logged.store)
-    forbidden = []
-    if seen is not None and seen > MOST_SEEN:
-        forbidden.append(
-            f"{seen:.0%} of the rows were seen in training: a policy judged by these looks better "
-            "than it is; judge it by later logs"
-        )
-    verdict = judge(steps, seed, diagnosis=diagnosis, forbidden=forbidden)
-    said = [*verdict.reasons, *cautions(diagnosis, found)]
-    if seen is None:
-        said.append(
-            "the store that the run was trained on is not there any more: whether these logs were "
-            "seen in training is not known"
-        )
-    if unknown := logged.unknown_items:
-        said.append(
-            f"{unknown:,} rows show items that the run does not know, and so never would: they "
-            "weigh 0"
-        )
+    verdict = judge(steps, seed, diagnosis=diagnosis, forbidden=_seen_too_often(seen))
+    said = [*verdict.reasons, *cautions(diagnosis, found), *_of_the_logs(seen, logged)]
     about = {
         "target_return": target_return,
         "discount": discount,
@@ -105,6 +89,30 @@ def judge_off_policy(
         for name, one in found.items()
     ]
     return OffPolicyReport(rows, said, verdict)
+
+
+def _seen_too_often(seen: float | None) -> list[str]:
+    if seen is None or seen <= MOST_SEEN:
+        return []
+    return [
+        f"{seen:.0%} of the rows were seen in training: a policy judged by these looks better than "
+        "it is; judge it by later logs"
+    ]
+
+
+def _of_the_logs(seen: float | None, logged: LoggedSessions) -> list[str]:
+    said = []
+    if seen is None:
+        said.append(
+            "the store that the run was trained on is not there any more: whether these logs were "
+            "seen in training is not known"
+        )
+    if unknown := logged.unknown_items:
+        said.append(
+            f"{unknown:,} rows show items that the run does not know, and so never would: they "
+            "weigh 0"
+        )
+    return said
 
 
 def as_row(name: str, found: Estimate) -> dict[str, Any]:

@@ -4,14 +4,20 @@ PYTHON ?= python3
 #   make demo PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu"
 PIP_FLAGS ?=
 BIN := .venv/bin
+# Files of tests side by side, one a core; a file stays whole, so that what its tests share is made
+# once. One thread each, or the workers' linear algebra fights over the cores.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
 
-.PHONY: demo test lint types wheel clean
+.PHONY: demo test test-slow lint types wheel clean
 
 demo: .venv/base  ## Set up and run the main job end to end on simulated logs.
 	$(BIN)/ucfrec demo --out demo-out
 
-test: .venv/dev  ## Set up and run the tests.
-	$(BIN)/python -m pytest
+test: .venv/dev  ## Set up and run the tests, all but the slow ones.
+	$(PYTEST) -m "not slow"
+
+test-slow: .venv/dev  ## The slow tests: trainings and worlds that take many seconds each.
+	$(PYTEST) -m slow
 
 lint: .venv/dev  ## Style.
 	$(BIN)/ruff check .

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ucfrec.commands.demo_run import LEARNERS, WORLDS, DemoConfig, demo
+from ucfrec.commands.demo import LEARNERS, WORLDS, DemoConfig, demo
 from ucfrec.files import atomic_file
 
 RESULTS = Path(__file__).parent / "results" / "demo.jsonl"

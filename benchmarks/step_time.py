@@ -17,7 +17,7 @@ import torch
 from ucfrec.episodes.windows import Windows
 from ucfrec.files import atomic_file
 from ucfrec.policies.base import SequencePolicy
-from ucfrec.policies.registry import POLICIES
+from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import provenance
 from ucfrec.runs.config import resolve_config
 
@@ -59,7 +59,7 @@ def main() -> None:
     learners = {}
     for name in LEARNERS:
         settings = [f"policy.dim={options.dim}", f"policy.context={options.context}"]
-        policy = POLICIES[name](resolve_config(name, None, settings).policy, SIZES)
+        policy = policy_class(name)(resolve_config(name, None, settings).policy, SIZES)
         learners[name] = policy, torch.optim.AdamW(policy.parameters(), fused=True)
     seconds: dict[str, list[float]] = {name: [] for name in learners}
     for turn in range(options.rounds + 2):

@@ -1,54 +1,113 @@
-"""UCF in three lines of Python: fit, recommend, save and load."""
+"""Recommender: fit, recommend, save and load, in three lines of Python."""
 
 import shutil
 import tempfile
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import pandas as pd
+import pyarrow.parquet as pq
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.recommending.recommend import Histories, recommend
+from ucfrec.files import atomic_folder
+from ucfrec.logs.clean import REASONS
+from ucfrec.logs.histories import log_table
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare
+from ucfrec.recommending.histories import histories_of_frame
+from ucfrec.recommending.recommend import recommend
 from ucfrec.runs.config import config_from_dict, resolve_config
 from ucfrec.runs.run import train_run
-from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.runs.trained_policy import TrainedPolicy, describe_trained
 
 
-class UCF:
-    """Unified Causal Transformer: counterfactual copies and the hybrid policy (Algorithm 1).
+class Recommender:
+    """A policy that recommends items, trained from logs.
 
     Example::
 
-        policy = UCF(settings=["train.steps=2000"]).fit(EpisodeStore.open("store"))
+        policy = Recommender("ucf", settings={"train.steps": 2000}).fit("store")
         policy.recommend(histories, k=10)
     """
 
-    def __init__(self, policy: str = "ucf", settings: Sequence[str] = (), seed: int = 0) -> None:
+    def __init__(
+        self,
+        policy: str = "ucf",
+        settings: Mapping[str, Any] | Sequence[str] = (),
+        seed: int = 0,
+    ) -> None:
         """Args:
-        policy: learner, "ucf" or a baseline (`ucfrec.policies.registry.POLICIES`).
-        settings: `table.field=value`, as the command line's `--set`.
+        policy: learner, "ucf" or a baseline, as for `ucfrec train --policy`.
+        settings: as for `ucfrec train --set`: `{"train.steps": 200}`, `{"train": {"steps": 200}}`
+            or `["train.steps=200"]`.
         seed: of everything random.
 
         Raises:
-            InputError: a setting is unknown.
+            InputError: the policy or a setting is unknown or out of range.
         """
         self.config = resolve_config(policy, None, settings, seed)
         self._scratch: tempfile.TemporaryDirectory[str] | None = None
         self._folder: Path | None = None
+        self._trained: TrainedPolicy | None = None
 
-    def fit(self, store: EpisodeStore, out: Path | str | None = None) -> Self:
-        """Train on the store's training episodes.
+    def __repr__(self) -> str:
+        if self._trained is None:
+            return f"Recommender({self.config.policy_name!r}, not trained)"
+        return f"Recommender({describe_trained(self._trained.record)})"
+
+    def fit(
+        self,
+        data: EpisodeStore | pd.DataFrame | Path | str,
+        out: Path | str | None = None,
+        *,
+        reward: str | None = None,
+        session_by: str | None = None,
+        gap_minutes: float | None = None,
+        split: tuple[float, ...] | None = None,
+        mapping: LogMapping | None = None,
+    ) -> Self:
+        """Train on the training episodes of a store, or of logs that are prepared first.
 
         Args:
+            data: a store or its folder; or logs: a file, folder or glob, or a frame with one row
+                an interaction: `user_id`, `item_id`, `timestamp` (milliseconds, dates or
+                timestamps) and feedback.
             out: run folder, resumed from if training was interrupted; None for a temporary one.
+            reward: of logs: SQL expression over the feedback columns; see `PrepareOptions`.
+            session_by: of logs: "session_id", "gap" or "user"; see `PrepareOptions`.
+            gap_minutes: of logs: with "gap", a longer pause ends the session (30).
+            split: of logs: shares of training, validation and test (0.8, 0.1, 0.1).
+            mapping: of logs: what their columns are called, and tables of features.
+
+        Raises:
+            InputError: the data cannot be used, or `out` is a run on other data or settings.
         """
-        if out is None:
-            self._scratch = tempfile.TemporaryDirectory(prefix="ucfrec-")
-            out = Path(self._scratch.name) / "run"
-        self._folder = Path(out)
-        train_run(store, self._folder, self.config)
+        given = {
+            "reward": reward,
+            "session_by": session_by,
+            "gap_minutes": gap_minutes,
+            "split": split,
+        }
+        options = {name: value for name, value in given.items() if value is not None}
+        with ExitStack() as stack:
+            if not isinstance(data, EpisodeStore):
+                prepared = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ucfrec-")))
+                store = _store(data, prepared, mapping, options)
+            elif options or mapping is not None:
+                raise InputError(f"{data} is prepared already; prepare its logs with other options")
+            else:
+                store = data
+            scratch = None
+            if out is None:
+                scratch = tempfile.TemporaryDirectory(prefix="ucfrec-")
+                out = Path(scratch.name) / "run"
+            train_run(store, Path(out), self.config)
+        self._scratch, self._folder = scratch, Path(out)
+        self._trained = TrainedPolicy.load(self._folder)
         return self
 
     @property
@@ -59,54 +118,120 @@ class UCF:
             InputError: `fit` comes first.
         """
         if self._folder is None:
-            raise InputError("this policy is not trained yet; call fit(store) or UCF.load(run)")
+            raise InputError("this policy is not trained yet; call fit(...) or load(run) first")
         return self._folder
 
     @property
     def trained(self) -> TrainedPolicy:
-        """The policy with the best weights on validation."""
-        return TrainedPolicy.load(self.run)
+        """The policy with the best weights on validation, read once.
+
+        Raises:
+            InputError: `fit` comes first.
+        """
+        if self._trained is None:
+            raise InputError("this policy is not trained yet; call fit(...) or load(run) first")
+        return self._trained
 
     def recommend(
         self,
         histories: pd.DataFrame,
         k: int = 10,
         *,
-        target_return: float | None = None,
         filter_seen: bool = True,
+        candidates: Sequence[Any] | None = None,
+        skip_unknown: bool = False,
+        target_return: float | None = None,
+        mapping: LogMapping | None = None,
     ) -> pd.DataFrame:
-        """The `k` best next items of every user.
+        """The `k` best next items of every user; nothing is written to disk.
+
+        Rows are read as `ucfrec prepare` reads them; sessions are cut as those of training were.
+        Of rows that repeat a user, item and time, one counts. At most the last 1,000 rows of a user
+        make the state; all of them count as seen.
 
         Args:
-            histories: `user_id`, `item_id`, `timestamp` and `reward`, one row an interaction.
-            target_return: asked of what follows; None for the largest training return.
+            histories: one row an interaction, in any order: `user_id`, `item_id`, `timestamp`
+                (milliseconds, dates or timestamps); `reward`, or the columns of the training
+                reward's expression; `session_id`, if the run's sessions were cut by it; and
+                `observation` (lists of floats), if the run has observations.
+            k: at least 1.
             filter_seen: leave out items of the user's own history.
+            candidates: the only item_ids to recommend; None for all.
+            skip_unknown: ignore rows of items that the policy does not know.
+            target_return: what the rest of the session shall earn, in units of the training
+                reward; None for the largest training return.
+            mapping: what the columns of `histories` are called.
 
         Returns:
-            `user_id`, `rank` (from 1), `item_id`, `score` (log-probability), k rows a user.
+            `user_id`, `rank` (from 1), `item_id`, `score` (log-probability among all items): k rows
+            a user, users in sorted order; fewer rows where fewer items are left, as with less than
+            k candidates.
 
         Raises:
-            InputError: a column is missing, or an item is unknown to the policy.
+            InputError: an argument is wrong, a column is missing or of a wrong type, rows have
+                missing or undefined values, or an item or candidate is unknown to the policy.
         """
         trained = self.trained
-        target = trained.target_return(1.0) if target_return is None else target_return
-        batch = Histories.from_frame(histories)
-        (frame,) = recommend(trained, [batch], k, target_return=target, filter_seen=filter_seen)
-        return frame
+        frames = recommend(
+            trained,
+            histories_of_frame(trained, histories, mapping or LogMapping()),
+            k,
+            target_return=trained.target_return(1.0) if target_return is None else target_return,
+            filter_seen=filter_seen,
+            candidates=candidates,
+            skip_unknown=skip_unknown,
+        )
+        return pd.concat(frames, ignore_index=True)
 
     def save(self, folder: Path | str) -> None:
-        """Copy the run to a new folder, which `load` and the command line read."""
-        shutil.copytree(self.run, folder)
+        """Copy the run to a new folder, which `load` and the command line read.
+
+        Raises:
+            InputError: the folder exists, or `fit` comes first.
+        """
+        run = self.run
+        with atomic_folder(Path(folder)) as scratch:
+            shutil.copytree(run, scratch, dirs_exist_ok=True)
 
     @classmethod
     def load(cls, run: Path | str) -> Self:
-        """A policy from a run folder.
+        """A policy from a run folder, of this class or of `ucfrec train`.
 
         Raises:
-            InputError: the folder holds no run.
+            InputError: the folder holds no run, or one without weights yet.
         """
-        record = TrainedPolicy.load(Path(run)).record
         policy = cls()
-        policy.config = config_from_dict(record["config"])
-        policy._folder = Path(run)
+        policy._folder, policy._trained = Path(run), TrainedPolicy.load(Path(run))
+        policy.config = config_from_dict(policy._trained.record["config"])
         return policy
+
+
+UCF = Recommender
+"""The Unified Causal Transformer is the default learner (Algorithm 1)."""
+
+
+def _store(
+    data: pd.DataFrame | Path | str,
+    scratch: Path,
+    mapping: LogMapping | None,
+    options: Mapping[str, Any],
+) -> EpisodeStore:
+    """The store at `data`, or one of the logs in `data`, prepared in the folder `scratch`."""
+    if isinstance(data, (str, Path)):
+        if (Path(data) / "meta.json").is_file():
+            if options or mapping is not None:
+                raise InputError(f"{data} is prepared already; prepare its logs with other options")
+            return EpisodeStore.open(data)
+        logs = data
+    else:
+        logs = scratch / "logs.parquet"
+        pq.write_table(log_table(data, "logs"), logs)
+    report = prepare([logs], mapping or LogMapping(), scratch / "store", PrepareOptions(**options))
+    dropped = {reason: rows for reason, rows in report["dropped"].items() if rows}
+    if dropped:
+        reasons = "; ".join(f"{n:,}: {REASONS.get(name, name)}" for name, n in dropped.items())
+        warnings.warn(
+            f"{sum(dropped.values()):,} of {report['rows_read']:,} rows were left out ({reasons})",
+            stacklevel=3,
+        )
+    return EpisodeStore.open(scratch / "store")

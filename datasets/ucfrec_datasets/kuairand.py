@@ -87,7 +87,7 @@ def _resolve(paths: Sequence[str | Path], given: LogMapping) -> tuple[tuple[Path
 def _table(
     files: Sequence[Path], prefix: str, key: str, columns: tuple[str, ...]
 ) -> tuple[FeatureTable, ...]:
-    """The files of one kind as one table; the first of a name, were it there twice."""
+    """The files of one kind as one table; of files with the same name, the first."""
     named: dict[str, Path] = {}
     for file in files:
         if file.name.startswith(prefix):

@@ -10,8 +10,8 @@ from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, log_files
 ITEMS: Final = "item_context"
 USER_FEATURES: Final = tuple(f"user_feature_{n}" for n in range(4))
 USER: Final = f"concat_ws('-', {', '.join(f'left({name}, 8)' for name in USER_FEATURES)})"
-"""The logs name nobody: users of equal features are one user. The values are hashes, of fewer than
-ten kinds each, that their first digits tell apart."""
+"""The logs hold no user ids: users of equal features are one user. The values are hashes, fewer
+than ten of each feature, which differ in their first eight digits."""
 ITEM_FEATURES: Final = tuple(f"item_feature_{n}" for n in range(4))
 
 MAPPING: Final = LogMapping(
@@ -20,7 +20,7 @@ MAPPING: Final = LogMapping(
         "timestamp": "\"timestamp\"::TIMESTAMPTZ AT TIME ZONE 'UTC'",
         "propensity": "propensity_score",
         "session_id": "concat_ws(' ', \"timestamp\", position)",
-        # Where on the page: known before the item is chosen.
+        # Place on the page: known before the item is chosen.
         "observation": "[position = 1, position = 2, position = 3]::FLOAT[]",
     },
     reward="click",

@@ -19,7 +19,7 @@ from ucfrec.acting.rollout import Actor, BoolArray, FloatArray, Informed
 from ucfrec.episodes.distractor import logged_observations, reward_bit, with_observations
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.evaluate import World
+from ucfrec.evaluation.world import World
 from ucfrec.plugins import Simulator
 from ucfrec_simulators.kuai import kuairand
 from ucfrec_simulators.session_env import AnyArray

@@ -16,7 +16,7 @@ from torch import Tensor
 from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.rollout import rollout
 from ucfrec.commands.cli import main
-from ucfrec.evaluation.evaluate import World
+from ucfrec.evaluation.world import World
 from ucfrec.plugins import load_plugin
 from ucfrec.runs.trained_policy import TrainedPolicy
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from ucfrec.commands.demo_run import BEHAVIORS, LEARNERS, WORLDS, DemoConfig, demo
+from ucfrec.commands.demo import BEHAVIORS, LEARNERS, WORLDS, DemoConfig, demo
 
 TINY = DemoConfig(
     sessions=400,

@@ -29,7 +29,7 @@ from tests.support.episodes import (
 from ucfrec import schema
 from ucfrec.episodes import store as store_module
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Overlay, Windows
+from ucfrec.episodes.windows import Overlay, Transitions, Windows
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder
@@ -488,12 +488,134 @@ def test_an_overlay_without_edits_or_copies_changes_nothing(folder: Path) -> Non
     assert same(plain.windows(*copy, 5), base.windows(np.full(7, 2), np.arange(7), 5))
 
 
-def test_splitting_a_union_leaves_its_base(folder: Path) -> None:
+def test_copies_are_never_dropped_silently(folder: Path) -> None:
     base = write_store(folder / "store", random_episodes(LENGTHS * 2), some_states())
     union = base.with_overlay(random_overlay(base, 9, seed=4)[0])
+    for lose in (
+        lambda: union.split("train"),
+        lambda: union.select(np.arange(3)),
+        lambda: union.with_returns_to_go(np.zeros(union.n_steps, dtype=np.float32)),
+        lambda: union.without_observed([0]),
+    ):
+        with pytest.raises(InputError, match=r"9 edited copies.*without_copies\(\)"):
+            lose()
+    plain = union.without_copies()
+    assert plain.overlay is None
+    assert same(every_window(plain, 4), every_window(base, 4))
     for name in schema.SPLITS:
-        assert np.array_equal(union.split(name).episode_ids, base.split(name).episode_ids)
-        assert union.split(name).overlay is None
+        assert np.array_equal(plain.split(name).episode_ids, base.split(name).episode_ids)
+
+
+def test_a_second_overlay_comes_after_the_first(folder: Path) -> None:
+    base = write_store(folder / "store", random_episodes(LENGTHS), some_states())
+    first, second = (random_overlay(base, copies, seed=copies)[0] for copies in (3, 2))
+    union = base.with_overlay(first).with_overlay(second)
+    assert same(every_window(union, 4), every_window(base.with_overlay(first.joined(second)), 4))
+
+
+def test_an_overlay_of_another_store_is_refused(folder: Path) -> None:
+    base = write_store(folder / "store", random_episodes(LENGTHS), some_states())
+    overlay, _ = random_overlay(base, 4, seed=1)
+    with pytest.raises(InputError, match=r"copies of episodes that .* does not have"):
+        base.with_overlay(replace(overlay, copy_source=overlay.copy_source + len(LENGTHS)))
+    with pytest.raises(InputError, match=f"edits states of 1; the store's have {base.state_size}"):
+        base.with_overlay(replace(overlay, edit_state=overlay.edit_state[:, :1]))
+
+
+# A store in memory.
+
+
+@given(lengths_of_episodes, st.booleans(), st.integers(0, 9))
+def test_a_store_in_memory_is_the_one_on_disk(lengths: list[int], items: bool, seed: int) -> None:
+    episodes = random_episodes(lengths, seed, items=items)
+    states = some_states() if items else None
+    of_steps, of_episodes = step_columns(episodes), episode_columns(episodes)
+    memory = EpisodeStore.from_arrays(of_steps, lengths_of(episodes), of_episodes, states)
+    with tempfile.TemporaryDirectory() as name:
+        disk = write_store(Path(name) / "store", episodes, states)
+        for a, b in ((memory, disk), (memory.split("train"), disk.split("train"))):
+            assert same(every_window(a, 3), every_window(b, 3))
+            assert np.array_equal(a.returns, b.returns)
+            for column in of_steps:
+                read = a.step_values(column, *a.all_steps()), b.step_values(column, *b.all_steps())
+                assert np.array_equal(*read)
+                assert read[0].dtype == read[1].dtype
+            for column in of_episodes:
+                assert np.array_equal(a.episode_values(column), b.episode_values(column))
+    with pytest.raises(InputError, match="<memory> has no column 'zeal'"):
+        memory.step_values("zeal", *memory.all_steps())
+
+
+def test_wrong_arrays_make_no_store_in_memory() -> None:
+    steps = {schema.REWARD: np.ones(4), schema.ACTION: np.ones((4, 2))}
+    for lengths, changed, message in (
+        ([3, 2], {}, "'reward' has 4 values instead of 5"),
+        ([4, 0], {}, "without steps"),
+        ([4], {schema.ACTION: np.ones((3, 2))}, "'action' has 3 values instead of 4"),
+        ([4], {schema.REWARD: np.array([1, np.nan, 1, 1])}, "1 of 4 rewards are not finite"),
+    ):
+        with pytest.raises(InputError, match=message):
+            EpisodeStore.from_arrays({**steps, **changed}, np.array(lengths))
+    with pytest.raises(InputError, match="'user' has 1 values instead of 2"):
+        EpisodeStore.from_arrays(steps, np.array([3, 1]), {schema.USER: np.zeros(1)})
+
+
+# What is said of them, and shapes.
+
+
+def test_a_store_says_what_it_holds(folder: Path) -> None:
+    episodes = random_episodes([700, 800])
+    episodes[0].split = episodes[1].split = 0
+    store = write_store(folder / "store", episodes, some_states())
+    assert repr(store) == "EpisodeStore(1,500 steps, 2 episodes, 11 items, reward=reward)"
+    train = store.split("train").select(np.array([0]))
+    assert (
+        repr(train) == "EpisodeStore(700 steps, 1 episodes, 11 items, reward=reward, split=train)"
+    )
+    overlay, edits = random_overlay(store, 3, seed=0, share=0.01)
+    assert "2 episodes and 3 edited copies" in repr(store.with_overlay(overlay))
+    assert repr(overlay) == f"Overlay(3 copies, {len(edits)} edited states of {store.state_size})"
+    at = np.array([0, 1, 1]), np.array([5, 6, 7])
+    assert repr(store.windows(*at, 4)) == (
+        f"Windows(3 of 4 steps, states of {store.state_size}, actions are items)"
+    )
+    assert repr(store.transitions(*at)) == (
+        f"Transitions(3 steps, states of {store.state_size}, actions of 4)"
+    )
+
+
+def test_steps_that_an_episode_does_not_have_are_refused(folder: Path) -> None:
+    store = write_store(folder / "store", random_episodes(LENGTHS), some_states())
+    for episodes, ends, length, message in (
+        ([0], [LENGTHS[0]], 2, "episode 0 has 3 steps, none numbered 3"),
+        ([0], [-1], 2, "episode 0 has 3 steps, none numbered -1"),
+        ([-1], [0], 2, "no episodes -1 to -1"),
+        ([0, len(LENGTHS)], [0, 0], 2, f"no episodes 0 to {len(LENGTHS)}"),
+        ([0, 1], [0], 2, "two arrays of the same length"),
+        ([[0]], [[0]], 2, "two arrays of the same length"),
+        ([0], [0], 0, "at least 1 step"),
+    ):
+        with pytest.raises(InputError, match=message):
+            store.windows(np.array(episodes), np.array(ends), length)
+    with pytest.raises(InputError, match="no split is called 'training'; there are train, valid"):
+        store.split("training")
+
+
+@pytest.mark.parametrize("of", ["windows", "transitions", "overlay"])
+def test_tensors_whose_shapes_do_not_go_together_are_refused(folder: Path, of: str) -> None:
+    store = write_store(folder / "store", random_episodes(LENGTHS), some_states())
+    at = np.array([0, 2]), np.array([1, 1])
+    good: Windows | Transitions | Overlay = {
+        "windows": store.windows(*at, 3),
+        "transitions": store.transitions(*at),
+        "overlay": random_overlay(store, 3, seed=0)[0],
+    }[of]
+    for name, values in vars(good).items():
+        for wrong in (values[1:], values[..., None, None]):
+            if of == "overlay" and name == "copy_source" and wrong.ndim == 1:
+                continue  # any number of copies is good
+            with pytest.raises(InputError, match=rf"shapes do not go together \(.*{name}"):
+                replace(good, **{name: wrong})
 
 
 def test_an_overlay_comes_back_from_its_file(folder: Path) -> None:

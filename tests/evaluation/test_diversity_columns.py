@@ -14,8 +14,9 @@ from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.diversity import Recommended
 from ucfrec.evaluation.diversity_columns import COLUMNS, variety_columns
-from ucfrec.evaluation.evaluate import World, evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.simulated_store import simulated_store
+from ucfrec.evaluation.world import World
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run, training_views
 from ucfrec.runs.trained_policy import TrainedPolicy

@@ -1,8 +1,10 @@
 """The training loop: resumes to the bit, stops in time, keeps the best, says what it did."""
 
+import dataclasses
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 import time
@@ -19,7 +21,7 @@ from tests.support import killed_training
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, save_training
 from ucfrec.fitting.loop import Fit, LoopConfig, fit
-from ucfrec.fitting.tensorboard import read_scalars
+from ucfrec.fitting.metrics_log import read_metrics
 
 ROOT = Path(__file__).parents[2]
 FAST = LoopConfig(steps=12, batch_size=4, learning_rate=0.1, warmup_steps=0, validate_every=2)
@@ -93,10 +95,10 @@ def test_every_validation_of_a_killed_training_is_logged(
     left_alone: tuple[Path, Fit], killed_often: list[tuple[Path, dict[str, Any]]]
 ) -> None:
     every = range(killed_training.EVERY, killed_training.STEPS + 1, killed_training.EVERY)
-    expected = read_scalars(left_alone[0])["validation_loss"]
+    expected = read_metrics(left_alone[0])["validation_loss"]
     assert list(expected) == list(every)
     for folder, _ in killed_often:
-        assert read_scalars(folder)["validation_loss"] == expected
+        assert read_metrics(folder)["validation_loss"] == expected
 
 
 def test_a_longer_training_goes_on_where_a_shorter_one_ended(tmp_path: Path) -> None:
@@ -226,7 +228,7 @@ def test_the_loss_goes_down_in_training_mode(tmp_path: Path) -> None:
     )
     fit(module, draw, loss, config, tmp_path, seed=1, validate=lambda: 0.0)
     assert modes == [True] * 300
-    logged = read_scalars(tmp_path)["mine"]
+    logged = read_metrics(tmp_path)["mine"]
     assert logged[300] < 0.05 * logged[50] or logged[300] < 1e-3
 
 
@@ -307,7 +309,7 @@ def test_a_validation_loss_that_is_never_finite_is_named(tmp_path: Path) -> None
 def test_every_validation_is_logged(tmp_path: Path) -> None:
     losses = [3.0, 1.0, 2.0, 1.0, 4.0, 2.0]
     validated(tmp_path, losses, FAST)
-    logged = read_scalars(tmp_path)
+    logged = read_metrics(tmp_path)
     every = [2, 4, 6, 8, 10, 12]
     tags = {"mine", "loss", "gradient_norm", "samples_per_second", "waiting_for_data"}
     assert logged.keys() == {*tags, "validation_loss"}
@@ -316,6 +318,21 @@ def test_every_validation_is_logged(tmp_path: Path) -> None:
         assert all(math.isfinite(value) for value in values.values()), tag
     assert list(logged["validation_loss"].values()) == losses
     assert logged["mine"] == logged["loss"]
+
+
+def test_without_a_terminal_a_line_says_how_far_it_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ucfrec.progress.FIRST_LINE", 0.0)
+    monkeypatch.setattr("ucfrec.progress.NEXT_LINE", 0.0)
+    module = linear()
+    fit(module, draw, squared(module), FAST, tmp_path, seed=1, describe="critic")
+    lines = capsys.readouterr().err.splitlines()
+    assert any(re.match(r"critic: 6 of 12 steps \(50%\), .* steps/s, .* left", x) for x in lines)
+    assert any("loss " in line for line in lines)
+    longer = dataclasses.replace(FAST, steps=16)
+    fit(module, draw, squared(module), longer, tmp_path, seed=1, describe="critic")
+    assert capsys.readouterr().err.startswith("critic: 13 of 16 steps")
 
 
 @pytest.mark.parametrize("slow", ["draw", "loss"])
@@ -336,7 +353,7 @@ def test_speed_and_waiting_are_measured(tmp_path: Path, slow: str) -> None:
 
     config = LoopConfig(steps=15, batch_size=64, validate_every=5)
     fit(module, slow_draw, slow_loss, config, tmp_path, seed=1, validate=validate)
-    logged = read_scalars(tmp_path)
+    logged = read_metrics(tmp_path)
     for step in (10, 15):  # the first steps also import and allocate
         assert 0 <= logged["waiting_for_data"][step] <= 1
         assert (logged["waiting_for_data"][step] > 0.5) == (slow == "draw")

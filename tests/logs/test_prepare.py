@@ -15,12 +15,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from safetensors import SafetensorError
 
-from ucfrec import schema
+from ucfrec import progress, schema
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError
+from ucfrec.logs.histories import read_histories
 from ucfrec.logs.mapping import FeatureTable, LogMapping, columns_given, log_files, read_mapping
-from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, read_histories, validate
+from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, validate
 from ucfrec.logs.summary import format_report
 from ucfrec_datasets import generic
 
@@ -213,7 +214,43 @@ def test_of_repeated_rows_the_best_rewarded_stays(tmp_path: Path) -> None:
     options = PrepareOptions(split=(1.0, 0.0, 0.0))
     report = prepare([write(log, tmp_path / "l.parquet")], LogMapping(), tmp_path / "s", options)
     assert report["dropped"]["duplicate"] == 2
+    assert report["conflicting_duplicates"] == 2
+    assert "the highest is kept" in format_report(report)
     assert list(steps_of(tmp_path / "s")["reward"]) == [3.0, 0.0]
+
+
+def test_repeated_rows_that_agree_are_no_conflict(tmp_path: Path) -> None:
+    log = make_log().drop_duplicates(["user_id", "item_id", "timestamp"])
+    log["reward"] = log["reward"].where(log.index > 0)  # an undefined reward equals itself
+    again = log.iloc[:20].copy()
+    again.iloc[5:8, again.columns.get_loc("reward")] += 1
+    path = write(pd.concat([log, again]), tmp_path / "log.parquet")
+    report = validate([path], LogMapping())
+    assert report["dropped"]["duplicate"] == 20
+    assert report["conflicting_duplicates"] == 3
+
+
+def test_a_long_preparation_prints_lines_where_there_is_no_terminal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(progress, "FIRST_LINE", 0)
+    monkeypatch.setattr(progress, "NEXT_LINE", 0)
+    path = write(make_log(), tmp_path / "log.parquet")
+    report = prepare([path], LogMapping(), tmp_path / "store", SMALL)
+    printed = capsys.readouterr().err.splitlines()
+    assert printed[0].startswith("check the logs: 1 of 4 stages (25%), ")
+    steps = report["steps"]
+    assert any(line.startswith(f"write the store: {steps} of {steps} steps") for line in printed)
+
+
+@pytest.mark.parametrize("rows", [2, 30])
+def test_a_log_of_one_row_a_user_is_prepared(tmp_path: Path, rows: int) -> None:
+    log = pd.DataFrame({"user_id": range(rows), "item_id": 1, "timestamp": START})
+    log["timestamp"] += np.arange(rows) * MINUTE
+    log["reward"] = np.arange(rows) % 2
+    options = PrepareOptions(split=(1.0, 0.0, 0.0))
+    report = prepare([write(log, tmp_path / "l.parquet")], LogMapping(), tmp_path / "s", options)
+    assert (report["unsorted_rows"], report["episodes"]) == (0, rows)
 
 
 def test_undefined_parts_make_a_reward_undefined(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ from ucfrec.policies.cdt4rec import CDT4RecPolicy
 from ucfrec.policies.cql import ConservativeQ, CQLConfig, optimistic_returns, relabelled
 from ucfrec.policies.dt4rec import DT4RecPolicy
 from ucfrec.policies.edt4rec import EDT4RecPolicy, _consistent, _entropy
-from ucfrec.policies.registry import POLICIES
+from ucfrec.policies.registry import policy_class
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import new_policy
 
@@ -41,7 +41,7 @@ both_heads = pytest.mark.parametrize("sizes", [VECTORS, CATALOG], ids=["vectors"
 
 def build(name: str, sizes: dict[str, int], **settings: Any) -> SequencePolicy:
     torch.manual_seed(0)
-    learner = POLICIES[name]
+    learner = policy_class(name)
     policy = learner(learner.Config(**SMALL, **settings), sizes)
     if sizes["items"]:
         policy.head.start_from(torch.randn(ITEMS, 4), torch.rand(ITEMS))

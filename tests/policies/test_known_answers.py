@@ -8,7 +8,7 @@ import torch
 
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
-from ucfrec.policies.registry import POLICIES
+from ucfrec.policies.registry import BUILT_IN
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -86,7 +86,7 @@ def chosen(run: Path, given: EpisodeStore, items: bool) -> np.ndarray:
     [(False, True), (False, False), (True, True)],
     ids=["planted-items", "planted-vectors", "noise-items"],
 )
-@pytest.mark.parametrize("name", POLICIES)
+@pytest.mark.parametrize("name", BUILT_IN)
 def test_planted_preferences_are_learned_and_noise_is_not(
     name: str, noise: bool, items: bool, tmp_path: Path
 ) -> None:

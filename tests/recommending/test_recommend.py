@@ -1,5 +1,7 @@
 """Recommendations: one answer from Python and from files, from what the policy would see."""
 
+import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,13 +10,17 @@ import pandas as pd
 import pytest
 import torch
 
-from ucfrec import UCF, EpisodeStore
+from ucfrec import EpisodeStore, Recommender
+from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
-from ucfrec.logs import LogMapping, PrepareOptions, prepare, read_histories
-from ucfrec.recommending.recommend import Histories, recommend
+from ucfrec.logs import LogMapping, PrepareOptions, prepare
+from ucfrec.recommending.histories import histories_of_files
+from ucfrec.recommending.recommend import recommend
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SETTINGS = ["train.steps=30", "policy.dim=16", "policy.context=4", "augment.copies=0"]
+
+SMALL = ["train.steps=3", "policy.dim=8", "policy.context=4"]
 
 
 def random_log(users: int = 40, items: int = 30, rows: int = 1500) -> pd.DataFrame:
@@ -33,54 +39,90 @@ def log() -> pd.DataFrame:
 
 
 @pytest.fixture(scope="module")
-def fitted(log: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> tuple[UCF, Path]:
+def fitted(log: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> tuple[Recommender, Path]:
     folder = tmp_path_factory.mktemp("recommend")
     log.to_parquet(folder / "log.parquet")
     options = PrepareOptions(reward="reward", session_by="gap", gap_minutes=20)
     prepare([folder / "log.parquet"], LogMapping(), folder / "store", options)
     store = EpisodeStore.open(folder / "store")
-    return UCF(settings=SETTINGS).fit(store, folder / "run"), folder
+    return Recommender("ucf", settings=SETTINGS).fit(store, folder / "run"), folder
 
 
-def test_python_and_files_agree(fitted: tuple[UCF, Path], log: pd.DataFrame) -> None:
+def test_python_and_files_agree(fitted: tuple[Recommender, Path], log: pd.DataFrame) -> None:
     policy, folder = fitted
     from_frame = policy.recommend(log, k=5)
-    read = read_histories([folder / "log.parquet"], LogMapping(), "reward", 1000)
     trained = TrainedPolicy.load(folder / "run")
     target = trained.target_return(1.0)
-    batches = map(Histories.from_batch, read)
+    batches = histories_of_files(trained, [folder / "log.parquet"], LogMapping())
     (from_files,) = recommend(trained, batches, 5, target_return=target)
     pd.testing.assert_frame_equal(from_frame, from_files, check_dtype=False)
 
 
+@pytest.mark.parametrize("session_by", ["gap", "session_id", "user"])
+@pytest.mark.parametrize("observed", [False, True])
 def test_scores_are_the_policys_at_the_next_step(
-    fitted: tuple[UCF, Path], log: pd.DataFrame
+    log: pd.DataFrame, tmp_path: Path, session_by: str, observed: bool
 ) -> None:
-    """An independent route: the log with one row more, prepared as episodes."""
-    policy, folder = fitted
-    user = int(log.user_id.iloc[-1])
-    dummy = log.iloc[[-1]].assign(timestamp=log.timestamp.iloc[-1] + 1000, item_id=0, reward=0.0)
-    pd.concat([log, dummy]).to_parquet(folder / "longer.parquet")
-    options = PrepareOptions(reward="reward", session_by="gap", gap_minutes=20)
-    out = folder / "longer"
-    prepare([folder / "longer.parquet"], LogMapping(), out, options, like=folder / "store")
-    store = EpisodeStore.open(out)
-    users = pd.read_parquet(folder / "store" / "users.parquet").user_id.to_numpy()
-    episode = np.flatnonzero(users[store.episode_values("user")] == user)[-1:]
+    """An independent route: the log with one row more a user, prepared as episodes on disk."""
+    rng = np.random.default_rng(1)
+    # Sessions that overlap in time, so that the latest is not what comes after a pause.
+    log = log.assign(session_id=log.user_id * 10 + rng.integers(3, size=len(log)))
+    if observed:
+        log["observation"] = list(rng.normal(size=(len(log), 2)).astype(np.float32))
+    log.to_parquet(tmp_path / "log.parquet")
+    policy = Recommender("dt", settings=SMALL).fit(
+        tmp_path / "log.parquet",
+        tmp_path / "run",
+        reward="reward",
+        session_by=session_by,
+        gap_minutes=20,
+    )
+    given = log[log.user_id < 12].sample(frac=1, random_state=2)
+    latest = given.sort_values("timestamp").groupby("user_id").tail(1)
+    next_rows = latest.assign(timestamp=latest.timestamp + 1000, item_id=0, reward=0.0)
+    pd.concat([given, next_rows]).to_parquet(tmp_path / "longer.parquet")
+    options = PrepareOptions(reward="reward", session_by=session_by, gap_minutes=20)
+    prepare(
+        [tmp_path / "longer.parquet"],
+        LogMapping(),
+        tmp_path / "longer",
+        options,
+        like=tmp_path / "run",
+    )
+    store = EpisodeStore.open(tmp_path / "longer")
+    ends = store.lengths - 1
+    times = store.step_values("timestamp", np.arange(len(store)), ends)
+    at = np.flatnonzero(np.isin(times, next_rows.timestamp))
+    assert len(at) == len(next_rows)
     trained = policy.trained
-    end = store.lengths[episode] - 1
-    windows = store.windows(episode, end, trained.policy.config.context)
+    users = trained.user_ids[store.episode_values("user")[at]]
+    assert users.tolist() == sorted(set(given.user_id))
+    windows = store.windows(at, ends[at], trained.policy.config.context)
     asked = (windows.returns_to_go + 7.0).masked_fill(~windows.mask, 0.0)
     with torch.no_grad():
-        logits = trained.policy.act(replace(windows, returns_to_go=asked))
-    expected = logits.log_softmax(-1)[0]
-    top = policy.recommend(log, k=30, target_return=7.0, filter_seen=False)
-    top = top[top.user_id == user].sort_values("item_id")
-    np.testing.assert_allclose(top.score, expected.numpy(), rtol=1e-4, atol=1e-5)
+        expected = trained.policy.act(replace(windows, returns_to_go=asked)).log_softmax(-1)
+    found = policy.recommend(given, k=30, target_return=7.0, filter_seen=False)
+    scores = found.pivot_table(index="user_id", columns="item_id", values="score")
+    assert scores.index.tolist() == users.tolist()
+    np.testing.assert_allclose(scores.to_numpy(), expected.numpy(), rtol=1e-4, atol=1e-5)
+
+
+def test_other_users_and_the_order_of_rows_change_nothing(
+    fitted: tuple[Recommender, Path], log: pd.DataFrame
+) -> None:
+    policy, _ = fitted
+    everybody = policy.recommend(log, k=30)
+    pd.testing.assert_frame_equal(
+        policy.recommend(log.sample(frac=1, random_state=0), 30), everybody
+    )
+    few = log[log.user_id.isin([3, 17, 30])]
+    alone = policy.recommend(few, k=30)
+    expected = everybody[everybody.user_id.isin([3, 17, 30])].reset_index(drop=True)
+    pd.testing.assert_frame_equal(alone, expected, rtol=1e-4)
 
 
 def test_only_the_latest_session_makes_the_state_but_all_is_seen(
-    fitted: tuple[UCF, Path], log: pd.DataFrame
+    fitted: tuple[Recommender, Path], log: pd.DataFrame
 ) -> None:
     policy, _ = fitted
     user = log[log.user_id == 3]
@@ -95,20 +137,230 @@ def test_only_the_latest_session_makes_the_state_but_all_is_seen(
 
 
 def test_a_loaded_policy_is_the_one_saved(
-    fitted: tuple[UCF, Path], log: pd.DataFrame, tmp_path: Path
+    fitted: tuple[Recommender, Path], log: pd.DataFrame, tmp_path: Path
 ) -> None:
     policy, _ = fitted
     policy.save(tmp_path / "copy")
-    loaded = UCF.load(tmp_path / "copy")
+    loaded = Recommender.load(tmp_path / "copy")
     assert loaded.config == policy.config
     pd.testing.assert_frame_equal(loaded.recommend(log), policy.recommend(log))
 
 
-def test_wrong_histories_are_refused(fitted: tuple[UCF, Path], log: pd.DataFrame) -> None:
+def test_the_command_equals_the_python_api(
+    fitted: tuple[Recommender, Path], log: pd.DataFrame, tmp_path: Path
+) -> None:
+    policy, folder = fitted
+    repeated = pd.concat([log.assign(reward=0.0), log])  # of two rewards, the higher counts
+    repeated.to_parquet(tmp_path / "log.parquet")
+    arguments = [str(folder / "run"), str(tmp_path / "log.parquet"), "--k", "7", "--keep-seen"]
+    assert main(["recommend", *arguments, "--out", str(tmp_path / "out.parquet")]) == 0
+    written = pd.read_parquet(tmp_path / "out.parquet")
+    pd.testing.assert_frame_equal(written, policy.recommend(log, k=7, filter_seen=False))
+    pd.testing.assert_frame_equal(written, policy.recommend(repeated, k=7, filter_seen=False))
+
+
+def test_only_candidates_are_recommended(
+    fitted: tuple[Recommender, Path], log: pd.DataFrame
+) -> None:
     policy, _ = fitted
-    with pytest.raises(InputError, match="no column 'reward'; the nearest are"):
-        policy.recommend(log.rename(columns={"reward": "rewards"}))
-    with pytest.raises(InputError, match=r"1 rows have an item_id .* \(1 items: 999\)"):
-        policy.recommend(pd.concat([log, log.head(1).assign(item_id=999)]))
-    with pytest.raises(InputError, match="not trained yet"):
-        UCF().recommend(log)
+    chosen = [4, 8, 15, 16, 23]
+    everything = policy.recommend(log, k=30, filter_seen=False)
+    expected = everything[everything.item_id.isin(chosen)].reset_index(drop=True)
+    expected["rank"] = expected.groupby("user_id").cumcount() + 1
+    for given in (chosen, np.array(chosen), set(chosen), list(map(str, chosen))):
+        found = policy.recommend(log, k=30, filter_seen=False, candidates=given)
+        pd.testing.assert_frame_equal(found, expected)
+    unseen = policy.recommend(log, k=30, candidates=chosen)
+    assert set(zip(unseen.user_id, unseen.item_id, strict=True)) == {
+        (user, item)
+        for user in set(log.user_id)
+        for item in set(chosen) - set(log[log.user_id == user].item_id)
+    }
+    for wrong, message in (
+        ([4, 999, 1000], r"2 of 3 candidates are items .* \(999, 1000\)"),
+        ([], "candidates is empty"),
+        (4, "candidates is 4; give a list"),
+        ("48", "candidates is '48'; give a list"),
+    ):
+        with pytest.raises(InputError, match=message):
+            policy.recommend(log, candidates=wrong)  # type: ignore[arg-type]
+
+
+def test_unknown_items_are_refused_or_skipped(
+    fitted: tuple[Recommender, Path], log: pd.DataFrame
+) -> None:
+    policy, _ = fitted
+    strange = pd.concat([log, log.tail(9).assign(item_id=999, timestamp=log.timestamp.max() + 1)])
+    with pytest.raises(InputError, match=r"\d rows have an item_id .* \(1 items: 999\)"):
+        policy.recommend(strange)
+    pd.testing.assert_frame_equal(
+        policy.recommend(strange, skip_unknown=True), policy.recommend(log)
+    )
+    newcomer = pd.DataFrame(
+        {"user_id": [777], "item_id": [999], "timestamp": log.timestamp.max(), "reward": [1.0]}
+    )
+    assert len(policy.recommend(newcomer, k=4, skip_unknown=True)) == 4
+
+
+def test_the_reward_is_the_runs_expression_unless_there_is_a_column(
+    log: pd.DataFrame, tmp_path: Path
+) -> None:
+    feedback = log.rename(columns={"reward": "is_click"}).assign(seconds=range(len(log)))
+    policy = Recommender("dt", settings=SMALL).fit(feedback, reward="1 - 2 * is_click")
+    evaluated = policy.recommend(feedback)
+    given = log.assign(reward=1 - 2 * log.reward)
+    pd.testing.assert_frame_equal(evaluated, policy.recommend(given))
+    both = feedback.assign(reward=given.reward, is_click=0)
+    pd.testing.assert_frame_equal(evaluated, policy.recommend(both))
+    with pytest.raises(InputError, match="no column 'is_click'"):
+        policy.recommend(feedback.drop(columns="is_click"))
+
+
+def times_of_every_type() -> dict[str, Callable[[pd.Series], object]]:
+    def utc(ms: pd.Series) -> pd.Series:
+        return pd.to_datetime(ms, unit="ms")
+
+    return {
+        "float": lambda ms: ms.astype(float),
+        "Int64": lambda ms: ms.astype("Int64"),
+        **{
+            f"datetime64[{unit}]": lambda ms, unit=unit: utc(ms).astype(f"datetime64[{unit}]")
+            for unit in ("s", "ms", "us", "ns")
+        },
+        "with a zone": lambda ms: utc(ms).dt.tz_localize("UTC").dt.tz_convert("Asia/Tokyo"),
+        "objects": lambda ms: utc(ms).astype(object),
+    }
+
+
+@pytest.mark.parametrize("kind", times_of_every_type())
+@pytest.mark.parametrize("zone", ["UTC", "America/New_York"])
+def test_times_mean_the_same_here_and_in_prepare(
+    fitted: tuple[Recommender, Path],
+    log: pd.DataFrame,
+    tmp_path: Path,
+    kind: str,
+    zone: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    policy, _ = fitted
+    whole = log.assign(timestamp=log.timestamp // 1000 * 1000)
+    typed = whole.assign(timestamp=times_of_every_type()[kind](whole.timestamp))
+    monkeypatch.setenv("TZ", zone)
+    time.tzset()
+    try:
+        pd.testing.assert_frame_equal(policy.recommend(typed), policy.recommend(whole))
+        read = []
+        for name, frame in (("typed", typed), ("whole", whole)):
+            frame.to_parquet(tmp_path / f"{name}.parquet")
+            options = PrepareOptions(reward="reward", session_by="gap", gap_minutes=20)
+            prepare([tmp_path / f"{name}.parquet"], LogMapping(), tmp_path / name, options)
+            store = EpisodeStore.open(tmp_path / name)
+            read.append((store.lengths, store.step_values("timestamp", *store.all_steps())))
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+    for a, b in zip(*read, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert set(read[0][1]) == set(whole.timestamp)
+
+
+def test_seconds_need_a_mapping_here_and_in_prepare(
+    fitted: tuple[Recommender, Path], log: pd.DataFrame, tmp_path: Path
+) -> None:
+    policy, _ = fitted
+    seconds = log.assign(timestamp=log.timestamp / 1000)
+    seconds.to_parquet(tmp_path / "log.parquet")
+    with pytest.raises(InputError, match="is the time in milliseconds"):
+        policy.recommend(seconds)
+    with pytest.raises(InputError, match="is the time in milliseconds"):
+        prepare([tmp_path / "log.parquet"], LogMapping(), tmp_path / "store")
+    mapping = LogMapping({"timestamp": "timestamp * 1000"})
+    pd.testing.assert_frame_equal(policy.recommend(seconds, mapping=mapping), policy.recommend(log))
+    prepare([tmp_path / "log.parquet"], mapping, tmp_path / "store")
+    store = EpisodeStore.open(tmp_path / "store")
+    assert set(store.step_values("timestamp", *store.all_steps())) == set(log.timestamp)
+
+
+WRONG: dict[str, tuple[Callable[[pd.DataFrame], object], str]] = {
+    "a list": (lambda log: [1, 2], "histories: a list is not a pandas DataFrame"),
+    "no rows": (lambda log: log.head(0), "the frame has no rows"),
+    "no user": (lambda log: log.drop(columns="user_id"), "no column 'user_id'"),
+    "no item": (lambda log: log.rename(columns={"item_id": "item"}), "no column 'item_id'"),
+    "misspelt": (
+        lambda log: log.rename(columns={"reward": "rewards"}),
+        r"no column 'reward' \(for the reward\); nearest: rewards",
+    ),
+    "null users": (
+        lambda log: log.assign(user_id=log.user_id.astype("Int64").mask(log.index < 3)),
+        "3 rows: user, item or action, time or session is missing",
+    ),
+    "null times": (
+        lambda log: log.assign(
+            timestamp=pd.to_datetime(log.timestamp, unit="ms").mask(log.index < 2)
+        ),
+        "2 rows: user, item or action, time or session is missing",
+    ),
+    "a clock of 1970": (
+        lambda log: log.assign(timestamp=log.timestamp.mask(log.index < 4, 1)),
+        "4 rows: time before 2000.*is the time in milliseconds",
+    ),
+    "no number": (
+        lambda log: log.assign(reward=log.reward.mask(log.index < 5)),
+        "5 rows: reward is missing, NaN or infinite",
+    ),
+    "infinite": (
+        lambda log: log.assign(reward=log.reward.mask(log.index < 5, np.inf)),
+        "5 rows: reward is missing, NaN or infinite",
+    ),
+    "text for times": (
+        lambda log: log.assign(timestamp=log.timestamp.astype(str)),
+        r"timestamp \(timestamp\) is VARCHAR; use milliseconds",
+    ),
+    "text for rewards": (
+        lambda log: log.assign(reward="good"),
+        r"reward \(reward\) is VARCHAR",
+    ),
+    "fractions for users": (
+        lambda log: log.assign(user_id=log.user_id + 0.5),
+        r"user_id \(user_id\) is DOUBLE",
+    ),
+    "values of several types": (
+        lambda log: log.assign(user_id=[1, "b", *log.user_id[2:]]),
+        "user_id holds values of several types",
+    ),
+    "two columns of a name": (
+        lambda log: pd.concat([log, log.item_id], axis=1),
+        "two columns are called item_id",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_histories_are_refused(
+    fitted: tuple[Recommender, Path], log: pd.DataFrame, case: str
+) -> None:
+    change, message = WRONG[case]
+    with pytest.raises(InputError, match=message) as caught:
+        fitted[0].recommend(change(log))  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+
+
+def test_wrong_numbers_are_refused(fitted: tuple[Recommender, Path], log: pd.DataFrame) -> None:
+    policy, _ = fitted
+    for k in (0, -1, 2.0, "3", True, None):
+        with pytest.raises(InputError, match=r"k is .*; give a whole number, 1 or more"):
+            policy.recommend(log, k=k)  # type: ignore[arg-type]
+    assert policy.recommend(log, k=np.int64(2)).groupby("user_id").size().max() == 2
+    with pytest.raises(InputError, match="target_return is nan"):
+        policy.recommend(log, target_return=float("nan"))
+
+
+def test_sessions_by_id_need_the_column(log: pd.DataFrame) -> None:
+    sessions = log.assign(session_id=log.index % 7)
+    policy = Recommender("dt", settings=SMALL).fit(sessions, session_by="session_id")
+    with pytest.raises(InputError, match="no column 'session_id'"):
+        policy.recommend(log)
+    with pytest.raises(InputError, match=r"9 rows: user, .* or session is missing"):
+        policy.recommend(
+            sessions.assign(session_id=sessions.session_id.mask(log.index < 9).astype("Int64"))
+        )

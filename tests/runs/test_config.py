@@ -1,27 +1,60 @@
 """Configuration: what overrides what, clear refusals, and no field that nothing reads."""
 
 import ast
-from dataclasses import asdict, fields, is_dataclass
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from ucfrec.errors import InputError
-from ucfrec.policies.registry import POLICIES
-from ucfrec.runs.config import Config, config_from_dict, resolve_config
+from ucfrec.policies.cql import CQLConfig
+from ucfrec.policies.registry import BUILT_IN, policy_class
+from ucfrec.runs.config import TABLES, config_from_dict, resolve_config
+from ucfrec.settings import describe
 
 SOURCE = Path(__file__).parents[2] / "ucfrec"
 
 
-def test_set_overrides_the_file_which_overrides_the_defaults(tmp_path: Path) -> None:
+def test_set_overrides_the_file_which_overrides_presets_and_those_the_defaults(
+    tmp_path: Path,
+) -> None:
     file = tmp_path / "run.toml"
     file.write_text("[train]\nsteps = 7\nbatch_size = 9\n[policy]\nlambda_mask = 0.3\n")
-    config = resolve_config("ucf", file, ["train.steps=200", "policy.dropout=0"], seed=5)
+    presets = {"train": {"batch_size": 3, "warmup_steps": 4}}
+    config = resolve_config("ucf", file, ["train.steps=200", "policy.dropout=0"], 5, presets)
     assert (config.train.steps, config.train.batch_size, config.seed) == (200, 9, 5)
-    assert asdict(config.policy) == asdict(POLICIES["ucf"].Config()) | {
+    assert config.train.warmup_steps == 4
+    assert asdict(config.policy) == asdict(policy_class("ucf").Config()) | {
         "lambda_mask": 0.3,
         "dropout": 0.0,
     }
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        ["train.steps=200", "policy.dim=32", "csg.band=[0, 1]", "train.cosine=true"],
+        {"train.steps": 200, "policy.dim": 32, "csg.band": [0, 1], "train.cosine": True},
+        {"train": {"steps": 200, "cosine": True}, "policy": {"dim": 32}, "csg.band": (0, 1)},
+        {"train": {"steps": np.int64(200), "cosine": np.bool_(True)}, "policy.dim": 32}
+        | {"csg.band": (0.0, 1.0)},
+    ],
+    ids=["texts", "dotted", "nested", "numpy"],
+)
+def test_texts_mappings_and_files_go_the_same_way(
+    given: Mapping[str, Any] | Sequence[str], tmp_path: Path
+) -> None:
+    file = tmp_path / "run.toml"
+    file.write_text(
+        "[train]\nsteps = 200\ncosine = true\n[policy]\ndim = 32\n[csg]\nband = [0, 1]\n"
+    )
+    expected = resolve_config("ucf", file)
+    assert expected.csg.band == (0.0, 1.0)
+    assert resolve_config("ucf", None, given) == expected
 
 
 def test_only_ucf_trains_on_copies_unless_told_to() -> None:
@@ -30,7 +63,7 @@ def test_only_ucf_trains_on_copies_unless_told_to() -> None:
     assert resolve_config("dt", None, ["augment.copies=2"]).augment.copies == 2
 
 
-@pytest.mark.parametrize("policy", POLICIES)
+@pytest.mark.parametrize("policy", BUILT_IN)
 def test_a_configuration_survives_its_record(policy: str) -> None:
     config = resolve_config(policy, None, ["train.steps=3", "csg.band=[0.1, 0.4]"], seed=2)
     assert config_from_dict(asdict(config)) == config
@@ -39,20 +72,104 @@ def test_a_configuration_survives_its_record(policy: str) -> None:
 @pytest.mark.parametrize(
     ("override", "says"),
     [
-        ("train.stepz=1", "did you mean 'steps'"),
-        ("trian.steps=1", "did you mean 'train'"),
-        ("train.steps=many", "takes a int, not the str 'many'"),
-        ("train.steps=1.5", "takes a int"),
-        ("train.steps", "table.field=value"),
-        ("seed=3", "table.field=value"),
+        ("train.stepz=1", "train has no field 'stepz'; did you mean 'steps'?"),
+        ("trian.steps=1", "no table is called 'trian'; did you mean 'train'?"),
+        ("train.steps", "write table.field=value, as in train.steps=200"),
+        ("seed=3", "write table.field=value, as in train.steps=200"),
+        ("train.steps=many", "train.steps is 'many'; it must be a whole number from 1 to 1e12"),
+        ("train.steps=1.5", "train.steps is 1.5; it must be a whole number from 1 to 1e12"),
+        ("train.steps=0", "train.steps is 0; it must be a whole number from 1 to 1e12"),
+        ("train.steps=true", "train.steps is True; it must be a whole number from 1 to 1e12"),
+        (
+            "train.batch_size=0",
+            "train.batch_size is 0; it must be a whole number from 1 to 1,000,000",
+        ),
+        (
+            "train.learning_rate=-1",
+            "train.learning_rate is -1; it must be a number above 0 and at most 10",
+        ),
+        (
+            "train.learning_rate=nan",
+            "train.learning_rate is nan; it must be a number above 0 and at most 10",
+        ),
+        ("train.clip_norm=inf", "train.clip_norm is inf; it must be a number from 0 to 1,000,000"),
+        ("train.cosine=1", "train.cosine is 1; it must be true or false"),
+        ("policy.heads=3", "policy.heads is 3; it must divide policy.dim, which is 128"),
+        ("policy.dim=31", "policy.heads is 2; it must divide policy.dim, which is 31"),
+        ("policy.context=0", "policy.context is 0; it must be a whole number from 1 to 4,096"),
+        ("policy.dropout=2", "policy.dropout is 2; it must be a number at least 0 and below 1"),
+        (
+            f"policy.dim={10**30}",
+            f"policy.dim is {10**30}; it must be a whole number from 1 to 16,384",
+        ),
+        ("crm.beta=true", "crm.beta is True; it must be a number from 0 to 1,000,000"),
+        ("crm.beta=1e99", "crm.beta is 1e+99; it must be a number from 0 to 1,000,000"),
+        (
+            "csg.kind=nonsense",
+            "csg.kind is 'nonsense'; it must be 'tangent', 'faithful' or 'noise'",
+        ),
+        (
+            "csg.band=[0.5, 0.2]",
+            "csg.band is [0.5, 0.2]; the first length must not exceed the second",
+        ),
+        (
+            "csg.band=[-1, 0.2]",
+            "csg.band is [-1, 0.2]; it must be 2 values, each a number from 0 to",
+        ),
+        ("csg.band=[0.2]", "csg.band is [0.2]; it must be 2 values, each a number from 0 to"),
+        (
+            "augment.epsilon_r=abc",
+            "augment.epsilon_r is 'abc'; it must be a number from 0 to 1e15, or unset",
+        ),
+        ("augment.reward_quantile=1", "it must be a number at least 0 and below 1"),
     ],
 )
-def test_a_wrong_override_says_what_is_right(override: str, says: str) -> None:
-    with pytest.raises(InputError, match=says):
+def test_a_wrong_value_is_refused_in_one_line_wherever_it_is_given(
+    override: str, says: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=re.escape(says)) as caught:
         resolve_config("ucf", None, [override])
+    assert str(caught.value).startswith(f"--set {override}: ")
+    assert "\n" not in str(caught.value)
+    name, _, text = override.partition("=")
+    if not text or "." not in name:
+        return
+    table, _, key = name.partition(".")
+    file = tmp_path / "run.toml"
+    quoted = f'"{text}"' if text in ("many", "nonsense", "abc") else text
+    file.write_text(f"[{table}]\n{key} = {quoted}\n")
+    with pytest.raises(InputError, match=re.escape(says)) as caught:
+        resolve_config("ucf", file)
+    assert str(caught.value).startswith(f"{file}: ")
 
 
-def test_a_wrong_file_is_named(tmp_path: Path) -> None:
+def test_a_combination_names_every_place_it_was_given_in(tmp_path: Path) -> None:
+    file = tmp_path / "run.toml"
+    file.write_text("[policy]\ndim = 30\n")
+    with pytest.raises(InputError) as caught:
+        resolve_config("ucf", file, {"policy.heads": 4})
+    assert str(caught.value) == (
+        f"settings, {file}: policy.heads is 4; it must divide policy.dim, which is 30"
+    )
+    assert resolve_config("ucf", file, {"policy.heads": 3}).policy.dim == 30
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"train": 3}, "settings: train is a table of settings, not a value; give its field"),
+        ({"train": {"stepz": 3}}, "settings: train has no field 'stepz'; did you mean 'steps'?"),
+        ({"steps": 3}, "settings: no table is called 'steps'"),
+        ({"train.steps": "200"}, "settings: train.steps is '200'; it must be a whole number"),
+        ("train.steps=200", "give a list of texts, or a mapping"),
+    ],
+)
+def test_wrong_settings_from_python_are_refused(given: Any, says: str) -> None:
+    with pytest.raises(InputError, match=re.escape(says)):
+        resolve_config("ucf", None, given)
+
+
+def test_a_wrong_file_policy_or_seed_is_named(tmp_path: Path) -> None:
     file = tmp_path / "run.toml"
     file.write_text("steps = = 3")
     with pytest.raises(InputError, match=r"run\.toml is not TOML"):
@@ -61,18 +178,27 @@ def test_a_wrong_file_is_named(tmp_path: Path) -> None:
         resolve_config("ucf", tmp_path / "none.toml")
     with pytest.raises(InputError, match="no policy is called 'ufc'"):
         resolve_config("ufc")
+    for seed in (-1, 2**32):
+        with pytest.raises(InputError, match=f"^seed is {seed}; it must be a whole number from 0"):
+            resolve_config("ucf", seed=seed)
 
 
-def test_every_field_is_read() -> None:
+@pytest.mark.parametrize("policy", BUILT_IN)
+def test_every_field_means_something_and_is_read(policy: str) -> None:
     """A field that nothing reads is a promise that nothing keeps."""
     read = {
         node.attr
         for file in SOURCE.rglob("*.py")
-        for node in ast.walk(ast.parse(file.read_text()))
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
         if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load)
     }
-    config = resolve_config("ucf")
-    tables = [getattr(config, f.name) for f in fields(Config)]
-    names = [f.name for table in tables if is_dataclass(table) for f in fields(table)]
-    names += [f.name for policy in POLICIES.values() for f in fields(policy.Config)]
-    assert set(names) <= read
+    config = resolve_config(policy)
+    tables = [(name, getattr(config, name)) for name in TABLES]
+    for name, table in [*tables, ("cql", CQLConfig())]:
+        listed = list(describe(name, table))
+        assert [s.key for s in listed] == [f"{name}.{key}" for key in asdict(table)]
+        for setting in listed:
+            assert setting.meaning.endswith("."), setting.key
+            assert setting.key.partition(".")[2] in read, setting.key
+            bounded = re.search(r"\d|'|true", setting.allowed)
+            assert bounded, f"{setting.key} takes any value: {setting.allowed}"

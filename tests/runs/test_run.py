@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import pytest
 import torch
 
 from tests.support import killed_run
+from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay
 from ucfrec.errors import InputError
@@ -121,6 +123,58 @@ def test_a_store_without_validation_holds_some_training_episodes_out(tmp_path: P
     )
     with pytest.raises(InputError, match="1 training episodes"):
         train_run(single, tmp_path / "run-single", resolve_config("ucf"))
+    assert not (tmp_path / "run-single").exists()
+
+
+def two_columns(path: Path, reward: float | None = None) -> EpisodeStore:
+    """Sixty episodes of vectors; rewards are random unless all are `reward`."""
+    rng = np.random.default_rng(0)
+    columns = {
+        "observation": rng.normal(size=(300, 3)),
+        "action": rng.uniform(-1, 1, size=(300, 2)),
+        "reward": rng.random(300) if reward is None else np.full(300, reward),
+    }
+    return EpisodeStore.write(path, columns, np.full(60, 5))
+
+
+SHORT = [*killed_run.SETTINGS, "train.steps=4", "crm.epochs=1"]
+
+
+@pytest.mark.parametrize(
+    ("policy", "wrong", "says"),
+    [
+        (
+            "ucf",
+            ["policy.heads=3"],
+            r"=3, --set policy\.dim=16: policy\.heads is 3; it must divide",
+        ),
+        ("ucf", ["csg.kind=nonsense"], "csg.kind is 'nonsense'"),
+        ("ucf", ["train.steps=0"], r"train\.steps is 0; it must be a whole number"),
+        ("item-knn", [], "item-knn recommends items; this store's actions are vectors"),
+    ],
+)
+def test_a_start_that_fails_leaves_nothing_and_the_corrected_command_works_there(
+    policy: str, wrong: list[str], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    two_columns(tmp_path / "store")
+    command = ["train", str(tmp_path / "store"), "--out", str(tmp_path / "run")]
+    command += [word for setting in SHORT for word in ("--set", setting)]
+    bad = [word for setting in wrong for word in ("--set", setting)]
+    assert main([*command, "--policy", policy, *bad]) == 2
+    printed = capsys.readouterr().err.strip()
+    assert re.search(says, printed), printed
+    assert "\n" not in printed
+    assert [path.name for path in tmp_path.iterdir()] == ["store"]
+    assert main(command) == 0
+    assert TrainedPolicy.load(tmp_path / "run").name == "ucf"
+
+
+def test_rewards_that_never_vary_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+    flat = two_columns(tmp_path / "store", reward=0.5)
+    with pytest.raises(InputError, match=r"all 270 training rewards of .* equal 0\.5"):
+        train_run(flat, tmp_path / "run", resolve_config("ucf", None, SHORT))
+    assert not (tmp_path / "run").exists()
+    train_run(flat, tmp_path / "run", resolve_config("ucf", None, [*SHORT, "augment.copies=0"]))
 
 
 def test_a_checkpoint_that_cannot_be_written_is_one_clear_error(

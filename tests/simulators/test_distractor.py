@@ -16,7 +16,8 @@ from ucfrec.commands.cli import main
 from ucfrec.episodes.distractor import reward_bit
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.evaluate import World, evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.world import World
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -86,7 +87,7 @@ def test_clicks_that_are_the_rule_are_high_and_equal_rewards_are_refused(tmp_pat
         if 0 in clicks:
             np.testing.assert_array_equal(reward_bit(store), clicks)
         else:
-            with pytest.raises(InputError, match="no bit can go with them"):
+            with pytest.raises(InputError, match="no bit can be correlated"):
                 reward_bit(store)
     with pytest.raises(InputError, match=r"lies in \[0, 1\]"):
         reward_bit(store, flip=1.5)

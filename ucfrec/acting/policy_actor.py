@@ -21,7 +21,7 @@ class PolicyActor:
     """Plays N episodes at once with one batched forward pass a step (an `Actor` of `rollout`).
 
     Vector actions are played as predicted; of items, the one with the highest probability among
-    those that the world has and allows. Users known from the logs have their features.
+    those that the environment has and allows. Users of the logs have their features.
     """
 
     def __init__(
@@ -37,14 +37,14 @@ class PolicyActor:
         """Args:
         policy: in evaluation mode.
         episodes: N, episodes side by side.
-        target_return: return asked of every episode.
+        target_return: of every episode.
         observation_size: how many of the environment's observed numbers the logs had; 0 ignores
             the environment's observation.
         item_states: how states are made of items; None where the observation is the state.
         item_ids: (n_items,) the environment's number of each item of the store; −1 where it has
             none.
-        user_ids: (n_users,) sorted, what the logs called each user of the store; None or text
-            where the world knows none of them.
+        user_ids: (n_users,) sorted identifiers in the logs of the store's users; None or text
+            where the environment has other users.
         """
         n, k = episodes, policy.config.context
         self._policy, self._target = policy, float(target_return)
@@ -67,7 +67,7 @@ class PolicyActor:
         self._earned = torch.zeros(n, dtype=torch.float64)
 
     def begin(self, rows: IntArray) -> None:
-        """The episodes in `rows` start afresh."""
+        """The episodes in `rows` (positions among the N) start afresh."""
         self._mask[rows] = False
         self._steps[rows] = 0
         self._earned[rows] = 0.0
@@ -75,7 +75,7 @@ class PolicyActor:
             self._sessions.begin(rows)
 
     def inform(self, info: Mapping[str, Any]) -> None:
-        """Take note of whom the next step serves, and of items that may not be played."""
+        """Take note of the users of the next step, and of items that may not be played."""
         users, known = info.get(USER_IDS), self._user_ids
         if users is not None and self._sessions is not None and known is not None:
             at = np.minimum(np.searchsorted(known, users), len(known) - 1)
@@ -85,7 +85,15 @@ class PolicyActor:
 
     @torch.no_grad()
     def act(self, observations: FloatArray, live: BoolArray) -> tuple[npt.NDArray[Any], None]:
-        """Choose for the live rows; the rest get a zero action."""
+        """Choose for the live rows; the rest get a zero action.
+
+        Args:
+            observations: (N, at least `observation_size`).
+            live: (N,) episodes whose action counts.
+
+        Returns:
+            (N, A) vectors or (N,) numbers of items in the environment; propensities are unknown.
+        """
         observed = torch.as_tensor(observations, dtype=torch.float32)[:, : self._observation_size]
         states = observed if self._sessions is None else self._sessions.current(observed)
         target = torch.full_like(self._earned, self._target)
@@ -100,7 +108,7 @@ class PolicyActor:
         rows = torch.from_numpy(np.flatnonzero(live))
         device = self._policy.state_mean.device
         predicted = self._policy.act(self._windows(rows).to(device)).cpu()
-        # Rows that no longer count are played too, and must be allowed: they keep zeros.
+        # Rows that no longer count are played too, and need an allowed action: they keep zeros.
         filled = torch.zeros(len(live), predicted.shape[1])
         filled[rows] = predicted
         actions = self._best(filled) if isinstance(self._policy.head, ItemHead) else filled
@@ -109,7 +117,10 @@ class PolicyActor:
         return (played if self._item_ids is None else self._item_ids[played]), None
 
     def observe(self, actions: npt.NDArray[Any], rewards: FloatArray) -> None:
-        """Lower the return-to-go by the rewards (N,) and go on to the next step."""
+        """Lower the returns-to-go by the rewards (N,) and go on to the next step.
+
+        The actions (N, …) are those that `act` chose; they are on record already.
+        """
         earned = torch.from_numpy(rewards)
         if self._sessions is not None:
             self._sessions.record(self._actions[:, -1], earned)
@@ -122,7 +133,7 @@ class PolicyActor:
         if self._absent is not None:
             scores[:, self._absent] = -torch.inf
         if self._forbidden is not None:
-            # Column n_items takes what is forbidden in the world and unknown to the store.
+            # Column n_items takes what the environment forbids and the store does not have.
             scores = torch.cat([scores, torch.zeros(len(scores), 1)], dim=1)
             scores = scores.scatter(1, self._forbidden, -torch.inf)[:, :-1]
         return scores.argmax(-1)
@@ -131,7 +142,9 @@ class PolicyActor:
         """The store's numbers of the environment's items (N, L); n_items where it has none."""
         ids = self._item_ids
         if ids is None:
-            raise InputError("a world that forbids items needs a policy of items")
+            raise InputError(
+                "an environment that forbids items needs a policy whose actions are items"
+            )
         numbers = np.full(max(items.max(), ids.max()) + 2, len(ids))
         numbers[ids[ids >= 0]] = np.flatnonzero(ids >= 0)
         # The last place stands for −1, no item.

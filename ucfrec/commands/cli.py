@@ -1,7 +1,12 @@
-"""The command line. A command is imported once it is called."""
+"""The command line. Only the module of the command that is called is imported.
+
+Such a module imports what its command works with inside `run`, so that `--help` answers at once
+and no command loads what only another one needs.
+"""
 
 import argparse
 import errno
+import os
 import signal
 import sys
 from collections.abc import Mapping, Sequence
@@ -34,6 +39,7 @@ UCFREC = Program(
         "collect": "play sessions in a simulator, as Parquet logs",
         "prepare": "logs to an episode store",
         "train": "train a policy on a store; resumes",
+        "settings": "every setting of a training: default, range, meaning",
         "evaluate": "what a policy earns in a simulator",
         "recommend": "the next items for users of a log",
         "score": "a policy's probability of every choice of a log",
@@ -63,6 +69,10 @@ def run(program: Program, arguments: Sequence[str] | None) -> int:
         _module(program, options.command).run(options)
     except InputError as error:
         return _failed(options, f"{name}: {error}")
+    except BrokenPipeError:
+        # Whoever read the output, as `head` does, has read enough.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except OSError as error:
         if error.errno != errno.ENOSPC:
             raise

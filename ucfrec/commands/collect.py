@@ -5,8 +5,6 @@ from pathlib import Path
 
 from ucfrec.commands.options import world_options
 from ucfrec.errors import InputError
-from ucfrec.evaluation.collect import collect
-from ucfrec.evaluation.evaluate import World
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -19,6 +17,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """`ucfrec collect`."""
+    from ucfrec.evaluation.collect import collect
+    from ucfrec.evaluation.world import World
+
     world = World(options.env, options.env_folder)
     simulator = world.simulator()
     if options.behavior not in simulator.behaviors:

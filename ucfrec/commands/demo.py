@@ -1,10 +1,44 @@
-"""`ucfrec demo`: everything on simulated logs, collect to report."""
+"""`ucfrec demo`: everything on simulated logs, in two worlds, from `collect` to `report`."""
 
 import argparse
+import os
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
-from ucfrec.commands.demo_run import DemoConfig, demo
-from ucfrec.provenance import format_rows
+from ucfrec.progress import progress
+
+WORLDS = ("synthetic-taobao", "synthetic-catalog")
+LEARNERS: dict[str, tuple[str, ...]] = {
+    "bc": ("bc",),
+    "dt": ("dt",),
+    "ucf-no-augmentation": ("ucf", "augment.copies=0"),
+    "ucf": ("ucf",),
+}
+"""What is trained, by the name in the results: learner, then settings beside the demo's own."""
+BEHAVIORS = {"logging": "mixture", "random": "random", "optimal": "optimal"}
+"""Built-in policies evaluated beside, by the name in the results."""
+EVALUATION_SEED = 1_000_000
+"""Added to the seed of the logs, so that no evaluated session was logged."""
+
+
+@dataclass(frozen=True)
+class DemoConfig:
+    """Small enough for minutes on two cores."""
+
+    sessions: int = 6000
+    episodes: int = 1000
+    target_quantile: float = 1.0
+    settings: Sequence[str] = (
+        "train.steps=1500",
+        "train.learning_rate=1e-3",
+        "crm.epochs=8",
+    )
+    context: int = 10
+    dim: int = 64
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -15,6 +49,73 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """`ucfrec demo`."""
-    rows = demo(options.out, options.seed, DemoConfig())
-    print(format_rows(rows))
+    from ucfrec.provenance import format_rows
+
+    print(format_rows(demo(options.out, options.seed, DemoConfig())))
     print(f"\nreport: {options.out / 'report.html'}; rows, logs, stores and runs lie beside it")
+
+
+def demo(out: Path, seed: int, config: DemoConfig) -> list[dict[str, Any]]:
+    """Run the demo in the folder `out`; returns the rows of `out/results.json`.
+
+    `out/report.html` is a page about them and the runs. Each world leaves its logs, store and runs
+    in `out/<world>`, ready for the other commands. Given again after an interruption, it goes on
+    where it was.
+    """
+    from ucfrec.evaluation.evaluate import evaluate_behavior
+    from ucfrec.evaluation.simulated_store import simulated_store
+    from ucfrec.evaluation.world import World
+    from ucfrec.files import write_json
+    from ucfrec.reporting.page import write_report
+
+    for world in WORLDS:
+        simulated_store(World(world), out / world, config.sessions, seed)
+    jobs = [(world, name) for name in reversed(LEARNERS) for world in WORLDS]
+    # One thread each: at this size two trainings side by side beat one on two threads.
+    with ProcessPoolExecutor(min(len(jobs), os.cpu_count() or 1), get_context("spawn")) as pool:
+        started = [pool.submit(_learn, out / world, name, seed, config) for world, name in jobs]
+        with progress(len(jobs), "train and evaluate", "policies") as bar:
+            for finished in as_completed(started):
+                finished.result()
+                bar.update()
+        learned = {job: future.result() for job, future in zip(jobs, started, strict=True)}
+    rows = []
+    for world in WORLDS:
+        for name, behavior in BEHAVIORS.items():
+            row = evaluate_behavior(World(world), behavior, config.episodes, EVALUATION_SEED + seed)
+            learned[world, name] = row | {"policy": name}
+        order = ("random", "logging", *LEARNERS, "optimal")
+        rows += [learned[world, name] for name in order]
+    write_json(out / "results.json", rows)
+    runs = [out / world / name for world in WORLDS for name in LEARNERS]
+    items = out / "synthetic-catalog" / "logs" / "items.parquet"
+    write_report(out / "report.html", runs, [out / "results.json"], items)
+    return rows
+
+
+def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> dict[str, Any]:
+    """Train one learner and play it; in a process of its own."""
+    import torch
+
+    from ucfrec.episodes.store import EpisodeStore
+    from ucfrec.evaluation.evaluate import evaluate_policy
+    from ucfrec.evaluation.world import World
+    from ucfrec.runs.config import resolve_config
+    from ucfrec.runs.run import train_run
+    from ucfrec.runs.trained_policy import TrainedPolicy
+
+    torch.set_num_threads(1)
+    learner, *settings = LEARNERS[name]
+    size = [f"policy.dim={config.dim}"]
+    size += [] if learner == "bc" else [f"policy.context={config.context}"]
+    resolved = resolve_config(learner, None, [*config.settings, *size, *settings], seed)
+    train_run(EpisodeStore.open(folder / "store"), folder / name, resolved)
+    trained = TrainedPolicy.load(folder / name)
+    return evaluate_policy(
+        World(folder.name),
+        trained,
+        name,
+        config.episodes,
+        EVALUATION_SEED + seed,
+        trained.target_return(config.target_quantile),
+    )

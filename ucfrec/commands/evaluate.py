@@ -5,10 +5,6 @@ from pathlib import Path
 
 from ucfrec.commands.options import target_given, target_options, world_options
 from ucfrec.errors import InputError
-from ucfrec.evaluation.evaluate import World, evaluate_behavior, evaluate_policy
-from ucfrec.files import write_json
-from ucfrec.provenance import format_rows
-from ucfrec.runs.trained_policy import TrainedPolicy
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -28,6 +24,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """`ucfrec evaluate`."""
+    from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
+    from ucfrec.evaluation.world import World
+    from ucfrec.files import write_json
+    from ucfrec.provenance import format_rows
+    from ucfrec.runs.trained_policy import TrainedPolicy
+
     world = World(options.env, options.env_folder)
     if not options.runs and not options.behavior:
         raise InputError("name a run folder, or a built-in policy with --behavior")

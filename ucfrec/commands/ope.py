@@ -4,12 +4,6 @@ import argparse
 from pathlib import Path
 
 from ucfrec.commands.options import log_options, logs_given, target_given, target_options
-from ucfrec.files import write_json
-from ucfrec.logs.summary import format_report
-from ucfrec.off_policy.evaluate import judge_off_policy
-from ucfrec.off_policy.score import logged_sessions
-from ucfrec.provenance import format_rows
-from ucfrec.runs.trained_policy import TrainedPolicy
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -29,6 +23,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """`ucfrec ope`."""
+    from ucfrec.files import write_json
+    from ucfrec.logs.summary import format_report
+    from ucfrec.off_policy.evaluate import judge_off_policy
+    from ucfrec.off_policy.score import logged_sessions
+    from ucfrec.provenance import format_rows
+    from ucfrec.runs.trained_policy import TrainedPolicy
+
     files, mapping = logs_given(options)
     trained = TrainedPolicy.load(options.run, options.checkpoint)
     with logged_sessions(options.run, trained, files, mapping, keep_unknown=True) as logged:

@@ -4,10 +4,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ucfrec.logs.mapping import Dataset, LogMapping, columns_given, read_mapping
-from ucfrec.plugins import load_plugin
-
 if TYPE_CHECKING:
+    from ucfrec.logs.mapping import Dataset, LogMapping
     from ucfrec.runs.trained_policy import TrainedPolicy
 
 
@@ -33,9 +31,9 @@ def log_options(parser: argparse.ArgumentParser) -> None:
 
 
 def target_options(parser: argparse.ArgumentParser) -> None:
-    """Which weights act, and what return is asked of them."""
+    """Which weights act, and their target return."""
     parser.add_argument("--checkpoint", choices=["best", "last"], default="best")
-    parser.add_argument("--target-return", type=float, help="return asked of an episode")
+    parser.add_argument("--target-return", type=float, help="target return of an episode")
     parser.add_argument(
         "--target-quantile",
         type=float,
@@ -44,8 +42,11 @@ def target_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def logs_given(options: argparse.Namespace) -> tuple[tuple[Path, ...], LogMapping]:
+def logs_given(options: argparse.Namespace) -> "tuple[tuple[Path, ...], LogMapping]":
     """Files and column mapping of a command that reads logs."""
+    from ucfrec.logs.mapping import LogMapping, columns_given, read_mapping
+    from ucfrec.plugins import load_plugin
+
     dataset: Dataset = load_plugin("datasets", options.dataset)
     given = LogMapping(columns_given(options.column))
     if options.mapping is not None:
@@ -54,7 +55,7 @@ def logs_given(options: argparse.Namespace) -> tuple[tuple[Path, ...], LogMappin
 
 
 def target_given(options: argparse.Namespace, trained: "TrainedPolicy") -> float:
-    """The return that `target_options` ask for."""
+    """The target return that `target_options` name."""
     if options.target_return is not None:
         return float(options.target_return)
     return trained.target_return(options.target_quantile)

@@ -5,8 +5,6 @@ from pathlib import Path
 
 from ucfrec.commands.options import log_options, logs_given
 from ucfrec.errors import InputError
-from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, validate
-from ucfrec.logs.summary import format_report
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -26,6 +24,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """`ucfrec prepare`."""
+    from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, validate
+    from ucfrec.logs.summary import format_report
+
     files, mapping = logs_given(options)
     given = {
         "reward": options.reward,

@@ -1,23 +1,27 @@
 """`ucfrec recommend`: the next items for users of a log."""
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from ucfrec.commands.frames import write_frames
 from ucfrec.commands.options import log_options, logs_given, target_given, target_options
-from ucfrec.logs.prepare import read_histories
-from ucfrec.recommending.recommend import LONGEST_HISTORY, Histories, recommend
-from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.progress import Progress, progress
+
+if TYPE_CHECKING:
+    from ucfrec.recommending.histories import Histories
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """What `recommend` takes."""
     parser.add_argument("run", type=Path, metavar="RUN")
     log_options(parser)
-    parser.add_argument("--k", type=int, default=10, help="items a user (10)")
-    parser.add_argument("--keep-seen", action="store_true", help="seen items may come again")
+    parser.add_argument("--k", type=int, default=10, help="items for each user (10)")
     parser.add_argument(
-        "--skip-unknown", action="store_true", help="ignore rows of items the run never saw"
+        "--keep-seen", action="store_true", help="recommend also items that the user has seen"
+    )
+    parser.add_argument(
+        "--skip-unknown", action="store_true", help="ignore rows of items the run does not know"
     )
     target_options(parser)
     parser.add_argument("--out", type=Path, required=True, help="Parquet file")
@@ -25,15 +29,27 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """`ucfrec recommend`."""
+    from ucfrec.commands.frames import write_frames
+    from ucfrec.recommending.histories import histories_of_files
+    from ucfrec.recommending.recommend import recommend
+    from ucfrec.runs.trained_policy import TrainedPolicy
+
     files, mapping = logs_given(options)
     trained = TrainedPolicy.load(options.run, options.checkpoint)
-    read = read_histories(files, mapping, trained.record["reward"], LONGEST_HISTORY)
-    frames = recommend(
-        trained,
-        map(Histories.from_batch, read),
-        options.k,
-        target_return=target_given(options, trained),
-        filter_seen=not options.keep_seen,
-        skip_unknown=options.skip_unknown,
-    )
-    print(f"{options.out}: {write_frames(options.out, frames):,} rows")
+    with progress(None, "recommend", "users") as bar:
+        frames = recommend(
+            trained,
+            _counted(histories_of_files(trained, files, mapping), bar),
+            options.k,
+            target_return=target_given(options, trained),
+            filter_seen=not options.keep_seen,
+            skip_unknown=options.skip_unknown,
+        )
+        rows = write_frames(options.out, frames)
+    print(f"{options.out}: {rows:,} rows")
+
+
+def _counted(batches: "Iterator[Histories]", bar: Progress) -> "Iterator[Histories]":
+    for batch in batches:
+        yield batch
+        bar.update(len(batch.users))

@@ -3,8 +3,6 @@
 import argparse
 from pathlib import Path
 
-from ucfrec.reporting.page import write_report
-
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """What `report` takes."""
@@ -16,12 +14,20 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         default=[],
         metavar="FILE",
-        help="rows of `ucfrec evaluate --json` or of the demo, JSON or JSON lines",
+        help="rows that `ucfrec evaluate`, `ucfrec ope` or the demo wrote, JSON or JSON lines",
+    )
+    parser.add_argument(
+        "--items",
+        type=Path,
+        metavar="FILE",
+        help="item features to show beside sample recommendations, Parquet or CSV with item_id",
     )
     parser.add_argument("--out", type=Path, default=Path("report.html"), help="(report.html)")
 
 
 def run(options: argparse.Namespace) -> None:
     """`ucfrec report`."""
-    write_report(options.out, options.runs, options.results)
+    from ucfrec.reporting.page import write_report
+
+    write_report(options.out, options.runs, options.results, options.items)
     print(f"report: {options.out}; open it in a browser")

@@ -3,11 +3,7 @@
 import argparse
 from pathlib import Path
 
-from ucfrec.commands.frames import write_frames
 from ucfrec.commands.options import log_options, logs_given, target_given, target_options
-from ucfrec.logs.summary import format_report
-from ucfrec.off_policy.score import logged_sessions, score
-from ucfrec.runs.trained_policy import TrainedPolicy
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -20,6 +16,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """`ucfrec score`."""
+    from ucfrec.commands.frames import write_frames
+    from ucfrec.logs.summary import format_report
+    from ucfrec.off_policy.score import logged_sessions, score
+    from ucfrec.runs.trained_policy import TrainedPolicy
+
     files, mapping = logs_given(options)
     trained = TrainedPolicy.load(options.run, options.checkpoint)
     with logged_sessions(options.run, trained, files, mapping) as logged:

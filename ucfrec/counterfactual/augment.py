@@ -8,27 +8,36 @@ import copy
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.counterfactual.edit_statistics import MoveReport, MoveStatistics
 from ucfrec.counterfactual.generators import CSGConfig, Generator, make_generator
-from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, CRMReport, fit_crm
+from ucfrec.counterfactual.reward_model import (
+    CausalRewardModel,
+    CRMConfig,
+    CRMReport,
+    fit_crm,
+    fit_warning,
+)
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import FloatArray, IntArray, Overlay, Transitions
 from ucfrec.errors import InputError
+from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.settings import Count, Quantile, settings_table
 
 _CHUNK = 8192
 _DELTA_LEVEL = "0.95"
 _ROUNDING = 1e-9
 
 
-@dataclass(frozen=True)
+@settings_table("augment")
 class AugmentConfig:
     """How many edited copies are made, and of which steps.
 
@@ -36,15 +45,15 @@ class AugmentConfig:
     makes its own copy. Appendix H, the default, is few copies that carry every accepted edit.
     """
 
-    copies: int = 1
-    """Of each episode, at most."""
-    edits_per_copy: int = 0
+    copies: Annotated[int, Field(ge=0, le=1000)] = 1
+    """Edited copies of each episode, at most; 0 trains without, and without a reward model."""
+    edits_per_copy: Annotated[int, Field(ge=0, le=1_000_000)] = 0
     """Edited steps in a copy, at most; 0 stands for every accepted one."""
-    reward_quantile: float = 0.3
+    reward_quantile: Quantile = 0.3
     """Steps with a reward below this quantile are left alone."""
-    epsilon_r: float | None = None
+    epsilon_r: Annotated[float, Field(ge=0, le=1e15)] | None = None
     """Tolerance of the gate in reward units; unset, 0.1 × standard deviation of the rewards."""
-    max_steps: int = 2_000_000
+    max_steps: Count = 2_000_000
     """Most steps to look at; of a larger store, episodes are drawn."""
 
 
@@ -65,7 +74,7 @@ class AugmentationReport:
     verdict: str
     """In plain words, what the bound is worth."""
     warnings: tuple[str, ...]
-    """Latent collapse or leak, edit collapse; empty if neither."""
+    """A reward model that predicts nothing, latent collapse or leak, edit collapse."""
     reward_model: CRMReport
 
 
@@ -103,14 +112,10 @@ def augment(
     """Edited copies of the episodes of `view`, a training view without an overlay (Algorithm 5).
 
     Raises:
-        InputError: the configuration asks for the impossible.
+        InputError: `config` has no copies.
     """
-    if config.copies < 1 or config.edits_per_copy < 0 or not 0 <= config.reward_quantile < 1:
-        raise InputError(
-            f"augment.copies is {config.copies}, edits_per_copy {config.edits_per_copy}, "
-            f"reward_quantile {config.reward_quantile}; they must be at least 1, at least 0 and "
-            "in [0, 1)"
-        )
+    if config.copies < 1:
+        raise InputError("augment.copies is 0; to make copies, it must be at least 1")
     rng = np.random.default_rng(seed)
     epsilon_r = config.epsilon_r
     if epsilon_r is None:
@@ -125,6 +130,22 @@ def augment(
     return overlay, _report(overlay, editor, crm_report)
 
 
+def require_rewards_vary(train: EpisodeStore) -> None:
+    """Refuse training episodes whose rewards are all equal: a reward model has nothing to learn.
+
+    Raises:
+        InputError: they are.
+    """
+    rewards = train.step_values(schema.REWARD, *train.all_steps())
+    if (rewards == rewards[0]).all():
+        raise InputError(
+            f"all {len(rewards):,} training rewards of {train.path} equal {rewards[0]:g}: there is "
+            "nothing for a reward model to learn; check the reward expression, or set "
+            "augment.copies=0"
+        )
+
+
+@random_state_kept()
 def counterfactual_copies(
     train: EpisodeStore,
     validation: EpisodeStore,
@@ -290,7 +311,8 @@ def _report(overlay: Overlay, editor: _Editor, crm_report: CRMReport) -> Augment
     moves = editor.moves()
     delta = crm_report.delta[_DELTA_LEVEL]
     bound = delta + editor.epsilon_r
-    warnings = [crm_report.warning] if crm_report.warning else []
+    of_model = (fit_warning(crm_report.r2_without_z), crm_report.warning)
+    warnings = [warning for warning in of_model if warning]
     if moves.edits and moves.mean_move_ratio > 0.5:
         warnings.append(
             f"edit collapse: {moves.mean_move_ratio:.0%} of the average edit is one shift common "

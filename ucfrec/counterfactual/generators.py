@@ -1,46 +1,73 @@
 """Counterfactual state generators: other states that would have earned the same reward."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Annotated, Literal, Protocol
 
 import numpy as np
 import torch
-from sklearn.cluster import MiniBatchKMeans
+from pydantic import Field
 from torch import Tensor, nn
 
 from ucfrec.counterfactual.reward_model import CausalRewardModel, mlp
 from ucfrec.episodes.windows import Transitions
-from ucfrec.errors import InputError
 from ucfrec.fitting.loop import LoopConfig, fit
+from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.settings import (
+    BatchSize,
+    LearningRate,
+    Quantile,
+    Weight,
+    Width,
+    require,
+    settings_table,
+)
 
 _TINY = 1e-12
 
 
-@dataclass(frozen=True)
+Length = Annotated[float, Field(ge=0, le=1e6)]
+
+
+@settings_table("csg")
 class CSGConfig:
     """Which generator, and how it is made (paper appendix G.2, Table 5)."""
 
     kind: Literal["tangent", "faithful", "noise"] = "tangent"
     """`tangent` draws a different edit every time; `faithful` is the paper's network, which learns
     nearly one shift for all states; `noise` is the control, moves that heed no reward."""
-    band: tuple[float, float] = (0.2, 0.5)
+    # TOML and JSON have lists only.
+    band: Annotated[tuple[Length, Length], Field(strict=False)] = (0.2, 0.5)
     """(ρ_low, ρ_high): length of a move, in standard deviations of the states."""
-    reward_quantile: float = 0.3
+    reward_quantile: Quantile = 0.3
     """Steps with a reward below this quantile are not learned from: 0.3 leaves the top 70%."""
-    clusters: int = 32
+    clusters: Annotated[int, Field(ge=1, le=100_000)] = 32
     """tangent: regions of the state space, each with its own principal directions."""
-    corrections: int = 3
+    corrections: Annotated[int, Field(ge=0, le=1000)] = 3
     """tangent: Newton steps back onto the level set of the reward."""
-    hidden: int = 256
-    learning_rate: float = 5e-4
-    batch_size: int = 256
-    epochs: int = 40
-    lambda_r: float = 1.0
-    lambda_band: float = 0.1
-    max_transitions: int = 200_000
+    hidden: Width = 256
+    """faithful: width of the three hidden layers."""
+    learning_rate: LearningRate = 5e-4
+    """faithful: step size of the updates."""
+    batch_size: BatchSize = 256
+    """faithful: transitions of an update."""
+    epochs: Annotated[int, Field(ge=1, le=100_000)] = 40
+    """faithful: passes over the transitions."""
+    lambda_r: Weight = 1.0
+    """faithful: weight of the squared change of the predicted reward, in standard deviations."""
+    lambda_band: Weight = 0.1
+    """faithful: weight of the squared distance of a move's length from the band."""
+    max_transitions: Annotated[int, Field(ge=100, le=10**9)] = 200_000
     """Most transitions to learn from; of more, that many are drawn."""
+
+    def __post_init__(self) -> None:
+        """Check the fields against each other."""
+        low, high = self.band
+        require(
+            low <= high,
+            f"csg.band is [{low:g}, {high:g}]; the first length must not exceed the second",
+            "csg.band",
+        )
 
 
 class Generator(Protocol):
@@ -161,6 +188,7 @@ class NoiseGenerator:
         return states + self._std * _scaled(noise, length)
 
 
+@random_state_kept()
 def make_generator(
     train: Transitions, crm: CausalRewardModel, config: CSGConfig, folder: Path, seed: int
 ) -> Generator:
@@ -173,15 +201,16 @@ def make_generator(
     chosen = torch.from_numpy(rng.permutation(rows)[: config.max_transitions])
     if config.kind == "tangent":
         return _tangent(crm.normalised_states(train.states[chosen]), crm, config, seed)
-    if config.kind == "faithful":
-        s, a, r = train.states[chosen], train.actions[chosen], train.rewards[chosen]
-        return _faithful(s, a, r, crm, config, folder, seed)
-    raise InputError(f"csg.kind is {config.kind!r}; it must be 'tangent', 'faithful' or 'noise'")
+    s, a, r = train.states[chosen], train.actions[chosen], train.rewards[chosen]
+    return _faithful(s, a, r, crm, config, folder, seed)
 
 
 def _tangent(
     states: Tensor, crm: CausalRewardModel, config: CSGConfig, seed: int
 ) -> TangentGenerator:
+    # scikit-learn takes a second and 100 MB, which reading a trained policy need not spend.
+    from sklearn.cluster import MiniBatchKMeans
+
     size = states.shape[1]
     clusters = max(1, min(config.clusters, len(states) // (8 * size)))
     fitted = MiniBatchKMeans(clusters, random_state=seed, n_init=1, batch_size=4096)

@@ -4,26 +4,31 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
 from ucfrec.episodes.windows import Transitions
 from ucfrec.errors import InputError
 from ucfrec.fitting.loop import LoopConfig, fit
+from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.settings import BatchSize, LearningRate, Weight, WeightDecay, Width, settings_table
 
 _ACTIVE_NATS = 0.01
 _LEAK = 0.1
+_PREDICTS_NOTHING = 0.02
+"""R² on held-out steps up to which a reward model is as good as none."""
 _QUANTILES = (0.5, 0.9, 0.95, 0.99)
 _CONSTANT = 1e-6
 _VALIDATION_LIMIT = 20_000
 _LOG_2PI = math.log(2 * math.pi)
 
 
-@dataclass(frozen=True)
+@settings_table("crm")
 class CRMConfig:
     """How the reward model is built and trained (paper appendix G.1, Table 4).
 
@@ -34,11 +39,13 @@ class CRMConfig:
     what is left of the reward cures it (5%; 0.82).
     """
 
-    latent_dim: int = 16
-    """16 for locomotion and logs, 32 for AntMaze."""
-    hidden: int = 256
-    beta: float = 0.1
-    decoder_std: float = 0.1
+    latent_dim: Annotated[int, Field(ge=1, le=4096)] = 16
+    """Dimensions of the disturbance z: 16 for locomotion and logs, 32 for AntMaze."""
+    hidden: Width = 256
+    """Width of the two hidden layers of encoder, decoder and regression."""
+    beta: Weight = 0.1
+    """β, weight of the KL divergence of z from its prior (Eq. 2)."""
+    decoder_std: Annotated[float, Field(gt=0, le=1000)] = 0.1
     """Standard deviation of p(r | s, a, z), in standard deviations of the reward.
 
     A disturbance below β × decoder_std² of the reward's variance is not abduced. The default is the
@@ -46,14 +53,17 @@ class CRMConfig:
     """
     mean_first: bool = True
     """Learn E[r | s, a] by regression, freeze it, train the CVAE on top; false: Eq. 2 alone."""
-    learning_rate: float = 3e-4
-    weight_decay: float = 1e-4
-    batch_size: int = 256
-    epochs: int = 40
-    """Of the regression and of the CVAE, at most."""
-    patience: int = 5
-    """Epochs without a better held-out value before stopping early."""
-    max_transitions: int = 200_000
+    learning_rate: LearningRate = 3e-4
+    """Step size of the updates."""
+    weight_decay: WeightDecay = 1e-4
+    """AdamW's pull of the weights towards 0."""
+    batch_size: BatchSize = 256
+    """Transitions of an update."""
+    epochs: Annotated[int, Field(ge=1, le=100_000)] = 40
+    """Passes over the transitions, of the regression and of the CVAE each, at most."""
+    patience: Annotated[int, Field(ge=0, le=100_000)] = 5
+    """Epochs without a better held-out value before stopping early; 0 never stops early."""
+    max_transitions: Annotated[int, Field(ge=100, le=10**9)] = 200_000
     """Most transitions to train on; of more, that many are drawn."""
 
 
@@ -202,6 +212,7 @@ def mlp(inputs: int, hidden: int, layers: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(*blocks, nn.Linear(hidden, outputs))
 
 
+@random_state_kept()
 def fit_crm(
     train: Transitions, validation: Transitions, config: CRMConfig, folder: Path, seed: int
 ) -> tuple[CausalRewardModel, CRMReport]:
@@ -319,6 +330,21 @@ def _report(model: CausalRewardModel, n_train: int, held_out: Transitions) -> CR
         delta={f"{level:g}": float(errors.quantile(level)) for level in _QUANTILES},
     )
     return replace(report, warning=_warning(report))
+
+
+def fit_warning(r2_without_z: float) -> str:
+    """What to say of a reward model that predicts nothing; empty of one that does.
+
+    Args:
+        r2_without_z: `CRMReport.r2_without_z`.
+    """
+    if r2_without_z > _PREDICTS_NOTHING:
+        return ""
+    return (
+        f"the reward model predicts nothing: from state and action its R² on held-out steps is "
+        f"{r2_without_z:.2f} (0 is what the mean reward alone reaches), so an edit that keeps its "
+        "prediction may still change the true reward"
+    )
 
 
 def _warning(report: CRMReport) -> str:

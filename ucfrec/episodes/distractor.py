@@ -1,4 +1,5 @@
-"""A bit that goes with the reward under the logging policy and causes nothing (Appendix G.4)."""
+"""A distractor: a bit that is correlated with the reward in the logs and causes nothing (Appendix
+G.4)."""
 
 import hashlib
 import shutil
@@ -20,25 +21,31 @@ def reward_bit(
 ) -> npt.NDArray[np.float32]:
     """d_t = I{r_t high} ⊕ Bernoulli(flip) of every step, (n_steps,) in the order of `all_steps`.
 
-    High is above the median of all rewards or, where nothing is, as of clicks that are the rule,
-    not below it. The paper's deterministic distractor has `flip` 0, its stochastic one 0.15.
+    A reward is high if it is above the median of all rewards; where the median is the largest
+    reward (more than half of all steps are clicks), if it is the median. The paper's deterministic
+    distractor has `flip` 0, its stochastic one 0.15.
 
     Args:
+        store: a store or a view of it.
+        flip: probability that a bit is wrong, in [0, 1].
+        seed: of the wrong bits.
         early: reveal the bit one step early, d_t = I{r_{t+1} high}; the last step of an episode has
-            no next reward and tells its own.
+            no next reward and reveals its own.
 
     Raises:
         InputError: `flip` is no probability, or all rewards are equal.
     """
     if not 0 <= flip <= 1:
-        raise InputError(f"the bit's chance of being wrong is {flip}; it lies in [0, 1]")
+        raise InputError(f"the probability of a wrong bit is {flip}; a probability lies in [0, 1]")
     episodes, steps = store.all_steps()
     rewards = store.step_values(schema.REWARD, episodes, steps)
     if rewards.min() == rewards.max():
-        raise InputError(f"all rewards of {store.path} are {rewards[0]:g}; no bit can go with them")
+        raise InputError(
+            f"all rewards of {store.path} are {rewards[0]:g}; no bit can be correlated with them"
+        )
     median = np.median(rewards)
-    told = np.minimum(steps + 1, store.lengths[episodes] - 1) if early else steps
-    shown = store.step_values(schema.REWARD, episodes, told)
+    revealed = np.minimum(steps + 1, store.lengths[episodes] - 1) if early else steps
+    shown = store.step_values(schema.REWARD, episodes, revealed)
     high = shown > median if median < rewards.max() else shown >= median
     wrong = np.random.default_rng(seed).random(len(rewards)) < flip
     return np.asarray(high ^ wrong, dtype=np.float32)
@@ -53,9 +60,10 @@ def with_observations(
     """Write `store` with other observations; every other file stays as it is.
 
     Args:
-        store: all of a store, no view of it.
+        store: a whole store, not a view of some episodes.
+        out: folder of the new store.
         observations: (n_steps, O) in the order of `all_steps`.
-        source: joins what the store says it was made from.
+        source: added to the store's record of what it was made from.
 
     Raises:
         InputError: `out` exists.

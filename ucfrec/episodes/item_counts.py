@@ -17,13 +17,14 @@ normalised watch ratio of the published dominance; a click counts too."""
 
 @dataclass(frozen=True)
 class TrainingCounts:
-    """What novelty and dominance know of the training log, in the order of the store's items."""
+    """Counts in the training log, which novelty and dominance use; items in the store's order."""
 
     shown: Tensor
     """(n_items,) int64 training steps of each item."""
     liked: Tensor
     """(n_items,) int64 those of them that were positive."""
     episodes: int
+    """Training episodes."""
 
     @classmethod
     def of(cls, train: EpisodeStore) -> "TrainingCounts":

@@ -1,19 +1,21 @@
 """Returns-to-go: one definition for training windows and for acting."""
 
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from torch import Tensor
 
-ArrayOrTensor = TypeVar("ArrayOrTensor", npt.NDArray[np.float64], Tensor)
+if TYPE_CHECKING:
+    from torch import Tensor
+
+ArrayOrTensor = TypeVar("ArrayOrTensor", npt.NDArray[np.float64], "Tensor")
 
 
 def remaining_return(total: ArrayOrTensor, earned: ArrayOrTensor) -> ArrayOrTensor:
     """What is left of `total` once `earned` has been collected (undiscounted, γ = 1).
 
     In training, `total` is the episode's return; when acting, it is the target return. Both have
-    the same shape; `earned` sums the rewards strictly before the step.
+    the same shape, any; `earned` sums the rewards strictly before the step.
     """
     return total - earned
 

@@ -20,12 +20,12 @@ IntArray = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class ItemStates:
-    """How states are made of items shown, rewards earned and what is known of the user.
+    """How states are made of items shown, rewards earned and features of the user.
 
     A state of size S = 3D + 2 + F + O holds, in this order: the recency-weighted mean embedding of
     the last `window` items shown (D), the same weighted by reward as well (D), the last item's
     embedding (D), the last reward scaled to [0, 1] (1), log(1 + step) (1), user features (F) and
-    the logged observation (O), where there are any.
+    the logged observation (O), where it has any numbers.
     """
 
     embeddings: Tensor
@@ -33,16 +33,16 @@ class ItemStates:
     user_features: Tensor
     """(n_users, F), standardised; F is 0 where none were given."""
     reward_low: float
-    """Reward that counts as no liking at all."""
+    """Reward that is scaled to 0, as are lower ones."""
     reward_high: float
-    """Reward that counts as full liking."""
+    """Reward that is scaled to 1, as are higher ones."""
     window: int = 10
     decay: float = 0.8
 
     def __post_init__(self) -> None:
         if not self.reward_low < self.reward_high:
             raise InputError(
-                f"rewards from {self.reward_low:g} to {self.reward_high:g} tell no liking apart; "
+                f"rewards from {self.reward_low:g} to {self.reward_high:g} have no scale; "
                 "reward_low must be below reward_high"
             )
         # Row −1 stands for "no item" and "unknown user": all zeros.
@@ -71,12 +71,12 @@ class ItemStates:
         """
         table: Tensor = self._items  # type: ignore[attr-defined]
         liking = ((rewards - self.reward_low) / (self.reward_high - self.reward_low)).clamp(0, 1)
-        there = (items >= 0).float()
+        valid = (items >= 0).float()
         shown = torch.zeros(*items.shape[:-1], table.shape[1])
-        liked, shown_weight, liked_weight = shown.clone(), there[..., 0] * 0, there[..., 0] * 0
+        liked, shown_weight, liked_weight = shown.clone(), valid[..., 0] * 0, valid[..., 0] * 0
         for back in range(self.window):
             embedding = table[items[..., back]]
-            weight = there[..., back] * self.decay**back
+            weight = valid[..., back] * self.decay**back
             shown = shown + weight.unsqueeze(-1) * embedding
             shown_weight = shown_weight + weight
             weight = weight * liking[..., back]
@@ -87,7 +87,7 @@ class ItemStates:
                 shown / shown_weight.clamp(min=1e-6).unsqueeze(-1),
                 liked / liked_weight.clamp(min=1e-6).unsqueeze(-1),
                 table[items[..., 0]],
-                (liking[..., 0] * there[..., 0]).unsqueeze(-1),
+                (liking[..., 0] * valid[..., 0]).unsqueeze(-1),
                 torch.log1p(steps.float()).unsqueeze(-1),
                 self._users[users],  # type: ignore[attr-defined]
                 observations,

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from ucfrec import schema
 from ucfrec.episodes.returns import returns_to_go
 from ucfrec.errors import InputError
-from ucfrec.files import write_json
+from ucfrec.files import atomic_folder, write_json
 
 Array = npt.NDArray[Any]
 BoolArray = npt.NDArray[np.bool_]
@@ -63,13 +63,7 @@ class StoreWriter:
         for name, values in (*steps.items(), *episodes.items()):
             if len(values) != len(first):
                 raise InputError(f"column {name!r} has {len(values)} steps instead of {len(first)}")
-        rewards = np.asarray(steps[schema.REWARD], dtype=schema.STEP_DTYPES[schema.REWARD])
-        strange = int(np.count_nonzero(~np.isfinite(rewards)))
-        if strange:  # suffix sums would carry it into every return of the shard
-            raise InputError(
-                f"{strange} of {len(first)} rewards are not finite; drop those rows or mend the "
-                "reward expression"
-            )
+        require_finite(steps[schema.REWARD])
         if len(first) == 0:
             return
         if self._n_steps == 0 and not first[0]:
@@ -77,10 +71,10 @@ class StoreWriter:
         starts, begin = np.flatnonzero(first), 0
         while True:
             full = begin + self._shard_steps - self._steps_in_shard
-            following = int(np.searchsorted(starts, full))
-            if following == len(starts):
+            next_start = int(np.searchsorted(starts, full))
+            if next_start == len(starts):
                 break
-            cut = int(starts[following])
+            cut = int(starts[next_start])
             self._append(*_rows(steps, first, episodes, slice(begin, cut)))
             self._close_shard()
             begin = cut
@@ -175,6 +169,53 @@ class StoreWriter:
         }
         write_json(self._folder / "meta.json", meta)
         return meta
+
+
+def write_arrays(
+    path: Path,
+    steps: Mapping[str, Array],
+    lengths: npt.NDArray[np.int64],
+    episodes: Mapping[str, Array],
+    reward: str,
+    source: Mapping[str, Any],
+    shard_steps: int,
+) -> None:
+    """See `EpisodeStore.write`."""
+    lengths = require_steps(path, lengths)
+    first = np.zeros(int(np.sum(lengths)), dtype=bool)
+    first[np.cumsum(lengths) - lengths] = True
+    with atomic_folder(path) as scratch:
+        writer = StoreWriter(scratch, shard_steps)
+        writer.append(steps, first, {k: np.repeat(v, lengths) for k, v in episodes.items()})
+        writer.finish(reward=reward, source=source)
+
+
+def require_steps(path: Path | str, lengths: Array) -> npt.NDArray[np.int64]:
+    """The lengths (E,) of episodes, if each has a step.
+
+    Raises:
+        InputError: one has none.
+    """
+    lengths = np.asarray(lengths)
+    if np.any(lengths < 1):
+        raise InputError(f"{path}: an episode without steps cannot be stored; leave it out")
+    return lengths
+
+
+def require_finite(rewards: Array) -> None:
+    """Refuse rewards (N,) that suffix sums would carry into every return of a shard.
+
+    Raises:
+        InputError: some are NaN or infinite, also once they are float32.
+    """
+    with np.errstate(over="ignore"):
+        stored = np.asarray(rewards, dtype=schema.STEP_DTYPES[schema.REWARD])
+    strange = int(np.count_nonzero(~np.isfinite(stored)))
+    if strange:
+        raise InputError(
+            f"{strange} of {len(stored)} rewards are not finite; drop those rows or mend the "
+            "reward expression"
+        )
 
 
 def _rows(

@@ -15,6 +15,7 @@ from gymnasium.vector import VectorEnv
 from ucfrec.acting.rollout import Actor, Episodes, Step, rollout
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder, write_json
+from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.plugins import Simulator
 from ucfrec.schema import ACTION, ITEM_ID, OBSERVATION, PROPENSITY, SESSION_ID, TIMESTAMP, USER_ID
 
@@ -42,6 +43,7 @@ def world_items(env: VectorEnv[Any, Any, Any]) -> npt.NDArray[np.int64]:
     return np.arange(int(env.single_action_space.n))
 
 
+@random_state_kept()
 def collect(
     simulator: Simulator,
     env: VectorEnv[Any, Any, Any],

@@ -2,8 +2,7 @@
 
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,8 @@ from ucfrec.evaluation.collect import world_items
 from ucfrec.evaluation.diversity import Recommended
 from ucfrec.evaluation.diversity_columns import COLUMNS, variety_columns
 from ucfrec.evaluation.metrics import session_metrics
-from ucfrec.plugins import Simulator, load_plugin
+from ucfrec.evaluation.world import World
+from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -25,19 +25,7 @@ SIDE_BY_SIDE = 512
 """Most episodes played at once."""
 
 
-@dataclass(frozen=True)
-class World:
-    """A simulator by name, with where its weights are."""
-
-    name: str
-    folder: Path | None = None
-
-    def simulator(self) -> Simulator:
-        """Load the simulator that the name stands for."""
-        simulator: Simulator = load_plugin("simulators", self.name)
-        return simulator
-
-
+@random_state_kept()
 def evaluate_behavior(world: World, behavior: str, episodes: int, seed: int) -> dict[str, Any]:
     """One result row for a built-in policy of a world (`random`, `optimal`, …).
 
@@ -53,6 +41,7 @@ def evaluate_behavior(world: World, behavior: str, episodes: int, seed: int) -> 
     return _row(world, behavior, env, actor, episodes, seed)
 
 
+@random_state_kept()
 def evaluate_policy(
     world: World,
     trained: TrainedPolicy,
@@ -61,7 +50,7 @@ def evaluate_policy(
     seed: int,
     target_return: float,
 ) -> dict[str, Any]:
-    """One result row for a trained policy asked for `target_return` in every episode.
+    """One result row for a trained policy with `target_return` in every episode.
 
     Raises:
         InputError: the policy's actions or observations are not this world's.

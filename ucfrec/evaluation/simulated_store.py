@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from ucfrec.evaluation.collect import collect
-from ucfrec.evaluation.evaluate import World
+from ucfrec.evaluation.world import World
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.schema import ITEM_ID, SESSION_ID
@@ -12,7 +12,7 @@ from ucfrec.schema import ITEM_ID, SESSION_ID
 def simulated_store(
     world: World, folder: Path, sessions: int, seed: int, behavior: str = "mixture"
 ) -> Path:
-    """Logs of a behavior policy in `folder/logs` and their store in `folder/store`, unless there.
+    """Play a behavior policy into `folder/logs`, prepare `folder/store`; what exists is kept.
 
     Returns:
         The store.

@@ -1,4 +1,4 @@
-"""The training loop: the only one. Reward model, generator and every policy pass through it."""
+"""The one training loop, of reward model, generator and every policy."""
 
 import math
 import time
@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import (
@@ -21,31 +21,39 @@ from ucfrec.fitting.checkpoint import (
     save_tensors,
     save_training,
 )
-from ucfrec.fitting.tensorboard import Events
+from ucfrec.fitting.metrics_log import MetricsLog
+from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.progress import Progress, progress
+from ucfrec.settings import BatchSize, Count, LearningRate, WeightDecay, settings_table
 
 Batch = TypeVar("Batch")
 
 
-@dataclass(frozen=True)
+@settings_table("train")
 class LoopConfig:
     """How long and how fast to learn.
 
     Policy defaults are the paper's Table 8; `steps` and the rest are ours.
     """
 
-    steps: int = 10_000
-    batch_size: int = 64
-    learning_rate: float = 1e-4
-    weight_decay: float = 1e-4
-    warmup_steps: int = 500
-    """Linear warm-up, then constant or along a cosine."""
+    steps: Count = 10_000
+    """Updates in all."""
+    batch_size: BatchSize = 64
+    """Windows of an update."""
+    learning_rate: LearningRate = 1e-4
+    """Step size of the updates, once warm."""
+    weight_decay: WeightDecay = 1e-4
+    """AdamW's pull of the weights towards 0."""
+    warmup_steps: Annotated[int, Field(ge=0, le=10**12)] = 500
+    """Steps in which the learning rate rises linearly; then it stays, or falls along a cosine. A
+    training of fewer steps ends before it has risen."""
     cosine: bool = False
     """After the warm-up, fall to 0 at the last step instead of staying constant."""
-    clip_norm: float = 0.25
+    clip_norm: Annotated[float, Field(ge=0, le=1e6)] = 0.25
     """Largest gradient norm; 0 clips nothing."""
-    validate_every: int = 500
+    validate_every: Count = 500
     """Steps between validations, checkpoints and log lines."""
-    patience: int = 0
+    patience: Annotated[int, Field(ge=0, le=10**9)] = 0
     """Validations without a better one before stopping early; 0 never stops early."""
 
 
@@ -63,11 +71,12 @@ class Fit:
 def step_generator(seed: int, step: int) -> np.random.Generator:
     """The generator from which everything random of one training step is drawn.
 
-    Step i needs no history: a run resumed at i draws what an uninterrupted one would have.
+    Step i needs no history: a run resumed at i draws the same as an uninterrupted one.
     """
     return np.random.default_rng([seed, step])
 
 
+@random_state_kept()
 def fit(
     module: nn.Module,
     draw: Callable[[np.random.Generator], Batch],
@@ -82,9 +91,10 @@ def fit(
     """Minimise `loss` over batches from `draw`, resuming from `folder` if it holds a checkpoint.
 
     Writes `last.safetensors` (all that resuming needs), `best.safetensors` (weights with the lowest
-    validation loss; the last weights without validation) and TensorBoard events to `folder`. A run
-    killed at any moment and started again ends with the same weights as one left alone (same
-    machine and device).
+    validation loss; the last weights without validation), `metrics.jsonl` and TensorBoard events to
+    `folder`. A run killed at any moment and started again ends with the same weights as an
+    uninterrupted one (same machine and device). The global random state is as before when it
+    returns or raises.
 
     Args:
         module: what is trained, in place; holds the best weights on return.
@@ -102,10 +112,8 @@ def fit(
     if last.exists():
         counters.update(load_training(last, module, optimizer))
     step = int(counters["step"])
-    clock, events = _Clock(step, counters["seconds"]), Events(folder, step)
-    bar = tqdm(total=config.steps, initial=step, desc=describe, unit="step", disable=None)
-    while step < config.steps and not 0 < config.patience <= counters["stale"]:
-        step += 1
+    clock, log = _Clock(step, counters["seconds"]), MetricsLog(folder, step)
+    for step, shown in _steps(counters, config, describe):
         generator = step_generator(seed, step)
         with clock.waiting():
             batch = draw(generator)
@@ -113,7 +121,6 @@ def fit(
         module.train()
         value, scalars = loss(batch)
         norm = _descend(value, module, optimizer, config, step)
-        bar.update()
         if step % config.validate_every and step != config.steps:
             continue
 
@@ -126,17 +133,28 @@ def fit(
             save_tensors(best, module.state_dict(), {"step": step})
         else:
             logged["validation_loss"] = _keep_best(module, validate, counters, step, best, describe)
-        events.add(step, logged)
-        bar.set_postfix(loss=f"{logged['loss']:.4g}")
+        log.add(step, logged)
+        shown.update(0, loss=logged["loss"])
         counters |= {"step": step, "seconds": clock.total()}
         save_training(last, module, optimizer, counters)
         clock.restart(step)
-    bar.close()
-    events.close()
+    log.close()
     load_weights(best, module, load_tensors(best)[0])
     module.eval()
     best_validation = math.nan if validate is None else counters["best_validation"]
     return Fit(step, int(counters["best_step"]), best_validation, counters["seconds"])
+
+
+def _steps(
+    counters: Mapping[str, float], config: LoopConfig, describe: str
+) -> Iterator[tuple[int, Progress]]:
+    """Number the steps that are left until the end or an early stop, and show how fast they go."""
+    step = int(counters["step"])
+    with progress(config.steps, describe, "steps", step) as shown:
+        while step < config.steps and not 0 < config.patience <= counters["stale"]:
+            step += 1
+            yield step, shown
+            shown.update()
 
 
 def _optimizer(module: nn.Module, config: LoopConfig) -> torch.optim.Optimizer:
@@ -218,7 +236,7 @@ def _keep_best(
     best: Path,
     describe: str,
 ) -> float:
-    """The validation loss; the weights are saved and the counters told if it is the lowest yet."""
+    """Return the validation loss; if it is the lowest yet, save the weights and count from here."""
     module.eval()
     with torch.no_grad():
         loss = validate()

@@ -1,7 +1,8 @@
 """Logs to episodes: files, mapping, cleaning, sessions, embeddings, store."""
 
+from ucfrec.logs.histories import read_histories
 from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping
-from ucfrec.logs.prepare import PrepareOptions, prepare, read_histories, validate
+from ucfrec.logs.prepare import PrepareOptions, prepare, validate
 
 __all__ = [
     "Dataset",

@@ -1,4 +1,4 @@
-"""The SQL that reads, judges and de-duplicates log rows: shared by `prepare` and `recommend`."""
+"""The SQL that reads, checks and de-duplicates log rows: shared by `prepare` and `recommend`."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -50,37 +50,56 @@ def engine(memory_limit: str, folder: Path) -> Iterator[duckdb.DuckDBPyConnectio
         folder: where it keeps its files until the end.
 
     Raises:
-        InputError: the limit is none.
+        InputError: the limit is not a size.
     """
     with TemporaryDirectory(prefix=".ucfrec-", dir=folder) as work:
         connection = duckdb.connect(str(Path(work) / "rows.duckdb"))
         try:
             connection.execute(f"SET temp_directory = '{work}/spill'")
-            connection.execute("SET enable_progress_bar = false")
-            connection.execute("SET error_on_division_by_zero = false")
             try:
                 connection.execute("SET memory_limit = ?", [memory_limit])
             except duckdb.Error:
                 raise InputError(f"memory_limit {memory_limit!r}: write e.g. 2GB") from None
-            # SQL's own least(x, 5) is 5 where x is NULL, NaN or infinite: a video of unknown length
-            # would count as watched five times. Undefined parts make a reward undefined instead.
-            for name, sign in (("least", "<"), ("greatest", ">")):
-                connection.execute(
-                    f"CREATE TEMP MACRO {name}(a, b) AS CASE WHEN isfinite(a::DOUBLE) AND "
-                    f"isfinite(b::DOUBLE) THEN CASE WHEN a {sign} b THEN a ELSE b END END, "
-                    f"(a, b, c) AS {name}({name}(a, b), c)"
-                )
+            _settle(connection)
             yield connection
         finally:
             connection.close()
 
 
+@contextmanager
+def engine_in_memory() -> Iterator[duckdb.DuckDBPyConnection]:
+    """A DuckDB that never touches the disk."""
+    connection = duckdb.connect(":memory:", config={"temp_directory": ""})
+    try:
+        _settle(connection)
+        yield connection
+    finally:
+        connection.close()
+
+
+def _settle(connection: duckdb.DuckDBPyConnection) -> None:
+    """What expressions mean, the same in every engine and on every machine."""
+    connection.execute("SET enable_progress_bar = false")
+    connection.execute("SET error_on_division_by_zero = false")
+    # Times with a zone are cast to times without one in this zone.
+    connection.execute("SET TimeZone = 'UTC'")
+    # SQL's own least(x, 5) is 5 where x is NULL, NaN or infinite: a video of unknown length
+    # would count as watched five times. Undefined parts make a reward undefined instead.
+    for name, sign in (("least", "<"), ("greatest", ">")):
+        connection.execute(
+            f"CREATE TEMP MACRO {name}(a, b) AS CASE WHEN isfinite(a::DOUBLE) AND "
+            f"isfinite(b::DOUBLE) THEN CASE WHEN a {sign} b THEN a ELSE b END END, "
+            f"(a, b, c) AS {name}({name}(a, b), c)"
+        )
+
+
 @dataclass(frozen=True)
 class CleanLog:
-    """A log whose rows lie judged in the table `rows` of `connection`, in file order.
+    """A log whose rows lie checked in the table `rows` of `connection`, in file order.
 
-    `rows` has the log columns of `columns`, `reward`, `row` (its place in the files) and `reason`,
-    NULL for rows to keep. Those kept are the view `clean`.
+    `rows` has the log columns of `columns`, `reward`, `row` (its place in the files), `reason`
+    (why the row is dropped, NULL for rows to keep) and `conflict` (of duplicates: their reward is
+    another than that of the row kept). The rows kept are the view `clean`.
     """
 
     connection: duckdb.DuckDBPyConnection
@@ -121,22 +140,35 @@ def read_log(
     known_items: Path | None,
     folder: Path,
 ) -> CleanLog:
-    """Read and judge every row of `files`.
+    """Read and check every row of `files`.
 
     Of rows that repeat a key (user, item or action, time) the one with the highest reward is kept
-    (feedback that came late adds to an impression), ties broken by the other columns: whatever
-    the order of rows and files, the same.
+    (feedback that came late adds to an impression), ties broken by the other columns, so that the
+    order of rows and files does not matter.
 
     Args:
         reward: scalar SQL expression over the files' columns.
         session_by: "session_id", "gap" or "user"; None for session_id where there is one, or gap.
-        known_items: a store's `items.parquet`, where other items are of no use.
+        known_items: a store's `items.parquet`, whose items alone are kept.
         folder: named when its disk is full.
 
     Raises:
-        InputError: anything of the files, columns or types that makes the log unusable.
+        InputError: a file, column or type makes the log unusable.
     """
     tables = tuple(open_tables(connection, files))
+    return judge_rows(connection, tables, mapping, reward, session_by, known_items, folder)
+
+
+def judge_rows(
+    connection: duckdb.DuckDBPyConnection,
+    tables: tuple[Table, ...],
+    mapping: LogMapping,
+    reward: str,
+    session_by: str | None,
+    known_items: Path | None,
+    folder: Path,
+) -> CleanLog:
+    """`read_log` of tables that are open already."""
     columns = _present(tables, mapping, session_by)
     selects = [_select(connection, table, mapping, columns, reward) for table in tables]
     with explained(connection, tables, folder):
@@ -153,27 +185,30 @@ def read_log(
         sizes = _vector_sizes(connection, columns)
         by = session_by or (schema.SESSION_ID if schema.SESSION_ID in columns else "gap")
         log = CleanLog(connection, tables, columns, sizes, by)
-        connection.execute(_judge(log, known_items))
+        connection.execute(_checked(log, known_items))
         connection.execute("DROP TABLE read")
-        connection.execute("CREATE VIEW clean AS SELECT * FROM rows WHERE reason IS NULL")
+        connection.execute(
+            "CREATE VIEW clean AS SELECT * EXCLUDE (reason, conflict) FROM rows "
+            "WHERE reason IS NULL"
+        )
     return log
 
 
 def _present(
     tables: Sequence[Table], mapping: LogMapping, session_by: str | None
 ) -> tuple[str, ...]:
-    """Log columns that the files have; required ones count as there, so that binding says more."""
+    """Log columns of the files; required ones are always listed, binding explains a missing one."""
     named = {name: value for name, value in mapping.columns.items() if value}
     switched_off = mapping.columns.keys() - named.keys()
     everywhere = set.intersection(*({c.casefold() for c in t.columns} for t in tables))
-    there = (set(named) | everywhere) - switched_off
+    present = (set(named) | everywhere) - switched_off
     if session_by == schema.SESSION_ID:
-        there.add(session_by)
-    if schema.ACTION in named or (schema.ACTION in there and schema.ITEM_ID not in there):
+        present.add(session_by)
+    if schema.ACTION in named or (schema.ACTION in present and schema.ITEM_ID not in present):
         key = schema.ACTION
     else:
         key = schema.ITEM_ID
-    optional = (name for name in OPTIONAL_COLUMNS if name in there)
+    optional = (name for name in OPTIONAL_COLUMNS if name in present)
     return (schema.USER_ID, key, schema.TIMESTAMP, *optional)
 
 
@@ -252,15 +287,15 @@ def _vector_sizes(
             "GROUP BY size ORDER BY n DESC, size LIMIT 4"
         ).fetchall()
         if len(counts) > 1:
-            told = ", ".join(f"{n} rows of {size}" for size, n in counts)
-            raise InputError(f"{name} has lists of unequal length: {told}; make them equal")
+            lengths = ", ".join(f"{n} rows of {size}" for size, n in counts)
+            raise InputError(f"{name} has lists of unequal length: {lengths}; make them equal")
         if not counts or counts[0][0] == 0:
             raise InputError(f"{name} has no values in any row; map another column or none")
         sizes[name] = int(counts[0][0])
     return sizes
 
 
-def _judge(log: CleanLog, known_items: Path | None) -> str:
+def _checked(log: CleanLog, known_items: Path | None) -> str:
     keys = [schema.USER_ID, log.key, schema.TIMESTAMP]
     keys += [schema.SESSION_ID] if log.session_by == schema.SESSION_ID else []
     missing = " OR ".join(f"{k} IS NULL" for k in keys if k != schema.ACTION)
@@ -287,15 +322,18 @@ def _judge(log: CleanLog, known_items: Path | None) -> str:
             coalesce(abs({schema.REWARD}) <= {MAX_FLOAT}, false) AS good
             FROM read
         ), ranked AS (
-            SELECT *, row_number() OVER (
+            SELECT *, row_number() OVER w AS rank,
+                first_value({schema.REWARD}) OVER w AS kept_reward
+            FROM faults WINDOW w AS (
                 PARTITION BY fault, {schema.USER_ID}, {log.key}, {schema.TIMESTAMP}
                 ORDER BY {order}
-            ) AS rank FROM faults
+            )
         )
-        SELECT * EXCLUDE (fault, good, rank), CASE
+        SELECT * EXCLUDE (fault, good, rank, kept_reward), CASE
             WHEN fault IS NOT NULL THEN fault
             WHEN rank > 1 THEN 'duplicate'
             WHEN NOT good THEN 'reward_not_finite'
-        END AS reason
+        END AS reason,
+        fault IS NULL AND {schema.REWARD} IS DISTINCT FROM kept_reward AS conflict
         FROM ranked
     """

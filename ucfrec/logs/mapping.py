@@ -51,9 +51,9 @@ class LogMapping:
     is not named here has its own name in the file; "" says that the log has no such column. Times
     are milliseconds, or dates and timestamps (UTC)."""
     reward: str | None = None
-    """Reward unless another is asked for."""
+    """Reward unless `PrepareOptions` names another."""
     session_by: str | None = None
-    """How the rows fall into sessions unless told otherwise: "session_id", "gap" or "user"."""
+    """How rows make sessions, unless `PrepareOptions` says: "session_id", "gap" or "user"."""
     item_features: tuple[FeatureTable, ...] = ()
     user_features: tuple[FeatureTable, ...] = ()
 
@@ -64,7 +64,7 @@ class LogMapping:
                 raise InputError(f"{name!r} is no log column; those are {', '.join(known)}")
 
     def over(self, defaults: "LogMapping") -> "LogMapping":
-        """This mapping, with `defaults` wherever it says nothing."""
+        """This mapping, with the fields of `defaults` where it leaves them empty."""
         return LogMapping(
             {**defaults.columns, **self.columns},
             self.reward or defaults.reward,
@@ -81,7 +81,7 @@ class Dataset:
     summary: str
     """One line for `--help`."""
     resolve: Callable[[Sequence[str | Path], LogMapping], tuple[tuple[Path, ...], LogMapping]]
-    """(files, folders and globs, what the user says of them) to (log files, full mapping)."""
+    """(files, folders and globs, the user's own mapping) to (log files, full mapping)."""
 
 
 def columns_given(assignments: Sequence[str]) -> dict[str, str]:
@@ -117,7 +117,7 @@ def read_mapping(path: Path) -> LogMapping:
         columns = ["ln(1 + price)", "string_split(tags, '|')"]
 
     Raises:
-        InputError: the file is missing, is not TOML, or says something unknown.
+        InputError: the file is missing, is not TOML, or has an unknown field.
     """
     try:
         given: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))

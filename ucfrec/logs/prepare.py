@@ -1,6 +1,6 @@
 """Logs to episodes: Parquet and CSV files, cleaned, cut into sessions, written as a store.
 
-One SQL pipeline on an embedded DuckDB, out of core: rows are read and judged (`clean`), fall
+One SQL pipeline on an embedded DuckDB, out of core: rows are read and checked (`clean`), fall
 into sessions, and stream sorted into the store.
 """
 
@@ -18,14 +18,12 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from ucfrec import schema
-from ucfrec.episodes.store import ITEM_STATES
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder
 from ucfrec.logs.binding import explained, text
 from ucfrec.logs.clean import CleanLog, engine, read_log
-from ucfrec.logs.features import encode_features, load_features
-from ucfrec.logs.items import write_item_states
+from ucfrec.logs.feature_tables import load_features
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.sessions import (
     EPISODE_USERS,
@@ -41,6 +39,7 @@ from ucfrec.logs.sessions import (
     split_bounds,
 )
 from ucfrec.logs.summary import build_report, drop_counts, require_variety
+from ucfrec.progress import progress
 
 BATCH_ROWS: Final = 2**17
 
@@ -147,13 +146,13 @@ def prepare(
             explained(log.connection, log.tables, out.parent),
         ):
             writer = StoreWriter(folder)
-            for batch in log.connection.sql(ordered_steps(log)).to_arrow_reader(BATCH_ROWS):
-                _append(writer, batch, log)
+            with progress(report["steps"], "write the store", "steps") as bar:
+                for batch in log.connection.sql(ordered_steps(log)).to_arrow_reader(BATCH_ROWS):
+                    _append(writer, batch, log)
+                    bar.update(len(batch))
             writer.finish(report["reward"], report, _write_ids(log, folder))
-            if log.key == schema.ITEM_ID and like is None:
-                _learn_states(log, folder, features, options.embedding_size)
-            elif log.key == schema.ITEM_ID and like is not None:
-                shutil.copy(like / ITEM_STATES, folder / ITEM_STATES)
+            if log.key == schema.ITEM_ID:
+                _write_states(log, folder, features, options.embedding_size, like)
             if like is not None:
                 _copy(log, episode_users(), folder / EPISODE_USERS)
     return report
@@ -176,57 +175,6 @@ def validate(
         return report
 
 
-def read_histories(
-    paths: Sequence[str | Path],
-    mapping: LogMapping,
-    reward: str,
-    last: int,
-    memory_limit: str = "2GB",
-) -> Iterator[pa.RecordBatch]:
-    """What each user of a log was shown, cleaned as `prepare` cleans it.
-
-    Args:
-        paths: log files, folders and globs.
-        reward: scalar SQL expression over their columns.
-        last: how many of each user's most recent rows to give.
-
-    Yields:
-        Batches of users in sorted order: `user_id`; `item_ids`, `rewards` (float32) and
-        `timestamps` (ms), lists of at most `last`, the most recent last; `seen`, all of the user's
-        item_ids, sorted; and, where it is logged, the most recent `observation`.
-
-    Raises:
-        InputError: the input cannot be used.
-    """
-    folder = Path(gettempdir())
-    with engine(memory_limit, folder) as connection:
-        log = read_log(connection, log_files(paths), mapping, reward, "user", None, folder)
-        if log.key != schema.ITEM_ID:
-            raise InputError(f"{log.tables[0].files[0]}: its actions are vectors, not items")
-        drop_counts(log)
-        order = f"ORDER BY {schema.TIMESTAMP}, {schema.ITEM_ID}"
-        lists = ", ".join(
-            f"list({value} {order}) FILTER (WHERE back <= {last}) AS {name}"
-            for name, value in (
-                ("item_ids", schema.ITEM_ID),
-                ("rewards", f"CAST({schema.REWARD} AS FLOAT)"),
-                ("timestamps", schema.TIMESTAMP),
-            )
-        )
-        if schema.OBSERVATION in log.columns:
-            lists += f", any_value({schema.OBSERVATION}) FILTER (WHERE back = 1) AS observation"
-        backwards = f"{schema.TIMESTAMP} DESC, {schema.ITEM_ID} DESC"
-        query = f"""
-            SELECT {schema.USER_ID}, {lists}, list_sort(list(DISTINCT {schema.ITEM_ID})) AS seen
-            FROM (SELECT *, row_number() OVER (
-                PARTITION BY {schema.USER_ID} ORDER BY {backwards}
-            ) AS back FROM clean)
-            GROUP BY {schema.USER_ID} ORDER BY {schema.USER_ID}
-        """
-        with explained(connection, log.tables, folder):
-            yield from connection.sql(query).to_arrow_reader(BATCH_ROWS)
-
-
 Features = dict[str, list[str]]
 """By id column, the DuckDB tables that hold features."""
 
@@ -245,25 +193,30 @@ def _episodes(
     session_by = options.session_by or mapping.session_by
     known = None if like is None or keep_unknown else like / ITEMS_FILE
     with engine(options.memory_limit, spill) as connection:
-        log = read_log(connection, files, mapping, reward, session_by, known, spill)
-        with explained(connection, log.tables, spill):
-            dropped = drop_counts(log)
-            if like is None:
-                require_variety(log)
-            bounds = split_bounds(log, options.split if like is None else (1.0, 0.0, 0.0))
-            gap_ms = round(options.gap_minutes * 60_000)
-            cut = Cut(log.session_by, gap_ms, options.min_steps, bounds)
-            cut_episodes(log, cut)
-            features = {
-                name: load_features(connection, tables, name, log.id_type(name))
-                for name, tables in (
-                    (schema.USER_ID, mapping.user_features),
-                    (schema.ITEM_ID, mapping.item_features),
-                )
-                if name in log.columns and like is None
-            }
-            number_ids(log, features, like)
-            report = {"reward": reward, **build_report(log, cut, dropped)}
+        with progress(4, "check the logs", "stages") as stage:
+            log = read_log(connection, files, mapping, reward, session_by, known, spill)
+            stage.update()
+            with explained(connection, log.tables, spill):
+                dropped = drop_counts(log)
+                if like is None:
+                    require_variety(log)
+                bounds = split_bounds(log, options.split if like is None else (1.0, 0.0, 0.0))
+                gap_ms = round(options.gap_minutes * 60_000)
+                cut = Cut(log.session_by, gap_ms, options.min_steps, bounds)
+                cut_episodes(log, cut)
+                stage.update()
+                features = {
+                    name: load_features(connection, tables, name, log.id_type(name))
+                    for name, tables in (
+                        (schema.USER_ID, mapping.user_features),
+                        (schema.ITEM_ID, mapping.item_features),
+                    )
+                    if name in log.columns and like is None
+                }
+                number_ids(log, features, like)
+                stage.update()
+                report = {"reward": reward, **build_report(log, cut, dropped)}
+                stage.update()
         yield log, report, features
 
 
@@ -299,7 +252,18 @@ def _copy(log: CleanLog, query: str, file: Path) -> None:
     log.connection.execute(f"COPY ({query}) TO {text(str(file))} (FORMAT parquet)")
 
 
-def _learn_states(log: CleanLog, folder: Path, features: Features, size: int) -> None:
+def _write_states(
+    log: CleanLog, folder: Path, features: Features, size: int, like: Path | None
+) -> None:
+    """Learn how states are made of items, or take it over from the store `like`."""
+    # torch and scikit-learn take seconds: only here, and never to check a log.
+    from ucfrec.episodes.store import ITEM_STATES
+    from ucfrec.logs.features import encode_features
+    from ucfrec.logs.items import write_item_states
+
+    if like is not None:
+        shutil.copy(like / ITEM_STATES, folder / ITEM_STATES)
+        return
     encoded, counts = {}, {}
     for name, table, _ in ID_TABLES:
         (counts[name],) = log.one(f"SELECT count(*) FROM {table}")

@@ -90,7 +90,7 @@ def cut_episodes(log: CleanLog, cut: Cut) -> None:
             SELECT *, CAST(sum(first::INT) OVER w AS BIGINT) AS episode
             FROM ended WINDOW w AS (PARTITION BY {user} ORDER BY {order})
         ), measured AS (
-            SELECT * EXCLUDE (ends, began, row, reason),
+            SELECT * EXCLUDE (ends, began, row),
                 count(*) OVER e AS length, bool_or(ends) OVER e AS terminated
             FROM numbered WINDOW e AS (PARTITION BY {user}, episode)
         )
@@ -121,7 +121,7 @@ def number_ids(log: CleanLog, listed: dict[str, list[str]], like: Path | None) -
             continue
         if like is not None:
             source = f"read_parquet({text(str(like / file))}, file_row_number = true)"
-            # Integers there may be text here, or the other way round.
+            # The store's ids may be integers where these are text, or the other way round.
             known = f"TRY_CAST({name} AS {log.id_type(name)}) AS {name}"
             log.connection.execute(
                 f"CREATE TABLE {table} AS SELECT {known}, file_row_number AS number FROM {source}"

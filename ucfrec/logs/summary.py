@@ -2,12 +2,16 @@
 
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, Final
 
 from ucfrec import schema
 from ucfrec.errors import InputError
 from ucfrec.logs.clean import REASONS, CleanLog
+from ucfrec.logs.distributions import distributions
 from ucfrec.logs.sessions import Cut
+
+CONFLICT: Final = "of these have another reward than the row kept: the highest is kept"
+"""How rows that repeat a key but differ are settled; ties go by the other columns."""
 
 
 def drop_counts(log: CleanLog) -> dict[str, int]:
@@ -19,16 +23,16 @@ def drop_counts(log: CleanLog) -> dict[str, int]:
     found = dict(log.connection.sql("SELECT reason, count(*) FROM rows GROUP BY reason").fetchall())
     dropped = {reason: int(found.get(reason, 0)) for reason in REASONS}
     if None not in found:
-        told = "; ".join(f"{n} rows: {REASONS[reason]}" for reason, n in dropped.items() if n)
+        reasons = "; ".join(f"{n} rows: {REASONS[reason]}" for reason, n in dropped.items() if n)
         hint = "; is the time in milliseconds?" if dropped["clock_out_of_range"] else ""
         raise InputError(
-            f"{_named(log)}: no row is left ({told}{hint}); correct the mapping or the log"
+            f"{_named(log)}: no row is left ({reasons}{hint}); correct the mapping or the log"
         )
     return dropped
 
 
 def require_variety(log: CleanLog) -> None:
-    """See that there is something to learn.
+    """Check that rewards differ.
 
     Raises:
         InputError: all rewards are equal.
@@ -50,7 +54,7 @@ def _named(log: CleanLog) -> str:
 def count_unsorted(log: CleanLog) -> int:
     """Rows earlier than a row of the same user before them in the files."""
     (unsorted,) = log.one(f"""
-        SELECT count_if({schema.TIMESTAMP} < latest) FROM (
+        SELECT count(*) FILTER (WHERE {schema.TIMESTAMP} < latest) FROM (
             SELECT {schema.TIMESTAMP}, max({schema.TIMESTAMP}) OVER (
                 PARTITION BY {schema.USER_ID} ORDER BY row
                 ROWS BETWEEN UNBOUNDED PRECEDING AND 1 PRECEDING
@@ -62,7 +66,7 @@ def count_unsorted(log: CleanLog) -> int:
 
 def build_report(log: CleanLog, cut: Cut, dropped: Mapping[str, int]) -> dict[str, Any]:
     """Figures of the tables `rows`, `clean` and `steps`, all of them JSON-able."""
-    (read,) = log.one("SELECT count(*) FROM rows")
+    read, conflicts = log.one("SELECT count(*), count_if(conflict) FROM rows")
     (clean,) = log.one("SELECT count(*) FROM clean")
     steps, episodes, users, sessions, cuts, first_ms, last_ms = log.one(f"""
         SELECT count(*), count_if(first), count(DISTINCT {schema.USER_ID}), count_if(starts),
@@ -81,6 +85,7 @@ def build_report(log: CleanLog, cut: Cut, dropped: Mapping[str, int]) -> dict[st
         "files": [str(file) for table in log.tables for file in table.files],
         "rows_read": read,
         "dropped": {**dropped, "short_episode": clean - steps},
+        "conflicting_duplicates": conflicts,
         "unsorted_rows": count_unsorted(log),
         "steps": steps,
         "episodes": episodes,
@@ -92,6 +97,7 @@ def build_report(log: CleanLog, cut: Cut, dropped: Mapping[str, int]) -> dict[st
         "session_gap_ms": cut.gap_ms if cut.session_by == "gap" else None,
         "split_times_ms": list(cut.bounds),
         "time_range_ms": [first_ms, last_ms],
+        "summary": distributions(log),
         "reward_statistics": {"mean": mean, "std": deviation, "min": low, "max": high},
     }
     if log.key == schema.ITEM_ID:
@@ -110,6 +116,9 @@ def format_report(report: Mapping[str, Any]) -> str:
     for reason, rows in report["dropped"].items():
         if rows:
             lines.append((f"  dropped: {reason}", f"{rows:,}  {REASONS.get(reason, '')}"))
+    if report["conflicting_duplicates"]:
+        conflicts = f"{report['conflicting_duplicates']:,}  {CONFLICT}"
+        lines.append(("  conflicting duplicates", conflicts))
     lines += [
         ("  out of order", f"{report['unsorted_rows']:,} (sorted, none dropped)"),
         ("steps kept", f"{report['steps']:,}"),

@@ -35,6 +35,8 @@ from ucfrec.off_policy.shrinkage import shrunk
 FloatArray = npt.NDArray[np.float64]
 
 LOGGED = "logged"
+WEIGHTED = ("IPS", "SNIPS", "PDIS", "SNPDIS", "DR", "SNDR", "MIPS")
+"""Estimates that weigh sessions, unshrunk."""
 MODELS = ("DM", "FQE")
 """Estimates that nothing but a model stands behind."""
 

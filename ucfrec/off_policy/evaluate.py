@@ -131,7 +131,7 @@ def as_row(name: str, found: Estimate) -> dict[str, Any]:
 
 
 def _verdict_columns(verdict: Verdict) -> dict[str, Any]:
-    columns = asdict(verdict) | {"verdict": verdict.headline, "verdict_of": verdict.estimator}
+    columns = asdict(verdict) | {"verdict": str(verdict), "verdict_of": verdict.estimator}
     return {name: value for name, value in columns.items() if name not in ("estimator", "reasons")}
 
 

@@ -1,4 +1,4 @@
-"""Models of what a policy would earn, each fitted on other sessions than it is asked about.
+"""Models of what a policy would earn, each fitted on other sessions than it predicts.
 
 Fitted Q evaluation is Algorithm 3 of Le, Voloshin & Yue, *Batch Policy Learning under Constraints*
 (ICML 2019), with ridge regression, on sessions that end.
@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
-from tqdm import tqdm
 
 from ucfrec.errors import InputError
 from ucfrec.off_policy.logged_steps import Modelled
+from ucfrec.progress import progress
 
 FloatArray = npt.NDArray[np.float64]
 Float32Array = npt.NDArray[np.float32]
@@ -59,13 +59,15 @@ def cross_fitted(
     gram = _gram(features)
     penalty = _penalty(gram, len(reward))
     modelled = Modelled(*np.zeros((3, len(reward))))
-    for fold in tqdm(range(folds.max() + 1), desc="models", unit="fold", disable=None):
-        here = folds[session] == fold
-        ridge = _Ridge(features, gram - _gram(features[here]) + np.diag(penalty), ~here)
-        modelled.reward[here] = at_policy[here] @ ridge.fit(reward)
-        weights = fitted_q(ridge, at_policy, reward, last, discount)
-        modelled.q[here] = features[here] @ weights
-        modelled.v[here] = at_policy[here] @ weights
+    with progress(folds.max() + 1, "models", "folds") as bar:
+        for fold in range(folds.max() + 1):
+            here = folds[session] == fold
+            ridge = _Ridge(features, gram - _gram(features[here]) + np.diag(penalty), ~here)
+            modelled.reward[here] = at_policy[here] @ ridge.fit(reward)
+            weights = fitted_q(ridge, at_policy, reward, last, discount)
+            modelled.q[here] = features[here] @ weights
+            modelled.v[here] = at_policy[here] @ weights
+            bar.update()
     return modelled
 
 
@@ -81,7 +83,7 @@ class _Ridge:
         self._factor: Any = cho_factor(gram)
 
     def fit(self, target: FloatArray) -> Float32Array:
-        """(P,) weights for the target (N,); what stands there for rows not kept is ignored."""
+        """(P,) weights for the target (N,); its values in rows not kept are ignored."""
         kept = np.where(self.keep, target, 0.0).astype(np.float32)
         weights = cho_solve(self._factor, (kept @ self._features).astype(np.float64))
         return np.asarray(weights, dtype=np.float32)

@@ -13,7 +13,6 @@ import pandas as pd
 import pyarrow.parquet as pq
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore
@@ -22,6 +21,7 @@ from ucfrec.errors import InputError
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.logs.sessions import EPISODE_USERS
+from ucfrec.progress import progress
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SESSION, PROBABILITY, RANK, GREEDY = "session", "probability", "rank", "greedy_item_id"
@@ -109,12 +109,14 @@ def logged_sessions(
 def scored_steps(
     trained: TrainedPolicy, store: EpisodeStore, target_return: float
 ) -> Iterator[ScoredSteps]:
-    """Every step of `store` in order, a batch at a time, as it would be seen when acting: asked for
-    `target_return` less what the session has earned so far."""
+    """Every step of `store` in order, a batch at a time, as the policy would see it when acting.
+
+    Its return-to-go is `target_return` less what the session has earned so far.
+    """
     assert trained.item_ids is not None
     at_once = max(1, min(_STEPS_AT_ONCE, _LOGITS_AT_ONCE // len(trained.item_ids)))
     total = store.n_steps
-    with tqdm(total=total, desc="score", unit="step", unit_scale=True, disable=None) as bar:
+    with progress(total, "score", "steps") as bar:
         for begin in range(0, total, at_once):
             episodes, steps = store.locate(np.arange(begin, min(begin + at_once, total)))
             windows = store.windows(episodes, steps, trained.policy.config.context)

@@ -2,34 +2,44 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.heads import Head, head_from
+from ucfrec.settings import Dropout, Width, require, settings_table
 
 _CLIP = 10.0
 """Standardised states beyond this many standard deviations are clipped."""
 
 
-@dataclass(frozen=True)
-class PolicyConfig:
-    """What every sequence policy has."""
+Context = Annotated[int, Field(ge=1, le=4096)]
+Layers = Annotated[int, Field(ge=1, le=128)]
+Heads = Annotated[int, Field(ge=1, le=1024)]
+Kernel = Annotated[int, Field(ge=1, le=4096)]
+Timesteps = Annotated[int, Field(ge=1, le=10_000_000)]
 
-    context: int = 20
+
+@settings_table("policy")
+class PolicyConfig:
+    """Settings that every sequence policy has."""
+
+    context: Context = 20
     """K, steps of history that a prediction sees."""
-    dim: int = 128
+    dim: Width = 128
     """d, width of the model."""
-    dropout: float = 0.1
-    return_scale: float = 0.0
+    dropout: Dropout = 0.1
+    """Share of the model's activations that is set to 0 in training."""
+    return_scale: Annotated[float, Field(ge=0, le=1e12)] = 0.0
     """Returns-to-go are divided by this; 0 stands for the largest absolute training return."""
-    max_timestep: int = 1000
-    """Rows of the timestep embedding; later steps share the last."""
+    max_timestep: Timesteps = 1000
+    """Rows of the timestep embedding; later steps share the last. 1 tells the model no time."""
 
 
 class SequencePolicy(nn.Module, ABC):
@@ -122,6 +132,20 @@ class TokenEmbedding(nn.Module):
         returns = self.embed_return(windows.returns_to_go.unsqueeze(-1))
         states = self.embed_state(windows.states)
         return self.norm(returns + time), self.norm(states + time), self.norm(actions + time)
+
+
+def require_heads(config: PolicyConfig, heads: int) -> None:
+    """Refuse attention heads that do not divide the model's width.
+
+    Raises:
+        SettingError: they do not.
+    """
+    require(
+        config.dim % heads == 0,
+        f"policy.heads is {heads}; it must divide policy.dim, which is {config.dim}",
+        "policy.heads",
+        "policy.dim",
+    )
 
 
 def interleave(returns: Tensor, states: Tensor, actions: Tensor) -> Tensor:

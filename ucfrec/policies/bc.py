@@ -1,24 +1,26 @@
 """Behaviour cloning: the logged action from the current state alone."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 from torch import Tensor, nn
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
-from ucfrec.errors import InputError
-from ucfrec.policies.base import PolicyConfig, SequencePolicy
+from ucfrec.policies.base import Context, PolicyConfig, SequencePolicy
+from ucfrec.settings import settings_table
 
 
-@dataclass(frozen=True)
+@settings_table("policy")
 class BCConfig(PolicyConfig):
-    """A two-layer perceptron without memory."""
+    """Settings of behaviour cloning, a two-layer perceptron without memory."""
 
-    context: int = 1
-    best_share: float = 1.0
+    context: Context = 1
+    """K, steps of history; each prediction sees its own state only."""
+    best_share: Annotated[float, Field(gt=0, le=1)] = 1.0
     """Share of the training episodes, those with the highest returns, that is imitated: 0.1 is the
     10% BC of Chen et al. (2021)."""
 
@@ -45,14 +47,8 @@ class BCPolicy(SequencePolicy):
     def training_view(
         cls, train: EpisodeStore, config: PolicyConfig, folder: Path, seed: int
     ) -> EpisodeStore:
-        """The best episodes.
-
-        Raises:
-            InputError: `best_share` is not above 0 and at most 1.
-        """
+        """The episodes with the highest returns, `best_share` of them."""
         assert isinstance(config, BCConfig)
-        if not 0 < config.best_share <= 1:
-            raise InputError(f"policy.best_share is {config.best_share}; give a share up to 1")
         count = int(np.ceil(config.best_share * train.n_episodes))
         best = np.argsort(-train.returns, kind="stable")[:count]
         return train.select(np.sort(best))

@@ -1,7 +1,6 @@
 """CDT4Rec (Wang et al., SIGIR 2023): a Decision Transformer that also estimates the reward."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -11,15 +10,16 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.dt import DTConfig, DTPolicy
 from ucfrec.policies.losses import masked_mean
+from ucfrec.settings import Weight, settings_table
 
 
-@dataclass(frozen=True)
+@settings_table("policy")
 class CDT4RecConfig(DTConfig):
-    """Backbone as DT's, which is that of the public code."""
+    """Settings of CDT4Rec; its backbone is DT's, as in its public code."""
 
-    reward_weight: float = 0.5
-    """Of the reward's squared error, in standard deviations of the training rewards; 0 leaves DT.
-    The public code sums both losses of rewards that it does not standardise."""
+    reward_weight: Weight = 0.5
+    """Weight of the reward's squared error, in standard deviations of the training rewards; 0
+    leaves DT. The public code sums both losses of rewards that it does not standardise."""
 
 
 class CDT4RecPolicy(DTPolicy):

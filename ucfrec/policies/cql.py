@@ -1,11 +1,12 @@
 """Conservative Q-learning (Kumar et al., 2020), and returns-to-go relabelled by what it finds."""
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -14,6 +15,8 @@ from ucfrec.counterfactual.reward_model import mlp
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Transitions
 from ucfrec.fitting.loop import LoopConfig, fit
+from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.settings import BatchSize, Count, LearningRate, Weight, Width, settings_table
 
 FloatArray = npt.NDArray[np.float32]
 _CHUNK = 4096
@@ -21,19 +24,23 @@ _LOGGED = 100_000
 """Logged actions that candidates are drawn from, at most."""
 
 
-@dataclass(frozen=True)
+@settings_table("cql")
 class CQLConfig:
     """Small, as it only values states; no discount, as returns-to-go have none."""
 
-    steps: int = 2000
-    weight: float = 1.0
+    steps: Count = 2000
+    """Updates of the network."""
+    weight: Weight = 1.0
     """α of the conservative term."""
-    hidden: int = 128
-    candidates: int = 20
+    hidden: Width = 128
+    """Width of the two hidden layers."""
+    candidates: Annotated[int, Field(ge=2, le=10_000)] = 20
     """Actions that stand for all: half of them logged elsewhere, the rest drawn uniformly."""
-    learning_rate: float = 3e-4
-    batch_size: int = 128
-    target_rate: float = 0.01
+    learning_rate: LearningRate = 3e-4
+    """Step size of the updates."""
+    batch_size: BatchSize = 128
+    """Transitions of an update."""
+    target_rate: Annotated[float, Field(gt=0, le=1)] = 0.01
     """Share of the network that its target takes over every step."""
 
 
@@ -116,6 +123,7 @@ class ConservativeQ(nn.Module):
         return self.config.weight * pressed + error, {"td": error.detach()}
 
 
+@random_state_kept()
 def relabelled(store: EpisodeStore, config: CQLConfig, folder: Path, seed: int) -> EpisodeStore:
     """The store with returns-to-go raised to what CQL holds possible (EDT4Rec).
 

@@ -1,21 +1,29 @@
 """Decision ConvFormer (Kim et al., 2024): DT with convolutions in the place of attention."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ucfrec.episodes.windows import Windows
-from ucfrec.policies.base import PolicyConfig, SequencePolicy, TokenEmbedding, interleave
+from ucfrec.policies.base import (
+    Kernel,
+    Layers,
+    PolicyConfig,
+    SequencePolicy,
+    TokenEmbedding,
+    interleave,
+)
+from ucfrec.settings import settings_table
 
 
-@dataclass(frozen=True)
+@settings_table("policy")
 class DCConfig(PolicyConfig):
-    """Defaults of the official code."""
+    """Settings of Decision ConvFormer; defaults are those of its official code."""
 
-    layers: int = 3
-    kernel: int = 6
+    layers: Layers = 3
+    """Blocks of one convolution and one perceptron."""
+    kernel: Kernel = 6
     """Tokens that a convolution sees, 3 a step."""
 
 

@@ -1,22 +1,36 @@
 """Decision Transformer (Chen et al., 2021): the `w/o Arch` backbone and a baseline."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ucfrec.episodes.windows import Windows
-from ucfrec.policies.base import PolicyConfig, SequencePolicy, TokenEmbedding, interleave
+from ucfrec.policies.base import (
+    Heads,
+    Layers,
+    PolicyConfig,
+    SequencePolicy,
+    TokenEmbedding,
+    interleave,
+    require_heads,
+)
+from ucfrec.settings import settings_table
 
 
-@dataclass(frozen=True)
+@settings_table("policy")
 class DTConfig(PolicyConfig):
-    """Defaults of the official code."""
+    """Settings of the Decision Transformer; defaults are those of its official code."""
 
-    layers: int = 3
-    heads: int = 1
+    layers: Layers = 3
+    """Blocks of attention and a perceptron."""
+    heads: Heads = 1
+    """Attention heads of a block; they divide `dim`."""
+
+    def __post_init__(self) -> None:
+        """Check the fields against each other."""
+        require_heads(self, self.heads)
 
 
 class DTPolicy(SequencePolicy):

@@ -1,34 +1,41 @@
 """DT4Rec (Zhao et al., WWW 2023): returns as soft buckets, recurrent encoders, contrastive loss."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Annotated
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
-from ucfrec.policies.base import TokenEmbedding
+from ucfrec.policies.base import Heads, Layers, TokenEmbedding
 from ucfrec.policies.dt import DTConfig, DTPolicy
+from ucfrec.settings import Dropout, Weight, settings_table
 
 
-@dataclass(frozen=True)
+@settings_table("policy")
 class DT4RecConfig(DTConfig):
-    """Defaults of the public code where it says; the contrastive weight is ours."""
+    """Settings of DT4Rec: those of its public code, but for the contrastive loss, which is ours."""
 
-    layers: int = 2
-    heads: int = 8
-    buckets: int = 100
-    """B, of the reward prompt."""
-    recurrent_dropout: float = 0.2
-    negatives: int = 4
+    layers: Layers = 2
+    """Blocks of attention and a perceptron."""
+    heads: Heads = 8
+    """Attention heads of a block; they divide `dim`."""
+    buckets: Annotated[int, Field(ge=1, le=100_000)] = 100
+    """B, buckets of the reward prompt, spread over the training returns-to-go."""
+    recurrent_dropout: Dropout = 0.2
+    """Dropout between the two layers of the recurrent encoders."""
+    negatives: Annotated[int, Field(ge=1, le=1000)] = 4
     """Other returns that every window is asked for in the contrastive loss; the paper has 8, each
     costing a forward pass."""
-    contrastive_weight: float = 0.1
-    """0 leaves the loss of the released code, which has no contrastive part."""
-    temperature: float = 0.07
+    contrastive_weight: Weight = 0.1
+    """Weight of the contrastive loss; 0 leaves the loss of the released code, which has none."""
+    temperature: Annotated[float, Field(gt=0, le=1000)] = 0.07
+    """Of the contrastive loss: similarities are divided by it."""
 
 
 class DT4RecPolicy(DTPolicy):

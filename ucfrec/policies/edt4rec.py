@@ -2,35 +2,40 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
-from ucfrec.policies.base import PolicyConfig
+from ucfrec.policies.base import Context, PolicyConfig
 from ucfrec.policies.cql import CQLConfig, relabelled
 from ucfrec.policies.dt import DTConfig, DTPolicy
 from ucfrec.policies.heads import ItemHead, VectorHead
+from ucfrec.settings import Count, Weight, settings_table
 
 
-@dataclass(frozen=True)
+@settings_table("policy")
 class EDT4RecConfig(DTConfig):
-    """There is no public code; defaults follow Online DT where the paper is silent."""
+    """Settings of EDT4Rec, which has no public code: Online DT's where the paper is silent."""
 
-    context: int = 2
-    vector_entropy: float = -1.0
+    context: Context = 2
+    """K, steps of history that a prediction sees."""
+    vector_entropy: Annotated[float, Field(ge=-1000, le=1000)] = -1.0
     """β, lowest entropy (nats) for every dimension of a vector action."""
-    item_entropy: float = 0.3
-    """The same of items, as a share of that of the uniform choice."""
-    multiplier: float = 0.1
+    item_entropy: Annotated[float, Field(ge=-1000, le=1)] = 0.3
+    """The same of items, as a share of the entropy of the uniform choice; below 0 never binds."""
+    multiplier: Annotated[float, Field(gt=0, le=1e6)] = 0.1
     """λ of the entropy constraint before the first step."""
     relabel: bool = True
     """Raise returns-to-go to what CQL says was within reach."""
-    cql_steps: int = 2000
-    cql_weight: float = 1.0
+    cql_steps: Count = 2000
+    """Updates of CQL's network, where returns-to-go are raised."""
+    cql_weight: Weight = 1.0
     """α, how strongly CQL presses unseen actions down."""
 
 

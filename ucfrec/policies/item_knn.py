@@ -1,11 +1,11 @@
 """Item-based nearest neighbours (Sarwar et al., 2001): items liked in the same sessions."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
-from scipy import sparse
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -15,15 +15,17 @@ from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.policies.base import PolicyConfig, SequencePolicy
 from ucfrec.policies.heads import ItemHead
+from ucfrec.settings import settings_table
 
 _ROWS = 1024
 
 
-@dataclass(frozen=True)
+@settings_table("policy")
 class ItemKNNConfig(PolicyConfig):
-    """How many neighbours an item has."""
+    """Settings of the nearest neighbours; of the general ones, only `context` matters."""
 
-    neighbors: int = 100
+    neighbors: Annotated[int, Field(ge=1, le=1_000_000)] = 100
+    """Items with the highest cosines that count for each item; all, of a smaller catalogue."""
 
 
 class ItemKNNPolicy(SequencePolicy):
@@ -51,6 +53,8 @@ class ItemKNNPolicy(SequencePolicy):
 
     def start_from(self, train: EpisodeStore) -> None:
         """Find the neighbours of every item, itself among them."""
+        from scipy import sparse  # reading a trained policy does without
+
         episodes, steps = train.all_steps()
         items = train.step_values(schema.ITEM, episodes, steps)
         rewards = train.step_values(schema.REWARD, episodes, steps)

@@ -1,32 +1,58 @@
 """Long-Short Decision Transformer (Wang et al., 2025): attention beside dynamic convolution."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ucfrec.episodes.windows import Windows
-from ucfrec.errors import InputError
-from ucfrec.policies.base import PolicyConfig, SequencePolicy, TokenEmbedding, interleave
+from ucfrec.policies.base import (
+    Heads,
+    Kernel,
+    Layers,
+    PolicyConfig,
+    SequencePolicy,
+    Timesteps,
+    TokenEmbedding,
+    interleave,
+)
+from ucfrec.settings import Dropout, require, settings_table
 
 
-@dataclass(frozen=True)
+@settings_table("policy")
 class LSDTConfig(PolicyConfig):
-    """Defaults of the official code."""
+    """Settings of LSDT; defaults are those of its official code."""
 
-    dropout: float = 0.25
-    """Behind the mixed branches and the perceptron."""
-    max_timestep: int = 4096
-    layers: int = 3
-    heads: int = 2
-    attention_dropout: float = 0.1
-    kernel_dropout: float = 0.2
-    kernel: int = 6
+    dropout: Dropout = 0.25
+    """Dropout behind the mixed branches and the perceptron."""
+    max_timestep: Timesteps = 4096
+    """Rows of the timestep embedding; later steps share the last. 1 tells the model no time."""
+    layers: Layers = 3
+    """Blocks of attention beside convolution."""
+    heads: Heads = 2
+    """Attention heads of a block; they divide half of `dim`."""
+    attention_dropout: Dropout = 0.1
+    """Dropout behind attention."""
+    kernel_dropout: Dropout = 0.2
+    """Dropout of the kernels that tokens make for themselves."""
+    kernel: Kernel = 6
     """Tokens that a convolution sees, its own the last."""
-    kernel_groups: int = 16
-    """Groups of neighbouring channels that share a kernel."""
+    kernel_groups: Annotated[int, Field(ge=1, le=8192)] = 16
+    """Groups of neighbouring channels that share a kernel; they divide half of `dim`."""
+
+    def __post_init__(self) -> None:
+        """Check the fields against each other."""
+        require(
+            self.dim % (2 * self.kernel_groups) == 0 and self.dim % (2 * self.heads) == 0,
+            f"policy.dim is {self.dim}; half of it must split into {self.kernel_groups} "
+            f"kernel_groups and into {self.heads} heads",
+            "policy.dim",
+            "policy.kernel_groups",
+            "policy.heads",
+        )
 
 
 class LSDTPolicy(SequencePolicy):
@@ -42,11 +68,6 @@ class LSDTPolicy(SequencePolicy):
 
     def __init__(self, config: LSDTConfig, sizes: Mapping[str, int]) -> None:
         super().__init__(config, sizes)
-        if config.dim % (2 * config.kernel_groups) or config.dim % (2 * config.heads):
-            raise InputError(
-                f"policy.dim is {config.dim}; half of it must split into {config.kernel_groups} "
-                f"kernel_groups and into {config.heads} heads"
-            )
         self.embed = TokenEmbedding(config, sizes["state"])
         self.blocks = nn.ModuleList(_Block(config) for _ in range(config.layers))
         for module in self.blocks.modules():

@@ -1,20 +1,21 @@
 """SASRec (Kang & McAuley, 2018): the next action from the actions before, whatever they earned."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 from torch import Tensor, nn
 
 from ucfrec.episodes.windows import Windows
-from ucfrec.policies.base import SequencePolicy
+from ucfrec.policies.base import Layers, SequencePolicy
 from ucfrec.policies.dt import Block, DTConfig, visible_tokens
+from ucfrec.settings import settings_table
 
 
-@dataclass(frozen=True)
+@settings_table("policy")
 class SASRecConfig(DTConfig):
-    """Two blocks of one head, as published."""
+    """Settings of SASRec: two blocks of one head, as published."""
 
-    layers: int = 2
+    layers: Layers = 2
+    """Blocks of attention and a perceptron."""
 
 
 class SASRecPolicy(SequencePolicy):

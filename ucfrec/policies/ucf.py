@@ -1,32 +1,49 @@
 """UCF's hybrid causal architecture (paper section 3.2)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ucfrec.episodes.windows import Windows
-from ucfrec.policies.base import PolicyConfig, SequencePolicy, TokenEmbedding, interleave
+from ucfrec.policies.base import (
+    Heads,
+    Layers,
+    PolicyConfig,
+    SequencePolicy,
+    TokenEmbedding,
+    interleave,
+    require_heads,
+)
 from ucfrec.policies.losses import mask_loss, masked_mean, parent_targets
+from ucfrec.settings import Share, Weight, settings_table
 
 
-@dataclass(frozen=True)
+@settings_table("policy")
 class UCFConfig(PolicyConfig):
-    """UCF's hybrid policy; defaults are the paper's Tables 6 to 8, but for λ and the weight of
-    a_{t−1}, which were chosen on validation episodes (`benchmarks/LOG.md`)."""
+    """Settings of UCF's hybrid policy; defaults are the paper's Tables 6 to 8, but for λ and the
+    weight of a_{t−1}, which were chosen on validation episodes (`benchmarks/LOG.md`)."""
 
-    conv_blocks: int = 2
-    heads: int = 2
-    lambda_mask: float = 0.0
-    """λ, weight of the mask loss; any cost return in both worlds where it was swept."""
-    parent_window: int = 2
-    """w, how many earlier states count as parents."""
-    parent_decay: float = 0.6
-    """Weight of s_{t−k} is this to the power k."""
-    parent_action: float = 0.3
+    conv_blocks: Layers = 2
+    """Convolution blocks of each stream (returns-to-go, states, actions)."""
+    heads: Heads = 2
+    """Attention heads; they divide `dim`."""
+    lambda_mask: Weight = 0.0
+    """λ, weight of the mask loss, which supervises attention. Every value above 0 lowered the
+    return in both worlds where it was swept."""
+    parent_window: Annotated[int, Field(ge=0, le=4096)] = 2
+    """w, how many earlier states count as parents of an action, for the mask loss."""
+    parent_decay: Share = 0.6
+    """Weight of s_{t−k} as a parent is this to the power k."""
+    parent_action: Weight = 0.3
     """Weight of a_{t−1} as a parent."""
+
+    def __post_init__(self) -> None:
+        """Check the fields against each other."""
+        require_heads(self, self.heads)
 
 
 class UCFPolicy(SequencePolicy):

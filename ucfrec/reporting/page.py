@@ -1,66 +1,67 @@
-"""One HTML page about runs: what was trained on which data, how it went, what can be trusted."""
+"""One HTML page about runs: what their results allow to conclude, and how they came about."""
 
 import json
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ucfrec import __version__
+from ucfrec.counterfactual.reward_model import fit_warning
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_file, read_json
-from ucfrec.fitting.tensorboard import read_scalars
+from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.reporting import charts
-from ucfrec.reporting.page_results import read_results, worlds
+from ucfrec.reporting.copies import copies_table, moves_chart
+from ucfrec.reporting.curves import POINTS, REFERENCES, Curves, draw_curves, trained_on
+from ucfrec.reporting.data_quality import data_quality
+from ucfrec.reporting.page_results import estimates, read_results, worlds
+from ucfrec.reporting.samples import read_features, sample_tables
 from ucfrec.reporting.tables import Table, shown
+from ucfrec.reporting.verdict import verdict
 from ucfrec.runs.trained_policy import AUGMENTATION, learner_of, read_record
-
-_TITLES = {
-    "validation_loss": "Validation loss (action, held-out steps)",
-    "action_loss": "Training loss of the action (one batch)",
-    "attention_on_parents": "Attention mass on the causal parents (1: all of it)",
-    "mask_loss": "Mask loss of the attention (Eq. 5)",
-    "loss": "Training loss, all terms",
-    "gradient_norm": "Gradient norm before clipping",
-    "samples_per_second": "Samples a second",
-    "waiting_for_data": "Share of time waiting for data",
-}
-"""Curves by the name they are logged under, in the order of the page; others come after."""
-_POINTS = 200
-"""Most points a curve is drawn from."""
 
 
 @dataclass(frozen=True)
 class _Run:
+    folder: Path
     name: str
     record: Mapping[str, Any]
     copies: Mapping[str, Any] | None
     """The augmentation report; None without edited copies, or before they are made."""
-    scalars: Mapping[str, Mapping[int, float]]
+    logged: Curves
 
     @property
     def status(self) -> str:
-        wanted = self.record["config"]["train"]["steps"]
+        steps = self.record["config"]["train"]["steps"]
         if fitted := self.record.get("policy"):
             return f"finished after {fitted['steps']:,} steps"
-        logged = max((step for curve in self.scalars.values() for step in curve), default=0)
-        return f"not finished: logged up to step {logged:,} of {wanted:,}"
+        logged = max((step for curve in self.logged.values() for step in curve), default=0)
+        return f"not finished: logged up to step {logged:,} of {steps:,}"
+
+    @property
+    def references(self) -> Mapping[str, float]:
+        """Losses to compare its loss with; none where its loss is not the items' log-likelihood."""
+        comparable = "action_loss" in self.logged
+        return self.record.get("reference_losses", {}) if comparable else {}
 
 
-def write_report(out: Path, runs: Sequence[Path], results: Sequence[Path] = ()) -> None:
+def write_report(
+    out: Path, runs: Sequence[Path], results: Sequence[Path] = (), items: Path | None = None
+) -> None:
     """Write one self-contained page about `runs` to `out`, atomically.
 
     Runs on the same data share a section, their curves overlaid. A run that is still in training
     is shown as far as it is.
 
     Args:
-        results: rows of `ucfrec evaluate --json` or of `ucfrec demo`; JSON, or JSON lines if the
-            name ends in `.jsonl`.
+        results: rows of `ucfrec evaluate --json`, `ucfrec ope --json` or `ucfrec demo`; JSON, or
+            JSON lines if the name ends in `.jsonl`.
+        items: features to show beside sample recommendations, Parquet or CSV with `item_id`.
 
     Raises:
         InputError: a folder is no run, a file holds no such rows, or `out` is a folder.
@@ -70,19 +71,23 @@ def write_report(out: Path, runs: Sequence[Path], results: Sequence[Path] = ()) 
     of_data: dict[str, list[_Run]] = {}
     for run in _read_runs(runs):
         of_data.setdefault(run.record["fingerprint"], []).append(run)
+    found = read_results(results)
+    features = None if items is None else read_features(items)
     loader = PackageLoader("ucfrec.reporting", "")
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
     page = environment.get_template("report.html").render(
         version=__version__,
+        verdict=verdict(found),
         warnings=[
-            (run.name, text) for of in of_data.values() for run in of for text in _doubts(run)
+            (run.name, text) for of in of_data.values() for run in of for text in _warnings(run)
         ],
-        sections=[_section(of) for of in of_data.values()],
-        worlds=worlds([row for path in results for row in read_results(path)]),
+        sections=[_section(of, features) for of in of_data.values()],
+        worlds=worlds(found),
+        estimates=estimates(found),
         layout=charts,
-        points=_POINTS,
+        points=POINTS,
     )
     with atomic_file(out) as scratch:
         # Folder names need not be Unicode.
@@ -99,33 +104,51 @@ def _read_runs(folders: Sequence[Path]) -> list[_Run]:
             copies = read_json(path / AUGMENTATION)
         common = os.path.commonpath([other.parent for other in paths])
         name = str(path.relative_to(common))
-        runs.append(_Run(name, record, copies, read_scalars(path / "policy")))
+        logged = trained_on(read_metrics(path / "policy"), record["config"])
+        runs.append(_Run(path, name, record, copies, logged))
     return runs
 
 
-def _doubts(run: _Run) -> list[str]:
-    """What a reader must know before believing a run."""
-    doubts = [] if "policy" in run.record else [run.status]
+def _warnings(run: _Run) -> list[str]:
+    """What a reader must know before relying on a run."""
+    said = [] if "policy" in run.record else [run.status]
     if run.copies is not None:
-        doubts += run.copies["warnings"]
-        meant = run.copies["bound"] < run.copies["reward_model"]["reward_std"]
-        if not (meant and run.copies["moves"]["edits"]):
-            doubts.append(run.copies["verdict"])
-    return doubts
+        model = run.copies["reward_model"]
+        # Runs from before recorded no warning of the fit.
+        said += dict.fromkeys([*run.copies["warnings"], fit_warning(model["r2_without_z"])])
+        means_something = run.copies["bound"] < model["reward_std"]
+        if not (means_something and run.copies["moves"]["edits"]):
+            said.append(run.copies["verdict"])
+    best = run.record.get("policy", {}).get("best_validation")
+    popularity = run.references.get("popularity")
+    if best is not None and popularity is not None and not best < popularity:
+        said.append(
+            f"the best validation loss, {best:.4g}, is not below {popularity:.4g}, what showing "
+            "items by their popularity alone reaches: nothing is learned of users"
+        )
+    return [text for text in said if text]
 
 
-def _section(runs: Sequence[_Run]) -> dict[str, Any]:
+def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
     """What the template shows of runs on the same data."""
-    edited = [run for run in runs if run.copies is not None]
+    names = [run.name for run in runs]
+    edited = [(run.name, run.copies) for run in runs if run.copies is not None]
+    of_items = [run for run in runs if run.record["sizes"]["items"]]
+    styled = [(run.name, style, run.copies) for style, run in enumerate(runs) if run.copies]
     return {
-        "names": [run.name for run in runs],
+        "names": names,
         "store": runs[0].record["store"],
         "data": _data(runs[0].record),
+        "quality": data_quality(runs[0].record),
         "summary": _summary(runs),
-        "curves": _curves(runs),
-        "verdicts": [(run.name, run.copies["verdict"]) for run in edited if run.copies],
-        "copies": _copies(edited),
-        "moves": _moves(runs),
+        "curves": draw_curves(names, [r.logged for r in runs], [r.references for r in runs]),
+        "unlogged": [run.name for run in runs if not run.logged],
+        "finished": any("policy" in run.record for run in runs),
+        "references": any(run.references for run in runs),
+        "verdicts": [(name, copies["verdict"]) for name, copies in edited],
+        "copies": copies_table(edited) if edited else None,
+        "moves": moves_chart(styled),
+        "samples": [(run.name, sample_tables(run.folder, features)) for run in of_items],
         "differences": _differences(runs),
         "records": [(run.name, json.dumps(run.record, indent=2)) for run in runs],
     }
@@ -159,81 +182,15 @@ def _summary(runs: Sequence[_Run]) -> Table:
         ("wall time, s", [run.record["wall_time_s"] if fit else None
                           for run, fit in zip(runs, fitted, strict=True)]),
     ]  # fmt: skip
+    if any(run.references for run in runs):
+        for key, name in REFERENCES.items():
+            rows.append((f"loss with {name}", [run.references.get(key) for run in runs]))
     return _of_runs("Runs", runs, rows)
 
 
 def _of_runs(caption: str, runs: Sequence[_Run], rows: Sequence[tuple[str, list[Any]]]) -> Table:
     body = [(name, [shown(value) for value in values]) for name, values in rows]
     return Table(caption, "", [run.name for run in runs], body)
-
-
-def _curves(runs: Sequence[_Run]) -> list[tuple[charts.LineChart, Table]]:
-    """Every scalar that some run logged: its curves, and the same numbers as a table."""
-    logged = {tag for run in runs for tag in run.scalars}
-    drawn = []
-    for tag in sorted(logged, key=lambda t: ([*_TITLES, t].index(t), t)):
-        curves = {
-            style: _thinned(run.scalars[tag])
-            for style, run in enumerate(runs)
-            if tag in run.scalars
-        }
-        curves = {style: curve for style, curve in curves.items() if curve}
-        if not curves:
-            continue
-        title, names = _TITLES.get(tag, tag), [runs[style].name for style in curves]
-        lines = [(runs[style].name, style, curve) for style, curve in curves.items()]
-        steps = sorted({step for curve in curves.values() for step in curve})
-        rows = [(f"{s:g}", [shown(c.get(s)) for c in curves.values()]) for s in steps]
-        drawn.append((charts.line_chart(title, "step", lines), Table(title, "step", names, rows)))
-    return drawn
-
-
-def _thinned(curve: Mapping[int, float]) -> dict[float, float]:
-    """The finite points, or evenly chosen ones and the last if there are more than `_POINTS`."""
-    points = [(float(at), value) for at, value in sorted(curve.items()) if math.isfinite(value)]
-    every = -(-len(points) // _POINTS) or 1
-    return dict(points[::-1][::every][::-1])
-
-
-def _copies(runs: Sequence[_Run]) -> Table | None:
-    if not runs:
-        return None
-    reports = [run.copies for run in runs if run.copies is not None]
-    models, moves = [r["reward_model"] for r in reports], [r["moves"] for r in reports]
-    rows = [
-        ("edited copies", [r["copies"] for r in reports]),
-        ("accepted edits", [m["edits"] for m in moves]),
-        ("acceptance (share of proposals)", [r["acceptance"] for r in reports]),
-        ("δ, error of the reward model", [r["delta"] for r in reports]),
-        ("ε_r, tolerance of the gate", [r["epsilon_r"] for r in reports]),
-        ("bound δ + ε_r", [r["bound"] for r in reports]),
-        ("standard deviation of the reward", [m["reward_std"] for m in models]),
-        ("R² with z", [m["r2"] for m in models]),
-        ("R² without z", [m["r2_without_z"] for m in models]),
-        ("active latent dimensions",
-         [f"{m['active_dimensions']} of {m['latent_dim']}" for m in models]),
-        ("share of z in the reward's variance", [m["z_share"] for m in models]),
-        ("leak: correlation of z with E[r | s, a]", [m["z_leak"] for m in models]),
-        ("mean-move ratio (1: one shift for all states)", [m["mean_move_ratio"] for m in moves]),
-        ("effective rank of the moves",
-         [f"{shown(m['effective_rank'])} of {m['dimensions']}" for m in moves]),
-        ("median length of a move ‖Δ‖₂", [m["length_quantiles"].get("0.5") for m in moves]),
-    ]  # fmt: skip
-    return _of_runs("What the edited copies rest on; δ, ε_r in units of the reward", runs, rows)
-
-
-def _moves(runs: Sequence[_Run]) -> charts.LineChart | None:
-    """Distribution of ‖Δ‖₂."""
-    curves = []
-    for style, run in enumerate(runs):
-        if run.copies is None or not run.copies["moves"]["edits"]:
-            continue
-        moves = run.copies["moves"]
-        middles = [(a + b) / 2 for a, b in pairwise(moves["histogram_edges"])]
-        shares = [count / moves["edits"] for count in moves["histogram_counts"]]
-        curves.append((run.name, style, dict(zip(middles, shares, strict=True))))
-    title = "Accepted edits by the length of their move"
-    return charts.line_chart(title, "‖Δ‖₂", curves) if curves else None
 
 
 def _differences(runs: Sequence[_Run]) -> Table | None:

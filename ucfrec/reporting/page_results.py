@@ -1,28 +1,65 @@
-"""What policies earned, as the report shows it."""
+"""What policies earned or would have earned, as the report shows it."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ucfrec.errors import InputError
 from ucfrec.evaluation.diversity_columns import COLUMNS
 from ucfrec.files import read_json
+from ucfrec.off_policy.estimators import LOGGED
 from ucfrec.reporting import charts
-from ucfrec.reporting.grid import Row, read_rows
+from ucfrec.reporting.grid import read_rows
 from ucfrec.reporting.tables import Table, shown
 
+Row = Mapping[str, Any]
 _INTERVAL = ("R_cum", "R_cum_low", "R_cum_high")
 _METRICS = ("R_avg_pooled", "R_avg_episode", "length", *COLUMNS, "target_return", "episodes")
 _SEEDS = ("seed", "train_seed")
+_WEIGHTS = ("effective_sessions", "largest_weight", "sessions", "overlap")
 
 
-def read_results(path: Path) -> list[Row]:
-    """Result rows, each with its world, policy and R_cum; JSON lines if the name ends in `.jsonl`.
+@dataclass(frozen=True)
+class Estimates:
+    """What the estimators of one `ucfrec ope` say about one policy."""
+
+    name: str
+    logged: Row | None
+    """What the logged sessions earned."""
+    rows: Sequence[Row]
+    """One an estimator, `logged` left out."""
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Results:
+    """The result rows of a report."""
+
+    worlds: Mapping[str, Sequence[Row]]
+    """By world, rows of `ucfrec evaluate` or of the demo."""
+    estimates: Sequence[Estimates]
+
+
+def read_results(paths: Sequence[Path]) -> Results:
+    """Read result rows; JSON lines from files whose name ends in `.jsonl`, else JSON.
 
     Raises:
-        InputError: the file is missing or holds something else.
+        InputError: a file is missing or holds something else.
     """
+    worlds: dict[str, list[Row]] = {}
+    estimates: list[Estimates] = []
+    for path in paths:
+        rows = _rows_of(path)
+        for row in rows:
+            if "estimator" not in row:
+                worlds.setdefault(row["world"], []).append(row)
+        estimates += _estimates([row for row in rows if "estimator" in row])
+    return Results(worlds, estimates)
+
+
+def _rows_of(path: Path) -> list[Row]:
     if path.suffix == ".jsonl" and path.exists():
         rows: Any = read_rows(path)
     else:
@@ -31,12 +68,23 @@ def read_results(path: Path) -> list[Row]:
         raise InputError(f"{path} holds no list of result rows; give what `ucfrec evaluate` wrote")
     for number, row in enumerate(rows, start=1):
         known = row if isinstance(row, dict) else {}
-        lacking = [name for name in ("world", "policy") if not isinstance(known.get(name), str)]
-        lacking += [name for name in _INTERVAL if not _finite(known.get(name))]
+        texts = ("estimator" if "estimator" in known else "world", "policy")
+        lacking = [name for name in texts if not isinstance(known.get(name), str)]
+        # An estimate that nothing but a model stands behind has no interval.
+        open_ended = "estimator" in known and known.get("R_cum_low") is None
+        needed = _INTERVAL[:1] if open_ended else _INTERVAL
+        lacking += [name for name in needed if not _finite(known.get(name))]
+        lacking += [
+            name
+            for name in (*_METRICS, *_WEIGHTS)
+            if known.get(name) is not None and not isinstance(known[name], (int, float))
+        ]
+        if not isinstance(known.get("warnings", []), list):
+            lacking.append("warnings")
         if lacking:
             raise InputError(
                 f"{path}, row {number}, has no usable {', '.join(lacking)}; give rows that "
-                "`ucfrec evaluate --json` or `ucfrec demo` wrote"
+                "`ucfrec evaluate --json`, `ucfrec ope --json` or `ucfrec demo` wrote"
             )
     return rows
 
@@ -45,34 +93,89 @@ def _finite(value: Any) -> bool:
     return isinstance(value, (int, float)) and math.isfinite(value)
 
 
-def worlds(rows: Sequence[Row]) -> list[tuple[charts.BarChart, Table]]:
+def _estimates(rows: Sequence[Row]) -> list[Estimates]:
+    """Rows of one file by the `ucfrec ope` that wrote them, each beginning with `logged`."""
+    groups: list[list[Row]] = []
+    for row in rows:
+        if row["estimator"] == LOGGED or not groups:
+            groups.append([])
+        groups[-1].append(row)
+    return [_judged(group) for group in groups]
+
+
+def _judged(group: Sequence[Row]) -> Estimates:
+    logged = next((row for row in group if row["estimator"] == LOGGED), None)
+    rows = [row for row in group if row is not logged]
+    policy = rows[0] if rows else group[0]
+    run, choice = policy.get("run"), policy.get("choice")
+    name = policy["policy"]
+    name += "" if choice is None else f" ({choice})"
+    name += "" if run is None else f" of {run}"
+    warnings = dict.fromkeys(str(text) for row in group for text in row.get("warnings", []))
+    return Estimates(name, logged, rows, tuple(warnings))
+
+
+def worlds(results: Results) -> list[tuple[charts.BarChart, Table]]:
     """Bars and table of every world's rows."""
+    return [_world(world, rows) for world, rows in results.worlds.items()]
+
+
+def _world(world: str, rows: Sequence[Row]) -> tuple[charts.BarChart, Table]:
+    names = _row_names(rows)
+    columns = [c for c in (*_METRICS, *_SEEDS) if any(row.get(c) is not None for row in rows)]
+    body = [
+        (name, [interval(row), *(_cell(row, column) for column in columns)])
+        for name, row in zip(names, rows, strict=True)
+    ]
+    table = Table(f"{world}: means of episodes", "policy", ["R_cum", *columns], body)
+    return _bars(f"R_cum in {world}, with 95% intervals", names, rows), table
+
+
+def estimates(results: Results) -> list[tuple[Estimates, charts.BarChart, Table]]:
+    """Bars and table of every policy that was judged from logs."""
     drawn = []
-    for world in dict.fromkeys(row["world"] for row in rows):
-        there = [row for row in rows if row["world"] == world]
-        names = _row_names(there)
-        bars = [
-            (name, float(row["R_cum"]), float(row["R_cum_low"]), float(row["R_cum_high"]))
-            for name, row in zip(names, there, strict=True)
+    for one in results.estimates:
+        rows = [*([one.logged] if one.logged else []), *one.rows]
+        names = [_estimator(row) for row in rows]
+        body = [
+            (name, [interval(row), *(shown(row.get(column)) for column in _WEIGHTS)])
+            for name, row in zip(names, rows, strict=True)
         ]
-        columns = [c for c in (*_METRICS, *_SEEDS) if any(row.get(c) is not None for row in there)]
-        body = []
-        for row, (name, value, low, high) in zip(there, bars, strict=True):
-            r_cum = f"{shown(value)} [{shown(low)}, {shown(high)}]"
-            body.append((name, [r_cum, *(_cell(row, column) for column in columns)]))
-        table = Table(f"{world}: means of episodes", "policy", ["R_cum", *columns], body)
-        drawn.append((charts.bar_chart(f"R_cum in {world}, with 95% intervals", bars), table))
+        columns = ["mean return of a session", "effective sample", "share of the largest weight"]
+        table = Table(f"Estimates for {one.name}", "", [*columns, "sessions", "overlap"], body)
+        chart = _bars(f"Mean return of a session: {one.name}, with 95% intervals", names, rows)
+        drawn.append((one, chart, table))
     return drawn
 
 
+def _estimator(row: Row) -> str:
+    return "logged sessions" if row["estimator"] == LOGGED else str(row["estimator"])
+
+
+def _bars(title: str, names: Sequence[str], rows: Sequence[Row]) -> charts.BarChart:
+    bars = [
+        (name, float(row["R_cum"]), float(row["R_cum_low"]), float(row["R_cum_high"]))
+        for name, row in zip(names, rows, strict=True)
+        if row["R_cum_low"] is not None
+    ]
+    return charts.bar_chart(title, bars)
+
+
+def interval(row: Row) -> str:
+    """R_cum with its 95% interval, if it has one."""
+    if row["R_cum_low"] is None:
+        return f"{shown(row['R_cum'])} [–]"
+    return f"{shown(row['R_cum'])} [{shown(row['R_cum_low'])}, {shown(row['R_cum_high'])}]"
+
+
 def _row_names(rows: Sequence[Row]) -> list[str]:
-    """The policies; where one comes twice, with what tells its rows apart."""
+    """The policies; where one has several rows, with the fields that differ between them."""
     names = []
     for row in rows:
         same = [other for other in rows if other["policy"] == row["policy"]]
-        telling = ("run", "checkpoint", *_SEEDS)
-        apart = [key for key in telling if any(o.get(key) != row.get(key) for o in same)]
-        names.append(", ".join([row["policy"], *(f"{key} {_cell(row, key)}" for key in apart)]))
+        fields = ("run", "checkpoint", *_SEEDS)
+        differing = [key for key in fields if any(o.get(key) != row.get(key) for o in same)]
+        names.append(", ".join([row["policy"], *(f"{key} {_cell(row, key)}" for key in differing)]))
     return names
 
 

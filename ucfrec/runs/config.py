@@ -1,11 +1,13 @@
-"""One frozen configuration: defaults, a TOML file over them, `--set` over that."""
+"""One frozen configuration: defaults, presets over them, a TOML file over those, `--set` on top."""
 
-import difflib
 import tomllib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Final, NamedTuple
+
+import numpy as np
+from pydantic import Field
 
 from ucfrec.counterfactual.augment import AugmentConfig
 from ucfrec.counterfactual.generators import CSGConfig
@@ -13,101 +15,141 @@ from ucfrec.counterfactual.reward_model import CRMConfig
 from ucfrec.errors import InputError
 from ucfrec.fitting.loop import LoopConfig
 from ucfrec.policies.base import PolicyConfig
-from ucfrec.policies.registry import POLICIES
+from ucfrec.policies.registry import policy_class
+from ucfrec.settings import SettingError, nearest, settings_table
+
+TABLES: Final = ("policy", "train", "crm", "csg", "augment")
 
 
-@dataclass(frozen=True)
+@settings_table("")
 class Config:
     """All that decides a run, with its data."""
 
     policy_name: str
+    """The learner."""
     policy: PolicyConfig
+    """The learner's own settings."""
     train: LoopConfig = field(default_factory=LoopConfig)
+    """The training loop of the policy."""
     crm: CRMConfig = field(default_factory=CRMConfig)
+    """The causal reward model, fitted where there are copies."""
     csg: CSGConfig = field(default_factory=CSGConfig)
+    """The generator of counterfactual states."""
     augment: AugmentConfig = field(default_factory=AugmentConfig)
-    seed: int = 0
+    """The edited copies."""
+    # scikit-learn takes no larger one.
+    seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 0
+    """Of everything random."""
 
 
 def resolve_config(
     policy_name: str = "ucf",
     file: Path | None = None,
-    overrides: Sequence[str] = (),
+    overrides: Mapping[str, Any] | Sequence[str] = (),
     seed: int = 0,
     presets: Mapping[str, Any] | None = None,
 ) -> Config:
-    """The configuration of a run.
+    """The configuration of a run; later sources win over earlier ones, whichever table they set.
 
     Args:
-        policy_name: a key of `POLICIES`. Learners other than UCF start without counterfactual
-            copies (`augment.copies = 0`), so that `--policy dt` is the plain baseline and
-            `--policy dt --set augment.copies=1` is the paper's `w/o Arch`.
+        policy_name: one of `ucfrec.policies.registry.policy_names`. Learners other than UCF start
+            without counterfactual copies (`augment.copies = 0`), so that `--policy dt` is the plain
+            baseline and `--policy dt --set augment.copies=1` is the paper's `w/o Arch`.
         file: TOML with tables `policy`, `train`, `crm`, `csg` and `augment`.
-        overrides: `table.field=value`, the value as in TOML.
-        presets: the same tables, under those of `file`: what an adapter knows of its data.
+        overrides: texts `table.field=value`, the value as in TOML; or a mapping, by table and
+            field (`{"train": {"steps": 200}}`) or by both at once (`{"train.steps": 200}`).
+        seed: of everything random.
+        presets: as `overrides`, under `file`: what an adapter knows of its data.
 
     Raises:
-        InputError: an unknown learner, table or field, or a value of another type.
+        InputError: an unknown learner, table or field, or a value or combination of values that is
+            not allowed; says where it was given.
     """
-    if policy_name not in POLICIES:
-        raise InputError(f"no policy is called {policy_name!r}; there are {', '.join(POLICIES)}")
-    learner = POLICIES[policy_name]
-    config = Config(policy_name, learner.Config(), seed=seed)
-    if not learner.augmented:
-        config = replace(config, augment=replace(config.augment, copies=0))
-    config = _update(config, presets or {}, "presets")
+    given = [*_from_mapping(presets or {}, "presets")]
     if file is not None:
-        config = _update(config, _read_toml(file), str(file))
-    for override in overrides:
-        name, separator, text = override.partition("=")
-        table, dot, key = name.strip().partition(".")
-        if not separator or not dot:
-            raise InputError(f"--set {override}: write table.field=value, as in train.steps=200")
-        config = _update(config, {table: {key: _toml_value(text)}}, f"--set {override}")
-    return config
+        given += _from_mapping(_read_toml(file), str(file))
+    if isinstance(overrides, Mapping):
+        given += _from_mapping(overrides, "settings")
+    else:
+        given += _from_texts(overrides)
+    return _build(policy_name, given, seed)
 
 
 def config_from_dict(values: Mapping[str, Any]) -> Config:
-    """What `dataclasses.asdict` made of a configuration, as one again."""
-    config = Config(values["policy_name"], POLICIES[values["policy_name"]].Config())
-    tables = {name: table for name, table in values.items() if isinstance(table, Mapping)}
-    return replace(_update(config, tables, "the run's configuration"), seed=values["seed"])
+    """What `dataclasses.asdict` made of a configuration, as one again.
+
+    Raises:
+        InputError: as `resolve_config`.
+    """
+    tables = {name: values[name] for name in values if isinstance(values[name], Mapping)}
+    given = _from_mapping(tables, "the run's configuration")
+    return _build(values["policy_name"], given, values["seed"])
 
 
-def _update(config: Config, tables: Mapping[str, Any], where: str) -> Config:
-    for name, values in tables.items():
-        known = [f.name for f in fields(config) if is_dataclass(getattr(config, f.name))]
-        if name not in known or not isinstance(values, Mapping):
-            raise InputError(f"{where}: no table is called {name!r}; {_nearest(name, known)}")
-        table = getattr(config, name)
-        config = replace(config, **{name: _update_table(table, values, f"{where}: {name}")})
-    return config
+class _Given(NamedTuple):
+    """One value, and where it was given."""
+
+    table: str
+    key: str
+    value: Any
+    where: str
 
 
-def _update_table(table: Any, values: Mapping[str, Any], where: str) -> Any:
-    changes = {}
-    for key, value in values.items():
-        known = [f.name for f in fields(table)]
-        if key not in known:
-            raise InputError(f"{where} has no field {key!r}; {_nearest(key, known)}")
-        changes[key] = _coerced(value, getattr(table, key), f"{where}.{key}")
-    return replace(table, **changes)
+def _build(policy_name: str, given: Iterable[_Given], seed: int) -> Config:
+    """Each table is built once, from all that was given, so that values are judged together."""
+    learner = policy_class(policy_name)
+    tables: dict[str, dict[str, Any]] = {name: {} for name in TABLES}
+    if not learner.augmented:
+        tables["augment"]["copies"] = 0
+    sources = {}
+    for table, key, value, where in given:
+        tables[table][key] = value.item() if isinstance(value, np.generic) else value
+        sources[f"{table}.{key}"] = where
+    try:
+        return Config(
+            policy_name,
+            learner.Config(**tables["policy"]),
+            LoopConfig(**tables["train"]),
+            CRMConfig(**tables["crm"]),
+            CSGConfig(**tables["csg"]),
+            AugmentConfig(**tables["augment"]),
+            seed,
+        )
+    except SettingError as error:
+        where = ", ".join(dict.fromkeys(sources[key] for key in error.keys if key in sources))
+        raise InputError(f"{where}: {error}" if where else str(error)) from None
 
 
-def _coerced(value: Any, current: Any, where: str) -> Any:
-    if isinstance(current, tuple):
-        value = tuple(value) if isinstance(value, (list, tuple)) else value
-    elif (current is None or isinstance(current, float)) and isinstance(value, int):
-        value = float(value)
-    if value is not None and current is not None and type(value) is not type(current):
-        wanted, got = type(current).__name__, type(value).__name__
-        raise InputError(f"{where} takes a {wanted}, not the {got} {value!r}")
-    return value
+def _from_texts(texts: Sequence[str]) -> Iterator[_Given]:
+    if isinstance(texts, str):
+        raise InputError(f"settings are the text {texts!r}; give a list of texts, or a mapping")
+    for text in texts:
+        name, separator, value = text.partition("=")
+        table, dot, key = name.strip().partition(".")
+        where = f"--set {text}"
+        if not separator or not dot:
+            raise InputError(f"{where}: write table.field=value, as in train.steps=200")
+        yield _Given(_table(table, where), key, _toml_value(value), where)
 
 
-def _nearest(name: str, known: Sequence[str]) -> str:
-    near = difflib.get_close_matches(name, known, n=1)
-    return f"did you mean {near[0]!r}?" if near else f"there are {', '.join(known)}"
+def _from_mapping(values: Mapping[str, Any], where: str) -> Iterator[_Given]:
+    for name, value in values.items():
+        table, dot, key = str(name).partition(".")
+        _table(table, where)
+        if dot:
+            yield _Given(table, key, value, where)
+        elif isinstance(value, Mapping):
+            yield from (_Given(table, str(key), own, where) for key, own in value.items())
+        else:
+            raise InputError(
+                f"{where}: {table} is a table of settings, not a value; give its field"
+            )
+
+
+def _table(name: str, where: str) -> str:
+    if name not in TABLES:
+        raise InputError(f"{where}: no table is called {name!r}; {nearest(name, TABLES)}")
+    return name
 
 
 def _toml_value(text: str) -> Any:

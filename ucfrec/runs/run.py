@@ -11,18 +11,21 @@ import numpy as np
 import torch
 
 from ucfrec import schema
-from ucfrec.counterfactual.augment import counterfactual_copies
+from ucfrec.counterfactual.augment import counterfactual_copies, require_rewards_vary
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.episodes.windows import Overlay, Windows
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder, read_json, write_json
 from ucfrec.fitting.loop import fit
+from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
-from ucfrec.policies.registry import POLICIES
+from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import command_line, versions
 from ucfrec.runs.config import Config, config_from_dict
+from ucfrec.runs.reference_losses import reference_losses
+from ucfrec.runs.samples import SAMPLES, sample_recommendations
 from ucfrec.runs.trained_policy import AUGMENTATION, COUNTS, ITEMS, RUN, USERS
 
 _VALIDATION_BATCHES = 16
@@ -30,6 +33,7 @@ _VALIDATION_BATCH = 256
 _QUANTILES = (0.5, 0.75, 0.9, 0.95, 0.99, 1.0)
 
 
+@random_state_kept()
 def train_run(
     store: EpisodeStore,
     out: Path,
@@ -40,7 +44,8 @@ def train_run(
     """Train a policy on the training episodes of `store`, or go on where `out` was left.
 
     Reward model, generator, edited copies (unless `augment.copies` is 0), then the policy; each
-    stage that is finished is kept.
+    stage that is finished is kept. `out` comes into being once all that can be checked has been:
+    a start that fails leaves nothing. The global random state is as before on return.
 
     Args:
         about: what an adapter adds to the record.
@@ -52,25 +57,30 @@ def train_run(
         time and what every stage reports.
 
     Raises:
-        InputError: `out` is a run on another store or with another configuration, or the store has
-            no training episodes.
+        InputError: `out` is a run on another store or with another configuration, the store has
+            too few training episodes, or the learner cannot act on it.
     """
     train, validation = training_views(store)
+    if (out / RUN).exists():
+        _require_same(read_json(out / RUN), store, out, config)
+    elif config.augment.copies > 0:
+        require_rewards_vary(train)
+    policy = new_policy(train, config)
     if not (out / RUN).exists():
-        _begin(store, train, out, config, about or {})
+        _begin(store, train, validation, out, config, about or {})
     record = read_json(out / RUN)
-    _require_same(record, store, out, config)
     record["config"] = dataclasses.asdict(config)
     began = time.perf_counter() - record["wall_time_s"]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    learner = POLICIES[config.policy_name]
-    train = learner.training_view(train, config.policy, out / "view", config.seed)
+    view = policy.training_view(train, config.policy, out / "view", config.seed)
+    if view is not train:
+        train, policy = view, new_policy(view, config)
+    policy = policy.to(device)
     if config.augment.copies > 0:
         overlay, record["augmentation"] = _counterfactuals(train, validation, out, config)
         more_copies = overlay if more_copies is None else overlay.joined(more_copies)
     if more_copies is not None:
         train = train.with_overlay(more_copies)
-    policy = new_policy(train, config).to(device)
     k = policy.config.context
 
     def draw(generator: np.random.Generator) -> Windows:
@@ -88,6 +98,9 @@ def train_run(
     )
     record["policy"] = dataclasses.asdict(fitted)
     record["wall_time_s"] = time.perf_counter() - began
+    if store.has_items:
+        target = max(record["return_quantiles"].values())
+        write_json(out / SAMPLES, sample_recommendations(policy, validation, target))
     write_json(out / RUN, record)
     return dict(record)
 
@@ -109,6 +122,7 @@ def training_views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
 def _begin(
     store: EpisodeStore,
     train: EpisodeStore,
+    validation: EpisodeStore,
     out: Path,
     config: Config,
     about: Mapping[str, Any],
@@ -128,6 +142,7 @@ def _begin(
         "train_steps": train.n_steps,
         "return_quantiles": {str(q): float(np.quantile(train.returns, q)) for q in _QUANTILES},
         "mean_return": float(train.returns.mean()),
+        "data": store.meta["source"],
         "versions": versions(),
         "wall_time_s": 0.0,
         **about,
@@ -137,7 +152,9 @@ def _begin(
             if (store.path / name).exists():
                 shutil.copyfile(store.path / name, scratch / name)
         if store.has_items:
-            TrainingCounts.of(train).save(scratch / COUNTS)
+            counts = TrainingCounts.of(train)
+            counts.save(scratch / COUNTS)
+            record["reference_losses"] = reference_losses(counts, validation)
         write_json(scratch / RUN, record)
 
 
@@ -197,11 +214,12 @@ def _sizes(store: EpisodeStore) -> dict[str, int]:
     return {"state": store.state_size, "action": columns[schema.ACTION][0], "items": 0}
 
 
+@random_state_kept()
 def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
     """A policy with the normalisation and item embeddings of `train`, its weights untrained."""
     torch.manual_seed(config.seed)
-    policy = POLICIES[config.policy_name](config.policy, _sizes(train))
-    base = EpisodeStore.select(train, np.arange(len(train.episode_ids)))
+    policy = policy_class(config.policy_name)(config.policy, _sizes(train))
+    base = train.without_copies()
     mean, std = base.state_statistics
     policy.state_mean.copy_(mean)
     policy.state_std.copy_(torch.where(std > 1e-6, std, 1.0))

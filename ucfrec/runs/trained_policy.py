@@ -20,8 +20,9 @@ from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.files import read_json
 from ucfrec.fitting.checkpoint import load_tensors, load_weights
+from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
-from ucfrec.policies.registry import POLICIES
+from ucfrec.policies.registry import policy_class
 from ucfrec.runs.config import config_from_dict
 
 RUN, AUGMENTATION = "run.json", "augmentation.json"
@@ -52,7 +53,8 @@ class TrainedPolicy:
         """
         record = read_record(run)
         config = config_from_dict(record["config"])
-        policy = POLICIES[config.policy_name](config.policy, record["sizes"])
+        with random_state_kept():
+            policy = policy_class(config.policy_name)(config.policy, record["sizes"])
         path = run / "policy" / f"{checkpoint}.safetensors"
         load_weights(path, policy, _weights(path))
         policy.eval()
@@ -65,6 +67,9 @@ class TrainedPolicy:
             _ids(run / USERS, schema.USER_ID),
             TrainingCounts.load(run / COUNTS) if (run / COUNTS).exists() else None,
         )
+
+    def __repr__(self) -> str:
+        return f"TrainedPolicy({describe_trained(self.record)})"
 
     @property
     def name(self) -> str:
@@ -121,11 +126,23 @@ def read_record(run: Path) -> dict[str, Any]:
     return dict(read_json(run / RUN))
 
 
+def describe_trained(record: Mapping[str, Any]) -> str:
+    """The learner of a run's record and what it was trained on, in one line."""
+    facts = [
+        repr(learner_of(record)),
+        f"trained on {record['train_steps']:,} steps",
+        f"{record['train_episodes']:,} episodes",
+    ]
+    if record["sizes"]["items"]:
+        facts.append(f"{record['sizes']['items']:,} items")
+    return ", ".join([*facts, f"reward={record['reward']}"])
+
+
 def learner_of(record: Mapping[str, Any]) -> str:
     """The learner of a run's record, and whether it departs from its usual use of edited copies."""
     config = config_from_dict(record["config"])
     augmented = config.augment.copies > 0
-    if augmented == POLICIES[config.policy_name].augmented:
+    if augmented == policy_class(config.policy_name).augmented:
         return config.policy_name
     return f"{config.policy_name}-{'augmented' if augmented else 'no-augmentation'}"
 

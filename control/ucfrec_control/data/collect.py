@@ -4,18 +4,21 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import gymnasium
 import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import VectorEnv
-from tqdm import tqdm
+from pydantic import Field
 
 from ucfrec.acting.rollout import Actor, BoolArray, FloatArray, IntArray, Step, rollout
 from ucfrec.errors import InputError
 from ucfrec.files import read_json, write_json
+from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.progress import progress
 from ucfrec.provenance import provenance
+from ucfrec.settings import Count, require, settings_table
 from ucfrec_control.data.d4rl import write_d4rl
 from ucfrec_control.data.sac import SacConfig, SacLearner, seed_all
 from ucfrec_control.data.trajectories import PACKAGES, Trajectories
@@ -24,23 +27,35 @@ from ucfrec_control.worlds.environments import SIDE_BY_SIDE, make_env
 SHOWN: Final = ("dataset", "trajectories", "steps", "mean_return")
 
 
-@dataclass(frozen=True)
+@settings_table("")
 class CollectConfig:
     """What is trained and how much is rolled out."""
 
-    steps: int = 1_000_000
+    steps: Count = 1_000_000
     """Training steps, rounded up to whole episodes."""
-    every: int = 10_000
+    every: Count = 10_000
     """Steps between evaluations; each also keeps the policy and a checkpoint to resume from."""
-    episodes: int = 20
+    episodes: Count = 20
     """Episodes of an evaluation."""
-    fraction: float = 1 / 3
+    fraction: Annotated[float, Field(gt=0, lt=1)] = 1 / 3
     """Of the way from the random policy's return to the expert's, where `medium` is taken."""
-    size: int = 1_000_000
+    size: Count = 1_000_000
     """Steps rolled out of `medium` and of `expert`, rounded up to whole episodes."""
     sac: SacConfig = field(default_factory=SacConfig)
+    """The learner."""
+
+    def __post_init__(self) -> None:
+        """Check the fields against each other."""
+        require(
+            self.steps > self.sac.learning_starts,
+            f"steps is {self.steps}, all of them uniform play; learning starts after "
+            f"{self.sac.learning_starts}",
+            "steps",
+            "sac.learning_starts",
+        )
 
 
+@random_state_kept()
 def collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[dict[str, Any]]:
     """Train SAC and write `medium`, `medium-replay`, `expert` and `medium-expert` to `out`.
 
@@ -59,7 +74,6 @@ def collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[di
         InputError: `out` is complete already or of another configuration, the environment cannot be
             made or has no step limit, or the learner never beat the random policy.
     """
-    _check(config)
     if (out / "MANIFEST.json").exists():
         raise InputError(f"{out} is complete already; remove it or name another output folder")
     training = _train(env_id, out / "training", seed, config)
@@ -107,18 +121,6 @@ def _write(
     return rows
 
 
-def _check(config: CollectConfig) -> None:
-    if min(config.steps, config.every, config.episodes, config.size) < 1:
-        raise InputError("steps, steps between evaluations, episodes and size are at least 1")
-    if config.steps <= config.sac.learning_starts:
-        raise InputError(
-            f"{config.steps} steps are uniform play only; learning starts after "
-            f"{config.sac.learning_starts}"
-        )
-    if not 0 < config.fraction < 1:
-        raise InputError(f"the fraction is {config.fraction}; it lies between 0 and 1")
-
-
 def _claim(file: Path, described: Mapping[str, Any]) -> None:
     """Make the folder of `file` this collection's, or see that it is."""
     if not file.exists():
@@ -158,16 +160,14 @@ def _train(env_id: str, folder: Path, seed: int, config: CollectConfig) -> _Trai
     training = _Training(learner, folder, random_return, [])
     if training.checkpoint.exists():
         training.evaluations.extend(learner.load(training.checkpoint)["evaluations"])
-    with tqdm(
-        total=config.steps, initial=learner.steps, desc="train SAC", unit="step", disable=None
-    ) as bar:
+    with progress(config.steps, "train SAC", "steps", done=learner.steps) as bar:
         while learner.steps < config.steps:
             began = learner.steps
             learner.play_episode(bar)
             due = learner.steps // config.every > began // config.every
             if due or learner.steps >= config.steps:
                 _evaluate(training, judged, seed, config.episodes)
-                bar.set_postfix({"return": f"{training.evaluations[-1]['return']:.1f}"})
+                bar.update(0, mean_return=training.evaluations[-1]["return"])
     env.close()
     judged.close()
     return training
@@ -248,7 +248,7 @@ def _roll_out(training: _Training, index: int, env_id: str, seed: int, size: int
     # Few steps need few episodes at once: a thousand steps is these tasks' usual limit.
     env = make_env(env_id, min(SIDE_BY_SIDE, max(1, size // 1000)))
     rounds: list[Trajectories] = []
-    with tqdm(total=size, desc=f"roll out policy {index}", unit="step", disable=None) as bar:
+    with progress(size, f"roll out policy {index}", "steps") as bar:
         while sum(len(part.rewards) for part in rounds) < size:
             key = seed_all(seed, 4, index, len(rounds))
             steps: list[Step] = []

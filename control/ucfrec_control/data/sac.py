@@ -6,36 +6,42 @@ number, and checkpoints are taken between episodes, so no state of a generator o
 need be stored.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import gymnasium
 import numpy as np
 import numpy.typing as npt
 import torch
 from gymnasium.vector import VectorEnv
-from tqdm import tqdm
+from pydantic import Field
 
 from ucfrec.acting.rollout import BoolArray, FloatArray, IntArray
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, save_tensors
+from ucfrec.progress import Progress
+from ucfrec.settings import BatchSize, LearningRate, Share, Width, settings_table
 
 _COLUMNS: Final = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 """Arrays of the replay buffer, each (capacity, 1, …)."""
 
 
-@dataclass(frozen=True)
+@settings_table("sac")
 class SacConfig:
     """Haarnoja et al. (2018), entropy coefficient learned."""
 
-    learning_starts: int = 10_000
+    learning_starts: Annotated[int, Field(ge=0, le=10**12)] = 10_000
     """Uniform steps before the first update; then there is one update a step."""
-    batch_size: int = 256
-    hidden: int = 256
-    learning_rate: float = 3e-4
-    discount: float = 0.99
-    target_rate: float = 0.005
+    batch_size: BatchSize = 256
+    """Transitions of an update."""
+    hidden: Width = 256
+    """Width of the two hidden layers of actor and critics."""
+    learning_rate: LearningRate = 3e-4
+    """Step size of the updates."""
+    discount: Share = 0.99
+    """γ, of later rewards."""
+    target_rate: Annotated[float, Field(gt=0, le=1)] = 0.005
+    """Share of the critics that their targets take over every update."""
 
 
 class SacLearner:
@@ -63,7 +69,7 @@ class SacLearner:
         """Steps played so far, all of them in the replay buffer."""
         return int(self._buffer.pos)
 
-    def play_episode(self, bar: "tqdm[Any]") -> None:
+    def play_episode(self, bar: Progress) -> None:
         """Play one episode to its end, learning; uniform actions before `learning_starts`."""
         reset_seed = seed_all(self._seed, 1, self.episode)
         generator = np.random.default_rng(reset_seed)

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from ucfrec.errors import InputError
 from ucfrec.files import read_json
-from ucfrec.fitting.tensorboard import read_scalars
+from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.provenance import config_hash
 from ucfrec.reporting.grid import Row, read_rows
 from ucfrec.runs.trained_policy import RUN
@@ -184,7 +184,7 @@ def _attention(run: _Run) -> Figure:
 def _training(runs: Sequence[_Run]) -> Figure:
     curves: dict[str, list[Mapping[int, float]]] = {}
     for run in runs:
-        logged = read_scalars(run.path / "policy").get("validation_loss", {})
+        logged = read_metrics(run.path / "policy").get("validation_loss", {})
         if logged:
             curves.setdefault(run.method, []).append(logged)
     if not curves:

@@ -23,7 +23,7 @@ def find_preset(task: str, kind: str, policy: str) -> Preset:
     Args:
         task: name of a `ucfrec_control.worlds.scores.Task`; "" for none.
         kind: as `ucfrec_control.worlds.scores.find_kind` tells it.
-        policy: a key of `ucfrec.policies.registry.POLICIES`.
+        policy: one of `ucfrec.policies.registry.policy_names`.
     """
     here = {"task": task, "kind": kind, "policy": policy}
     tables: dict[str, dict[str, Any]] = {}

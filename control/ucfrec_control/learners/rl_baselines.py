@@ -2,15 +2,14 @@
 
 import logging
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 import torch
-from tqdm import tqdm
 
 from ucfrec import schema
 from ucfrec.acting.rollout import BoolArray, FloatArray, IntArray
@@ -18,9 +17,12 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_file, atomic_folder, read_json, write_json
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
-from ucfrec.fitting.tensorboard import Events
+from ucfrec.fitting.metrics_log import MetricsLog
+from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.progress import progress
 from ucfrec.provenance import command_line, versions
 from ucfrec.runs.trained_policy import RUN
+from ucfrec.settings import BatchSize, Count, settings_table
 from ucfrec_control.data.trajectories import PACKAGES
 from ucfrec_control.worlds.scores import find_kind, find_task
 
@@ -31,15 +33,20 @@ _ACTOR, _CHECKPOINT = "actor.safetensors", "checkpoint.pt"
 _HOPPER_NARROW = ("medium", "medium-replay", "mixed")
 
 
-@dataclass(frozen=True)
+@settings_table("rl")
 class RLConfig:
     """All that decides a training, with its data."""
 
-    algorithm: str
-    steps: int
+    algorithm: Literal["iql", "cql"]
+    """Of d3rlpy."""
+    steps: Count
+    """Updates in all."""
     task: str
+    """Name of a `ucfrec_control.worlds.scores.Task`, or "": decides CORL's settings."""
     kind: str
-    batch_size: int = 256
+    """Of the dataset, as `ucfrec_control.worlds.scores.find_kind` tells it; the same."""
+    batch_size: BatchSize = 256
+    """Transitions of an update."""
 
 
 class RLPolicy:
@@ -53,9 +60,10 @@ class RLPolicy:
         self.name: str = self.record["config"]["policy_name"]
         tensors, _ = load_tensors(run / _ACTOR)
         self._mean, self._std = (tensors.pop(f"state.{name}").numpy() for name in ("mean", "std"))
-        self._learner = _learner(RLConfig(**self.record["config"]["policy"]))
         sizes = self.record["sizes"]
-        self._learner.create_impl((sizes["state"],), sizes["action"])
+        with random_state_kept():
+            self._learner = _learner(RLConfig(**self.record["config"]["policy"]))
+            self._learner.create_impl((sizes["state"],), sizes["action"])
         load_weights(run / _ACTOR, self._learner.impl.modules.policy, tensors)
 
     def actor(self, episodes: int, target_return: float | None) -> "RLPolicy":
@@ -79,7 +87,7 @@ def is_rl(record: Mapping[str, Any]) -> bool:
 
 
 def rl_config(
-    dataset: Mapping[str, Any], algorithm: str, steps: int, batch_size: int = 256
+    dataset: Mapping[str, Any], algorithm: Any, steps: int, batch_size: int = 256
 ) -> RLConfig:
     """The settings for the data that `ucfrec_control.learners.train.dataset_of` describes."""
     task = find_task(dataset["env_id"], dataset["dataset"])
@@ -92,51 +100,58 @@ def plain_config(config: RLConfig, seed: int) -> dict[str, Any]:
     return {"policy_name": config.algorithm, "policy": asdict(config), "seed": seed}
 
 
+@random_state_kept()
 def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dict[str, Any]:
     """Train on the training trajectories, or go on from the checkpoint in `out`; returns the record
     of the run.
 
     A finished run is read, not repeated. One that was killed and is started again ends with the
-    same actor as one left alone (same machine and device).
+    same actor as one left alone (same machine and device). The global random state is as before on
+    return.
 
     Raises:
         InputError: d3rlpy is not installed, or `out` is of another configuration or other data.
     """
     d3rlpy = _d3rlpy()
-    if not (out / RUN).exists():
-        _begin(store, out, config, seed)
-    record: dict[str, Any] = read_json(out / RUN)
-    asked = (plain_config(config, seed), store.meta["fingerprint"])
-    if (record["config"], record["fingerprint"]) != asked:
-        raise InputError(f"{out} was trained otherwise; remove it or name another run folder")
-    if "policy" in record:
-        return record
+    if (out / RUN).exists():
+        known: dict[str, Any] = read_json(out / RUN)
+        wanted = (plain_config(config, seed), store.meta["fingerprint"])
+        if (known["config"], known["fingerprint"]) != wanted:
+            raise InputError(f"{out} was trained otherwise; remove it or name another run folder")
+        if "policy" in known:
+            return known
     begun = perf_counter()
     d3rlpy.seed(seed)
     train = store.split("train")
+    if not train.n_episodes:
+        raise InputError(
+            f"{store.path} has no training trajectories; prepare it with a later split"
+        )
     mean, std = train.state_statistics
     dataset = _dataset(d3rlpy, train, mean.numpy(), std.numpy())
     learner = _learner(config, "cuda:0" if torch.cuda.is_available() else "cpu:0")
+    if not (out / RUN).exists():
+        _begin(store, out, config, seed)
+    record: dict[str, Any] = read_json(out / RUN)
     step, seconds = _resume(out / _CHECKPOINT, learner, dataset)
-    events = Events(out, step)
-    bar = tqdm(total=config.steps, initial=step, desc=config.algorithm, unit="step", disable=None)
-    while step < config.steps:
-        if step:  # a seed of its own after each checkpoint: no generator's state need be kept
-            d3rlpy.seed(seed + step)
-        steps = min(CHECKPOINT_EVERY, config.steps - step)
-        ((_, losses),) = learner.fit(
-            dataset,
-            n_steps=steps,
-            n_steps_per_epoch=steps,
-            logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
-            show_progress=False,
-            callback=lambda *_: bar.update(),
-        )
-        step += steps
-        events.add(step, losses)
-        _save(out / _CHECKPOINT, learner, step, seconds + perf_counter() - begun)
-    bar.close()
-    events.close()
+    log = MetricsLog(out, step)
+    with progress(config.steps, config.algorithm, "steps", done=step) as bar:
+        while step < config.steps:
+            if step:  # a seed of its own after each checkpoint: no generator's state need be kept
+                d3rlpy.seed(seed + step)
+            steps = min(CHECKPOINT_EVERY, config.steps - step)
+            ((_, losses),) = learner.fit(
+                dataset,
+                n_steps=steps,
+                n_steps_per_epoch=steps,
+                logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
+                show_progress=False,
+                callback=lambda *_: bar.update(),
+            )
+            step += steps
+            log.add(step, losses)
+            _save(out / _CHECKPOINT, learner, step, seconds + perf_counter() - begun)
+    log.close()
     actor = learner.impl.modules.policy.state_dict()
     save_tensors(out / _ACTOR, {**actor, "state.mean": mean, "state.std": std}, {})
     record["policy"] = {"steps": config.steps, "best_step": None}

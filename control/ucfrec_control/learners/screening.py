@@ -13,17 +13,20 @@ largest errors of the next state are capped: a few falls must not decide.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from pydantic import Field
 from scipy import stats
 from torch import Tensor, nn
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import IntArray, Overlay
 from ucfrec.errors import InputError
+from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.runs.run import training_views
+from ucfrec.settings import BatchSize, Count, LearningRate, Share, Width, settings_table
 
 _HELD_OUT_EVERY = 5
 _CLIP = 10.0
@@ -31,27 +34,31 @@ _CHUNK = 1024
 _HELPED = 3
 
 
-@dataclass(frozen=True)
+@settings_table("screening")
 class ScreeningConfig:
     """Predictors, and how much help counts."""
 
-    hidden: int = 192
-    shared_steps: int = 3000
+    hidden: Width = 192
+    """Width of the two hidden layers of a predictor."""
+    shared_steps: Count = 3000
     """Updates of one predictor that serves every missing dimension."""
-    own_steps: int = 1000
+    own_steps: Count = 1000
     """Updates of a copy of it for each missing dimension; without them a dimension that is nearly
     a function of others seems to help."""
-    batch_size: int = 256
-    learning_rate: float = 3e-3
-    max_transitions: int = 100_000
-    min_effect: float = 0.01
+    batch_size: BatchSize = 256
+    """Transitions of an update."""
+    learning_rate: LearningRate = 3e-3
+    """Highest step size of the updates; a third of it for the copies."""
+    max_transitions: Annotated[int, Field(ge=100, le=10**9)] = 100_000
+    """Most transitions to judge by; of more, that many are drawn."""
+    min_effect: Share = 0.01
     """Least share of a next dimension's unexplained variance that counts as help."""
-    capped: float = 0.005
+    capped: Share = 0.005
     """Share of the largest squared errors of a next dimension that count as the largest below:
     where a body falls, one step in a thousand may make up half of their sum."""
-    min_reward_effect: float = 0.01
+    min_reward_effect: Share = 0.01
     """Least share of the reward's variance that counts as help."""
-    level: float = 0.01
+    level: Share = 0.01
     """Level of the tests, over held-out trajectories."""
 
 
@@ -89,6 +96,7 @@ class ScreeningReport:
         return tuple(d.dimension for d in self.dimensions if not d.causes)
 
 
+@random_state_kept()
 def screen(store: EpisodeStore, config: ScreeningConfig, seed: int) -> ScreeningReport:
     """Judge every dimension of the observed states, on the training episodes of `store`.
 

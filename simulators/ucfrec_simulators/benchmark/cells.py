@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.evaluation.evaluate import World, evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.world import World
 from ucfrec.provenance import config_hash
 from ucfrec.reporting.grid import Row
 from ucfrec.runs.config import Config, resolve_config
@@ -25,7 +26,7 @@ class Method:
     """A row of a table."""
 
     policy: str
-    """Key of `ucfrec.policies.registry.POLICIES`."""
+    """One of `ucfrec.policies.registry.policy_names`."""
     settings: tuple[str, ...] = ()
     conditioned: bool = True
     """Whether it is asked for a return."""

@@ -24,7 +24,7 @@ class Budget:
     settings: tuple[str, ...]
     """Of all methods, over their defaults."""
     cuts: Mapping[str, tuple[str, ...]]
-    """Of single learners, by key of `ucfrec.policies.registry.POLICIES`."""
+    """Of single learners, by their name in `ucfrec.policies.registry`."""
     judging: Judging
     sweep_seeds: int
     """Of the sweeps and of the distractor."""

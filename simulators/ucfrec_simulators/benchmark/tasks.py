@@ -8,8 +8,8 @@ from typing import Final
 import pyarrow as pa
 
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.evaluation.evaluate import World
 from ucfrec.evaluation.simulated_store import simulated_store
+from ucfrec.evaluation.world import World
 from ucfrec.logs.mapping import Dataset, LogMapping, log_files
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.plugins import load_plugin

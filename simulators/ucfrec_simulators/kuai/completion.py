@@ -21,6 +21,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder, write_json
 from ucfrec.fitting.loop import LoopConfig, fit
+from ucfrec.fitting.random_state import random_state_kept
 
 USERS_FILE, ITEMS_FILE, REPORT_FILE = "users.parquet", "items.parquet", "completion.json"
 BINS: Final = 10
@@ -118,6 +119,7 @@ class Completed:
         return np.asarray(1 / (1 + np.exp(-logits)))
 
 
+@random_state_kept()
 def complete(
     store: EpisodeStore,
     tags: Mapping[int, tuple[int, ...]],

@@ -22,6 +22,7 @@ from torch import nn
 from ucfrec.acting.rollout import Actor, BoolArray, FloatArray, IntArray, Step, rollout
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
+from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.provenance import versions
 from ucfrec_simulators.behaviors import Actions, Memoryless, SessionMixture, truncated_normal
 from ucfrec_simulators.taobao.environment import ACTION_DIM, MAX_CLICKS, TaobaoEnv, taobao
@@ -208,6 +209,7 @@ def _high(env: VectorEnv[Any, Any, Any]) -> FloatArray:
     return np.asarray(space.high, dtype=np.float32)
 
 
+@random_state_kept()
 def snapshots(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig) -> list[nn.Module]:
     """Networks of one training, after equal shares of its sessions, weakest stage first.
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from tqdm import tqdm
 
 from ucfrec.errors import InputError
+from ucfrec.progress import progress
 
 pytest.importorskip("mujoco", reason="needs ucfrec[control]")
 pytest.importorskip("stable_baselines3", reason="needs ucfrec[collect]")
@@ -118,8 +118,9 @@ def test_files_say_what_they_are(collected: Path) -> None:
 
 def test_an_episode_cut_by_the_step_limit_is_a_timeout() -> None:
     learner = SacLearner(module.make_env("Pendulum-v1", 1), 0, 1000, SacConfig())
-    for _ in range(2):
-        learner.play_episode(tqdm(disable=True))
+    with progress(None, "play", "steps") as bar:
+        for _ in range(2):
+            learner.play_episode(bar)
     replay = learner.replay(learner.steps)
     assert np.flatnonzero(replay["timeouts"]).tolist() == [199, 399]
     assert not replay["terminals"].any()

@@ -13,7 +13,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay
 from ucfrec.errors import InputError
 from ucfrec.files import read_json
-from ucfrec.fitting.tensorboard import read_scalars
+from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec_control.benchmark.robustness import drops
 from ucfrec_control.cli import main
 from ucfrec_control.figures import diagnostics, plots
@@ -142,7 +142,7 @@ def test_rows_of_the_attention_map_sum_to_one_and_see_no_future(runs: Path) -> N
 
 
 def test_curves_are_means_over_seeds(runs: Path) -> None:
-    logged = [read_scalars(runs / f"bc-{s}" / "policy")["validation_loss"] for s in (0, 1)]
+    logged = [read_metrics(runs / f"bc-{s}" / "policy")["validation_loss"] for s in (0, 1)]
     (axes,) = plots.training_curves({"bc": logged}, "loss").axes
     (line,) = axes.lines
     assert list(line.get_xdata()) == [2, 4]

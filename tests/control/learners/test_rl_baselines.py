@@ -2,17 +2,17 @@
 
 import json
 import re
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 import torch
-from tqdm import tqdm
 
 from tests.support.control_files import hopper_like, write_hdf5
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files import read_json
-from ucfrec.fitting.tensorboard import read_scalars
+from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec_control.benchmark.plan import TABLES, Budget, benchmark
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
@@ -33,16 +33,15 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> EpisodeStore:
     return read_d4rl(file).write_store(folder / "store")
 
 
-class _Stops(tqdm):  # type: ignore[type-arg]
-    """A bar during whose fifth step the user interrupts."""
+class _Stops:
+    """Progress during whose fifth step the user interrupts."""
 
     seen = 0
 
-    def update(self, n: float | None = 1) -> bool | None:
+    def update(self, n: float = 1, **shown: float) -> None:
         self.seen += 1
         if self.seen == 5:
             raise KeyboardInterrupt
-        return super().update(n)
 
 
 @pytest.mark.parametrize("algorithm", ["iql", "cql"])
@@ -56,7 +55,7 @@ def test_a_training_that_was_interrupted_ends_as_one_left_alone(
     monkeypatch.setattr(rl_baselines, "CHECKPOINT_EVERY", 2)
     train_rl(store, tmp_path / "alone", config, 0)
     with monkeypatch.context() as interrupted:
-        interrupted.setattr(rl_baselines, "tqdm", _Stops)
+        interrupted.setattr(rl_baselines, "progress", lambda *_, **__: nullcontext(_Stops()))
         with pytest.raises(KeyboardInterrupt):
             train_rl(store, tmp_path / "interrupted", config, 0)
     with pytest.raises(InputError, match="does not exist"):
@@ -65,7 +64,7 @@ def test_a_training_that_was_interrupted_ends_as_one_left_alone(
     train_rl(store, tmp_path / "interrupted", config, 0)
     actors = [tmp_path / run / "actor.safetensors" for run in ("alone", "interrupted")]
     assert actors[0].read_bytes() == actors[1].read_bytes()
-    alone, interrupted = (read_scalars(tmp_path / run) for run in ("alone", "interrupted"))
+    alone, interrupted = (read_metrics(tmp_path / run) for run in ("alone", "interrupted"))
     for loss in ("actor_loss", "critic_loss"):
         assert list(alone[loss]) == [2, 4, 6, 7]
         assert alone[loss] == interrupted[loss]

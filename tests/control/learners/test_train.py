@@ -15,7 +15,7 @@ from ucfrec.acting.rollout import rollout
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files import read_json
-from ucfrec.policies.registry import POLICIES
+from ucfrec.policies.registry import BUILT_IN
 from ucfrec.runs.config import resolve_config
 from ucfrec_control.benchmark.plan import BUDGETS, METHODS, TABLES, Budget
 from ucfrec_control.cli import main
@@ -146,7 +146,7 @@ def test_a_policy_with_a_distractor_is_judged_at_zero(folder: Path, tmp_path: Pa
 
 def test_presets_are_configurations_with_targets() -> None:
     kinds = ("medium", "medium-replay", "medium-expert", "mixed", "diverse", "")
-    for policy in POLICIES:
+    for policy in BUILT_IN:
         for task in TASKS:
             for kind in kinds:
                 preset = find_preset(task.name, kind, policy)

@@ -10,7 +10,8 @@ import pytest
 from tests.support.real_data import data_folder
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.evaluate import World, evaluate_behavior
+from ucfrec.evaluation.evaluate import evaluate_behavior
+from ucfrec.evaluation.world import World
 from ucfrec.plugins import Benchmark, load_plugin
 from ucfrec.reporting.grid import read_rows
 from ucfrec_simulators.benchmark import plan

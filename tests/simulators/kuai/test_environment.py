@@ -21,7 +21,8 @@ from ucfrec.acting.rollout import FORBIDDEN, Step, rollout
 from ucfrec.episodes.states import ItemStates
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import collect
-from ucfrec.evaluation.evaluate import World, _item_numbers
+from ucfrec.evaluation.evaluate import _item_numbers
+from ucfrec.evaluation.world import World
 from ucfrec.plugins import Simulator
 from ucfrec.policies.dt import DTConfig, DTPolicy
 from ucfrec_simulators.behaviors import Constant, Uniform
@@ -131,7 +132,7 @@ def test_a_masked_item_is_refused_and_a_deaf_actor_too() -> None:
     env.step(np.array([3, 4]))
     with pytest.raises(InputError, match=r"1 of 2 sessions were shown an item again \(such as 4\)"):
         env.step(np.array([5, 4]))
-    with pytest.raises(InputError, match="Constant cannot be told"):
+    with pytest.raises(InputError, match="Constant does not take note"):
         rollout(env, Constant(np.zeros(1, np.float32)), 2, 0)
 
 

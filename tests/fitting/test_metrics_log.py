@@ -1,0 +1,145 @@
+"""`metrics.jsonl`: what is written is read, whatever was cut off; anything else is named."""
+
+import json
+import math
+import struct
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tensorboardX.proto.event_pb2 import Event
+
+from ucfrec.errors import InputError
+from ucfrec.fitting.metrics_log import METRICS, MetricsLog, read_metrics
+
+
+def logged(folder: Path, start: int, rows: dict[int, dict[str, float]]) -> None:
+    log = MetricsLog(folder, start)
+    for step, scalars in rows.items():
+        log.add(step, scalars)
+    log.close()
+
+
+def test_what_is_logged_is_read_and_each_line_is_json(tmp_path: Path) -> None:
+    assert read_metrics(tmp_path) == {}
+    logged(tmp_path, 0, {5: {"loss": 1.5, "entropy": math.inf}, 10: {"loss": 0.1 + 0.2}})
+    found = read_metrics(tmp_path)
+    assert found["loss"] == {5: 1.5, 10: 0.1 + 0.2}
+    assert math.isnan(found["entropy"][5])
+
+    def refuse(name: str) -> float:
+        raise AssertionError(f"{name} is no JSON")
+
+    lines = (tmp_path / METRICS).read_text().splitlines()
+    rows = [json.loads(line, parse_constant=refuse) for line in lines]
+    assert rows == [{"step": 5, "loss": 1.5, "entropy": None}, {"step": 10, "loss": 0.1 + 0.2}]
+
+
+def test_lines_are_on_disk_before_the_log_is_closed(tmp_path: Path) -> None:
+    log = MetricsLog(tmp_path, 0)
+    log.add(1, {"loss": 2.0})
+    assert read_metrics(tmp_path) == {"loss": {1: 2.0}}
+    log.close()
+
+
+def test_steps_that_a_resumed_training_logs_again_override(tmp_path: Path) -> None:
+    logged(tmp_path, 0, {5: {"loss": 3.0}, 10: {"loss": 2.0}, 15: {"loss": 9.0}})
+    logged(tmp_path, 10, {15: {"loss": 1.0}, 20: {"loss": 0.5}})
+    assert list(read_metrics(tmp_path)["loss"].items()) == [
+        (5, 3.0),
+        (10, 2.0),
+        (15, 1.0),
+        (20, 0.5),
+    ]
+
+
+def test_a_torn_last_line_is_left_out_and_never_joined_to_the_next(tmp_path: Path) -> None:
+    logged(tmp_path, 0, {5: {"loss": 3.0}, 10: {"loss": 2.0}})
+    whole = (tmp_path / METRICS).read_bytes()
+    for cut in range(1, len(whole.splitlines()[-1]) + 1):
+        (tmp_path / METRICS).write_bytes(whole[:-cut])
+        assert read_metrics(tmp_path) == {"loss": {5: 3.0}}, cut
+    logged(tmp_path, 5, {10: {"loss": 2.5}})
+    assert read_metrics(tmp_path) == {"loss": {5: 3.0, 10: 2.5}}
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("", "is not JSON"),
+        ("{", "is not JSON"),
+        ("[" * 100_000, "is not JSON"),
+        ('{"step": 1, "loss": ' + "1" * 5000 + "}", "is not JSON"),
+        ("[1]", "is no JSON object"),
+        ("null", "is no JSON object"),
+        ('{"loss": 1}', "no whole number from 0 as 'step'"),
+        ('{"step": -1}', "no whole number"),
+        ('{"step": 1.5}', "no whole number"),
+        ('{"step": true}', "no whole number"),
+        ('{"step": 1' + "0" * 30 + "}", "no whole number"),
+        ('{"step": 1, "loss": "low"}', "no number as 'loss'"),
+        ('{"step": 1, "loss": false}', "no number as 'loss'"),
+        ('{"step": 1, "loss": 1' + "0" * 400 + "}", "too large a number as 'loss'"),
+    ],
+)
+def test_other_lines_are_named_in_one_line(tmp_path: Path, line: str, says: str) -> None:
+    (tmp_path / METRICS).write_text(
+        '{"step": 1, "loss": 2}\n' + line + '\n{"step": 2, "loss": 1}\n'
+    )
+    with pytest.raises(InputError, match=says) as caught:
+        read_metrics(tmp_path)
+    assert f"{tmp_path / METRICS}, line 2," in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=5,
+)
+LINES = st.binary(max_size=30) | JSON.map(lambda value: json.dumps(value).encode()) | (
+    st.dictionaries(st.sampled_from(["step", "loss", "kl"]), JSON).map(
+        lambda row: json.dumps(row).encode()
+    )
+)  # fmt: skip
+
+
+@given(st.lists(LINES, max_size=4))
+def test_whatever_lies_there_is_read_as_numbers_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, lines: list[bytes]
+) -> None:
+    folder = tmp_path_factory.mktemp("fuzz")
+    (folder / METRICS).write_bytes(b"\n".join(lines))
+    try:
+        found: Any = read_metrics(folder)
+    except InputError:
+        return
+    for name, curve in found.items():
+        assert isinstance(name, str)
+        assert all(type(step) is int and type(value) is float for step, value in curve.items())
+        assert list(curve) == sorted(curve)
+
+
+def events(path: Path) -> dict[int, dict[str, float]]:
+    """What an event file holds, read from the documentation of TFRecord."""
+    content, at, found = path.read_bytes(), 0, {}
+    while at < len(content):
+        (size,) = struct.unpack_from("<Q", content, at)
+        event = Event.FromString(content[at + 12 : at + 12 + size])
+        at += 12 + size + 4
+        if event.summary.value:
+            found[event.step] = {v.tag: v.simple_value for v in event.summary.value}
+    return found
+
+
+def test_tensorboard_gets_the_same(tmp_path: Path) -> None:
+    log = MetricsLog(tmp_path, 0)
+    log.add(5, {"loss": 1.5})
+    (file,) = tmp_path.glob("events.out.tfevents.*")
+    assert events(file) == {5: {"loss": 1.5}}  # on disk while the training runs
+    log.close()
+    logged(tmp_path, 5, {10: {"loss": 0.25}})
+    (resumed,) = set(tmp_path.glob("events.out.tfevents.*")) - {file}
+    assert events(resumed) == {10: {"loss": 0.25}}

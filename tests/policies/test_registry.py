@@ -1,0 +1,166 @@
+"""Learners by name: ucfrec's own, imported when asked for, and those installed beside it."""
+
+import subprocess
+import sys
+from importlib import invalidate_caches
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ucfrec.commands.cli import main
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.policies.base import SequencePolicy
+from ucfrec.policies.registry import BUILT_IN, policy_class, policy_names
+from ucfrec.runs.config import resolve_config
+from ucfrec.runs.run import train_run
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+MINE = '''
+from dataclasses import dataclass
+from typing import Annotated
+from pydantic import Field
+from torch import nn
+from ucfrec.policies.base import PolicyConfig, SequencePolicy
+from ucfrec.settings import settings_table
+
+@settings_table("policy")
+class MineConfig(PolicyConfig):
+    """Settings of mine."""
+
+    depth: Annotated[int, Field(ge=1, le=4)] = 2
+    """Layers."""
+
+class Mine(SequencePolicy):
+    Config = MineConfig
+
+    def __init__(self, config, sizes):
+        super().__init__(config, sizes)
+        given = [sizes["state"]] + [config.dim] * config.depth
+        self.net = nn.Sequential(*map(nn.Linear, given, given[1:]))
+
+    def features(self, windows):
+        return self.net(windows.states)
+
+class NotOne:
+    pass
+
+class Odd(SequencePolicy):
+    Config = dict
+
+@dataclass(frozen=True)
+class UncheckedConfig(PolicyConfig):
+    depth: int = 2
+
+class Unchecked(SequencePolicy):
+    Config = UncheckedConfig
+'''
+ENTRY_POINTS = """[ucfrec.policies]
+mine = my_learner:Mine
+dt = my_learner:Mine
+not-one = my_learner:NotOne
+odd = my_learner:Odd
+unchecked = my_learner:Unchecked
+gone = my_learner:Gone
+nowhere = no_such_learner:Mine
+"""
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A distribution as pip leaves it, on the path."""
+    site = tmp_path / "site"
+    info = site / "my_learner-1.0.dist-info"
+    info.mkdir(parents=True)
+    (site / "my_learner.py").write_text(MINE)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-learner\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(ENTRY_POINTS)
+    monkeypatch.syspath_prepend(str(site))
+    monkeypatch.delitem(sys.modules, "my_learner", raising=False)
+    invalidate_caches()
+
+
+def small_store(path: Path) -> EpisodeStore:
+    rng = np.random.default_rng(0)
+    columns = {
+        "observation": rng.normal(size=(60, 3)),
+        "action": rng.uniform(-1, 1, size=(60, 2)),
+        "reward": rng.random(60),
+    }
+    return EpisodeStore.write(path, columns, np.full(12, 5))
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_every_name_is_a_learner(name: str) -> None:
+    assert issubclass(policy_class(name), SequencePolicy)
+
+
+def test_names_are_known_without_importing_any_learner() -> None:
+    program = (
+        "import sys; from ucfrec.policies.registry import policy_names; "
+        "assert 'lsdt' in policy_names(); "
+        "print({'torch', 'pydantic', 'gymnasium', 'ucfrec.policies.ucf'} & set(sys.modules))"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert ended.stdout.strip() == "set()"
+
+
+@pytest.mark.usefixtures("installed")
+def test_an_installed_learner_is_trained_listed_and_read_back(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert policy_names()[: len(BUILT_IN)] == tuple(BUILT_IN)
+    assert "mine" in policy_names()
+    assert policy_class("dt").__module__ == "ucfrec.policies.dt"
+    small_store(tmp_path / "store")
+    command = ["train", str(tmp_path / "store"), "--out", str(tmp_path / "run"), "--policy", "mine"]
+    command += ["--set", "train.steps=4", "--set", "policy.depth=3", "--set", "policy.dim=8"]
+    assert main(command) == 0
+    trained = TrainedPolicy.load(tmp_path / "run")
+    assert (trained.name, type(trained.policy).__name__) == ("mine", "Mine")
+    assert len(trained.policy.net) == 3  # type: ignore[arg-type]
+    capsys.readouterr()
+    assert main(["settings", "--policy", "mine"]) == 0
+    assert "policy.depth" in capsys.readouterr().out
+    assert main([*command, "--set", "policy.depth=5"]) == 2
+    assert "policy.depth is 5; it must be a whole number from 1 to 4" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("installed")
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("not-one", "no class derived from ucfrec.policies.base.SequencePolicy"),
+        ("odd", "not derived from ucfrec.policies.base.PolicyConfig"),
+        ("unchecked", "not derived from .* under @ucfrec.settings.settings_table"),
+        ("gone", "my_learner:Gone, which cannot be imported"),
+        ("nowhere", "no_such_learner:Mine, which cannot be imported"),
+        ("min", "there are ucf, dt, .*, mine"),
+    ],
+)
+def test_what_is_no_learner_is_refused(name: str, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        policy_class(name)
+
+
+@pytest.mark.usefixtures("installed")
+def test_an_installed_learner_that_cannot_be_built_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mine = policy_class("mine")
+    store = small_store(tmp_path / "store")
+    config = resolve_config("mine", None, ["train.steps=2", "policy.dim=8"])
+    built = mine.__init__
+
+    def broken(self: SequencePolicy, *args: object) -> None:
+        raise ZeroDivisionError("of my own")
+
+    monkeypatch.setattr(mine, "__init__", broken)
+    with pytest.raises(ZeroDivisionError):
+        train_run(store, tmp_path / "run", config)
+    assert not (tmp_path / "run").exists()
+    monkeypatch.setattr(mine, "__init__", built)
+    train_run(store, tmp_path / "run", config)

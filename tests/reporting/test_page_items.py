@@ -1,0 +1,218 @@
+"""Reports of policies of items: reference losses, switched-off losses, samples, data, estimates."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+
+from tests.support import killed_run
+from tests.support.episodes import (
+    N_ITEMS,
+    episode_columns,
+    lengths_of,
+    random_episodes,
+    some_states,
+    step_columns,
+)
+from tests.support.report_page import HOSTILE, SOURCE, number, page_of, record_of, rewritten, row
+from ucfrec.commands.cli import main
+from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.reporting.page import write_report
+from ucfrec.runs.config import resolve_config
+from ucfrec.runs.run import train_run
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+SETTINGS = (*killed_run.SETTINGS, "train.steps=20", "train.learning_rate=1e-3")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store of items and runs `ucf` and `greedy` on it; treat as read-only."""
+    folder = tmp_path_factory.mktemp("items")
+    episodes = random_episodes([2 + n % 6 for n in range(150)], seed=1)
+    EpisodeStore.write(
+        folder / "store",
+        step_columns(episodes),
+        lengths_of(episodes),
+        episode_columns(episodes),
+        source=SOURCE,
+    )
+    some_states().save(folder / "store" / ITEM_STATES)
+    ids = pa.table({"item_id": [f"item {n}" for n in range(N_ITEMS)], "train_count": [7] * N_ITEMS})
+    pq.write_table(ids, folder / "store" / "items.parquet")
+    for run, learner in (("ucf", "ucf"), ("greedy", "crm-greedy")):
+        config = resolve_config(learner, None, SETTINGS if run == "ucf" else SETTINGS[:-1], seed=3)
+        train_run(EpisodeStore.open(folder / "store"), folder / run, config)
+    return folder
+
+
+def test_losses_are_drawn_against_uniform_and_popularity(folder: Path, tmp_path: Path) -> None:
+    store = EpisodeStore.open(folder / "store")
+    train, held_out = store.split("train"), store.split("validation")
+    shown = np.bincount(train.step_values("item", *train.all_steps()), minlength=N_ITEMS)
+    share = (shown + 1) / (shown.sum() + N_ITEMS)
+    items = held_out.step_values("item", *held_out.all_steps())
+    found = record_of(folder / "ucf")["reference_losses"]
+    assert found["uniform"] == pytest.approx(math.log(N_ITEMS))
+    assert found["popularity"] == pytest.approx(-np.log(share[items]).mean())
+    page = page_of(tmp_path / "report.html", folder / "ucf")
+    labels = [d for t, d in page.elements if t == "line" and d["class"] == "level"]
+    assert len(labels) == 2 * 2  # validation and training loss
+    assert f"all items alike: {math.log(N_ITEMS):.4g}" in page.text
+    assert number(page.tables["Runs"]["loss with items by popularity"]["ucf"]) == pytest.approx(
+        found["popularity"], rel=1e-3
+    )
+
+
+def test_a_squared_error_is_not_compared_with_likelihoods(folder: Path, tmp_path: Path) -> None:
+    page = page_of(tmp_path / "report.html", folder / "greedy")
+    assert not [d for t, d in page.elements if t == "line" and d["class"] == "level"]
+    assert "loss with items by popularity" not in page.tables["Runs"]
+
+
+def test_no_curve_of_a_loss_that_is_switched_off(folder: Path, tmp_path: Path) -> None:
+    assert record_of(folder / "ucf")["config"]["policy"]["lambda_mask"] == 0
+    tables = page_of(tmp_path / "off.html", folder / "ucf").tables
+    assert "Mask loss of the attention (Eq. 5)" not in tables
+    assert "Training loss, all terms" not in tables  # it is the action loss
+    assert "Training loss of the action (one batch)" in tables
+    config = record_of(folder / "ucf")["config"]
+    config["policy"] = config["policy"] | {"lambda_mask": 0.1}
+    on = rewritten(folder / "ucf", tmp_path / "on", config=config)
+    assert "Mask loss of the attention (Eq. 5)" in page_of(tmp_path / "on.html", on).tables
+
+
+def test_learning_nothing_of_users_is_a_warning(folder: Path, tmp_path: Path) -> None:
+    says = "is not below 2.3, what showing items by their popularity alone reaches"
+    for best, warned in ((2.3, True), (2.2, False)):
+        policy = record_of(folder / "ucf")["policy"] | {"best_validation": best}
+        losses = {"uniform": 2.4, "popularity": 2.3}
+        run = rewritten(
+            folder / "ucf", tmp_path / f"run{warned}", policy=policy, reference_losses=losses
+        )
+        assert (says in page_of(tmp_path / "report.html", run).text) is warned
+
+
+def test_a_reward_model_that_predicts_nothing_is_a_warning(folder: Path, tmp_path: Path) -> None:
+    augmentation = record_of(folder / "ucf")["augmentation"]
+    for r2, warned in ((-0.07, True), (0.02, True), (0.03, False)):
+        model = augmentation["reward_model"] | {"r2_without_z": r2}
+        changed = augmentation | {"reward_model": model, "warnings": []}
+        run = rewritten(folder / "ucf", tmp_path / f"run {r2}", augmentation=changed)
+        text = page_of(tmp_path / "report.html", run).text
+        assert (f"the reward model predicts nothing: from state and action its R² on held-out "
+                f"steps is {r2:.2f}" in text) is warned  # fmt: skip
+
+
+def test_samples_are_what_the_policy_shows(folder: Path, tmp_path: Path) -> None:
+    run = folder / "ucf"
+    samples = json.loads((run / "samples.json").read_text())
+    trained, held_out = TrainedPolicy.load(run), EpisodeStore.open(folder / "store")
+    held_out = held_out.split("validation")
+    first = held_out.windows(np.array([0]), held_out.lengths[:1] - 1, 5)
+    more = samples["target_return"] - float(held_out.returns[0])
+    best = trained.log_probabilities(first, more)[0].topk(5).indices
+    session = samples["sessions"][0]
+    assert session["recommended"] == best.tolist()
+    items = held_out.step_values("item", *held_out.all_steps())[: held_out.lengths[0]]
+    assert session["history"] == items[:-1][-5:].tolist()
+    assert session["logged"] == items[-1]
+    assert samples["target_return"] == max(record_of(run)["return_quantiles"].values())
+    table = page_of(tmp_path / "report.html", run).tables["Held-out session 1"]
+    lines = [name for name in table if name.startswith("recommended 1")]
+    assert table[lines[0]]["item_id"] == f"item {best[0]}"
+    assert torch.isfinite(first.states).all()
+
+
+def test_features_come_beside_samples_and_never_run(folder: Path, tmp_path: Path) -> None:
+    features = tmp_path / "features.csv"
+    rows = [f'item {n},"{HOSTILE}",{n % 2}' for n in range(N_ITEMS)]
+    features.write_text(
+        "\n".join(["item_id,title,fresh", *(r.replace('"alert(2)"', "2") for r in rows)])
+    )
+    out = tmp_path / "report.html"
+    assert main(["report", str(folder / "ucf"), "--items", str(features), "--out", str(out)]) == 0
+    page = out.read_text()
+    assert "&lt;script&gt;" in page
+    assert "<script" not in page
+    assert "fresh 1" in page
+    assert "fresh 0" not in page
+    features.write_text("id\n1\n")
+    with pytest.raises(InputError, match="has no column 'item_id'"):
+        write_report(out, [folder / "ucf"], items=features)
+    with pytest.raises(InputError, match="cannot be read as Parquet or CSV"):
+        write_report(out, [folder / "ucf"], items=folder / "ucf" / "run.json")
+
+
+def test_data_quality_comes_from_the_run_folder(folder: Path, tmp_path: Path) -> None:
+    page = page_of(tmp_path / "report.html", folder / "ucf")
+    assert page.tables["Rows of the logs"]["rows read"] == {"count": "1,200"}
+    assert page.tables["Steps by reward"]["1"] == {"count": "279", "share": "23.66%"}
+    assert "not recorded" not in page.text
+
+
+def test_a_run_from_before_is_shown_with_what_it_recorded(folder: Path, tmp_path: Path) -> None:
+    old = rewritten(folder / "ucf", tmp_path / "old", data=None, reference_losses=None)
+    (old / "samples.json").unlink()
+    (old / "policy" / "metrics.jsonl").unlink()
+    text = page_of(tmp_path / "report.html", old).text
+    for what in ("Rows read and dropped", "item popularity", "Curves of old", "old"):
+        assert f"{what}: not recorded." in text, what
+
+
+def test_estimates_from_logs_are_shown_with_their_warnings(folder: Path, tmp_path: Path) -> None:
+    about = {
+        "effective_sessions": 33.25, "largest_weight": 0.5, "sessions": 600, "overlap": 1.01,
+        "warnings": [HOSTILE], "run": "runs/ucf",
+    }  # fmt: skip
+    rows = [
+        row("", "behavior", 2.0, estimator="logged", choice="as logged", **about),
+        row("", "ucf", 3.0, estimator="DR", choice="softmax", **about),
+    ]
+    for one in rows:
+        del one["world"]
+    (tmp_path / "ope.json").write_text(json.dumps([*rows, *rows]))
+    page = page_of(tmp_path / "report.html", folder / "ucf", results=(tmp_path / "ope.json",))
+    table = page.tables["Estimates for ucf (softmax) of runs/ucf"]
+    assert table["DR"] == {
+        "mean return of a session": "3 [2.5, 4.5]", "effective sample": "33.25",
+        "share of the largest weight": "0.5", "sessions": "600", "overlap": "1.01",
+    }  # fmt: skip
+    assert table["logged sessions"]["mean return of a session"] == "2 [1.5, 3.5]"
+    assert page.text.index("not to be relied on") < page.text.index("Trained on")
+    assert len([d for t, d in page.elements if t == "rect" and d["class"] == "bar"][:4]) == 4
+    assert not {tag for tag, _ in page.elements} & {"script", "img"}
+
+
+def test_models_have_no_interval_and_the_verdict_of_ope_is_quoted(
+    folder: Path, tmp_path: Path
+) -> None:
+    none = {"R_cum_low": None, "R_cum_high": None, "verdict": f"Do not rely on it: {HOSTILE}"}
+    rows = [
+        row("", "behavior", 2.0, estimator="logged"),
+        row("", "ucf", 3.0, estimator="FQE") | none,
+    ]
+    (tmp_path / "ope.json").write_text(json.dumps(rows))
+    page = page_of(tmp_path / "report.html", folder / "ucf", results=(tmp_path / "ope.json",))
+    assert page.tables["Estimates for ucf"]["FQE"]["mean return of a session"] == "3 [–]"
+    assert "For ucf: Do not rely on it" in page.text
+    (tmp_path / "ope.json").write_text(json.dumps(rows[1:]))
+    page_of(tmp_path / "report.html", folder / "ucf", results=(tmp_path / "ope.json",))
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"effective_sessions": "many"}, {"warnings": "one"}, {"R_cum": None}, {"policy": 3}]
+)
+def test_estimates_of_another_kind_are_refused(
+    folder: Path, tmp_path: Path, wrong: dict[str, object]
+) -> None:
+    good = row("", "ucf", 1.0, estimator="DR")
+    (tmp_path / "ope.json").write_text(json.dumps([good, good | wrong]))
+    with pytest.raises(InputError, match=f"row 2, has no usable {next(iter(wrong))}"):
+        write_report(tmp_path / "out.html", [folder / "ucf"], [tmp_path / "ope.json"])

@@ -1,0 +1,105 @@
+"""The verdict claims what intervals allow, and no more."""
+
+from typing import Any
+
+import pytest
+
+from tests.support.report_page import row
+from ucfrec.reporting.page_results import Estimates, Results
+from ucfrec.reporting.verdict import NO_RESULTS, verdict
+
+
+def earned(policy: str, value: float, wide: float = 0.1, **more: Any) -> dict[str, Any]:
+    interval = {"R_cum_low": value - wide, "R_cum_high": value + wide}
+    return row("a", policy, value, **more) | interval
+
+
+def of_world(*rows: dict[str, Any]) -> str:
+    (said,) = verdict(Results({"a": rows}, ()))
+    return said
+
+
+def estimated(name: str, value: float, wide: float = 0.1) -> dict[str, Any]:
+    return {**earned("ucf", value, wide), "estimator": name}
+
+
+def of_logs(*rows: dict[str, Any], warnings: tuple[str, ...] = (), logged: bool = True) -> str:
+    of_logged = estimated("logged", 1.0) if logged else None
+    (said,) = verdict(Results({}, [Estimates("ucf", of_logged, rows, warnings)]))
+    return said
+
+
+def test_without_results_nothing_is_said_of_earnings() -> None:
+    assert verdict(Results({}, ())) == [NO_RESULTS]
+    assert "nothing is known of what these policies earn" in NO_RESULTS
+
+
+def test_the_best_is_named_with_its_interval_and_what_it_lies_above() -> None:
+    said = of_world(
+        earned("random", 1.0), earned("dt", 2.0, train_seed=0), earned("ucf", 3.0, train_seed=0),
+        earned("optimal", 9.0), earned("logging", 2.95),
+    )  # fmt: skip
+    assert "ucf earned most of 2 trained policies: 3 (95% interval 2.9 to 3.1)" in said
+    assert "lies above those of the others, the next being dt (2)" in said
+    assert "more than random (1), and less than optimal (9)" in said
+    assert "Whether it earns more or less than logging (2.95) is open" in said
+    assert "Each policy was trained once" in said
+
+
+def test_intervals_that_overlap_leave_it_open() -> None:
+    said = of_world(earned("dt", 2.9, train_seed=0), earned("ucf", 3.0, train_seed=0))
+    assert "overlaps that of dt (2.9): which of them earns more is open" in said
+    assert "nothing to compare" in said
+
+
+def test_seeds_of_training_are_taken_together() -> None:
+    rows = [earned("ucf", value, train_seed=seed) for seed, value in enumerate((3.0, 4.0, 5.0))]
+    said = of_world(*rows, earned("random", 3.5), earned("bad", 1.0))
+    assert "4 in the mean of 3 trainings (their 95% intervals together: 2.9 to 5.1)" in said
+    assert "more than bad (1)" in said
+    assert "less than random (3.5) is open" in said
+    assert "trained once" not in said
+
+
+def test_checkpoints_of_one_run_are_no_seeds() -> None:
+    rows = [earned("ucf", 3.0, train_seed=0, checkpoint="best"),
+            earned("ucf", 2.0, train_seed=0, checkpoint="last")]  # fmt: skip
+    said = of_world(*rows)
+    assert "ucf, checkpoint best earned most of 2 trained policies: 3 (" in said
+    assert "trained once" in said
+
+
+def test_built_in_policies_alone_say_nothing_of_trained_ones() -> None:
+    assert of_world(earned("random", 1.0)) == (
+        "In a, only built-in policies were played: random (1)."
+    )
+
+
+@pytest.mark.parametrize(
+    ("dr", "ips", "says"),
+    [
+        (2.0, 3.0, "Every weighted estimate (IPS and DR) says that it earns more"),
+        (0.2, 0.1, "Every weighted estimate (IPS and DR) says that it earns less"),
+        (1.1, 0.9, "No weighted estimate (IPS and DR) tells it from the logging policy"),
+        (2.0, 1.0, "do not agree (DR more than the logging policy, of IPS and DR)"),
+        (2.0, 0.1, "do not agree (DR more; IPS less than the logging policy, of IPS and DR)"),
+    ],
+)
+def test_estimates_conclude_only_where_all_of_them_do(dr: float, ips: float, says: str) -> None:
+    said = of_logs(estimated("DM", 9.0), estimated("IPS", ips), estimated("DR", dr))
+    assert f"DR estimates {dr:g} [" in said
+    assert "logged sessions earned 1 [0.9, 1.1]" in said
+    assert says in said
+
+
+def test_an_estimate_with_warnings_is_not_relied_on() -> None:
+    said = of_logs(estimated("DR", 5.0), warnings=("effective sample 3",))
+    assert "DR estimates 5 [4.9, 5.1] a session, which is not to be relied on: effective" in said
+    assert "earns more" not in said
+
+
+def test_models_alone_conclude_nothing() -> None:
+    said = of_logs(estimated("DM", 5.0), estimated("FQE", 6.0), warnings=("no propensity",))
+    assert "allow no weighted estimate (no propensity)" in said
+    assert "DM 5 [4.9, 5.1] and FQE 6 [5.9, 6.1]: that supports no conclusion" in said
+    assert "is not among the rows" in of_logs(estimated("DR", 5.0), logged=False)

@@ -1,0 +1,102 @@
+"""Reports as tests read them, and rows to put into them."""
+
+import json
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+from ucfrec.reporting.page import write_report
+
+VOID = {"meta", "br", "img", "link", "input", "hr"}
+HOSTILE = "</title><script>alert('1')</script><img src=x onerror=\"alert(2)\">&amp;"
+
+QUANTILES = {"0": 1.0, "0.25": 1.0, "0.5": 2.0, "0.75": 3.0, "0.99": 6.5, "1": 7.0}
+SOURCE: dict[str, Any] = {
+    "rows_read": 1200,
+    "dropped": {"null_key": 3, "duplicate": 12, "conflicting_duplicate": 6, "short_episode": 0},
+    "unsorted_rows": 4,
+    "steps": 1179,
+    "items": 9,
+    "summary": {
+        "session_lengths": {"edges": [1, 2, 4, 8], "counts": [4, 3, 1], "quantiles": QUANTILES},
+        "rewards": {"values": [0.0, 1.0], "counts": [900, 279], "quantiles": QUANTILES},
+        "item_popularity": {"edges": [0, 1, 2], "counts": [1, 8], "quantiles": QUANTILES},
+    },
+}
+"""What `prepare` reports of a store."""
+
+
+class Page(HTMLParser):
+    """What a page holds; fails where tags do not match."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.tables: dict[str, dict[str, dict[str, str]]] = {}
+        """{caption: {row: {column: cell}}}"""
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self.raw = path.read_text(encoding="utf-8")
+        self._open: list[str] = []
+        self._rows: list[list[str]] = []
+        self._caption = self._cell = ""
+        self.feed(self.raw)
+        self.close()
+        assert self._open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self._open.append(tag)
+        if tag == "table":
+            self._rows, self._caption = [], ""
+        elif tag == "tr":
+            self._rows.append([])
+        elif tag in ("td", "th"):
+            self._cell = ""
+            assert tag == "td" or dict(attrs)["scope"] in ("row", "col")
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop() == tag
+        if tag in ("td", "th"):
+            self._rows[-1].append(self._cell.strip())
+        elif tag == "table":
+            head, *body = self._rows
+            rows = {row[0]: dict(zip(head[1:], row[1:], strict=True)) for row in body}
+            self.tables[self._caption] = rows
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+        if self._open and self._open[-1] == "caption":
+            self._caption += data
+        self._cell += data
+
+
+def page_of(out: Path, *runs: Path, results: tuple[Path, ...] = ()) -> Page:
+    write_report(out, runs, results)
+    return Page(out)
+
+
+def record_of(run: Path) -> dict[str, Any]:
+    record: dict[str, Any] = json.loads((run / "run.json").read_text())
+    return record
+
+
+def rewritten(run: Path, to: Path, **changes: Any) -> Path:
+    """A copy of a run with another record; a change to None takes the field away."""
+    shutil.copytree(run, to)
+    record = {k: v for k, v in (record_of(run) | changes).items() if v is not None}
+    (to / "run.json").write_text(json.dumps(record))
+    return to
+
+
+def row(world: str, policy: str, value: float, **more: Any) -> dict[str, Any]:
+    interval = {"R_cum": value, "R_cum_low": value - 0.5, "R_cum_high": value + 1.5}
+    return {"world": world, "policy": policy, **interval, **more}
+
+
+def number(cell: str) -> float:
+    return float(cell.replace(",", ""))

@@ -1,0 +1,152 @@
+"""Fit, recommend, save and load from Python."""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import ucfrec
+from tests.recommending.test_recommend import SMALL, random_log
+from ucfrec import UCF, EpisodeStore, Recommender
+from ucfrec.errors import InputError
+from ucfrec.logs import LogMapping, PrepareOptions, prepare
+
+
+@pytest.fixture(scope="module")
+def log() -> pd.DataFrame:
+    return random_log()
+
+
+@pytest.fixture(scope="module")
+def folder(log: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The log in two files, and the store of both."""
+    path = tmp_path_factory.mktemp("recommender")
+    log.head(700).to_parquet(path / "log-1.parquet")
+    log.tail(len(log) - 700).to_parquet(path / "log-2.parquet")
+    options = PrepareOptions(reward="reward", session_by="gap", gap_minutes=20)
+    prepare([path / "log-*.parquet"], LogMapping(), path / "store", options)
+    return path
+
+
+@pytest.fixture(scope="module")
+def fitted(folder: Path) -> Recommender:
+    return Recommender("dt", settings=SMALL, seed=3).fit(EpisodeStore.open(folder / "store"))
+
+
+def test_the_names_of_the_package() -> None:
+    assert set(ucfrec.__all__) == {"UCF", "EpisodeStore", "Recommender", "__version__"}
+    assert UCF is Recommender
+    assert UCF(settings=SMALL).config.policy_name == "ucf"
+    with pytest.raises(AttributeError, match="no attribute 'Recommendation'"):
+        ucfrec.Recommendation  # noqa: B018
+
+
+@pytest.mark.parametrize("kind", ["folder of the store", "glob", "frame"])
+def test_a_store_its_logs_and_a_frame_of_them_train_the_same_policy(
+    fitted: Recommender, folder: Path, log: pd.DataFrame, kind: str, tmp_path: Path
+) -> None:
+    policy = Recommender("dt", settings=SMALL, seed=3)
+    rules = {"reward": "reward", "session_by": "gap", "gap_minutes": 20.0}
+    if kind == "folder of the store":
+        policy.fit(str(folder / "store"), tmp_path / "run")
+    elif kind == "glob":
+        policy.fit(folder / "log-*.parquet", tmp_path / "run", **rules)  # type: ignore[arg-type]
+    else:
+        policy.fit(log, tmp_path / "run", **rules)  # type: ignore[arg-type]
+    assert policy.run == tmp_path / "run"
+    assert policy.trained.record["fingerprint"] == fitted.trained.record["fingerprint"]
+    pd.testing.assert_frame_equal(policy.recommend(log), fitted.recommend(log))
+
+
+def test_a_frame_leaves_only_the_run_behind(
+    log: pd.DataFrame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scratch, work = tmp_path / "scratch", tmp_path / "work"
+    scratch.mkdir()
+    work.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
+    monkeypatch.chdir(work)
+    policy = Recommender("dt", settings=SMALL).fit(log, tmp_path / "run")
+    assert not [*scratch.iterdir(), *work.iterdir()]
+    folders = (scratch, work, tmp_path, tmp_path / "run", tmp_path / "run" / "policy")
+    before = [folder.stat().st_mtime_ns for folder in folders]
+    policy.recommend(log)
+    assert [folder.stat().st_mtime_ns for folder in folders] == before  # nothing came and went
+    kept = Recommender("dt", settings=SMALL).fit(log)
+    assert [path.name for path in kept.run.parent.iterdir()] == ["run"]
+    assert kept.run.is_relative_to(scratch)
+
+
+def test_an_interrupted_fit_on_a_frame_goes_on(log: pd.DataFrame, tmp_path: Path) -> None:
+    """The same frame is the same store, wherever it was prepared in between."""
+    first = Recommender("dt", settings=SMALL).fit(log, tmp_path / "run")
+    again = Recommender("dt", settings=SMALL).fit(log, tmp_path / "run")
+    pd.testing.assert_frame_equal(first.recommend(log), again.recommend(log))
+    with pytest.raises(InputError, match="is a run on another store"):
+        Recommender("dt", settings=SMALL).fit(log.head(900), tmp_path / "run")
+
+
+def test_rows_that_are_left_out_are_warned_of(log: pd.DataFrame, tmp_path: Path) -> None:
+    holes = log.assign(reward=log.reward.mask(log.index < 5))
+    with pytest.warns(UserWarning, match=r"5 of 1,500 rows were left out \(5: reward is missing"):
+        Recommender("dt", settings=SMALL).fit(holes, tmp_path / "run")
+
+
+def test_data_that_cannot_be_used(fitted: Recommender, folder: Path, log: pd.DataFrame) -> None:
+    policy = Recommender("dt", settings=SMALL)
+    store = folder / "store"
+    for data, options, message in (
+        (store, {"reward": "reward"}, "is prepared already"),
+        (EpisodeStore.open(store), {"gap_minutes": 3.0}, "is prepared already"),
+        (store, {"mapping": LogMapping({"user_id": "uid"})}, "is prepared already"),
+        (folder / "nothing", {}, "nothing does not exist"),
+        ([1, 2], {}, "logs: a list is not a pandas DataFrame"),
+        (log.head(0), {}, "logs: the frame has no rows"),
+        (log.drop(columns="item_id"), {}, "no column 'item_id'"),
+        (log, {"reward": "is_click"}, "no column 'is_click'"),
+        (log, {"session_by": "day"}, "session_by is 'day'"),
+        (log.assign(reward=1.0), {}, "nothing to learn"),
+    ):
+        with pytest.raises(InputError, match=message):
+            policy.fit(data, **options)  # type: ignore[arg-type]
+        assert repr(policy) == "Recommender('dt', not trained)"
+    for use in (lambda: policy.run, lambda: policy.recommend(log), lambda: policy.trained):
+        with pytest.raises(InputError, match="not trained yet"):
+            use()
+
+
+def test_a_recommender_says_what_it_was_trained_on(fitted: Recommender) -> None:
+    record = fitted.trained.record
+    steps, episodes = record["train_steps"], record["train_episodes"]
+    facts = f"'dt', trained on {steps:,} steps, {episodes:,} episodes, 30 items, reward=reward"
+    assert repr(fitted) == f"Recommender({facts})"
+    assert repr(fitted.trained) == f"TrainedPolicy({facts})"
+
+
+def test_a_loaded_policy_is_the_one_saved(
+    fitted: Recommender, log: pd.DataFrame, tmp_path: Path
+) -> None:
+    fitted.save(tmp_path / "copy")
+    loaded = UCF.load(tmp_path / "copy")
+    assert loaded.config == fitted.config
+    assert repr(loaded) == repr(fitted)
+    pd.testing.assert_frame_equal(loaded.recommend(log), fitted.recommend(log))
+    assert loaded.trained is loaded.trained
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(InputError, match="copy exists already"):
+        fitted.save(tmp_path / "copy")
+    assert sorted(tmp_path.iterdir()) == before
+    with pytest.raises(InputError, match="is not a run folder"):
+        Recommender.load(tmp_path)
+
+
+def test_text_and_integers_that_look_alike_are_the_same_ids(
+    fitted: Recommender, log: pd.DataFrame
+) -> None:
+    text = log.assign(user_id=log.user_id.astype(str), item_id=log.item_id.astype(str))
+    found, expected = fitted.recommend(text, k=30), fitted.recommend(log, k=30)
+    assert found.user_id.map(type).eq(str).all()
+    found = found.astype({"user_id": np.int64}).sort_values(["user_id", "rank"])
+    pd.testing.assert_frame_equal(found.reset_index(drop=True), expected, rtol=1e-4)

@@ -1,0 +1,125 @@
+"""Tables of settings: dataclasses in every respect, but for values that they do not take."""
+
+import copy
+import pickle
+import subprocess
+import sys
+from dataclasses import FrozenInstanceError, asdict, fields, replace
+from typing import Annotated, Literal
+
+import pytest
+from pydantic import Field
+
+from ucfrec.errors import InputError
+from ucfrec.settings import SettingError, describe, require, settings_table
+
+
+@settings_table("shop")
+class Shop:
+    """A table."""
+
+    shelves: Annotated[int, Field(ge=1, le=2000)]
+    """How many
+    there are."""
+    width: Annotated[float, Field(gt=0)] = 0.5
+    """Of each."""
+    sells: Literal["bread", "wine"] = "bread"
+    """What is on them."""
+    open: bool = True
+    """Now."""
+    hours: Annotated[tuple[int, int], Field(strict=False)] | None = None
+    """From, to."""
+    name: str = ""
+    """Above the door."""
+
+    def __post_init__(self) -> None:
+        require(
+            self.shelves * self.width <= 10,
+            f"shop.shelves is {self.shelves}; no room for {self.width}",
+            "shop.shelves",
+            "shop.width",
+        )
+
+
+@settings_table("shop")
+class Bakery(Shop):
+    """A table over another."""
+
+    width: Annotated[float, Field(gt=0)] = 0.25
+    ovens: int = 2
+    """In the back."""
+
+
+def test_a_table_is_a_dataclass() -> None:
+    shop = Bakery(3, ovens=1)
+    assert asdict(shop) == {
+        "shelves": 3,
+        "width": 0.25,
+        "sells": "bread",
+        "open": True,
+        "hours": None,
+        "name": "",
+        "ovens": 1,
+    }
+    assert [f.name for f in fields(shop)] == list(asdict(shop))
+    assert fields(shop)[1].default == 0.25
+    assert replace(shop, width=2) == Bakery(3, 2.0, ovens=1)
+    assert type(replace(shop, width=2).width) is float
+    assert {shop, copy.deepcopy(shop), pickle.loads(pickle.dumps(shop))} == {shop}
+    with pytest.raises(FrozenInstanceError):
+        shop.ovens = 3  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"shelves": 0}, "shop.shelves is 0; it must be a whole number from 1 to 2,000"),
+        ({"shelves": True}, "shop.shelves is True; it must be a whole number from 1 to 2,000"),
+        ({"shelves": 2.0}, "shop.shelves is 2.0; it must be a whole number from 1 to 2,000"),
+        ({"width": "1"}, "shop.width is '1'; it must be a number above 0"),
+        ({"width": False}, "shop.width is False; it must be a number above 0"),
+        ({"width": float("inf")}, "shop.width is inf; it must be a number above 0"),
+        ({"sells": "milk"}, "shop.sells is 'milk'; it must be 'bread' or 'wine'"),
+        ({"open": 1}, "shop.open is 1; it must be true or false"),
+        ({"hours": (1,)}, "shop.hours is (1,); it must be 2 values, each a whole number, or unset"),
+        ({"name": 3}, "shop.name is 3; it must be text"),
+        ({"name": ["x" * 100]}, f"shop.name is ['{'x' * 55}…; it must be text"),
+        ({"shelfs": 2}, "shop has no field 'shelfs'; did you mean 'shelves'?"),
+        ({"shelves": 300}, "shop.shelves is 300; no room for 0.25"),
+    ],
+)
+def test_what_is_not_allowed_is_named(given: dict[str, object], says: str) -> None:
+    with pytest.raises(SettingError) as caught:
+        Bakery(**{"shelves": 3, **given})  # type: ignore[arg-type]
+    assert str(caught.value) == says
+    assert isinstance(caught.value, InputError)
+
+
+def test_positions_and_what_is_missing_are_named_too() -> None:
+    with pytest.raises(SettingError, match=r"^shop\.width is 0; it must be a number above 0$"):
+        Bakery(3, 0)
+    with pytest.raises(SettingError, match=r"^shop\.shelves is missing; it must be a whole"):
+        Bakery()  # type: ignore[call-arg]
+    with pytest.raises(SettingError, match="no room for 6") as caught:
+        replace(Shop(2), width=6)
+    assert caught.value.keys == ("shop.shelves", "shop.width")
+
+
+def test_help_and_prepare_start_without_it() -> None:
+    program = (
+        "import sys, ucfrec.commands.cli, ucfrec.commands.prepare; "
+        "print({'pydantic', 'gymnasium'} & set(sys.modules))"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert ended.stdout.strip() == "set()"
+
+
+def test_fields_are_described_where_they_were_first_explained() -> None:
+    listed = {setting.key: setting for setting in describe("shop", Bakery(3))}
+    assert list(listed) == [f"shop.{f.name}" for f in fields(Bakery)]
+    assert listed["shop.shelves"].meaning == "How many there are."
+    assert (listed["shop.width"].meaning, listed["shop.width"].value) == ("Of each.", 0.25)
+    assert listed["shop.ovens"].meaning == "In the back."
+    assert listed["shop.hours"].allowed == "2 values, each a whole number, or unset"

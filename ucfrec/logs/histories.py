@@ -1,0 +1,164 @@
+"""What each user of a log was shown, from files or from a frame in memory."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import gettempdir
+from typing import TYPE_CHECKING, Final
+
+import pyarrow as pa
+
+from ucfrec import schema
+from ucfrec.errors import InputError
+from ucfrec.logs.binding import Table, explained, quoted
+from ucfrec.logs.clean import REASONS, CleanLog, engine, engine_in_memory, judge_rows, read_log
+from ucfrec.logs.mapping import LogMapping, log_files
+from ucfrec.logs.prepare import BATCH_ROWS
+from ucfrec.logs.summary import drop_counts
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+HISTORIES: Final = "histories"
+"""Name of a frame in messages."""
+
+
+@dataclass(frozen=True)
+class _Frame(Table):
+    """A frame in memory, under its name in the engine."""
+
+    @property
+    def sql(self) -> str:
+        return quoted(str(self.files[0]))
+
+
+def read_histories(
+    paths: Sequence[str | Path],
+    mapping: LogMapping,
+    reward: str,
+    last: int,
+    memory_limit: str = "2GB",
+    session_by: str = "user",
+) -> Iterator[pa.RecordBatch]:
+    """What each user of a log was shown, cleaned as `prepare` cleans it.
+
+    Args:
+        paths: log files, folders and globs.
+        mapping: what their columns mean.
+        reward: scalar SQL expression over their columns.
+        last: how many of each user's most recent rows to give.
+        memory_limit: beyond it, rows spill to disk.
+        session_by: "session_id" gives `session_ids`, too.
+
+    Yields:
+        Batches of users in sorted order: `user_id`; `item_ids`, `rewards` (float32) and
+        `timestamps` (ms), lists of at most `last`, the most recent last; `seen`, all of the user's
+        item_ids, sorted; and, where it is logged, the most recent `observation`.
+
+    Raises:
+        InputError: the input cannot be used.
+    """
+    folder, files = Path(gettempdir()), log_files(paths)
+    with engine(memory_limit, folder) as connection:
+        log = read_log(connection, files, mapping, reward, session_by, None, folder)
+        drop_counts(log)
+        with explained(connection, log.tables, folder):
+            yield from _by_user(log, last)
+
+
+def frame_histories(
+    frame: "pd.DataFrame", mapping: LogMapping, reward: str, last: int, session_by: str = "user"
+) -> Iterator[pa.RecordBatch]:
+    """The same of a log in memory, by the same rules and without touching the disk.
+
+    Rows that `prepare` would drop are refused here, but for those that repeat a user, item and
+    time.
+
+    Raises:
+        InputError: `frame` is no frame or has no rows, a column is missing, doubled or of a wrong
+            type, or rows cannot be used.
+    """
+    columns = log_table(frame, HISTORIES)
+    with engine_in_memory() as connection:
+        connection.register(HISTORIES, columns)
+        described = connection.sql(f"DESCRIBE {HISTORIES}").fetchall()
+        table = _Frame((Path(HISTORIES),), tuple((row[0], row[1]) for row in described))
+        log = judge_rows(connection, (table,), mapping, reward, session_by, None, Path(HISTORIES))
+        _require_clean(log)
+        with explained(connection, log.tables, Path(HISTORIES)):
+            yield from _by_user(log, last)
+
+
+def log_table(frame: "pd.DataFrame", name: str) -> pa.Table:
+    """The columns of a frame of logs that a log file could hold.
+
+    Args:
+        name: of the frame, in messages.
+
+    Raises:
+        InputError: it is no frame, has no rows, or two columns of one name.
+    """
+    import pandas as pd
+
+    if not isinstance(frame, pd.DataFrame):
+        raise InputError(
+            f"{name}: a {type(frame).__name__} is not a pandas DataFrame; give one with a row for "
+            "every interaction"
+        )
+    if frame.empty:
+        raise InputError(f"{name}: the frame has no rows; give one for every interaction")
+    names = Counter(str(column).casefold() for column in frame.columns)
+    if twice := [column for column, n in names.items() if n > 1]:
+        raise InputError(
+            f"{name}: two columns are called {', '.join(twice)} (case does not count); rename one"
+        )
+    columns = {}
+    for column in frame.columns:
+        try:
+            columns[str(column)] = pa.Array.from_pandas(frame[column])
+        except (pa.ArrowInvalid, pa.ArrowTypeError, pa.ArrowNotImplementedError) as error:
+            if column in (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP):
+                reason = str(error).splitlines()[0]
+                raise InputError(
+                    f"{name}: {column} holds values of several types ({reason}); make them one"
+                ) from None
+            # Any other column of Python objects is none that a reward could be made of.
+    return pa.table(columns)
+
+
+def _require_clean(log: CleanLog) -> None:
+    dropped = drop_counts(log)
+    faults = {reason: n for reason, n in dropped.items() if n and reason != "duplicate"}
+    if faults:
+        rows = "; ".join(f"{n:,} rows: {REASONS[reason]}" for reason, n in faults.items())
+        hint = "; is the time in milliseconds?" if "clock_out_of_range" in faults else ""
+        raise InputError(f"{HISTORIES}: {rows}{hint}; correct those rows or leave them out")
+
+
+def _by_user(log: CleanLog, last: int) -> Iterator[pa.RecordBatch]:
+    if log.key != schema.ITEM_ID:
+        raise InputError(f"{log.tables[0].files[0]}: its actions are vectors, not items")
+    lists = {
+        "item_ids": schema.ITEM_ID,
+        "rewards": f"CAST({schema.REWARD} AS FLOAT)",
+        "timestamps": schema.TIMESTAMP,
+    }
+    if log.session_by == schema.SESSION_ID:
+        lists["session_ids"] = schema.SESSION_ID
+    order = f"ORDER BY {schema.TIMESTAMP}, {schema.ITEM_ID}"
+    gathered = ", ".join(
+        f"list({value} {order}) FILTER (WHERE back <= {last}) AS {name}"
+        for name, value in lists.items()
+    )
+    if schema.OBSERVATION in log.columns:
+        gathered += f", any_value({schema.OBSERVATION}) FILTER (WHERE back = 1) AS observation"
+    backwards = f"{schema.TIMESTAMP} DESC, {schema.ITEM_ID} DESC"
+    query = f"""
+        SELECT {schema.USER_ID}, {gathered}, list_sort(list(DISTINCT {schema.ITEM_ID})) AS seen
+        FROM (SELECT *, row_number() OVER (
+            PARTITION BY {schema.USER_ID} ORDER BY {backwards}
+        ) AS back FROM clean)
+        GROUP BY {schema.USER_ID} ORDER BY {schema.USER_ID}
+    """
+    yield from log.connection.sql(query).to_arrow_reader(BATCH_ROWS)

@@ -1,0 +1,89 @@
+"""What `prepare` read, dropped and kept, as the report shows it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ucfrec.logs.clean import REASONS
+from ucfrec.reporting import charts
+from ucfrec.reporting.tables import Table, shown
+
+_DISTRIBUTIONS = {
+    "session_lengths": ("Sessions by length", "steps of a session"),
+    "rewards": ("Steps by reward", "reward"),
+    "item_popularity": ("Items by popularity", "steps that show the item"),
+}
+"""Title and x-axis of what `prepare` summarises, by its name there."""
+_MIDDLE = ("0", "0.25", "0.5", "0.75", "0.99", "1")
+_COUNTS = {
+    "rows_read": "rows read",
+    "unsorted_rows": "rows out of order (sorted)",
+    "steps": "steps kept",
+    "users": "users",
+    "items": "items",
+    "sessions": "sessions",
+    "sessions_cut": "sessions cut at a split",
+    "unknown_propensities": "steps with an unknown propensity",
+}
+
+
+@dataclass(frozen=True)
+class DataQuality:
+    """Tables and pictures of the rows that a store was made of."""
+
+    rows: Table | None
+    """None where nothing is recorded: runs from before, and stores not made by `prepare`."""
+    dropped: Table | None
+    quantiles: Table | None
+    pictures: list[tuple[charts.Histogram, Table]]
+
+
+def data_quality(record: Mapping[str, Any]) -> DataQuality:
+    """From the record of a run."""
+    source = record.get("data") or {}
+    if "rows_read" not in source:
+        return DataQuality(None, None, None, [])
+    rows = [(name, [shown(source[key])]) for key, name in _COUNTS.items() if key in source]
+    summary = source.get("summary") or {}
+    found = {name: summary[name] for name in _DISTRIBUTIONS if name in summary}
+    return DataQuality(
+        Table("Rows of the logs", "", ["count"], rows),
+        _dropped(source["dropped"], source["rows_read"]),
+        _quantiles(found),
+        [_picture(name, one) for name, one in found.items() if any(one["counts"])],
+    )
+
+
+def _dropped(dropped: Mapping[str, int], read: int) -> Table:
+    reasons = {
+        **REASONS,
+        "short_episode": "its session, or the piece of it in one split, is too short",
+    }
+    body = [
+        (
+            f"{reason.replace('_', ' ')}: {reasons.get(reason, 'dropped')}",
+            [shown(rows), f"{rows / read:.2%}" if read else "–"],
+        )
+        for reason, rows in dropped.items()
+    ]
+    return Table("Rows dropped, by reason", "", ["rows", "share of rows read"], body)
+
+
+def _quantiles(found: Mapping[str, Mapping[str, Any]]) -> Table | None:
+    body = [
+        (_DISTRIBUTIONS[name][0], [shown(one["quantiles"].get(level)) for level in _MIDDLE])
+        for name, one in found.items()
+    ]
+    columns = ["smallest", "25%", "median", "75%", "99%", "largest"]
+    return Table("Quantiles", "", columns, body) if body else None
+
+
+def _picture(name: str, one: Mapping[str, Any]) -> tuple[charts.Histogram, Table]:
+    title, x_label = _DISTRIBUTIONS[name]
+    chart = charts.histogram(title, x_label, one["counts"], one.get("edges"), one.get("values"))
+    total = sum(one["counts"])
+    body = [
+        (column.name, [shown(count), f"{count / total:.2%}"])
+        for column, count in zip(chart.columns, one["counts"], strict=True)
+    ]
+    return chart, Table(title, x_label, ["count", "share"], body)

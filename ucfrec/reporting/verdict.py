@@ -1,0 +1,174 @@
+"""What the results of a report allow to conclude, in sentences.
+
+Two things are called different only where their 95% intervals do not overlap, which is stricter
+than a test of the difference at 5%.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from ucfrec.off_policy.estimators import WEIGHTED
+from ucfrec.reporting.page_results import Estimates, Results, Row, interval
+from ucfrec.reporting.tables import shown
+
+NO_RESULTS = (
+    "No result is given, so nothing is known of what these policies earn. A validation loss says "
+    "how well logged choices are predicted, and that is not what they earn. Play the policies "
+    "(ucfrec evaluate --json) or judge them from logs (ucfrec ope --json), and give the rows with "
+    "--results."
+)
+
+
+@dataclass(frozen=True)
+class _Earned:
+    """What one policy earned in one world, over all its rows there."""
+
+    policy: str
+    trained: bool
+    rows: int
+    trainings: int
+    """Different training seeds."""
+    value: float
+    """Mean over rows."""
+    low: float
+    """Lowest end of the rows' intervals."""
+    high: float
+
+    def above(self, other: "_Earned") -> bool:
+        """Whether all intervals lie above all of the other's."""
+        return self.low > other.high
+
+    def __str__(self) -> str:
+        return f"{self.policy} ({shown(self.value)})"
+
+
+def verdict(results: Results) -> list[str]:
+    """A paragraph for every world and every policy judged from logs."""
+    said = [_of_world(world, rows) for world, rows in results.worlds.items()]
+    said += [_of_estimates(one) for one in results.estimates]
+    return said or [NO_RESULTS]
+
+
+def _of_world(world: str, rows: Sequence[Row]) -> str:
+    earned = _earned(rows)
+    trained = sorted((one for one in earned if one.trained), key=lambda one: -one.value)
+    references = [one for one in earned if not one.trained]
+    if not trained:
+        return f"In {world}, only built-in policies were played: {_listed(references)}."
+    best, *others = trained
+    said = [_best(world, best, others)]
+    if references:
+        said.append(_against(best, references))
+    else:
+        said.append(
+            "No random, logging or best built-in policy was played, so there is nothing to "
+            "compare that with."
+        )
+    if max(one.trainings for one in trained) < 2:
+        one = "It was" if not others else "Each policy was"
+        said.append(f"{one} trained once; what another training seed would give is not known.")
+    return " ".join(said)
+
+
+def _earned(rows: Sequence[Row]) -> list[_Earned]:
+    """A policy's rows of one checkpoint as one, in order of first appearance."""
+    groups: dict[tuple[str, str | None], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row["policy"], row.get("checkpoint")), []).append(row)
+    several = {policy for policy, _ in groups if sum(key[0] == policy for key in groups) > 1}
+    return [
+        _Earned(
+            f"{policy}, checkpoint {checkpoint}" if policy in several else policy,
+            any(row.get("train_seed") is not None for row in group),
+            len(group),
+            len({row.get("train_seed") for row in group}),
+            sum(row["R_cum"] for row in group) / len(group),
+            min(row["R_cum_low"] for row in group),
+            max(row["R_cum_high"] for row in group),
+        )
+        for (policy, checkpoint), group in groups.items()
+    ]
+
+
+def _best(world: str, best: _Earned, others: Sequence[_Earned]) -> str:
+    if best.trainings > 1:
+        how = (
+            f"{shown(best.value)} in the mean of {best.trainings} trainings (their 95% intervals "
+            f"together: {shown(best.low)} to {shown(best.high)})"
+        )
+    else:
+        how = f"{shown(best.value)} (95% interval {shown(best.low)} to {shown(best.high)})"
+    if not others:
+        return f"In {world}, {best.policy} earned {how} an episode."
+    said = f"In {world}, {best.policy} earned most of {len(others) + 1} trained policies: {how}"
+    said += " an episode."
+    close = [one for one in others if not best.above(one)]
+    if close:
+        said += f" Its interval overlaps that of {_listed(close)}:"
+        return f"{said} which of them earns more is open."
+    return f"{said} Its interval lies above those of the others, the next being {others[0]}."
+
+
+def _against(best: _Earned, references: Sequence[_Earned]) -> str:
+    """How the best trained policy compares with built-in ones."""
+    above = [one for one in references if best.above(one)]
+    below = [one for one in references if one.above(best)]
+    open_ = [one for one in references if one not in above and one not in below]
+    parts = []
+    if above:
+        parts.append(f"more than {_listed(above)}")
+    if below:
+        parts.append(f"less than {_listed(below)}")
+    said = f"It earned {', and '.join(parts)}." if parts else ""
+    if open_:
+        said += f" Whether it earns more or less than {_listed(open_)} is open: intervals overlap."
+    return said.strip()
+
+
+def _of_estimates(one: Estimates) -> str:
+    computed = next((row["verdict"] for row in one.rows if row.get("verdict")), None)
+    if computed is not None:
+        return f"For {one.name}: {computed}."
+    weighted = [row for row in one.rows if row["estimator"] in WEIGHTED]
+    told = "; ".join(one.warnings)
+    if not weighted:
+        models = _listed([f"{row['estimator']} {interval(row)}" for row in one.rows])
+        because = f" ({told})" if told else ""
+        said = f"For {one.name}, these logs allow no weighted estimate{because}."
+        return f"{said} Models alone say {models}: that supports no conclusion." if models else said
+    named = {row["estimator"]: row for row in weighted}
+    quoted = named.get("DR") or named.get("SNIPS") or weighted[0]
+    figure = f"{quoted['estimator']} estimates {interval(quoted)} a session"
+    if told:
+        return f"For {one.name}, {figure}, which is not to be relied on: {told}."
+    if one.logged is None:
+        return f"For {one.name}, {figure}. What the logged sessions earned is not among the rows."
+    return f"For {one.name}, {figure}; the logged sessions earned {interval(one.logged)}. " + (
+        _compared(weighted, one.logged)
+    )
+
+
+def _compared(weighted: Sequence[Row], logged: Row) -> str:
+    above = [row["estimator"] for row in weighted if row["R_cum_low"] > logged["R_cum_high"]]
+    below = [row["estimator"] for row in weighted if row["R_cum_high"] < logged["R_cum_low"]]
+    everyone = _listed([row["estimator"] for row in weighted])
+    for names, more in ((above, "more"), (below, "less")):
+        if len(names) == len(weighted):
+            return (
+                f"Every weighted estimate ({everyone}) says that it earns {more} than the logging "
+                "policy, as far as the logged propensities are right."
+            )
+    if not above and not below:
+        return f"No weighted estimate ({everyone}) tells it from the logging policy."
+    sides: Mapping[str, list[str]] = {"more": above, "less": below}
+    parts = [f"{_listed(names)} {more}" for more, names in sides.items() if names]
+    return (
+        f"The weighted estimates do not agree ({'; '.join(parts)} than the logging policy, of "
+        f"{everyone}), so whether it earns more is open."
+    )
+
+
+def _listed(things: Sequence[object]) -> str:
+    """`a`, `a and b`, `a, b and c`."""
+    names = [str(thing) for thing in things]
+    return " and ".join(part for part in (", ".join(names[:-1]), *names[-1:]) if part)

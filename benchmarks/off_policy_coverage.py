@@ -10,17 +10,16 @@ interval of each estimator holds the truth among these; an asterisk marks less t
 """
 
 import argparse
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from tqdm import tqdm
 
 from ucfrec.off_policy.estimators import Estimate, estimate
 from ucfrec.off_policy.fqe import cross_fitted
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.verdict import judge
+from ucfrec.progress import progress
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -152,15 +151,15 @@ def held(found: Estimate | None, truth: float) -> bool:
     return found.low <= truth <= found.high
 
 
-def coverage(
-    world: World, replications: int, progress: Callable[[range], "tqdm[int]"]
-) -> tuple[float, dict[str, float]]:
+def coverage(name: str, replications: int) -> tuple[float, dict[str, float]]:
     """Share of replications whose verdict stands, and coverage among these (NaN without any)."""
     standing = []
-    for seed in progress(range(replications)):
-        stands, holds = replication(world, seed)
-        if stands:
-            standing.append(holds)
+    with progress(replications, name, "replications") as bar:
+        for seed in range(replications):
+            stands, holds = replication(WORLDS[name], seed)
+            if stands:
+                standing.append(holds)
+            bar.update()
     share = len(standing) / replications
     covered = {
         name: float(np.mean([holds[name] for holds in standing])) if standing else np.nan
@@ -176,11 +175,7 @@ def main() -> None:
     options = parser.parse_args()
     print(f"{'world':<24} {'stands':>6}  " + " ".join(f"{name:>7}" for name in SHOWN))
     for name in options.worlds:
-        share, covered = coverage(
-            WORLDS[name],
-            options.replications,
-            lambda seeds, name=name: tqdm(seeds, desc=name, leave=False, disable=None),
-        )
+        share, covered = coverage(name, options.replications)
         cells = [
             "      –" if np.isnan(one) else f"{one:6.1%}{' ' if LOW <= one <= HIGH else '*'}"
             for one in covered.values()

@@ -87,8 +87,8 @@ def prepare_logs(folder: Path) -> EpisodeStore:
 
 # Part 3: train.
 #
-# `Recommender` trains on the training split and keeps the weights with the best validation loss. The
-# run folder can be resumed, and read by every `ucfrec` command. The settings make it small.
+# `Recommender` trains on the training split and keeps the weights with the best validation loss.
+# The run folder can be resumed, and read by every `ucfrec` command. The settings make it small.
 
 
 def train(store: EpisodeStore, folder: Path) -> Recommender:
@@ -99,8 +99,9 @@ def train(store: EpisodeStore, folder: Path) -> Recommender:
 # Part 4: recommend, and look at what it is worth.
 #
 # Histories are rows like those of the logs, one an interaction; the policy knows how its reward is
-# computed from them. Because we made the users up, we can look up how much of each recommended video
-# they would truly watch. With real logs nobody can: `judge_three_ways.py` shows what can be done then.
+# computed from them. Because we made the users up, we can look up how much of each recommended
+# video they would truly watch. With real logs nobody can: `judge_three_ways.py` shows what can be
+# done then.
 
 
 def true_value(frame: pd.DataFrame, appeal: npt.NDArray[np.float64]) -> float:

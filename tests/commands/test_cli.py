@@ -168,20 +168,28 @@ def test_ope_writes_the_rows_it_prints(
     assert main(arguments) == 0
     printed = capsys.readouterr().out
     rows = {row["estimator"]: row for row in json.loads(out.read_text())}
-    weighted = {"IPS", "SNIPS", "PDIS", "DR"} & set(rows)
-    assert set(rows) - weighted == {"logged", "DM", "FQE"}
+    weighted = set(rows) - {"logged", "DM", "FQE"}
     assert weighted or choice
+    assert not weighted or {"IPS", "SNIPS", "PDIS", "SNPDIS", "DR", "SNDR"} <= weighted
     log = pd.read_parquet(logs)
     assert rows["logged"]["R_cum"] == pytest.approx(log.is_click.sum() / 300)
-    for row in rows.values():
-        assert row["R_cum_low"] <= row["R_cum"] <= row["R_cum_high"]
+    for name, row in rows.items():
+        if name in ("DM", "FQE") or row["R_cum_low"] is None:
+            # Their error is the model's, which no resampling of sessions shows.
+            assert (row["R_cum_low"], row["R_cum_high"]) == (None, None)
+            assert re.search(rf"^{name} .*\[–, –\]", printed, re.MULTILINE)
+        else:
+            assert row["R_cum_low"] <= row["R_cum"] <= row["R_cum_high"]
         assert (row["sessions"], row["steps"], row["seed"]) == (300, len(log), 3)
         assert (row["run"], row["checkpoint"]) == (run, "best")
         assert row["fingerprint"]
         assert row["command"]
-    # Three hundred sessions are too few, and it says so.
+    # These are the logs that the run was trained on, and it says so.
     assert all(f"warning: {line}" in printed for line in rows["logged"]["warnings"])
-    assert "session" in " ".join(rows["logged"]["warnings"])
+    assert rows["logged"]["seen_in_training"] > 0.8
+    assert "of the rows were seen in training" in rows["logged"]["warnings"][0]
+    assert rows["logged"]["reliable"] is False
+    assert "verdict: Do not rely on this estimate" in printed
     assert main(arguments) == 0
     assert {row["estimator"]: row for row in json.loads(out.read_text())} == rows
 
@@ -215,12 +223,15 @@ def test_ope_tells_from_uniform_logs_what_playing_tells(
     for name in ("IPS", "SNIPS", "PDIS", "DR"):
         row = rows[name]
         assert row["R_cum_low"] - 2 * error < truth < row["R_cum_high"] + 2 * error, name
-    widths = {name: row["R_cum_high"] - row["R_cum_low"] for name, row in rows.items()}
-    assert widths["DR"] < widths["PDIS"] < widths["IPS"]
+    errors = {name: row["R_cum_error"] for name, row in rows.items() if row["R_cum_error"]}
+    assert errors["DR"] < errors["PDIS"] < errors["IPS"]
     assert rows["DR"]["overlap"] == pytest.approx(1, abs=0.05)
+    # Simulated clocks are coarse: a few users are shown the same item at the same time.
+    assert 0 < rows["DR"]["seen_in_training"] < 0.05
+    assert rows["DR"]["reliable"]
 
 
-def test_ope_without_propensities_has_only_models(
+def test_ope_without_propensities_has_only_models_and_without_one_leaves_a_session_out(
     catalog: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run, logs = catalog
@@ -229,15 +240,21 @@ def test_ope_without_propensities_has_only_models(
     without = pd.concat([log, strange]).drop(columns="propensity")
     without.to_parquet(tmp_path / "without.parquet")
     log.assign(propensity=log.propensity.where(log.index != 5)).to_parquet(tmp_path / "one.parquet")
-    for name, missing in (("without", len(log)), ("one", 1)):
+    for name in ("without", "one"):
         out = tmp_path / f"{name}.json"
         assert main(["ope", run, str(tmp_path / f"{name}.parquet"), "--json", str(out)]) == 0
         rows = json.loads(out.read_text())
-        assert [row["estimator"] for row in rows] == ["logged", "DM", "FQE"]
-        assert rows[0]["overlap"] is None
         printed = capsys.readouterr().out
-        assert f"warning: {missing:,} of {len(log):,} steps have no propensity" in printed
-        assert ("warning: 2 rows show items" in printed) is (name == "without")
+        if name == "without":
+            assert [row["estimator"] for row in rows] == ["logged", "DM", "FQE"]
+            assert rows[0]["overlap"] is None
+            assert "no session has all its propensities" in printed
+            assert "warning: 2 rows show items" in printed
+            assert rows[0]["unknown_item_rows"] == 2
+        else:
+            assert {"DR", "SNPDIS"} <= {row["estimator"] for row in rows}
+            assert rows[0]["sessions_without_propensity"] == 1
+            assert "warning: 1 of 300 sessions have a step without propensity" in printed
 
 
 def test_score_and_ope_refuse_what_they_cannot_use(

@@ -14,7 +14,10 @@ from ucfrec.errors import InputError
 from ucfrec.evaluation.metrics import bootstrap_interval
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import prepare
-from ucfrec.off_policy.estimators import LoggedSteps, estimate, overlap, warnings
+from ucfrec.off_policy.diagnostics import diagnose
+from ucfrec.off_policy.estimators import estimate
+from ucfrec.off_policy.logged_steps import LoggedSteps
+from ucfrec.off_policy.verdict import judge
 from ucfrec.plugins import load_plugin
 from ucfrec_datasets.obd import DATASET
 
@@ -125,5 +128,8 @@ def test_random_logs_tell_what_thompson_sampling_earns() -> None:
         assert found[name].high - found[name].low > high - low
     assert found["PDIS"].value == found["IPS"].value  # one step a session
     assert 1000 < found["IPS"].effective_sessions < 5000
-    assert overlap(steps) == pytest.approx(1, abs=0.05)
-    assert warnings(steps, found) == []
+    assert diagnose(steps).overlap == pytest.approx(1, abs=0.05)
+    verdict = judge(steps, seed=0)
+    assert verdict.reliable
+    assert verdict.lift_low is not None
+    assert verdict.lift_low < earned.mean() - random.click.mean() < verdict.lift_high

@@ -10,37 +10,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.recommending.test_recommend import SETTINGS, random_log
-from ucfrec import UCF, EpisodeStore
 from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
-from ucfrec.logs import LogMapping, PrepareOptions, prepare
+from ucfrec.logs import LogMapping
 from ucfrec.off_policy.evaluate import logged_steps, step_features
 from ucfrec.off_policy.score import LoggedSessions, logged_sessions, score, scored_steps
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 TARGET = 7.5
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run, and the logs to score: other sessions, some of a user the run never saw."""
-    folder = tmp_path_factory.mktemp("score")
-    log = random_log().sample(frac=1, random_state=1)
-    log.iloc[:1000].to_parquet(folder / "train.parquet")
-    options = PrepareOptions(reward="reward", session_by="gap", gap_minutes=20)
-    prepare([folder / "train.parquet"], LogMapping(), folder / "store", options)
-    UCF(settings=SETTINGS).fit(EpisodeStore.open(folder / "store"), folder / "run")
-    rest = log.iloc[1000:].assign(propensity=1 / 30)
-    rest["user_id"] = np.where(rest.user_id == 5, 10**6, rest.user_id)
-    rest.to_parquet(folder / "rest.parquet")
-    return folder
-
-
-@pytest.fixture
-def trained(folder: Path) -> TrainedPolicy:
-    return TrainedPolicy.load(folder / "run")
 
 
 @pytest.fixture
@@ -139,7 +117,7 @@ def test_models_are_asked_about_what_the_policy_would_show(
     trained: TrainedPolicy, logged: LoggedSessions, greedy: bool
 ) -> None:
     frame = pd.concat(score(trained, logged, TARGET))
-    steps = logged_steps(trained, logged.store, TARGET, greedy, seed=0)
+    steps = logged_steps(trained, logged, TARGET, greedy, seed=0)
     certain = (frame.greedy_item_id == frame.item_id).astype(float)
     np.testing.assert_allclose(steps.target, certain if greedy else frame.probability, rtol=1e-5)
     np.testing.assert_array_equal(steps.session, frame.session)
@@ -179,6 +157,45 @@ def test_items_the_run_does_not_know_are_counted(folder: Path, tmp_path: Path) -
     with (
         pytest.raises(InputError, match=r"no row is left \(4 rows: item is none of the store's"),
         logged_sessions(folder / "run", trained, files, LogMapping()),
+    ):
+        pass
+
+
+def test_unknown_items_may_stay_with_no_probability(
+    folder: Path, trained: TrainedPolicy, logged: LoggedSessions, tmp_path: Path
+) -> None:
+    """Every third row shows something new: its probability is 0, and what came before in the
+    session is judged as ever."""
+    log = pd.read_parquet(folder / "rest.parquet")
+    new = np.arange(len(log)) % 3 == 0
+    log.assign(item_id=np.where(new, 999, log.item_id)).to_parquet(tmp_path / "log.parquet")
+    before = logged_steps(trained, logged, TARGET, greedy=False, seed=0)
+    files = [tmp_path / "log.parquet"]
+    with logged_sessions(folder / "run", trained, files, LogMapping(), keep_unknown=True) as kept:
+        unknown = kept.store.step_values("item", *kept.store.all_steps()) < 0
+        assert kept.unknown_items == unknown.sum() == new.sum()
+        assert kept.report["dropped"]["unknown_item"] == 0
+        steps = logged_steps(trained, kept, TARGET, greedy=False, seed=0)
+    assert (steps.target[unknown] == 0).all()
+    assert (steps.weights[unknown] == 0).all()
+    untouched = np.logical_and.accumulate(~unknown)
+    for session in range(len(steps.first)):
+        rows = slice(steps.first[session], steps.last[session] + 1)
+        untouched[rows] = np.logical_and.accumulate(~unknown[rows])
+    assert untouched.sum() > 300
+    np.testing.assert_allclose(steps.target[untouched], before.target[untouched], rtol=1e-4)
+
+
+def test_logs_of_another_catalogue_are_refused(
+    folder: Path, trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    log = pd.read_parquet(folder / "rest.parquet")
+    log.assign(item_id=log.item_id + 1000).to_parquet(tmp_path / "log.parquet")
+    with (
+        pytest.raises(InputError, match=r"in none of the .* rows does the run know the item"),
+        logged_sessions(
+            folder / "run", trained, [tmp_path / "log.parquet"], LogMapping(), keep_unknown=True
+        ),
     ):
         pass
 

@@ -190,6 +190,22 @@ def test_estimates_from_logs_are_shown_with_their_warnings(folder: Path, tmp_pat
     assert not {tag for tag, _ in page.elements} & {"script", "img"}
 
 
+def test_models_have_no_interval_and_the_verdict_of_ope_is_quoted(
+    folder: Path, tmp_path: Path
+) -> None:
+    none = {"R_cum_low": None, "R_cum_high": None, "verdict": f"Do not rely on it: {HOSTILE}"}
+    rows = [
+        row("", "behavior", 2.0, estimator="logged"),
+        row("", "ucf", 3.0, estimator="FQE") | none,
+    ]
+    (tmp_path / "ope.json").write_text(json.dumps(rows))
+    page = page_of(tmp_path / "report.html", folder / "ucf", results=(tmp_path / "ope.json",))
+    assert page.tables["Estimates for ucf"]["FQE"]["mean return of a session"] == "3 [–]"
+    assert "For ucf: Do not rely on it" in page.text
+    (tmp_path / "ope.json").write_text(json.dumps(rows[1:]))
+    page_of(tmp_path / "report.html", folder / "ucf", results=(tmp_path / "ope.json",))
+
+
 @pytest.mark.parametrize(
     "wrong", [{"effective_sessions": "many"}, {"warnings": "one"}, {"R_cum": None}, {"policy": 3}]
 )

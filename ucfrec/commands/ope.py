@@ -14,6 +14,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--greedy", action="store_true", help="judge the most probable item, not the softmax"
     )
+    parser.add_argument(
+        "--discount", type=float, default=1.0, help="of the returns that are estimated (default 1)"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, help="write the result rows here")
 
@@ -29,7 +32,7 @@ def run(options: argparse.Namespace) -> None:
 
     files, mapping = logs_given(options)
     trained = TrainedPolicy.load(options.run, options.checkpoint)
-    with logged_sessions(options.run, trained, files, mapping) as logged:
+    with logged_sessions(options.run, trained, files, mapping, keep_unknown=True) as logged:
         print(format_report(logged.report))
         judged = judge_off_policy(
             options.run,
@@ -38,11 +41,13 @@ def run(options: argparse.Namespace) -> None:
             target_return=target_given(options, trained),
             greedy=options.greedy,
             seed=options.seed,
+            discount=options.discount,
         )
     rows = [row | {"checkpoint": options.checkpoint} for row in judged.rows]
     shown = ("estimator", "policy", "choice", "R_cum", "effective_sessions", "sessions")
     print(f"\n{format_rows(rows, shown)}")
     for warning in judged.warnings:
         print(f"warning: {warning}")
+    print(f"verdict: {judged.verdict.headline}")
     if options.json is not None:
         write_json(options.json, rows)

@@ -109,6 +109,7 @@ def prepare(
     out: str | Path,
     options: PrepareOptions | None = None,
     like: Path | None = None,
+    keep_unknown: bool = False,
 ) -> dict[str, Any]:
     """Write the logs as an `EpisodeStore` at `out`, whole or not at all.
 
@@ -120,7 +121,8 @@ def prepare(
     Args:
         paths: log files, folders and globs.
         like: a store, or a run on it, whose users, items and item states are taken over, to judge
-            a policy trained on it by other logs. Rows with items it does not know are dropped,
+            a policy trained on it by other logs. Rows with items it does not know are dropped
+            unless `keep_unknown` says to keep them, as item −1;
             users it does not know have number −1 (`episode_users.parquet` names the user of every
             episode), and all episodes are uncut and of the split "train".
 
@@ -138,7 +140,11 @@ def prepare(
     with atomic_folder(out) as folder:
         spill = options.temp_folder or out.parent
         with (
-            _episodes(files, mapping, options, spill, like) as (log, report, features),
+            _episodes(files, mapping, options, spill, like, keep_unknown) as (
+                log,
+                report,
+                features,
+            ),
             explained(log.connection, log.tables, out.parent),
         ):
             writer = StoreWriter(folder)
@@ -182,11 +188,12 @@ def _episodes(
     options: PrepareOptions,
     spill: Path,
     like: Path | None,
+    keep_unknown: bool = False,
 ) -> Iterator[tuple[CleanLog, dict[str, Any], Features]]:
     """The log in sessions, what there is to report of it, and the features."""
     reward = options.reward or mapping.reward or schema.REWARD
     session_by = options.session_by or mapping.session_by
-    known = None if like is None else like / ITEMS_FILE
+    known = None if like is None or keep_unknown else like / ITEMS_FILE
     inputs = (*files, *_further_inputs(mapping, like))
     with engine(inputs, spill, options.memory_limit) as connection:
         with progress(4, "check the logs", "stages") as stage:

@@ -144,8 +144,8 @@ def ordered_steps(log: CleanLog) -> str:
     columns = ["coalesce(users.number, -1) AS user", "split", "terminated", "first"]
     joins = f"LEFT JOIN users USING ({schema.USER_ID})"
     if log.key == schema.ITEM_ID:
-        columns.append(f"items.number AS {schema.ITEM}")
-        joins += f" JOIN items USING ({schema.ITEM_ID})"
+        columns.append(f"coalesce(items.number, -1) AS {schema.ITEM}")
+        joins += f" LEFT JOIN items USING ({schema.ITEM_ID})"
     columns += [schema.TIMESTAMP, f"CAST({schema.REWARD} AS FLOAT) AS {schema.REWARD}"]
     columns += log.vector_size
     columns += [c for c in (schema.PROPENSITY, schema.IS_RANDOM) if c in log.columns]

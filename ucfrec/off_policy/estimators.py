@@ -1,210 +1,203 @@
-"""What a policy would have earned a session, from logs of another: arrays in, estimates out."""
+"""What a policy would have earned a session, from logs of another: arrays in, estimates out.
 
-from collections.abc import Mapping
+Every estimate is a mean discounted return of a session, in the unit of the reward. Notation as in
+`ucfrec.off_policy.logged_steps`: G_i the logged return, w_it the weight of step t, w_i that of the
+whole session, E_n the mean over sessions.
+
+| name | equation | source |
+|---|---|---|
+| logged | E_n[G_i] | |
+| DM | E_n[Σ_t γ^t r̂_it], states and lengths as logged | Dudík, Langford & Li, ICML 2011 |
+| FQE | E_n[v_i0] | Le, Voloshin & Yue, ICML 2019 |
+| IPS | E_n[w_i G_i] | Precup, Sutton & Singh, ICML 2000 |
+| SNIPS | E_n[w_i G_i] / E_n[w_i] | Swaminathan & Joachims, NeurIPS 2015 |
+| PDIS | E_n[Σ_t γ^t w_it r_it] | Precup, Sutton & Singh 2000 |
+| SNPDIS | Σ_t γ^t E_n[w_it r_it] / E_n[w_it] | weighted PDIS: Precup 2000; Thomas 2015 |
+| DR | E_n[Σ_t γ^t (w_it (r_it − q_it) + w_i,t−1 v_it)] | Dudík 2011; Jiang & Li, ICML 2016 |
+| SNDR | DR with w_it / E_n[w_it] for w_it | weighted DR: Thomas & Brunskill, ICML 2016, eq. 8 |
+| MIPS | PDIS with weights of clusters | Saito & Joachims, ICML 2022 |
+| clipped IPS, SWITCH-DR, … | | `ucfrec.off_policy.shrinkage` |
+
+In the means over sessions at step t, a session that has ended counts with the weight of its last
+step, as if it went on without reward (Thomas & Brunskill 2016).
+"""
+
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ucfrec.errors import InputError
-from ucfrec.evaluation.metrics import ratio_intervals
-from ucfrec.off_policy.fqe import Modelled
+from ucfrec.off_policy.intervals import Interval, cluster_intervals
+from ucfrec.off_policy.logged_steps import LoggedSteps
+from ucfrec.off_policy.shrinkage import shrunk
 
 FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 LOGGED = "logged"
-WEIGHTED = ("IPS", "SNIPS", "PDIS", "DR")
-ENOUGH_SESSIONS, ENOUGH_OVERLAP, DOMINANT = 1000, 0.8, 0.1
-_LARGEST = 1e100
-"""Weights stop here: beyond, an estimate means nothing, and their squares stay finite."""
-
-
-@dataclass(frozen=True)
-class LoggedSteps:
-    """N logged steps of S sessions, a session's steps together and in order.
-
-    Raises:
-        InputError: lengths differ, sessions are not numbered in order, a number is not finite, a
-            probability is none.
-    """
-
-    session: IntArray
-    """(N,) number of each step's session: 0 to S − 1, never falling, none left out."""
-    reward: FloatArray
-    propensity: FloatArray
-    """(N,) the behavior policy's probability of the logged action; NaN where unknown."""
-    target: FloatArray
-    """(N,) the judged policy's probability of it."""
-    model: Modelled | None = None
-
-    def __post_init__(self) -> None:
-        n = len(self.session)
-        finite = {"reward": self.reward, "target": self.target}
-        if self.model is not None:
-            finite |= {f"modelled {name}": values for name, values in vars(self.model).items()}
-        for name, values in {**finite, "propensity": self.propensity}.items():
-            if values.shape != (n,):
-                raise InputError(f"{name} has shape {values.shape}, {n} steps are ({n},)")
-        for name, values in finite.items():
-            if not np.isfinite(values).all():
-                raise InputError(f"{name} is not finite at {(~np.isfinite(values)).sum()} steps")
-        rises = np.diff(self.session, prepend=-1)
-        if n == 0 or rises[0] != 1 or not np.isin(rises, (0, 1)).all():
-            raise InputError("sessions are numbered from 0 in order, and there is at least one")
-        if not ((self.target >= 0) & (self.target <= 1)).all():
-            raise InputError("probabilities of the judged policy lie between 0 and 1")
-        if not (np.isnan(self.propensity) | (self.propensity > 0) & (self.propensity <= 1)).all():
-            raise InputError(
-                "propensities must be above 0 and at most 1 (a probability, not a density); "
-                "correct that column"
-            )
-
-    @cached_property
-    def first(self) -> IntArray:
-        """(S,) step that begins each session."""
-        return np.flatnonzero(np.diff(self.session, prepend=-1))
-
-    @property
-    def unknown_propensities(self) -> int:
-        """How many steps have none."""
-        return int(np.isnan(self.propensity).sum())
-
-    def per_session(self, values: FloatArray) -> FloatArray:
-        """(S,) sums of values (N,)."""
-        return np.asarray(np.add.reduceat(values, self.first))
+WEIGHTED = ("IPS", "SNIPS", "PDIS", "SNPDIS", "DR", "SNDR", "MIPS")
+"""Estimates that weigh sessions, unshrunk."""
+MODELS = ("DM", "FQE")
+"""Estimates that nothing but a model stands behind."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Mean return of a session, with its 95% percentile bootstrap interval over sessions."""
+    """Mean discounted return of a session."""
 
     value: float
-    low: float
-    high: float
+    low: float | None
+    """Ends of the 95% interval, studentised and clustered by user (`cluster_intervals`). None for
+    DM and FQE, whose error is the model's and not that of the sessions it is averaged over, and
+    where nothing spreads: too few sessions earn anything under the weights."""
+    high: float | None
+    error: float | None
+    """Standard error, over users."""
     effective_sessions: float
     """(Σw)² / Σw² of the sessions' weights (Kish 1965); S where nothing is weighted."""
     largest_weight: float
     """Share of the heaviest session in all weight."""
+    parameter: float | None = None
+    """The tuned λ or τ of an estimator that shrinks weights."""
+
+
+@dataclass(frozen=True)
+class Terms:
+    """An estimate as the ratio Σ above / Σ below of sums over sessions."""
+
+    above: FloatArray
+    """(S,)."""
+    below: FloatArray
+    weights: FloatArray
+    """(S,) what each session counts."""
+    parameter: float | None = None
 
 
 def estimate(steps: LoggedSteps, seed: int) -> dict[str, Estimate]:
-    """What sessions earned as logged, and what they would have earned.
+    """What sessions earned as logged, and what they would have earned under the judged policy.
 
-    Of `model`, where given: DM is the modelled reward of the judged policy, summed over a session's
-    logged steps (states and length stay as logged); FQE is v at its first step. With propensities
-    at every step: IPS weights a session's return by the product of its ratios, PDIS each reward by
-    the product up to its step (Precup 2000); SNIPS divides IPS by the mean weight of sessions
-    (Swaminathan & Joachims 2015); DR adds the weighted errors of q to v (Dudík 2011, over sessions
-    Jiang & Li 2016). Where no session has any weight, these four are left out.
+    DM, FQE and the doubly robust need `steps.model`; MIPS the probabilities of clusters; all that
+    weigh need propensities: sessions with a step whose propensity is unknown are left out of them,
+    which is right where propensities are lost at random. Where no session has any weight, those
+    that weigh are left out. SWITCH-DR, DRos and sub-Gaussian DR are defined for sessions of one
+    step.
+
+    Args:
+        seed: draws the bootstrap's resamples.
     """
-    ones = np.ones(len(steps.first))
-    returns = steps.per_session(steps.reward)
-    # Each is a ratio of sums over sessions: above, below, and the weights of sessions.
-    sums = {LOGGED: (returns, ones, ones)}
-    if steps.model is not None:
-        sums["DM"] = (steps.per_session(steps.model.reward), ones, ones)
-        sums["FQE"] = (steps.model.v[steps.first], ones, ones)
-    if not steps.unknown_propensities:
-        sums |= _weighted(steps, returns, ones)
-    above, below, _ = (np.stack(columns, axis=1) for columns in zip(*sums.values(), strict=True))
-    intervals = ratio_intervals(above, below, seed)
-    return {
-        name: Estimate(
-            value=float(over.sum() / under.sum()),
-            low=float(low),
-            high=float(high),
-            effective_sessions=float(weights.sum() ** 2 / (weights**2).sum()),
-            largest_weight=float(weights.max() / weights.sum()),
+    found: dict[str, Estimate] = {}
+    for group, terms in _groups(steps):
+        intervals = cluster_intervals(
+            np.stack([one.above for one in terms.values()], axis=1),
+            np.stack([one.below for one in terms.values()], axis=1),
+            group.user,
+            seed,
         )
-        for (name, (over, under, weights)), (low, high) in zip(sums.items(), intervals, strict=True)
-    }
-
-
-def _weighted(
-    steps: LoggedSteps, returns: FloatArray, ones: FloatArray
-) -> dict[str, tuple[FloatArray, FloatArray, FloatArray]]:
-    upto = cumulative_ratios(steps)
-    weights = upto[np.append(steps.first[1:], len(upto)) - 1]
-    if not weights.any():
-        return {}
-    found = {
-        "IPS": (weights * returns, ones, weights),
-        "SNIPS": (weights * returns, weights, weights),
-        "PDIS": (steps.per_session(upto * steps.reward), ones, weights),
-    }
-    if steps.model is not None:
-        before = np.roll(upto, 1)
-        before[steps.first] = 1.0
-        corrected = upto * (steps.reward - steps.model.q) + before * steps.model.v
-        found["DR"] = (steps.per_session(corrected), ones, weights)
+        for (name, one), interval in zip(terms.items(), intervals, strict=True):
+            found[name] = _summary(one, None if name in MODELS else interval)
     return found
 
 
-def cumulative_ratios(steps: LoggedSteps) -> FloatArray:
-    """(N,) product of target / propensity from the session's first step to each."""
-    upto = steps.target / steps.propensity
-    lengths = np.diff(np.append(steps.first, len(upto)))
-    # One pass a place in the session: sums of logarithms would lose digits over many sessions.
-    longest_first = np.argsort(-lengths, kind="stable")
-    starts, lengths = steps.first[longest_first], lengths[longest_first]
-    for place in range(1, int(lengths[0])):
-        at = starts[: np.searchsorted(-lengths, -place, side="left")] + place
-        upto[at] = np.minimum(upto[at] * upto[at - 1], _LARGEST)
-    return np.asarray(np.minimum(upto, _LARGEST))
-
-
-def overlap(steps: LoggedSteps) -> float:
-    """Mean ratio target / propensity of steps: an estimate of the share of the judged policy's
-    choices that the behavior policy could make too. Near 1 where it could make all; NaN without
-    propensities."""
-    return float((steps.target / steps.propensity).mean())
-
-
-def warnings(steps: LoggedSteps, found: Mapping[str, Estimate]) -> list[str]:
-    """Why not to believe `found`, a line a reason."""
-    weighted, sessions = ", ".join(WEIGHTED), len(steps.first)
-    if steps.unknown_propensities:
-        return [
-            f"{steps.unknown_propensities:,} of {len(steps.reward):,} steps have no propensity: "
-            f"no {weighted}; DM and FQE are only as good as their models"
-        ]
-    said = []
-    shared = overlap(steps)
-    if shared < ENOUGH_OVERLAP:
-        said.append(
-            f"overlap {shared:.2f} (below {ENOUGH_OVERLAP}): the logs lack much of what the policy "
-            "would show"
-        )
-    if "IPS" not in found:
-        said.append(
-            f"no session has any weight: in each of {sessions:,} the policy would never have made "
-            f"some logged choice; no {weighted}"
-        )
-        return said
-    weights = found["IPS"]
-    if weights.effective_sessions < ENOUGH_SESSIONS:
-        said.append(
-            f"effective sample {weights.effective_sessions:,.0f} of {sessions:,} sessions (below "
-            f"{ENOUGH_SESSIONS:,}): {weighted} and their intervals are not to be relied on"
-        )
-    if weights.largest_weight > DOMINANT:
-        said.append(
-            f"one session has {weights.largest_weight:.0%} of all weight: {weighted} tell of it "
-            "more than of the rest"
-        )
-    return said
-
-
-def as_row(name: str, found: Estimate) -> dict[str, Any]:
-    """An estimate as a result row; the mean return is R_cum, as in `ucfrec.evaluation.metrics`."""
-    return {
-        "estimator": name,
-        "R_cum": found.value,
-        "R_cum_low": found.low,
-        "R_cum_high": found.high,
-        "effective_sessions": found.effective_sessions,
-        "largest_weight": found.largest_weight,
+def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
+    """The terms of every estimate that weighs sessions, of steps with all propensities; none where
+    no session has any weight."""
+    weights, last = steps.weights, steps.session_weights
+    if not last.any():
+        return {}
+    ones = np.ones(len(last))
+    found = {
+        "IPS": Terms(last * steps.returns, ones, last),
+        "SNIPS": Terms(last * steps.returns, last, last),
+        "PDIS": Terms(steps.per_session(steps.discounts * weights * steps.reward), ones, last),
+        "SNPDIS": Terms(_normalised_by_step(steps, steps.reward, None), ones, last),
     }
+    if steps.model is not None:
+        left = steps.reward - steps.model.q
+        corrected = weights * left + steps.before(weights) * steps.model.v
+        found["DR"] = Terms(steps.per_session(steps.discounts * corrected), ones, last)
+        found["SNDR"] = Terms(_normalised_by_step(steps, left, steps.model.v), ones, last)
+    if (clustered := steps.cluster_weights) is not None:
+        above = steps.per_session(steps.discounts * clustered * steps.reward)
+        found["MIPS"] = Terms(above, ones, clustered[steps.last])
+    for name, (parameter, above, kept) in shrunk(steps).items():
+        found[name] = Terms(above, ones, kept, parameter)
+    return found
+
+
+def _groups(steps: LoggedSteps) -> Iterator[tuple[LoggedSteps, dict[str, Terms]]]:
+    """Estimates and the sessions that they are of."""
+    ones = np.ones(len(steps.first))
+    plain = {LOGGED: Terms(steps.returns, ones, ones)}
+    if steps.model is not None:
+        modelled = steps.per_session(steps.discounts * steps.model.reward)
+        plain["DM"] = Terms(modelled, ones, ones)
+        plain["FQE"] = Terms(steps.model.v[steps.first], ones, ones)
+    yield steps, plain
+    without = steps.per_session(np.isnan(steps.propensity).astype(np.float64)) > 0
+    if without.all():
+        return
+    known = steps.known()
+    if weighted := session_terms(known):
+        yield known, weighted
+
+
+def _summary(terms: Terms, interval: Interval | None) -> Estimate:
+    weights = terms.weights
+    return Estimate(
+        value=float(terms.above.sum() / terms.below.sum()),
+        low=None if interval is None else interval.low,
+        high=None if interval is None else interval.high,
+        error=None if interval is None else interval.error,
+        effective_sessions=effective_number(weights),
+        largest_weight=float(weights.max() / weights.sum()) if weights.any() else 1.0,
+        parameter=terms.parameter,
+    )
+
+
+def effective_number(weights: FloatArray) -> float:
+    """(Σw)² / Σw²: as many equal weights estimate a mean as well (Kish 1965)."""
+    top = weights.max()
+    if top == 0:
+        return 0.0
+    shares = weights / top
+    return float(shares.sum() ** 2 / (shares**2).sum())
+
+
+def step_totals(steps: LoggedSteps, weights: FloatArray) -> FloatArray:
+    """(T,) Σ_i w_it by step up to the longest session's, ended sessions with their last weight."""
+    alive = np.bincount(steps.step, weights)
+    ended = np.bincount(steps.lengths, weights[steps.last], len(alive) + 1)
+    return np.asarray(alive + np.cumsum(ended)[:-1])
+
+
+def _normalised_by_step(steps: LoggedSteps, left: FloatArray, v: FloatArray | None) -> FloatArray:
+    """(S,) estimate plus influence of each session; their mean is the estimate.
+
+    The estimate is Σ_t γ^t [Σ_i w_it left_it / W_t + Σ_i w_i,t−1 v_it / W_t−1] with W_t = Σ_i w_it
+    over all sessions. Its influence (the derivative by a session's share) stands for it in the
+    bootstrap, which so needs one number a session instead of one a session and step.
+
+    Args:
+        left: (N,) reward, or what the model leaves of it.
+        v: (N,) modelled values, or None.
+    """
+    weights, step, sessions = steps.weights, steps.step, len(steps.first)
+    totals = step_totals(steps, weights)
+    by_step = steps.discount ** np.arange(len(totals))
+    rewarded = by_step * np.bincount(step, weights * left) / totals
+    mine = steps.discounts * weights * left / totals[step]
+    # What W_t in the denominators takes off, for each unit of weight at step t.
+    slopes = rewarded / totals
+    value, start = float(rewarded.sum()), 0.0
+    if v is not None:
+        before = np.append(float(sessions), totals[:-1])
+        earlier = steps.before(weights)
+        valued = by_step * np.bincount(step, earlier * v) / before
+        mine = mine + steps.discounts * earlier * v / before[step]
+        slopes[:-1] += (valued / before)[1:]
+        value, start = value + float(valued.sum()), float(valued[0]) / sessions
+    # After its last step a session's weight stays and goes on to count in the denominators.
+    tail = np.append(np.cumsum(slopes[::-1])[::-1], 0.0)
+    taken = steps.per_session(weights * slopes[step])
+    taken += steps.session_weights * tail[steps.lengths]
+    return np.asarray(value + sessions * (steps.per_session(mine) - taken - start))

@@ -1,6 +1,7 @@
 """What a trained policy would have earned on logs: the logs read, modelled, weighed, reported."""
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,13 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.episodes.store import EpisodeStore
-from ucfrec.off_policy.estimators import LOGGED, LoggedSteps, as_row, estimate, overlap, warnings
+from ucfrec.off_policy.diagnostics import Diagnosis, diagnose
+from ucfrec.off_policy.estimators import LOGGED, Estimate, estimate
 from ucfrec.off_policy.fqe import cross_fitted
+from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.score import LoggedSessions, ScoredSteps, scored_steps
+from ucfrec.off_policy.training_rows import MOST_SEEN, share_seen
+from ucfrec.off_policy.verdict import Verdict, cautions, judge
 from ucfrec.provenance import provenance
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -24,10 +28,11 @@ Float32Array = npt.NDArray[np.float32]
 
 @dataclass(frozen=True)
 class OffPolicyReport:
-    """Result rows, one an estimator, and why not to believe them."""
+    """Result rows, one an estimator, and whether to believe them."""
 
     rows: list[dict[str, Any]]
     warnings: list[str]
+    verdict: Verdict
 
 
 def judge_off_policy(
@@ -38,36 +43,40 @@ def judge_off_policy(
     target_return: float,
     greedy: bool,
     seed: int,
+    discount: float = 1.0,
 ) -> OffPolicyReport:
     """Estimate the mean return of a session under the policy of `run`, from logs alone.
 
-    Models are fitted on these logs, each session judged by models of others. Takes about 5 kB of
-    memory a logged step.
+    Models are fitted on these logs, each user's sessions judged by models of other users. Takes
+    about 5 kB of memory a logged step.
 
     Args:
+        logged: read with `keep_unknown`: the policy would never show an item that it does not
+            know, so such a step weighs 0.
         greedy: judge the policy that shows its most probable item; otherwise the one that draws
             items from its softmax.
         seed: draws the folds and the bootstrap's resamples.
+        discount: γ of the returns that are estimated.
 
     Raises:
-        InputError: propensities are no probabilities, or there is only one session.
+        InputError: propensities are no probabilities, or there is only one user.
     """
-    steps = logged_steps(trained, logged.store, target_return, greedy, seed)
-    found = estimate(steps, seed)
-    said = warnings(steps, found)
-    dropped = logged.report["dropped"]
-    if unknown := dropped["unknown_item"]:
-        said.append(
-            f"{unknown:,} rows show items that the run does not know, and so never would: their "
-            "sessions are judged as if those rows were not there"
-        )
+    steps = logged_steps(trained, logged, target_return, greedy, seed, discount)
+    found, diagnosis = estimate(steps, seed), diagnose(steps)
+    seen = share_seen(trained, logged.store)
+    verdict = judge(steps, seed, diagnosis=diagnosis, forbidden=_seen_too_often(seen))
+    said = [*verdict.reasons, *cautions(diagnosis, found), *_of_the_logs(seen, logged)]
     about = {
         "target_return": target_return,
+        "discount": discount,
         "sessions": len(steps.first),
         "steps": len(steps.reward),
-        "dropped": dropped,
-        "overlap": None if steps.unknown_propensities else overlap(steps),
+        "dropped": logged.report["dropped"],
+        "unknown_item_rows": logged.unknown_items,
+        "seen_in_training": seen,
         "warnings": said,
+        **_verdict_columns(verdict),
+        **_diagnosis_columns(diagnosis),
         "run": str(run),
         "fingerprint": logged.store.meta["fingerprint"],
         "seed": seed,
@@ -79,13 +88,78 @@ def judge_off_policy(
         as_row(name, one) | (behavior if name == LOGGED else who) | about
         for name, one in found.items()
     ]
-    return OffPolicyReport(rows, said)
+    return OffPolicyReport(rows, said, verdict)
+
+
+def _seen_too_often(seen: float | None) -> list[str]:
+    if seen is None or seen <= MOST_SEEN:
+        return []
+    return [
+        f"{seen:.0%} of the rows were seen in training: a policy judged by these looks better than "
+        "it is; judge it by later logs"
+    ]
+
+
+def _of_the_logs(seen: float | None, logged: LoggedSessions) -> list[str]:
+    said = []
+    if seen is None:
+        said.append(
+            "the store that the run was trained on is not there any more: whether these logs were "
+            "seen in training is not known"
+        )
+    if unknown := logged.unknown_items:
+        said.append(
+            f"{unknown:,} rows show items that the run does not know, and so never would: they "
+            "weigh 0"
+        )
+    return said
+
+
+def as_row(name: str, found: Estimate) -> dict[str, Any]:
+    """An estimate as a result row; the mean return is R_cum, as in `ucfrec.evaluation.metrics`.
+    Without an interval its ends are None."""
+    return {
+        "estimator": name,
+        "R_cum": found.value,
+        "R_cum_low": found.low,
+        "R_cum_high": found.high,
+        "R_cum_error": found.error,
+        "effective_sessions": found.effective_sessions,
+        "largest_weight": found.largest_weight,
+        "parameter": found.parameter if found.parameter != math.inf else None,
+    }
+
+
+def _verdict_columns(verdict: Verdict) -> dict[str, Any]:
+    columns = asdict(verdict) | {"verdict": str(verdict), "verdict_of": verdict.estimator}
+    return {name: value for name, value in columns.items() if name not in ("estimator", "reasons")}
+
+
+def _diagnosis_columns(diagnosis: Diagnosis) -> dict[str, Any]:
+    return {
+        "overlap": diagnosis.overlap,
+        "users": diagnosis.users,
+        "sessions_without_propensity": diagnosis.left_out,
+        "effective_users": diagnosis.effective_users,
+        "effective_by_step": list(diagnosis.effective_by_step),
+        "stops_telling_at": diagnosis.stops_telling_at,
+        "weight_tests": [asdict(test) for test in diagnosis.tests],
+        "mean_weight": diagnosis.mean_weight,
+        "pareto_tail": diagnosis.tail,
+        "bounds": None if diagnosis.bounds is None else list(diagnosis.bounds),
+    }
 
 
 def logged_steps(
-    trained: TrainedPolicy, store: EpisodeStore, target_return: float, greedy: bool, seed: int
+    trained: TrainedPolicy,
+    logged: LoggedSessions,
+    target_return: float,
+    greedy: bool,
+    seed: int,
+    discount: float = 1.0,
 ) -> LoggedSteps:
-    """The steps of `store` with the policy's probabilities and models of what it would earn."""
+    """The logged steps with the policy's probabilities and models of what it would earn."""
+    store = logged.store
     assert trained.item_states is not None
     one_state, one_item = torch.zeros(1, store.state_size), trained.item_states.embeddings[:1]
     width = _features(one_state, one_item).shape[1]
@@ -100,15 +174,18 @@ def logged_steps(
     propensity = np.full(len(reward), np.nan)
     if schema.PROPENSITY in store.meta["columns"]:
         propensity = store.step_values(schema.PROPENSITY, episodes, steps).astype(np.float64)
+    user = np.unique(logged.users, return_inverse=True)[1]
     # What cannot be weighed is found out before anything is fitted.
-    unmodelled = LoggedSteps(episodes, reward, propensity, target)
-    return replace(unmodelled, model=cross_fitted(features, at_policy, reward, episodes, seed))
+    unmodelled = LoggedSteps(episodes, reward, propensity, target, user=user, discount=discount)
+    model = cross_fitted(features, at_policy, reward, episodes, seed, user, discount)
+    return replace(unmodelled, model=model)
 
 
 def step_features(
     trained: TrainedPolicy, batch: ScoredSteps, greedy: bool
 ) -> tuple[npt.NDArray[Any], Float32Array, Float32Array]:
-    """What models see of B logged steps.
+    """What models see of B logged steps. An item that the run does not know (−1) has probability 0
+    and an embedding of zeros.
 
     Returns:
         The judged policy's probability (B,) of the logged item; features (B, P) of the state and
@@ -117,14 +194,15 @@ def step_features(
     assert trained.item_states is not None
     embeddings = trained.item_states.embeddings
     states, items = batch.windows.states[:, -1], batch.windows.actions[:, -1]
+    known = items >= 0
     if greedy:
         best = batch.log_probabilities.argmax(1)
         target, shown = (best == items).double(), embeddings[best]
     else:
         probabilities = batch.log_probabilities.exp()
-        target = probabilities.gather(1, items[:, None])[:, 0].double()
+        target = probabilities.gather(1, items[:, None].clamp(min=0))[:, 0].double() * known
         shown = probabilities @ embeddings
-    chosen = _features(states, embeddings[items])
+    chosen = _features(states, embeddings[items] * known[:, None])
     return target.clamp(0, 1).numpy(), chosen, _features(states, shown)
 
 

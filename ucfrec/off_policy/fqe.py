@@ -1,10 +1,9 @@
 """Models of what a policy would earn, each fitted on other sessions than it predicts.
 
 Fitted Q evaluation is Algorithm 3 of Le, Voloshin & Yue, *Batch Policy Learning under Constraints*
-(ICML 2019), with ridge regression, undiscounted, on sessions that end.
+(ICML 2019), with ridge regression, on sessions that end.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
 
 from ucfrec.errors import InputError
+from ucfrec.off_policy.logged_steps import Modelled
 from ucfrec.progress import progress
 
 FloatArray = npt.NDArray[np.float64]
@@ -24,26 +24,17 @@ _ROWS_AT_ONCE = 2**16
 _CLOSE = 1e-6
 
 
-@dataclass(frozen=True)
-class Modelled:
-    """What models fitted on other sessions say of N logged steps, under the judged policy."""
-
-    reward: FloatArray
-    """(N,) mean reward of the step."""
-    q: FloatArray
-    """(N,) return from the logged action on."""
-    v: FloatArray
-    """(N,) the mean of `q` over the policy's actions."""
-
-
 def cross_fitted(
     features: Float32Array,
     at_policy: Float32Array,
     reward: FloatArray,
     session: IntArray,
     seed: int,
+    user: IntArray | None = None,
+    discount: float = 1.0,
 ) -> Modelled:
-    """Linear models of reward and Q, cross-fitted over sessions.
+    """Linear models of reward and Q, cross-fitted over users: no session is judged by a model that
+    saw it, nor by one that saw another session of its user.
 
     Args:
         features: (N, P) of the logged state and action; the first is 1.
@@ -52,15 +43,19 @@ def cross_fitted(
         reward: (N,).
         session: (N,) number of each step's session, from 0, never falling; steps in order.
         seed: draws the folds.
+        user: (S,) whose session each is; None where each is somebody else's.
+        discount: γ of Q.
 
     Raises:
-        InputError: there are fewer than two sessions.
+        InputError: there are fewer than two users.
     """
-    sessions = int(session[-1]) + 1
-    if sessions < 2:
-        raise InputError("a model needs sessions other than the one it judges; give more logs")
-    folds = np.random.default_rng(seed).permutation(sessions) % min(FOLDS, sessions)
-    last = np.diff(session, append=sessions) > 0
+    sessions = np.arange(int(session[-1]) + 1)
+    group = sessions if user is None else np.unique(user, return_inverse=True)[1]
+    users = int(group.max()) + 1
+    if users < 2:
+        raise InputError("a model needs sessions of users other than the one it judges")
+    folds = (np.random.default_rng(seed).permutation(users) % min(FOLDS, users))[group]
+    last = np.diff(session, append=len(sessions)) > 0
     gram = _gram(features)
     penalty = _penalty(gram, len(reward))
     modelled = Modelled(*np.zeros((3, len(reward))))
@@ -69,7 +64,7 @@ def cross_fitted(
             here = folds[session] == fold
             ridge = _Ridge(features, gram - _gram(features[here]) + np.diag(penalty), ~here)
             modelled.reward[here] = at_policy[here] @ ridge.fit(reward)
-            weights = fitted_q(ridge, at_policy, reward, last)
+            weights = fitted_q(ridge, at_policy, reward, last, discount)
             modelled.q[here] = features[here] @ weights
             modelled.v[here] = at_policy[here] @ weights
             bar.update()
@@ -95,7 +90,11 @@ class _Ridge:
 
 
 def fitted_q(
-    ridge: _Ridge, at_policy: Float32Array, reward: FloatArray, last: BoolArray
+    ridge: _Ridge,
+    at_policy: Float32Array,
+    reward: FloatArray,
+    last: BoolArray,
+    discount: float = 1.0,
 ) -> Float32Array:
     """(P,) weights of Q: as many steps ahead as the longest session has, or until they settle.
 
@@ -103,6 +102,7 @@ def fitted_q(
 
     Args:
         last: (N,) where a session ends and nothing follows.
+        discount: γ.
     """
     ends = np.flatnonzero(last)
     horizon = int(np.diff(ends, prepend=-1).max())
@@ -114,7 +114,7 @@ def fitted_q(
         following = np.where(last, 0.0, np.roll(at_policy @ weights, -1)).clip(low, high)
         if np.abs(following - before).max() <= _CLOSE * (high - low):
             break
-        weights = ridge.fit(reward + following)
+        weights = ridge.fit(reward + discount * following)
     return weights
 
 

@@ -41,6 +41,8 @@ class LoggedSessions:
     """(E,) identifier of each session's user."""
     report: dict[str, Any]
     """What was read and dropped, for `ucfrec.logs.summary.format_report`."""
+    unknown_items: int = 0
+    """Steps that show an item which the run does not know."""
 
 
 @dataclass(frozen=True)
@@ -57,11 +59,16 @@ class ScoredSteps:
 
 @contextmanager
 def logged_sessions(
-    run: Path, trained: TrainedPolicy, files: Sequence[Path], mapping: LogMapping
+    run: Path,
+    trained: TrainedPolicy,
+    files: Sequence[Path],
+    mapping: LogMapping,
+    keep_unknown: bool = False,
 ) -> Iterator[LoggedSessions]:
     """Read logs as the training logs of `run` were read; they lie on disk until the block ends.
 
-    Rows of items that the run does not know are dropped and counted in the report.
+    Rows of items that the run does not know are dropped and counted in the report; with
+    `keep_unknown` they stay, as item −1, and `LoggedSessions.unknown_items` counts them.
 
     Raises:
         InputError: the policy's actions are vectors, the logs cannot be used, none of their items
@@ -83,15 +90,21 @@ def logged_sessions(
         options = replace(options, gap_minutes=gap_ms / 60_000)
     with tempfile.TemporaryDirectory(prefix="ucfrec-") as scratch:
         folder = Path(scratch) / "store"
-        report = prepare(files, mapping, folder, options, like=run)
+        report = prepare(files, mapping, folder, options, like=run, keep_unknown=keep_unknown)
         store = EpisodeStore.open(folder)
+        unknown = int((store.step_values(schema.ITEM, *store.all_steps()) < 0).sum())
+        if unknown == store.n_steps:
+            raise InputError(
+                f"{files[0]}: in none of the {unknown:,} rows does the run know the item (item is "
+                "none of the store's); judge it by logs of the same catalogue"
+            )
         if store.observation_size != record["observation_size"]:
             raise InputError(
                 f"the policy was trained with observations of {record['observation_size']} numbers;"
                 f" those of the logs have {store.observation_size}"
             )
         users = np.asarray(pq.read_table(folder / EPISODE_USERS).column(schema.USER_ID))
-        yield LoggedSessions(store, users, report)
+        yield LoggedSessions(store, users, report, unknown)
 
 
 def scored_steps(
@@ -110,7 +123,9 @@ def scored_steps(
             windows = store.windows(episodes, steps, trained.policy.config.context)
             # A logged return-to-go is the session's return less what it has earned so far.
             more = torch.from_numpy(target_return - store.returns[episodes])
-            log_probabilities = trained.log_probabilities(windows, more.unsqueeze(1))
+            # What follows an unknown item (−1) has no weight: any known item may stand for it.
+            known = replace(windows, actions=windows.actions.clamp(min=0))
+            log_probabilities = trained.log_probabilities(known, more.unsqueeze(1))
             yield ScoredSteps(episodes, steps, windows, log_probabilities)
             bar.update(len(steps))
 

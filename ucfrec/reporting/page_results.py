@@ -65,7 +65,10 @@ def _rows_of(path: Path) -> list[Row]:
         known = row if isinstance(row, dict) else {}
         texts = ("estimator" if "estimator" in known else "world", "policy")
         lacking = [name for name in texts if not isinstance(known.get(name), str)]
-        lacking += [name for name in _INTERVAL if not _finite(known.get(name))]
+        # An estimate that nothing but a model stands behind has no interval.
+        open_ended = "estimator" in known and known.get("R_cum_low") is None
+        needed = _INTERVAL[:1] if open_ended else _INTERVAL
+        lacking += [name for name in needed if not _finite(known.get(name))]
         lacking += [
             name
             for name in (*_METRICS, *_WEIGHTS)
@@ -148,12 +151,15 @@ def _bars(title: str, names: Sequence[str], rows: Sequence[Row]) -> charts.BarCh
     bars = [
         (name, float(row["R_cum"]), float(row["R_cum_low"]), float(row["R_cum_high"]))
         for name, row in zip(names, rows, strict=True)
+        if row["R_cum_low"] is not None
     ]
     return charts.bar_chart(title, bars)
 
 
 def interval(row: Row) -> str:
-    """R_cum with its 95% interval."""
+    """R_cum with its 95% interval, if it has one."""
+    if row["R_cum_low"] is None:
+        return f"{shown(row['R_cum'])} [–]"
     return f"{shown(row['R_cum'])} [{shown(row['R_cum_low'])}, {shown(row['R_cum_high'])}]"
 
 

@@ -126,6 +126,9 @@ def _against(best: _Earned, references: Sequence[_Earned]) -> str:
 
 
 def _of_estimates(one: Estimates) -> str:
+    computed = next((row["verdict"] for row in one.rows if row.get("verdict")), None)
+    if computed is not None:
+        return f"For {one.name}: {computed}."
     weighted = [row for row in one.rows if row["estimator"] in WEIGHTED]
     warnings = "; ".join(one.warnings)
     if not weighted:

@@ -1,0 +1,189 @@
+"""How often 95% off-policy intervals hold the true value, where the verdict lets them stand.
+
+    python benchmarks/off_policy_coverage.py                     # 200 replications each, minutes
+    python benchmarks/off_policy_coverage.py --replications 40 --worlds "heavy tails"
+
+Sessions are drawn from small worlds of tables, whose values under any policy are exact. For every
+world the table says in what share of the replications the verdict stands, and how often the
+interval of each estimator holds the truth among these; an asterisk marks less than 90% or more than
+98%, where the verdict stands in more than 5% of the replications.
+"""
+
+import argparse
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from ucfrec.off_policy.estimators import Estimate, estimate
+from ucfrec.off_policy.fqe import cross_fitted
+from ucfrec.off_policy.logged_steps import LoggedSteps
+from ucfrec.off_policy.verdict import judge
+from ucfrec.progress import progress
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+SHOWN = ("logged", "IPS", "SNIPS", "PDIS", "SNPDIS", "DR", "SNDR", "lift")
+LOW, HIGH = 0.90, 0.98
+
+
+@dataclass(frozen=True)
+class World:
+    """X contexts, A actions, sessions of fixed length; a user's sessions begin in one context."""
+
+    users: int = 1000
+    sessions_a_user: int = 1
+    steps: int = 1
+    actions: int = 8
+    contexts: int = 6
+    reward: float = 0.3
+    """Mean reward of a step, about."""
+    taste: float = 0.0
+    """Half the width of what a user adds to every reward probability, as a share of `reward`."""
+    distance: float = 0.5
+    """How far the judged policy's logits are from the behavior's."""
+    model_knows: bool = True
+    """Whether the model sees context and action, or only if the action's number is odd."""
+
+    def tables(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Behavior, target and mean reward (X, A), and the next context's (X, A, X)."""
+        rng = np.random.default_rng(14)
+        shape = (self.contexts, self.actions)
+        logits = rng.normal(size=shape)
+        behavior = softmax(logits)
+        target = softmax(logits + self.distance * rng.normal(size=shape))
+        pays = self.reward * rng.uniform(0.4, 1.6, shape)
+        return behavior, target, pays, rng.dirichlet(np.ones(self.contexts), shape)
+
+    def value(self) -> tuple[float, float]:
+        """Mean return of a session: the target's, and the behavior's."""
+        behavior, target, pays, follows = self.tables()
+        found = []
+        for policy in (target, behavior):
+            v = np.zeros(self.contexts)
+            for _ in range(self.steps):
+                v = (policy * (pays + follows @ v)).sum(axis=1)
+            found.append(float(v.mean()))
+        return found[0], found[1]
+
+    def logged(self, seed: int) -> LoggedSteps:
+        """Logs of the behavior policy, modelled."""
+        rng = np.random.default_rng(seed)
+        behavior, target, pays, follows = self.tables()
+        sessions = self.users * self.sessions_a_user
+        user = np.repeat(np.arange(self.users), self.sessions_a_user)
+        context = rng.integers(self.contexts, size=self.users)[user]
+        extra = self.taste * self.reward * rng.uniform(-1, 1, self.users)[user]
+        at = np.empty((2, sessions, self.steps), dtype=np.int64)
+        reward = np.empty((sessions, self.steps))
+        for step in range(self.steps):
+            action = drawn(behavior[context], rng)
+            at[:, :, step] = context, action
+            paid = rng.random(sessions) < np.clip(pays[context, action] + extra, 0, 1)
+            reward[:, step] = paid
+            context = drawn(follows[context, action], rng)
+        contexts, actions = at.reshape(2, -1)
+        steps = LoggedSteps(
+            session=np.repeat(np.arange(sessions), self.steps),
+            reward=reward.ravel(),
+            propensity=behavior[contexts, actions],
+            target=target[contexts, actions],
+            user=user,
+        )
+        cells = np.arange(target.size).reshape(target.shape)
+        if not self.model_knows:
+            cells = np.broadcast_to(np.arange(self.actions) % 2, target.shape)
+        one_hot = np.eye(target.size, dtype=np.float32)[cells]
+        seen = one_hot[contexts, actions]
+        at_policy = np.einsum("xa,xaf->xf", target, one_hot)[contexts].astype(np.float32)
+        ones = np.ones((len(contexts), 1), dtype=np.float32)
+        model = cross_fitted(
+            np.hstack([ones, seen]),
+            np.hstack([ones, at_policy]),
+            steps.reward,
+            steps.session,
+            seed,
+            user,
+        )
+        return replace(steps, model=model)
+
+
+WORLDS = {
+    "bandit": World(users=2000),
+    "ten rows a user": World(users=300, sessions_a_user=10, taste=0.4),
+    "5% reward": World(users=4000, reward=0.05),
+    "five-step sessions": World(users=2000, steps=5, distance=0.25),
+    "20 sessions a user": World(users=300, sessions_a_user=20, steps=2, taste=0.4),
+    "heavy tails": World(users=1000, actions=50, distance=2.0),
+    "heavy tails, more users": World(users=2500, actions=50, distance=2.0),
+    "heavy tails, five steps": World(users=1000, steps=5, distance=1.0),
+    "wrong model": World(users=2000, model_knows=False),
+}
+
+
+def softmax(logits: FloatArray) -> FloatArray:
+    exponents = np.exp(logits - logits.max(axis=1, keepdims=True))
+    return np.asarray(exponents / exponents.sum(axis=1, keepdims=True))
+
+
+def drawn(probabilities: FloatArray, rng: np.random.Generator) -> IntArray:
+    """(n,) a column drawn from each row (n, K)."""
+    beyond = rng.random((len(probabilities), 1)) > probabilities.cumsum(axis=1)
+    return np.minimum(beyond.sum(axis=1), probabilities.shape[1] - 1)
+
+
+def replication(world: World, seed: int) -> tuple[bool, dict[str, bool]]:
+    """Whether the verdict stands, and which intervals hold the truth."""
+    steps, (truth, as_logged) = world.logged(seed), world.value()
+    verdict, found = judge(steps, seed), estimate(steps, seed)
+    holds: dict[str, bool] = {}
+    for name in SHOWN[:-1]:
+        holds[name] = held(found.get(name), as_logged if name == "logged" else truth)
+    low, high = verdict.lift_low, verdict.lift_high
+    holds["lift"] = low is not None and high is not None and low <= truth - as_logged <= high
+    return verdict.reliable, holds
+
+
+def held(found: Estimate | None, truth: float) -> bool:
+    if found is None or found.low is None or found.high is None:
+        return False
+    return found.low <= truth <= found.high
+
+
+def coverage(name: str, replications: int) -> tuple[float, dict[str, float]]:
+    """Share of replications whose verdict stands, and coverage among these (NaN without any)."""
+    standing = []
+    with progress(replications, name, "replications") as bar:
+        for seed in range(replications):
+            stands, holds = replication(WORLDS[name], seed)
+            if stands:
+                standing.append(holds)
+            bar.update()
+    share = len(standing) / replications
+    covered = {
+        name: float(np.mean([holds[name] for holds in standing])) if standing else np.nan
+        for name in SHOWN
+    }
+    return share, covered
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--replications", type=int, default=200)
+    parser.add_argument("--worlds", nargs="+", choices=list(WORLDS), default=list(WORLDS))
+    options = parser.parse_args()
+    print(f"{'world':<24} {'stands':>6}  " + " ".join(f"{name:>7}" for name in SHOWN))
+    for name in options.worlds:
+        share, covered = coverage(name, options.replications)
+        cells = [
+            "      –" if np.isnan(one) else f"{one:6.1%}{' ' if LOW <= one <= HIGH else '*'}"
+            for one in covered.values()
+        ]
+        if share <= 0.05:
+            cells = [cell.replace("*", " ") for cell in cells]
+        print(f"{name:<24} {share:>6.1%}  " + " ".join(cells), flush=True)
+
+
+if __name__ == "__main__":
+    main()

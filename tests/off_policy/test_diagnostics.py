@@ -1,0 +1,47 @@
+"""Tails and bounds against what is known of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.support.logged_steps import random_steps
+from ucfrec.off_policy.diagnostics import diagnose, identification_bounds, pareto_tail
+
+
+@pytest.mark.parametrize("shape", [0.2, 0.5, 0.9])
+def test_the_tail_of_a_pareto_sample_has_its_shape(shape: float) -> None:
+    rng = np.random.default_rng(1)
+    found = [pareto_tail(rng.pareto(1 / shape, 20_000) + 1) for _ in range(20)]
+    assert np.mean([one for one in found if one is not None]) == pytest.approx(shape, abs=0.05)
+
+
+def test_weights_of_few_values_have_no_tail() -> None:
+    assert pareto_tail(np.tile([0.0, 1.0, 3.0], 1000)) is None
+    assert pareto_tail(np.ones(5)) is None
+
+
+def test_effective_users_follow_each_step_of_uneven_sessions() -> None:
+    steps = random_steps([1, 4, 2, 3] * 20)
+    user = np.arange(80) % 7
+    found = diagnose(replace(steps, user=user)).effective_by_step
+    for place in range(4):
+        weight = np.array(
+            [
+                steps.weights[first + min(place, length - 1)]
+                for first, length in zip(steps.first, steps.lengths, strict=True)
+            ]
+        )
+        by_user = np.bincount(user, weight)
+        assert found[place] == pytest.approx(by_user.sum() ** 2 / (by_user**2).sum())
+
+
+def test_bounds_are_the_estimate_where_nothing_lacks() -> None:
+    steps = random_steps([3] * 50)
+    whole = replace(steps, target=steps.propensity)
+    low, high = identification_bounds(whole, (-1, 1))
+    assert low == high == pytest.approx(whole.returns.mean())
+    half = replace(steps, target=steps.propensity / 2)
+    low, high = identification_bounds(half, (0, 1))
+    # Half of the first choices lack, three quarters of the second, seven eighths of the third.
+    assert high - low == pytest.approx(0.5 + 0.75 + 0.875)

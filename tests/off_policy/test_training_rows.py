@@ -1,0 +1,51 @@
+"""Rows that a run was trained on are noticed where it is judged by them."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from ucfrec.logs import LogMapping
+from ucfrec.off_policy.evaluate import judge_off_policy
+from ucfrec.off_policy.score import logged_sessions
+from ucfrec.off_policy.training_rows import share_seen
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+
+@pytest.mark.parametrize(("seen", "expected"), [(0, 0.0), (300, 0.5)])
+def test_the_share_of_rows_seen_in_training(
+    folder: Path, trained: TrainedPolicy, tmp_path: Path, seen: int, expected: float
+) -> None:
+    train = pd.read_parquet(folder / "train.parquet").sort_values("timestamp")
+    rest = pd.read_parquet(folder / "rest.parquet").head(600 - seen)
+    # The last tenth of the training log is its test split, which the run never saw.
+    pd.concat([train.head(seen), rest]).to_parquet(tmp_path / "log.parquet")
+    with logged_sessions(
+        folder / "run", trained, [tmp_path / "log.parquet"], LogMapping()
+    ) as logged:
+        assert share_seen(trained, logged.store) == pytest.approx(expected, abs=0.01)
+
+
+def test_judging_by_the_training_log_is_refused(folder: Path, trained: TrainedPolicy) -> None:
+    log = folder / "train.parquet"
+    with logged_sessions(folder / "run", trained, [log], LogMapping(), keep_unknown=True) as logged:
+        judged = judge_off_policy(
+            folder / "run", trained, logged, target_return=5.0, greedy=False, seed=0
+        )
+    assert not judged.verdict.reliable
+    assert "90% of the rows were seen in training" in judged.verdict.reasons[0]
+    assert judged.rows[0]["seen_in_training"] == pytest.approx(0.9, abs=0.01)
+
+
+def test_without_the_training_store_nothing_is_known(
+    folder: Path, trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    shutil.copytree(folder / "store", tmp_path / "store")
+    for store in (tmp_path / "gone", tmp_path / "store"):
+        moved = replace(trained, record={**trained.record, "store": str(store)})
+        with logged_sessions(
+            folder / "run", trained, [folder / "rest.parquet"], LogMapping()
+        ) as logged:
+            assert (share_seen(moved, logged.store) is None) is (store.name == "gone")

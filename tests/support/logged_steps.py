@@ -1,0 +1,52 @@
+"""Random logged steps, and the reference inputs of the Open Bandit Pipeline and SCOPE-RL."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ucfrec.off_policy.logged_steps import LoggedSteps, Modelled, cluster_probabilities
+
+REFERENCE = Path(__file__).parents[1] / "off_policy" / "fixtures" / "reference.npz"
+
+
+def random_steps(
+    lengths: list[int], seed: int = 0, modelled: bool = True, discount: float = 1.0
+) -> LoggedSteps:
+    rng = np.random.default_rng(seed)
+    n = sum(lengths)
+    return LoggedSteps(
+        session=np.repeat(np.arange(len(lengths)), lengths),
+        reward=rng.normal(size=n),
+        propensity=rng.uniform(0.05, 1, n),
+        target=rng.uniform(0, 1, n) * (rng.random(n) < 0.9),
+        model=Modelled(*rng.normal(size=(3, n))) if modelled else None,
+        discount=discount,
+    )
+
+
+def reference(name: str) -> tuple[LoggedSteps, dict[str, npt.NDArray[Any]]]:
+    """The inputs "bandit" or "sequence" as logged steps, and what the references make of them."""
+    with np.load(REFERENCE) as files:
+        given = {key: files[key] for key in files.files}
+    shared = {key: given[key] for key in ("gamma", "lambdas", *(k for k in given if "λ" in k))}
+    ours = {k.removeprefix(f"{name} "): v for k, v in given.items() if k.startswith(f"{name} ")}
+    row, action, q = np.arange(len(ours["reward"])), ours["action"], ours["q"]
+    v = (ours["target"] * q).sum(axis=1)
+    length = 1 if name == "bandit" else 5
+    clusters = {}
+    if name == "bandit":
+        for policy, column in (("behavior", "propensity"), ("target", "target")):
+            of_cluster = cluster_probabilities(ours[policy], ours["cluster"], action)
+            clusters[f"cluster_{column}"] = of_cluster
+    steps = LoggedSteps(
+        session=row // length,
+        reward=ours["reward"],
+        propensity=ours["behavior"][row, action],
+        target=ours["target"][row, action],
+        model=Modelled(reward=v, q=q[row, action], v=v),
+        discount=1.0 if name == "bandit" else float(given["gamma"]),
+        **clusters,
+    )
+    return steps, ours | shared

@@ -1,0 +1,229 @@
+"""What in the logs speaks against an off-policy estimate: support, weights, tails, missing numbers.
+
+Notation as in `ucfrec.off_policy.logged_steps`. With true propensities, and a behavior policy that
+could choose whatever the judged policy may, ratios have mean 1 at every step, and so have their
+products. Means below 1 come of choices that the logs lack or of propensities that are too large;
+means above 1 of propensities that are too small.
+"""
+
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from ucfrec.off_policy.estimators import effective_number, step_totals
+from ucfrec.off_policy.intervals import cluster_means
+from ucfrec.off_policy.logged_steps import LoggedSteps
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+ENOUGH_TO_TEST: Final = 30
+"""Users below which a mean weight is not tested."""
+ENOUGH_USERS: Final = 200
+"""Effective users below which no estimate stands: in `benchmarks/off_policy_coverage.py` intervals
+of fewer hold the truth too seldom."""
+_SIGNIFICANCE, _TOLERANCE = 0.01, 0.02
+SESSION_PRODUCTS: Final = "session products"
+
+
+@dataclass(frozen=True)
+class WeightTest:
+    """A mean weight that should be 1."""
+
+    name: str
+    mean: float
+    error: float
+    """Standard error over users."""
+    passed: bool
+    """Within 2% of 1, or not significantly away from it: two-sided, 1% for all tests together
+    (Bonferroni)."""
+
+    def __str__(self) -> str:
+        return f"{self.name}: mean weight {self.mean:.3g} ± {self.error:.2g}"
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What `diagnose` finds."""
+
+    sessions: int
+    users: int
+    left_out: int
+    """Sessions with a step of unknown propensity: no part of what follows."""
+    overlap: float | None
+    """Mean ratio of steps; None where nothing can be weighed, as in the rest."""
+    tests: tuple[WeightTest, ...]
+    effective_by_step: tuple[float, ...]
+    """(T,) effective users at each step, of the products up to it."""
+    effective_users: float
+    """Of the session products, summed by user."""
+    largest_weight: float
+    """Share of the heaviest user in all weight."""
+    rewarded_users: int
+    """Users with a session that has both weight and reward."""
+    mean_weight: float | None
+    """Mean session product, 1 in expectation."""
+    tail: float | None
+    """Shape k of the Pareto tail of the weights (`pareto_tail`)."""
+    bounds: tuple[float, float] | None
+    """Between these lies the value if the propensities are true, whatever the choices that the logs
+    lack would earn; up to the sampling error of PDIS."""
+
+    @property
+    def stops_telling_at(self) -> int | None:
+        """First step (from 1) with fewer effective users than an estimate needs; None if the logs
+        tell to the end."""
+        few = [n < ENOUGH_USERS for n in self.effective_by_step]
+        return few.index(True) + 1 if any(few) else None
+
+
+def diagnose(
+    steps: LoggedSteps,
+    reward_range: tuple[float, float] | None = None,
+    segment: IntArray | None = None,
+) -> Diagnosis:
+    """Look for what forbids an estimate.
+
+    Args:
+        reward_range: least and greatest reward of a step; None for those observed.
+        segment: (S,) number of each session's segment (of users, of weeks, of contexts known before
+            the first choice), each of which is tested alone.
+    """
+    lacking = steps.per_session(np.isnan(steps.propensity).astype(np.float64)) > 0
+    users = len(lacking) if steps.user is None else len(np.unique(steps.user))
+    if lacking.all():
+        nothing = (None, (), (), 0.0, 1.0, 0, None, None, None)
+        return Diagnosis(len(lacking), users, len(lacking), *nothing)
+    known = steps.known()
+    by_user = _summed(_users(known), known.session_weights)
+    rewarded = _summed(_users(known), np.abs(known.session_weights * known.returns))
+    if reward_range is None:
+        reward_range = (float(steps.reward.min()), float(steps.reward.max()))
+    return Diagnosis(
+        sessions=len(lacking),
+        users=users,
+        left_out=int(lacking.sum()),
+        overlap=float((known.target / known.propensity).mean()),
+        tests=weight_tests(known, None if segment is None else segment[~lacking]),
+        effective_by_step=_effective_by_step(known),
+        effective_users=effective_number(by_user),
+        largest_weight=float(by_user.max() / by_user.sum()) if by_user.any() else 1.0,
+        rewarded_users=int((rewarded > 0).sum()),
+        mean_weight=float(known.session_weights.mean()),
+        tail=pareto_tail(by_user),
+        bounds=identification_bounds(known, reward_range),
+    )
+
+
+def weight_tests(steps: LoggedSteps, segment: IntArray | None = None) -> tuple[WeightTest, ...]:
+    """Two-sided tests that mean weights are 1: the ratios of each step, the session products, and
+    those of each segment. Errors are clustered by user; groups of under 30 users are left out.
+
+    Args:
+        segment: (S,) as `diagnose` takes it.
+    """
+    ratios, places = steps.target / steps.propensity, _by_place(steps)
+    groups = [
+        (f"step {place + 1}", ratios[rows], steps.session[rows])
+        for place, rows in enumerate(places)
+    ]
+    everyone = np.arange(len(steps.first))
+    groups.append((SESSION_PRODUCTS, steps.session_weights, everyone))
+    for number in [] if segment is None else np.unique(segment):
+        there = np.flatnonzero(segment == number)
+        groups.append((f"segment {number}", steps.session_weights[there], there))
+    found = []
+    for name, values, sessions in groups:
+        user = sessions if steps.user is None else steps.user[sessions]
+        if len(np.unique(user)) >= ENOUGH_TO_TEST:
+            (mean,), (error,) = cluster_means(values[:, None], user)
+            found.append((name, float(mean), float(error)))
+    limit = NormalDist().inv_cdf(1 - _SIGNIFICANCE / (2 * max(len(found), 1)))
+    return tuple(
+        WeightTest(name, mean, error, abs(mean - 1) <= max(_TOLERANCE, limit * error))
+        for name, mean, error in found
+    )
+
+
+def pareto_tail(weights: FloatArray) -> float | None:
+    """Shape k of a generalised Pareto distribution fitted to the largest weights.
+
+    From 0.5 on the variance is infinite; from 0.7 on a mean, and its interval, is unreliable
+    whatever the sample (Vehtari, Simpson, Gelman, Yao & Gabry, JMLR 2024). Fitted by Zhang &
+    Stephens, Technometrics 2009.
+
+    Args:
+        weights: (n,).
+
+    Returns:
+        None where the largest fifth, or 3√n, have fewer than ten different values: no tail.
+    """
+    size = int(min(0.2 * len(weights), 3 * len(weights) ** 0.5))
+    ordered = np.sort(weights)
+    excess = ordered[len(weights) - size :] - ordered[max(len(weights) - size - 1, 0)]
+    excess = excess[excess > 0]
+    if len(np.unique(excess)) < 10:
+        return None
+    excess = excess / excess[-1]
+    n, grid = len(excess), 30 + int(len(excess) ** 0.5)
+    quartile = excess[int(n / 4 + 0.5) - 1]
+    theta = 1 + (1 - np.sqrt(grid / (np.arange(1, grid + 1) - 0.5))) / (3 * quartile)
+    shapes = np.log1p(-theta[:, None] * excess).mean(axis=1)
+    likelihood = n * (np.log(-theta / shapes) - shapes - 1)
+    posterior = np.exp(likelihood - likelihood.max())
+    best = float((theta * posterior).sum() / posterior.sum())
+    return float(np.log1p(-best * excess).mean())
+
+
+def identification_bounds(
+    steps: LoggedSteps, reward_range: tuple[float, float]
+) -> tuple[float, float]:
+    """PDIS plus the least and the most that choices without support could have earned.
+
+    At step t a share 1 − E_n[w_t] of the judged policy's sessions has left what the logs support
+    (Manski 1990, for weights: Khan et al., AISTATS 2024); each of their steps earns something in
+    `reward_range`, or nothing once the session has ended. No session is longer than the longest
+    logged.
+    """
+    totals = step_totals(steps, steps.weights) / len(steps.first)
+    lacking = np.maximum(1 - totals, 0)
+    worth = float((steps.discount ** np.arange(len(totals)) * lacking).sum())
+    earned = steps.per_session(steps.discounts * steps.weights * steps.reward).mean()
+    low, high = reward_range
+    # A single step is always taken; a longer session may end.
+    if len(totals) > 1:
+        low, high = min(low, 0.0), max(high, 0.0)
+    return float(earned + worth * low), float(earned + worth * high)
+
+
+def _users(steps: LoggedSteps) -> IntArray:
+    """(S,) users numbered from 0."""
+    if steps.user is None:
+        return np.arange(len(steps.first))
+    return np.asarray(np.unique(steps.user, return_inverse=True)[1])
+
+
+def _summed(users: IntArray, values: FloatArray) -> FloatArray:
+    """(U,) sums of values (S,) by user."""
+    return np.bincount(users, values).astype(np.float64)
+
+
+def _by_place(steps: LoggedSteps) -> list[IntArray]:
+    """The rows of every place in a session, sessions in order."""
+    order = np.argsort(steps.step, kind="stable")
+    return np.split(order, np.cumsum(np.bincount(steps.step))[:-1])
+
+
+def _effective_by_step(steps: LoggedSteps) -> tuple[float, ...]:
+    users, weights = _users(steps), steps.weights
+    # An ended session keeps the weight of its last step.
+    summed, found = np.bincount(users).astype(np.float64), []
+    for place, rows in enumerate(_by_place(steps)):
+        before = weights[rows - 1] if place else np.ones(len(rows))
+        change = np.bincount(users[steps.session[rows]], weights[rows] - before, len(summed))
+        summed = np.maximum(summed + change, 0)
+        found.append(effective_number(summed))
+    return tuple(found)

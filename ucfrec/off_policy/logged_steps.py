@@ -1,0 +1,233 @@
+"""Logged steps as flat arrays, and the importance weights that follow from them.
+
+Notation of the whole package: session i of S, step t (from 0) of its T_i steps; ρ_it =
+target / propensity of the logged action; w_it = Π_{k ≤ t} ρ_ik, with w_i,−1 = 1; γ the discount.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from ucfrec.errors import InputError
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+_LARGEST = 1e100
+"""Weights stop here: beyond, an estimate means nothing, and their squares stay finite."""
+
+
+@dataclass(frozen=True)
+class Modelled:
+    """What models fitted on other sessions say of N logged steps, under the judged policy."""
+
+    reward: FloatArray
+    """(N,) mean reward of the step."""
+    q: FloatArray
+    """(N,) discounted return from the logged action on."""
+    v: FloatArray
+    """(N,) Σ_a π(a | s) q(s, a): the mean of `q` over the judged policy's actions."""
+
+
+@dataclass(frozen=True)
+class LoggedSteps:
+    """N logged steps of S sessions, a session's steps together and in order.
+
+    Raises:
+        InputError: lengths differ, sessions are not numbered in order, a number is not finite, a
+            probability or the discount is out of its range.
+    """
+
+    session: IntArray
+    """(N,) number of each step's session: 0 to S − 1, never falling, none left out."""
+    reward: FloatArray
+    """(N,) in any unit; estimates are in the same unit."""
+    propensity: FloatArray
+    """(N,) the behavior policy's probability of the logged action, in (0, 1]; NaN where unknown."""
+    target: FloatArray
+    """(N,) the judged policy's probability of it, in [0, 1]; 0 where it cannot choose it."""
+    model: Modelled | None = None
+    user: IntArray | None = None
+    """(S,) whose session it is: sessions of one user are resampled together. None where every
+    session is somebody else's."""
+    discount: float = 1.0
+    """γ in (0, 1]: a reward at step t (from 0) counts γ^t."""
+    cluster_propensity: FloatArray | None = None
+    """(N,) the behavior policy's probability of the logged action's cluster, for MIPS; see
+    `cluster_probabilities`."""
+    cluster_target: FloatArray | None = None
+    """(N,) the judged policy's probability of it."""
+
+    def __post_init__(self) -> None:
+        n = len(self.session)
+        rises = np.diff(self.session, prepend=-1)
+        if n == 0 or rises[0] != 1 or not np.isin(rises, (0, 1)).all():
+            raise InputError("sessions are numbered from 0 in order, and there is at least one")
+        finite = {"reward": self.reward}
+        if self.model is not None:
+            finite |= {f"modelled {name}": values for name, values in vars(self.model).items()}
+        for name, values in finite.items():
+            _require_shape(name, values, n)
+            if not np.isfinite(values).all():
+                raise InputError(f"{name} is not finite at {(~np.isfinite(values)).sum()} steps")
+        _require_probabilities(self.propensity, self.target, n)
+        if (self.cluster_propensity is None) is not (self.cluster_target is None):
+            raise InputError("give both cluster_propensity and cluster_target, or neither")
+        if self.cluster_propensity is not None and self.cluster_target is not None:
+            _require_probabilities(self.cluster_propensity, self.cluster_target, n)
+        if self.user is not None and self.user.shape != (len(self.first),):
+            raise InputError(
+                f"user has shape {self.user.shape}; {len(self.first)} sessions are "
+                f"({len(self.first)},): one user a session"
+            )
+        if not 0 < self.discount <= 1:
+            raise InputError(f"discount is {self.discount}; it is above 0 and at most 1")
+
+    @cached_property
+    def first(self) -> IntArray:
+        """(S,) step that begins each session."""
+        return np.flatnonzero(np.diff(self.session, prepend=-1))
+
+    @cached_property
+    def lengths(self) -> IntArray:
+        """(S,) steps of each session."""
+        return np.diff(np.append(self.first, len(self.session)))
+
+    @cached_property
+    def last(self) -> IntArray:
+        """(S,) step that ends each session."""
+        return self.first + self.lengths - 1
+
+    @cached_property
+    def step(self) -> IntArray:
+        """(N,) place of each step in its session, from 0."""
+        return np.arange(len(self.session)) - self.first[self.session]
+
+    @cached_property
+    def discounts(self) -> FloatArray:
+        """(N,) γ^t."""
+        return np.asarray(self.discount**self.step, dtype=np.float64)
+
+    @cached_property
+    def returns(self) -> FloatArray:
+        """(S,) discounted return of each session as logged."""
+        return self.per_session(self.discounts * self.reward)
+
+    @cached_property
+    def weights(self) -> FloatArray:
+        """(N,) w_it; NaN from a step without propensity on."""
+        return self._products(self.target / self.propensity)
+
+    @cached_property
+    def session_weights(self) -> FloatArray:
+        """(S,) w of each session's last step: the product of all its ratios."""
+        return self.weights[self.last]
+
+    @cached_property
+    def cluster_weights(self) -> FloatArray | None:
+        """(N,) products of ratios of the logged actions' clusters; None without them."""
+        if self.cluster_propensity is None or self.cluster_target is None:
+            return None
+        return self._products(self.cluster_target / self.cluster_propensity)
+
+    @property
+    def unknown_propensities(self) -> int:
+        """How many steps have none."""
+        return int(np.isnan(self.propensity).sum())
+
+    def per_session(self, values: FloatArray) -> FloatArray:
+        """(S,) sums of values (N,)."""
+        return np.asarray(np.add.reduceat(values, self.first))
+
+    def before(self, upto: FloatArray) -> FloatArray:
+        """(N,) w_i,t−1 of products (N,): 1 at the first step."""
+        earlier = np.roll(upto, 1)
+        earlier[self.first] = 1.0
+        return earlier
+
+    def known(self) -> "LoggedSteps":
+        """The sessions of whose every step the propensity is known, numbered anew.
+
+        Raises:
+            InputError: there is none.
+        """
+        if not self.unknown_propensities:
+            return self
+        return self.only(self.per_session(np.isnan(self.propensity).astype(np.float64)) == 0)
+
+    def only(self, keep: BoolArray) -> "LoggedSteps":
+        """The sessions that `keep` (S,) marks, numbered anew.
+
+        Raises:
+            InputError: it marks none.
+        """
+        rows = keep[self.session]
+        parts = {
+            name: values[rows]
+            for name in ("reward", "propensity", "target", "cluster_propensity", "cluster_target")
+            if (values := getattr(self, name)) is not None
+        }
+        model = self.model
+        if model is not None:
+            model = Modelled(*(values[rows] for values in vars(model).values()))
+        return replace(
+            self,
+            session=(np.cumsum(keep) - 1)[self.session[rows]],
+            model=model,
+            user=None if self.user is None else self.user[keep],
+            **parts,
+        )
+
+    def _products(self, upto: FloatArray) -> FloatArray:
+        """(N,) products of ratios (N,) from the session's first step to each."""
+        # One pass a place in the session: sums of logarithms would lose digits over many sessions.
+        longest_first = np.argsort(-self.lengths, kind="stable")
+        starts, lengths = self.first[longest_first], self.lengths[longest_first]
+        for place in range(1, int(lengths[0])):
+            at = starts[: np.searchsorted(-lengths, -place, side="left")] + place
+            upto[at] = np.minimum(upto[at] * upto[at - 1], _LARGEST)
+        return np.asarray(np.minimum(upto, _LARGEST))
+
+
+def cluster_probabilities(
+    probabilities: FloatArray, cluster: IntArray, action: IntArray
+) -> FloatArray:
+    """A policy's probability of the cluster of each logged action, for MIPS.
+
+    In a large catalogue hardly any single item is shown often by both policies, but items alike
+    are. Where the reward depends on an item only through its cluster, weights of clusters are
+    unbiased, and far smaller (Saito & Joachims, ICML 2022, eq. 7 and Theorem 3.2).
+
+    Args:
+        probabilities: (N, A) of every action at every step; give large catalogues in chunks of
+            rows.
+        cluster: (A,) cluster of every action, e.g. k-means of item embeddings.
+        action: (N,) the logged actions.
+
+    Returns:
+        (N,) for `cluster_propensity` or `cluster_target` of `LoggedSteps`.
+    """
+    same = cluster[None, :] == cluster[action][:, None]
+    return np.asarray(np.minimum((probabilities * same).sum(axis=1), 1.0), dtype=np.float64)
+
+
+def _require_shape(name: str, values: FloatArray, n: int) -> None:
+    if values.shape != (n,):
+        raise InputError(f"{name} has shape {values.shape}, {n} steps are ({n},)")
+
+
+def _require_probabilities(propensity: FloatArray, target: FloatArray, n: int) -> None:
+    _require_shape("propensity", propensity, n)
+    _require_shape("target", target, n)
+    if not np.isfinite(target).all():
+        raise InputError(f"target is not finite at {(~np.isfinite(target)).sum()} steps")
+    if not ((target >= 0) & (target <= 1)).all():
+        raise InputError("probabilities of the judged policy lie between 0 and 1")
+    if not (np.isnan(propensity) | (propensity > 0) & (propensity <= 1)).all():
+        raise InputError(
+            "propensities must be above 0 and at most 1 (a probability, not a density); "
+            "correct that column"
+        )

@@ -6,7 +6,19 @@
 Sessions are drawn from small worlds of tables, whose values under any policy are exact. For every
 world the table says in what share of the replications the verdict stands, and how often the
 interval of each estimator holds the truth among these; an asterisk marks less than 90% or more than
-98%, where the verdict stands in more than 5% of the replications.
+98%, where the verdict stands in more than 5% of the replications. Measured, the first three worlds
+with 200 replications (standard error 1.5 points), the others with 100 (2.2 points):
+
+world                    stands   logged     IPS   SNIPS    PDIS  SNPDIS      DR    SNDR    lift
+bandit                    99.5%   95.0%   94.0%   94.0%   94.0%   94.0%   93.5%   94.0%   94.5%
+ten rows a user           99.5%   94.5%   95.5%   95.0%   95.5%   94.5%   94.0%   94.5%   95.5%
+5% reward                100.0%   94.5%   95.0%   94.0%   95.0%   94.0%   92.5%   92.0%   93.5%
+five-step sessions       100.0%   95.0%   94.0%   98.0%   94.0%   97.0%   99.0%*  96.0%   96.0%
+20 sessions a user        99.0%   96.0%   92.9%   94.9%   94.9%   94.9%   98.0%   96.0%   97.0%
+heavy tails                0.0%        –       –       –       –       –       –       –       –
+heavy tails, more users   98.0%   95.9%   94.9%   93.9%   94.9%   93.9%   93.9%   93.9%   94.9%
+heavy tails, five steps    0.0%        –       –       –       –       –       –       –       –
+wrong model              100.0%   93.0%   90.0%   91.0%   90.0%   91.0%   91.0%   91.0%   92.0%
 """
 
 import argparse

@@ -50,8 +50,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-# The help of `train` names the learners, which are imported for that.
-@pytest.mark.parametrize("command", sorted(UCFREC.commands.keys() - {"train"}))
+@pytest.mark.parametrize("command", sorted(UCFREC.commands))
 def test_help_needs_no_slow_import(command: str) -> None:
     assert not loaded(command, "--help") & SLOW_TO_IMPORT
 
@@ -79,7 +78,7 @@ def test_collecting_needs_no_training_code(tmp_path: Path) -> None:
         ("ucfrec.runs.trained_policy", {"torch", "pyarrow"}),
         ("ucfrec.runs.run", {"torch", "pyarrow"}),
         ("ucfrec.off_policy.evaluate", {"torch", "pyarrow", "duckdb", "pandas", "scipy"}),
-        ("ucfrec.recommending.recommend", {"torch", "pyarrow", "pandas"}),
+        ("ucfrec.recommending.recommend", {"torch", "pyarrow", "pandas", "duckdb"}),
     ],
 )
 def test_what_works_on_a_run_imports_what_it_uses(module: str, needed: set[str]) -> None:

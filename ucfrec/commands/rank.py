@@ -2,22 +2,14 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from ucfrec import schema
 from ucfrec.commands.options import log_options, logs_given, target_given, target_options
-from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.ranking import MEASURES, Period, compare, rank_steps, rankers_named
-from ucfrec.evaluation.ranking_baselines import PolicyRanker, baselines
-from ucfrec.files import write_json
-from ucfrec.logs.summary import format_report
-from ucfrec.off_policy.score import logged_sessions
-from ucfrec.provenance import provenance
-from ucfrec.reporting.tables import format_rows
-from ucfrec.runs.trained_policy import RUN, TrainedPolicy
+
+if TYPE_CHECKING:
+    from ucfrec.episodes.store import EpisodeStore
+    from ucfrec.runs.trained_policy import TrainedPolicy
 
 _SHOWN = ("hit_rate_shown", "hit_rate_liked", "ndcg_liked", "recall_liked", "gauc", "item_rate")
 
@@ -27,8 +19,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     log_options(parser)
     parser.add_argument("--k", type=int, default=10, help="items recommended at a step (10)")
     target_options(parser)
-    parser.add_argument("--seed", type=int, default=0, help="of resampled users and `random`")
-    parser.add_argument("--json", type=Path, help="write the result rows here")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="of resampled users and of the random baseline (0)"
+    )
+    parser.add_argument("--json", type=Path, help="write the rows, with intervals, here")
     parser.usage = "%(prog)s RUN... [LOGS...] [options]"
     parser.epilog = (
         "Without LOGS, the test split of the store that the first run was trained on is ranked."
@@ -37,6 +31,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """`ucfrec rank`."""
+    from ucfrec.evaluation.ranking import MEASURES
+    from ucfrec.evaluation.ranking_table import require_one_catalogue, training_store
+    from ucfrec.files import write_json
+    from ucfrec.logs.summary import format_report
+    from ucfrec.off_policy.score import logged_sessions
+    from ucfrec.reporting.tables import format_rows
+    from ucfrec.runs.trained_policy import RUN, TrainedPolicy
+
     runs = [Path(path) for path in options.logs if (Path(path) / RUN).is_file()]
     options.logs = [path for path in options.logs if Path(path) not in runs]
     if not runs:
@@ -44,90 +46,47 @@ def run(options: argparse.Namespace) -> None:
     if options.k < 1:
         raise InputError(f"--k is {options.k}; recommend at least 1 item")
     trained = [TrainedPolicy.load(run, options.checkpoint) for run in runs]
-    _require_one_catalogue(runs, trained)
-    train = _training_store(trained[0])
+    require_one_catalogue(trained)
+    train = training_store(trained[0])
     if options.logs:
         files, mapping = logs_given(options)
         with logged_sessions(runs[0], trained[0], files, mapping) as logged:
             print(format_report(logged.report), end="\n\n")
-            rows = _rows(options, runs, trained, train, logged.store, logged.users)
+            rows = _rows(options, trained, train, logged.store, logged.users)
     else:
-        if train is None:
-            raise InputError(
-                f"{runs[0]}: its store {trained[0].record['store']} is gone or another by now; "
-                "name the logs to rank"
-            )
-        test = train.split("test")
-        if not test.n_episodes:
-            raise InputError(f"{train.path} has no test split; name later logs to rank")
-        users = test.episode_values(schema.USER)
-        rows = _rows(options, runs, trained, train, test, users)
+        test = _test_split(trained[0], train)
+        rows = _rows(options, trained, train, test, test.episode_values("user"))
     print(format_rows(rows, ("policy", *_SHOWN, "coverage")))
-    print(f"\n{_legend(options.k)}")
+    print("\n" + "\n".join(f"{name:<16}{MEASURES[name]}" for name in _SHOWN))
+    print(f"k is {rows[0]['k']}; --json has 95% intervals and paired differences by user")
     if options.json is not None:
         write_json(options.json, rows)
 
 
-def _require_one_catalogue(runs: list[Path], trained: list[TrainedPolicy]) -> None:
-    for run, policy in zip(runs, trained, strict=True):
-        if policy.item_states is None:
-            raise InputError(f"{run}: the actions of this policy are vectors; there is no ranking")
-        if policy.record["fingerprint"] != trained[0].record["fingerprint"]:
-            raise InputError(
-                f"{run} was trained on another store than {runs[0]}; rank them one by one"
-            )
-
-
-def _training_store(trained: TrainedPolicy) -> EpisodeStore | None:
-    """The store that the run was trained on, where it still lies there."""
-    path = Path(trained.record["store"])
-    if not (path / "meta.json").is_file():
-        return None
-    store = EpisodeStore.open(path)
-    return store if store.meta["fingerprint"] == trained.record["fingerprint"] else None
+def _test_split(trained: "TrainedPolicy", store: "EpisodeStore | None") -> "EpisodeStore":
+    if store is None:
+        raise InputError(
+            f"{trained.folder}: its store {trained.record['store']} is gone or has changed; name "
+            "the logs to rank"
+        )
+    test = store.split("test")
+    if not test.n_episodes:
+        raise InputError(f"{store.path} has no test split; name later logs to rank")
+    return test
 
 
 def _rows(
     options: argparse.Namespace,
-    runs: list[Path],
-    trained: list[TrainedPolicy],
-    train: EpisodeStore | None,
-    judged: EpisodeStore,
+    trained: "list[TrainedPolicy]",
+    train: "EpisodeStore | None",
+    later: "EpisodeStore",
     users: Any,
 ) -> list[dict[str, Any]]:
-    counts = trained[0].counts
-    assert counts is not None
+    from ucfrec.evaluation.ranking_baselines import PolicyRanker
+    from ucfrec.evaluation.ranking_table import ranking_rows
+
     policies = [
         PolicyRanker(policy, target_given(options, policy), policy.name) for policy in trained
     ]
-    floors = baselines(counts, None if train is None else train.split("train"), options.seed)
-    named = rankers_named([*policies, *floors])
-    k = min(options.k, len(counts.shown))
-    ranked = {name: rank_steps(ranker, judged, k) for name, ranker in named.items()}
-    period = Period.of(judged, np.asarray(users))
-    reference = next(iter(named))
-    about = {
-        "k": k,
-        "steps": len(period.items),
-        "users": len(np.unique(period.users)),
-        "reference": reference,
-        "seed": options.seed,
-        "checkpoint": options.checkpoint,
-        "fingerprint": judged.meta["fingerprint"],
-        "train_fingerprint": trained[0].record["fingerprint"],
-        **provenance(),
-    }
-    rows = []
-    for found in compare(period, ranked, k, reference, options.seed):
-        row: dict[str, Any] = {"policy": found.name, "coverage": found.coverage}
-        for name in MEASURES:
-            row[name] = found.values[name]
-            row[f"{name}_interval"] = list(found.intervals[name])
-            row[f"{name}_less_{reference}"] = list(found.differences[name])
-        rows.append(row | about)
-    return rows
-
-
-def _legend(k: int) -> str:
-    lines = [f"{name:<16}{MEASURES[name]}" for name in _SHOWN]
-    return "\n".join([*lines, f"k is {k}; --json has 95% intervals and paired differences by user"])
+    rows = ranking_rows(policies, trained[0], train, later, users, options.k, options.seed)
+    return [row | {"checkpoint": options.checkpoint} for row in rows]

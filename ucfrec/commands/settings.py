@@ -5,11 +5,12 @@ import inspect
 import shutil
 import textwrap
 from collections.abc import Iterator, Sequence
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from ucfrec.policies.registry import policy_names
-from ucfrec.runs.config import TABLES, resolve_config
-from ucfrec.settings import Setting, describe
+
+if TYPE_CHECKING:
+    from ucfrec.settings import Setting
 
 _NARROWEST: Final = 40
 """Columns that the meaning needs beside the rest; with fewer it stands beneath."""
@@ -35,6 +36,9 @@ def run(options: argparse.Namespace) -> None:
 
 def settings_text(policy: str, width: int) -> str:
     """Every setting of a training of `policy`, a section a table, in lines of `width` columns."""
+    from ucfrec.runs.config import TABLES, resolve_config
+    from ucfrec.settings import describe
+
     config, width = resolve_config(policy), min(width, _WIDEST)
     tables = {name: list(describe(name, getattr(config, name))) for name in TABLES}
     shown = [_cells(setting) for settings in tables.values() for setting in settings]
@@ -56,7 +60,7 @@ def _summary(table: Any) -> str:
     return inspect.cleandoc(type(table).__doc__ or "").partition("\n\n")[0]
 
 
-def _cells(setting: Setting) -> tuple[str, str, str, str]:
+def _cells(setting: "Setting") -> tuple[str, str, str, str]:
     return setting.key, _as_toml(setting.value), setting.allowed, setting.meaning
 
 

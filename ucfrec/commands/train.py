@@ -3,12 +3,7 @@
 import argparse
 from pathlib import Path
 
-import torch
-
-from ucfrec.episodes.store import EpisodeStore
 from ucfrec.policies.registry import policy_names
-from ucfrec.runs.config import resolve_config
-from ucfrec.runs.run import describe_run, train_run
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -33,6 +28,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """`ucfrec train`."""
+    import torch
+
+    from ucfrec.episodes.store import EpisodeStore
+    from ucfrec.runs.config import resolve_config
+    from ucfrec.runs.run import describe_run, train_run
+
     if options.threads is not None:
         torch.set_num_threads(options.threads)
     config = resolve_config(options.policy, options.config, options.set, options.seed)

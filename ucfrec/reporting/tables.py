@@ -76,9 +76,9 @@ def shown(value: Any) -> str:
 
 
 def _cell(row: Mapping[str, Any], name: str) -> str:
-    value, low, high = row[name], row.get(f"{name}_low"), row.get(f"{name}_high")
-    if isinstance(value, float) and low is not None and high is not None:
-        return f"{number(value)} [{number(low)}, {number(high)}]"
+    value = row[name]
+    if isinstance(value, float) and {f"{name}_low", f"{name}_high"} <= row.keys():
+        return f"{number(value)} [{_text(row[f'{name}_low'])}, {_text(row[f'{name}_high'])}]"
     return _text(value)
 
 

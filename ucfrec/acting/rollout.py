@@ -136,36 +136,54 @@ def rollout(
     live = episode < episodes
     with progress(episodes, describe, "episodes") as bar:
         while live.any():
-            if isinstance(actor, Informed):
-                actor.inform(info)
-            actions, propensities = actor.act(observations, live)
-            next_observations, rewards, terminated, truncated, next_info = env.step(actions)
-            rewards = np.asarray(rewards, dtype=np.float32)
-            actor.observe(actions, rewards)
-            rows = np.flatnonzero(live)
-            returns[episode[rows]] += rewards[rows]
-            lengths[episode[rows]] += 1
+            step, next_observations, next_info = _play_step(
+                env, actor, observations, info, episode, live
+            )
+            counted = step.select(np.flatnonzero(live))
+            returns[counted.episodes] += counted.rewards
+            lengths[counted.episodes] += 1
             if on_step is not None:
-                step = Step(
-                    rows=np.arange(n),
-                    episodes=episode,
-                    observations=observations,
-                    actions=actions,
-                    rewards=rewards,
-                    next_observations=_before_reset(next_observations, next_info),
-                    propensities=propensities,
-                    terminated=terminated,
-                    truncated=truncated,
-                    user_ids=info.get(USER_IDS),
-                )
-                on_step(step.select(rows))
-            ended = terminated | truncated
+                on_step(counted)
+            ended = step.terminated | step.truncated
             actor.begin(np.flatnonzero(ended))
             bar.update(int((ended & live).sum()))
             episode = np.where(ended, episode + n, episode)
             live = episode < episodes
             observations, info = next_observations, next_info
     return Episodes(returns, lengths)
+
+
+def _play_step(
+    env: "VectorEnv[Any, Any, Any]",
+    actor: Actor,
+    observations: FloatArray,
+    info: Mapping[str, Any],
+    episode: IntArray,
+    live: BoolArray,
+) -> tuple[Step, FloatArray, Mapping[str, Any]]:
+    """One step of all N environments, and the observations and `info` of the next one.
+
+    `episode` (N,) is the index of each environment's episode.
+    """
+    if isinstance(actor, Informed):
+        actor.inform(info)
+    actions, propensities = actor.act(observations, live)
+    next_observations, rewards, terminated, truncated, next_info = env.step(actions)
+    rewards = np.asarray(rewards, dtype=np.float32)
+    actor.observe(actions, rewards)
+    step = Step(
+        rows=np.arange(env.num_envs),
+        episodes=episode,
+        observations=observations,
+        actions=actions,
+        rewards=rewards,
+        next_observations=_before_reset(next_observations, next_info),
+        propensities=propensities,
+        terminated=terminated,
+        truncated=truncated,
+        user_ids=info.get(USER_IDS),
+    )
+    return step, next_observations, next_info
 
 
 def _require_same_step_reset(env: "VectorEnv[Any, Any, Any]") -> None:

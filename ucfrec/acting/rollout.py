@@ -83,8 +83,10 @@ class Step:
 
     def select(self, rows: IntArray) -> "Step":
         """The step with only `rows` (L,), indices into the M rows."""
-        columns = vars(self).items()
-        return Step(**{name: None if x is None else x[rows] for name, x in columns})
+        columns: dict[str, Any] = {
+            name: None if column is None else column[rows] for name, column in vars(self).items()
+        }
+        return Step(**columns)
 
 
 @dataclass(frozen=True)
@@ -160,7 +162,7 @@ def _play_step(
     info: Mapping[str, Any],
     episode: IntArray,
     live: BoolArray,
-) -> tuple[Step, FloatArray, Mapping[str, Any]]:
+) -> tuple[Step, FloatArray, dict[str, Any]]:
     """One step of all N environments, and the observations and `info` of the next one.
 
     `episode` (N,) is the index of each environment's episode.

@@ -38,7 +38,7 @@ class Catalog(Protocol):
 
 
 def world_items(env: VectorEnv[Any, Any, Any]) -> npt.NDArray[np.int64]:
-    """Identifiers (n_items,) of a world's items in logs: those of its catalogue, or else indices."""
+    """Identifiers (n_items,) of a world's items in logs: those of its catalogue, or indices."""
     world = env.unwrapped
     if isinstance(world, Catalog):
         return np.asarray(world.item_features()[ITEM_ID], dtype=np.int64)

@@ -78,9 +78,9 @@ class LSDTPolicy(SequencePolicy):
     def features(self, windows: Windows) -> Tensor:
         """(B, K, d) at the s_t tokens."""
         hidden = interleave(*self.embed(windows, self.head.embed(windows.actions)))
-        there = windows.mask.repeat_interleave(3, dim=1)
+        valid = windows.mask.repeat_interleave(3, dim=1)
         for block in self.blocks:
-            hidden = block(hidden, there)
+            hidden = block(hidden, valid)
         return hidden[:, 1::3]
 
 
@@ -99,9 +99,9 @@ class _Block(nn.Module):
         self.mlp_norm = nn.LayerNorm(dim)
         self.dropout = nn.Dropout(config.dropout)
 
-    def forward(self, hidden: Tensor, there: Tensor) -> Tensor:
+    def forward(self, hidden: Tensor, valid: Tensor) -> Tensor:
         long, short = hidden.chunk(2, dim=-1)
-        both = torch.cat([self.long(long, there), self.short(short, there)], dim=-1)
+        both = torch.cat([self.long(long, valid), self.short(short, valid)], dim=-1)
         squeezed = F.relu(self.squeeze(both))
         gate = torch.cat([layer(squeezed) for layer in self.gates], dim=-1).softmax(-1)
         hidden = self.norm(hidden + self.dropout(self.out(gate * both)))
@@ -115,7 +115,7 @@ class _Attention(nn.Module):
         self.query_key_value = nn.Linear(config.dim // 2, 3 * (config.dim // 2))
         self.dropout = nn.Dropout(config.attention_dropout)
 
-    def forward(self, hidden: Tensor, there: Tensor) -> Tensor:
+    def forward(self, hidden: Tensor, valid: Tensor) -> Tensor:
         batch, tokens, dim = hidden.shape
         # (B, L, 3c) -> three times (B, H, L, c/H)
         query, key, value = (
@@ -124,7 +124,7 @@ class _Attention(nn.Module):
         )
         earlier = torch.ones(tokens, tokens, dtype=torch.bool, device=hidden.device).tril()
         oneself = torch.eye(tokens, dtype=torch.bool, device=hidden.device)
-        visible = ((earlier & there.unsqueeze(1)) | oneself).unsqueeze(1)
+        visible = ((earlier & valid.unsqueeze(1)) | oneself).unsqueeze(1)
         mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=visible)
         return self.dropout(mixed.transpose(1, 2).reshape(hidden.shape))  # type: ignore[no-any-return]
 
@@ -142,9 +142,9 @@ class _DynamicConvolution(nn.Module):
         self.out = nn.Linear(dim, dim)
         self.dropout = nn.Dropout(config.kernel_dropout)
 
-    def forward(self, hidden: Tensor, there: Tensor) -> Tensor:
+    def forward(self, hidden: Tensor, valid: Tensor) -> Tensor:
         batch, tokens, dim = hidden.shape
-        values = F.glu(self.gated(hidden)).masked_fill(~there.unsqueeze(-1), 0.0)
+        values = F.glu(self.gated(hidden)).masked_fill(~valid.unsqueeze(-1), 0.0)
         taps = self.dropout(self.taps(values)).view(batch, tokens, self.groups, 1, self.kernel)
         # (B, 5 + L, c) -> (B, L, c, 6) -> (B, L, groups, c/groups, 6)
         seen = F.pad(values, (0, 0, self.kernel - 1, 0)).unfold(1, self.kernel, 1)

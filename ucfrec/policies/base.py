@@ -92,7 +92,7 @@ class SequencePolicy(nn.Module, ABC):
 
     @abstractmethod
     def features(self, windows: Windows) -> Tensor:
-        """Inputs (B, K, d) of the action head, from normalised windows; row t is independent of a_t."""
+        """Inputs (B, K, d) of the action head, from normalised windows; row t ignores a_t."""
 
     def normalized(self, windows: Windows) -> Windows:
         """Standardised states, and returns-to-go divided by `return_scale`.

@@ -87,7 +87,7 @@ class ConservativeQ(nn.Module):
         return value.squeeze(-1)
 
     def candidates(self, count: int) -> Tensor:
-        """Random candidate actions for `count` states, (count, C, A); see `CQLConfig.candidates`."""
+        """Random actions (count, C, A) for `count` states; see `CQLConfig.candidates`."""
         shape = (count, self.config.candidates // 2)
         logged = self.logged[torch.randint(len(self.logged), shape)]
         if self.every is not None:
@@ -104,7 +104,7 @@ class ConservativeQ(nn.Module):
         return flat.view(len(states), -1)
 
     def state_values(self, states: Tensor, network: nn.Module | None = None) -> Tensor:
-        """V̂(s) (M,) of states (M, S): mean of Q under the softmax of Q over sampled candidates."""
+        """V̂(s) (M,) of states (M, S): mean of Q under the softmax of Q over candidates."""
         values = self.compared(states, self.candidates(len(states)), network)
         return (values.softmax(-1) * values).sum(-1)
 

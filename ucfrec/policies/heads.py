@@ -29,7 +29,7 @@ class VectorHead(nn.Module):
         return self.embed_action(actions / self.scale)  # type: ignore[no-any-return]
 
     def predict(self, features: Tensor) -> Tensor:
-        """Actions (..., A) from features (..., d), within ± `scale`, the largest logged magnitude."""
+        """Actions (..., A) from features (..., d), within ± `scale`, the logs' largest value."""
         return torch.tanh(self.out(features)) * self.scale
 
     def loss(self, features: Tensor, actions: Tensor) -> Tensor:

@@ -45,7 +45,7 @@ class ItemKNNPolicy(SequencePolicy):
         super().__init__(config, sizes)
         if not isinstance(self.head, ItemHead):
             raise InputError(
-                "item-knn recommends items, but this store's actions are vectors; use another policy"
+                "item-knn recommends items; this store's actions are vectors; use another policy"
             )
         shape = (sizes["items"], min(config.neighbors, sizes["items"]))
         self.register_buffer("neighbors", torch.zeros(shape, dtype=torch.int64))

@@ -90,13 +90,13 @@ class Recommender:
             InputError: the data cannot be used, options for logs were given with a store, or `out`
                 is a run on other data or settings.
         """
-        given = {
+        log_options = {
             "reward": reward,
             "session_by": session_by,
             "gap_minutes": gap_minutes,
             "split": split,
         }
-        options = {name: value for name, value in given.items() if value is not None}
+        options = {name: value for name, value in log_options.items() if value is not None}
         with ExitStack() as stack:
             if not isinstance(data, EpisodeStore):
                 prepared = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ucfrec-")))

@@ -46,7 +46,7 @@ def policy_class(name: str) -> "type[SequencePolicy]":
             whose `Config` is a table of settings.
     """
     if name not in policy_names():
-        raise InputError(f"no policy is called {name!r}; there are {', '.join(policy_names())}")
+        raise InputError(f"no policy is called {name!r}; choose from {', '.join(policy_names())}")
     if name in BUILT_IN:
         module, _, title = BUILT_IN[name].partition(":")
         built_in: type[SequencePolicy] = getattr(import_module(f"ucfrec.policies.{module}"), title)

@@ -1,4 +1,4 @@
-"""Recommender: fit, recommend, save and load, in three lines of Python."""
+"""Recommender: train a policy on logs, recommend items, save and load it."""
 
 import shutil
 import tempfile
@@ -71,29 +71,33 @@ class Recommender:
         split: tuple[float, ...] | None = None,
         mapping: LogMapping | None = None,
     ) -> Self:
-        """Train on the training episodes of a store, or of logs that are prepared first.
+        """Train on a store's training episodes; logs are prepared into a temporary store first.
 
         Args:
             data: a store or its folder; or logs: a file, folder or glob, or a frame with one row
-                an interaction: `user_id`, `item_id`, `timestamp` (milliseconds, dates or
+                per interaction: `user_id`, `item_id`, `timestamp` (milliseconds, dates or
                 timestamps) and feedback.
-            out: run folder, resumed from if training was interrupted; None for a temporary one.
-            reward: of logs: SQL expression over the feedback columns; see `PrepareOptions`.
-            session_by: of logs: "session_id", "gap" or "user"; see `PrepareOptions`.
-            gap_minutes: of logs: with "gap", a longer pause ends the session (30).
-            split: of logs: shares of training, validation and test (0.8, 0.1, 0.1).
-            mapping: of logs: what their columns are called, and tables of features.
+            out: run folder, resumed if training was interrupted; None for a temporary one.
+            reward: logs only: SQL expression over the feedback columns; see `PrepareOptions`.
+            session_by: logs only: "session_id", "gap" or "user"; see `PrepareOptions`.
+            gap_minutes: logs only: with "gap", a longer pause (minutes) starts a new session (30).
+            split: logs only: shares of training, validation and test (0.8, 0.1, 0.1).
+            mapping: logs only: names of the columns, and feature tables.
+
+        Returns:
+            This recommender, trained.
 
         Raises:
-            InputError: the data cannot be used, or `out` is a run on other data or settings.
+            InputError: the data cannot be used, options for logs were given with a store, or `out`
+                is a run on other data or settings.
         """
-        given = {
+        log_options = {
             "reward": reward,
             "session_by": session_by,
             "gap_minutes": gap_minutes,
             "split": split,
         }
-        options = {name: value for name, value in given.items() if value is not None}
+        options = {name: value for name, value in log_options.items() if value is not None}
         with ExitStack() as stack:
             if not isinstance(data, EpisodeStore):
                 prepared = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ucfrec-")))
@@ -116,7 +120,7 @@ class Recommender:
         """The run folder.
 
         Raises:
-            InputError: `fit` comes first.
+            InputError: the recommender is not trained; call `fit` first.
         """
         if self._folder is None:
             raise InputError("this policy is not trained yet; call fit(...) or load(run) first")
@@ -124,10 +128,10 @@ class Recommender:
 
     @property
     def trained(self) -> TrainedPolicy:
-        """The policy with the best weights on validation, read once.
+        """The policy with the lowest validation loss.
 
         Raises:
-            InputError: `fit` comes first.
+            InputError: the recommender is not trained; call `fit` first.
         """
         if self._trained is None:
             raise InputError("this policy is not trained yet; call fit(...) or load(run) first")
@@ -146,31 +150,32 @@ class Recommender:
     ) -> pd.DataFrame:
         """The `k` best next items of every user; nothing is written to disk.
 
-        Rows are read as `ucfrec prepare` reads them; sessions are cut as those of training were.
-        Of rows that repeat a user, item and time, one counts. At most the last 1,000 rows of a user
-        make the state; all of them count as seen.
+        Rows are read as by `ucfrec prepare`, and sessions are split as those of training. Rows that
+        repeat a user, item and time count once. The state is made of at most the last 1,000 rows of
+        a user; all rows count as seen.
 
         Args:
-            histories: one row an interaction, in any order: `user_id`, `item_id`, `timestamp`
+            histories: one row per interaction, in any order: `user_id`, `item_id`, `timestamp`
                 (milliseconds, dates or timestamps); `reward`, or the columns of the training
-                reward's expression; `session_id`, if the run's sessions were cut by it; and
+                reward's expression; `session_id`, if the run's sessions are split by it; and
                 `observation` (lists of floats), if the run has observations.
-            k: at least 1.
-            filter_seen: leave out items of the user's own history.
+            k: number of items per user, at least 1.
+            filter_seen: leave out items that the user's history contains.
             candidates: the only item_ids to recommend; None for all.
-            skip_unknown: ignore rows of items that the policy does not know.
-            target_return: what the rest of the session shall earn, in units of the training
+            skip_unknown: ignore rows of items that are not in the training data.
+            target_return: target return of the rest of the session, in units of the training
                 reward; None for the largest training return.
-            mapping: what the columns of `histories` are called.
+            mapping: names of the columns of `histories`.
 
         Returns:
-            `user_id`, `rank` (from 1), `item_id`, `score` (log-probability among all items): k rows
-            a user, users in sorted order; fewer rows where fewer items are left, as with less than
-            k candidates.
+            `user_id`, `rank` (from 1), `item_id`, `score` (log-probability among all items, nats):
+            k rows per user, users in sorted order; fewer rows if fewer items remain, as with less
+            than k candidates.
 
         Raises:
-            InputError: an argument is wrong, a column is missing or of a wrong type, rows have
-                missing or undefined values, or an item or candidate is unknown to the policy.
+            InputError: the recommender is not trained, an argument is wrong, a column is missing or
+                of a wrong type, rows have missing or undefined values, or an item or candidate is
+                not in the training data.
         """
         trained = self.trained
         frames = recommend(
@@ -185,10 +190,10 @@ class Recommender:
         return pd.concat(frames, ignore_index=True)
 
     def save(self, folder: Path | str) -> None:
-        """Copy the run to a new folder, which `load` and the command line read.
+        """Copy the run to a new folder, which `load` and the command line can read.
 
         Raises:
-            InputError: the folder exists, or `fit` comes first.
+            InputError: the folder exists, or the recommender is not trained.
         """
         run = self.run
         with atomic_folder(Path(folder)) as scratch:
@@ -196,10 +201,10 @@ class Recommender:
 
     @classmethod
     def load(cls, run: Path | str) -> Self:
-        """A policy from a run folder, of this class or of `ucfrec train`.
+        """Load a recommender from a run folder, made by `save`, `fit` or `ucfrec train`.
 
         Raises:
-            InputError: the folder holds no run, or one without weights yet.
+            InputError: the folder is not a run folder, or has no checkpoint yet.
         """
         policy = cls()
         policy._folder, policy._trained = Path(run), TrainedPolicy.load(Path(run))
@@ -208,7 +213,7 @@ class Recommender:
 
 
 UCF = Recommender
-"""The Unified Causal Transformer is the default learner (Algorithm 1)."""
+"""A `Recommender`, whose default learner is the Unified Causal Transformer (Algorithm 1)."""
 
 
 def _store(
@@ -217,7 +222,7 @@ def _store(
     mapping: LogMapping | None,
     options: Mapping[str, Any],
 ) -> EpisodeStore:
-    """The store at `data`, or one of the logs in `data`, prepared in the folder `scratch`."""
+    """The store at `data`, or one prepared from the logs in `data` in the folder `scratch`."""
     if isinstance(data, (str, Path)):
         if (Path(data) / "meta.json").is_file():
             if options or mapping is not None:

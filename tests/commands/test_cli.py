@@ -284,7 +284,7 @@ def test_a_run_of_another_store_or_configuration_is_refused(
     assert "another store" in refused(["train", other, "--out", run, *settings()], capsys)
     store = str(folder / "synthetic-catalog-store")
     changed = ["train", store, "--out", run, *settings("train.batch_size=8")]
-    assert "batch_size is 64 there, 8 here" in refused(changed, capsys)
+    assert "batch_size is 64 in the run, 8 now" in refused(changed, capsys)
     assert main(["train", store, "--out", run, *settings()]) == 0
 
 

@@ -33,7 +33,7 @@ def test_lines_are_aligned_and_fit(width: int) -> None:
     starts = {line.index("a whole number") for line in keys if "a whole number" in line}
     assert len(starts) == 1
     assert all(len(line) <= min(width, 160) for line in lines if line not in keys or width >= 160)
-    assert "K, steps of history that a prediction sees." in "\n".join(lines)
+    assert "K, steps of history that a prediction uses." in "\n".join(lines)
 
 
 def test_the_help_of_train_leads_here(capsys: pytest.CaptureFixture[str]) -> None:

@@ -133,7 +133,7 @@ def test_an_installed_learner_is_trained_listed_and_read_back(
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("not-one", "no class derived from ucfrec.policies.base.SequencePolicy"),
+        ("not-one", "not a class derived from ucfrec.policies.base.SequencePolicy"),
         ("odd", "not derived from ucfrec.policies.base.PolicyConfig"),
         ("unchecked", "not derived from .* under @ucfrec.settings.settings_table"),
         ("gone", "my_learner:Gone, which cannot be imported"),

@@ -157,7 +157,10 @@ def test_a_combination_names_every_place_it_was_given_in(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("given", "says"),
     [
-        ({"train": 3}, "settings: train is a table of settings, not a value; give its field"),
+        (
+            {"train": 3},
+            "settings: train is a table of settings; give a value for one of its fields",
+        ),
         ({"train": {"stepz": 3}}, "settings: train has no field 'stepz'; did you mean 'steps'?"),
         ({"steps": 3}, "settings: no table is called 'steps'"),
         ({"train.steps": "200"}, "settings: train.steps is '200'; it must be a whole number"),

@@ -1,1 +1,1 @@
-"""A trained policy acts, session by session."""
+"""Playing episodes in simulated environments with a trained or built-in policy."""

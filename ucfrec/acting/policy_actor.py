@@ -1,4 +1,4 @@
-"""A trained policy as an actor: last K steps, return-to-go lowered by what is earned."""
+"""A trained policy as an actor: it sees the last K steps and the remaining target return."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -18,10 +18,10 @@ from ucfrec.policies.heads import ItemHead
 
 
 class PolicyActor:
-    """Plays N episodes at once with one batched forward pass a step (an `Actor` of `rollout`).
+    """Plays N episodes at once with one batched forward pass per step (an `Actor` of `rollout`).
 
-    Vector actions are played as predicted; of items, the one with the highest probability among
-    those that the environment has and allows. Users of the logs have their features.
+    Vector actions are played as predicted. Of items, the most probable one that the environment
+    has and allows is played. Users who are in the training logs keep their logged features.
     """
 
     def __init__(
@@ -37,15 +37,15 @@ class PolicyActor:
         """
         Args:
             policy: in evaluation mode.
-            episodes: N, episodes side by side.
-            target_return: of every episode.
-            observation_size: how many of the environment's observed numbers the logs had; 0 ignores
-                the environment's observation.
-            item_states: how states are made of items; None where the observation is the state.
-            item_ids: (n_items,) the environment's number of each item of the store; −1 where it has
-                none.
-            user_ids: (n_users,) sorted identifiers in the logs of the store's users; None or text
-                where the environment has other users.
+            episodes: N, number of episodes played in parallel.
+            target_return: target return of every episode, in units of the training reward.
+            observation_size: leading entries of the environment's observation that the logs
+                contain; 0 ignores the observation.
+            item_states: builds states from items; None if the observation is the state.
+            item_ids: (n_items,) the environment's index of each item of the store, −1 for items
+                that it lacks; None for vector actions.
+            user_ids: (n_users,) identifiers of the store's users, sorted; None or text if they are
+                not the environment's users.
         """
         n, k = episodes, policy.config.context
         self._policy, self._target = policy, float(target_return)
@@ -65,18 +65,22 @@ class PolicyActor:
         self._returns_to_go, self._rewards = torch.zeros(2, n, k)
         self._mask = torch.zeros(n, k, dtype=torch.bool)
         self._steps = torch.zeros(n, dtype=torch.int64)
-        self._earned = torch.zeros(n, dtype=torch.float64)
+        self._reward_sums = torch.zeros(n, dtype=torch.float64)
 
     def begin(self, rows: IntArray) -> None:
-        """The episodes in `rows` (positions among the N) start afresh."""
+        """Start a new episode in each of `rows`, (M,) environment indices from 0 to N − 1."""
         self._mask[rows] = False
         self._steps[rows] = 0
-        self._earned[rows] = 0.0
+        self._reward_sums[rows] = 0.0
         if self._sessions is not None:
             self._sessions.begin(rows)
 
     def inform(self, info: Mapping[str, Any]) -> None:
-        """Take note of the users of the next step, and of items that may not be played."""
+        """Record the users of the next step (`USER_IDS`) and its forbidden items (`FORBIDDEN`).
+
+        Raises:
+            InputError: items are forbidden, but the policy's actions are vectors.
+        """
         users, known = info.get(USER_IDS), self._user_ids
         if users is not None and self._sessions is not None and known is not None:
             at = np.minimum(np.searchsorted(known, users), len(known) - 1)
@@ -86,69 +90,71 @@ class PolicyActor:
 
     @torch.no_grad()
     def act(self, observations: FloatArray, live: BoolArray) -> tuple[npt.NDArray[Any], None]:
-        """Choose for the live rows; the rest get a zero action.
+        """Choose the actions of the live rows; the other rows are scored as zeros.
 
         Args:
-            observations: (N, at least `observation_size`).
-            live: (N,) episodes whose action counts.
+            observations: (N, O) with O at least `observation_size`.
+            live: (N,) true where the action is used.
 
         Returns:
-            (N, A) vectors or (N,) numbers of items in the environment; propensities are unknown.
+            (N, A) vectors or (N,) indices of the environment's items; and None, because the
+            propensities are unknown.
         """
         observed = torch.as_tensor(observations, dtype=torch.float32)[:, : self._observation_size]
         states = observed if self._sessions is None else self._sessions.current(observed)
-        target = torch.full_like(self._earned, self._target)
-        self._states = _pushed(self._states, states)
-        self._returns_to_go = _pushed(
-            self._returns_to_go, remaining_return(target, self._earned).float()
+        target = torch.full_like(self._reward_sums, self._target)
+        self._states = _appended(self._states, states)
+        self._returns_to_go = _appended(
+            self._returns_to_go, remaining_return(target, self._reward_sums).float()
         )
-        self._mask = _pushed(self._mask, torch.ones_like(self._mask[:, 0]))
-        self._actions = _pushed(self._actions, torch.zeros_like(self._actions[:, 0]))
-        self._rewards = _pushed(self._rewards, torch.zeros_like(self._rewards[:, 0]))
+        self._mask = _appended(self._mask, torch.ones_like(self._mask[:, 0]))
+        self._actions = _appended(self._actions, torch.zeros_like(self._actions[:, 0]))
+        self._rewards = _appended(self._rewards, torch.zeros_like(self._rewards[:, 0]))
 
         rows = torch.from_numpy(np.flatnonzero(live))
         device = self._policy.state_mean.device
         predicted = self._policy.act(self._windows(rows).to(device)).cpu()
-        # Rows that no longer count are played too, and need an allowed action: they keep zeros.
-        filled = torch.zeros(len(live), predicted.shape[1])
-        filled[rows] = predicted
-        actions = self._best(filled) if isinstance(self._policy.head, ItemHead) else filled
+        # The environment steps rows that are not live too, so they also need an allowed action.
+        outputs = torch.zeros(len(live), predicted.shape[1])
+        outputs[rows] = predicted
+        actions = self._best(outputs) if isinstance(self._policy.head, ItemHead) else outputs
         self._actions[:, -1] = actions
         played = actions.numpy()
         return (played if self._item_ids is None else self._item_ids[played]), None
 
     def observe(self, actions: npt.NDArray[Any], rewards: FloatArray) -> None:
-        """Lower the returns-to-go by the rewards (N,) and go on to the next step.
+        """Subtract the rewards (N,) from the returns-to-go and advance by one step.
 
-        The actions (N, …) are those that `act` chose; they are on record already.
+        `actions`, (N, A) or (N,), is not used: `act` has recorded them.
         """
-        earned = torch.from_numpy(rewards)
+        latest = torch.from_numpy(rewards)
         if self._sessions is not None:
-            self._sessions.record(self._actions[:, -1], earned)
-        self._earned += earned
-        self._rewards[:, -1] = earned
+            self._sessions.record(self._actions[:, -1], latest)
+        self._reward_sums += latest
+        self._rewards[:, -1] = latest
         self._steps += 1
 
     def _best(self, scores: Tensor) -> Tensor:
-        """Items (N,) with the highest of scores (N, n_items) among those that may be played."""
+        """Allowed items (N,) with the highest of the scores (N, n_items)."""
         if self._absent is not None:
             scores[:, self._absent] = -torch.inf
         if self._forbidden is not None:
-            # Column n_items takes what the environment forbids and the store does not have.
+            # The extra column n_items absorbs forbidden items that the store lacks.
             scores = torch.cat([scores, torch.zeros(len(scores), 1)], dim=1)
             scores = scores.scatter(1, self._forbidden, -torch.inf)[:, :-1]
         return scores.argmax(-1)
 
     def _in_store(self, items: IntArray) -> Tensor:
-        """The store's numbers of the environment's items (N, L); n_items where it has none."""
+        """The store's indices of the environment's items (N, L); n_items for items it lacks."""
         ids = self._item_ids
         if ids is None:
             raise InputError(
-                "an environment that forbids items needs a policy whose actions are items"
+                "the environment forbids items, but the policy's actions are vectors; use a policy "
+                "trained on items"
             )
         numbers = np.full(max(items.max(), ids.max()) + 2, len(ids))
         numbers[ids[ids >= 0]] = np.flatnonzero(ids >= 0)
-        # The last place stands for −1, no item.
+        # Index −1, the padding of `items`, reads the last entry.
         numbers[-1] = len(ids)
         return torch.from_numpy(numbers[items])
 
@@ -168,6 +174,6 @@ class PolicyActor:
         )
 
 
-def _pushed(history: Tensor, latest: Tensor) -> Tensor:
-    """(N, K, …) without its oldest column and with `latest` (N, …) at the end."""
+def _appended(history: Tensor, latest: Tensor) -> Tensor:
+    """`history` (N, K, …) without its first column, and with `latest` (N, …) as its last."""
     return torch.cat([history[:, 1:], latest.unsqueeze(1)], dim=1)

@@ -1,4 +1,4 @@
-"""Episodes played in many environments side by side, by one actor."""
+"""Play episodes with one actor in many environments in parallel."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -18,60 +18,60 @@ IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float32]
 
 USER_IDS: Final = "user_id"
-"""Key of `info`: (N,) identifiers of the users of the next step, as in the logs."""
+"""Key of `info`: (N,) int64, user of each environment's next step, numbered as in the logs."""
 FORBIDDEN: Final = "forbidden"
-"""Key of `info`: (N, L) items that may not be played next, −1 where there are fewer than L."""
+"""Key of `info`: (N, L) int64, items not allowed at the next step; rows are padded with −1."""
 
 
 class Actor(Protocol):
-    """Chooses actions for N episodes at once: a trained policy, or a rule."""
+    """Chooses actions for N episodes at once: a trained policy or a built-in rule."""
 
     def begin(self, rows: IntArray) -> None:
-        """The episodes in `rows` (positions among the N) start afresh."""
+        """Start a new episode in each of `rows`, (M,) environment indices from 0 to N − 1."""
 
     def act(
         self, observations: FloatArray, live: BoolArray
     ) -> tuple[npt.NDArray[Any], FloatArray | None]:
-        """Choose one action a row.
+        """Choose one action per environment.
 
         Args:
             observations: (N, O).
-            live: (N,) rows whose action counts; what is returned for the others is ignored.
+            live: (N,) true where the action is used; actions of the other rows are ignored.
 
         Returns:
-            Actions, (N, A) float32 or (N,) int64, and the probability (of items) or the density
-            (of vectors, where it may exceed 1) with which each was chosen, (N,), or None where it
-            is unknown or does not exist.
+            The actions, (N, A) float32 vectors or (N,) int64 items, and their propensities (N,):
+            the probability of each item, or the probability density of each vector, which may
+            exceed 1. Propensities are None if they are unknown or undefined.
         """
 
     def observe(self, actions: npt.NDArray[Any], rewards: FloatArray) -> None:
-        """Take note of the actions (N, …) just played and the rewards (N,) they earned."""
+        """Record the actions just played, (N, A) or (N,), and their rewards (N,)."""
 
 
 @runtime_checkable
 class Informed(Protocol):
-    """An actor that uses what the environment reports beside its observations."""
+    """An actor that also uses the environment's `info`."""
 
     def inform(self, info: Mapping[str, Any]) -> None:
-        """Take note of `info` (see `USER_IDS`, `FORBIDDEN`) before choosing the next actions."""
+        """Record `info` (keys `USER_IDS` and `FORBIDDEN`); called before each `act`."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """One step of the M rows that count; arrays are aligned."""
+    """One step of M episodes; row i of every array belongs to the same episode."""
 
     rows: IntArray
-    """(M,) positions among the N environments."""
+    """(M,) environment indices, 0 to N − 1."""
     episodes: IntArray
-    """(M,) number of the episode that each row plays, 0 to episodes − 1."""
+    """(M,) episode indices, 0 to episodes − 1."""
     observations: FloatArray
-    """(M, O) what was known before acting."""
+    """(M, O) observations before the actions."""
     actions: npt.NDArray[Any]
     """(M, A) vectors or (M,) items."""
     rewards: FloatArray
     """(M,)."""
     next_observations: FloatArray
-    """(M, O) what the actions led to; of an episode that ended, its own last one."""
+    """(M, O) observations after the actions; the final observation where the episode ended."""
     propensities: FloatArray | None
     """(M,) see `Actor.act`."""
     terminated: BoolArray
@@ -79,17 +79,24 @@ class Step:
     truncated: BoolArray
     """(M,)."""
     user_ids: IntArray | None
-    """(M,) users of the step, where the environment reports them (`USER_IDS`)."""
+    """(M,) users of the step; None if the environment does not report them (`USER_IDS`)."""
+
+    def select(self, rows: IntArray) -> "Step":
+        """The step with only `rows` (L,), indices into the M rows."""
+        columns: dict[str, Any] = {
+            name: None if column is None else column[rows] for name, column in vars(self).items()
+        }
+        return Step(**columns)
 
 
 @dataclass(frozen=True)
 class Episodes:
-    """What was earned, one row an episode."""
+    """Outcome of every episode."""
 
     returns: npt.NDArray[np.float64]
-    """(episodes,) sum of the rewards."""
+    """(episodes,) sums of rewards, in reward units."""
     lengths: IntArray
-    """(episodes,) steps."""
+    """(episodes,) numbers of steps."""
 
 
 def rollout(
@@ -102,22 +109,87 @@ def rollout(
 ) -> Episodes:
     """Play exactly `episodes` episodes.
 
-    Environment i of N plays episodes i, i + N, i + 2N, …: the number is fixed beforehand, so
-    episodes are not preferred for being short.
+    Environment i of N plays episodes i, i + N, i + 2N, …: with a fixed assignment, short episodes
+    are not over-represented.
 
     Args:
         env: N environments, reset within the step (`AutoresetMode.SAME_STEP`).
         actor: chooses the actions.
-        episodes: how many to play.
-        seed: environment i starts with `seed` + i.
-        on_step: called with every step of the episodes that count.
+        episodes: number of episodes to play.
+        seed: environment i is seeded with `seed` + i.
+        on_step: called after each step with the rows that belong to one of the `episodes`.
         describe: name of the progress bar.
+
+    Returns:
+        Return and length of each episode.
 
     Raises:
         InputError: the environment does not reset within the step, or forbids actions (`FORBIDDEN`)
             and the actor has no `inform`.
     """
-    # Only playing needs gymnasium: scoring logs and recommending do without.
+    _require_same_step_reset(env)
+    n = env.num_envs
+    returns = np.zeros(episodes, dtype=np.float64)
+    lengths = np.zeros(episodes, dtype=np.int64)
+    observations, info = env.reset(seed=seed)
+    _require_informed(env, info, actor)
+    actor.begin(np.arange(n))
+    episode = np.arange(n)
+    live = episode < episodes
+    with progress(episodes, describe, "episodes") as bar:
+        while live.any():
+            step, next_observations, next_info = _play_step(
+                env, actor, observations, info, episode, live
+            )
+            counted = step.select(np.flatnonzero(live))
+            returns[counted.episodes] += counted.rewards
+            lengths[counted.episodes] += 1
+            if on_step is not None:
+                on_step(counted)
+            ended = step.terminated | step.truncated
+            actor.begin(np.flatnonzero(ended))
+            bar.update(int((ended & live).sum()))
+            episode = np.where(ended, episode + n, episode)
+            live = episode < episodes
+            observations, info = next_observations, next_info
+    return Episodes(returns, lengths)
+
+
+def _play_step(
+    env: "VectorEnv[Any, Any, Any]",
+    actor: Actor,
+    observations: FloatArray,
+    info: Mapping[str, Any],
+    episode: IntArray,
+    live: BoolArray,
+) -> tuple[Step, FloatArray, dict[str, Any]]:
+    """One step of all N environments, and the observations and `info` of the next one.
+
+    `episode` (N,) is the index of each environment's episode.
+    """
+    if isinstance(actor, Informed):
+        actor.inform(info)
+    actions, propensities = actor.act(observations, live)
+    next_observations, rewards, terminated, truncated, next_info = env.step(actions)
+    rewards = np.asarray(rewards, dtype=np.float32)
+    actor.observe(actions, rewards)
+    step = Step(
+        rows=np.arange(env.num_envs),
+        episodes=episode,
+        observations=observations,
+        actions=actions,
+        rewards=rewards,
+        next_observations=_before_reset(next_observations, next_info),
+        propensities=propensities,
+        terminated=terminated,
+        truncated=truncated,
+        user_ids=info.get(USER_IDS),
+    )
+    return step, next_observations, next_info
+
+
+def _require_same_step_reset(env: "VectorEnv[Any, Any, Any]") -> None:
+    # Imported here because scoring logs and recommending run without gymnasium.
     from gymnasium.vector import AutoresetMode
 
     if env.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
@@ -125,58 +197,22 @@ def rollout(
             f"{type(env).__name__} does not reset in the same step; build it with "
             "autoreset_mode=AutoresetMode.SAME_STEP"
         )
-    n = env.num_envs
-    returns = np.zeros(episodes, dtype=np.float64)
-    lengths = np.zeros(episodes, dtype=np.int64)
-    observations, info = env.reset(seed=seed)
+
+
+def _require_informed(
+    env: "VectorEnv[Any, Any, Any]", info: Mapping[str, Any], actor: Actor
+) -> None:
     if FORBIDDEN in info and not isinstance(actor, Informed):
         raise InputError(
-            f"{type(env).__name__} forbids some actions and {type(actor).__name__} does not take "
-            "note of them; give it a method `inform`"
+            f"{type(env).__name__} forbids some actions, which {type(actor).__name__} ignores; "
+            "give it a method `inform`"
         )
-    actor.begin(np.arange(n))
-    episode = np.arange(n)
-    live = episode < episodes
-    with progress(episodes, describe, "episodes") as bar:
-        while live.any():
-            if isinstance(actor, Informed):
-                actor.inform(info)
-            actions, propensities = actor.act(observations, live)
-            next_observations, rewards, terminated, truncated, info_next = env.step(actions)
-            rewards = np.asarray(rewards, dtype=np.float32)
-            actor.observe(actions, rewards)
-            rows = np.flatnonzero(live)
-            returns[episode[rows]] += rewards[rows]
-            lengths[episode[rows]] += 1
-            if on_step is not None:
-                users = info.get(USER_IDS)
-                on_step(
-                    Step(
-                        rows=rows,
-                        episodes=episode[rows],
-                        observations=observations[rows],
-                        actions=actions[rows],
-                        rewards=rewards[rows],
-                        next_observations=_led_to(next_observations, info_next)[rows],
-                        propensities=None if propensities is None else propensities[rows],
-                        terminated=terminated[rows],
-                        truncated=truncated[rows],
-                        user_ids=None if users is None else users[rows],
-                    )
-                )
-            ended = terminated | truncated
-            actor.begin(np.flatnonzero(ended))
-            bar.update(int((ended & live).sum()))
-            episode = np.where(ended, episode + n, episode)
-            live = episode < episodes
-            observations, info = next_observations, info_next
-    return Episodes(returns, lengths)
 
 
-def _led_to(next_observations: FloatArray, info: Mapping[str, Any]) -> FloatArray:
-    """Observations (N, O) after a step, before the episodes that ended were replaced."""
+def _before_reset(next_observations: FloatArray, info: Mapping[str, Any]) -> FloatArray:
+    """Observations (N, O) after a step; of episodes that ended, the final one, not the reset's."""
     if "final_obs" not in info:
         return next_observations
-    led_to, ended = next_observations.copy(), np.asarray(info["_final_obs"])
-    led_to[ended] = np.stack(list(info["final_obs"][ended]))
-    return led_to
+    before_reset, ended = next_observations.copy(), np.asarray(info["_final_obs"])
+    before_reset[ended] = np.stack(list(info["final_obs"][ended]))
+    return before_reset

@@ -1,1 +1,1 @@
-"""Policies judged in simulated worlds."""
+"""Evaluation of policies: simulated worlds, and ranking on later logs."""

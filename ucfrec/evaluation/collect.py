@@ -1,4 +1,4 @@
-"""Sessions that a behavior policy plays in a simulator, written as Parquet logs."""
+"""Play a behavior policy in a simulator and write its sessions as Parquet logs."""
 
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
@@ -20,22 +20,25 @@ from ucfrec.plugins import Simulator
 from ucfrec.schema import ACTION, ITEM_ID, OBSERVATION, PROPENSITY, SESSION_ID, TIMESTAMP, USER_ID
 
 EPOCH_MS: Final = 1_704_067_200_000
-"""2024-01-01 00:00 UTC, when the first session starts."""
+"""Start of the first session, 2024-01-01 00:00 UTC, in ms."""
 SESSION_MS: Final = 60_000
+"""Time between the starts of two sessions, in ms."""
 STEP_MS: Final = 1_000
+"""Time between two steps of a session, in ms."""
 ROWS_PER_GROUP: Final = 65_536
+"""Rows of a Parquet row group, at least, but for the last."""
 
 
 @runtime_checkable
 class Catalog(Protocol):
-    """A world that describes its items."""
+    """A simulated world with a table of its items."""
 
     def item_features(self) -> pa.Table:
-        """One row an item, in the order of their numbers, with `item_id`."""
+        """One row per item in the order of the action indices, with a column `item_id`."""
 
 
 def world_items(env: VectorEnv[Any, Any, Any]) -> npt.NDArray[np.int64]:
-    """What the logs call each item of a world, (n_items,): by its catalogue, or its number."""
+    """Identifiers (n_items,) of a world's items in logs: those of its catalogue, or indices."""
     world = env.unwrapped
     if isinstance(world, Catalog):
         return np.asarray(world.item_features()[ITEM_ID], dtype=np.int64)
@@ -57,25 +60,30 @@ def collect(
 ) -> Episodes:
     """Play `sessions` sessions and write them as logs that `ucfrec prepare` reads.
 
-    `out` gets `sessions.parquet` (one row a step: user, session, time in ms, item or action,
-    observation, the simulator's feedback, the propensity where it is known; sessions played side by
-    side are interleaved), `items.parquet` if the world describes its items, and `collect.json`,
-    the record of the run. Sessions start a minute apart and their steps follow by the second.
-    Memory stays bounded: rows are written a row group at a time.
+    `out` contains `sessions.parquet` (one row per step: user, session, time in ms, item or action,
+    observation, the simulator's feedback, and the propensity if it is known; sessions played in
+    parallel are interleaved), `items.parquet` if the world describes its items, and `collect.json`,
+    the record of the run. Sessions start 60 s apart and their steps 1 s apart. Memory is bounded,
+    because rows are written one row group at a time.
 
     Args:
+        simulator: names the feedback column.
         env: a world made by `simulator`.
         actor: a behavior policy for `env`.
-        env_name, behavior: what the record calls them.
+        sessions: number of sessions to play, at least 1.
+        seed: environment i is seeded with `seed` + i.
+        out: new folder.
+        env_name: name of the world in the record.
+        behavior: name of the behavior policy in the record.
 
     Returns:
-        Returns and lengths of the sessions, by session id.
+        Returns and lengths of the sessions, ordered by session id.
 
     Raises:
-        InputError: `sessions` is not positive, or `out` exists.
+        InputError: `sessions` is below 1, or `out` exists.
     """
     if sessions < 1:
-        raise InputError(f"sessions is {sessions}; at least one must be played")
+        raise InputError(f"sessions is {sessions}; give 1 or more")
     with atomic_folder(out) as folder:
         log = _SessionLog(folder / "sessions.parquet", env, simulator.feedback)
         played = rollout(env, actor, sessions, seed, log.record, describe="collect")
@@ -88,7 +96,7 @@ def collect(
 
 
 class _SessionLog:
-    """Turns steps into Parquet row groups."""
+    """Writes steps to a Parquet file, one row group at a time."""
 
     def __init__(self, path: Path, env: VectorEnv[Any, Any, Any], feedback: str) -> None:
         self._path, self._feedback = path, feedback
@@ -101,7 +109,7 @@ class _SessionLog:
         self._writer: pq.ParquetWriter | None = None
 
     def record(self, step: Step) -> None:
-        """Note one step of every live session."""
+        """Add one step of all live sessions."""
         self._steps.append(step)
         self._numbers.append(self._played[step.rows])
         self._played[step.rows] = np.where(
@@ -112,7 +120,7 @@ class _SessionLog:
             self._flush()
 
     def close(self) -> None:
-        """Write what is left and finish the file."""
+        """Write the remaining steps and close the file."""
         if self._steps:
             self._flush()
         if self._writer is not None:
@@ -128,7 +136,7 @@ class _SessionLog:
     def _columns(self) -> dict[str, pa.Array]:
         steps = self._steps
         session = np.concatenate([step.episodes for step in steps])
-        # One user's sessions may overlap; the odd milliseconds keep their rows apart even so.
+        # A user's sessions may overlap; the added milliseconds keep their timestamps distinct.
         start = EPOCH_MS + session * SESSION_MS + session % STEP_MS
         users = [step.episodes if step.user_ids is None else step.user_ids for step in steps]
         actions = np.concatenate([step.actions for step in steps])
@@ -149,7 +157,7 @@ class _SessionLog:
 
 
 def _lists(rows: npt.NDArray[Any]) -> pa.Array:
-    """Rows (M, D) as a list<float> column."""
+    """`rows` (M, D) as a column of type list<float>."""
     offsets = np.arange(len(rows) + 1, dtype=np.int32) * np.int32(rows.shape[1])
     return pa.ListArray.from_arrays(offsets, rows.astype(np.float32).ravel())
 

@@ -1,4 +1,4 @@
-"""What sessions were made of: coverage, diversity, novelty, dominance (EasyRL4Rec, DORL)."""
+"""Coverage, diversity, novelty and dominance of recommended items (EasyRL4Rec, DORL)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -9,47 +9,48 @@ import numpy.typing as npt
 from ucfrec.acting.rollout import BoolArray, IntArray, Step
 
 Similarity = Callable[[IntArray, IntArray], npt.NDArray[np.floating]]
-"""Of items (M,) and items (M,), aligned: (M,), 1 for equal items."""
+"""Similarity (M,) of two aligned arrays of items (M,), at most 1; equal items have 1."""
 
 
 @dataclass
 class Recommended:
-    """Items of every episode, collected by `rollout(…, on_step=recommended.record)`."""
+    """The recommended items of all episodes, collected by `rollout(…, on_step=self.record)`."""
 
     _episodes: list[IntArray] = field(default_factory=list)
     _items: list[IntArray] = field(default_factory=list)
 
     def record(self, step: Step) -> None:
-        """Note one step."""
+        """Add one step."""
         self._episodes.append(step.episodes)
         self._items.append(step.actions)
 
     def sessions(self) -> tuple[IntArray, IntArray]:
-        """(episodes, items) of all steps, (M,) each, episode by episode in the order played."""
+        """Episode index (M,) and item (M,) of all steps, sorted by episode and then by step."""
         episodes = np.concatenate(self._episodes)
         order = np.argsort(episodes, kind="stable")
         return episodes[order], np.concatenate(self._items)[order]
 
 
 def coverage(items: IntArray, n_items: int) -> float:
-    """CV: share of the catalogue that was recommended at all."""
+    """CV: share of the `n_items` items of the catalogue that occur in `items` (M,)."""
     return len(np.unique(items)) / n_items
 
 
 def coverage_per_turn(items: IntArray) -> float:
-    """CV_turn: different items over recommendations."""
+    """CV_turn: number of distinct items in `items` (M,), divided by M."""
     return len(np.unique(items)) / len(items)
 
 
 def diversity(episodes: IntArray, items: IntArray, similarity: Similarity) -> float:
-    """Mean over episodes of the mean of 1 − similarity over their pairs; 1 for a single item.
+    """Mean over episodes of the mean of 1 − similarity over pairs of steps; 1 for a single step.
 
     Args:
-        episodes: (M,) sorted, at least one step.
-        items: (M,).
+        episodes: (M,) sorted episode indices, M at least 1.
+        items: (M,) the items of these steps.
+        similarity: of two items.
     """
     _, starts, lengths = np.unique(episodes, return_index=True, return_counts=True)
-    # Every step pairs with all later ones of its episode, so no episode needs a turn of its own.
+    # Pairs of all episodes are enumerated at once: each step with all later ones of its episode.
     last = np.repeat(starts + lengths, lengths)
     later = last - np.arange(len(items)) - 1
     first = np.repeat(np.arange(len(items)), later)
@@ -62,7 +63,7 @@ def diversity(episodes: IntArray, items: IntArray, similarity: Similarity) -> fl
 
 
 def tag_jaccard(incidence: BoolArray) -> Similarity:
-    """Shared tags over all tags of two items, of a table (n_items, n_tags); 0 without any."""
+    """Jaccard similarity of two items' tags, from `incidence` (n_items, n_tags); 0 without tags."""
 
     def similarity(one: IntArray, other: IntArray) -> npt.NDArray[np.floating]:
         shared = (incidence[one] & incidence[other]).sum(axis=1)
@@ -73,23 +74,26 @@ def tag_jaccard(incidence: BoolArray) -> Similarity:
 
 
 def novelty(items: IntArray, popularity: npt.NDArray[np.floating]) -> float:
-    """Mean of −ln(popularity) of what was recommended; items without any count as the rarest one.
+    """Mean of −ln(popularity) over recommendations, in nats.
+
+    An item with popularity 0 counts as the least popular item above 0.
 
     Args:
-        popularity: (n_items,) interactions over users, some above 0.
+        items: (M,) recommended items.
+        popularity: (n_items,) interactions divided by users, at least one above 0.
     """
-    some = popularity[popularity > 0].min()
-    return float(-np.log(np.maximum(popularity, some))[items].mean())
+    lowest = popularity[popularity > 0].min()
+    return float(-np.log(np.maximum(popularity, lowest))[items].mean())
 
 
 def dominant_tags(incidence: BoolArray, positives: IntArray, share: float = 0.8) -> BoolArray:
-    """(n_tags,) which tags dominate: the most frequent, as long as they cover at most `share`.
+    """Dominant tags (n_tags,): the most frequent ones that together cover at most `share`.
 
     Args:
         incidence: (n_items, n_tags).
-        positives: (n_items,) positive interactions of the training log; each counts once for every
-            tag of its item.
-        share: of all those counts.
+        positives: (n_items,) numbers of positive interactions in the training log; each counts
+            once for every tag of its item.
+        share: share of the sum of all tags' counts.
     """
     counts = positives @ incidence.astype(np.int64)
     order = np.argsort(-counts, kind="stable")
@@ -100,5 +104,11 @@ def dominant_tags(incidence: BoolArray, positives: IntArray, share: float = 0.8)
 
 
 def dominance(items: IntArray, incidence: BoolArray, dominant: BoolArray) -> float:
-    """MCD: share of recommendations that carry a dominant tag."""
+    """MCD: share of recommendations `items` (M,) that have a dominant tag.
+
+    Args:
+        items: (M,) recommended items.
+        incidence: (n_items, n_tags).
+        dominant: (n_tags,) from `dominant_tags`.
+    """
     return float(incidence[items][:, dominant].any(axis=1).mean())

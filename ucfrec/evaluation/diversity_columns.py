@@ -1,4 +1,4 @@
-"""The variety of what was played in a world of items, as columns of a result row."""
+"""Coverage, diversity, novelty and dominance as columns of a result row."""
 
 from typing import Any
 
@@ -21,9 +21,9 @@ from ucfrec.evaluation.diversity import (
 )
 
 TAGS = "tags"
-"""Column of a catalogue that lists each item's tags."""
+"""Catalogue column with the list of each item's tags."""
 ONE_HOT = "tag_"
-"""Prefix of the columns of a catalogue that has one for each tag instead, above 0 if it holds."""
+"""Prefix of catalogue columns, one per tag, that are above 0 for items with the tag."""
 COLUMNS = (
     "coverage", "coverage_per_turn", "diversity", "novelty", "majority_category_dominance",
 )  # fmt: skip
@@ -35,14 +35,16 @@ def variety_columns(
     counts: TrainingCounts | None = None,
     numbers: IntArray | None = None,
 ) -> dict[str, float | None]:
-    """The `COLUMNS`; None where what a metric needs is unknown.
+    """The `COLUMNS`; a metric whose inputs are missing is None.
 
-    Diversity (tag Jaccard) and dominance need a catalogue with `tags`; novelty and dominance need
-    `counts`, which built-in policies do not have.
+    Diversity (tag Jaccard) and dominance need a catalogue with tags; novelty and dominance need
+    `counts` and `numbers`, which built-in policies do not have.
 
     Args:
-        counts: of the training log.
-        numbers: (items of the log,) the world's number of each, −1 where it has none.
+        env: a world of items.
+        recommended: the items of all steps.
+        counts: item counts of the training log.
+        numbers: (items of the log,) the world's index of each item, −1 for items that it lacks.
     """
     episodes, items = recommended.sessions()
     n_items = len(world_items(env))
@@ -67,7 +69,7 @@ def variety_columns(
 
 
 def _incidence(env: VectorEnv[Any, Any, Any]) -> BoolArray | None:
-    """(n_items, n_tags) of the world's catalogue; None where it has no lists of tags."""
+    """Tags (n_items, n_tags) of the world's catalogue; None if it has no tags."""
     world = env.unwrapped
     table = world.item_features() if isinstance(world, Catalog) else pa.table({})
     hot = [name for name in table.column_names if name.startswith(ONE_HOT)]

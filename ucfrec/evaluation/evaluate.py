@@ -1,4 +1,4 @@
-"""What a policy earns in a simulated world."""
+"""Evaluate policies in simulated worlds."""
 
 import time
 from collections.abc import Mapping
@@ -22,12 +22,18 @@ from ucfrec.provenance import config_hash, provenance
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SIDE_BY_SIDE = 512
-"""Most episodes played at once."""
+"""Largest number of episodes played in parallel."""
 
 
 @random_state_kept()
 def evaluate_behavior(world: World, behavior: str, episodes: int, seed: int) -> dict[str, Any]:
-    """One result row for a built-in policy of a world (`random`, `optimal`, …).
+    """Result row of a world's built-in policy (`random`, `optimal`, …).
+
+    Args:
+        world: the simulated world.
+        behavior: name of the policy.
+        episodes: number of episodes to play.
+        seed: seed of the environments and of the policy.
 
     Raises:
         InputError: the world has no policy of that name.
@@ -50,10 +56,18 @@ def evaluate_policy(
     seed: int,
     target_return: float,
 ) -> dict[str, Any]:
-    """One result row for a trained policy with `target_return` in every episode.
+    """Result row of a trained policy.
+
+    Args:
+        world: the simulated world.
+        trained: the policy.
+        name: name of the policy in the row.
+        episodes: number of episodes to play.
+        seed: environment i is seeded with `seed` + i.
+        target_return: target return of every episode, in units of the training reward.
 
     Raises:
-        InputError: the policy's actions or observations are not this world's.
+        InputError: the policy's actions or observations do not fit this world.
     """
     env = world.simulator().make(min(episodes, SIDE_BY_SIDE), world.folder)
     numbers = _item_numbers(world, env, trained)
@@ -77,10 +91,10 @@ def _row(
     counts: TrainingCounts | None = None,
     numbers: IntArray | None = None,
 ) -> dict[str, Any]:
-    began = time.perf_counter()
+    start = time.perf_counter()
     recommended, describe = Recommended(), f"{name} in {world.name}"
     played = rollout(env, actor, episodes, seed, recommended.record, describe)
-    seconds = time.perf_counter() - began
+    seconds = time.perf_counter() - start
     variety: Mapping[str, float | None] = dict.fromkeys(COLUMNS)
     if isinstance(env.single_action_space, spaces.Discrete):
         variety = variety_columns(env, recommended, counts, numbers)
@@ -99,13 +113,13 @@ def _row(
 
 
 def _item_numbers(world: World, env: Any, trained: TrainedPolicy) -> IntArray | None:
-    """The world's number of each item of the policy, −1 where it has none; None for vectors."""
+    """The world's index of each item of the policy, −1 for items it lacks; None for vectors."""
     space, sizes = env.single_action_space, trained.record["sizes"]
-    observed = int(np.prod(env.single_observation_space.shape))
-    wanted = trained.record["observation_size"]
-    if wanted > observed:
+    provided = int(np.prod(env.single_observation_space.shape))
+    expected = trained.record["observation_size"]
+    if expected > provided:
         raise InputError(
-            f"the policy observes {wanted} numbers, {world.name} shows {observed}; train it on "
+            f"the policy observes {expected} numbers, {world.name} shows {provided}; train it on "
             f"logs of {world.name}"
         )
     if not isinstance(space, spaces.Discrete):
@@ -117,12 +131,15 @@ def _item_numbers(world: World, env: Any, trained: TrainedPolicy) -> IntArray | 
     if ids is None or ids.dtype.kind not in "iu":
         raise _misfit(world, f"{len(known)} items with whole numbers as {schema.ITEM_ID}")
     order = np.argsort(known)
-    at = order[np.minimum(np.searchsorted(known, ids, sorter=order), len(known) - 1)]
-    numbers = np.where(known[at] == ids, at, -1)
+    nearest = order[np.minimum(np.searchsorted(known, ids, sorter=order), len(known) - 1)]
+    numbers = np.where(known[nearest] == ids, nearest, -1)
     if (numbers < 0).all():
         raise _misfit(world, f"items {known.min()} to {known.max()} as {schema.ITEM_ID}")
     return numbers
 
 
 def _misfit(world: World, takes: str) -> InputError:
-    return InputError(f"{world.name} takes {takes}, which the policy was not trained on")
+    return InputError(
+        f"{world.name} takes {takes}, which the policy was not trained on; train it on logs of "
+        f"{world.name}"
+    )

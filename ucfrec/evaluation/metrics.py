@@ -1,4 +1,4 @@
-"""What episodes earned: R_cum, R_avg in both readings, length, with bootstrap intervals."""
+"""Metrics of played episodes (R_cum, two versions of R_avg, length) and bootstrap intervals."""
 
 from dataclasses import dataclass
 
@@ -12,24 +12,26 @@ _RESAMPLES = 2000
 
 @dataclass(frozen=True)
 class SessionMetrics:
-    """Means over episodes."""
+    """Metrics of a set of episodes; rewards and returns in reward units."""
 
     R_cum: float
-    """Mean episode return (R_tra elsewhere)."""
+    """Mean episode return (called R_tra in some papers)."""
     R_cum_low: float
     """Lower end of the 95% percentile bootstrap interval of R_cum, over episodes."""
     R_cum_high: float
+    """Upper end of the same interval."""
     R_avg_pooled: float
-    """All reward over all steps (R_each elsewhere)."""
+    """Sum of all rewards divided by the number of all steps (called R_each in some papers)."""
     R_avg_episode: float
-    """Mean over episodes of the episode's own mean reward a step."""
+    """Mean over episodes of the episode's mean reward per step."""
     length: float
-    """Mean steps an episode."""
+    """Mean number of steps per episode."""
     episodes: int
+    """Number of episodes."""
 
 
 def session_metrics(played: Episodes, seed: int) -> SessionMetrics:
-    """Summarise episodes; `seed` draws the bootstrap's resamples."""
+    """Metrics of the played episodes; `seed` seeds the bootstrap."""
     low, high = bootstrap_interval(played.returns, seed)
     return SessionMetrics(
         R_cum=float(played.returns.mean()),
@@ -45,7 +47,7 @@ def session_metrics(played: Episodes, seed: int) -> SessionMetrics:
 def bootstrap_interval(
     values: npt.NDArray[np.float64], seed: int, level: float = 0.95
 ) -> tuple[float, float]:
-    """Percentile bootstrap interval of the mean of `values` (N,)."""
+    """Percentile bootstrap interval (low, high) of the mean of `values` (N,), 2,000 resamples."""
     ((low, high),) = ratio_intervals(values[:, None], np.ones((len(values), 1)), seed, level)
     return float(low), float(high)
 
@@ -53,9 +55,15 @@ def bootstrap_interval(
 def ratio_intervals(
     above: npt.NDArray[np.float64], below: npt.NDArray[np.float64], seed: int, level: float = 0.95
 ) -> npt.NDArray[np.float64]:
-    """Percentile bootstrap intervals (C, 2) of the ratios Σ above / Σ below of rows (N, C).
+    """Percentile bootstrap intervals (C, 2) of the column ratios Σ above / Σ below.
 
-    Resamples in which nothing stands below are left out.
+    Rows are resampled; resamples whose denominator is 0 are left out.
+
+    Args:
+        above: (N, C) numerators.
+        below: (N, C) denominators, at least 0.
+        seed: of the resamples.
+        level: coverage of the interval.
     """
     ratios = resampled_ratios(above, below, seed)
     return np.asarray(np.nanquantile(ratios, [(1 - level) / 2, (1 + level) / 2], axis=0).T)
@@ -64,10 +72,12 @@ def ratio_intervals(
 def resampled_ratios(
     above: npt.NDArray[np.float64], below: npt.NDArray[np.float64], seed: int
 ) -> npt.NDArray[np.float64]:
-    """Σ above / Σ below of rows (N, C) drawn with replacement, (2000, C); NaN where nothing stands
-    below."""
+    """Ratios Σ above / Σ below (2000, C) of rows (N, C) drawn with replacement.
+
+    Ratios whose denominator is 0 are NaN.
+    """
     generator = np.random.default_rng(seed)
-    # Multinomial counts stand for resampled rows: memory stays at N, whatever the resamples.
+    # Multinomial counts of the rows replace copies of them, which limits memory to O(N).
     share, both = np.full(len(above), 1 / len(above)), np.hstack([above, below])
     sums = np.array([generator.multinomial(len(both), share) @ both for _ in range(_RESAMPLES)])
     numerators, denominators = np.hsplit(sums, 2)

@@ -1,8 +1,8 @@
-"""Next-period ranking: how a policy ranks the items that users were shown, and clicked, later.
+"""Ranking metrics on a later period: the rank of the items that users were shown or clicked.
 
-Every step is ranked over the whole catalogue from what was known before it; no negatives are
-sampled (Krichene & Rendle, KDD 2020). A step counts as *liked* where its reward, scaled to [0, 1]
-as in item states, is at least `ucfrec.episodes.item_counts.LIKED`: a click.
+At every step, the whole catalogue is ranked from what was known before the step; no negatives are
+sampled (Krichene & Rendle, KDD 2020). A step is *liked* (a click) if its reward, scaled to [0, 1]
+as in item states, is at least `ucfrec.episodes.item_counts.LIKED`.
 """
 
 import warnings
@@ -31,47 +31,49 @@ FloatArray = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Steps:
-    """B judged steps and what was known before each."""
+    """B evaluated steps of a store, with their histories."""
 
     store: EpisodeStore
     episodes: IntArray
-    """(B,) positions in the store."""
+    """(B,) episode of each step, as an index into the store."""
     steps: IntArray
-    """(B,)."""
+    """(B,) position of each step in its episode, from 0."""
     users: IntArray
-    """(B,) row of each step's user in the training store; −1 for a user it does not know."""
+    """(B,) row of each step's user in the training store; −1 for users that it lacks."""
 
     def windows(self, length: int) -> Windows:
-        """The last `length` steps up to each judged one; its own action and reward are the last
-        column's, which no ranker may read."""
+        """Windows of `length` steps that end with each evaluated step.
+
+        The last column contains the evaluated step's action and reward; rankers must not read them.
+        """
         return self.store.windows(self.episodes, self.steps, length)
 
 
 class Ranker(Protocol):
-    """Anything that scores the catalogue at a step."""
+    """Scores all items of the catalogue at every step."""
 
     @property
     def name(self) -> str:
-        """How result rows call it."""
+        """Name in result rows."""
 
     def scores(self, steps: Steps) -> Tensor:
-        """(B, n_items): higher is better; (1, n_items) where all steps have the same."""
+        """Scores (B, n_items), higher is better; (1, n_items) if all steps have the same scores."""
 
 
 @dataclass(frozen=True)
 class Ranked:
-    """What one ranker made of N judged steps."""
+    """One ranker's results at N evaluated steps."""
 
     ranks: FloatArray
-    """(N,) rank of the shown item, from 1; ties share their mean rank."""
+    """(N,) rank of the shown item, from 1; tied items share their mean rank."""
     scores: FloatArray
     """(N,) score of the shown item."""
     top: IntArray
-    """(N, k) items that it would have shown, best first."""
+    """(N, k) recommended items, best first."""
 
 
-def judged_steps(store: EpisodeStore, at_once: int) -> Iterator[Steps]:
-    """Every step of `store` in order, `at_once` at a time."""
+def evaluated_steps(store: EpisodeStore, at_once: int) -> Iterator[Steps]:
+    """All steps of `store` in order, in batches of `at_once`."""
     users = store.episode_values(schema.USER).astype(np.int64)
     for begin in range(0, store.n_steps, at_once):
         numbers = np.arange(begin, min(begin + at_once, store.n_steps))
@@ -84,12 +86,14 @@ def rank_steps(ranker: Ranker, store: EpisodeStore, k: int) -> Ranked:
     """Rank every step of `store`.
 
     Args:
-        k: items that are recommended at a step.
+        ranker: scores the items.
+        store: episodes of items.
+        k: number of recommended items per step, at most n_items.
     """
     n_items = len(store.item_states.embeddings)
     at_once = max(1, min(_STEPS_AT_ONCE, _SCORES_AT_ONCE // n_items))
     parts = []
-    for batch in judged_steps(store, at_once):
+    for batch in evaluated_steps(store, at_once):
         shown = store.step_values(schema.ITEM, batch.episodes, batch.steps).astype(np.int64)
         scores = ranker.scores(batch)
         if len(scores) == 1:
@@ -100,14 +104,14 @@ def rank_steps(ranker: Ranker, store: EpisodeStore, k: int) -> Ranked:
 
 
 def _ranked(scores: Tensor, shown: Tensor, k: int) -> tuple[FloatArray, FloatArray, IntArray]:
-    own = scores.gather(1, shown.unsqueeze(1))
-    above, equal = (scores > own).sum(1), (scores == own).sum(1)
+    of_shown = scores.gather(1, shown.unsqueeze(1))
+    above, equal = (scores > of_shown).sum(1), (scores == of_shown).sum(1)
     ranks = 1 + above.double() + (equal - 1).double() / 2
-    return ranks.numpy(), own[:, 0].double().numpy(), scores.topk(k, dim=1).indices.numpy()
+    return ranks.numpy(), of_shown[:, 0].double().numpy(), scores.topk(k, dim=1).indices.numpy()
 
 
 def _ranked_alike(scores: Tensor, shown: Tensor, k: int) -> tuple[FloatArray, FloatArray, IntArray]:
-    """The same where all steps have the scores (n_items,): they are sorted once."""
+    """`_ranked` for scores (n_items,) that all steps share, which are sorted only once."""
     ranks = rankdata(-scores.double().numpy(), method="average")
     top = np.broadcast_to(scores.topk(k).indices.numpy(), (len(shown), k))
     return ranks[shown], scores[shown].double().numpy(), top
@@ -115,19 +119,19 @@ def _ranked_alike(scores: Tensor, shown: Tensor, k: int) -> tuple[FloatArray, Fl
 
 @dataclass(frozen=True)
 class Period:
-    """The judged steps: what every ranker is compared with."""
+    """The N evaluated steps: the items shown and whether they were liked."""
 
     users: npt.NDArray[Any]
     """(N,) identifier of each step's user."""
     items: IntArray
     """(N,) items shown."""
     liked: npt.NDArray[np.bool_]
-    """(N,)."""
+    """(N,) true at liked steps."""
     n_items: int
 
     @classmethod
     def of(cls, store: EpisodeStore, users: npt.NDArray[Any]) -> "Period":
-        """All steps of `store`, `users` (E,) being the identifier of each episode's user."""
+        """The steps of `store`; `users` (E,) are the user identifiers of its E episodes."""
         episodes, steps = store.all_steps()
         items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
         n_items = len(store.item_states.embeddings)
@@ -135,8 +139,10 @@ class Period:
 
     @property
     def item_rates(self) -> FloatArray:
-        """(n_items,) share of the period's impressions of an item that were liked; NaN where it
-        was never shown."""
+        """Share of each item's impressions in the period that were liked, (n_items,).
+
+        NaN for items that were never shown.
+        """
         shown = np.bincount(self.items, minlength=self.n_items)
         liked = np.bincount(self.items, self.liked, minlength=self.n_items)
         with np.errstate(invalid="ignore"):
@@ -145,20 +151,34 @@ class Period:
 
 MEASURES: Mapping[str, str] = {
     "hit_rate_shown": "share of steps whose shown item is among the k recommended",
-    "ndcg_shown": "1 / log2(1 + rank) of the shown item where it is among the k, mean of steps",
-    "hit_rate_liked": "the first, of liked steps only",
-    "ndcg_liked": "the second, of liked steps only",
-    "recall_liked": "share of a user's liked items of the period that are among the k recommended "
-    "at the user's first step",
-    "gauc": "probability that a liked step scores above another of the same user, by impressions",
-    "item_rate": "share of likes in the period of the items recommended, those it showed",
+    "ndcg_shown": "mean over steps of 1 / log2(1 + rank) of the shown item, 0 if it is not among "
+    "the k recommended",
+    "hit_rate_liked": "hit_rate_shown over liked steps only",
+    "ndcg_liked": "ndcg_shown over liked steps only",
+    "recall_liked": "share of the items that a user liked in the period that are among the k "
+    "recommended at the user's first step, mean over users",
+    "gauc": "probability that a liked step scores higher than another step of the same user, mean "
+    "over users weighted by impressions",
+    "item_rate": "mean share of liked impressions, in the period, of the recommended items that "
+    "the period showed",
     "known": "share of recommended items that the period showed",
 }
-"""What each measure is; a mean of users' sums, so that intervals are by user."""
+"""Description of each measure. Every measure is a ratio of sums over users, so that users can be
+resampled."""
 
 
 def measure(period: Period, ranked: Ranked, k: int) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Every measure as (above, below), (U,) each, by user: its value is Σ above / Σ below."""
+    """Every measure as numerators and denominators per user.
+
+    Args:
+        period: the N evaluated steps.
+        ranked: a ranker's results at these steps.
+        k: number of recommended items per step.
+
+    Returns:
+        By measure, (above, below), (U,) each, with one entry per user; the measure's value is
+        Σ above / Σ below.
+    """
     users, owner = np.unique(period.users, return_inverse=True)
     hit = ranked.ranks <= k
     gain = hit / np.log2(1 + ranked.ranks)
@@ -184,27 +204,29 @@ def measure(period: Period, ranked: Ranked, k: int) -> dict[str, tuple[FloatArra
 def _recall(
     period: Period, ranked: Ranked, owner: IntArray, n_users: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Of each user with liked items: the share of them recommended at the first step; and 1."""
+    """Per user: the share of liked items recommended at the first step, and 1; 0 and 0 if none."""
     pairs = np.unique(np.stack([owner, period.items])[:, period.liked], axis=1)
-    # Steps are in order of user and time: the first of a user is where `owner` first says so.
+    # Steps are sorted by time within a user, so the first row of a user is the first step.
     first = np.full(n_users, len(owner))
     np.minimum.at(first, owner, np.arange(len(owner)))
-    found = (ranked.top[first[pairs[0]]] == pairs[1][:, None]).any(1)
-    wanted = np.bincount(pairs[0], minlength=n_users)
+    hits = (ranked.top[first[pairs[0]]] == pairs[1][:, None]).any(1)
+    n_liked = np.bincount(pairs[0], minlength=n_users)
     with np.errstate(invalid="ignore"):
-        share = np.nan_to_num(np.bincount(pairs[0], found, minlength=n_users) / wanted)
-    return share, (wanted > 0).astype(np.float64)
+        share = np.nan_to_num(np.bincount(pairs[0], hits, minlength=n_users) / n_liked)
+    return share, (n_liked > 0).astype(np.float64)
 
 
 def _group_auc(
     scores: FloatArray, liked: npt.NDArray[np.bool_], owner: IntArray, n_users: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Each user's AUC times impressions, and impressions, of users with both kinds of step
-    (Zhu et al., KDD 2017)."""
+    """Per user: AUC times impressions, and impressions (Zhu et al., KDD 2017).
+
+    Both are 0 for users whose steps are all liked or all not liked.
+    """
     sizes = np.bincount(owner, minlength=n_users)
-    _, place = np.unique(scores, return_inverse=True)
-    # Ranks within users: those of (user, score) less the steps of the users before.
-    ranks = rankdata(owner * len(scores) + place) - (np.cumsum(sizes) - sizes)[owner]
+    _, level = np.unique(scores, return_inverse=True)
+    # Ranks within users: ranks of (user, score) minus the number of steps of earlier users.
+    ranks = rankdata(owner * len(scores) + level) - (np.cumsum(sizes) - sizes)[owner]
     positive = np.bincount(owner, liked, minlength=n_users)
     negative = sizes - positive
     above = np.bincount(owner, ranks * liked, minlength=n_users) - positive * (positive + 1) / 2
@@ -217,49 +239,54 @@ def _group_auc(
 
 @dataclass(frozen=True)
 class Compared:
-    """One ranker's measures."""
+    """One ranker's measures, by the names in `MEASURES`."""
 
     name: str
     values: Mapping[str, float]
     intervals: Mapping[str, Sequence[float]]
-    """95%, by a bootstrap over users."""
+    """Low and high end of the 95% interval, by a percentile bootstrap over users."""
     differences: Mapping[str, Sequence[float]]
-    """Value less the reference's with its 95% interval, the same users drawn for both."""
+    """Value minus the reference's, and the ends of its 95% interval (paired bootstrap)."""
     coverage: float
-    """Share of the catalogue that is recommended at all."""
+    """Share of the catalogue's items that are recommended at one step or more."""
 
 
 def compare(
     period: Period, ranked: Mapping[str, Ranked], k: int, reference: str, seed: int
 ) -> list[Compared]:
-    """Measures of every ranker with intervals by user, and differences from `reference`.
+    """Measures of every ranker, with intervals over users and differences from `reference`.
 
     Args:
-        ranked: by the ranker's name.
-        reference: one of those names.
-        seed: of the resampled users, the same for all rankers.
+        period: the evaluated steps.
+        ranked: results by the ranker's name.
+        k: number of recommended items per step.
+        reference: one of these names.
+        seed: of the bootstrap, whose resampled users are the same for all rankers.
+
+    Returns:
+        One entry per ranker, in the order of `ranked`.
     """
-    measured = [measure(period, own, k) for own in ranked.values()]
-    # (U, rankers, measures): users are drawn once for all rankers.
+    measured = [measure(period, each, k) for each in ranked.values()]
+    # (U, rankers, measures), so that one draw of users serves all rankers.
     above, below = (
-        np.stack([np.stack([own[m][part] for m in MEASURES], axis=1) for own in measured], axis=1)
+        np.stack([np.stack([each[m][part] for m in MEASURES], axis=1) for each in measured], axis=1)
         for part in (0, 1)
     )
     drawn = resampled_ratios(_flat(above), _flat(below), seed).reshape(-1, *above.shape[1:])
     with np.errstate(invalid="ignore"):
         values = above.sum(0) / below.sum(0)
-    at = list(ranked).index(reference)
+    column = list(ranked).index(reference)
     ends = _ends(drawn)
-    differences = np.stack([values - values[at], *_ends(drawn - drawn[:, at : at + 1])])
+    differences = np.stack([values - values[column], *_ends(drawn - drawn[:, column : column + 1])])
     return [
         Compared(
             name,
             dict(zip(MEASURES, values[row].tolist(), strict=True)),
             dict(zip(MEASURES, ends[:, row].T.tolist(), strict=True)),
             dict(zip(MEASURES, differences[:, row].T.tolist(), strict=True)),
-            len(np.unique(own.top)) / period.n_items,
+            len(np.unique(each.top)) / period.n_items,
         )
-        for row, (name, own) in enumerate(ranked.items())
+        for row, (name, each) in enumerate(ranked.items())
     ]
 
 
@@ -268,18 +295,18 @@ def _flat(values: FloatArray) -> FloatArray:
 
 
 def _ends(drawn: FloatArray) -> FloatArray:
-    """(2, rankers, measures) ends of the 95% percentile intervals; NaN where nothing was drawn."""
+    """Ends (2, rankers, measures) of the 95% intervals; NaN if all resampled ratios are NaN."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         return np.asarray(np.nanquantile(drawn, [0.025, 0.975], axis=0))
 
 
 def rankers_named(rankers: Sequence[Ranker]) -> dict[str, Ranker]:
-    """By name, numbered from the second of a name on."""
+    """The rankers by name; of equal names, the second and later ones get a suffix -2, -3, …"""
     named: dict[str, Ranker] = {}
     for ranker in rankers:
-        name, again = ranker.name, 2
+        name, number = ranker.name, 2
         while name in named:
-            name, again = f"{ranker.name}-{again}", again + 1
+            name, number = f"{ranker.name}-{number}", number + 1
         named[name] = ranker
     return named

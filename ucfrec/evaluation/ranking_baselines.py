@@ -1,4 +1,4 @@
-"""What a trained policy must beat at ranking: simple rankers fitted on the same training rows."""
+"""Trained policies as rankers, and simple baselines fitted on the same training rows."""
 
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -17,19 +17,20 @@ from ucfrec.policies.item_knn import ItemKNNConfig, ItemKNNPolicy
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 _PRIOR: Final = 10.0
-"""Impressions at the mean rate that every item is credited with before its own are counted."""
+"""Impressions at the mean click rate that are added to every item's counts (smoothing)."""
 _KNN_HISTORY: Final = 20
+"""Steps of the session that item-kNN reads."""
 _ALS_FACTORS: Final = 32
 
 
 class PolicyRanker:
-    """A trained policy's probabilities, given a target return."""
+    """Ranks items by a trained policy's probabilities at a target return (reward units)."""
 
     def __init__(self, trained: TrainedPolicy, target_return: float, name: str) -> None:
         self.name, self._trained, self._target = name, trained, target_return
 
     def scores(self, steps: Steps) -> Tensor:
-        """(B, n_items) log-probabilities; earlier rewards of the session lower the target."""
+        """Log-probabilities (B, n_items); earlier rewards of the session lower the return-to-go."""
         windows = steps.windows(self._trained.policy.config.context)
         more = torch.from_numpy(self._target - steps.store.returns[steps.episodes])
         return self._trained.log_probabilities(windows, more.unsqueeze(1))
@@ -37,19 +38,19 @@ class PolicyRanker:
 
 @dataclass(frozen=True)
 class SameForAll:
-    """One score an item, whoever the user is."""
+    """Ranks items by fixed scores, the same for all users."""
 
     name: str
     items: Tensor
-    """(n_items,)."""
+    """(n_items,) score of each item."""
 
     def scores(self, steps: Steps) -> Tensor:
-        """(1, n_items)."""
+        """The fixed scores (1, n_items)."""
         return self.items.unsqueeze(0)
 
 
 class Random:
-    """Every item equally likely."""
+    """Ranks items by uniform random scores."""
 
     name = "random"
 
@@ -57,12 +58,15 @@ class Random:
         self._n_items, self._generator = n_items, torch.Generator().manual_seed(seed)
 
     def scores(self, steps: Steps) -> Tensor:
-        """(B, n_items) uniform."""
+        """Scores (B, n_items), uniform in [0, 1)."""
         return torch.rand(len(steps.steps), self._n_items, generator=self._generator)
 
 
 class ItemNeighbours:
-    """Cosine to what the session so far liked, popularity where it liked nothing."""
+    """Ranks items by their cosine to the session's rewarded items; ties go to the popular ones.
+
+    See `ItemKNNPolicy`.
+    """
 
     name = "item-knn"
 
@@ -78,13 +82,16 @@ class ItemNeighbours:
         self._tie_break = 1e-6 * popularity / popularity.max()
 
     def scores(self, steps: Steps) -> Tensor:
-        """(B, n_items)."""
+        """Scores (B, n_items)."""
         windows = steps.windows(_KNN_HISTORY)
         return self._knn.features(windows)[:, -1] + self._tie_break
 
 
 class MatrixFactorisation:
-    """Implicit-feedback ALS (Hu et al., 2008) of the package `implicit` on users' liked items."""
+    """Implicit-feedback ALS (Hu et al., 2008) on users' liked items.
+
+    Needs the package `implicit`.
+    """
 
     name = "als"
 
@@ -104,7 +111,7 @@ class MatrixFactorisation:
         )
         with threadpool_limits(1, "blas"):
             model.fit(matrix, show_progress=False)
-        # The last row stands for users without a liked item: popularity decides.
+        # The last row, zeros, is for unknown users; zeros leave only the popularity tie-break.
         factors = np.vstack([np.asarray(model.user_factors), np.zeros(_ALS_FACTORS)])
         factors[:-1][np.diff(matrix.indptr) == 0] = 0.0
         self._users = torch.from_numpy(factors.astype(np.float32))
@@ -112,31 +119,33 @@ class MatrixFactorisation:
         self._tie_break = 1e-6 * popularity / popularity.max()
 
     def scores(self, steps: Steps) -> Tensor:
-        """(B, n_items)."""
+        """Scores (B, n_items)."""
         known = np.where(steps.users < len(self._users) - 1, steps.users, -1)
         return self._users[torch.from_numpy(known)] @ self._items.T + self._tie_break
 
 
 def baselines(counts: TrainingCounts, train: EpisodeStore | None, seed: int) -> list[Ranker]:
-    """Random, most shown, most clicked, item click rate; item-kNN and, where the package `implicit`
-    is installed (extra `rank`), ALS.
+    """Baseline rankers: random, most shown, most clicked, item click rate, item-kNN and ALS.
+
+    ALS is included if the package `implicit` is installed (extra `rank`).
 
     Args:
-        counts: of the training rows.
-        train: the training episodes; None where the store is not at hand, which leaves out item-kNN
+        counts: item counts of the training rows.
+        train: the training episodes; None if their store is unavailable, which leaves out item-kNN
             and ALS.
+        seed: of the random scores and of ALS.
     """
     shown, liked = counts.shown.double(), counts.liked.double()
     mean = float(liked.sum() / shown.sum())
     rate = (liked + _PRIOR * mean) / (shown + _PRIOR)
-    found: list[Ranker] = [
+    rankers: list[Ranker] = [
         Random(len(shown), seed),
         SameForAll("most shown", shown),
         SameForAll("most clicked", liked),
         SameForAll("item click rate", rate),
     ]
     if train is not None:
-        found.append(ItemNeighbours(train, shown.float()))
+        rankers.append(ItemNeighbours(train, shown.float()))
         if find_spec("implicit") is not None:
-            found.append(MatrixFactorisation(train, shown.float(), seed))
-    return found
+            rankers.append(MatrixFactorisation(train, shown.float(), seed))
+    return rankers

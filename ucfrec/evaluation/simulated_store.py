@@ -1,4 +1,4 @@
-"""Stores of sessions that a simulator played: collected, then prepared as anybody's logs are."""
+"""Stores of simulated sessions: collected as logs, then prepared like any other logs."""
 
 from pathlib import Path
 
@@ -12,10 +12,17 @@ from ucfrec.schema import ITEM_ID, SESSION_ID
 def simulated_store(
     world: World, folder: Path, sessions: int, seed: int, behavior: str = "mixture"
 ) -> Path:
-    """Play a behavior policy into `folder/logs`, prepare `folder/store`; what exists is kept.
+    """Collect logs in `folder/logs` and prepare `folder/store`; existing folders are reused.
+
+    Args:
+        world: the simulator to play in.
+        folder: holds both folders.
+        sessions: number of sessions to play.
+        seed: seed of the environments and of the behavior policy.
+        behavior: name of one of the simulator's built-in policies.
 
     Returns:
-        The store.
+        The path of the store.
     """
     logs, store = folder / "logs", folder / "store"
     simulator = world.simulator()

@@ -1,4 +1,4 @@
-"""What every sequence policy shares: configuration, normalisation, action loss, token embedding."""
+"""Base of all sequence policies: configuration, normalisation, action loss, token embedding."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -28,30 +28,30 @@ Timesteps = Annotated[int, Field(ge=1, le=10_000_000)]
 
 @settings_table("policy")
 class PolicyConfig:
-    """Settings that every sequence policy has."""
+    """Settings of every sequence policy."""
 
     context: Context = 20
-    """K, steps of history that a prediction sees."""
+    """K, steps of history that a prediction uses."""
     dim: Width = 128
     """d, width of the model."""
     dropout: Dropout = 0.1
     """Share of the model's activations that is set to 0 in training."""
     return_scale: Annotated[float, Field(ge=0, le=1e12)] = 0.0
-    """Returns-to-go are divided by this; 0 stands for the largest absolute training return."""
+    """Returns-to-go are divided by this; 0 selects the largest absolute training return."""
     max_timestep: Timesteps = 1000
-    """Rows of the timestep embedding; later steps share the last. 1 tells the model no time."""
+    """Rows of the timestep embedding; later steps share the last row. 1 hides the time."""
 
 
 class SequencePolicy(nn.Module, ABC):
     """Predicts a_t from returns-to-go and states up to t and actions before t.
 
-    Subclasses give `features`; everything about data (normalisation, item embeddings) is held in
+    Subclasses implement `features`. Statistics of the data (normalisation, item embeddings) are
     buffers, so that a checkpoint is complete.
     """
 
     Config: ClassVar[type[PolicyConfig]] = PolicyConfig
     augmented: ClassVar[bool] = False
-    """Whether counterfactual copies join the training data unless configured otherwise."""
+    """Whether the default of `augment.copies` is above 0 for this learner."""
 
     state_mean: Tensor
     state_std: Tensor
@@ -60,8 +60,11 @@ class SequencePolicy(nn.Module, ABC):
     head: Head
 
     def __init__(self, config: PolicyConfig, sizes: Mapping[str, int]) -> None:
-        """Build for `sizes`: `state` S, `action` A (of an item: its embedding's size), `items`
-        (0 where actions are vectors)."""
+        """Args:
+        config: settings, an instance of the class's `Config`.
+        sizes: `state` S; `action` A, the size of an action vector or of an item's embedding; and
+            `items`, the number of items, 0 if actions are vectors.
+        """
         super().__init__()
         self.config = config
         self.register_buffer("state_mean", torch.zeros(sizes["state"]))
@@ -74,38 +77,44 @@ class SequencePolicy(nn.Module, ABC):
     def training_view(
         cls, train: EpisodeStore, config: PolicyConfig, folder: Path, seed: int
     ) -> EpisodeStore:
-        """What the policy learns from, of the training episodes: all of them, unless it says more.
+        """The episodes to train on, derived from the training episodes; by default all, unchanged.
 
         Args:
-            folder: where anything that this takes to compute is kept, for a run that is resumed.
+            train: the training episodes.
+            config: settings of the policy.
+            folder: keeps intermediate results, so that a resumed run reuses them.
+            seed: seed of every random draw.
         """
         return train
 
     def start_from(self, train: EpisodeStore) -> None:
-        """Take over what the architecture must know of its training data before the first step."""
+        """Set buffers from the training episodes, before the first update."""
 
     @abstractmethod
     def features(self, windows: Windows) -> Tensor:
-        """What predicts the actions, (B, K, d), from normalised windows; row t sees no a_t."""
+        """Inputs (B, K, d) of the action head, from normalised windows; row t ignores a_t."""
 
     def normalized(self, windows: Windows) -> Windows:
-        """Standardised states; returns-to-go, scaled, none below the lowest of the training data.
+        """Standardised states, and returns-to-go divided by `return_scale`.
 
-        A session that has earned its target would else be asked for less than nothing, and that is
-        what the policy would then aim at.
+        Returns-to-go are first raised to the lowest value in the training data: after a session has
+        reached its target return, they would otherwise leave the range of the training data.
         """
         states = ((windows.states - self.state_mean) / self.state_std).clamp(-_CLIP, _CLIP)
-        asked = windows.returns_to_go.clamp(min=self.lowest_return_to_go)
-        return replace(windows, states=states, returns_to_go=asked / self.return_scale)
+        returns_to_go = windows.returns_to_go.clamp(min=self.lowest_return_to_go)
+        return replace(windows, states=states, returns_to_go=returns_to_go / self.return_scale)
 
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
-        """Action loss over all steps of the windows, and scalars to log (Algorithm 6)."""
+        """Mean action loss over all steps of the windows, and scalars to log (Algorithm 6).
+
+        In nats for items; for vectors, the squared error relative to the action's range.
+        """
         features = self.features(self.normalized(windows))
         value = self.head.loss(features[windows.mask], windows.actions[windows.mask])
         return value, {"action_loss": value.detach()}
 
     def action_loss(self, windows: Windows) -> Tensor:
-        """The action loss at each window's last step: what validation compares."""
+        """Mean action loss over the windows' last steps, the validation loss."""
         features = self.features(self.normalized(windows))
         return self.head.loss(features[:, -1], windows.actions[:, -1])
 
@@ -115,8 +124,10 @@ class SequencePolicy(nn.Module, ABC):
 
 
 class TokenEmbedding(nn.Module):
-    """Returns-to-go, states and actions as tokens: one linear layer a modality, a shared learned
-    timestep embedding, LayerNorm (Appendix G.3)."""
+    """Tokens of returns-to-go, states and actions (Appendix G.3).
+
+    One linear layer per modality, a shared learned timestep embedding, LayerNorm.
+    """
 
     def __init__(self, config: PolicyConfig, state_size: int) -> None:
         super().__init__()
@@ -126,7 +137,12 @@ class TokenEmbedding(nn.Module):
         self.norm = nn.LayerNorm(config.dim)
 
     def forward(self, windows: Windows, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Tokens of each modality, (B, K, d), given embedded actions (B, K, d)."""
+        """Tokens of returns-to-go, states and actions, (B, K, d) each.
+
+        Args:
+            windows: normalised.
+            actions: (B, K, d) embedded actions.
+        """
         last = self.embed_timestep.num_embeddings - 1
         time = self.embed_timestep(windows.timesteps.clamp(max=last))
         returns = self.embed_return(windows.returns_to_go.unsqueeze(-1))
@@ -135,10 +151,10 @@ class TokenEmbedding(nn.Module):
 
 
 def require_heads(config: PolicyConfig, heads: int) -> None:
-    """Refuse attention heads that do not divide the model's width.
+    """Check that the number of attention heads divides the model's width.
 
     Raises:
-        SettingError: they do not.
+        SettingError: it does not.
     """
     require(
         config.dim % heads == 0,
@@ -149,6 +165,6 @@ def require_heads(config: PolicyConfig, heads: int) -> None:
 
 
 def interleave(returns: Tensor, states: Tensor, actions: Tensor) -> Tensor:
-    """(B, K, d) three times to (B, 3K, d) in the order R_0, s_0, a_0, R_1, …"""
+    """Merge three tensors (B, K, d) into (B, 3K, d) in the order R_0, s_0, a_0, R_1, …"""
     batch, length, dim = returns.shape
     return torch.stack([returns, states, actions], dim=2).reshape(batch, 3 * length, dim)

@@ -1,4 +1,4 @@
-"""Behaviour cloning: the logged action from the current state alone."""
+"""Behaviour cloning: predicts the logged action from the current state alone."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,17 +16,17 @@ from ucfrec.settings import settings_table
 
 @settings_table("policy")
 class BCConfig(PolicyConfig):
-    """Settings of behaviour cloning, a two-layer perceptron without memory."""
+    """Settings of behaviour cloning, a two-layer perceptron on the current state."""
 
     context: Context = 1
-    """K, steps of history; each prediction sees its own state only."""
+    """K, steps of a training window; each prediction uses its own state only."""
     best_share: Annotated[float, Field(gt=0, le=1)] = 1.0
-    """Share of the training episodes, those with the highest returns, that is imitated: 0.1 is the
-    10% BC of Chen et al. (2021)."""
+    """Share of the training episodes to imitate, those with the highest returns; 0.1 is the 10% BC
+    of Chen et al. (2021)."""
 
 
 class BCPolicy(SequencePolicy):
-    """Imitates the logging policy; neither returns-to-go nor history enter."""
+    """Imitates the logging policy; returns-to-go and history are not used."""
 
     Config = BCConfig
     config: BCConfig
@@ -47,12 +47,12 @@ class BCPolicy(SequencePolicy):
     def training_view(
         cls, train: EpisodeStore, config: PolicyConfig, folder: Path, seed: int
     ) -> EpisodeStore:
-        """The episodes with the highest returns, `best_share` of them."""
+        """The share `best_share` of the episodes, those with the highest returns."""
         assert isinstance(config, BCConfig)
         count = int(np.ceil(config.best_share * train.n_episodes))
         best = np.argsort(-train.returns, kind="stable")[:count]
         return train.select(np.sort(best))
 
     def features(self, windows: Windows) -> Tensor:
-        """(B, K, d), each from its own state."""
+        """Features (B, K, d), each from its own state."""
         return self.net(windows.states)  # type: ignore[no-any-return]

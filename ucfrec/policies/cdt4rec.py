@@ -15,19 +15,19 @@ from ucfrec.settings import Weight, settings_table
 
 @settings_table("policy")
 class CDT4RecConfig(DTConfig):
-    """Settings of CDT4Rec; its backbone is DT's, as in its public code."""
+    """Settings of CDT4Rec; the backbone is DT, as in its public code."""
 
     reward_weight: Weight = 0.5
-    """Weight of the reward's squared error, in standard deviations of the training rewards; 0
-    leaves DT. The public code sums both losses of rewards that it does not standardise."""
+    """Weight of the squared error of the standardised reward; 0 gives DT. The public code adds both
+    losses unweighted and does not standardise rewards."""
 
 
 class CDT4RecPolicy(DTPolicy):
     """DT with a causal reward estimator on its hidden states.
 
-    The state s_t queries the actions a_0, …, a_t (keys and values); what it finds, with the state,
-    predicts r_t, and the error trains the shared blocks. The public code concatenates the hidden
-    states of a_t and s_t instead, and never trains its reward head.
+    The hidden state of s_t attends to those of a_0, …, a_t (keys and values). The result and the
+    state together predict r_t, and the error also trains the shared blocks. The public code
+    concatenates the hidden states of a_t and s_t instead, and never trains its reward head.
     """
 
     Config = CDT4RecConfig
@@ -44,29 +44,34 @@ class CDT4RecPolicy(DTPolicy):
         self.estimate = nn.Sequential(nn.Linear(2 * dim, dim), nn.ReLU(), nn.Linear(dim, 1))
 
     def start_from(self, train: EpisodeStore) -> None:
-        """Take over the mean and deviation of the training rewards."""
+        """Set the mean and standard deviation of the training rewards."""
         rewards = torch.from_numpy(train.step_values(schema.REWARD, *train.all_steps()))
         self.reward_mean.copy_(rewards.mean())
         self.reward_std.copy_(rewards.std(correction=0).clamp(min=1e-6))
 
     def estimated_rewards(self, hidden: Tensor, mask: Tensor) -> Tensor:
-        """Standardised rewards (B, K) of the actions taken, from hidden tokens (B, 3K, d)."""
+        """Estimates (B, K) of the logged actions' standardised rewards.
+
+        Args:
+            hidden: (B, 3K, d) outputs of `transform`.
+            mask: (B, K) bool, false at padding.
+        """
         states, actions = hidden[:, 1::3], hidden[:, 2::3]
         length = mask.shape[1]
         later = torch.ones(length, length, dtype=torch.bool, device=mask.device).triu(1)
-        oneself = torch.eye(length, dtype=torch.bool, device=mask.device)
-        hidden_keys = (later | ~mask.unsqueeze(1)) & ~oneself  # (B, K, K)
-        found, _ = self.attention(
+        diagonal = torch.eye(length, dtype=torch.bool, device=mask.device)
+        hidden_keys = (later | ~mask.unsqueeze(1)) & ~diagonal  # (B, K, K)
+        attended, _ = self.attention(
             states,
             actions,
             actions,
             attn_mask=hidden_keys.repeat_interleave(self.config.heads, dim=0),
             need_weights=False,
         )
-        return self.estimate(torch.cat([found, states], dim=-1)).squeeze(-1)  # type: ignore[no-any-return]
+        return self.estimate(torch.cat([attended, states], dim=-1)).squeeze(-1)  # type: ignore[no-any-return]
 
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
-        """Action loss and weighted reward loss over all steps."""
+        """Action loss plus weighted reward loss over all steps, and scalars to log."""
         mask = windows.mask
         hidden = self.transform(self.normalized(windows))
         action_loss = self.head.loss(hidden[:, 1::3][mask], windows.actions[mask])

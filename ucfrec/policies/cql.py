@@ -1,4 +1,4 @@
-"""Conservative Q-learning (Kumar et al., 2020), and returns-to-go relabelled by what it finds."""
+"""Conservative Q-learning (Kumar et al., 2020), and returns-to-go relabelled by its values."""
 
 from pathlib import Path
 from typing import Annotated
@@ -21,12 +21,12 @@ from ucfrec.settings import BatchSize, Count, LearningRate, Weight, Width, setti
 FloatArray = npt.NDArray[np.float32]
 _CHUNK = 4096
 _LOGGED = 100_000
-"""Logged actions that candidates are drawn from, at most."""
+"""Largest number of logged actions that candidates are drawn from."""
 
 
 @settings_table("cql")
 class CQLConfig:
-    """Small, as it only values states; no discount, as returns-to-go have none."""
+    """Settings of CQL, which estimates state values here; like returns-to-go, without discount."""
 
     steps: Count = 2000
     """Updates of the network."""
@@ -35,19 +35,19 @@ class CQLConfig:
     hidden: Width = 128
     """Width of the two hidden layers."""
     candidates: Annotated[int, Field(ge=2, le=10_000)] = 20
-    """Actions that stand for all: half of them logged elsewhere, the rest drawn uniformly."""
+    """Actions sampled in place of all actions: half from the logs, half uniformly."""
     learning_rate: LearningRate = 3e-4
-    """Step size of the updates."""
+    """Learning rate."""
     batch_size: BatchSize = 128
-    """Transitions of an update."""
+    """Transitions per update."""
     target_rate: Annotated[float, Field(gt=0, le=1)] = 0.01
-    """Share of the network that its target takes over every step."""
+    """Rate at which the target network moves to the network at every update."""
 
 
 class ConservativeQ(nn.Module):
-    """Q(s, a) of states and action vectors (items stand as their embeddings), and its target.
+    """Q(s, a) of states and action vectors (embeddings, for items), and its target network.
 
-    States are standardised, values are in units of the largest absolute training return.
+    States are standardised; values are in units of the largest absolute training return.
     """
 
     state_mean: Tensor
@@ -81,13 +81,13 @@ class ConservativeQ(nn.Module):
         self.target.requires_grad_(False)
 
     def q(self, states: Tensor, actions: Tensor, network: nn.Module | None = None) -> Tensor:
-        """(M,) values of (M, S) states and (M, A) actions."""
+        """Values (M,) of states (M, S) and actions (M, A), by `network` or the trained network."""
         standard = ((states - self.state_mean) / self.state_std).clamp(-10, 10)
         value: Tensor = (network or self.network)(torch.cat([standard, actions], dim=-1))
         return value.squeeze(-1)
 
     def candidates(self, count: int) -> Tensor:
-        """(count, candidates, A) actions that are compared in `count` states."""
+        """Random actions (count, C, A) for `count` states; see `CQLConfig.candidates`."""
         shape = (count, self.config.candidates // 2)
         logged = self.logged[torch.randint(len(self.logged), shape)]
         if self.every is not None:
@@ -98,40 +98,45 @@ class ConservativeQ(nn.Module):
         return torch.cat([logged, drawn], dim=1)
 
     def compared(self, states: Tensor, actions: Tensor, network: nn.Module | None = None) -> Tensor:
-        """(M, C) values of candidate actions (M, C, A) in states (M, S)."""
+        """Values (M, C) of candidate actions (M, C, A) in states (M, S)."""
         repeated = states.unsqueeze(1).expand(-1, actions.shape[1], -1)
         flat = self.q(repeated.flatten(0, 1), actions.flatten(0, 1), network)
         return flat.view(len(states), -1)
 
     def state_values(self, states: Tensor, network: nn.Module | None = None) -> Tensor:
-        """V̂(s) (M,): the mean of Q under the policy that Q implies, softmax over candidates."""
+        """V̂(s) (M,) of states (M, S): mean of Q under the softmax of Q over candidates."""
         values = self.compared(states, self.candidates(len(states)), network)
         return (values.softmax(-1) * values).sum(-1)
 
     def loss(self, batch: Transitions) -> tuple[Tensor, dict[str, Tensor]]:
-        """α (logsumexp_a Q(s, a) − Q(s, a_data)) + ½ TD²; the target network follows."""
+        """α (logsumexp_a Q(s, a) − Q(s, a_data)) + ½ TD², and scalars to log.
+
+        Also moves the target network.
+        """
         with torch.no_grad():
             for slow, fast in zip(self.target.parameters(), self.network.parameters(), strict=True):
                 slow.lerp_(fast, self.config.target_rate)
-            following = self.state_values(batch.next_states, self.target)
-            goal = batch.rewards / self.unit + following.masked_fill(batch.last, 0.0)
+            next_values = self.state_values(batch.next_states, self.target)
+            target = batch.rewards / self.unit + next_values.masked_fill(batch.last, 0.0)
         value = self.q(batch.states, batch.actions)
         others = self.compared(batch.states, self.candidates(len(value)))
-        everything = torch.cat([others, value.unsqueeze(1)], dim=1).logsumexp(-1)
-        pressed = (everything - value).mean()
-        error = 0.5 * F.mse_loss(value, goal)
-        return self.config.weight * pressed + error, {"td": error.detach()}
+        soft_maximum = torch.cat([others, value.unsqueeze(1)], dim=1).logsumexp(-1)
+        conservative = (soft_maximum - value).mean()
+        error = 0.5 * F.mse_loss(value, target)
+        return self.config.weight * conservative + error, {"td": error.detach()}
 
 
 @random_state_kept()
 def relabelled(store: EpisodeStore, config: CQLConfig, folder: Path, seed: int) -> EpisodeStore:
-    """The store with returns-to-go raised to what CQL holds possible (EDT4Rec).
+    """The store with returns-to-go raised by CQL's state values (EDT4Rec).
 
     Backwards through each episode, R_{t−1} = r_{t−1} + max(R_t, V̂(s_t)).
 
     Args:
-        store: training episodes, no copies.
-        folder: keeps the Q function; resumed from.
+        store: training episodes without edited copies.
+        config: settings of CQL.
+        folder: keeps the Q function; training resumes from it.
+        seed: seed of every random draw.
     """
     torch.manual_seed(seed)
     network = ConservativeQ(store, config)
@@ -166,27 +171,29 @@ def optimistic_returns(
 ) -> FloatArray:
     """R_t = r_t + max(R_{t+1}, V_{t+1}) within each episode, R = V = 0 after its end.
 
-    With C_t the rewards before t, R_t + C_t is the largest of V_k + C_k over k > t (V = 0 at the
-    end): a running maximum from the back, here over all episodes at once.
+    With C_t the sum of rewards before t, R_t + C_t is the maximum of V_k + C_k over k > t (V = 0
+    after the last step): a running maximum from the end, computed for all episodes at once.
 
     Example: rewards [1, 0, 0] with values [9, 2, 5] of one episode give [6, 5, 0].
 
     Args:
-        rewards: (N,) of all episodes, one after the other.
-        values: (N,) V of the state before each step.
-        lengths: (E,).
+        rewards: (N,) of all episodes, concatenated.
+        values: (N,) V of the state before each step, in reward units.
+        lengths: (E,) steps per episode.
+
+    Returns:
+        (N,) returns-to-go, in reward units.
     """
     ends = np.cumsum(lengths)
     owner = np.repeat(np.arange(len(lengths)), lengths)
     total = np.cumsum(rewards, dtype=np.float64)
-    before = total - rewards  # C_t, from the first episode on
+    before = total - rewards  # C_t plus the rewards of earlier episodes
     first = before[ends - lengths][owner]
-    # What step t can hope for from t + 1: V_{t+1} + C_{t+1}, or C at the end.
-    following = np.append(values[1:], 0.0)
-    following[ends - 1] = 0.0
-    hope = following + (total - first)
-    # Later episodes come first from the back; a step down between them keeps them apart.
-    step = float(np.ptp(hope)) + 1.0
-    apart = hope - owner * step
-    highest = np.maximum.accumulate(apart[::-1])[::-1] + owner * step
+    next_values = np.append(values[1:], 0.0)
+    next_values[ends - 1] = 0.0
+    attainable = next_values + (total - first)  # V_{t+1} + C_{t+1}
+    # An offset that grows with the episode index makes the running maximum restart per episode.
+    offset = float(np.ptp(attainable)) + 1.0
+    separated = attainable - owner * offset
+    highest = np.maximum.accumulate(separated[::-1])[::-1] + owner * offset
     return np.asarray(highest - (before - first), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""One-step greed: the action with the highest predicted reward, as if sessions had no tomorrow."""
+"""Greedy policy: the action with the highest predicted immediate reward."""
 
 from collections.abc import Mapping
 from typing import Final
@@ -16,17 +16,17 @@ from ucfrec.policies.base import PolicyConfig, SequencePolicy
 from ucfrec.policies.heads import VectorHead
 
 _CANDIDATES: Final = 512
-"""Logged action vectors to choose from."""
+"""Number of logged action vectors to choose from."""
 _PAIRS: Final = 2**15
-"""Pairs of state and action judged at once."""
+"""Pairs of state and action that are evaluated at once."""
 
 
 class CRMGreedyPolicy(SequencePolicy):
     """Chooses argmax_a E[r | s, a] of the reward model's first part (`CRMConfig.mean_first`).
 
-    Disturbances are at their prior mean, since nobody knows tomorrow's. The model is trained here,
-    by squared error on standardised rewards. Items are judged by their embeddings, all of them;
-    of vectors, actions that were logged are, as beyond them the model knows nothing.
+    Disturbances are set to their prior mean, because future ones are unknown. The model is trained
+    here, by squared error on standardised rewards. The candidates are all items, represented by
+    their embeddings, or a sample of the logged action vectors, beyond which the model has no data.
     """
 
     reward_mean: Tensor
@@ -42,7 +42,7 @@ class CRMGreedyPolicy(SequencePolicy):
         self.register_buffer("candidates", torch.zeros(count, sizes["action"]))
 
     def start_from(self, train: EpisodeStore) -> None:
-        """Take the candidates and the rewards' mean and spread."""
+        """Set the candidates, and the mean and standard deviation of the rewards."""
         episodes, steps = train.all_steps()
         rewards = train.step_values(schema.REWARD, episodes, steps)
         self.reward_mean.fill_(float(rewards.mean()))
@@ -59,7 +59,7 @@ class CRMGreedyPolicy(SequencePolicy):
         return windows.states
 
     def _errors(self, windows: Windows) -> Tensor:
-        """Squared errors (B, K) of the standardised rewards."""
+        """Squared errors (B, K) of the predicted standardised rewards."""
         states, actions = self.normalized(windows).states, windows.actions
         if not isinstance(self.head, VectorHead):
             actions = self.candidates[actions]
@@ -68,16 +68,17 @@ class CRMGreedyPolicy(SequencePolicy):
         return F.mse_loss(predicted, standard, reduction="none")
 
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
-        """Mean squared error over all steps of the windows."""
+        """Mean squared error of standardised rewards over all steps, and scalars to log."""
         value = self._errors(windows)[windows.mask].mean()
         return value, {"reward_loss": value.detach()}
 
     def action_loss(self, windows: Windows) -> Tensor:
-        """The same at each window's last step."""
+        """Mean squared error of standardised rewards over the windows' last steps."""
         return self._errors(windows)[:, -1].mean()
 
     def act(self, windows: Windows) -> Tensor:
-        """Of the last step: predicted rewards of all items (B, n_items), or vectors (B, A)."""
+        """At the last step: predicted standardised rewards of all items (B, n_items), or the best
+        action vectors (B, A)."""
         states = self.normalized(windows).states[:, -1]
         values = self._values(states)
         if isinstance(self.head, VectorHead):
@@ -85,13 +86,13 @@ class CRMGreedyPolicy(SequencePolicy):
         return values
 
     def _values(self, states: Tensor) -> Tensor:
-        """Of every candidate in every state, (B, n_candidates)."""
+        """Predicted standardised rewards (B, n_candidates) in states (B, S)."""
         first, *rest = self.model
         assert isinstance(first, nn.Linear)
-        # The first layer is linear, so that its two halves are computed once a state and once a
-        # candidate instead of once a pair.
+        # The first layer is linear: its state part is computed once per state and its action part
+        # once per candidate, instead of both once per pair.
         size = states.shape[1]
-        offered = F.linear(self.candidates, first.weight[:, size:], first.bias)
-        known, after = F.linear(states, first.weight[:, :size]), nn.Sequential(*rest)
-        chunks = torch.split(known, max(1, _PAIRS // len(offered)))
-        return torch.cat([after(rows.unsqueeze(1) + offered).squeeze(-1) for rows in chunks])
+        of_actions = F.linear(self.candidates, first.weight[:, size:], first.bias)
+        of_states, remaining = F.linear(states, first.weight[:, :size]), nn.Sequential(*rest)
+        chunks = torch.split(of_states, max(1, _PAIRS // len(of_actions)))
+        return torch.cat([remaining(rows.unsqueeze(1) + of_actions).squeeze(-1) for rows in chunks])

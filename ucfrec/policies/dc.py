@@ -1,4 +1,4 @@
-"""Decision ConvFormer (Kim et al., 2024): DT with convolutions in the place of attention."""
+"""Decision ConvFormer (Kim et al., 2024): DT with convolutions instead of attention."""
 
 from collections.abc import Mapping
 
@@ -19,20 +19,20 @@ from ucfrec.settings import settings_table
 
 @settings_table("policy")
 class DCConfig(PolicyConfig):
-    """Settings of Decision ConvFormer; defaults are those of its official code."""
+    """Settings of Decision ConvFormer; defaults are those of the official code."""
 
     layers: Layers = 3
-    """Blocks of one convolution and one perceptron."""
+    """Blocks, each a convolution and a perceptron."""
     kernel: Kernel = 6
-    """Tokens that a convolution sees, 3 a step."""
+    """Kernel size of the convolutions in tokens, 3 per step."""
 
 
 class DCPolicy(SequencePolicy):
-    """Pre-LN blocks of one depthwise convolution a modality over R_0, s_0, a_0, R_1, …
+    """Pre-LN blocks over R_0, s_0, a_0, R_1, … with one depthwise convolution per modality.
 
-    Source: https://github.com/beanie00/Decision-ConvFormer, whose padding, zeros that are embedded
-    like everything else, leaks into the first steps. Here padded tokens are zero before every
-    convolution: a padded window gives what the shorter one does.
+    Source: https://github.com/beanie00/Decision-ConvFormer. There, zero padding is embedded like
+    valid steps and affects the first steps. Here, padded tokens are set to zero before every
+    convolution, so that padding a window does not change its outputs.
     """
 
     Config = DCConfig
@@ -50,11 +50,11 @@ class DCPolicy(SequencePolicy):
                 nn.init.zeros_(module.bias)
 
     def features(self, windows: Windows) -> Tensor:
-        """(B, K, d) at the s_t tokens."""
+        """Features (B, K, d): outputs at the tokens s_t."""
         hidden = self.dropout(interleave(*self.embed(windows, self.head.embed(windows.actions))))
-        there = windows.mask.repeat_interleave(3, dim=1).unsqueeze(-1)
+        valid = windows.mask.repeat_interleave(3, dim=1).unsqueeze(-1)
         for block in self.blocks:
-            hidden = block(hidden, there)
+            hidden = block(hidden, valid)
         return self.final_norm(hidden[:, 1::3])  # type: ignore[no-any-return]
 
 
@@ -72,10 +72,10 @@ class _Block(nn.Module):
             nn.Linear(dim, 4 * dim), nn.GELU(), nn.Linear(4 * dim, dim), nn.Dropout(config.dropout)
         )
 
-    def forward(self, hidden: Tensor, there: Tensor) -> Tensor:
-        normed = self.mixer_norm(hidden).masked_fill(~there, 0.0).transpose(1, 2)  # (B, d, 3K)
+    def forward(self, hidden: Tensor, valid: Tensor) -> Tensor:
+        normed = self.mixer_norm(hidden).masked_fill(~valid, 0.0).transpose(1, 2)  # (B, d, 3K)
         padded = F.pad(normed, (self.reach, 0))
-        # The filter is the output token's modality's: with stride 3 only those outputs are made.
+        # Each modality has its own filter; stride 3 computes only the outputs of that modality.
         mixed = [conv(padded[..., i:]).transpose(1, 2) for i, conv in enumerate(self.mixers)]
         hidden = hidden + interleave(*mixed)
         return hidden + self.mlp(self.mlp_norm(hidden))  # type: ignore[no-any-return]

@@ -1,4 +1,4 @@
-"""Decision Transformer (Chen et al., 2021): the `w/o Arch` backbone and a baseline."""
+"""Decision Transformer (Chen et al., 2021): a baseline and the backbone of `w/o Arch`."""
 
 from collections.abc import Mapping
 
@@ -21,12 +21,12 @@ from ucfrec.settings import settings_table
 
 @settings_table("policy")
 class DTConfig(PolicyConfig):
-    """Settings of the Decision Transformer; defaults are those of its official code."""
+    """Settings of the Decision Transformer; defaults are those of the official code."""
 
     layers: Layers = 3
-    """Blocks of attention and a perceptron."""
+    """Transformer blocks, each attention and a perceptron."""
     heads: Heads = 1
-    """Attention heads of a block; they divide `dim`."""
+    """Attention heads per block; must divide `dim`."""
 
     def __post_init__(self) -> None:
         """Check the fields against each other."""
@@ -34,9 +34,9 @@ class DTConfig(PolicyConfig):
 
 
 class DTPolicy(SequencePolicy):
-    """GPT-2 blocks without positional embedding over R_0, s_0, a_0, R_1, …; a_t read at s_t.
+    """GPT-2 blocks without positional embedding over R_0, s_0, a_0, R_1, …; s_t predicts a_t.
 
-    Weights as in the official code, less its two unused prediction heads and unused word table.
+    The weights are those of the official code without its unused prediction heads and word table.
     """
 
     Config = DTConfig
@@ -54,11 +54,11 @@ class DTPolicy(SequencePolicy):
                 nn.init.zeros_(module.bias)
 
     def features(self, windows: Windows) -> Tensor:
-        """(B, K, d) at the s_t tokens."""
+        """Features (B, K, d): outputs at the tokens s_t."""
         return self.transform(windows)[:, 1::3]
 
     def transform(self, windows: Windows) -> Tensor:
-        """(B, 3K, d) at all tokens, R_0, s_0, a_0, R_1, …"""
+        """Outputs at all tokens R_0, s_0, a_0, R_1, …, (B, 3K, d), from normalised windows."""
         tokens = interleave(*self.embed(windows, self.head.embed(windows.actions)))
         hidden = self.dropout(tokens)
         visible = visible_tokens(windows.mask.repeat_interleave(3, dim=1))
@@ -68,7 +68,7 @@ class DTPolicy(SequencePolicy):
 
 
 class Block(nn.Module):
-    """Pre-LN causal attention and a perceptron."""
+    """Pre-LN Transformer block: causal attention and a perceptron."""
 
     def __init__(self, config: DTConfig) -> None:
         super().__init__()
@@ -82,7 +82,7 @@ class Block(nn.Module):
         self.dropout = nn.Dropout(config.dropout)
 
     def forward(self, hidden: Tensor, visible: Tensor) -> Tensor:
-        """(B, L, d) to (B, L, d); `visible` (B, 1, L, L) from `visible_tokens`."""
+        """Map (B, L, d) to (B, L, d); `visible` (B, 1, L, L) comes from `visible_tokens`."""
         batch, tokens, dim = hidden.shape
         # (B, L, 3d) -> three times (B, H, L, d/H)
         query, key, value = (
@@ -96,9 +96,12 @@ class Block(nn.Module):
         return hidden + self.dropout(self.mlp(self.mlp_norm(hidden)))  # type: ignore[no-any-return]
 
 
-def visible_tokens(there: Tensor) -> Tensor:
-    """(B, 1, L, L): tokens at or before one's own that are `there` (B, L), and always oneself."""
-    length = there.shape[1]
-    earlier = torch.ones(length, length, dtype=torch.bool, device=there.device).tril()
-    oneself = torch.eye(length, dtype=torch.bool, device=there.device)
-    return ((earlier & there.unsqueeze(1)) | oneself).unsqueeze(1)
+def visible_tokens(valid: Tensor) -> Tensor:
+    """Causal attention mask (B, 1, L, L), true where row i may attend to column j.
+
+    A token attends to itself and to earlier tokens that are `valid` (B, L), i.e. not padding.
+    """
+    length = valid.shape[1]
+    earlier = torch.ones(length, length, dtype=torch.bool, device=valid.device).tril()
+    diagonal = torch.eye(length, dtype=torch.bool, device=valid.device)
+    return ((earlier & valid.unsqueeze(1)) | diagonal).unsqueeze(1)

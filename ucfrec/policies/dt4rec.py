@@ -19,33 +19,33 @@ from ucfrec.settings import Dropout, Weight, settings_table
 
 @settings_table("policy")
 class DT4RecConfig(DTConfig):
-    """Settings of DT4Rec: those of its public code, but for the contrastive loss, which is ours."""
+    """Settings of DT4Rec; defaults are those of its public code, which has no contrastive loss."""
 
     layers: Layers = 2
-    """Blocks of attention and a perceptron."""
+    """Transformer blocks, each attention and a perceptron."""
     heads: Heads = 8
-    """Attention heads of a block; they divide `dim`."""
+    """Attention heads per block; must divide `dim`."""
     buckets: Annotated[int, Field(ge=1, le=100_000)] = 100
-    """B, buckets of the reward prompt, spread over the training returns-to-go."""
+    """Buckets of the reward prompt, spread evenly over the range of training returns-to-go."""
     recurrent_dropout: Dropout = 0.2
     """Dropout between the two layers of the recurrent encoders."""
     negatives: Annotated[int, Field(ge=1, le=1000)] = 4
-    """Other returns that every window is asked for in the contrastive loss; the paper has 8, each
-    costing a forward pass."""
+    """Wrong returns-to-go per window in the contrastive loss, each of which costs a forward pass;
+    the paper has 8."""
     contrastive_weight: Weight = 0.1
-    """Weight of the contrastive loss; 0 leaves the loss of the released code, which has none."""
+    """Weight of the contrastive loss; 0 gives the loss of the public code."""
     temperature: Annotated[float, Field(gt=0, le=1000)] = 0.07
-    """Of the contrastive loss: similarities are divided by it."""
+    """Temperature of the contrastive loss, which divides the similarities."""
 
 
 class DT4RecPolicy(DTPolicy):
     """DT whose tokens come from a reward prompt and from recurrent encoders.
 
-    Contrastive part: the features that predict a step's action must be nearer to that action when
-    asked for the true return than for others. The public code shifts the next return by 0 to 7;
-    ours takes returns of other windows of the batch, which are on the scale of the data. Actions
-    here are one item or one vector, so they are decoded by the shared heads, not by its recurrent
-    decoder, which starts from the encoding of the true action.
+    The contrastive loss draws the features of a step closer to the embedding of its action with the
+    logged return-to-go than with others. The public code shifts the next return by 0 to 7; here,
+    the others are returns of other windows of the batch, which are on the scale of the data.
+    Actions are one item or one vector, so the shared heads decode them. The recurrent decoder of
+    the public code is not used; it starts from the encoding of the true action.
     """
 
     Config = DT4RecConfig
@@ -57,14 +57,14 @@ class DT4RecPolicy(DTPolicy):
         self.embed = PromptedEmbedding(config, sizes["state"])
 
     def start_from(self, train: EpisodeStore) -> None:
-        """Spread the buckets over the training returns-to-go."""
+        """Spread the buckets evenly over the range of training returns-to-go."""
         returns = torch.from_numpy(train.step_values(schema.RETURN_TO_GO, *train.all_steps()))
         low, high = returns.min() / self.return_scale, returns.max() / self.return_scale
         centres = self.embed.embed_return.centres
         centres.copy_(low + (high - low) * torch.linspace(0, 1, len(centres)))
 
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
-        """Action loss and weighted contrastive loss over all steps."""
+        """Action loss plus weighted contrastive loss over all steps, and scalars to log."""
         config, mask = self.config, windows.mask
         normalized = self.normalized(windows)
         features = self.features(normalized)
@@ -77,22 +77,22 @@ class DT4RecPolicy(DTPolicy):
         return action_loss + config.contrastive_weight * contrast, scalars
 
     def contrastive_loss(self, windows: Windows, features: Tensor) -> Tensor:
-        """InfoNCE over the true return and those of other windows, mean over all steps.
+        """InfoNCE (nats) of the logged return against those of other windows, mean over all steps.
 
         Args:
-            windows: normalised, B of them.
-            features: (B, K, d) of them.
+            windows: B normalised windows.
+            features: (B, K, d) their features.
         """
         config, mask = self.config, windows.mask
-        wanted = self.head.embed(windows.actions)[mask]
-        scores = [F.cosine_similarity(features[mask], wanted, dim=-1)]
+        actions = self.head.embed(windows.actions)[mask]
+        scores = [F.cosine_similarity(features[mask], actions, dim=-1)]
         for _ in range(config.negatives):
             other = torch.randperm(len(mask), device=mask.device)
-            known = mask & mask[other]
-            returns = torch.where(known, windows.returns_to_go[other], windows.returns_to_go)
-            asked = self.features(replace(windows, returns_to_go=returns))
-            score = F.cosine_similarity(asked[mask], wanted, dim=-1)
-            # What was asked for is no negative of itself.
+            both_valid = mask & mask[other]
+            returns = torch.where(both_valid, windows.returns_to_go[other], windows.returns_to_go)
+            negative = self.features(replace(windows, returns_to_go=returns))
+            score = F.cosine_similarity(negative[mask], actions, dim=-1)
+            # An equal return-to-go is not a negative.
             same = (returns == windows.returns_to_go)[mask]
             scores.append(score.masked_fill(same, -torch.inf))
         logits = torch.stack(scores, dim=-1) / config.temperature  # (M, 1 + negatives)
@@ -100,7 +100,7 @@ class DT4RecPolicy(DTPolicy):
 
 
 class PromptedEmbedding(TokenEmbedding):
-    """Tokens: returns by the reward prompt, states and actions by two-layer recurrent networks."""
+    """Tokens: returns from the reward prompt, states and actions from two-layer GRUs."""
 
     embed_return: "RewardPrompt"
 
@@ -113,7 +113,7 @@ class PromptedEmbedding(TokenEmbedding):
         )
 
     def forward(self, windows: Windows, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Tokens of each modality, (B, K, d), given embedded actions (B, K, d)."""
+        """Tokens of returns-to-go, states and actions, (B, K, d) each; see `TokenEmbedding`."""
         states = _recurrent(self.states, self.embed_state(windows.states), windows.mask)
         actions = _recurrent(self.actions, actions, windows.mask)
         last = self.embed_timestep.num_embeddings - 1
@@ -123,10 +123,10 @@ class PromptedEmbedding(TokenEmbedding):
 
 
 class RewardPrompt(nn.Module):
-    """A return as a soft mixture of buckets, so that near returns have near embeddings.
+    """Embeds a return as a soft mixture of buckets: similar returns have similar embeddings.
 
-    h = LeakyReLU(w R), z = softmax(W h + h), and Σ_b z_b M_b with M_b a linear map of the centre of
-    bucket b.
+    h = LeakyReLU(w R), z = softmax(W h + h); the embedding is Σ_b z_b M_b, where M_b is a linear
+    map of the centre of bucket b.
     """
 
     centres: Tensor
@@ -139,14 +139,14 @@ class RewardPrompt(nn.Module):
         self.embed_centre = nn.Linear(1, config.dim)
 
     def forward(self, returns: Tensor) -> Tensor:
-        """(B, K, 1) to (B, K, d)."""
+        """Embed scaled returns-to-go (B, K, 1) as (B, K, d)."""
         hidden = F.leaky_relu(self.weight(returns))
         shares = (self.mix(hidden) + hidden).softmax(-1)  # (B, K, buckets)
         return shares @ self.embed_centre(self.centres.unsqueeze(-1))  # type: ignore[no-any-return]
 
 
 def _recurrent(network: nn.GRU, inputs: Tensor, mask: Tensor) -> Tensor:
-    """Run over (B, K, d) whose padding is on the left, as if it were on the right."""
+    """Outputs (B, K, d) of the network for left-padded inputs, run with the padding moved right."""
     length = mask.shape[1]
     padding = (~mask).sum(1, keepdim=True)
     places = torch.arange(length, device=mask.device)

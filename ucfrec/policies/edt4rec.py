@@ -1,4 +1,4 @@
-"""EDT4Rec (Chen et al., 2024): a stochastic head kept varied, and returns stitched by CQL."""
+"""EDT4Rec (Chen et al., 2024): a stochastic head with an entropy bound, CQL-relabelled returns."""
 
 import math
 from collections.abc import Mapping
@@ -21,29 +21,29 @@ from ucfrec.settings import Count, Weight, settings_table
 
 @settings_table("policy")
 class EDT4RecConfig(DTConfig):
-    """Settings of EDT4Rec, which has no public code: Online DT's where the paper is silent."""
+    """Settings of EDT4Rec, which has no public code; those of Online DT if the paper gives none."""
 
     context: Context = 2
-    """K, steps of history that a prediction sees."""
+    """K, steps of history that a prediction uses."""
     vector_entropy: Annotated[float, Field(ge=-1000, le=1000)] = -1.0
-    """β, lowest entropy (nats) for every dimension of a vector action."""
+    """β, lowest entropy (nats) per dimension of a vector action."""
     item_entropy: Annotated[float, Field(ge=-1000, le=1)] = 0.3
-    """The same of items, as a share of the entropy of the uniform choice; below 0 never binds."""
+    """Lowest entropy for items, as a share of the uniform distribution's; below 0 has no effect."""
     multiplier: Annotated[float, Field(gt=0, le=1e6)] = 0.1
-    """λ of the entropy constraint before the first step."""
+    """Initial value of λ, the multiplier of the entropy constraint."""
     relabel: bool = True
-    """Raise returns-to-go to what CQL says was within reach."""
+    """Whether returns-to-go are raised by CQL's state values."""
     cql_steps: Count = 2000
-    """Updates of CQL's network, where returns-to-go are raised."""
+    """Updates of CQL's network, if `relabel` is true."""
     cql_weight: Weight = 1.0
-    """α, how strongly CQL presses unseen actions down."""
+    """α, weight of CQL's conservative term, which lowers the values of unlogged actions."""
 
 
 class EDT4RecPolicy(DTPolicy):
-    """DT with a stochastic head under max −J − λH and λ ≥ 0, on relabelled returns.
+    """DT with a stochastic head and a lower bound on its entropy H, on relabelled returns.
 
-    The policy minimises the negative log-likelihood subject to an entropy of at least β; λ descends
-    λ(H − β) in the same step instead of alternating with it. It acts by its mode.
+    The policy minimises the negative log-likelihood subject to H ≥ β. The multiplier λ ≥ 0 descends
+    λ(H − β) in the same update instead of an alternating one. Actions are the distribution's mode.
     """
 
     Config = EDT4RecConfig
@@ -62,7 +62,7 @@ class EDT4RecPolicy(DTPolicy):
     def training_view(
         cls, train: EpisodeStore, config: PolicyConfig, folder: Path, seed: int
     ) -> EpisodeStore:
-        """The episodes with relabelled returns-to-go."""
+        """The episodes with returns-to-go raised by CQL; unchanged if `relabel` is false."""
         assert isinstance(config, EDT4RecConfig)
         if not config.relabel:
             return train
@@ -70,7 +70,7 @@ class EDT4RecPolicy(DTPolicy):
         return relabelled(train, cql, folder, seed)
 
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
-        """Negative log-likelihood and the two sides of the entropy constraint."""
+        """Negative log-likelihood (nats) plus the entropy constraint's terms for λ and policy."""
         normalized = self.normalized(_consistent(windows))
         features = self.features(normalized)[windows.mask]
         action_loss = self.head.loss(features, windows.actions[windows.mask])
@@ -85,24 +85,21 @@ class EDT4RecPolicy(DTPolicy):
 
 
 class GaussianHead(VectorHead):
-    """A diagonal Gaussian about the deterministic head's action, in shares of the action's range.
-
-    The loss is its negative log-likelihood a step.
-    """
+    """A diagonal Gaussian whose mean is the action of `VectorHead`, in units of `scale`."""
 
     def __init__(self, dim: int, size: int) -> None:
         super().__init__(dim, size)
         self.log_deviation = nn.Linear(dim, size)
 
     def deviations(self, features: Tensor) -> Tensor:
-        """Log standard deviations, (..., d) to (..., A), kept where squares stay finite."""
+        """Log standard deviations (..., A) from features (..., d), clamped to [−5, 2]."""
         return self.log_deviation(features).clamp(-5.0, 2.0)  # type: ignore[no-any-return]
 
     def loss(self, features: Tensor, actions: Tensor) -> Tensor:
-        """Mean negative log-likelihood over M steps: features (M, d), actions (M, A)."""
+        """Mean negative log-likelihood (nats) over M steps: features (M, d), actions (M, A)."""
         log_deviation = self.deviations(features)
-        miss = (actions - self.predict(features)) / self.scale / log_deviation.exp()
-        nats = 0.5 * miss.square() + log_deviation + 0.5 * math.log(2 * math.pi)
+        error = (actions - self.predict(features)) / self.scale / log_deviation.exp()
+        nats = 0.5 * error.square() + log_deviation + 0.5 * math.log(2 * math.pi)
         return nats.sum(-1).mean()
 
 
@@ -116,10 +113,10 @@ def _entropy(head: nn.Module, features: Tensor) -> Tensor:
 
 
 def _consistent(windows: Windows) -> Windows:
-    """Returns-to-go that fall by the reward of each step, down to the last step's own.
+    """The windows with returns-to-go that decrease by each step's reward to the last step's value.
 
-    Relabelled returns of neighbouring steps need not differ by the reward between them; when
-    acting, they always do.
+    Relabelled returns-to-go of adjacent steps need not differ by the reward between them; those
+    used in acting always do.
     """
     rewards = windows.rewards[:, :-1].flip(1).cumsum(1).flip(1)  # r_t + … + r_{last − 1}
     last = windows.returns_to_go[:, -1:]

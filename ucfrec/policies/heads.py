@@ -1,4 +1,4 @@
-"""Where actions enter and leave a policy: vectors, or items of a catalogue."""
+"""Action heads, which embed and predict actions: vectors, or items of a catalogue."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,8 +8,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 SAMPLED_SOFTMAX_ABOVE = 100_000
-"""Items beyond which the loss samples the softmax's denominator."""
+"""Number of items above which the loss samples the denominator of the softmax."""
 SAMPLED_NEGATIVES = 4096
+"""Items sampled for it per batch."""
 
 
 class VectorHead(nn.Module):
@@ -24,24 +25,24 @@ class VectorHead(nn.Module):
         self.out = nn.Linear(dim, size)
 
     def embed(self, actions: Tensor) -> Tensor:
-        """(B, K, A) to (B, K, d)."""
+        """Embed actions (B, K, A) as (B, K, d)."""
         return self.embed_action(actions / self.scale)  # type: ignore[no-any-return]
 
     def predict(self, features: Tensor) -> Tensor:
-        """(..., d) to actions (..., A), each within ± `scale`, the largest value in the logs."""
+        """Actions (..., A) from features (..., d), within ± `scale`, the logs' largest value."""
         return torch.tanh(self.out(features)) * self.scale
 
     def loss(self, features: Tensor, actions: Tensor) -> Tensor:
-        """Mean squared error over M steps: features (M, d), actions (M, A)."""
+        """Mean squared error over M steps in units of `scale`: features (M, d), actions (M, A)."""
         return F.mse_loss(self.predict(features) / self.scale, actions / self.scale)
 
 
 class ItemHead(nn.Module):
     """Items: dot products with item vectors, trained by negative log-likelihood (Algorithm 6).
 
-    An item's vector is a projection of its fixed embedding, which cold items have too, plus a
-    correction learned for the item itself. The bias starts at the log of the item's share of the
-    training steps, so that an untrained policy recommends what is popular.
+    An item's vector is a learned projection of its fixed embedding, which items without training
+    steps have too, plus a correction learned per item. The bias is initialised to the log of the
+    item's share of the training steps, so that an untrained policy recommends popular items.
     """
 
     embeddings: Tensor
@@ -56,37 +57,38 @@ class ItemHead(nn.Module):
         self.bias = nn.Parameter(torch.zeros(n_items))
 
     def start_from(self, embeddings: Tensor, counts: Tensor) -> None:
-        """Take over the embeddings (n_items, D) and training counts (n_items,) of a store."""
+        """Set the embeddings (n_items, D) and, from training counts (n_items,), the bias."""
         self.embeddings.copy_(embeddings)
         self.counts.copy_(counts + 1)
         with torch.no_grad():
             self.bias.copy_(torch.log(self.counts / self.counts.sum()))
 
     def vectors(self, items: Tensor) -> Tensor:
-        """(...,) int64 items to (..., d)."""
+        """Vectors (..., d) of int64 items (...,)."""
         return self.project(self.embeddings[items]) + self.correction[items]  # type: ignore[no-any-return]
 
     def embed(self, actions: Tensor) -> Tensor:
-        """(B, K) int64 to (B, K, d)."""
+        """Embed int64 items (B, K) as (B, K, d)."""
         return self.vectors(actions)
 
     def predict(self, features: Tensor) -> Tensor:
-        """(..., d) to logits over all items (..., n_items)."""
+        """Logits over all items (..., n_items) from features (..., d)."""
         vectors = self.project(self.embeddings) + self.correction
         logits: Tensor = features @ vectors.T / features.shape[-1] ** 0.5 + self.bias
         return logits
 
     def loss(self, features: Tensor, actions: Tensor) -> Tensor:
-        """Mean negative log-likelihood over M steps: features (M, d), actions (M,)."""
+        """Mean negative log-likelihood (nats) over M steps: features (M, d), actions (M,)."""
         if len(self.counts) <= SAMPLED_SOFTMAX_ABOVE:
             return F.cross_entropy(self.predict(features), actions)
         return self.sampled_loss(features, actions, SAMPLED_NEGATIVES)
 
     def sampled_loss(self, features: Tensor, actions: Tensor, negatives: int) -> Tensor:
-        """The same over a sampled denominator, corrected by log Q.
+        """Negative log-likelihood (nats) with `negatives` sampled items in the denominator.
 
-        Negatives come from the smoothed popularity Q; subtracting log Q from every logit keeps the
-        estimate of the full softmax consistent (Bengio & Senécal, 2008).
+        Negatives are drawn from the smoothed popularity Q; subtracting their log expected counts
+        from their logits keeps the estimate of the full softmax consistent (Bengio & Senécal,
+        2008). Features are (M, d), actions (M,).
         """
         share = self.counts / self.counts.sum()
         drawn = torch.multinomial(share, negatives, replacement=True)
@@ -105,7 +107,7 @@ Head = VectorHead | ItemHead
 
 
 def head_from(sizes: Mapping[str, Any], dim: int) -> Head:
-    """The head for a store's kind of action."""
+    """The head for a store's actions: items if `sizes["items"]` is above 0, otherwise vectors."""
     if sizes["items"]:
         return ItemHead(dim, sizes["items"], sizes["action"])
     return VectorHead(dim, sizes["action"])

@@ -22,17 +22,17 @@ _ROWS = 1024
 
 @settings_table("policy")
 class ItemKNNConfig(PolicyConfig):
-    """Settings of the nearest neighbours; of the general ones, only `context` matters."""
+    """Settings of item-kNN; of the general policy settings, only `context` has an effect."""
 
     neighbors: Annotated[int, Field(ge=1, le=1_000_000)] = 100
-    """Items with the highest cosines that count for each item; all, of a smaller catalogue."""
+    """Neighbours of each item, those with the highest cosines; at most the number of items."""
 
 
 class ItemKNNPolicy(SequencePolicy):
-    """Scores items by their cosine to what the session so far liked, weighted by reward.
+    """Scores items by their cosines to the session's earlier items, weighted by their rewards.
 
-    Cosines are of the columns of the session × item matrix of rewards above the lowest one. Only a
-    temperature and each item's bias are learned by gradient; states and returns do not enter.
+    Cosines are between columns of the session × item matrix of rewards minus the lowest reward.
+    Only a temperature and a bias per item are learned by gradient; states and returns are not used.
     """
 
     Config = ItemKNNConfig
@@ -44,7 +44,9 @@ class ItemKNNPolicy(SequencePolicy):
     def __init__(self, config: ItemKNNConfig, sizes: Mapping[str, int]) -> None:
         super().__init__(config, sizes)
         if not isinstance(self.head, ItemHead):
-            raise InputError("item-knn recommends items; this store's actions are vectors")
+            raise InputError(
+                "item-knn recommends items; this store's actions are vectors; use another policy"
+            )
         shape = (sizes["items"], min(config.neighbors, sizes["items"]))
         self.register_buffer("neighbors", torch.zeros(shape, dtype=torch.int64))
         self.register_buffer("cosines", torch.zeros(shape))
@@ -52,8 +54,9 @@ class ItemKNNPolicy(SequencePolicy):
         self.temperature = nn.Parameter(torch.ones(()))
 
     def start_from(self, train: EpisodeStore) -> None:
-        """Find the neighbours of every item, itself among them."""
-        from scipy import sparse  # reading a trained policy does without
+        """Find the neighbours of every item; an item is a neighbour of itself."""
+        # Imported here because loading a trained policy does not need scipy.
+        from scipy import sparse
 
         episodes, steps = train.all_steps()
         items = train.step_values(schema.ITEM, episodes, steps)
@@ -69,15 +72,15 @@ class ItemKNNPolicy(SequencePolicy):
             self.cosines[rows], self.neighbors[rows] = cosines.topk(self.cosines.shape[1])
 
     def features(self, windows: Windows) -> Tensor:
-        """(B, K, n_items) summed cosines to the items before, weighted by reward.
+        """Cosines to the earlier items, summed with their rewards as weights, (B, K, n_items).
 
-        Takes windows as they are: rewards are not normalised.
+        Windows must not be normalised.
         """
         weights = (windows.rewards - self.reward_low) * windows.mask
-        given = self.cosines[windows.actions] * weights.unsqueeze(-1)  # (B, K, neighbours)
-        scores = given.new_zeros(*windows.mask.shape, len(self.cosines))
-        scores.scatter_add_(-1, self.neighbors[windows.actions], given)
-        # Row t sums the steps before it; its own is not even subtracted, which would round.
+        weighted = self.cosines[windows.actions] * weights.unsqueeze(-1)  # (B, K, neighbours)
+        scores = weighted.new_zeros(*windows.mask.shape, len(self.cosines))
+        scores.scatter_add_(-1, self.neighbors[windows.actions], weighted)
+        # Row t sums earlier steps only. Subtracting step t from its sum would round.
         return F.pad(scores.cumsum(1)[:, :-1], (0, 0, 1, 0))
 
     def _logits(self, windows: Windows) -> Tensor:
@@ -85,14 +88,14 @@ class ItemKNNPolicy(SequencePolicy):
         return self.temperature * self.features(windows) + self.head.bias
 
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
-        """Negative log-likelihood of the logged items."""
+        """Mean negative log-likelihood (nats) of the logged items, and scalars to log."""
         value = F.cross_entropy(self._logits(windows)[windows.mask], windows.actions[windows.mask])
         return value, {"action_loss": value.detach()}
 
     def action_loss(self, windows: Windows) -> Tensor:
-        """The same at each window's last step."""
+        """Mean negative log-likelihood (nats) over the windows' last steps."""
         return F.cross_entropy(self.act(windows), windows.actions[:, -1])
 
     def act(self, windows: Windows) -> Tensor:
-        """Logits over items at the last step (B, n_items)."""
+        """Logits over items at the last step, (B, n_items)."""
         return self._logits(windows)[:, -1]

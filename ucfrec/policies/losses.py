@@ -1,14 +1,14 @@
-"""Means that ignore padding, and the supervised-attention (mask) loss."""
+"""A mean that ignores padding, and the supervised-attention (mask) loss."""
 
 import torch
 from torch import Tensor
 
 EPSILON = 1e-8
-"""Inside the logarithm of Eq. 5 (Table 7)."""
+"""Added inside the logarithm of Eq. 5 (Table 7)."""
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    """Mean of `values` where `mask` is true; what stands elsewhere, NaN even, has no part in it."""
+    """Mean of `values` where `mask` is true; other values are ignored, even NaN."""
     return values[mask].mean()
 
 
@@ -20,7 +20,10 @@ def parent_targets(mask: Tensor, window: int, decay: float, previous_action: flo
     normalised to sum to one.
 
     Args:
-        mask: (B, K) bool, true at steps of the episode.
+        mask: (B, K) bool, true at steps of the episode, false at padding.
+        window: number of earlier states that are parents.
+        decay: weight of the state k steps earlier is decay^k.
+        previous_action: weight of a_{t−1}.
 
     Returns:
         (B, K, 3K); rows of padded steps are zero.
@@ -39,7 +42,7 @@ def parent_targets(mask: Tensor, window: int, decay: float, previous_action: flo
 
 
 def mask_loss(attention: Tensor, targets: Tensor, mask: Tensor) -> Tensor:
-    """Cross-entropy of attention against the causal parents (Eq. 5), mean over heads and steps.
+    """Mean cross-entropy (nats) of attention against the causal parents (Eq. 5).
 
     Args:
         attention: (B, H, K, 3K) probabilities after the softmax, before dropout.

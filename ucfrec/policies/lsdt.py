@@ -1,4 +1,4 @@
-"""Long-Short Decision Transformer (Wang et al., 2025): attention beside dynamic convolution."""
+"""Long-Short Decision Transformer (Wang et al., 2025): attention and dynamic convolution."""
 
 from collections.abc import Mapping
 from typing import Annotated
@@ -24,24 +24,24 @@ from ucfrec.settings import Dropout, require, settings_table
 
 @settings_table("policy")
 class LSDTConfig(PolicyConfig):
-    """Settings of LSDT; defaults are those of its official code."""
+    """Settings of LSDT; defaults are those of the official code."""
 
     dropout: Dropout = 0.25
-    """Dropout behind the mixed branches and the perceptron."""
+    """Dropout after the mixed branches and the perceptron."""
     max_timestep: Timesteps = 4096
-    """Rows of the timestep embedding; later steps share the last. 1 tells the model no time."""
+    """Rows of the timestep embedding; later steps share the last row. 1 hides the time."""
     layers: Layers = 3
-    """Blocks of attention beside convolution."""
+    """Blocks, each attention and convolution in parallel, then a perceptron."""
     heads: Heads = 2
-    """Attention heads of a block; they divide half of `dim`."""
+    """Attention heads per block; must divide half of `dim`."""
     attention_dropout: Dropout = 0.1
-    """Dropout behind attention."""
+    """Dropout after attention."""
     kernel_dropout: Dropout = 0.2
-    """Dropout of the kernels that tokens make for themselves."""
+    """Dropout of the kernels, which are computed from each token."""
     kernel: Kernel = 6
-    """Tokens that a convolution sees, its own the last."""
+    """Kernel size of the convolutions in tokens; the last is the output's own token."""
     kernel_groups: Annotated[int, Field(ge=1, le=8192)] = 16
-    """Groups of neighbouring channels that share a kernel; they divide half of `dim`."""
+    """Groups of adjacent channels that share a kernel; must divide half of `dim`."""
 
     def __post_init__(self) -> None:
         """Check the fields against each other."""
@@ -56,11 +56,12 @@ class LSDTConfig(PolicyConfig):
 
 
 class LSDTPolicy(SequencePolicy):
-    """Post-LN blocks: half of the channels attend (long), half are convolved (short), one gate.
+    """Post-LN blocks: attention on half of the channels (long), convolution on the rest (short).
 
-    Source: https://github.com/WangJinCheng1998/LONG-SHORT-DECISION-TRANSFORMER, less its unused
-    return and state heads and the five of its eleven taps that its causal mask switches off.
-    Padding is hidden from attention and zero where it is convolved.
+    A gate weights both halves. Source:
+    https://github.com/WangJinCheng1998/LONG-SHORT-DECISION-TRANSFORMER, without its unused return
+    and state heads and without the five of its eleven taps that its causal mask sets to zero.
+    Padding is masked in attention and set to zero before convolutions.
     """
 
     Config = LSDTConfig
@@ -76,11 +77,11 @@ class LSDTPolicy(SequencePolicy):
                 nn.init.zeros_(module.bias)
 
     def features(self, windows: Windows) -> Tensor:
-        """(B, K, d) at the s_t tokens."""
+        """Features (B, K, d): outputs at the tokens s_t."""
         hidden = interleave(*self.embed(windows, self.head.embed(windows.actions)))
-        there = windows.mask.repeat_interleave(3, dim=1)
+        valid = windows.mask.repeat_interleave(3, dim=1)
         for block in self.blocks:
-            hidden = block(hidden, there)
+            hidden = block(hidden, valid)
         return hidden[:, 1::3]
 
 
@@ -99,9 +100,9 @@ class _Block(nn.Module):
         self.mlp_norm = nn.LayerNorm(dim)
         self.dropout = nn.Dropout(config.dropout)
 
-    def forward(self, hidden: Tensor, there: Tensor) -> Tensor:
+    def forward(self, hidden: Tensor, valid: Tensor) -> Tensor:
         long, short = hidden.chunk(2, dim=-1)
-        both = torch.cat([self.long(long, there), self.short(short, there)], dim=-1)
+        both = torch.cat([self.long(long, valid), self.short(short, valid)], dim=-1)
         squeezed = F.relu(self.squeeze(both))
         gate = torch.cat([layer(squeezed) for layer in self.gates], dim=-1).softmax(-1)
         hidden = self.norm(hidden + self.dropout(self.out(gate * both)))
@@ -115,7 +116,7 @@ class _Attention(nn.Module):
         self.query_key_value = nn.Linear(config.dim // 2, 3 * (config.dim // 2))
         self.dropout = nn.Dropout(config.attention_dropout)
 
-    def forward(self, hidden: Tensor, there: Tensor) -> Tensor:
+    def forward(self, hidden: Tensor, valid: Tensor) -> Tensor:
         batch, tokens, dim = hidden.shape
         # (B, L, 3c) -> three times (B, H, L, c/H)
         query, key, value = (
@@ -123,14 +124,14 @@ class _Attention(nn.Module):
             for x in self.query_key_value(hidden).chunk(3, dim=-1)
         )
         earlier = torch.ones(tokens, tokens, dtype=torch.bool, device=hidden.device).tril()
-        oneself = torch.eye(tokens, dtype=torch.bool, device=hidden.device)
-        visible = ((earlier & there.unsqueeze(1)) | oneself).unsqueeze(1)
+        diagonal = torch.eye(tokens, dtype=torch.bool, device=hidden.device)
+        visible = ((earlier & valid.unsqueeze(1)) | diagonal).unsqueeze(1)
         mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=visible)
         return self.dropout(mixed.transpose(1, 2).reshape(hidden.shape))  # type: ignore[no-any-return]
 
 
 class _DynamicConvolution(nn.Module):
-    """A causal convolution whose kernel each token makes for itself (Wu et al., 2019)."""
+    """A causal convolution whose kernels are computed from each token (Wu et al., 2019)."""
 
     def __init__(self, config: LSDTConfig) -> None:
         super().__init__()
@@ -142,12 +143,12 @@ class _DynamicConvolution(nn.Module):
         self.out = nn.Linear(dim, dim)
         self.dropout = nn.Dropout(config.kernel_dropout)
 
-    def forward(self, hidden: Tensor, there: Tensor) -> Tensor:
+    def forward(self, hidden: Tensor, valid: Tensor) -> Tensor:
         batch, tokens, dim = hidden.shape
-        values = F.glu(self.gated(hidden)).masked_fill(~there.unsqueeze(-1), 0.0)
+        values = F.glu(self.gated(hidden)).masked_fill(~valid.unsqueeze(-1), 0.0)
         taps = self.dropout(self.taps(values)).view(batch, tokens, self.groups, 1, self.kernel)
         # (B, 5 + L, c) -> (B, L, c, 6) -> (B, L, groups, c/groups, 6)
-        seen = F.pad(values, (0, 0, self.kernel - 1, 0)).unfold(1, self.kernel, 1)
-        seen = seen.reshape(batch, tokens, self.groups, dim // self.groups, self.kernel)
-        mixed = (seen * taps.softmax(-1)).sum(-1).view(batch, tokens, dim)
+        local = F.pad(values, (0, 0, self.kernel - 1, 0)).unfold(1, self.kernel, 1)
+        local = local.reshape(batch, tokens, self.groups, dim // self.groups, self.kernel)
+        mixed = (local * taps.softmax(-1)).sum(-1).view(batch, tokens, dim)
         return self.out(mixed + self.bias)  # type: ignore[no-any-return]

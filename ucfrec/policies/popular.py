@@ -1,4 +1,4 @@
-"""The same answer for everybody: the most popular item, or the mean logged action."""
+"""A constant policy: the most popular item, or the mean logged action."""
 
 from torch import Tensor
 
@@ -7,7 +7,7 @@ from ucfrec.policies.base import SequencePolicy
 
 
 class PopularPolicy(SequencePolicy):
-    """A floor that knows nobody: the head sees nothing, so that only its biases learn."""
+    """Baseline that ignores its inputs: only the biases of the head are learned."""
 
     def features(self, windows: Windows) -> Tensor:
         """(B, K, d) of zeros."""

@@ -1,7 +1,7 @@
-"""Learners by the name that `--policy` takes; each is imported once it is asked for.
+"""Learners by their `--policy` names; a learner is imported when it is first used.
 
-Anyone's own learner joins them through the entry-point group `ucfrec.policies`, as a short name
-that points at a class derived from `ucfrec.policies.base.SequencePolicy`::
+Other packages add learners through the entry-point group `ucfrec.policies`, which maps a name to
+a class derived from `ucfrec.policies.base.SequencePolicy`::
 
     [project.entry-points."ucfrec.policies"]
     mine = "my_package.policy:MyPolicy"
@@ -30,23 +30,23 @@ BUILT_IN: Final = {
     "item-knn": "item_knn:ItemKNNPolicy",
     "crm-greedy": "crm_greedy:CRMGreedyPolicy",
 }
-"""Module of `ucfrec.policies`, and class, by name."""
+"""Module in `ucfrec.policies` and class of each built-in learner, by name."""
 
 
 def policy_names() -> tuple[str, ...]:
-    """Every learner: those of ucfrec, then those that are installed beside it."""
+    """Names of all learners: the built-in ones, then those of installed plugins."""
     return (*BUILT_IN, *(name for name in plugin_names("policies") if name not in BUILT_IN))
 
 
 def policy_class(name: str) -> "type[SequencePolicy]":
-    """The learner called `name`. An installed one does not replace ucfrec's of the same name.
+    """The class of the learner `name`; built-in learners take precedence over plugins.
 
     Raises:
-        InputError: there is none, it cannot be imported, or it is no `SequencePolicy` whose
-            `Config` is a table of settings.
+        InputError: no learner has this name, it cannot be imported, or it is not a `SequencePolicy`
+            whose `Config` is a table of settings.
     """
     if name not in policy_names():
-        raise InputError(f"no policy is called {name!r}; there are {', '.join(policy_names())}")
+        raise InputError(f"no policy is called {name!r}; choose from {', '.join(policy_names())}")
     if name in BUILT_IN:
         module, _, title = BUILT_IN[name].partition(":")
         built_in: type[SequencePolicy] = getattr(import_module(f"ucfrec.policies.{module}"), title)
@@ -54,18 +54,18 @@ def policy_class(name: str) -> "type[SequencePolicy]":
     return _checked(name, load_plugin("policies", name))
 
 
-def _checked(name: str, found: object) -> "type[SequencePolicy]":
+def _checked(name: str, learner: object) -> "type[SequencePolicy]":
     from ucfrec.policies.base import PolicyConfig, SequencePolicy
     from ucfrec.settings import is_table
 
-    if not (isinstance(found, type) and issubclass(found, SequencePolicy)):
+    if not (isinstance(learner, type) and issubclass(learner, SequencePolicy)):
         raise InputError(
-            f"the policy {name!r} is installed as {found!r}, which is no class derived from "
+            f"the policy {name!r} is installed as {learner!r}, which is not a class derived from "
             "ucfrec.policies.base.SequencePolicy"
         )
-    if not (issubclass(found.Config, PolicyConfig) and is_table(found.Config)):
+    if not (issubclass(learner.Config, PolicyConfig) and is_table(learner.Config)):
         raise InputError(
-            f"the policy {name!r} is configured by {found.Config!r}, which is not derived from "
+            f"the policy {name!r} is configured by {learner.Config!r}, which is not derived from "
             "ucfrec.policies.base.PolicyConfig under @ucfrec.settings.settings_table"
         )
-    return found
+    return learner

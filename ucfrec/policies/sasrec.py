@@ -1,4 +1,4 @@
-"""SASRec (Kang & McAuley, 2018): the next action from the actions before, whatever they earned."""
+"""SASRec (Kang & McAuley, 2018): predicts the next action from the earlier actions alone."""
 
 from collections.abc import Mapping
 
@@ -12,17 +12,17 @@ from ucfrec.settings import settings_table
 
 @settings_table("policy")
 class SASRecConfig(DTConfig):
-    """Settings of SASRec: two blocks of one head, as published."""
+    """Settings of SASRec; two blocks with one head, as in the paper."""
 
     layers: Layers = 2
-    """Blocks of attention and a perceptron."""
+    """Transformer blocks, each attention and a perceptron."""
 
 
 class SASRecPolicy(SequencePolicy):
-    """Causal self-attention over a_0, …, a_{t−1}; neither states nor returns enter.
+    """Causal self-attention over a_0, …, a_{t−1}; states, rewards and returns are not used.
 
-    Positions are steps of the episode. The loss is the shared head's softmax over all items (or a
-    sample of them, corrected), where the published one contrasts with a single random item.
+    Positions are steps of the episode. The loss is the action head's softmax over all items, or a
+    sampled one; the paper's loss contrasts the item with a single random item.
     """
 
     Config = SASRecConfig
@@ -36,9 +36,9 @@ class SASRecPolicy(SequencePolicy):
         self.final_norm = nn.LayerNorm(config.dim)
 
     def features(self, windows: Windows) -> Tensor:
-        """(B, K, d); row t sees the actions before t."""
+        """Features (B, K, d); row t depends on the actions before t."""
         before = self.head.embed(windows.actions).roll(1, dims=1)
-        # The first step of a window has no action before it that the window holds.
+        # The first step of a window has no earlier action in the window.
         known = windows.mask & windows.mask.roll(1, dims=1)
         known[:, 0] = False
         last = self.embed_timestep.num_embeddings - 1

@@ -24,22 +24,25 @@ from ucfrec.settings import Share, Weight, settings_table
 
 @settings_table("policy")
 class UCFConfig(PolicyConfig):
-    """Settings of UCF's hybrid policy; defaults are the paper's Tables 6 to 8, but for λ and the
-    weight of a_{t−1}, which were chosen on validation episodes (`benchmarks/LOG.md`)."""
+    """Settings of UCF's hybrid policy.
+
+    Defaults are those of the paper's Tables 6 to 8, except λ and the weight of a_{t−1}, which were
+    chosen on validation episodes (`benchmarks/LOG.md`).
+    """
 
     conv_blocks: Layers = 2
     """Convolution blocks of each stream (returns-to-go, states, actions)."""
     heads: Heads = 2
-    """Attention heads; they divide `dim`."""
+    """Attention heads; must divide `dim`."""
     lambda_mask: Weight = 0.0
     """λ, weight of the mask loss, which supervises attention. Every value above 0 lowered the
-    return in both worlds where it was swept."""
+    return in both simulated worlds in which it was varied."""
     parent_window: Annotated[int, Field(ge=0, le=4096)] = 2
-    """w, how many earlier states count as parents of an action, for the mask loss."""
+    """w, number of earlier states that are parents of an action in the mask loss."""
     parent_decay: Share = 0.6
-    """Weight of s_{t−k} as a parent is this to the power k."""
+    """Weight of the parent s_{t−k} is this to the power k."""
     parent_action: Weight = 0.3
-    """Weight of a_{t−1} as a parent."""
+    """Weight of the parent a_{t−1}."""
 
     def __post_init__(self) -> None:
         """Check the fields against each other."""
@@ -47,10 +50,10 @@ class UCFConfig(PolicyConfig):
 
 
 class UCFPolicy(SequencePolicy):
-    """One convolution stream a modality, one attention block supervised towards causal parents.
+    """One convolution stream per modality, then an attention block supervised by causal parents.
 
-    Sources: section 3.2, Appendix G.3, Tables 6 to 8. Only the rows that predict an action (query
-    s_t) pass through the attention block; keys and values are all 3K tokens.
+    Sources: section 3.2, Appendix G.3, Tables 6 to 8. The queries of the attention block are the
+    tokens s_t, which predict the actions; keys and values are all 3K tokens.
     """
 
     Config = UCFConfig
@@ -74,18 +77,18 @@ class UCFPolicy(SequencePolicy):
         self.final_norm = nn.LayerNorm(dim)
 
     def features(self, windows: Windows) -> Tensor:
-        """(B, K, d) at the s_t tokens."""
+        """Features (B, K, d): outputs at the tokens s_t."""
         return self.attend(windows)[0]
 
     def attend(self, windows: Windows) -> tuple[Tensor, Tensor]:
-        """Features (B, K, d), and the attention (B, H, K, 3K) that they came from."""
+        """Features (B, K, d) and attention probabilities (B, H, K, 3K), from normalised windows."""
         tokens = self.embed(windows, self.head.embed(windows.actions))
         streams = (self.return_stream, self.state_stream, self.action_stream)
         returns, states, actions = (
             stream(token, windows.mask) for stream, token in zip(streams, tokens, strict=True)
         )
-        # Concatenating what step t has revealed so far ([R, 0, 0], [R, s, 0], [R, s, a]) and one
-        # linear layer is a running sum of the layer's three blocks.
+        # A linear layer on the concatenation of the modalities known so far ([R, 0, 0], [R, s, 0],
+        # [R, s, a]) equals a running sum of the products with the three blocks of its weight.
         of_return, of_state, of_action = self.fuse.weight.chunk(3, dim=1)
         revealed = F.linear(returns, of_return, self.fuse.bias)
         fused_returns = self.fuse_norm(returns + revealed)
@@ -101,7 +104,7 @@ class UCFPolicy(SequencePolicy):
         return self.final_norm(hidden), attention
 
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
-        """L_action + λ L_mask (Eq. 5, Algorithm 6)."""
+        """L_action + λ L_mask over all steps (Eq. 5, Algorithm 6), and scalars to log."""
         config, mask = self.config, windows.mask
         features, attention = self.attend(self.normalized(windows))
         action_loss = self.head.loss(features[mask], windows.actions[mask])
@@ -125,7 +128,7 @@ class ConvStream(nn.Module):
         self.blocks = nn.ModuleList(_ConvBlock(config) for _ in range(config.conv_blocks))
 
     def forward(self, tokens: Tensor, mask: Tensor) -> Tensor:
-        """(B, K, d) to (B, K, d); padded steps are zeroed before every convolution."""
+        """Map (B, K, d) to (B, K, d); padded steps are set to zero before every convolution."""
         keep = mask.unsqueeze(-1)
         for block in self.blocks:
             tokens = block(tokens.masked_fill(~keep, 0.0))
@@ -142,13 +145,13 @@ class _ConvBlock(nn.Module):
         self.norm = nn.LayerNorm(dim)
 
     def forward(self, tokens: Tensor) -> Tensor:
-        # (B, K, d) -> (B, d, 2 + K) -> (B, K, d): the output at t sees t − 2 to t.
+        # (B, K, d) -> (B, d, 2 + K) -> (B, K, d): the output at t depends on t − 2 to t.
         local = self.depthwise(F.pad(tokens.transpose(1, 2), (2, 0))).transpose(1, 2)
         return self.norm(tokens + self.dropout(F.gelu(self.pointwise(local))))  # type: ignore[no-any-return]
 
 
 class SupervisedAttention(nn.Module):
-    """Multi-head attention from the s_t tokens to all tokens revealed by then (Table 7)."""
+    """Multi-head attention from the tokens s_t to all tokens up to s_t (Table 7)."""
 
     def __init__(self, config: UCFConfig) -> None:
         super().__init__()
@@ -160,11 +163,16 @@ class SupervisedAttention(nn.Module):
         self.dropout = nn.Dropout(config.dropout)
 
     def forward(self, states: Tensor, tokens: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Attend from `states` (B, K, d) over `tokens` (B, 3K, d).
+        """Attend from `states` (B, K, d) to `tokens` (B, 3K, d).
+
+        Args:
+            states: the queries.
+            tokens: keys and values, in the order R_0, s_0, a_0, R_1, …
+            mask: (B, K) bool, false at padding.
 
         Returns:
-            Output (B, K, d), and probabilities (B, H, K, 3K) before dropout; each row sums to one,
-            and a padded row looks at itself only.
+            Output (B, K, d), and probabilities (B, H, K, 3K) before dropout. Each row sums to one;
+            padded tokens get zero probability, except from their own row.
         """
         batch, length, dim = states.shape
 
@@ -181,9 +189,9 @@ class SupervisedAttention(nn.Module):
 
 
 def _visible(mask: Tensor) -> Tensor:
-    """(B, K, 3K): which tokens the row of s_t may see, those up to s_t that are not padding."""
+    """(B, K, 3K): true where s_t may attend to a token: itself and valid tokens before it."""
     length = mask.shape[1]
     row = 3 * torch.arange(length, device=mask.device).unsqueeze(1) + 1
     token = torch.arange(3 * length, device=mask.device)
-    there = mask.repeat_interleave(3, dim=1).unsqueeze(1)
-    return (token <= row) & there | (token == row)
+    valid = mask.repeat_interleave(3, dim=1).unsqueeze(1)
+    return (token <= row) & valid | (token == row)

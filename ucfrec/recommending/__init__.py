@@ -1,1 +1,1 @@
-"""The next items for users of a log."""
+"""Recommending next items to the users of a log."""

@@ -1,4 +1,4 @@
-"""What users were shown, read as the training logs of a run were read."""
+"""Users' histories, read in the same way as the training logs of a run."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from ucfrec.logs.mapping import LogMapping
 from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 
 LONGEST_HISTORY = 1000
-"""Rows of a user that are read at most."""
+"""Most recent rows of a user that are read; older ones only count as seen."""
 
 Array = npt.NDArray[Any]
 IntArray = npt.NDArray[np.int64]
@@ -26,30 +26,30 @@ BoolArray = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Histories:
-    """What U users were shown: N rows, users one after the other, each user's in order of time."""
+    """Histories of U users: N rows, sorted by user and then by time."""
 
     users: Array
     """(U,) identifiers."""
     owner: IntArray
-    """(N,) user, 0 to U − 1, of each row; sorted."""
+    """(N,) user index of each row, 0 to U − 1; sorted."""
     item_ids: Array
-    """(N,)."""
+    """(N,) identifiers in the logs."""
     rewards: npt.NDArray[np.float32]
-    """(N,)."""
+    """(N,) in reward units."""
     timestamps: IntArray
     """(N,) milliseconds."""
     session_ids: Array | None
-    """(N,), where sessions are told apart by them."""
+    """(N,); None if sessions are not split by them."""
     seen_owner: IntArray
-    """(M,) user of each item to filter; sorted."""
+    """(M,) user index of each entry of `seen_ids`; sorted."""
     seen_ids: Array
-    """(M,) items that a user has seen, however long ago."""
+    """(M,) identifiers of all items that a user has seen, also before the N rows."""
     observations: npt.NDArray[np.float32] | None
-    """(U, O) last logged observation."""
+    """(U, O) last logged observation; None if the logs have none."""
 
     @classmethod
     def from_batch(cls, batch: pa.RecordBatch) -> Self:
-        """From a batch of `ucfrec.logs.read_histories`."""
+        """Convert a batch of `ucfrec.logs.histories.read_histories`, one row per user."""
         owner, item_ids = _flat(batch.column("item_ids"))
         seen_owner, seen_ids = _flat(batch.column("seen"))
         session_ids = observations = None
@@ -71,15 +71,17 @@ class Histories:
         )
 
     def latest_session(self, gap_ms: float | None) -> "Histories":
-        """The same users with only the rows of the session of their last row.
+        """The same users with only the rows of each user's latest session.
 
-        That session is the one with the same `session_ids`, if there are any; otherwise it begins
-        after the last pause of more than `gap_ms`, or with the first row if `gap_ms` is None.
+        With `session_ids`, these are the rows with the session id of the user's last row. Without,
+        the session begins after the last pause of more than `gap_ms` milliseconds, or with the
+        user's first row if `gap_ms` is None.
         """
         row = np.arange(len(self.owner))
         latest = np.zeros(len(self.users), dtype=np.int64)
         if self.session_ids is not None:
-            latest[self.owner] = row  # the last of a user's rows is written last
+            # Of repeated indices, the last assignment remains: each user's last row.
+            latest[self.owner] = row
             return self.rows(self.session_ids == self.session_ids[latest[self.owner]])
         if gap_ms is None:
             return self
@@ -89,7 +91,7 @@ class Histories:
         return self.rows(row >= latest[self.owner])
 
     def rows(self, keep: BoolArray) -> "Histories":
-        """The same users with only the rows (N,) to keep."""
+        """The same users with only the rows where `keep` (N,) is true."""
         kept = {
             name: getattr(self, name)[keep]
             for name in ("owner", "item_ids", "rewards", "timestamps", "session_ids")
@@ -101,15 +103,18 @@ class Histories:
 def histories_of_files(
     trained: TrainedPolicy, files: Sequence[str | Path], mapping: LogMapping
 ) -> Iterator[Histories]:
-    """Logs in files, a batch of users at a time, users in sorted order.
+    """Read histories from log files in batches of users, users in sorted order.
 
     Args:
-        trained: whose reward expression, sessions and observations the logs have.
+        trained: policy whose reward expression, session rule and observations apply.
         files: log files, folders and globs.
-        mapping: what their columns mean.
+        mapping: names of the columns.
+
+    Returns:
+        The batches.
 
     Raises:
-        InputError: the logs cannot be used.
+        InputError: a file or a column is missing, or has values that cannot be used.
     """
     batches = read_histories(
         files,
@@ -124,17 +129,26 @@ def histories_of_files(
 def histories_of_frame(
     trained: TrainedPolicy, frame: pd.DataFrame, mapping: LogMapping
 ) -> Iterator[Histories]:
-    """The same of a frame in memory. Its rewards are its column `reward`, where it has one, or the
-    run's reward expression over its columns.
+    """Read histories from a frame in batches of users, users in sorted order.
+
+    Rewards are the frame's column `reward`, or else the run's reward expression over its columns.
+
+    Args:
+        trained: policy whose reward expression, session rule and observations apply.
+        frame: one row per interaction.
+        mapping: names of the columns.
+
+    Returns:
+        The batches.
 
     Raises:
-        InputError: the frame cannot be used.
+        InputError: a column is missing, or has values that cannot be used.
     """
-    given = schema.REWARD in getattr(frame, "columns", ())
+    has_rewards = schema.REWARD in getattr(frame, "columns", ())
     batches = frame_histories(
         frame,
         _columns_used(trained, mapping),
-        schema.REWARD if given else _reward(trained),
+        schema.REWARD if has_rewards else _reward(trained),
         LONGEST_HISTORY,
         session_by=_session_by(trained),
     )
@@ -157,7 +171,7 @@ def _session_by(trained: TrainedPolicy) -> str:
 
 
 def _flat(lists: pa.ListArray) -> tuple[IntArray, Array]:
-    """Row of each element, and the elements, of a column of lists."""
+    """Of a column of lists: the row index of each element, and the elements."""
     lengths = np.diff(np.asarray(lists.offsets))
     owner: IntArray = np.repeat(np.arange(len(lengths)), lengths)
     return owner, np.asarray(lists.flatten())

@@ -1,4 +1,4 @@
-"""The next items for users of a log, known from training or not."""
+"""Recommend next items to the users of a log, also to users who are not in the training logs."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
@@ -34,29 +34,32 @@ def recommend(
 ) -> Iterator[pd.DataFrame]:
     """The `k` best next items of every user.
 
-    A user's latest session is read as one that goes on: the state is what the policy would see at
-    its next step, and `target_return` is what the rest of the session shall earn. Users that were
-    not in the training logs are served from their rows alone.
+    A user's latest session is assumed to continue: items are scored at its next step, with
+    `target_return` as the return-to-go. For users who are not in the training logs, the state is
+    made of their rows alone.
 
     Args:
         trained: a policy of items.
-        batches: the users.
-        k: at least 1.
-        target_return: in units of the training reward.
+        batches: the users' histories.
+        k: number of items per user, at least 1.
+        target_return: target return of the rest of the session, in units of the training reward.
         filter_seen: leave out every item that the user has seen.
-        candidates: the only items to recommend, to whichever user; None for all.
-        skip_unknown: ignore rows of items that the policy does not know.
+        candidates: the only item_ids to recommend, for all users; None for all items.
+        skip_unknown: ignore rows of items that are not in the training data.
 
     Returns:
-        A frame a batch: `user_id`, `rank` (from 1), `item_id`, `score` (log-probability among all
-        items); k rows a user, fewer where fewer items are left.
+        One frame per batch: `user_id`, `rank` (from 1), `item_id`, `score` (log-probability among
+        all items, nats); k rows per user, fewer if fewer items remain.
 
     Raises:
-        InputError: an argument is wrong, the policy has no items, or does not know some of the
-            logs' items or of the candidates.
+        InputError: an argument is wrong, the policy's actions are vectors, or an item of the logs
+            or of the candidates is not in the training data. Items of the logs are checked when
+            their batch is read.
     """
     if trained.item_states is None or trained.item_ids is None:
-        raise InputError("this policy's actions are vectors, not items; there is nothing to rank")
+        raise InputError(
+            "this policy's actions are vectors; recommending needs a policy trained on items"
+        )
     if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or k < 1:
         raise InputError(f"k is {k!r}; give a whole number, 1 or more")
     if not np.isfinite(target_return):
@@ -90,20 +93,22 @@ def _best(
     """The `k` best items at the last step of every episode of `store`.
 
     Args:
-        seen: (M,) items not to recommend to the users `batch.seen_owner`, −1 for none.
-        excluded: (n_items,) true for items not to recommend to anybody.
+        seen: (M,) index of each item of `batch.seen_ids`, which its user is not recommended; −1
+            for items without an index.
+        excluded: (n_items,) true for items that no user is recommended.
     """
     item_ids, frames = trained.item_ids, []
     assert item_ids is not None
     for first in range(0, len(batch.users), _USERS_AT_ONCE):
         rows = np.arange(first, min(first + _USERS_AT_ONCE, len(batch.users)))
         windows = store.windows(rows, store.lengths[rows] - 1, trained.policy.config.context)
-        # What the session has earned since each step is in its returns-to-go already.
+        # The logged returns-to-go already contain the rewards between each step and the last.
         scores = trained.log_probabilities(windows, target_return)
         if seen is not None:
-            mine = slice(*np.searchsorted(batch.seen_owner, [rows[0], rows[-1] + 1]))
-            known = seen[mine] >= 0
-            scores[batch.seen_owner[mine][known] - first, seen[mine][known]] = -torch.inf
+            of_rows = slice(*np.searchsorted(batch.seen_owner, [rows[0], rows[-1] + 1]))
+            known = seen[of_rows] >= 0
+            owners, items = batch.seen_owner[of_rows][known], seen[of_rows][known]
+            scores[owners - first, items] = -torch.inf
         if excluded is not None:
             scores[:, excluded] = -torch.inf
         frames.append(_ranked(batch.users[rows], item_ids, scores, k))
@@ -111,16 +116,16 @@ def _best(
 
 
 def _positions(index: "pd.Index[Any]", ids: Array) -> IntArray:
-    """Where each of `ids` (N,) stands in `index`, −1 where it does not."""
-    given = pd.Index(ids)
-    if pd.api.types.is_integer_dtype(index.dtype) != pd.api.types.is_integer_dtype(given.dtype):
+    """Position of each of `ids` (N,) in `index`, −1 for ids that it lacks."""
+    wanted = pd.Index(ids)
+    if pd.api.types.is_integer_dtype(index.dtype) != pd.api.types.is_integer_dtype(wanted.dtype):
         # Integers of one log may be text in another, as for `prepare(like=...)`.
-        index, given = index.astype(str), given.astype(str)
-    return np.asarray(index.get_indexer(given), dtype=np.int64)
+        index, wanted = index.astype(str), wanted.astype(str)
+    return np.asarray(index.get_indexer(wanted), dtype=np.int64)
 
 
 def _all_but(index: "pd.Index[Any]", candidates: Sequence[Any]) -> Tensor:
-    """(n_items,) true for the items that are no candidates."""
+    """(n_items,) true for the items that are not among the candidates."""
     if isinstance(candidates, str) or not pd.api.types.is_list_like(candidates):
         raise InputError(f"candidates is {candidates!r}; give a list of item_ids")
     ids = np.asarray(list(candidates))
@@ -158,25 +163,25 @@ def _some(values: Sequence[Any]) -> str:
 def _next_steps(
     trained: TrainedPolicy, histories: Histories, index: "pd.Index[Any]"
 ) -> EpisodeStore:
-    """Every user's session and one more step, the one to recommend for."""
+    """One episode per user: the session's steps and the next step, for which items are scored."""
     n_users = len(histories.users)
-    # Row i moves down by one for every user before its own: that leaves a free row after each.
-    at = np.arange(len(histories.owner)) + histories.owner
+    # Shifting each row by its user index leaves a free row at the end of every episode.
+    places = np.arange(len(histories.owner)) + histories.owner
     lengths = np.bincount(histories.owner, minlength=n_users) + 1
     items = np.zeros(int(lengths.sum()), dtype=np.int64)
     rewards = np.zeros(len(items), dtype=np.float32)
-    items[at], rewards[at] = _positions(index, histories.item_ids), histories.rewards
+    items[places], rewards[places] = _positions(index, histories.item_ids), histories.rewards
     columns: dict[str, Array] = {schema.ITEM: items, schema.REWARD: rewards}
-    wanted = trained.record["observation_size"]
-    if wanted:
-        observed = histories.observations
-        given = 0 if observed is None else observed.shape[1]
-        if observed is None or given != wanted:
+    expected = trained.record["observation_size"]
+    if expected:
+        observations = histories.observations
+        size = 0 if observations is None else observations.shape[1]
+        if observations is None or size != expected:
             raise InputError(
-                f"the policy was trained with observations of {wanted} numbers; those of the "
-                f"histories have {given}"
+                f"the policy was trained with observations of {expected} numbers; those of the "
+                f"histories have {size}"
             )
-        columns[schema.OBSERVATION] = np.repeat(observed, lengths, axis=0)
+        columns[schema.OBSERVATION] = np.repeat(observations, lengths, axis=0)
     users = _positions(pd.Index(trained.user_ids), histories.users)
     return EpisodeStore.from_arrays(columns, lengths, {schema.USER: users}, trained.item_states)
 
@@ -184,12 +189,12 @@ def _next_steps(
 def _ranked(users: Array, item_ids: Array, scores: Tensor, k: int) -> pd.DataFrame:
     top = scores.topk(min(k, scores.shape[1]), dim=-1)
     rank = np.broadcast_to(np.arange(1, top.indices.shape[1] + 1), top.indices.shape)
-    left = torch.isfinite(top.values).numpy()
+    allowed = torch.isfinite(top.values).numpy()
     return pd.DataFrame(
         {
-            schema.USER_ID: np.repeat(users, left.sum(1)),
-            RANK: rank[left],
-            schema.ITEM_ID: item_ids[top.indices.numpy()[left]],
-            SCORE: top.values.numpy()[left],
+            schema.USER_ID: np.repeat(users, allowed.sum(1)),
+            RANK: rank[allowed],
+            schema.ITEM_ID: item_ids[top.indices.numpy()[allowed]],
+            SCORE: top.values.numpy()[allowed],
         }
     )

@@ -1,1 +1,1 @@
-"""A run: its configuration, its training and what is read back from it."""
+"""Training runs: configuration, training, run folders, and policies loaded from them."""

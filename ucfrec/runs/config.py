@@ -1,4 +1,4 @@
-"""One frozen configuration: defaults, presets over them, a TOML file over those, `--set` on top."""
+"""The configuration of a run: defaults, overridden by presets, then a TOML file, then `--set`."""
 
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -23,7 +23,7 @@ TABLES: Final = ("policy", "train", "crm", "csg", "augment")
 
 @settings_table("")
 class Config:
-    """All that decides a run, with its data."""
+    """Everything that determines a run, apart from its data."""
 
     policy_name: str
     """The learner."""
@@ -32,14 +32,14 @@ class Config:
     train: LoopConfig = field(default_factory=LoopConfig)
     """The training loop of the policy."""
     crm: CRMConfig = field(default_factory=CRMConfig)
-    """The causal reward model, fitted where there are copies."""
+    """The causal reward model, fitted if `augment.copies` is above 0."""
     csg: CSGConfig = field(default_factory=CSGConfig)
     """The generator of counterfactual states."""
     augment: AugmentConfig = field(default_factory=AugmentConfig)
-    """The edited copies."""
-    # scikit-learn takes no larger one.
+    """The edited copies of training episodes."""
+    # scikit-learn accepts no larger seed.
     seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 0
-    """Of everything random."""
+    """Seed of every random draw."""
 
 
 def resolve_config(
@@ -49,62 +49,62 @@ def resolve_config(
     seed: int = 0,
     presets: Mapping[str, Any] | None = None,
 ) -> Config:
-    """The configuration of a run; later sources win over earlier ones, whichever table they set.
+    """Build the configuration of a run: `overrides` win over `file`, and `file` over `presets`.
 
     Args:
-        policy_name: one of `ucfrec.policies.registry.policy_names`. Learners other than UCF start
-            without counterfactual copies (`augment.copies = 0`), so that `--policy dt` is the plain
-            baseline and `--policy dt --set augment.copies=1` is the paper's `w/o Arch`.
+        policy_name: one of `ucfrec.policies.registry.policy_names`. The default of `augment.copies`
+            is 0 for learners other than UCF: `--policy dt` is the plain baseline and `--policy dt
+            --set augment.copies=1` is the paper's `w/o Arch`.
         file: TOML with tables `policy`, `train`, `crm`, `csg` and `augment`.
-        overrides: texts `table.field=value`, the value as in TOML; or a mapping, by table and
-            field (`{"train": {"steps": 200}}`) or by both at once (`{"train.steps": 200}`).
-        seed: of everything random.
-        presets: as `overrides`, under `file`: what an adapter knows of its data.
+        overrides: texts `table.field=value`, the value in TOML syntax; or a mapping, either nested
+            (`{"train": {"steps": 200}}`) or flat (`{"train.steps": 200}`).
+        seed: seed of every random draw, 0 to 2³² − 1.
+        presets: defaults that a dataset adapter sets for its data; a mapping as in `overrides`.
 
     Raises:
-        InputError: an unknown learner, table or field, or a value or combination of values that is
-            not allowed; says where it was given.
+        InputError: a learner, table or field is unknown, or a value or a combination of values is
+            not allowed; the message names the source of the setting.
     """
-    given = [*_from_mapping(presets or {}, "presets")]
+    settings = [*_from_mapping(presets or {}, "presets")]
     if file is not None:
-        given += _from_mapping(_read_toml(file), str(file))
+        settings += _from_mapping(_read_toml(file), str(file))
     if isinstance(overrides, Mapping):
-        given += _from_mapping(overrides, "settings")
+        settings += _from_mapping(overrides, "settings")
     else:
-        given += _from_texts(overrides)
-    return _build(policy_name, given, seed)
+        settings += _from_texts(overrides)
+    return _build(policy_name, settings, seed)
 
 
 def config_from_dict(values: Mapping[str, Any]) -> Config:
-    """What `dataclasses.asdict` made of a configuration, as one again.
+    """Rebuild a configuration from its `dataclasses.asdict`.
 
     Raises:
-        InputError: as `resolve_config`.
+        InputError: see `resolve_config`.
     """
     tables = {name: values[name] for name in values if isinstance(values[name], Mapping)}
-    given = _from_mapping(tables, "the run's configuration")
-    return _build(values["policy_name"], given, values["seed"])
+    settings = _from_mapping(tables, "the run's configuration")
+    return _build(values["policy_name"], settings, values["seed"])
 
 
-class _Given(NamedTuple):
-    """One value, and where it was given."""
+class _Setting(NamedTuple):
+    """One setting and its source."""
 
     table: str
     key: str
     value: Any
-    where: str
+    source: str
 
 
-def _build(policy_name: str, given: Iterable[_Given], seed: int) -> Config:
-    """Each table is built once, from all that was given, so that values are judged together."""
+def _build(policy_name: str, settings: Iterable[_Setting], seed: int) -> Config:
+    """Build each table once, from all its settings, so that values are checked together."""
     learner = policy_class(policy_name)
     tables: dict[str, dict[str, Any]] = {name: {} for name in TABLES}
     if not learner.augmented:
         tables["augment"]["copies"] = 0
     sources = {}
-    for table, key, value, where in given:
+    for table, key, value, source in settings:
         tables[table][key] = value.item() if isinstance(value, np.generic) else value
-        sources[f"{table}.{key}"] = where
+        sources[f"{table}.{key}"] = source
     try:
         return Config(
             policy_name,
@@ -116,39 +116,39 @@ def _build(policy_name: str, given: Iterable[_Given], seed: int) -> Config:
             seed,
         )
     except SettingError as error:
-        where = ", ".join(dict.fromkeys(sources[key] for key in error.keys if key in sources))
-        raise InputError(f"{where}: {error}" if where else str(error)) from None
+        source = ", ".join(dict.fromkeys(sources[key] for key in error.keys if key in sources))
+        raise InputError(f"{source}: {error}" if source else str(error)) from None
 
 
-def _from_texts(texts: Sequence[str]) -> Iterator[_Given]:
+def _from_texts(texts: Sequence[str]) -> Iterator[_Setting]:
     if isinstance(texts, str):
         raise InputError(f"settings are the text {texts!r}; give a list of texts, or a mapping")
     for text in texts:
         name, separator, value = text.partition("=")
         table, dot, key = name.strip().partition(".")
-        where = f"--set {text}"
+        source = f"--set {text}"
         if not separator or not dot:
-            raise InputError(f"{where}: write table.field=value, as in train.steps=200")
-        yield _Given(_table(table, where), key, _toml_value(value), where)
+            raise InputError(f"{source}: write table.field=value, as in train.steps=200")
+        yield _Setting(_table(table, source), key, _toml_value(value), source)
 
 
-def _from_mapping(values: Mapping[str, Any], where: str) -> Iterator[_Given]:
+def _from_mapping(values: Mapping[str, Any], source: str) -> Iterator[_Setting]:
     for name, value in values.items():
         table, dot, key = str(name).partition(".")
-        _table(table, where)
+        _table(table, source)
         if dot:
-            yield _Given(table, key, value, where)
+            yield _Setting(table, key, value, source)
         elif isinstance(value, Mapping):
-            yield from (_Given(table, str(key), own, where) for key, own in value.items())
+            yield from (_Setting(table, str(key), each, source) for key, each in value.items())
         else:
             raise InputError(
-                f"{where}: {table} is a table of settings, not a value; give its field"
+                f"{source}: {table} is a table of settings; give a value for one of its fields"
             )
 
 
-def _table(name: str, where: str) -> str:
+def _table(name: str, source: str) -> str:
     if name not in TABLES:
-        raise InputError(f"{where}: no table is called {name!r}; {nearest(name, TABLES)}")
+        raise InputError(f"{source}: no table is called {name!r}; {nearest(name, TABLES)}")
     return name
 
 
@@ -163,6 +163,6 @@ def _read_toml(file: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise InputError(f"{file} does not exist") from None
+        raise InputError(f"{file} does not exist; give the path of a TOML file") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{file} is not TOML: {error}") from None

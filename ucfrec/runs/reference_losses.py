@@ -1,4 +1,4 @@
-"""Losses to compare a policy of items with: what it takes no learning to reach."""
+"""Validation losses of two trivial predictors, to compare a policy of items with."""
 
 import math
 
@@ -10,19 +10,20 @@ from ucfrec.episodes.store import EpisodeStore
 
 
 def reference_losses(counts: TrainingCounts, validation: EpisodeStore) -> dict[str, float]:
-    """Mean negative log-likelihood, in nats, of the items of all held-out steps.
+    """Mean negative log-likelihood (nats) of the logged items over all validation steps.
 
     Args:
-        counts: of the training steps.
-        validation: the held-out episodes; one at least.
+        counts: item counts of the training steps.
+        validation: validation episodes, at least one.
 
     Returns:
-        `uniform`: all items equally probable. `popularity`: probable by their share of the training
-        steps, each counted once more, which is where `ItemHead` begins.
+        `uniform`: the loss if all items are equally probable. `popularity`: the loss if an item's
+        probability is its share of the training steps with one added to every count, which is how
+        the bias of `ItemHead` is initialised.
     """
     items = torch.from_numpy(validation.step_values(schema.ITEM, *validation.all_steps())).long()
-    seen = counts.shown + 1
-    log_shares = torch.log(seen / seen.sum())
+    smoothed = counts.shown + 1
+    log_shares = torch.log(smoothed / smoothed.sum())
     return {
         "uniform": math.log(len(counts.shown)),
         "popularity": -float(log_shares[items].double().mean()),

@@ -1,4 +1,4 @@
-"""A training run (Algorithm 1) and the folder that holds it."""
+"""Train a policy (Algorithm 1) and keep everything it produces in a run folder."""
 
 import dataclasses
 import shutil
@@ -41,23 +41,27 @@ def train_run(
     about: Mapping[str, Any] | None = None,
     more_copies: Overlay | None = None,
 ) -> dict[str, Any]:
-    """Train a policy on the training episodes of `store`, or go on where `out` was left.
+    """Train a policy on the training episodes of `store`, or resume the run in `out`.
 
-    Reward model, generator, edited copies (unless `augment.copies` is 0), then the policy; each
-    stage that is finished is kept. `out` comes into being once all that can be checked has been:
-    a start that fails leaves nothing. The global random state is as before on return.
+    The stages are reward model, generator and edited copies (unless `augment.copies` is 0), then
+    the policy; finished stages are not repeated. `out` is created after all inputs have been
+    checked, so that a rejected run leaves no folder. The global random state is restored on return.
 
     Args:
-        about: what an adapter adds to the record.
-        more_copies: an adapter's own edited copies of training episodes, beside the counterfactual
-            ones.
+        store: prepared episodes.
+        out: run folder, new or interrupted.
+        config: configuration of all stages.
+        about: entries that a dataset adapter adds to the record.
+        more_copies: a dataset adapter's edited copies of training episodes, used in addition to
+            the counterfactual ones.
 
     Returns:
-        The record in `run.json`: where the run comes from, and what every stage reports.
+        The content of `run.json`: provenance, configuration and the report of every stage.
 
     Raises:
         InputError: `out` is a run on another store or with another configuration, the store has
-            too few training episodes, or the learner cannot act on it.
+            too few training episodes or constant rewards, or the learner does not support its
+            actions.
     """
     train, validation = training_views(store)
     if (out / RUN).exists():
@@ -69,7 +73,7 @@ def train_run(
         _begin(store, train, validation, out, config, about or {})
     record = read_json(out / RUN)
     record["config"] = dataclasses.asdict(config)
-    began = time.perf_counter() - record["wall_time_s"]
+    start = time.perf_counter() - record["wall_time_s"]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     view = policy.training_view(train, config.policy, out / "view", config.seed)
     if view is not train:
@@ -82,7 +86,7 @@ def train_run(
         train = train.with_overlay(more_copies)
     fitted = _fit_policy(policy, train, validation, out, config)
     record["policy"] = dataclasses.asdict(fitted)
-    record["wall_time_s"] = time.perf_counter() - began
+    record["wall_time_s"] = time.perf_counter() - start
     _write_samples(out, policy, validation, record)
     write_json(out / RUN, record)
     return dict(record)
@@ -113,12 +117,18 @@ def _fit_policy(
 
 
 def training_views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
-    """Episodes to learn from and, apart, to validate on: the store's splits, or, where none is for
-    validation, every tenth training episode."""
+    """The training and the validation episodes of a store.
+
+    Without a validation split, every tenth training episode is held out for validation.
+
+    Raises:
+        InputError: the store has fewer than 2 training episodes.
+    """
     train, validation = store.split("train"), store.split("validation")
     if train.n_episodes < 2:
         raise InputError(
-            f"{store.path} has {train.n_episodes} training episodes; prepare it with a later split"
+            f"{store.path} has {train.n_episodes} training episodes, at least 2 are needed; "
+            "prepare it with a larger training share"
         )
     if validation.n_episodes:
         return train, validation
@@ -174,26 +184,26 @@ def _require_same(
             f"{record['fingerprint'][:12]}), not on {store.path} "
             f"({store.meta['fingerprint'][:12]}); name another run folder"
         )
-    began = config_from_dict(record["config"])
+    started = config_from_dict(record["config"])
     if not config.train.cosine:
-        # More steps are no other run: training goes on from where it ended.
-        longer = dataclasses.replace(began.train, steps=config.train.steps)
-        began = dataclasses.replace(began, train=longer)
-    before, now = dataclasses.asdict(began), dataclasses.asdict(config)
+        # Without a cosine schedule, a run may be resumed with more steps.
+        longer = dataclasses.replace(started.train, steps=config.train.steps)
+        started = dataclasses.replace(started, train=longer)
+    before, now = dataclasses.asdict(started), dataclasses.asdict(config)
     for table, values in now.items():
         if before[table] != values:
-            was = _difference(before[table], values)
+            difference = _difference(before[table], values)
             raise InputError(
-                f"{out} was begun with another {table} ({was}); name another run folder, or give "
-                "the same configuration to resume"
+                f"{out} was started with another {table} ({difference}); name another run folder, "
+                "or give the same configuration to resume"
             )
 
 
 def _difference(before: Any, now: Any) -> str:
     if not isinstance(now, Mapping):
-        return f"{before} there, {now} here"
+        return f"{before} in the run, {now} now"
     return ", ".join(
-        f"{key} is {before.get(key)} there, {value} here"
+        f"{key} is {before.get(key)} in the run, {value} now"
         for key, value in now.items()
         if before.get(key) != value
     )
@@ -202,7 +212,7 @@ def _difference(before: Any, now: Any) -> str:
 def _counterfactuals(
     train: EpisodeStore, validation: EpisodeStore, out: Path, config: Config
 ) -> tuple[Overlay, dict[str, Any]]:
-    """Edited copies and what is reported of them, made once a run."""
+    """The edited copies of a run and their report; made once, then read from `out`."""
     overlay_path, report_path = out / "overlay.safetensors", out / AUGMENTATION
     if not report_path.exists():
         overlay, report = counterfactual_copies(
@@ -223,7 +233,7 @@ def _sizes(store: EpisodeStore) -> dict[str, int]:
 
 @random_state_kept()
 def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
-    """A policy with the normalisation and item embeddings of `train`, its weights untrained."""
+    """An untrained policy with the normalisation and item embeddings of `train`."""
     torch.manual_seed(config.seed)
     policy = policy_class(config.policy_name)(config.policy, _sizes(train))
     base = train.without_copies()
@@ -233,8 +243,8 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
     scale = config.policy.return_scale or float(np.abs(base.returns).max()) or 1.0
     policy.return_scale.fill_(scale)
     episodes, steps = base.all_steps()
-    asked = base.step_values(schema.RETURN_TO_GO, episodes, steps)
-    policy.lowest_return_to_go.fill_(float(asked.min()))
+    returns_to_go = base.step_values(schema.RETURN_TO_GO, episodes, steps)
+    policy.lowest_return_to_go.fill_(float(returns_to_go.min()))
     if isinstance(policy.head, ItemHead):
         counts = np.bincount(
             base.step_values(schema.ITEM, episodes, steps), minlength=len(policy.head.counts)
@@ -248,7 +258,7 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
 
 
 def _validation(policy: SequencePolicy, validation: EpisodeStore, seed: int) -> Any:
-    """The mean action loss at held-out steps, the same ones at every call."""
+    """A function that returns the mean action loss at a fixed sample of validation steps."""
     generator = np.random.default_rng([seed, 0])
     drawn = [
         validation.draw_steps(generator, _VALIDATION_BATCH) for _ in range(_VALIDATION_BATCHES)
@@ -265,14 +275,14 @@ def _validation(policy: SequencePolicy, validation: EpisodeStore, seed: int) -> 
 def _write_samples(
     out: Path, policy: SequencePolicy, validation: EpisodeStore, record: Mapping[str, Any]
 ) -> None:
-    """Keep a few recommendations for the report, at the target return that commands default to."""
+    """Save a few recommendations for the report, with the commands' default target return."""
     if validation.has_items:
         target = max(record["return_quantiles"].values())
         write_json(out / SAMPLES, sample_recommendations(policy, validation, target))
 
 
 def describe_run(record: Mapping[str, Any]) -> str:
-    """What a finished run found, in a few lines."""
+    """Summary of a finished run's record, a few lines of text."""
     lines = []
     if "augmentation" in record:
         report = record["augmentation"]

@@ -1,4 +1,4 @@
-"""A few recommendations of a finished run, kept for its report."""
+"""Example recommendations of a finished run, shown in its report."""
 
 from dataclasses import replace
 from typing import Any
@@ -18,25 +18,27 @@ _SESSIONS, _HISTORY, _ITEMS = 3, 5, 5
 def sample_recommendations(
     policy: SequencePolicy, validation: EpisodeStore, target_return: float
 ) -> dict[str, Any]:
-    """What `policy` would show at the last step of a few held-out sessions.
+    """Recommendations of `policy` at the last step of a few validation sessions.
 
     Args:
-        validation: held-out episodes of items.
-        target_return: of a whole session; what the session has earned so far is taken off.
+        policy: a policy of items.
+        validation: validation episodes of items.
+        target_return: target return of a whole session, in reward units; rewards before the last
+            step are subtracted.
 
     Returns:
-        JSON-able: `target_return` and `sessions`, each with the `history` of items before the last
-        step and their `rewards` (the latest 5), the item `logged` there, and the items
-        `recommended`, best first. Items are rows of `items.parquet`; none is filtered out.
+        A JSON object: `target_return`, and `sessions` with up to 5 items before the last step
+        (`history`), their `rewards`, the item `logged` at the last step and the 5 items
+        `recommended`, best first. Items are row numbers of `items.parquet`; none is filtered out.
     """
     long_enough = np.flatnonzero(validation.lengths >= min(2, validation.lengths.max()))
     places = np.linspace(0, len(long_enough) - 1, min(_SESSIONS, len(long_enough)))
     episodes = long_enough[places.astype(np.int64)]
     windows = validation.windows(episodes, validation.lengths[episodes] - 1, policy.config.context)
-    # A logged return-to-go is the session's return less what it has earned so far.
+    # A logged return-to-go is the session's return minus its rewards so far.
     more = torch.from_numpy(target_return - validation.returns[episodes]).unsqueeze(1)
-    wanted = (windows.returns_to_go + more).masked_fill(~windows.mask, 0.0).float()
-    windows = replace(windows, returns_to_go=wanted).to(policy.state_mean.device)
+    returns_to_go = (windows.returns_to_go + more).masked_fill(~windows.mask, 0.0).float()
+    windows = replace(windows, returns_to_go=returns_to_go).to(policy.state_mean.device)
     best = policy.act(windows).topk(min(_ITEMS, len(validation.item_states.embeddings)))
     sessions = []
     for place, episode in enumerate(episodes):

@@ -32,26 +32,32 @@ COUNTS = "training_counts.safetensors"
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """A policy read back from a run folder, with all that acting and recommending need."""
+    """A policy loaded from a run folder, with all that acting and recommending need."""
 
     folder: Path
-    """The run folder that it was read from."""
+    """The run folder."""
     policy: SequencePolicy
     record: Mapping[str, Any]
+    """Content of `run.json`."""
     item_states: ItemStates | None
+    """Builds states from items; None if the logged observation is the state."""
     item_ids: npt.NDArray[Any] | None
-    """(n_items,) identifiers in the logs; None where actions are vectors."""
+    """(n_items,) item identifiers in the logs; None if actions are vectors."""
     user_ids: npt.NDArray[Any]
-    """(n_users,) identifiers in the logs; empty where there are none."""
+    """(n_users,) user identifiers in the logs; empty if the store has none."""
     counts: TrainingCounts | None = None
-    """None where actions are vectors, and of runs from before counts were kept."""
+    """Item counts of the training steps; None if actions are vectors or the run lacks the file."""
 
     @classmethod
     def load(cls, run: Path, checkpoint: str = "best") -> "TrainedPolicy":
-        """Read `best` (on validation) or `last` weights of a run.
+        """Load a policy from a run folder.
+
+        Args:
+            run: the folder.
+            checkpoint: `best` (lowest validation loss) or `last` weights.
 
         Raises:
-            InputError: `run` is no run folder, or has no checkpoint yet.
+            InputError: `run` is not a run folder, or has no checkpoint yet.
         """
         record = read_record(run)
         config = config_from_dict(record["config"])
@@ -76,23 +82,27 @@ class TrainedPolicy:
 
     @property
     def name(self) -> str:
-        """See `learner_of`."""
+        """Name of the learner; see `learner_of`."""
         return learner_of(self.record)
 
     def target_return(self, quantile: float) -> float:
-        """The `quantile` of training returns, interpolated between those the run recorded."""
+        """The `quantile` (0 to 1) of the training returns, in reward units.
+
+        Interpolated between the quantiles that the run recorded.
+        """
         known = self.record["return_quantiles"]
         return float(np.interp(quantile, [float(q) for q in known], list(known.values())))
 
     @torch.no_grad()
     def log_probabilities(self, windows: Windows, more: Tensor | float) -> Tensor:
-        """(B, n_items) of the item at each window's last step (policies of items).
+        """Log-probabilities (nats) of all items at each window's last step, (B, n_items).
 
         Args:
-            more: return asked for beyond the windows' returns-to-go, one number or (B, 1).
+            windows: B windows of a store of items.
+            more: added to the windows' returns-to-go, one number or (B, 1), in reward units.
         """
-        asked = (windows.returns_to_go + more).masked_fill(~windows.mask, 0.0)
-        windows = replace(windows, returns_to_go=asked).to(self.policy.state_mean.device)
+        returns_to_go = (windows.returns_to_go + more).masked_fill(~windows.mask, 0.0)
+        windows = replace(windows, returns_to_go=returns_to_go).to(self.policy.state_mean.device)
         return self.policy.act(windows).log_softmax(-1).cpu()
 
     def actor(
@@ -101,11 +111,13 @@ class TrainedPolicy:
         target_return: float,
         item_numbers: npt.NDArray[np.int64] | None = None,
     ) -> PolicyActor:
-        """An actor for `episodes` environments side by side.
+        """An actor for `episodes` parallel environments.
 
         Args:
-            item_numbers: (n_items,) the environment's number of each item, −1 where it has none;
-                None where they are the `item_ids`.
+            episodes: number of environments.
+            target_return: target return of every episode, in reward units.
+            item_numbers: (n_items,) the environment's index of each item, −1 for items that it
+                lacks; None if the `item_ids` are these indices.
         """
         return PolicyActor(
             self.policy,
@@ -119,10 +131,10 @@ class TrainedPolicy:
 
 
 def read_record(run: Path) -> dict[str, Any]:
-    """What a run, finished or not, has recorded so far.
+    """The content of a run's `run.json`, complete once the run has finished.
 
     Raises:
-        InputError: `run` is no run folder.
+        InputError: `run` is not a run folder.
     """
     if not (run / RUN).exists():
         raise InputError(f"{run} is not a run folder: it has no {RUN}; train one first")
@@ -130,7 +142,7 @@ def read_record(run: Path) -> dict[str, Any]:
 
 
 def describe_trained(record: Mapping[str, Any]) -> str:
-    """The learner of a run's record and what it was trained on, in one line."""
+    """One line on a run's record: the learner and the size of its training data."""
     facts = [
         repr(learner_of(record)),
         f"trained on {record['train_steps']:,} steps",
@@ -142,7 +154,11 @@ def describe_trained(record: Mapping[str, Any]) -> str:
 
 
 def learner_of(record: Mapping[str, Any]) -> str:
-    """The learner of a run's record, and whether it departs from its usual use of edited copies."""
+    """Name of the learner of a run's record.
+
+    Followed by `-augmented` or `-no-augmentation` if the run's use of edited copies is not the
+    learner's default.
+    """
     config = config_from_dict(record["config"])
     augmented = config.augment.copies > 0
     if augmented == policy_class(config.policy_name).augmented:

@@ -132,7 +132,7 @@ def test_a_masked_item_is_refused_and_a_deaf_actor_too() -> None:
     env.step(np.array([3, 4]))
     with pytest.raises(InputError, match=r"1 of 2 sessions were shown an item again \(such as 4\)"):
         env.step(np.array([5, 4]))
-    with pytest.raises(InputError, match="Constant does not take note"):
+    with pytest.raises(InputError, match="which Constant ignores"):
         rollout(env, Constant(np.zeros(1, np.float32)), 2, 0)
 
 

@@ -17,7 +17,7 @@ one; the others record results, report them and define the error class."""
 
 
 def code_version(*roots: str | Path, exclude: Collection[str] = ()) -> str:
-    """Hash the source files of `roots` and of every ucfrec module that they import, directly or not.
+    """Hash the source files of `roots` and of every ucfrec module that they import, transitively.
 
     Import statements are parsed from the source, also those inside functions; nothing is executed.
     Each file is read once per process, so a file that is edited while the process runs does not

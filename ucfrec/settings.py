@@ -176,9 +176,8 @@ def _setting_error(
     if isinstance(cause, SettingError):
         return cause
     # Pydantic locates positional arguments by their index.
-    location = first["loc"][0]
-    at_index = isinstance(location, int) and location < len(known)
-    key = known[int(location)] if at_index else str(location)
+    at = first["loc"][0]
+    key = known[at] if isinstance(at, int) and at < len(known) else str(at)
     if key not in known:
         message = f"{name} has no field {key!r}; {nearest(key, known)}"
         return SettingError(message, _key(name, key))

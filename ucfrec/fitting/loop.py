@@ -33,8 +33,8 @@ Batch = TypeVar("Batch")
 class LoopConfig:
     """Length of a training and settings of its optimizer (AdamW).
 
-    The defaults for policies follow the paper's Table 8; it does not give `steps`,
-    `validate_every` and `patience`.
+    The defaults are those of policies in the paper's Table 8; settings that it does not give, such
+    as `steps`, are our choice.
     """
 
     steps: Count = 10_000

@@ -346,8 +346,7 @@ def _report(overlay: Overlay, editor: _Editor, crm_report: CRMReport) -> Augment
     if moves.edits and moves.mean_move_ratio > 0.5:
         warnings.append(
             f"edit collapse: {moves.mean_move_ratio:.0%} of the average edit is one shift common "
-            f"to all states (effective rank {moves.effective_rank:.1f} of {moves.dimensions}); use "
-            "csg.kind=tangent for varied edits"
+            f"to all states (effective rank {moves.effective_rank:.1f} of {moves.dimensions})"
         )
     return AugmentationReport(
         copies=len(overlay.copy_source),

@@ -27,7 +27,7 @@ class MoveReport:
     mean_move_ratio: float
     """‖mean Δ‖ / mean ‖Δ‖: 1 if all edits are the same shift, near 0 if they are varied."""
     effective_rank: float
-    """exp of the entropy of the normalised spectrum of E[ΔΔᵀ]: number of directions of the moves."""
+    """exp of the entropy of the spectrum of E[ΔΔᵀ]: effective number of directions of the moves."""
     dimensions: int
     """Number of state dimensions that vary in the training data; bounds the effective rank."""
 

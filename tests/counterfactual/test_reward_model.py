@@ -13,10 +13,9 @@ from ucfrec.counterfactual.reward_model import (
     CausalRewardModel,
     CRMConfig,
     Posterior,
-    fit_crm,
-    fit_warning,
     kl_to_prior,
 )
+from ucfrec.counterfactual.reward_model_fit import fit_crm, fit_warning
 from ucfrec.errors import InputError
 
 QUICK = CRMConfig(epochs=1, hidden=32, latent_dim=3, learning_rate=1e-3)

@@ -19,13 +19,8 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.counterfactual.edit_statistics import MoveReport, MoveStatistics
 from ucfrec.counterfactual.generators import CSGConfig, Generator, make_generator
-from ucfrec.counterfactual.reward_model import (
-    CausalRewardModel,
-    CRMConfig,
-    CRMReport,
-    fit_crm,
-    fit_warning,
-)
+from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig
+from ucfrec.counterfactual.reward_model_fit import CRMReport, fit_crm, fit_warning
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import FloatArray, IntArray, Overlay, Transitions
 from ucfrec.errors import InputError

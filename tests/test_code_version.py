@@ -1,4 +1,4 @@
-"""The version of the code of a measurement: changed by what it runs through, by nothing else."""
+"""The code version of a measurement changes with the modules that it imports, and only those."""
 
 import importlib
 import subprocess

@@ -1,4 +1,4 @@
-"""`metrics.jsonl`: what is written is read, whatever was cut off; anything else is named."""
+"""`metrics.jsonl`: written lines are read back, incomplete ones ignored, invalid ones reported."""
 
 import json
 import math

@@ -97,25 +97,20 @@ def fit(
 ) -> Fit:
     """Minimise `loss` over batches from `draw`, resuming from `folder` if it holds a checkpoint.
 
-    Writes to `folder`: `last.safetensors` (everything needed to resume), `best.safetensors` (the
-    weights with the lowest validation loss; without validation, the last ones), `metrics.jsonl` and
-    TensorBoard events. A training killed at any moment and started again ends with the same weights
-    as an uninterrupted one on the same machine and device. The global random state is restored when
-    the function returns or raises.
+    Writes `last.safetensors` (to resume), `best.safetensors` (weights with the lowest validation
+    loss; without validation, the last), `metrics.jsonl` and TensorBoard events to `folder`. A
+    training killed at any moment and started again ends with the same weights as an uninterrupted
+    one (same machine and device). The global random state is restored.
 
     Args:
         module: trained in place; holds the best weights on return.
         draw: draws a batch with the given generator.
-        loss: returns the scalar to minimise, and scalars to log by name, for a batch.
-        config: length of the training and settings of the optimizer.
-        folder: of checkpoints and logs; created if missing.
-        seed: of batches and of torch's random numbers in each step.
-        validate: returns the validation loss; called in evaluation mode without gradients.
+        loss: the scalar to minimise, and scalars to log by name, of a batch.
+        validate: the validation loss; called in evaluation mode without gradients.
         describe: name of the training in progress and error messages.
 
     Raises:
-        InputError: the loss or gradient is not finite, or the checkpoint in `folder` is damaged or
-            of another architecture.
+        InputError: a loss or gradient is not finite, or a checkpoint is damaged or does not fit.
     """
     folder.mkdir(parents=True, exist_ok=True)
     last, best = folder / "last.safetensors", folder / "best.safetensors"

@@ -98,9 +98,8 @@ def fit(
     """Minimise `loss` over batches from `draw`, resuming from `folder` if it holds a checkpoint.
 
     Writes `last.safetensors` (to resume), `best.safetensors` (weights with the lowest validation
-    loss; without validation, the last), `metrics.jsonl` and TensorBoard events to `folder`. A
-    training killed at any moment and started again ends with the same weights as an uninterrupted
-    one (same machine and device). The global random state is restored.
+    loss, else the last), `metrics.jsonl` and TensorBoard events to `folder`. A training killed and
+    resumed ends with the weights of an uninterrupted one. The global random state is restored.
 
     Args:
         module: trained in place; holds the best weights on return.

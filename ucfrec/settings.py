@@ -55,9 +55,10 @@ class SettingError(InputError):
     """A value, or a combination of values, that a table of settings rejects."""
 
     def __init__(self, message: str, *keys: str) -> None:
-        """Args:
-        message: names the field, its value and the allowed values.
-        keys: the rejected fields, as `table.field`.
+        """
+        Args:
+            message: names the field, its value and the allowed values.
+            keys: the rejected fields, as `table.field`.
         """
         super().__init__(message)
         self.keys = keys

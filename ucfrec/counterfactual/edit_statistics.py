@@ -36,8 +36,9 @@ class MoveStatistics:
     """Accumulates statistics of moves chunk by chunk, without keeping the moves."""
 
     def __init__(self, size: int) -> None:
-        """Args:
-        size: S, dimensions of a move.
+        """
+        Args:
+            size: S, dimensions of a move.
         """
         self._total = torch.zeros(size, dtype=torch.float64)
         self._moments = torch.zeros(size, size, dtype=torch.float64)

@@ -106,11 +106,12 @@ class TangentGenerator:
     def __init__(
         self, crm: CausalRewardModel, centres: Tensor, covariances: Tensor, config: CSGConfig
     ) -> None:
-        """Args:
-        crm: the fitted reward model.
-        centres: (C, S) centres of the clusters of normalised states.
-        covariances: (C, S, S) covariance of the normalised states of each cluster.
-        config: band and number of Newton steps.
+        """
+        Args:
+            crm: the fitted reward model.
+            centres: (C, S) centres of the clusters of normalised states.
+            covariances: (C, S, S) covariance of the normalised states of each cluster.
+            config: band and number of Newton steps.
         """
         self._crm = crm
         self._centres = centres

@@ -37,11 +37,12 @@ class Columns:
         arrays: Mapping[str, Array] | None = None,
         item_states: ItemStates | None = None,
     ) -> None:
-        """Args:
-        path: folder of the store.
-        meta: contents of its `meta.json`.
-        arrays: columns in memory, by name, used instead of the files of the folder.
-        item_states: used instead of the file of the folder.
+        """
+        Args:
+            path: folder of the store.
+            meta: contents of its `meta.json`.
+            arrays: columns in memory, by name, used instead of the files of the folder.
+            item_states: used instead of the file of the folder.
         """
         self.path, self.meta = path, meta
         self._arrays, self._item_states_in_memory = dict(arrays or {}), item_states

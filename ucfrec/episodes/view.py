@@ -29,10 +29,11 @@ class EpisodeView:
     def __init__(
         self, columns: Columns, episode_ids: IntArray | None = None, overlay: Overlay | None = None
     ) -> None:
-        """Args:
-        columns: of the store.
-        episode_ids: (E,) numbers in the store of the view's episodes; None for all.
-        overlay: edited copies.
+        """
+        Args:
+            columns: of the store.
+            episode_ids: (E,) numbers in the store of the view's episodes; None for all.
+            overlay: edited copies.
         """
         self._columns, self._selected = columns, episode_ids
         self.overlay = overlay

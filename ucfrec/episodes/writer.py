@@ -32,9 +32,10 @@ class StoreWriter:
     """
 
     def __init__(self, folder: Path, shard_steps: int = 2**24) -> None:
-        """Args:
-        folder: to write to.
-        shard_steps: a shard ends with the first episode that brings it to this many steps.
+        """
+        Args:
+            folder: to write to.
+            shard_steps: a shard ends with the first episode that brings it to this many steps.
         """
         self._folder = folder
         self._shard_steps = shard_steps

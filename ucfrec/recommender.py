@@ -40,15 +40,14 @@ class Recommender:
         settings: Mapping[str, Any] | Sequence[str] = (),
         seed: int = 0,
     ) -> None:
-        """
-        Args:
-            policy: learner, "ucf" or a baseline, as for `ucfrec train --policy`.
-            settings: as for `ucfrec train --set`: `{"train.steps": 200}`, `{"train": {"steps": 200}}`
-                or `["train.steps=200"]`.
-            seed: of everything random.
+        """Args:
+        policy: learner, "ucf" or a baseline, as for `ucfrec train --policy`.
+        settings: as for `ucfrec train --set`: `{"train.steps": 200}`, `{"train": {"steps": 200}}`
+            or `["train.steps=200"]`.
+        seed: of everything random.
 
-            Raises:
-                InputError: the policy or a setting is unknown or out of range.
+        Raises:
+            InputError: the policy or a setting is unknown or out of range.
         """
         self.config = resolve_config(policy, None, settings, seed)
         self._scratch: tempfile.TemporaryDirectory[str] | None = None

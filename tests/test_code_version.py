@@ -1,4 +1,4 @@
-"""The version of the code of a measurement: changed by what it runs through, by nothing else."""
+"""The code version of a measurement changes with the modules that it imports, and only those."""
 
 import importlib
 import subprocess
@@ -65,13 +65,13 @@ def test_what_is_imported_has_a_part_in_it(toolbox: Path, name: str, has_part: b
 
 
 def test_what_is_left_out_is_left_out_with_what_only_it_imports(toolbox: Path) -> None:
-    before = code_version("toolbox.root", apart=["toolbox.used"])
+    before = code_version("toolbox.root", exclude=["toolbox.used"])
     _write(toolbox, {"lazy.py": "x = 2\n", "used.py": FILES["used.py"] + "more = 1\n"})
     _forget()
-    assert code_version("toolbox.root", apart=["toolbox.used"]) == before
+    assert code_version("toolbox.root", exclude=["toolbox.used"]) == before
     _write(toolbox, {"far.py": "w = 3\n"})
     _forget()
-    assert code_version("toolbox.root", apart=["toolbox.used"]) != before
+    assert code_version("toolbox.root", exclude=["toolbox.used"]) != before
 
 
 def test_a_script_is_named_by_its_path(toolbox: Path) -> None:

@@ -1,4 +1,4 @@
-"""What rows say of where they come from, and what they do not say."""
+"""Provenance: the recorded command without folders of the machine, and peak memory."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Tables of settings: dataclasses in every respect, but for values that they do not take."""
+"""Tables of settings: they behave as dataclasses, and reject invalid values."""
 
 import copy
 import pickle

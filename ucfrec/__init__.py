@@ -18,7 +18,7 @@ _MODULES = {
 
 
 def __getattr__(name: str) -> Any:
-    # Importing torch takes a second; `ucfrec --help` does without.
+    # Lazy, because importing torch takes a second and `ucfrec --help` does not need it.
     if name in _MODULES:
         return getattr(import_module(_MODULES[name]), name)
     raise AttributeError(f"module 'ucfrec' has no attribute {name!r}")

@@ -1,4 +1,4 @@
-"""`python -m ucfrec` is the command `ucfrec`."""
+"""Makes `python -m ucfrec` run the command `ucfrec`."""
 
 import sys
 

@@ -1,9 +1,9 @@
-"""The one error that a user of the toolkit is meant to read."""
+"""The error that ucfrec raises for input that a user can correct."""
 
 
 class InputError(ValueError):
-    """Something handed to ucfrec cannot be used as it is.
+    """A file, value or combination of settings that ucfrec cannot use.
 
-    The message is one line that names what is wrong, where (file, column, row count) and what to
-    do. The command line prints it and exits with status 2.
+    The message is one line: what is wrong, where (file, column, row count) and what to do. The
+    command line prints it and exits with status 2.
     """

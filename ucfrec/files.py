@@ -1,4 +1,4 @@
-"""Outputs that appear whole or not at all."""
+"""Atomic files and folders, JSON, and locks between processes."""
 
 import json
 import os
@@ -13,9 +13,9 @@ from ucfrec.errors import InputError
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Yield a scratch folder beside `path` that takes its place when the block ends well.
+    """Yield a scratch folder next to `path` that is renamed to `path` when the block succeeds.
 
-    If the block raises, the scratch folder is removed and `path` is untouched.
+    If the block raises, the scratch folder is removed and `path` is not created.
 
     Raises:
         InputError: `path` exists already.
@@ -35,7 +35,10 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Yield a scratch path beside `path` that takes its place when the block ends well."""
+    """Yield a scratch path next to `path` that replaces `path` when the block succeeds.
+
+    If the block raises, the scratch file is removed and `path` keeps its old content.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     scratch = path.with_name(f".{path.name}.partial-{os.getpid()}")
     try:
@@ -46,7 +49,11 @@ def atomic_file(path: Path) -> Iterator[Path]:
 
 
 def write_json(path: Path, value: Mapping[str, Any] | list[Any]) -> None:
-    """Write `value` as indented JSON, atomically."""
+    """Write `value` as indented JSON, atomically; NaN and ±∞ become `NaN` and `Infinity`.
+
+    Raises:
+        TypeError: `value` holds an object that JSON cannot represent.
+    """
     with atomic_file(path) as scratch:
         scratch.write_text(json.dumps(value, indent=2, allow_nan=True) + "\n", encoding="utf-8")
 
@@ -67,17 +74,18 @@ def read_json(path: Path) -> Any:
 
 @contextmanager
 def file_lock(file: Path, byte: int = 0, wait: bool = True) -> Iterator[bool]:
-    """Hold a lock that processes share by the name of a file, made where it does not exist.
+    """Hold a lock on one byte of a file, shared by all processes that lock the same file.
 
-    The system frees it when the process ends, however it ends. A process must not hold two bytes of
-    one file: to close it frees both.
+    The operating system releases the lock when the process ends, also when it is killed. A process
+    must not hold locks on two bytes of one file at a time: releasing one releases both (POSIX).
 
     Args:
-        byte: what is locked; who locks another byte of the file is not in the way.
-        wait: until it is free, or give up at once.
+        file: created, with its parent folders, if missing.
+        byte: offset of the locked byte; locks on different bytes do not conflict.
+        wait: block until the lock is free; if false, give up at once.
 
     Yields:
-        Whether the lock is held.
+        Whether the lock is held; always true if `wait` is.
     """
     import fcntl  # not on Windows
 

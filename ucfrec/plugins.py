@@ -1,9 +1,9 @@
-"""What sibling packages, and anyone's own, announce through entry points.
+"""Plugins: simulators, datasets, benchmarks and learners that packages declare as entry points.
 
-A package adds a simulator to the command line by declaring, under the entry-point group
-`ucfrec.simulators`, a short name that points at a `Simulator`; datasets likewise under
-`ucfrec.datasets`, benchmarks under `ucfrec.benchmarks`, and learners, as classes derived from
-`ucfrec.policies.base.SequencePolicy`, under `ucfrec.policies`.
+A package adds a simulator to the command line by declaring, in the entry-point group
+`ucfrec.simulators`, a short name that points to a `Simulator`. Datasets are declared in
+`ucfrec.datasets`, benchmarks (`Benchmark`) in `ucfrec.benchmarks`, and learners (classes derived
+from `ucfrec.policies.base.SequencePolicy`) in `ucfrec.policies`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -26,77 +26,79 @@ _ONE_OF: Final = {
     "policies": "policy",
     "simulators": "simulator",
 }
-"""What one plugin of a group is called."""
+"""Singular of each group, for messages."""
 
 
 @dataclass(frozen=True)
 class Simulator:
-    """A world that sessions are played in."""
+    """A simulated environment in which sessions are played."""
 
     summary: str
     """One line for `--help`."""
     make: "Callable[[int, Path | None], VectorEnv[Any, Any, Any]]"
-    """(number of sessions side by side, folder of weights or None) to a vector environment with
-    `AutoresetMode.SAME_STEP`."""
+    """Makes a vector environment with `AutoresetMode.SAME_STEP` from (number of parallel sessions,
+    folder of weights or None)."""
     behaviors: "Mapping[str, Callable[[VectorEnv[Any, Any, Any], int], Actor]]"
-    """Built-in policies by name, each made from (environment, seed): `random`, `mixture`, and
-    `optimal` where it is known."""
+    """Built-in behavior policies by name, each made from (environment, seed): `random`, `mixture`
+    and, if it is known, `optimal`."""
     feedback: str
-    """Column that holds the reward in the logs that `ucfrec collect` writes."""
+    """Name of the reward column in the logs that `ucfrec collect` writes."""
 
 
 @dataclass(frozen=True)
 class Benchmark:
-    """Tables that `ucfrec benchmark NAME` measures and prints."""
+    """A set of tables that `ucfrec benchmark NAME` measures and prints."""
 
     summary: str
     """One line for `--help`."""
     tables: tuple[str, ...]
-    """By name, in the order in which they are measured."""
+    """Names of the tables, in the order in which they are measured."""
     run: Callable[["BenchmarkRequest"], str]
-    """Measures the cells that have no row yet; returns the tables as Markdown."""
+    """Measures the cells that have no result row yet; returns the tables as Markdown."""
     show: Callable[[Sequence[str], Sequence["ResultRow"]], str]
-    """(tables, rows of the suite) to the tables that the rows have something for, as Markdown."""
+    """Formats (table names, result rows) as Markdown; tables without any result are left out."""
 
 
 @dataclass(frozen=True)
 class BenchmarkRequest:
-    """What of a benchmark is measured, and where to."""
+    """Which tables of a benchmark are measured, and where the results are written."""
 
     budget: str
+    """Name of the budget: how many seeds, training steps and episodes are spent on a cell."""
     tables: Sequence[str]
+    """Names of the tables to measure."""
     out: Path
-    """Folder of logs, stores and runs."""
+    """Folder for logs, stores and runs."""
     results: Path
-    """File of result rows."""
+    """File to which result rows are added."""
     workers: int
-    """Processes."""
+    """Number of parallel processes."""
     log_seed: int = 0
-    """Of the logs that are simulated."""
+    """Seed of the simulated logs."""
     evaluation_seed: int | None = None
-    """Of the episodes that are reported; None for the budget's."""
+    """Seed of the evaluation episodes; None stands for the budget's."""
 
 
 def plugin_names(group: str) -> list[str]:
-    """Everything installed under the entry-point group `ucfrec.<group>`, sorted."""
+    """Names of the plugins installed in the entry-point group `ucfrec.<group>`, sorted."""
     return sorted(entry_points(group=f"ucfrec.{group}").names)
 
 
 def load_plugin(group: str, name: str) -> Any:
-    """Load the object that `name` stands for in the entry-point group `ucfrec.<group>`.
+    """Import the plugin `name` of the entry-point group `ucfrec.<group>`.
 
     Raises:
-        InputError: nothing of that name is installed, or it cannot be imported.
+        InputError: no plugin of that name is installed, or it cannot be imported.
     """
-    found = entry_points(group=f"ucfrec.{group}")
-    if name not in found.names:
+    installed = entry_points(group=f"ucfrec.{group}")
+    if name not in installed.names:
         known = ", ".join(plugin_names(group)) or "none"
         raise InputError(f"no {_ONE_OF[group]} is called {name!r}; installed: {known}")
-    entry = found[name]
+    entry = installed[name]
     try:
         return entry.load()
     except (ImportError, AttributeError) as error:
         raise InputError(
             f"the {_ONE_OF[group]} {name!r} is installed as {entry.value}, which cannot be "
-            f"imported: {error}"
+            f"imported ({error}); reinstall its package"
         ) from error

@@ -1,4 +1,4 @@
-"""Progress of long jobs: a bar on a terminal, a plain line now and then in a log file."""
+"""Progress of long jobs on stderr: a bar on a terminal, plain lines at intervals elsewhere."""
 
 import sys
 import time
@@ -7,50 +7,51 @@ from contextlib import contextmanager
 from typing import Any, Protocol
 
 FIRST_LINE = 10.0
-"""Seconds without a terminal before the first line; a shorter job prints nothing."""
+"""Seconds before the first line, without a terminal; a shorter job prints nothing."""
 NEXT_LINE = 30.0
-"""Seconds between two lines."""
+"""Seconds between lines."""
 
 
 class Progress(Protocol):
-    """What `progress` yields."""
+    """The display that `progress` yields."""
 
-    def update(self, n: float = 1, **shown: float) -> None:
-        """Count `n` more units as done; `shown` are values to print beside, e.g. `loss=0.3`."""
+    def update(self, n: float = 1, **metrics: float) -> None:
+        """Count `n` more units as done, and display `metrics` next to them, e.g. `loss=0.3`."""
 
 
 @contextmanager
-def progress(total: float | None, what: str, unit: str, done: float = 0) -> Iterator[Progress]:
-    """Show on stderr how far a job is, how fast it goes and how long it will still take.
+def progress(total: float | None, job: str, unit: str, done: float = 0) -> Iterator[Progress]:
+    """Display on stderr the finished share of a job, its rate and the estimated time left.
 
     Args:
-        total: units of the whole job; None where that is unknown.
-        what: the job, e.g. "train".
+        total: units of the whole job; None if unknown.
+        job: name of the job, e.g. "train".
         unit: what is counted, in the plural, e.g. "steps".
-        done: units that an earlier start of the same job left done.
+        done: units that were finished before this process resumed the job; they do not count
+            towards the rate.
     """
-    bar = _Bar if sys.stderr.isatty() else _Lines
-    shown = bar(total, what, unit, done)
+    display_class = _Bar if sys.stderr.isatty() else _Lines
+    display = display_class(total, job, unit, done)
     try:
-        yield shown
+        yield display
     finally:
-        shown.close()
+        display.close()
 
 
 class _Bar:
-    """On a terminal: tqdm, imported only here."""
+    """On a terminal: a tqdm bar."""
 
-    def __init__(self, total: float | None, what: str, unit: str, done: float) -> None:
+    def __init__(self, total: float | None, job: str, unit: str, done: float) -> None:
         from tqdm import tqdm
 
         scale = total is None or total >= 100_000
         self._bar: tqdm[Any] = tqdm(
-            total=total, desc=what, unit=f" {unit}", initial=done, unit_scale=scale
+            total=total, desc=job, unit=f" {unit}", initial=done, unit_scale=scale
         )
 
-    def update(self, n: float = 1, **shown: float) -> None:
-        if shown:
-            self._bar.set_postfix(shown, refresh=False)
+    def update(self, n: float = 1, **metrics: float) -> None:
+        if metrics:
+            self._bar.set_postfix(metrics, refresh=False)
         self._bar.update(n)
 
     def close(self) -> None:
@@ -58,18 +59,18 @@ class _Bar:
 
 
 class _Lines:
-    """In a log file: lines, so that a job of a night can be followed."""
+    """Without a terminal: plain lines, so that a long job can be followed in a log file."""
 
-    def __init__(self, total: float | None, what: str, unit: str, done: float) -> None:
-        self._total, self._what, self._unit = total, what, unit
-        self._before = self._done = done
+    def __init__(self, total: float | None, job: str, unit: str, done: float) -> None:
+        self._total, self._job, self._unit = total, job, unit
+        self._initial = self._done = done
         self._start = time.monotonic()
         self._next = self._start + FIRST_LINE
-        self._shown: dict[str, float] = {}
+        self._metrics: dict[str, float] = {}
 
-    def update(self, n: float = 1, **shown: float) -> None:
+    def update(self, n: float = 1, **metrics: float) -> None:
         self._done += n
-        self._shown |= shown
+        self._metrics |= metrics
         now = time.monotonic()
         if now >= self._next:
             self._next = now + NEXT_LINE
@@ -78,11 +79,11 @@ class _Lines:
     def close(self) -> None:
         seconds = time.monotonic() - self._start
         if seconds >= FIRST_LINE:
-            line = f"{self._what}: {self._done:,.0f} {self._unit} done, {_duration(seconds)}"
+            line = f"{self._job}: {self._done:,.0f} {self._unit} done, {_duration(seconds)}"
             print(line, file=sys.stderr, flush=True)
 
     def _print(self, seconds: float) -> None:
-        rate = (self._done - self._before) / seconds
+        rate = (self._done - self._initial) / seconds
         if self._total:
             share = self._done / self._total
             parts = [f"{self._done:,.0f} of {self._total:,.0f} {self._unit} ({share:.0%})"]
@@ -91,12 +92,12 @@ class _Lines:
         parts.append(_rate(rate, self._unit))
         if self._total and rate > 0:
             parts.append(f"{_duration(max(self._total - self._done, 0) / rate)} left")
-        parts += [f"{name} {value:.4g}" for name, value in self._shown.items()]
-        print(f"{self._what}: {', '.join(parts)}", file=sys.stderr, flush=True)
+        parts += [f"{name} {value:.4g}" for name, value in self._metrics.items()]
+        print(f"{self._job}: {', '.join(parts)}", file=sys.stderr, flush=True)
 
 
 def _rate(per_second: float, unit: str) -> str:
-    """A rate in the time unit that makes it at least one, where there is one."""
+    """A rate in the shortest time unit in which it is at least 1, at most hours: `3 steps/min`."""
     for span, seconds in (("s", 1), ("min", 60), ("h", 3600)):
         rate = per_second * seconds
         if rate >= 1 or span == "h":
@@ -105,7 +106,7 @@ def _rate(per_second: float, unit: str) -> str:
 
 
 def _duration(seconds: float) -> str:
-    """Two neighbouring units of time: `42 s`, `3 min 20 s`, `5 h 12 min`."""
+    """A duration in its two largest units: `42 s`, `3 min 20 s`, `5 h 12 min`."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     if hours:

@@ -1,4 +1,4 @@
-"""Where a result comes from: command, commit, versions, configuration, memory."""
+"""Provenance of a result: command, commit, package versions, hash of the settings, peak memory."""
 
 import hashlib
 import json
@@ -13,34 +13,42 @@ _PACKAGES = ("ucfrec", "torch", "numpy", "gymnasium")
 
 
 def versions(packages: Sequence[str] = ()) -> dict[str, str]:
-    """Versions of what decides numbers, and of an adapter's own `packages`.
+    """Installed versions of Python and of the packages that results depend on.
 
-    Packages that are not installed are left out.
+    Args:
+        packages: further distributions to include, e.g. those of a simulator.
+
+    Returns:
+        {name: version}; packages that are not installed are left out.
     """
-    found = {"python": sys.version.split()[0]}
+    installed = {"python": sys.version.split()[0]}
     for name in (*_PACKAGES, *packages):
         try:
-            found[name] = version(name)
+            installed[name] = version(name)
         except PackageNotFoundError:
             continue
-    return found
+    return installed
 
 
 def provenance(packages: Sequence[str] = ()) -> dict[str, Any]:
-    """What every result row records of the process that made it; `packages` as in `versions`."""
+    """Command, commit and versions of this process, as every result row records them.
+
+    Args:
+        packages: see `versions`.
+    """
     return {"command": command_line(), "commit": _commit(), "versions": versions(packages)}
 
 
 def command_line() -> str:
-    """The command of this process, with absolute paths cut to their last name.
+    """The command of this process, with absolute paths shortened to their last component.
 
-    So no row says where on one machine something lies.
+    Result rows are published and must not reveal the folders of a machine.
     """
     return " ".join([Path(sys.argv[0]).name, *map(without_folders, sys.argv[1:])])
 
 
 def without_folders(argument: str) -> str:
-    """An argument of a command, an absolute path in it (also after `=`) cut to its last name."""
+    """Shorten an absolute path in a command's argument (also after `=`) to its last component."""
     option, equals, value = "", "", argument
     if not _is_absolute(argument):
         option, equals, value = argument.rpartition("=")
@@ -49,18 +57,18 @@ def without_folders(argument: str) -> str:
 
 
 def _is_absolute(path: str) -> bool:
-    """Whether it names one place on one machine, under whichever system."""
+    """Whether `path` is absolute on POSIX or Windows, or relative to a home folder."""
     rooted = PurePosixPath(path).is_absolute() or PureWindowsPath(path).is_absolute()
     return rooted or path.startswith("~")
 
 
 def config_hash(config: Mapping[str, Any]) -> str:
-    """A short name for a configuration: 12 hexadecimal digits of the SHA-256 of its JSON."""
+    """The first 12 hexadecimal digits of the SHA-256 of a configuration as JSON, keys sorted."""
     return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()[:12]
 
 
 def reset_peak_memory() -> None:
-    """Let `peak_memory_mib` start again from what is in use now; only Linux can."""
+    """Make `peak_memory_mib` measure from now on; has no effect on systems other than Linux."""
     try:
         Path("/proc/self/clear_refs").write_text("5")
     except OSError:
@@ -68,9 +76,9 @@ def reset_peak_memory() -> None:
 
 
 def peak_memory_mib() -> float:
-    """Most resident memory of this process since `reset_peak_memory`, in MiB.
+    """Peak resident memory of this process since `reset_peak_memory`, in MiB.
 
-    Where that cannot be reset (not on Linux): since the process began.
+    On systems other than Linux: since the process began.
     """
     status = Path("/proc/self/status")
     if status.exists():
@@ -88,7 +96,7 @@ def _commit() -> str | None:
     root = Path(__file__).resolve().parent.parent
     if not (root / ".git").exists():
         return None
-    answer = subprocess.run(
+    result = subprocess.run(
         ["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=False
     )
-    return answer.stdout.strip() or None
+    return result.stdout.strip() or None

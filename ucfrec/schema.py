@@ -1,8 +1,8 @@
-"""Names and types of log columns and of episode-store columns: nowhere else are they spelt."""
+"""Names and dtypes of log columns and of episode-store columns; defined in this module only."""
 
 from typing import Final
 
-# Log columns, one row an impression.
+# Log columns, one row per impression.
 USER_ID: Final = "user_id"
 ITEM_ID: Final = "item_id"
 TIMESTAMP: Final = "timestamp"
@@ -11,16 +11,16 @@ SESSION_ID: Final = "session_id"
 PROPENSITY: Final = "propensity"
 IS_RANDOM: Final = "is_random"
 ACTION: Final = "action"
-"""A list of floats, in logs whose actions are vectors rather than items."""
+"""A list of floats, in logs whose actions are vectors instead of items."""
 OBSERVATION: Final = "observation"
-"""A list of floats: what was known just before the action."""
+"""A list of floats: what was observed just before the action."""
 
-# Episode-store columns, one row a step.
+# Episode-store columns, one row per step.
 ITEM: Final = "item"
 REWARD: Final = "reward"
 RETURN_TO_GO: Final = "return_to_go"
 
-# Episode-store columns, one row an episode.
+# Episode-store columns, one row per episode.
 USER: Final = "user"
 SPLIT: Final = "split"
 TERMINATED: Final = "terminated"
@@ -37,7 +37,7 @@ STEP_DTYPES: Final = {
 EPISODE_DTYPES: Final = {USER: "<i8", SPLIT: "|u1", TERMINATED: "|u1"}
 
 SPLITS: Final = ("train", "validation", "test")
-"""In order of time; `split` holds the position in this tuple."""
+"""In chronological order; the column `split` holds the index in this tuple."""
 
 STORE_VERSION: Final = 1
-"""Raised whenever a store written before could be misread."""
+"""Version of the store format; increased whenever an older ucfrec would misread a new store."""

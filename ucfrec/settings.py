@@ -1,7 +1,7 @@
-"""Tables of settings: frozen dataclasses whose values are checked when they are built.
+"""Tables of settings: frozen dataclasses that validate their values when they are constructed.
 
-A field states its type and range in its annotation, its default behind it, and its meaning in the
-text below it; errors and `ucfrec settings` read all three from there.
+The annotation of a field gives its type and range, the assignment its default, and the docstring
+below it its meaning; error messages and `ucfrec settings` show all three.
 """
 
 import difflib
@@ -29,7 +29,7 @@ from ucfrec.errors import InputError
 
 Table = TypeVar("Table")
 _CHECKED: Final = ConfigDict(
-    # `true` is no number, and text is none either; a whole number may stand for any number.
+    # Strict: `true` and "1" are not accepted as numbers; an int is accepted as a float.
     strict=True,
     extra="forbid",
     allow_inf_nan=False,
@@ -37,28 +37,28 @@ _CHECKED: Final = ConfigDict(
 )
 
 Count = Annotated[int, Field(ge=1, le=10**12)]
-"""Of updates, rows or episodes; there is at least one."""
+"""A number of updates, rows or episodes, at least 1."""
 Width = Annotated[int, Field(ge=1, le=16_384)]
-"""Of a network's layer."""
+"""Units in a layer of a network."""
 Weight = Annotated[float, Field(ge=0, le=1e6)]
-"""Of a term of a loss; 0 leaves it out."""
+"""Weight of a term of a loss; 0 disables the term."""
 LearningRate = Annotated[float, Field(gt=0, le=10)]
 WeightDecay = Annotated[float, Field(ge=0, le=1000)]
 BatchSize = Annotated[int, Field(ge=1, le=1_000_000)]
 Dropout = Annotated[float, Field(ge=0, lt=1)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Quantile = Annotated[float, Field(ge=0, lt=1)]
-"""Below it something is left out; at 1 all would be."""
+"""A threshold below which steps are left out; 1 is not allowed, it would leave out all."""
 
 
 class SettingError(InputError):
-    """A value that a table of settings does not take."""
+    """A value, or a combination of values, that a table of settings rejects."""
 
     def __init__(self, message: str, *keys: str) -> None:
         """
         Args:
-            message: names field, value and what is allowed.
-            keys: the fields concerned, as `table.field`.
+            message: names the field, its value and the allowed values.
+            keys: the rejected fields, as `table.field`.
         """
         super().__init__(message)
         self.keys = keys
@@ -66,30 +66,29 @@ class SettingError(InputError):
 
 @dataclass(frozen=True)
 class Setting:
-    """One field of a table, for a reader."""
+    """The description of one field of a table."""
 
     key: str
-    """`table.field`, as `--set` takes it."""
+    """`table.field`, as in `--set table.field=value`."""
     value: Any
+    """Current value."""
     allowed: str
     """Type and range, in words."""
     meaning: str
+    """The docstring of the field, on one line."""
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(Field, field))
 def settings_table(name: str) -> Callable[[type[Table]], type[Table]]:
-    """Make a class a frozen dataclass that checks its values when built.
+    """A decorator that makes a class a frozen dataclass with validated fields.
 
-    Fields are annotated as pydantic reads them (`Annotated[int, Field(ge=1)]`); what must hold
-    between fields is checked in `__post_init__`, by `require`. `dataclasses.fields`, `asdict` and
-    `replace` work as on any dataclass.
+    Ranges are annotated for pydantic (`Annotated[int, Field(ge=1)]`); constraints between fields
+    are checked in `__post_init__`, with `require`. `dataclasses.fields`, `asdict` and `replace`
+    work as on any dataclass. Constructing the class with an invalid value raises `SettingError`.
 
     Args:
-        name: of the table, which errors put before the field's: `policy` of `policy.heads`; empty
-            for fields that are of no table.
-
-    Raises:
-        SettingError: of the class that is made, when built with a value that it does not take.
+        name: of the table, the prefix of its fields in messages: `policy` in `policy.heads`; empty
+            for fields outside any table.
     """
 
     def decorate(cls: type[Table]) -> type[Table]:
@@ -103,37 +102,45 @@ def settings_table(name: str) -> Callable[[type[Table]], type[Table]]:
             except ValidationError as error:
                 names = [f.name for f in fields(table)]
                 given = dict(zip(names, args, strict=False)) | values
-                raise _refusal(table, name, error, given) from None
+                raise _setting_error(table, name, error, given) from None
 
         table.__init__ = checked
-        made: type[Table] = table
-        return made
+        result: type[Table] = table
+        return result
 
     return decorate
 
 
 def require(holds: bool, message: str, *keys: str) -> None:
-    """Refuse a combination of values, in a table's `__post_init__`.
+    """Check a constraint between fields, in the `__post_init__` of a table.
 
     Args:
-        message: names fields, values and what is allowed.
-        keys: the fields concerned, as `table.field`.
+        holds: whether the constraint is satisfied.
+        message: names the fields, their values and the allowed values.
+        keys: the fields of the constraint, as `table.field`.
 
     Raises:
-        SettingError: unless `holds`.
+        SettingError: `holds` is false.
     """
     if not holds:
         raise SettingError(message, *keys)
 
 
 def describe(name: str, table: Any) -> Iterator[Setting]:
-    """Every field of `table`, an instance of a class that `settings_table` made."""
+    """Describe every field of `table`, an instance of a class decorated by `settings_table`.
+
+    A field that a subclass redefines without a docstring has the meaning given by its base class.
+
+    Args:
+        name: of the table, the prefix of the keys.
+        table: the instance whose values are shown.
+    """
     for key, info in _fields(type(table)).items():
         meaning = next(
             (
-                own[key].description
+                base_fields[key].description
                 for base in type(table).__mro__
-                if key in (own := _fields(base)) and own[key].description
+                if key in (base_fields := _fields(base)) and base_fields[key].description
             ),
             "",
         )
@@ -142,33 +149,34 @@ def describe(name: str, table: Any) -> Iterator[Setting]:
 
 
 def is_table(cls: type) -> bool:
-    """Whether `settings_table` made the class itself, not only one that it derives from."""
+    """Whether `cls` itself is decorated by `settings_table`, not only a base class of it."""
     return bool(_fields(cls))
 
 
 def nearest(name: str, known: Sequence[str]) -> str:
-    """The known name that was probably meant, or all of them."""
-    near = difflib.get_close_matches(name, known, n=1)
-    return f"did you mean {near[0]!r}?" if near else f"there are {', '.join(known)}"
+    """The end of a message about an unknown `name`: the most similar known name, else all."""
+    matches = difflib.get_close_matches(name, known, n=1)
+    return f"did you mean {matches[0]!r}?" if matches else f"there are {', '.join(known)}"
 
 
 def _fields(table: type) -> Mapping[str, Any]:
-    """Pydantic's account of each field; empty for any other class."""
+    """Pydantic's `FieldInfo` of each field; empty for any other class."""
     if not pydantic.dataclasses.is_pydantic_dataclass(table):
         return {}
-    found: Mapping[str, Any] = table.__dict__["__pydantic_fields__"]
-    return found
+    infos: Mapping[str, Any] = table.__dict__["__pydantic_fields__"]
+    return infos
 
 
-def _refusal(
+def _setting_error(
     table: Any, name: str, error: ValidationError, given: Mapping[str, Any]
 ) -> SettingError:
-    """The first thing that is wrong, in a line."""
+    """The first of pydantic's errors, as one line."""
     first = error.errors(include_url=False)[0]
     known = list(_fields(table))
     cause = first.get("ctx", {}).get("error")
     if isinstance(cause, SettingError):
         return cause
+    # Pydantic locates positional arguments by their index.
     at = first["loc"][0]
     key = known[at] if isinstance(at, int) and at < len(known) else str(at)
     if key not in known:

@@ -14,7 +14,8 @@ from tests.support.real_data import data_folder
 from ucfrec.counterfactual.augment import accept
 from ucfrec.counterfactual.edit_statistics import MoveReport, MoveStatistics
 from ucfrec.counterfactual.generators import CSGConfig, Generator, make_generator
-from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, fit_crm
+from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig
+from ucfrec.counterfactual.reward_model_fit import fit_crm
 from ucfrec.episodes.windows import Transitions
 from ucfrec.errors import InputError
 

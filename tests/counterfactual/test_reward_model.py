@@ -1,4 +1,4 @@
-"""The reward model finds the planted disturbance, and says so when there is none."""
+"""The reward model recovers a planted disturbance, and its report warns when it does not."""
 
 import json
 from dataclasses import asdict, replace
@@ -13,10 +13,9 @@ from ucfrec.counterfactual.reward_model import (
     CausalRewardModel,
     CRMConfig,
     Posterior,
-    fit_crm,
-    fit_warning,
     kl_to_prior,
 )
+from ucfrec.counterfactual.reward_model_fit import fit_crm, fit_warning
 from ucfrec.errors import InputError
 
 QUICK = CRMConfig(epochs=1, hidden=32, latent_dim=3, learning_rate=1e-3)
@@ -38,7 +37,7 @@ def test_the_planted_disturbance_is_abduced() -> None:
     assert (predicted - t.rewards).abs().quantile(0.95) <= 2 * report.delta["0.95"]
 
 
-def test_the_report_tells_what_z_is_worth() -> None:
+def test_the_report_measures_the_share_of_z() -> None:
     _, report = fitted()
     assert report.z_share == pytest.approx(0.3, abs=0.06)
     assert report.r2_without_z == pytest.approx(0.7, abs=0.06)
@@ -50,7 +49,7 @@ def test_the_report_tells_what_z_is_worth() -> None:
     assert json.loads(json.dumps(asdict(report)))["train_transitions"] == 20_000
 
 
-def test_the_plain_autoencoder_leaks_and_is_told_on(tmp_path: Path) -> None:
+def test_the_plain_autoencoder_leaks_and_the_report_warns(tmp_path: Path) -> None:
     train, held_out = planted(8_000, 0).transitions, planted(4_000, 1).transitions
     plain = replace(FIT, mean_first=False, epochs=15)
     _, report = fit_crm(train, held_out, plain, tmp_path, seed=0)
@@ -58,7 +57,7 @@ def test_the_plain_autoencoder_leaks_and_is_told_on(tmp_path: Path) -> None:
     assert report.warning.startswith("latent leak")
 
 
-def test_a_reward_without_disturbance_collapses_and_is_told_on(tmp_path: Path) -> None:
+def test_a_reward_without_disturbance_collapses_and_the_report_warns(tmp_path: Path) -> None:
     train, held_out = planted(8_000, 0, share=0).transitions, planted(2_000, 1, share=0).transitions
     train = replace(train, rewards=train.states[:, 0] - train.actions[:, 1])
     held_out = replace(held_out, rewards=held_out.states[:, 0] - held_out.actions[:, 1])
@@ -68,7 +67,7 @@ def test_a_reward_without_disturbance_collapses_and_is_told_on(tmp_path: Path) -
     assert "collapse" in report.warning
 
 
-def test_a_model_of_rewards_that_nothing_predicts_is_named(tmp_path: Path) -> None:
+def test_a_model_of_unpredictable_rewards_gives_a_warning(tmp_path: Path) -> None:
     train, held_out = planted(4_000, 0).transitions, planted(4_000, 1).transitions
     generator = torch.Generator().manual_seed(0)
     train = replace(train, rewards=torch.randn(4_000, generator=generator))

@@ -56,15 +56,16 @@ def test_a_long_store_keeps_its_digits() -> None:
 
 
 @given(episodes_of_eighths)
-def test_acting_towards_the_logged_return_sees_what_training_saw(
+def test_acting_with_the_logged_return_as_target_gives_the_training_returns_to_go(
     episodes: list[list[float]],
 ) -> None:
-    """An actor asked for an episode's return, and earning its rewards, meets its returns-to-go."""
+    """With an episode's return as target return and its rewards, acting repeats its values."""
     trained = returns_to_go(*flat(episodes)).tolist()
     seen: list[float] = []
     for episode in episodes:
-        target, earned = torch.tensor([sum(episode)], dtype=torch.float64), torch.zeros(1).double()
+        target = torch.tensor([sum(episode)], dtype=torch.float64)
+        collected = torch.zeros(1).double()
         for reward in episode:
-            seen += remaining_return(target, earned).float().tolist()
-            earned += reward
+            seen += remaining_return(target, collected).float().tolist()
+            collected += reward
     assert seen == trained

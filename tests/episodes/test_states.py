@@ -1,4 +1,4 @@
-"""States in training and in acting are one thing, and know nothing of what comes after."""
+"""States are identical in training and in acting, and do not depend on later steps."""
 
 import tempfile
 from pathlib import Path
@@ -37,7 +37,7 @@ def acted(episodes: list[Logged], states: ItemStates, rows: int) -> list[Tensor]
     while any(number < len(episodes) for number in playing):
         live = [row for row in range(rows) if playing[row] < len(episodes)]
         observations = torch.full((rows, size), 5.0)
-        # Rows that play nothing any more are fed nonsense.
+        # Rows without an episode get arbitrary values, which must not affect the others.
         items, rewards = np.full(rows, 1), np.full(rows, 2.0)
         for row in live:
             logged = episodes[playing[row]]

@@ -325,7 +325,7 @@ def test_a_view_leaves_out_some_of_what_was_observed(
 ) -> None:
     episodes = random_episodes(LENGTHS, observation=3, items=items)
     store = write_store(folder / "store", episodes, some_states() if items else None, shard_steps)
-    view = store.select(np.array([6, 2, 4])).without_observed([1])
+    view = store.select(np.array([6, 2, 4])).without_observation_dimensions([1])
     assert (view.observation_size, view.state_size) == (2, store.state_size - 1)
     for part in (view, view.select(np.array([2, 0]))):
         seen, whole = (every_window(each, 4) for each in (part, store.select(part.episode_ids)))
@@ -495,7 +495,7 @@ def test_copies_are_never_dropped_silently(folder: Path) -> None:
         lambda: union.split("train"),
         lambda: union.select(np.arange(3)),
         lambda: union.with_returns_to_go(np.zeros(union.n_steps, dtype=np.float32)),
-        lambda: union.without_observed([0]),
+        lambda: union.without_observation_dimensions([0]),
     ):
         with pytest.raises(InputError, match=r"9 edited copies.*without_copies\(\)"):
             lose()
@@ -614,7 +614,7 @@ def test_tensors_whose_shapes_do_not_go_together_are_refused(folder: Path, of: s
         for wrong in (values[1:], values[..., None, None]):
             if of == "overlay" and name == "copy_source" and wrong.ndim == 1:
                 continue  # any number of copies is good
-            with pytest.raises(InputError, match=rf"shapes do not go together \(.*{name}"):
+            with pytest.raises(InputError, match=rf"shapes do not match \(.*{name}"):
                 replace(good, **{name: wrong})
 
 

@@ -1,4 +1,4 @@
-"""The training loop: resumes to the bit, stops in time, keeps the best, says what it did."""
+"""The training loop: bit-exact resumption, early stopping, best weights, logs."""
 
 import dataclasses
 import json

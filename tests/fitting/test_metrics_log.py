@@ -1,4 +1,4 @@
-"""`metrics.jsonl`: what is written is read, whatever was cut off; anything else is named."""
+"""`metrics.jsonl`: written lines are read back, incomplete ones ignored, invalid ones reported."""
 
 import json
 import math
@@ -72,9 +72,9 @@ def test_a_torn_last_line_is_left_out_and_never_joined_to_the_next(tmp_path: Pat
         ("{", "is not JSON"),
         ("[" * 100_000, "is not JSON"),
         ('{"step": 1, "loss": ' + "1" * 5000 + "}", "is not JSON"),
-        ("[1]", "is no JSON object"),
-        ("null", "is no JSON object"),
-        ('{"loss": 1}', "no whole number from 0 as 'step'"),
+        ("[1]", "is not a JSON object"),
+        ("null", "is not a JSON object"),
+        ('{"loss": 1}', "no whole number of 0 or more as 'step'"),
         ('{"step": -1}', "no whole number"),
         ('{"step": 1.5}', "no whole number"),
         ('{"step": true}', "no whole number"),

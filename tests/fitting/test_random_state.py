@@ -1,4 +1,4 @@
-"""Training seeds what it draws from; whoever calls it finds the global generators untouched."""
+"""Functions that seed the global generators restore them for their caller."""
 
 import random
 from collections.abc import Iterator
@@ -116,7 +116,7 @@ def test_a_run_and_reading_it_back(store: EpisodeStore, tmp_path: Path, name: st
 
 
 @pytest.mark.parametrize("world", ["synthetic-taobao", "synthetic-catalog"])
-def test_collecting_and_judging(world: str, tmp_path: Path) -> None:
+def test_collecting_and_evaluating(world: str, tmp_path: Path) -> None:
     at = World(world)
     with unnoticed():
         simulated_store(at, tmp_path, 60, 0)

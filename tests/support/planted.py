@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, CRMReport, fit_crm
+from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig
+from ucfrec.counterfactual.reward_model_fit import CRMReport, fit_crm
 from ucfrec.episodes.windows import Transitions
 
 STATE, ACTION = 7, 2

@@ -1,7 +1,7 @@
-"""Offline counterfactual augmentation: edited copies of episodes, and what they can be trusted for.
+"""Offline counterfactual augmentation: edited copies of episodes and a report on their quality.
 
-Rewards, actions, next states and returns-to-go of a copy are its source's: an overlay holds edited
-states and nothing else (paper appendix H).
+Rewards, actions, next states and returns-to-go of a copy are those of its source; an overlay holds
+only the edited states (paper appendix H).
 """
 
 import copy
@@ -19,13 +19,8 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.counterfactual.edit_statistics import MoveReport, MoveStatistics
 from ucfrec.counterfactual.generators import CSGConfig, Generator, make_generator
-from ucfrec.counterfactual.reward_model import (
-    CausalRewardModel,
-    CRMConfig,
-    CRMReport,
-    fit_crm,
-    fit_warning,
-)
+from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig
+from ucfrec.counterfactual.reward_model_fit import CRMReport, fit_crm, fit_warning
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import FloatArray, IntArray, Overlay, Transitions
 from ucfrec.errors import InputError
@@ -39,43 +34,52 @@ _ROUNDING = 1e-9
 
 @settings_table("augment")
 class AugmentConfig:
-    """How many edited copies are made, and of which steps.
+    """How many edited copies are made, and which steps are edited.
 
-    Algorithm 5 is `copies=K, edits_per_copy=1, reward_quantile=0`: each of K accepted proposals
-    makes its own copy. Appendix H, the default, is few copies that carry every accepted edit.
+    The paper's Algorithm 5 is `copies=K, edits_per_copy=1, reward_quantile=0`: each of K accepted
+    proposals makes a separate copy. The default is appendix H: few copies that contain every
+    accepted edit.
     """
 
     copies: Annotated[int, Field(ge=0, le=1000)] = 1
-    """Edited copies of each episode, at most; 0 trains without, and without a reward model."""
+    """Maximum number of edited copies of each episode; 0 trains without copies and without a reward
+    model."""
     edits_per_copy: Annotated[int, Field(ge=0, le=1_000_000)] = 0
-    """Edited steps in a copy, at most; 0 stands for every accepted one."""
+    """Maximum number of edited steps in a copy; 0 means no limit."""
     reward_quantile: Quantile = 0.3
-    """Steps with a reward below this quantile are left alone."""
+    """Steps with a reward below this quantile are not edited."""
     epsilon_r: Annotated[float, Field(ge=0, le=1e15)] | None = None
-    """Tolerance of the gate in reward units; unset, 0.1 × standard deviation of the rewards."""
+    """ε_r, tolerance of the reward gate in reward units; unset, 0.1 × standard deviation of the
+    rewards."""
     max_steps: Count = 2_000_000
-    """Most steps to look at; of a larger store, episodes are drawn."""
+    """Maximum number of steps to propose edits for; from a larger store, episodes are sampled."""
 
 
 @dataclass(frozen=True)
 class AugmentationReport:
-    """What was edited, and what Proposition 1 promises for it."""
+    """Number and kind of the edits, and the bound of Proposition 1 on their effect."""
 
     copies: int
+    """Number of edited copies."""
     proposals: int
+    """Number of proposed edits."""
     acceptance: float
-    """Share of proposals that passed the gate."""
+    """Share of proposals that passed both gates."""
     moves: MoveReport
+    """Statistics of the accepted edits."""
     epsilon_r: float
+    """Tolerance of the reward gate, in reward units."""
     delta: float
-    """What |f̂_r(s, a, z) − r| stays below on 95% of held-out steps."""
+    """δ: the 95% quantile of |f̂_r(s, a, z) − r| on held-out steps, in reward units."""
     bound: float
-    """δ + ε_r, in reward units: how far an edit may have moved the true reward."""
+    """δ + ε_r, in reward units: largest change of the true reward by an edit (Proposition 1)."""
     verdict: str
-    """In plain words, what the bound is worth."""
+    """A sentence on whether the bound is informative."""
     warnings: tuple[str, ...]
-    """A reward model that predicts nothing, latent collapse or leak, edit collapse."""
+    """Warnings of a reward model that predicts nothing, latent collapse, latent leak and edit
+    collapse."""
     reward_model: CRMReport
+    """Quality of the reward model."""
 
 
 def accept(
@@ -86,14 +90,18 @@ def accept(
     epsilon_r: float,
     rho_high: float,
 ) -> Tensor:
-    """Which proposals pass both gates of Eq. 4 (Algorithm 4), as bools (M,).
+    """Which proposals pass both gates of Eq. 4 (Algorithm 4).
 
     Args:
-        factual: M steps as they were logged.
+        crm: the fitted reward model.
+        factual: M logged steps.
         z: (M, latent_dim) disturbances abduced from them.
         proposals: (M, S) counterfactual states.
-        epsilon_r: largest |f̂_r(s_c, a, z) − r|, in reward units.
-        rho_high: largest ‖(s_c − s) / σ_s‖₂; dimensions with σ_s = 0 must not move at all.
+        epsilon_r: largest allowed |f̂_r(s_c, a, z) − r|, in reward units.
+        rho_high: largest allowed ‖(s_c − s) / σ_s‖₂; dimensions with σ_s = 0 must not change.
+
+    Returns:
+        (M,) bool.
     """
     change = (crm.predict(proposals, factual.actions, z) - factual.rewards).abs()
     length = crm.moves(factual.states, proposals).norm(dim=1)
@@ -109,13 +117,21 @@ def augment(
     config: AugmentConfig,
     seed: int,
 ) -> tuple[Overlay, AugmentationReport]:
-    """Edited copies of the episodes of `view`, a training view without an overlay (Algorithm 5).
+    """Make edited copies of episodes (Algorithm 5, or appendix H; see `AugmentConfig`).
+
+    Args:
+        view: the training episodes, without edited copies.
+        crm: the fitted reward model.
+        crm_report: its quality, for the report.
+        generator: proposes counterfactual states.
+        config: numbers of copies and edits, and the gate.
+        seed: of sampling and proposals.
 
     Raises:
-        InputError: `config` has no copies.
+        InputError: `config.copies` is 0.
     """
     if config.copies < 1:
-        raise InputError("augment.copies is 0; to make copies, it must be at least 1")
+        raise InputError("augment.copies is 0; set it to at least 1 to make edited copies")
     rng = np.random.default_rng(seed)
     epsilon_r = config.epsilon_r
     if epsilon_r is None:
@@ -123,7 +139,7 @@ def augment(
     editor = _Editor(view, crm, generator, epsilon_r, seed)
     episodes, steps = _candidates(view, config, rng)
     if config.edits_per_copy:
-        rounds = _deal(editor, episodes, steps, config, rng)
+        rounds = _fill_copies(editor, episodes, steps, config, rng)
     else:
         rounds = (editor.edit(episodes, steps, copy=k) for k in range(config.copies))
     overlay = _overlay(view, _join(rounds, view.state_size), config.copies)
@@ -131,10 +147,10 @@ def augment(
 
 
 def require_rewards_vary(train: EpisodeStore) -> None:
-    """Refuse training episodes whose rewards are all equal: a reward model has nothing to learn.
+    """Check that the training rewards are not all equal, which a reward model cannot learn from.
 
     Raises:
-        InputError: they are.
+        InputError: all training rewards are equal.
     """
     rewards = train.step_values(schema.REWARD, *train.all_steps())
     if (rewards == rewards[0]).all():
@@ -155,30 +171,38 @@ def counterfactual_copies(
     folder: Path,
     seed: int,
 ) -> tuple[Overlay, AugmentationReport]:
-    """Lines 1 to 3 of Algorithm 1: reward model, generator, edited copies.
+    """Fit reward model and generator, and make edited copies (lines 1 to 3 of Algorithm 1).
 
     Args:
-        train: view that everything is learned from and copies are made of.
-        validation: view that only measures the reward model and stops its training.
-        folder: where checkpoints are kept; resumed from if there are some.
+        train: view to fit both models to and to copy episodes from.
+        validation: view for early stopping and for the quality of the reward model.
+        crm_config: settings of the reward model.
+        csg_config: settings of the state generator.
+        config: settings of the copies.
+        folder: of the checkpoints, which training resumes from.
+        seed: of everything random.
+
+    Raises:
+        InputError: all training rewards are equal, there are no held-out steps, or `config.copies`
+            is 0.
     """
-    most = max(crm_config.max_transitions, csg_config.max_transitions)
-    fitted = sample_transitions(train, most, seed)
-    held_out = sample_transitions(validation, most // 10, seed)
-    crm, crm_report = fit_crm(fitted, held_out, crm_config, folder / "crm", seed)
-    generator = make_generator(fitted, crm, csg_config, folder / "csg", seed)
+    limit = max(crm_config.max_transitions, csg_config.max_transitions)
+    training = sample_transitions(train, limit, seed)
+    held_out = sample_transitions(validation, limit // 10, seed)
+    crm, crm_report = fit_crm(training, held_out, crm_config, folder / "crm", seed)
+    generator = make_generator(training, crm, csg_config, folder / "csg", seed)
     return augment(train, crm, crm_report, generator, config, seed)
 
 
 def sample_transitions(view: EpisodeStore, limit: int, seed: int) -> Transitions:
-    """All transitions of a view, or `limit` drawn from them if there are more."""
+    """All transitions of a view; if there are more than `limit`, so many drawn with replacement."""
     if view.n_steps <= limit:
         return view.transitions(*view.all_steps())
     return view.transitions(*view.draw_steps(np.random.default_rng(seed), limit))
 
 
 class _Edits(NamedTuple):
-    """Accepted edits, aligned; episodes are positions in the view."""
+    """M accepted edits: position of the episode in the view, copy, step, state (M, S)."""
 
     episode: IntArray
     copy: IntArray
@@ -187,7 +211,7 @@ class _Edits(NamedTuple):
 
 
 class _Editor:
-    """Proposes and judges chunk by chunk, and keeps count."""
+    """Proposes edits, applies the gates chunk by chunk, and collects statistics."""
 
     def __init__(
         self,
@@ -199,7 +223,8 @@ class _Editor:
     ) -> None:
         self._view, self._crm, self._generator = view, crm, generator
         self._random = torch.Generator().manual_seed(seed)
-        # Judged in float64 as stored in float32, so that whoever checks finds both gates hold.
+        # The gates are evaluated in float64 on the stored float32 values, so that a later check
+        # of an overlay confirms every edit.
         self._exact = copy.deepcopy(crm).double()
         self._moves = MoveStatistics(view.state_size)
         self.epsilon_r = epsilon_r
@@ -207,7 +232,7 @@ class _Editor:
         self.proposals = 0
 
     def edit(self, episodes: IntArray, steps: IntArray, copy: int = 0) -> _Edits:
-        """Propose once at each of the given steps; the accepted edits, in the given order."""
+        """Propose one edit at each of the given steps; returns the accepted ones, in order."""
         kept, states = np.zeros(len(steps), dtype=bool), []
         for start in range(0, len(steps), _CHUNK):
             rows = slice(start, start + _CHUNK)
@@ -243,18 +268,18 @@ class _Editor:
 def _candidates(
     view: EpisodeStore, config: AugmentConfig, rng: np.random.Generator
 ) -> tuple[IntArray, IntArray]:
-    """(episodes, steps) that pass the reward filter, by episode."""
+    """(episodes, steps) that pass the reward filter, in order of episodes."""
     order = rng.permutation(view.n_episodes)
-    fitting = np.searchsorted(np.cumsum(view.lengths[order]), config.max_steps, side="right")
-    chosen = np.sort(order[: max(1, int(fitting))])
-    lengths = view.lengths[chosen]
-    episodes, steps = np.repeat(chosen, lengths), _ranges(np.zeros_like(lengths), lengths)
+    count = np.searchsorted(np.cumsum(view.lengths[order]), config.max_steps, side="right")
+    sampled = np.sort(order[: max(1, int(count))])
+    lengths = view.lengths[sampled]
+    episodes, steps = np.repeat(sampled, lengths), _ranges(np.zeros_like(lengths), lengths)
     rewards = view.step_values(schema.REWARD, episodes, steps)
     high = rewards >= np.quantile(rewards, config.reward_quantile)
     return episodes[high], steps[high]
 
 
-def _deal(
+def _fill_copies(
     editor: _Editor,
     episodes: IntArray,
     steps: IntArray,
@@ -263,44 +288,44 @@ def _deal(
 ) -> Iterator[_Edits]:
     """Propose at each episode's steps in random order until its copies are full (Algorithm 5).
 
-    In each round every episode proposes exactly as often as it still lacks edits, so nothing is
-    proposed that the algorithm, one step at a time, would not have.
+    In each round every episode proposes as many edits as its copies still need, so no edit is
+    proposed that the algorithm, which proceeds one step at a time, would not propose.
     """
     order = np.lexsort((rng.random(len(steps)), episodes))
-    found_in, counts = np.unique(episodes, return_counts=True)
+    unique_episodes, counts = np.unique(episodes, return_counts=True)
     first = np.cumsum(counts) - counts
-    tried, accepted = np.zeros_like(counts), np.zeros_like(counts)
+    proposed, accepted = np.zeros_like(counts), np.zeros_like(counts)
     while True:
-        lacking = config.copies * config.edits_per_copy - accepted
-        trying = np.minimum(lacking, counts - tried)
-        if not trying.any():
+        needed = config.copies * config.edits_per_copy - accepted
+        new_proposals = np.minimum(needed, counts - proposed)
+        if not new_proposals.any():
             return
-        rows = order[_ranges(first + tried, trying)]
+        rows = order[_ranges(first + proposed, new_proposals)]
         edits = editor.edit(episodes[rows], steps[rows])
-        which = np.searchsorted(found_in, edits.episode)
-        new = np.bincount(which, minlength=len(counts))
-        number = _ranges(accepted, new)
+        index = np.searchsorted(unique_episodes, edits.episode)
+        new_edits = np.bincount(index, minlength=len(counts))
+        number = _ranges(accepted, new_edits)
         yield edits._replace(copy=number // config.edits_per_copy)
-        tried, accepted = tried + trying, accepted + new
+        proposed, accepted = proposed + new_proposals, accepted + new_edits
 
 
 def _ranges(starts: IntArray, lengths: IntArray) -> IntArray:
-    """start, start + 1, …, start + length − 1 for each pair, one after the other."""
+    """The concatenated ranges start, start + 1, …, start + length − 1."""
     ends = np.cumsum(lengths)
     return np.arange(ends[-1] if len(ends) else 0) + np.repeat(starts - ends + lengths, lengths)
 
 
 def _join(rounds: Iterator[_Edits], state_size: int) -> _Edits:
-    none = np.zeros(0, dtype=np.int64)
-    empty = _Edits(none, none, none, np.zeros((0, state_size), dtype=np.float32))
+    no_index = np.zeros(0, dtype=np.int64)
+    empty = _Edits(no_index, no_index, no_index, np.zeros((0, state_size), dtype=np.float32))
     return _Edits(*(np.concatenate(parts) for parts in zip(empty, *rounds, strict=True)))
 
 
 def _overlay(view: EpisodeStore, edits: _Edits, copies: int) -> Overlay:
-    made, edit_copy = np.unique(edits.episode * copies + edits.copy, return_inverse=True)
+    copy_keys, edit_copy = np.unique(edits.episode * copies + edits.copy, return_inverse=True)
     order = np.lexsort((edits.step, edit_copy))
     return Overlay(
-        copy_source=view.episode_ids[made // copies],
+        copy_source=view.episode_ids[copy_keys // copies],
         edit_copy=edit_copy[order],
         edit_step=edits.step[order],
         edit_state=edits.state[order],
@@ -311,8 +336,8 @@ def _report(overlay: Overlay, editor: _Editor, crm_report: CRMReport) -> Augment
     moves = editor.moves()
     delta = crm_report.delta[_DELTA_LEVEL]
     bound = delta + editor.epsilon_r
-    of_model = (fit_warning(crm_report.r2_without_z), crm_report.warning)
-    warnings = [warning for warning in of_model if warning]
+    model_warnings = (fit_warning(crm_report.r2_without_z), crm_report.warning)
+    warnings = [warning for warning in model_warnings if warning]
     if moves.edits and moves.mean_move_ratio > 0.5:
         warnings.append(
             f"edit collapse: {moves.mean_move_ratio:.0%} of the average edit is one shift common "
@@ -335,17 +360,17 @@ def _report(overlay: Overlay, editor: _Editor, crm_report: CRMReport) -> Augment
 def _verdict(edits: int, bound: float, crm_report: CRMReport) -> str:
     if edits == 0:
         return (
-            "no edit was accepted: the reward model misses held-out rewards by "
-            f"{crm_report.delta['0.5']:.3g} in the median, or the generator changes them"
+            "no edit was accepted: the reward model's median error on held-out steps is "
+            f"{crm_report.delta['0.5']:.3g}, or the generator changes the predicted reward"
         )
     deviations = bound / crm_report.reward_std
     if deviations >= 1:
         return (
             f"the bound means nothing: it allows a change of {bound:.3g}, {deviations:.1f} "
-            "standard deviations of the reward; the reward model is too poor"
+            "standard deviations of the reward; the reward model is too inaccurate"
         )
     return (
         f"an accepted edit changes the true reward by at most {bound:.3g} ({deviations:.2f} "
-        "standard deviations), as far as the reward model is as good at edited states as on 95% "
-        "of held-out steps"
+        "standard deviations), provided that the reward model is as accurate at edited states as "
+        "on 95% of held-out steps"
     )

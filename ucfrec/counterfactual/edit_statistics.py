@@ -1,4 +1,4 @@
-"""What the accepted edits look like: how long, how varied."""
+"""Statistics of the accepted edits: their lengths and their variety."""
 
 import math
 from dataclasses import dataclass
@@ -17,38 +17,47 @@ class MoveReport:
     """Moves Δ = (s_c − s) / σ_s of the accepted edits (paper appendix I.2)."""
 
     edits: int
+    """Number of accepted edits."""
     length_quantiles: dict[str, float]
-    """Of ‖Δ‖₂."""
+    """Quantiles of ‖Δ‖₂ by level; empty without edits."""
     histogram_edges: tuple[float, ...]
-    """From 0 to ρ_high."""
+    """Edges of the bins of ‖Δ‖₂, from 0 to ρ_high."""
     histogram_counts: tuple[int, ...]
-    """Edits by ‖Δ‖₂ between the edges."""
+    """Number of edits in each bin."""
     mean_move_ratio: float
-    """‖mean Δ‖ / mean ‖Δ‖: 1 if all states are shifted alike, about 0 if edits are varied."""
+    """‖mean Δ‖ / mean ‖Δ‖: 1 if all edits are the same shift, near 0 if they are varied."""
     effective_rank: float
-    """exp of the entropy of the spectrum of E[ΔΔᵀ]: how many directions the moves take."""
+    """exp of the entropy of the spectrum of E[ΔΔᵀ]: effective number of directions of the moves."""
     dimensions: int
-    """State dimensions that vary in training, which bounds the effective rank."""
+    """Number of state dimensions that vary in the training data; bounds the effective rank."""
 
 
 class MoveStatistics:
-    """Gathers moves chunk by chunk; the moves themselves are not kept."""
+    """Accumulates statistics of moves chunk by chunk, without keeping the moves."""
 
     def __init__(self, size: int) -> None:
-        """For moves of `size` dimensions."""
+        """
+        Args:
+            size: S, dimensions of a move.
+        """
         self._total = torch.zeros(size, dtype=torch.float64)
         self._moments = torch.zeros(size, size, dtype=torch.float64)
         self._lengths: list[Tensor] = []
 
     def add(self, moves: Tensor) -> None:
-        """Count moves (M, S)."""
+        """Add the moves Δ (M, S) of M accepted edits."""
         moves = moves.double()
         self._total += moves.sum(dim=0)
         self._moments += moves.T @ moves
         self._lengths.append(moves.norm(dim=1))
 
     def report(self, rho_high: float, dimensions: int) -> MoveReport:
-        """What was counted; where nothing moved, ratio and rank are NaN and 0."""
+        """Summarise the moves added so far; if none has a length, ratio is NaN and rank 0.
+
+        Args:
+            rho_high: upper end of the histogram of lengths.
+            dimensions: number of state dimensions that vary.
+        """
         lengths = torch.cat([torch.zeros(0, dtype=torch.float64), *self._lengths]).numpy()
         counts, edges = np.histogram(lengths, bins=_BINS, range=(0.0, rho_high))
         moved = bool(lengths.sum() > 0)

@@ -1,4 +1,4 @@
-"""Counterfactual state generators: other states that would have earned the same reward."""
+"""Counterfactual state generators: they propose other states with the same predicted reward."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -31,37 +31,37 @@ Length = Annotated[float, Field(ge=0, le=1e6)]
 
 @settings_table("csg")
 class CSGConfig:
-    """Which generator, and how it is made (paper appendix G.2, Table 5)."""
+    """Kind and settings of the state generator (paper appendix G.2, Table 5)."""
 
     kind: Literal["tangent", "faithful", "noise"] = "tangent"
     """`tangent` draws a different edit every time; `faithful` is the paper's network, which learns
-    nearly one shift for all states; `noise` is the control, moves that heed no reward."""
-    # TOML and JSON have lists only.
+    nearly one shift for all states; `noise` is the control: moves that ignore the reward."""
+    # Not strict, because TOML and JSON have lists instead of tuples.
     band: Annotated[tuple[Length, Length], Field(strict=False)] = (0.2, 0.5)
-    """(ρ_low, ρ_high): length of a move, in standard deviations of the states."""
+    """(ρ_low, ρ_high): shortest and longest move, in standard deviations of the states."""
     reward_quantile: Quantile = 0.3
-    """Steps with a reward below this quantile are not learned from: 0.3 leaves the top 70%."""
+    """Steps with a reward below this quantile are left out of training: 0.3 uses the top 70%."""
     clusters: Annotated[int, Field(ge=1, le=100_000)] = 32
-    """tangent: regions of the state space, each with its own principal directions."""
+    """tangent: clusters of states, each with its own covariance."""
     corrections: Annotated[int, Field(ge=0, le=1000)] = 3
-    """tangent: Newton steps back onto the level set of the reward."""
+    """tangent: Newton steps that return a move to the level set of the predicted reward."""
     hidden: Width = 256
     """faithful: width of the three hidden layers."""
     learning_rate: LearningRate = 5e-4
-    """faithful: step size of the updates."""
+    """faithful: learning rate."""
     batch_size: BatchSize = 256
-    """faithful: transitions of an update."""
+    """faithful: transitions per update."""
     epochs: Annotated[int, Field(ge=1, le=100_000)] = 40
-    """faithful: passes over the transitions."""
+    """faithful: number of passes over the transitions."""
     lambda_r: Weight = 1.0
     """faithful: weight of the squared change of the predicted reward, in standard deviations."""
     lambda_band: Weight = 0.1
     """faithful: weight of the squared distance of a move's length from the band."""
     max_transitions: Annotated[int, Field(ge=100, le=10**9)] = 200_000
-    """Most transitions to learn from; of more, that many are drawn."""
+    """Largest number of transitions to train on; from more, a random sample is drawn."""
 
     def __post_init__(self) -> None:
-        """Check the fields against each other."""
+        """Check that the band is in order."""
         low, high = self.band
         require(
             low <= high,
@@ -71,7 +71,7 @@ class CSGConfig:
 
 
 class Generator(Protocol):
-    """Proposes counterfactual states; the acceptance gate judges them."""
+    """Proposes counterfactual states, which the acceptance gate then accepts or rejects."""
 
     @property
     def band(self) -> tuple[float, float]:
@@ -80,29 +80,39 @@ class Generator(Protocol):
     def propose(
         self, states: Tensor, actions: Tensor, z: Tensor, generator: torch.Generator
     ) -> Tensor:
-        """States (M, S) that should earn f̂_r(s, a, z) under the same actions and disturbances.
+        """Propose a state s_c for each step, such that f̂_r(s_c, a, z) is close to f̂_r(s, a, z).
 
         Args:
-            states: (M, S).
-            actions: (M, A).
+            states: (M, S) states s, as logged.
+            actions: (M, A) actions a.
             z: (M, latent_dim) abduced disturbances.
-            generator: where anything random comes from.
+            generator: source of all random numbers.
+
+        Returns:
+            (M, S) counterfactual states s_c, in the units of `states`.
         """
 
 
 class TangentGenerator:
-    """Random moves within the level set of the reward, shaped like the data nearby.
+    """Random moves along the level set of the predicted reward.
 
-    A move is a draw from the Gaussian of the training states around s, conditioned on the reward
-    staying what it is: ∇f̂_r · Δ = 0. It is scaled to a length drawn from the band, and brought back
-    onto the level set by Newton steps along Σ∇f̂_r, the direction of the data that changes the
-    reward most. Nothing is learned but the covariances Σ.
+    A move Δ is drawn from a Gaussian with the covariance Σ of the training states in the cluster
+    nearest to s, conditioned on an unchanged reward to first order: ∇f̂_r · Δ = 0. It is scaled to a
+    length drawn from the band, and returned to the level set by Newton steps along Σ∇f̂_r. Only the
+    clusters and their covariances are fitted to data. Not in the paper, whose generator is
+    `CounterfactualStateGenerator`.
     """
 
     def __init__(
         self, crm: CausalRewardModel, centres: Tensor, covariances: Tensor, config: CSGConfig
     ) -> None:
-        """Build from `centres` (C, S) and `covariances` (C, S, S) of normalised states."""
+        """
+        Args:
+            crm: the fitted reward model.
+            centres: (C, S) centres of the clusters of normalised states.
+            covariances: (C, S, S) covariance of the normalised states of each cluster.
+            config: band and number of Newton steps.
+        """
         self._crm = crm
         self._centres = centres
         self._covariances = covariances
@@ -129,9 +139,9 @@ class TangentGenerator:
             move - steepest * _ratio((gradient * move).sum(1), gradient, steepest), length
         )
         for _ in range(self._config.corrections):
-            now, gradient = self._reward(states, actions, z, move)
+            current, gradient = self._reward(states, actions, z, move)
             steepest = torch.einsum("mij,mj->mi", covariance, gradient)
-            step = steepest * _ratio(now - reward, gradient, steepest)
+            step = steepest * _ratio(current - reward, gradient, steepest)
             move = _shortened(move - _shortened(step, length), length)
         return states + self._crm.state_std * move
 
@@ -147,18 +157,18 @@ class TangentGenerator:
 
 
 class CounterfactualStateGenerator(nn.Module):
-    """The paper's generator g_ψ(s, a, z) (Eq. 3, Algorithm 3): one network, one edit a step."""
+    """The paper's generator g_ψ(s, a, z) (Eq. 3, Algorithm 3): a deterministic network."""
 
     def __init__(self, crm: CausalRewardModel, config: CSGConfig) -> None:
         super().__init__()
-        # Held in a tuple so that the reward model's weights are not taken for the generator's.
+        # In a tuple, so that torch does not register the reward model as a submodule.
         self._crm = (crm,)
         self.band = config.band
         given = crm.state_mean.numel() + crm.action_mean.numel() + crm.config.latent_dim
         self.network = mlp(given, config.hidden, 3, crm.state_mean.numel())
 
     def move(self, states: Tensor, actions: Tensor, z: Tensor) -> Tensor:
-        """Δ (M, S) in standard deviations of the states; 0 where those never vary."""
+        """Moves Δ (M, S), in standard deviations of the states; 0 in dimensions that never vary."""
         (crm,) = self._crm
         move: Tensor = self.network(torch.cat([crm.given(states, actions), z], dim=-1))
         return move * (crm.state_std > 0)
@@ -167,12 +177,15 @@ class CounterfactualStateGenerator(nn.Module):
     def propose(
         self, states: Tensor, actions: Tensor, z: Tensor, generator: torch.Generator
     ) -> Tensor:
-        """See `Generator.propose`; nothing is random here."""
+        """See `Generator.propose`; deterministic."""
         return states + self._crm[0].state_std * self.move(states, actions, z)
 
 
 class NoiseGenerator:
-    """Moves in any direction, as long as `TangentGenerator`'s: what heeding the reward adds."""
+    """A control: moves in random directions, with the lengths of `TangentGenerator`.
+
+    Comparing both shows the effect of preserving the predicted reward.
+    """
 
     def __init__(self, crm: CausalRewardModel, config: CSGConfig) -> None:
         self._std = crm.state_std
@@ -192,7 +205,15 @@ class NoiseGenerator:
 def make_generator(
     train: Transitions, crm: CausalRewardModel, config: CSGConfig, folder: Path, seed: int
 ) -> Generator:
-    """The generator that `config` names, learned from the steps of `train` with high rewards."""
+    """Make the generator of kind `config.kind`, fitted to the steps of `train` with high rewards.
+
+    Args:
+        train: M transitions to fit to.
+        crm: the fitted reward model; its parameters are frozen if the kind is `faithful`.
+        config: kind and settings.
+        folder: of the checkpoints of `faithful`, which resumes from them.
+        seed: of sampling, clustering and training.
+    """
     if config.kind == "noise":
         return NoiseGenerator(crm, config)
     rng = np.random.default_rng(seed)
@@ -208,7 +229,7 @@ def make_generator(
 def _tangent(
     states: Tensor, crm: CausalRewardModel, config: CSGConfig, seed: int
 ) -> TangentGenerator:
-    # scikit-learn takes a second and 100 MB, which reading a trained policy need not spend.
+    # Imported here because it takes a second and 100 MB, and loading a policy does not need it.
     from sklearn.cluster import MiniBatchKMeans
 
     size = states.shape[1]
@@ -220,7 +241,7 @@ def _tangent(
     covariances = torch.empty(clusters, size, size)
     for cluster in range(clusters):
         deviations = states[labels == cluster] - centres[cluster]
-        # A cluster of few states borrows the directions of all.
+        # Shrunk towards the covariance of all states, because a cluster may have few.
         covariances[cluster] = (deviations.T @ deviations + size * whole) / (len(deviations) + size)
     return TangentGenerator(crm, centres, covariances, config)
 
@@ -247,7 +268,7 @@ def _faithful(
             z = crm.abduct(s, a, r)
         move = csg.move(s, a, z)
         reward = crm.predict(s + crm.state_std * move, a, z)
-        # In standard deviations of the reward, so that λ means the same for every reward.
+        # In standard deviations of the reward, so that λ does not depend on its scale.
         change = ((reward - r) / crm.reward_std).square().mean()
         length = move.norm(dim=1)
         band = ((low - length).relu().square() + (length - high).relu().square()).mean()
@@ -270,7 +291,7 @@ def _faithful(
 
 
 def _ratio(change: Tensor, gradient: Tensor, steepest: Tensor) -> Tensor:
-    """How far (M, 1) to go along `steepest` for the reward to fall by `change` (M,)."""
+    """Step size (M, 1) against `steepest` that lowers the reward by `change` (M,), to 1st order."""
     return (change / ((gradient * steepest).sum(1) + _TINY)).unsqueeze(1)
 
 

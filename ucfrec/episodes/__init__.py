@@ -1,1 +1,1 @@
-"""What the data is: store, windows, states, returns-to-go."""
+"""The episode store, its windows, states and returns-to-go."""

@@ -1,4 +1,4 @@
-"""The columns of a store: memory-mapped from its folder, or arrays in memory."""
+"""The columns of an episode store: memory-mapped files or arrays in memory."""
 
 from collections.abc import Mapping
 from functools import cached_property
@@ -25,9 +25,9 @@ _IN_MEMORY = Path("<memory>")
 
 
 class Columns:
-    """All episodes of one store, E in number, with N steps together.
+    """The columns of all E episodes of a store, with N steps in total.
 
-    Episodes go by their number in the store here, 0 to E − 1, whichever view looks at them.
+    Episodes are numbered 0 to E − 1 in the order of the store, independently of any view.
     """
 
     def __init__(
@@ -41,30 +41,35 @@ class Columns:
         Args:
             path: folder of the store.
             meta: contents of its `meta.json`.
-            arrays: whole columns in memory that stand for those of the folder.
-            item_states: likewise.
+            arrays: columns in memory, by name, used instead of the files of the folder.
+            item_states: used instead of the file of the folder.
         """
         self.path, self.meta = path, meta
-        self._arrays, self._given_states = dict(arrays or {}), item_states
+        self._arrays, self._item_states_in_memory = dict(arrays or {}), item_states
         self._shards = [path / f"shard-{i:05d}" for i in range(meta["n_shards"])]
         self._steps: dict[str, _StepColumn] = {}
 
     @classmethod
     def open(cls, path: Path) -> "Columns":
-        """Those of a store folder; nothing but `meta.json` is read yet.
+        """Open a store folder; only `meta.json` is read, columns are mapped on first use.
 
         Raises:
-            InputError: the folder is no store, is damaged, or a newer ucfrec wrote it.
+            InputError: the folder is not a store, is damaged, or was written by a newer ucfrec.
         """
         if not (path / "meta.json").is_file():
-            raise InputError(f"{path} is not an episode store: it has no meta.json")
+            raise InputError(
+                f"{path} is not an episode store: it has no meta.json; give a folder that "
+                "`ucfrec prepare` wrote"
+            )
         meta = read_json(path / "meta.json")
         version = meta.get("version") if isinstance(meta, dict) else None
         if not isinstance(version, int):
-            raise InputError(f"{path / 'meta.json'} is not that of an episode store")
+            raise InputError(
+                f"{path / 'meta.json'} is damaged: it has no store version; prepare it again"
+            )
         if version > schema.STORE_VERSION:
             raise InputError(
-                f"{path} has store version {version}, this ucfrec reads up to "
+                f"{path} has store version {version}, this ucfrec reads versions up to "
                 f"{schema.STORE_VERSION}; upgrade ucfrec"
             )
         return cls(path, meta)
@@ -77,16 +82,23 @@ class Columns:
         episodes: Mapping[str, Array],
         item_states: ItemStates | None,
     ) -> "Columns":
-        """See `EpisodeStore.from_arrays`."""
+        """See `EpisodeStore.from_arrays`; `episodes` must include `split`.
+
+        Raises:
+            InputError: columns differ in length.
+        """
         offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
         arrays = {name: np.asarray(v, dtype=schema.STEP_DTYPES[name]) for name, v in steps.items()}
         arrays |= {
             name: np.asarray(v, dtype=schema.EPISODE_DTYPES[name]) for name, v in episodes.items()
         }
         for name, values in arrays.items():
-            wanted = int(offsets[-1]) if name in steps else len(lengths)
-            if len(values) != wanted:
-                raise InputError(f"column {name!r} has {len(values)} values instead of {wanted}")
+            expected = int(offsets[-1]) if name in steps else len(lengths)
+            if len(values) != expected:
+                raise InputError(
+                    f"column {name!r} has {len(values)} values instead of {expected}; give one per "
+                    f"{'step' if name in steps else 'episode'}"
+                )
         meta = {
             "version": schema.STORE_VERSION,
             "n_steps": int(offsets[-1]),
@@ -100,28 +112,28 @@ class Columns:
         arrays[schema.RETURN_TO_GO] = returns_to_go(arrays[schema.REWARD], offsets)
         return cls(_IN_MEMORY, meta, arrays, item_states)
 
-    def replaced(self, name: str, values: Array) -> "Columns":
-        """The same columns but for one step column, which is `values` (N,) or (N, size)."""
+    def with_step_column(self, name: str, values: Array) -> "Columns":
+        """A copy in which step column `name` is `values`, (N,) or (N, size); files stay as is."""
         sizes = dict(self.meta["columns"])
         if name in sizes:
             sizes[name] = list(values.shape[1:])
-        others = Columns(
+        copy = Columns(
             self.path,
             {**self.meta, "columns": sizes},
             {**self._arrays, name: values},
-            self._given_states,
+            self._item_states_in_memory,
         )
-        others._steps = {other: column for other, column in self._steps.items() if other != name}
-        return others
+        copy._steps = {other: column for other, column in self._steps.items() if other != name}
+        return copy
 
     @cached_property
     def starts(self) -> IntArray:
-        """(E,) place of each episode's first step among the N."""
+        """(E,) index of each episode's first step among the N steps of the store."""
         return self._starts_and_lengths[0]
 
     @cached_property
     def lengths(self) -> IntArray:
-        """(E,) steps of each episode."""
+        """(E,) number of steps of each episode."""
         return self._starts_and_lengths[1]
 
     @cached_property
@@ -140,39 +152,58 @@ class Columns:
 
     @property
     def observation_size(self) -> int:
-        """O, size of the logged observation; 0 where none was logged."""
+        """O, size of the logged observation; 0 if none was logged."""
         return int((self.meta["columns"].get(schema.OBSERVATION) or [0])[0])
 
     @cached_property
     def item_states(self) -> ItemStates:
-        """How states are made of items (stores of items only)."""
-        return self._given_states or ItemStates.load(self.path / ITEM_STATES)
+        """Builds states from items; for stores of items only.
+
+        Raises:
+            InputError: the file of item states is missing or damaged.
+        """
+        return self._item_states_in_memory or ItemStates.load(self.path / ITEM_STATES)
 
     @property
-    def knows_items(self) -> bool:
-        """Whether `item_states` is at hand."""
-        return self._given_states is not None or (self.path / ITEM_STATES).is_file()
+    def has_item_states(self) -> bool:
+        """Whether the store has `item_states`, in memory or as a file."""
+        return self._item_states_in_memory is not None or (self.path / ITEM_STATES).is_file()
 
     @cached_property
     def user_rows(self) -> IntArray:
-        """(E,) row of each episode's user among the user features; −1 where nothing is known."""
+        """(E,) row of each episode's user in the user features; −1 for an unknown user."""
         if self.item_states.user_features.shape[1] == 0:
             return np.full(self.meta["n_episodes"], -1)
-        return self.of_episodes(schema.USER)
+        return self.episode_column(schema.USER)
 
-    def of_episodes(self, name: str) -> Array:
-        """One episode column, (E,)."""
+    def episode_column(self, name: str) -> Array:
+        """The whole episode column `name`, (E,).
+
+        Raises:
+            InputError: the store has no such column, or its files are damaged.
+        """
         parts = self._parts(name)
         if not parts:
-            raise InputError(f"{self.path} has no column {name!r}")
+            raise InputError(f"{self.path} has no column {name!r}; write the store with it")
         return np.concatenate(parts)
 
-    def of_steps(self, name: str) -> Array:
-        """One step column as an array of its own, (N,) or (N, size)."""
+    def step_column(self, name: str) -> Array:
+        """A copy of the whole step column `name`, (N,) or (N, size).
+
+        Raises:
+            InputError: the store has no such column, or its files are damaged.
+        """
         return self._column(name).take(np.arange(self.meta["n_steps"]))
 
-    def at(self, name: str, index: IntArray) -> Array:
-        """One step column at places `index` among the N, any shape.
+    def step_values(self, name: str, index: IntArray) -> Array:
+        """Values of step column `name` at the step indices `index`.
+
+        Args:
+            name: of the column.
+            index: indices among the N steps of the store, of any shape.
+
+        Returns:
+            Values of the shape of `index`, followed by the size of a vector.
 
         Raises:
             InputError: the store has no such column, or its files are damaged.
@@ -180,34 +211,38 @@ class Columns:
         return self._column(name).take(index)
 
     def states(self, episodes: IntArray, steps: IntArray) -> Tensor:
-        """States (B, K, S) as they were logged.
+        """The logged states (without edits) before the given steps.
 
         Args:
-            episodes: (B,).
-            steps: (B, K), consecutive in a row; what stands where a step is below 0 is undefined.
+            episodes: (B,) numbers in the store.
+            steps: (B, K) steps of those episodes, consecutive in each row; may be below 0.
+
+        Returns:
+            (B, K, S) float32; undefined at steps below 0.
         """
         index = self.starts[episodes][:, None] + np.maximum(steps, 0)
-        observed = torch.zeros(*steps.shape, 0)
+        observations = torch.zeros(*steps.shape, 0)
         if self.observation_size:
-            observed = torch.from_numpy(self.at(schema.OBSERVATION, index))
+            observations = torch.from_numpy(self.step_values(schema.OBSERVATION, index))
         if not self.has_items:
-            return observed
-        back = self.item_states.window
-        # The K windows of history overlap: gather K + back − 1 steps once, then look through a
-        # sliding view, most recent first.
-        width = steps.shape[1] + back - 1
-        history = steps[:, -1:] - np.arange(width, 0, -1)  # (B, K + back − 1), up to step end − 1
-        at = np.maximum(index[:, -1:] - steps[:, -1:] + history, 0)
-        items = np.where(history >= 0, self.at(schema.ITEM, at), -1).astype(np.int64)
-        rewards = np.where(history >= 0, self.at(schema.REWARD, at), 0)
+            return observations
+        window = self.item_states.window
+        # The histories of the K steps overlap: gather their K + window − 1 steps once, then take
+        # sliding windows of them, reversed so that the most recent step comes first.
+        width = steps.shape[1] + window - 1
+        history = steps[:, -1:] - np.arange(width, 0, -1)  # (B, width), the last is step end − 1
+        history_index = np.maximum(index[:, -1:] - steps[:, -1:] + history, 0)
+        valid = history >= 0
+        items = np.where(valid, self.step_values(schema.ITEM, history_index), -1).astype(np.int64)
+        rewards = np.where(valid, self.step_values(schema.REWARD, history_index), 0)
         view = np.lib.stride_tricks.sliding_window_view
         users = self.user_rows[episodes][:, None]
         return self.item_states.build(
-            torch.from_numpy(view(items, back, axis=1)[..., ::-1].copy()),
-            torch.from_numpy(view(rewards, back, axis=1)[..., ::-1].astype(np.float32)),
+            torch.from_numpy(view(items, window, axis=1)[..., ::-1].copy()),
+            torch.from_numpy(view(rewards, window, axis=1)[..., ::-1].astype(np.float32)),
             torch.from_numpy(np.maximum(steps, 0)),
             torch.from_numpy(np.broadcast_to(users, steps.shape).copy()),
-            observed,
+            observations,
         )
 
     def _column(self, name: str) -> "_StepColumn":
@@ -224,14 +259,14 @@ class Columns:
         return self._steps[name]
 
     def _parts(self, name: str, mmap: bool = False) -> list[Array]:
-        """A column shard by shard; one in memory is one part."""
+        """A column as one array per shard; a column in memory is a single array."""
         if name in self._arrays:
             return [self._arrays[name]]
         return [_load(shard / f"{name}.npy", mmap) for shard in self._shards]
 
 
 class _StepColumn:
-    """One step column over all shards."""
+    """A step column, indexed across its shards."""
 
     def __init__(self, parts: list[Array]) -> None:
         self._parts = parts
@@ -241,15 +276,15 @@ class _StepColumn:
         return int(self._bounds[-1])
 
     def take(self, index: IntArray) -> Array:
-        """Values at places `index`, any shape, as an array of their own."""
+        """A copy of the values at the indices `index`, of any shape."""
         if len(self._parts) == 1:
             return np.asarray(self._parts[0][index])
         shard = np.searchsorted(self._bounds[1:-1], index, side="right")
-        like = self._parts[0]
-        values = np.empty((*index.shape, *like.shape[1:]), dtype=like.dtype)
+        first = self._parts[0]
+        values = np.empty((*index.shape, *first.shape[1:]), dtype=first.dtype)
         for i, part in enumerate(self._parts):
-            here = shard == i
-            values[here] = part[index[here] - self._bounds[i]]
+            in_shard = shard == i
+            values[in_shard] = part[index[in_shard] - self._bounds[i]]
         return values
 
 

@@ -1,5 +1,5 @@
-"""A distractor: a bit that is correlated with the reward in the logs and causes nothing (Appendix
-G.4)."""
+"""Distractors: an observed bit that correlates with the reward in the logs without causing it
+(paper appendix G.4)."""
 
 import hashlib
 import shutil
@@ -19,36 +19,40 @@ from ucfrec.files import atomic_folder, write_json
 def reward_bit(
     store: EpisodeStore, flip: float = 0.0, seed: int = 0, early: bool = False
 ) -> npt.NDArray[np.float32]:
-    """d_t = I{r_t high} ⊕ Bernoulli(flip) of every step, (n_steps,) in the order of `all_steps`.
+    """The distractor d_t = I{r_t is high} ⊕ Bernoulli(flip) of every step (paper appendix G.4).
 
-    A reward is high if it is above the median of all rewards; where the median is the largest
-    reward (more than half of all steps are clicks), if it is the median. The paper's deterministic
-    distractor has `flip` 0, its stochastic one 0.15.
+    A reward is high if it exceeds the median of all rewards; if the median equals the largest
+    reward (more than half of all steps are clicks), a reward is high if it equals the median. The
+    paper's deterministic distractor has `flip` 0, the stochastic one 0.15.
 
     Args:
         store: a store or a view of it.
-        flip: probability that a bit is wrong, in [0, 1].
-        seed: of the wrong bits.
-        early: reveal the bit one step early, d_t = I{r_{t+1} high}; the last step of an episode has
-            no next reward and reveals its own.
+        flip: probability that a bit is inverted, in [0, 1].
+        seed: of the inversions.
+        early: shift the bit one step ahead, d_t = I{r_{t+1} is high}; the last step of an episode,
+            which has no next reward, uses its own reward.
+
+    Returns:
+        (n_steps,) float32, 0 or 1, in the order of `all_steps`.
 
     Raises:
-        InputError: `flip` is no probability, or all rewards are equal.
+        InputError: `flip` is not a probability, or all rewards are equal.
     """
     if not 0 <= flip <= 1:
-        raise InputError(f"the probability of a wrong bit is {flip}; a probability lies in [0, 1]")
+        raise InputError(f"flip, the probability of a wrong bit, is {flip}; it must be in [0, 1]")
     episodes, steps = store.all_steps()
     rewards = store.step_values(schema.REWARD, episodes, steps)
     if rewards.min() == rewards.max():
         raise InputError(
-            f"all rewards of {store.path} are {rewards[0]:g}; no bit can be correlated with them"
+            f"all rewards of {store.path} are {rewards[0]:g}, so no distractor can correlate with "
+            "them; check the reward expression"
         )
     median = np.median(rewards)
-    revealed = np.minimum(steps + 1, store.lengths[episodes] - 1) if early else steps
-    shown = store.step_values(schema.REWARD, episodes, revealed)
-    high = shown > median if median < rewards.max() else shown >= median
-    wrong = np.random.default_rng(seed).random(len(rewards)) < flip
-    return np.asarray(high ^ wrong, dtype=np.float32)
+    revealed_steps = np.minimum(steps + 1, store.lengths[episodes] - 1) if early else steps
+    revealed = store.step_values(schema.REWARD, episodes, revealed_steps)
+    high = revealed > median if median < rewards.max() else revealed >= median
+    flipped = np.random.default_rng(seed).random(len(rewards)) < flip
+    return np.asarray(high ^ flipped, dtype=np.float32)
 
 
 def with_observations(
@@ -57,16 +61,19 @@ def with_observations(
     observations: npt.NDArray[np.float32],
     source: Mapping[str, Any],
 ) -> EpisodeStore:
-    """Write `store` with other observations; every other file stays as it is.
+    """Write a copy of `store` with other observations, atomically.
 
     Args:
-        store: a whole store, not a view of some episodes.
+        store: a whole store in a folder, not a view of some episodes.
         out: folder of the new store.
         observations: (n_steps, O) in the order of `all_steps`.
-        source: added to the store's record of what it was made from.
+        source: added to `source` in `meta.json`, the record of what the store was made from.
+
+    Returns:
+        The new store, opened.
 
     Raises:
-        InputError: `out` exists.
+        InputError: `out` exists already.
     """
     values = np.ascontiguousarray(observations, dtype=schema.STEP_DTYPES[schema.OBSERVATION])
     digest = hashlib.sha256(store.meta["fingerprint"].encode() + values.tobytes()).hexdigest()
@@ -88,7 +95,7 @@ def with_observations(
 
 
 def logged_observations(store: EpisodeStore) -> npt.NDArray[np.float32]:
-    """(n_steps, O) in the order of `all_steps`; O is 0 where none were logged."""
+    """The observations (n_steps, O) in the order of `all_steps`; O is 0 if none were logged."""
     if not store.observation_size:
         return np.zeros((store.n_steps, 0), dtype=np.float32)
     return np.asarray(store.step_values(schema.OBSERVATION, *store.all_steps()))

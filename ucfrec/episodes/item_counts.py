@@ -1,4 +1,4 @@
-"""How often the training log shows each item, and how often it was liked."""
+"""How often each item was shown, and how often it was liked, in the training log."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,45 +13,57 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.fitting.checkpoint import load_tensors, save_tensors
 
 LIKED = 0.6
-"""Liking, the reward scaled to [0, 1] as in item states, from which a step counts as positive: the
-normalised watch ratio of the published dominance; a click counts too."""
+"""A step counts as liked if its reward, scaled to [0, 1] as in item states, is at least this: the
+threshold on the normalised watch ratio in the published dominance metric; a click is liked."""
 
 
 def liked_steps(
     store: EpisodeStore, episodes: npt.NDArray[np.int64], steps: npt.NDArray[np.int64]
 ) -> npt.NDArray[np.bool_]:
-    """Whether each of the steps (N,) was liked: its reward, scaled as in item states, reaches
-    `LIKED`."""
+    """Whether each step was liked: its reward, scaled as in item states, is at least `LIKED`.
+
+    Args:
+        store: a view of a store of items.
+        episodes: (N,) positions in the view.
+        steps: (N,) steps of those episodes.
+
+    Returns:
+        (N,) bool.
+    """
     states, rewards = store.item_states, store.step_values(schema.REWARD, episodes, steps)
-    liking = (rewards - states.reward_low) / (states.reward_high - states.reward_low)
-    return np.asarray(liking >= LIKED)
+    scaled = (rewards - states.reward_low) / (states.reward_high - states.reward_low)
+    return np.asarray(scaled >= LIKED)
 
 
 @dataclass(frozen=True)
 class TrainingCounts:
-    """Counts in the training log, which novelty and dominance use; items in the store's order."""
+    """Counts of items in the training log, for novelty and dominance; items in store order."""
 
     shown: Tensor
-    """(n_items,) int64 training steps of each item."""
+    """(n_items,) int64 number of training steps that showed each item."""
     liked: Tensor
-    """(n_items,) int64 those of them that were positive."""
+    """(n_items,) int64 number of those steps that were liked."""
     episodes: int
-    """Training episodes."""
+    """Number of training episodes."""
 
     @classmethod
     def of(cls, train: EpisodeStore) -> "TrainingCounts":
-        """Count the steps of a view of a store of items."""
+        """Count the items in `train`, a view of a store of items."""
         steps, n = train.all_steps(), len(train.item_states.embeddings)
         items = torch.from_numpy(train.step_values(schema.ITEM, *steps)).long()
         liked = torch.bincount(items[liked_steps(train, *steps)], minlength=n)
         return cls(torch.bincount(items, minlength=n), liked, train.n_episodes)
 
     def save(self, path: Path) -> None:
-        """Write to one safetensors file."""
+        """Write to one safetensors file, atomically."""
         save_tensors(path, {"shown": self.shown, "liked": self.liked}, {"episodes": self.episodes})
 
     @classmethod
     def load(cls, path: Path) -> "TrainingCounts":
-        """Read what `save` wrote."""
+        """Read a file that `save` wrote.
+
+        Raises:
+            InputError: the file is missing or damaged.
+        """
         tensors, numbers = load_tensors(path)
         return cls(tensors["shown"], tensors["liked"], int(numbers["episodes"]))

@@ -1,4 +1,4 @@
-"""Returns-to-go: one definition for training windows and for acting."""
+"""Returns-to-go, defined once for both training and acting."""
 
 from typing import TYPE_CHECKING, TypeVar
 
@@ -11,13 +11,14 @@ if TYPE_CHECKING:
 ArrayOrTensor = TypeVar("ArrayOrTensor", npt.NDArray[np.float64], "Tensor")
 
 
-def remaining_return(total: ArrayOrTensor, earned: ArrayOrTensor) -> ArrayOrTensor:
-    """What is left of `total` once `earned` has been collected (undiscounted, γ = 1).
+def remaining_return(total: ArrayOrTensor, collected: ArrayOrTensor) -> ArrayOrTensor:
+    """The return-to-go: `total` minus the rewards collected so far (undiscounted, γ = 1).
 
-    In training, `total` is the episode's return; when acting, it is the target return. Both have
-    the same shape, any; `earned` sums the rewards strictly before the step.
+    Args:
+        total: the episode's return in training, the target return when acting; any shape.
+        collected: sum of the rewards strictly before the step, of the same shape.
     """
-    return total - earned
+    return total - collected
 
 
 def returns_to_go(
@@ -28,17 +29,17 @@ def returns_to_go(
     Example: rewards [1, 0, 2, 5] with offsets [0, 3, 4] give [3, 2, 2, 5].
 
     Args:
-        rewards: (N,) rewards of all episodes, one after the other.
-        offsets: (E + 1,) first step of each episode, then N.
+        rewards: (N,) rewards of all episodes, concatenated.
+        offsets: (E + 1,) index of the first step of each episode, followed by N.
 
     Returns:
-        (N,) returns-to-go.
+        (N,) returns-to-go in reward units; summed in float64, rounded to float32.
     """
     lengths = np.diff(offsets)
     before = np.concatenate([[0.0], np.cumsum(rewards, dtype=np.float64)])  # (N + 1,)
     totals = before[offsets[1:]] - before[offsets[:-1]]  # (E,)
-    earned = before[:-1] - np.repeat(before[offsets[:-1]], lengths)  # (N,)
+    collected = before[:-1] - np.repeat(before[offsets[:-1]], lengths)  # (N,)
     remaining: npt.NDArray[np.float32] = remaining_return(
-        np.repeat(totals, lengths), earned
+        np.repeat(totals, lengths), collected
     ).astype(np.float32)
     return remaining

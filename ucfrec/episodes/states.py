@@ -1,7 +1,7 @@
-"""Item-embedding states: what a session looked like just before step t.
+"""Item-embedding states: a vector that summarises a session just before step t.
 
-Training windows and acting call the same `ItemStates.build`, made of element-wise operations in a
-fixed order only, so both give the same bits whatever the batch.
+Training windows and acting both call `ItemStates.build`. It uses only element-wise operations in a
+fixed order, so its results are bit-identical for every batch size.
 """
 
 from dataclasses import dataclass
@@ -20,32 +20,37 @@ IntArray = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class ItemStates:
-    """How states are made of items shown, rewards earned and features of the user.
+    """Builds states from the items shown, their rewards and the features of the user.
 
     A state of size S = 3D + 2 + F + O holds, in this order: the recency-weighted mean embedding of
     the last `window` items shown (D), the same weighted by reward as well (D), the last item's
     embedding (D), the last reward scaled to [0, 1] (1), log(1 + step) (1), user features (F) and
-    the logged observation (O), where it has any numbers.
+    the logged observation (O).
+
+    Raises:
+        InputError: `reward_low` is not below `reward_high`.
     """
 
     embeddings: Tensor
     """(n_items, D)."""
     user_features: Tensor
-    """(n_users, F), standardised; F is 0 where none were given."""
+    """(n_users, F), standardised; F is 0 if there are none."""
     reward_low: float
-    """Reward that is scaled to 0, as are lower ones."""
+    """Rewards up to this one are scaled to 0."""
     reward_high: float
-    """Reward that is scaled to 1, as are higher ones."""
+    """Rewards from this one on are scaled to 1."""
     window: int = 10
+    """Number of most recent steps that enter the means."""
     decay: float = 0.8
+    """Factor by which the weight in the means falls with each step back."""
 
     def __post_init__(self) -> None:
         if not self.reward_low < self.reward_high:
             raise InputError(
-                f"rewards from {self.reward_low:g} to {self.reward_high:g} have no scale; "
-                "reward_low must be below reward_high"
+                f"rewards from {self.reward_low:g} to {self.reward_high:g} cannot be scaled to "
+                "[0, 1]; reward_low must be below reward_high"
             )
-        # Row −1 stands for "no item" and "unknown user": all zeros.
+        # Index −1 ("no item", "unknown user") selects this last row of zeros.
         object.__setattr__(self, "_items", _with_zero_row(self.embeddings))
         object.__setattr__(self, "_users", _with_zero_row(self.user_features))
 
@@ -57,37 +62,42 @@ class ItemStates:
     def build(
         self, items: Tensor, rewards: Tensor, steps: Tensor, users: Tensor, observations: Tensor
     ) -> Tensor:
-        """States before the steps `steps`.
+        """States just before the given steps.
 
         Args:
-            items: (..., window) int64, most recent first, −1 where the session had not begun.
+            items: (..., window) int64 items shown, most recent first; −1 before the session began.
             rewards: (..., window) rewards of those items.
-            steps: (...) int64, number of the step in its session, from 0.
-            users: (...) int64 rows of `user_features`, −1 for a user never seen.
-            observations: (..., O) logged with the step; O may be 0.
+            steps: (...) int64 number of each step in its session, from 0.
+            users: (...) int64 rows of `user_features`; −1 for an unknown user.
+            observations: (..., O) observations logged with the steps; O may be 0.
 
         Returns:
             (..., S) float32.
         """
         table: Tensor = self._items  # type: ignore[attr-defined]
-        liking = ((rewards - self.reward_low) / (self.reward_high - self.reward_low)).clamp(0, 1)
+        scaled_rewards = (rewards - self.reward_low) / (self.reward_high - self.reward_low)
+        scaled_rewards = scaled_rewards.clamp(0, 1)
         valid = (items >= 0).float()
-        shown = torch.zeros(*items.shape[:-1], table.shape[1])
-        liked, shown_weight, liked_weight = shown.clone(), valid[..., 0] * 0, valid[..., 0] * 0
-        for back in range(self.window):
-            embedding = table[items[..., back]]
-            weight = valid[..., back] * self.decay**back
-            shown = shown + weight.unsqueeze(-1) * embedding
-            shown_weight = shown_weight + weight
-            weight = weight * liking[..., back]
-            liked = liked + weight.unsqueeze(-1) * embedding
+        item_sum = torch.zeros(*items.shape[:-1], table.shape[1])
+        liked_sum, item_weight, liked_weight = (
+            item_sum.clone(),
+            valid[..., 0] * 0,
+            valid[..., 0] * 0,
+        )
+        for lag in range(self.window):
+            embedding = table[items[..., lag]]
+            weight = valid[..., lag] * self.decay**lag
+            item_sum = item_sum + weight.unsqueeze(-1) * embedding
+            item_weight = item_weight + weight
+            weight = weight * scaled_rewards[..., lag]
+            liked_sum = liked_sum + weight.unsqueeze(-1) * embedding
             liked_weight = liked_weight + weight
         return torch.cat(
             [
-                shown / shown_weight.clamp(min=1e-6).unsqueeze(-1),
-                liked / liked_weight.clamp(min=1e-6).unsqueeze(-1),
+                item_sum / item_weight.clamp(min=1e-6).unsqueeze(-1),
+                liked_sum / liked_weight.clamp(min=1e-6).unsqueeze(-1),
                 table[items[..., 0]],
-                (liking[..., 0] * valid[..., 0]).unsqueeze(-1),
+                (scaled_rewards[..., 0] * valid[..., 0]).unsqueeze(-1),
                 torch.log1p(steps.float()).unsqueeze(-1),
                 self._users[users],  # type: ignore[attr-defined]
                 observations,
@@ -96,7 +106,7 @@ class ItemStates:
         )
 
     def save(self, path: Path) -> None:
-        """Write to one safetensors file."""
+        """Write to one safetensors file, atomically."""
         numbers = {"window": self.window, "decay": self.decay}
         numbers |= {"reward_low": self.reward_low, "reward_high": self.reward_high}
         tensors = {"embeddings": self.embeddings, "user_features": self.user_features}
@@ -104,7 +114,11 @@ class ItemStates:
 
     @classmethod
     def load(cls, path: Path) -> "ItemStates":
-        """Read what `save` wrote."""
+        """Read a file that `save` wrote.
+
+        Raises:
+            InputError: the file is missing or damaged.
+        """
         tensors, numbers = load_tensors(path)
         return cls(tensors["embeddings"], tensors["user_features"], **numbers)
 
@@ -114,7 +128,7 @@ def _with_zero_row(table: Tensor) -> Tensor:
 
 
 class SessionStates:
-    """States of N sessions under way, kept up to date one step at a time."""
+    """States of N running sessions, updated after every step."""
 
     def __init__(self, states: ItemStates, sessions: int) -> None:
         self._states = states
@@ -122,21 +136,21 @@ class SessionStates:
         self._rewards = torch.zeros(sessions, states.window)
         self._steps = torch.zeros(sessions, dtype=torch.int64)
         self.users = torch.full((sessions,), -1, dtype=torch.int64)
-        """(N,) rows of the user table; −1, the default, for a user never seen."""
+        """(N,) int64 rows of the user features; −1, the default, for an unknown user."""
 
     def begin(self, rows: IntArray) -> None:
-        """The sessions in `rows` start afresh."""
+        """Start new sessions at the positions `rows`."""
         self._items[rows] = -1
         self._rewards[rows] = 0.0
         self._steps[rows] = 0
 
     def current(self, observations: Tensor) -> Tensor:
-        """(N, S) states before the next step, given (N, O) observations."""
+        """States (N, S) just before the next step, given its observations (N, O)."""
         return self._states.build(self._items, self._rewards, self._steps, self.users, observations)
 
     def record(self, items: Tensor, rewards: Tensor) -> None:
-        """Take note of the items (N,) just shown and the rewards (N,) they earned."""
-        rewards = rewards.float()  # as the store holds them
+        """Add a step to every session: the items (N,) shown and their rewards (N,)."""
+        rewards = rewards.float()  # rounded like the store's, for bit-identical states
         self._items = torch.cat([items.unsqueeze(1), self._items[:, :-1]], dim=1)
         self._rewards = torch.cat([rewards.unsqueeze(1), self._rewards[:, :-1]], dim=1)
         self._steps += 1

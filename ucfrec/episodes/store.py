@@ -1,4 +1,4 @@
-"""EpisodeStore: the episodes of a store folder, opened without reading and gathered in windows."""
+"""EpisodeStore: memory-mapped episodes, gathered as windows or single transitions."""
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -28,18 +28,18 @@ _STATISTICS_STEPS = 1_000_000
 
 
 class EpisodeStore(EpisodeView):
-    """Episodes (user sessions, robot trajectories) of one store, or a view of some of them.
+    """Episodes (user sessions, robot trajectories) of a store, or a view of some of them.
 
-    A store is opened (`open`), written (`write`) or made in memory (`from_arrays`), and has a view
-    of all its episodes; `split`, `select` and `with_overlay` make others.
+    `open`, `write` and `from_arrays` (in memory) return a view of all episodes of a store; `split`,
+    `select` and `with_overlay` return other views of the same columns. Views are never modified.
     """
 
     @classmethod
     def open(cls, path: str | Path) -> "EpisodeStore":
-        """Open a store folder; columns are memory-mapped, nothing is read yet.
+        """Open a store folder; only `meta.json` is read, columns are memory-mapped on first use.
 
         Raises:
-            InputError: the folder is no store, is damaged, or a newer ucfrec wrote it.
+            InputError: the folder is not a store, is damaged, or was written by a newer ucfrec.
         """
         return cls(Columns.open(Path(path)))
 
@@ -57,15 +57,21 @@ class EpisodeStore(EpisodeView):
         """Write a store from arrays in memory, atomically.
 
         Args:
+            path: folder of the store.
             steps: step columns of `ucfrec.schema`, each (N,) or (N, size).
-            lengths: (E,) steps of each episode, at least one, adding up to N.
-            episodes: episode columns, each (E,); without `split`, all are for training.
-            reward: the expression that the rewards were computed by.
-            source: what the store was made from.
-            shard_steps: a shard ends with the episode that reaches so many steps.
+            lengths: (E,) number of steps of each episode, at least 1, with sum N.
+            episodes: episode columns of `ucfrec.schema`, each (E,); without `split`, all episodes
+                are in the training split.
+            reward: the expression that computed the rewards, for the record.
+            source: what the store was made from, for the record.
+            shard_steps: a shard ends with the first episode that brings it to this many steps.
+
+        Returns:
+            The store, opened.
 
         Raises:
-            InputError: `path` exists, an episode has no steps, or rewards are not finite.
+            InputError: `path` exists already, an episode has no steps, columns differ in length, or
+                rewards are not finite.
         """
         values = _with_split(episodes, lengths)
         write_arrays(path, steps, lengths, values, reward, source or {}, shard_steps)
@@ -79,13 +85,14 @@ class EpisodeStore(EpisodeView):
         episodes: Mapping[str, Array] | None = None,
         item_states: ItemStates | None = None,
     ) -> "EpisodeStore":
-        """A store in memory, which lies in no folder.
+        """Make a store in memory, without files.
 
         Args:
             steps: step columns of `ucfrec.schema`, each (N,) or (N, size).
-            lengths: (E,) steps of each episode, at least one, adding up to N.
-            episodes: episode columns, each (E,); without `split`, all are for training.
-            item_states: how states are made, where `steps` has items.
+            lengths: (E,) number of steps of each episode, at least 1, with sum N.
+            episodes: episode columns of `ucfrec.schema`, each (E,); without `split`, all episodes
+                are in the training split.
+            item_states: builds states from items; required if actions are items.
 
         Raises:
             InputError: an episode has no steps, columns differ in length, or rewards are not
@@ -96,10 +103,13 @@ class EpisodeStore(EpisodeView):
         values = _with_split(episodes, lengths)
         return cls(Columns.from_arrays(steps, lengths, values, item_states))
 
-    # Which episodes.
+    # Views.
 
     def select(self, episodes: IntArray) -> "EpisodeStore":
-        """A view of the episodes at the positions `episodes`, in that order.
+        """A view of the episodes at the given positions of this view, in the given order.
+
+        Args:
+            episodes: positions, 0 to E − 1, of any number.
 
         Raises:
             InputError: this view has edited copies.
@@ -108,86 +118,101 @@ class EpisodeStore(EpisodeView):
         return EpisodeStore(self._columns, self.episode_ids[episodes])
 
     def split(self, name: str) -> "EpisodeStore":
-        """The view of one split's episodes, "train", "validation" or "test"; may be empty.
+        """A view of the episodes in one split.
+
+        Args:
+            name: "train", "validation" or "test"; the split may be empty.
 
         Raises:
-            InputError: there is no such split, or this view has edited copies.
+            InputError: `name` is none of these, or this view has edited copies.
         """
         if name not in schema.SPLITS:
             raise InputError(f"no split is called {name!r}; there are {', '.join(schema.SPLITS)}")
         self._require_no_copies("split")
-        chosen = self.episode_values(schema.SPLIT) == schema.SPLITS.index(name)
-        return self.select(np.flatnonzero(chosen))
+        in_split = self.episode_values(schema.SPLIT) == schema.SPLITS.index(name)
+        return self.select(np.flatnonzero(in_split))
 
     def with_overlay(self, overlay: Overlay) -> "EpisodeStore":
-        """This view and, after its episodes, the edited copies of `overlay`.
+        """A view with the edited copies of `overlay` appended after the episodes of this view.
 
         Raises:
-            InputError: the copies are of other episodes or of other states than the store's.
+            InputError: the overlay was made from another store: it copies episodes that this store
+                does not have, or its states have another size.
         """
         source, size = overlay.copy_source, overlay.edit_state.shape[1]
         if len(source) and not 0 <= source.min() <= source.max() < self.meta["n_episodes"]:
-            raise InputError(f"{overlay} has copies of episodes that {self.path} does not have")
+            raise InputError(
+                f"{overlay} has copies of episodes that {self.path} does not have; use the store "
+                "that the copies were made from"
+            )
         if size != self.state_size:
             raise InputError(
-                f"{overlay} edits states of {size}; the store's have {self.state_size}"
+                f"{overlay} edits states of {size}; the store's have {self.state_size}; use the "
+                "store that the copies were made from"
             )
         joined = overlay if self.overlay is None else self.overlay.joined(overlay)
-        return EpisodeStore(self._columns, self._chosen, joined)
+        return EpisodeStore(self._columns, self._selected, joined)
 
     def without_copies(self) -> "EpisodeStore":
-        """This view's episodes as they were logged."""
-        return EpisodeStore(self._columns, self._chosen)
+        """A view of the same logged episodes, without edited copies."""
+        return EpisodeStore(self._columns, self._selected)
 
     def with_returns_to_go(self, values: FloatArray) -> "EpisodeStore":
-        """This view with other returns-to-go, (n_steps,) in the order of `all_steps`.
+        """A view of the same episodes with other returns-to-go; the files are not changed.
+
+        Args:
+            values: (n_steps,) returns-to-go in reward units, in the order of `all_steps`.
 
         Raises:
             InputError: this view has edited copies.
         """
-        self._require_no_copies("give other returns-to-go to")
-        whole = self._columns.of_steps(schema.RETURN_TO_GO)
+        self._require_no_copies("replace the returns-to-go of")
+        column = self._columns.step_column(schema.RETURN_TO_GO)
         episodes, steps = self.all_steps()
-        whole[self._columns.starts[self._sources[episodes]] + steps] = values
-        columns = self._columns.replaced(schema.RETURN_TO_GO, whole)
-        return EpisodeStore(columns, self._chosen)
+        column[self._columns.starts[self._sources[episodes]] + steps] = values
+        columns = self._columns.with_step_column(schema.RETURN_TO_GO, column)
+        return EpisodeStore(columns, self._selected)
 
-    def without_observed(self, dimensions: Sequence[int]) -> "EpisodeStore":
-        """This view without some of the numbers that were observed.
+    def without_observation_dimensions(self, dimensions: Sequence[int]) -> "EpisodeStore":
+        """A view of the same episodes without some dimensions of the observations.
 
         Args:
-            dimensions: of the logged observation, each 0 to O − 1.
+            dimensions: to remove, each 0 to O − 1.
 
         Raises:
-            InputError: this view has edited copies, whose states hold those numbers.
+            InputError: this view has edited copies; their states include all dimensions.
         """
-        self._require_no_copies("leave observed numbers out of")
+        self._require_no_copies("remove observation dimensions from")
         kept = np.setdiff1d(np.arange(self.observation_size), dimensions)
-        whole = self._columns.of_steps(schema.OBSERVATION)[:, kept]
-        return EpisodeStore(self._columns.replaced(schema.OBSERVATION, whole), self._chosen)
+        column = self._columns.step_column(schema.OBSERVATION)[:, kept]
+        columns = self._columns.with_step_column(schema.OBSERVATION, column)
+        return EpisodeStore(columns, self._selected)
 
-    def _require_no_copies(self, what: str) -> None:
+    def _require_no_copies(self, operation: str) -> None:
         if self.overlay is not None:
             raise InputError(
-                f"{self} has edited copies; {what} its without_copies(), and lay copies over that "
-                "by with_overlay"
+                f"{self} has edited copies; {operation} its without_copies(), then add copies with "
+                "with_overlay"
             )
 
-    # Gathering.
+    # Windows and transitions.
 
     def windows(self, episodes: IntArray, ends: IntArray, length: int) -> Windows:
-        """Windows of the `length` steps up to and with step `ends[b]` of episode `episodes[b]`.
+        """Windows of `length` steps that end with step `ends[b]` (inclusive) of `episodes[b]`.
 
         Example: for an episode with rewards [5, 6, 7, 8], end 1 and length 3 give rewards
         [0, 5, 6], mask [false, true, true] and timesteps [0, 0, 1].
 
         Args:
             episodes: (B,) positions in the view.
-            ends: (B,) last step of each window.
+            ends: (B,) last step of each window, from 0.
             length: K, at least 1.
 
+        Returns:
+            B windows of K steps, padded on the left.
+
         Raises:
-            InputError: there is no such step, or the arguments have other shapes.
+            InputError: an episode or step does not exist, or the arguments have other shapes.
         """
         self._require_steps(episodes, ends, length)
         steps = ends[:, None] + np.arange(1 - length, 1)  # (B, K)
@@ -196,7 +221,7 @@ class EpisodeStore(EpisodeView):
         valid = torch.from_numpy(mask)
 
         def gather(name: str) -> Tensor:
-            values = torch.from_numpy(self._columns.at(name, index))
+            values = torch.from_numpy(self._columns.step_values(name, index))
             shape = (*valid.shape, *([1] * (values.ndim - valid.ndim)))
             return values.masked_fill(~valid.view(shape), 0)
 
@@ -210,31 +235,34 @@ class EpisodeStore(EpisodeView):
         )
 
     def transitions(self, episodes: IntArray, steps: IntArray) -> Transitions:
-        """Single steps of the view, with factual successors.
+        """Single steps with their next states; next states are as logged, also in edited copies.
 
         Args:
             episodes: (M,) positions in the view.
-            steps: (M,) of those episodes.
+            steps: (M,) steps of those episodes, from 0.
 
         Raises:
-            InputError: there is no such step, or the arguments have other shapes.
+            InputError: an episode or step does not exist, or the arguments have other shapes.
         """
         window = self.windows(episodes, steps, 1)
         last = steps == self.lengths[episodes] - 1
         next_steps = np.where(last, steps, steps + 1)
         next_states = self._columns.states(self._sources[episodes], next_steps[:, None])[:, 0]
-        ended = torch.from_numpy(last)
+        is_last = torch.from_numpy(last)
         return Transitions(
             states=window.states[:, 0],
             actions=self.action_vectors(window.actions[:, 0]),
             rewards=window.rewards[:, 0],
-            next_states=next_states.masked_fill(ended.unsqueeze(-1), 0.0),
-            last=ended,
+            next_states=next_states.masked_fill(is_last.unsqueeze(-1), 0.0),
+            last=is_last,
         )
 
     @cached_property
     def state_statistics(self) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation, each (S,), of the view's states; of at most a million."""
+        """Mean and standard deviation, each (S,) float32, of the states of the view.
+
+        Computed in float64 from at most a million steps, evenly spaced over the view.
+        """
         episodes, steps = self.all_steps()
         stride = -(-len(steps) // _STATISTICS_STEPS)
         total = torch.zeros(self.state_size, dtype=torch.float64)
@@ -249,7 +277,7 @@ class EpisodeStore(EpisodeView):
         return mean.float(), variance.sqrt().float()
 
     def _edited_states(self, episodes: IntArray, steps: IntArray) -> Tensor:
-        """States (B, K, S) at `steps` (B, K), edits applied; undefined where a step is below 0."""
+        """States (B, K, S) at `steps` (B, K) with edits applied; undefined at steps below 0."""
         states = self._columns.states(self._sources[episodes], steps)
         if self.overlay is not None:
             copies = episodes[:, None] - len(self.episode_ids)

@@ -1,4 +1,4 @@
-"""Which episodes a view of a store has, and the values of their steps."""
+"""Views of a store: the episodes of a view, and access to their columns."""
 
 from collections.abc import Mapping
 from functools import cached_property
@@ -21,9 +21,9 @@ FloatArray = npt.NDArray[np.float32]
 
 
 class EpisodeView:
-    """Some episodes of a store: E as they were logged and, after them, C edited copies.
+    """Some episodes of a store: E logged episodes, followed by C edited copies of episodes.
 
-    Arguments `episodes` are positions among those, 0 to E + C − 1.
+    Wherever a method takes `episodes`, these are positions in the view, 0 to E + C − 1.
     """
 
     def __init__(
@@ -31,11 +31,11 @@ class EpisodeView:
     ) -> None:
         """
         Args:
-            columns: what the store holds.
+            columns: of the store.
             episode_ids: (E,) numbers in the store of the view's episodes; None for all.
             overlay: edited copies.
         """
-        self._columns, self._chosen = columns, episode_ids
+        self._columns, self._selected = columns, episode_ids
         self.overlay = overlay
         """Edited copies of episodes, or None."""
 
@@ -43,10 +43,12 @@ class EpisodeView:
         facts = [f"{self.n_steps:,} steps", f"{len(self.episode_ids):,} episodes"]
         if self.overlay is not None:
             facts[1] += f" and {len(self.overlay.copy_source):,} edited copies"
-        if self.has_items and self._columns.knows_items:
+        if self.has_items and self._columns.has_item_states:
             facts.append(f"{len(self.item_states.embeddings):,} items")
         facts.append(f"reward={self.meta['reward']}")
-        splits = set() if self._chosen is None else set(self.episode_values(schema.SPLIT).tolist())
+        splits = (
+            set() if self._selected is None else set(self.episode_values(schema.SPLIT).tolist())
+        )
         if len(splits) == 1:
             facts.append(f"split={schema.SPLITS[splits.pop()]}")
         return f"{type(self).__name__}({', '.join(facts)})"
@@ -66,29 +68,29 @@ class EpisodeView:
 
     @cached_property
     def episode_ids(self) -> IntArray:
-        """(E,) numbers in the store of the view's episodes, copies not among them."""
-        return np.arange(self.meta["n_episodes"]) if self._chosen is None else self._chosen
+        """(E,) numbers in the store of the logged episodes of the view; excludes copies."""
+        return np.arange(self.meta["n_episodes"]) if self._selected is None else self._selected
 
     @cached_property
     def _sources(self) -> IntArray:
-        """(E + C,) number in the store of the episode behind every episode of the view."""
+        """(E + C,) number in the store of every episode of the view; a copy has its source's."""
         if self.overlay is None:
             return self.episode_ids
         return np.concatenate([self.episode_ids, self.overlay.copy_source])
 
     @cached_property
     def lengths(self) -> IntArray:
-        """(E + C,) steps of each episode."""
+        """(E + C,) number of steps of each episode."""
         return self._columns.lengths[self._sources]
 
     @property
     def n_episodes(self) -> int:
-        """E + C: episodes of the view, copies among them."""
+        """E + C, the number of episodes of the view, including copies."""
         return len(self._sources)
 
     @cached_property
     def n_steps(self) -> int:
-        """Steps of the view, those of copies among them."""
+        """Number of steps of the view, including those of copies."""
         return int(self.lengths.sum())
 
     @property
@@ -98,45 +100,56 @@ class EpisodeView:
 
     @property
     def item_states(self) -> ItemStates:
-        """How states are made of items (stores of items only)."""
+        """Builds states from items; for stores of items only.
+
+        Raises:
+            InputError: the file of item states is missing or damaged.
+        """
         return self._columns.item_states
 
     @property
     def observation_size(self) -> int:
-        """O, size of the logged observation; 0 where none was logged."""
+        """O, size of the logged observation; 0 if none was logged."""
         return self._columns.observation_size
 
     @property
     def state_size(self) -> int:
-        """S."""
+        """S, size of a state: that of the item state, if actions are items, plus O."""
         return self.observation_size + (self.item_states.size if self.has_items else 0)
 
     def episode_values(self, name: str) -> Array:
-        """One episode column, (E + C,); copies have their source's values."""
-        return self._columns.of_episodes(name)[self._sources]
+        """An episode column, (E + C,); a copy has the value of its source.
+
+        Raises:
+            InputError: the store has no such column, or its files are damaged.
+        """
+        return self._columns.episode_column(name)[self._sources]
 
     @cached_property
     def returns(self) -> FloatArray:
-        """(E + C,) return of each episode."""
-        return self._columns.at(schema.RETURN_TO_GO, self._columns.starts[self._sources])
+        """(E + C,) undiscounted return of each episode, in reward units."""
+        return self._columns.step_values(schema.RETURN_TO_GO, self._columns.starts[self._sources])
 
     def step_values(self, name: str, episodes: IntArray, steps: IntArray) -> Array:
-        """One step column at the given steps of the given episodes.
+        """Values of a step column at the given steps; edits do not apply.
 
         Args:
+            name: of the column.
             episodes: positions in the view, of any shape.
-            steps: of those episodes; a shape that broadcasts with the other.
+            steps: steps of those episodes, from 0, of a shape that broadcasts with `episodes`.
 
         Returns:
-            Values of the common shape, and the size of a vector after it.
+            Values of the broadcast shape, followed by the size of a vector.
 
         Raises:
-            InputError: the store has no such column.
+            InputError: the store has no such column, or its files are damaged.
         """
-        return self._columns.at(name, self._columns.starts[self._sources[episodes]] + steps)
+        return self._columns.step_values(
+            name, self._columns.starts[self._sources[episodes]] + steps
+        )
 
     def all_steps(self) -> tuple[IntArray, IntArray]:
-        """(episodes, steps), each (n_steps,), of every step of the view, in order."""
+        """(episodes, steps), each (n_steps,): every step of the view, episode by episode."""
         episodes = np.repeat(np.arange(self.n_episodes), self.lengths)
         return episodes, np.arange(self.n_steps) - (self._ends - self.lengths)[episodes]
 
@@ -145,32 +158,35 @@ class EpisodeView:
         return np.cumsum(self.lengths)
 
     def draw_steps(self, generator: np.random.Generator, count: int) -> tuple[IntArray, IntArray]:
-        """(episodes, steps), each (count,), drawn uniformly over the steps of the view."""
+        """(episodes, steps), each (count,): steps drawn uniformly, with replacement."""
         return self.locate(generator.integers(self.n_steps, size=count))
 
     def locate(self, numbers: IntArray) -> tuple[IntArray, IntArray]:
-        """(episodes, steps) of steps numbered 0 to n_steps − 1 through the view."""
+        """(episodes, steps) of the steps with the given indices in `all_steps`, of any shape."""
         episodes = np.searchsorted(self._ends, numbers, side="right")
         return episodes, numbers - (self._ends[episodes] - self.lengths[episodes])
 
     def action_vectors(self, actions: Tensor) -> Tensor:
-        """Actions as vectors (..., A): items (...) as their embeddings, vectors as they are."""
+        """Actions as vectors (..., A): the embeddings of items (...); vectors are unchanged."""
         return self.item_states.embeddings[actions] if self.has_items else actions
 
     def _require_steps(self, episodes: IntArray, ends: IntArray, length: int) -> None:
         if episodes.ndim != 1 or episodes.shape != ends.shape or length < 1:
             raise InputError(
-                f"windows of {length} steps at episodes {episodes.shape} and steps {ends.shape}: "
-                "give two arrays of the same length, and at least 1 step"
+                f"windows of {length} steps, episodes of shape {episodes.shape} and steps of shape "
+                f"{ends.shape}: give two arrays of the same length, and at least 1 step"
             )
         if len(episodes) == 0:
             return
         if not 0 <= episodes.min() <= episodes.max() < self.n_episodes:
-            raise InputError(f"{self} has no episodes {episodes.min()} to {episodes.max()}")
+            raise InputError(
+                f"{self} has no episodes {episodes.min()} to {episodes.max()}; give positions from "
+                f"0 to {self.n_episodes - 1}"
+            )
         outside = (ends < 0) | (ends >= self.lengths[episodes])
         if outside.any():
-            at = int(outside.argmax())
+            first = int(outside.argmax())
             raise InputError(
-                f"episode {episodes[at]} has {self.lengths[episodes[at]]} steps, none numbered "
-                f"{ends[at]}"
+                f"episode {episodes[first]} has {self.lengths[episodes[first]]} steps, none "
+                f"numbered {ends[first]}; steps are numbered from 0"
             )

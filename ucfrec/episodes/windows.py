@@ -1,4 +1,4 @@
-"""What is gathered from a store: windows, single steps, and the edited copies of episodes."""
+"""Batches gathered from a store (windows, transitions) and overlays of edited copies."""
 
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -18,10 +18,10 @@ FloatArray = npt.NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Windows:
-    """B windows of K steps, padded on the left; padding is zero and `mask` is false there.
+    """B windows of K steps, padded on the left; at padding all values are 0 and `mask` is false.
 
     Raises:
-        InputError: the shapes do not go together.
+        InputError: the shapes do not match.
     """
 
     states: Tensor
@@ -29,13 +29,13 @@ class Windows:
     actions: Tensor
     """(B, K, A) float32 vectors, or (B, K) int64 items."""
     rewards: Tensor
-    """(B, K)."""
+    """(B, K) float32, in reward units."""
     returns_to_go: Tensor
-    """(B, K) undiscounted Ĝ_t."""
+    """(B, K) float32 undiscounted Ĝ_t, in reward units."""
     timesteps: Tensor
-    """(B, K) int64, number of the step in its episode, from 0."""
+    """(B, K) int64 number of the step in its episode, from 0."""
     mask: Tensor
-    """(B, K) bool, true at steps of the episode."""
+    """(B, K) bool, true at steps of the episode, false at padding."""
 
     def __post_init__(self) -> None:
         shape = self.mask.shape
@@ -53,27 +53,27 @@ class Windows:
         return f"Windows({windows:,} of {steps} steps, states of {size}, actions are {actions})"
 
     def to(self, device: torch.device) -> "Windows":
-        """The same windows on `device`."""
+        """A copy of the windows on `device`."""
         moved = {f.name: getattr(self, f.name).to(device, non_blocking=True) for f in fields(self)}
         return Windows(**moved)
 
 
 @dataclass(frozen=True)
 class Transitions:
-    """M single steps, aligned.
+    """M single steps.
 
     Raises:
-        InputError: the shapes do not go together.
+        InputError: the shapes do not match.
     """
 
     states: Tensor
     """(M, S)."""
     actions: Tensor
-    """(M, A); an item stands as its embedding."""
+    """(M, A) vectors; an item is represented by its embedding."""
     rewards: Tensor
-    """(M,)."""
+    """(M,), in reward units."""
     next_states: Tensor
-    """(M, S) factual successors, never edited; zeros at the last step of an episode."""
+    """(M, S) next states as logged, never edited; zeros at the last step of an episode."""
     last: Tensor
     """(M,) bool, true at the last step of an episode."""
 
@@ -94,22 +94,23 @@ class Transitions:
 
 @dataclass(frozen=True)
 class Overlay:
-    """Edited copies of episodes: only what differs from the source is held.
+    """Edited copies of episodes, stored as the edited states only.
 
-    Rewards, actions, returns-to-go and next states of a copy are its source's (Appendix H).
+    Rewards, actions, returns-to-go and next states of a copy are those of its source (paper
+    appendix H).
 
     Raises:
-        InputError: the shapes do not go together.
+        InputError: the shapes do not match.
     """
 
     copy_source: IntArray
-    """(C,) number in the store of the episode that each copy was made of."""
+    """(C,) number in the store of the episode that was copied."""
     edit_copy: IntArray
-    """(M,) copy, 0 to C − 1, that each edit belongs to."""
+    """(M,) number of the copy, 0 to C − 1, that each edit belongs to."""
     edit_step: IntArray
-    """(M,) step of the episode that is edited; (copy, step) strictly increases."""
+    """(M,) step of the episode that each edit changes; (copy, step) is strictly increasing."""
     edit_state: FloatArray
-    """(M, S) the counterfactual state."""
+    """(M, S) counterfactual states."""
 
     def __post_init__(self) -> None:
         shape = self.edit_copy.shape
@@ -125,55 +126,60 @@ class Overlay:
         return f"Overlay({len(self.copy_source):,} copies, {edits:,} edited states of {size})"
 
     def edits_at(self, copies: IntArray, steps: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-        """Which of the steps asked for are edited.
+        """Find which of the given steps are edited.
 
         Args:
-            copies: (B, 1) copies; below 0 for an episode that is none.
-            steps: (B, K) steps of those copies; below 0 before the episode's first.
+            copies: (B, 1) numbers of copies; below 0 for an episode that is not a copy.
+            steps: (B, K) steps of those copies; below 0 at padding.
 
         Returns:
-            Rows and columns of `steps` that are edited, and the numbers of their edits.
+            For each edited step, its row and column in `steps` and the number of its edit, 0 to
+            M − 1; three arrays of the same length.
         """
         keys, stride = self._keys
-        inside = (copies >= 0) & (steps >= 0) & (steps < stride)
-        wanted = np.where(inside, copies * stride + steps, -1)
-        found = np.searchsorted(keys, wanted)
-        rows, columns = np.nonzero(keys[found] == wanted)
-        return rows, columns, found[rows, columns]
+        possible = (copies >= 0) & (steps >= 0) & (steps < stride)
+        step_keys = np.where(possible, copies * stride + steps, -1)
+        positions = np.searchsorted(keys, step_keys)
+        rows, columns = np.nonzero(keys[positions] == step_keys)
+        return rows, columns, positions[rows, columns]
 
     @cached_property
     def _keys(self) -> tuple[IntArray, int]:
-        """(M + 1,) one increasing number an edit, and one at the end that nothing reaches; and the
-        distance between the first steps of two copies."""
+        """(M + 1,) increasing keys copy × stride + step of the edits, and the stride.
+
+        The last key is a sentinel, larger than any other, so that every search ends inside.
+        """
         stride = int(self.edit_step.max(initial=0)) + 1
         keys = self.edit_copy * stride + self.edit_step
         return np.append(keys, np.iinfo(np.int64).max), stride
 
     def joined(self, other: "Overlay") -> "Overlay":
-        """The copies of this overlay, and after them those of `other`."""
-        after = Overlay(
+        """An overlay with the copies of this one, followed by those of `other`."""
+        renumbered = Overlay(
             other.copy_source,
             other.edit_copy + len(self.copy_source),
             other.edit_step,
             other.edit_state,
         )
-        pairs = ((getattr(self, f.name), getattr(after, f.name)) for f in fields(self))
+        pairs = ((getattr(self, f.name), getattr(renumbered, f.name)) for f in fields(self))
         return Overlay(*(np.concatenate(pair) for pair in pairs))
 
     def save(self, path: Path) -> None:
-        """Write to one safetensors file."""
+        """Write to one safetensors file, atomically."""
         arrays = {f.name: torch.from_numpy(getattr(self, f.name)) for f in fields(self)}
         save_tensors(path, arrays, {})
 
     @classmethod
     def load(cls, path: Path) -> "Overlay":
-        """Read what `save` wrote."""
+        """Read a file that `save` wrote.
+
+        Raises:
+            InputError: the file is missing or damaged.
+        """
         tensors, _ = load_tensors(path)
         return cls(**{name: tensor.numpy() for name, tensor in tensors.items()})
 
 
-def _shapes_differ(value: Windows | Transitions | Overlay, wanted: str) -> InputError:
+def _shapes_differ(value: Windows | Transitions | Overlay, expected: str) -> InputError:
     shapes = ", ".join(f"{f.name} {tuple(getattr(value, f.name).shape)}" for f in fields(value))
-    return InputError(
-        f"{type(value).__name__}: shapes do not go together ({shapes}); give {wanted}"
-    )
+    return InputError(f"{type(value).__name__}: shapes do not match ({shapes}); give {expected}")

@@ -1,4 +1,4 @@
-"""Writes an episode store, step by step, in bounded memory."""
+"""Writing an episode store incrementally, in bounded memory."""
 
 import hashlib
 from collections.abc import Mapping
@@ -18,10 +18,10 @@ BoolArray = npt.NDArray[np.bool_]
 
 
 class StoreWriter:
-    """Takes steps in order and lays them down as shards of .npy columns.
+    """Writes steps, appended in order, as shards of .npy columns.
 
-    The caller writes into a folder of its own, usually the scratch folder of
-    `ucfrec.files.atomic_folder`, so that a store appears whole or not at all.
+    `folder` should be a scratch folder of `ucfrec.files.atomic_folder`, so that a store appears
+    complete or not at all.
 
     Example: three steps, two episodes::
 
@@ -32,6 +32,11 @@ class StoreWriter:
     """
 
     def __init__(self, folder: Path, shard_steps: int = 2**24) -> None:
+        """
+        Args:
+            folder: to write to.
+            shard_steps: a shard ends with the first episode that brings it to this many steps.
+        """
         self._folder = folder
         self._shard_steps = shard_steps
         self._hashes: dict[str, Any] = {}
@@ -48,16 +53,18 @@ class StoreWriter:
         first: npt.NDArray[np.bool_],
         episodes: Mapping[str, Array],
     ) -> None:
-        """Add M steps in order.
+        """Append M steps.
 
         Args:
             steps: step columns of `ucfrec.schema`, each (M,) or, for `action` and `observation`,
                 (M, size). `reward`, and one of `item` and `action`, are required.
             first: (M,) true at the first step of an episode.
-            episodes: episode columns, each (M,), constant within an episode.
+            episodes: episode columns of `ucfrec.schema`, each (M,), constant within an episode;
+                `split` is required.
 
         Raises:
             InputError: columns differ in length, or rewards are not finite.
+            ValueError: the very first step does not begin an episode.
         """
         first = np.asarray(first, dtype=bool)
         for name, values in (*steps.items(), *episodes.items()):
@@ -67,7 +74,7 @@ class StoreWriter:
         if len(first) == 0:
             return
         if self._n_steps == 0 and not first[0]:
-            raise ValueError("the first step of a store begins an episode")
+            raise ValueError("the first step of a store must begin an episode")
         starts, begin = np.flatnonzero(first), 0
         while True:
             full = begin + self._shard_steps - self._steps_in_shard
@@ -136,10 +143,10 @@ class StoreWriter:
         """Close the last shard and write `meta.json`.
 
         Args:
-            reward: the expression that the rewards were computed by.
-            source: what the store was made from and what was dropped on the way.
-            ids: identifiers (of items, of users) whose order gives the columns their meaning; they
-                enter the fingerprint.
+            reward: the expression that computed the rewards, for the record.
+            source: what the store was made from and which rows were dropped, for the record.
+            ids: original identifiers (of items, of users) in the order in which the columns number
+                them, by name; they enter the fingerprint.
 
         Returns:
             The contents of `meta.json`.
@@ -148,7 +155,10 @@ class StoreWriter:
             InputError: no step was appended.
         """
         if self._n_steps == 0:
-            raise InputError("no episode is left to store: every row was dropped or none was read")
+            raise InputError(
+                "no episode is left to store: every row was dropped or none was read; check the "
+                "input and the filters"
+            )
         self._close_shard()
         for name, values in (ids or {}).items():
             self._hashes[f"ids {name}"] = hashlib.sha256("\n".join(map(str, values)).encode())
@@ -191,10 +201,17 @@ def write_arrays(
 
 
 def require_steps(path: Path | str, lengths: Array) -> npt.NDArray[np.int64]:
-    """The lengths (E,) of episodes, if each has a step.
+    """Check that every episode has at least one step.
+
+    Args:
+        path: of the store, for the message.
+        lengths: (E,) number of steps of each episode.
+
+    Returns:
+        `lengths` as an array.
 
     Raises:
-        InputError: one has none.
+        InputError: an episode has no steps.
     """
     lengths = np.asarray(lengths)
     if np.any(lengths < 1):
@@ -203,17 +220,17 @@ def require_steps(path: Path | str, lengths: Array) -> npt.NDArray[np.int64]:
 
 
 def require_finite(rewards: Array) -> None:
-    """Refuse rewards (N,) that suffix sums would carry into every return of a shard.
+    """Check that rewards (N,) are finite, because one that is not would spoil a shard's returns.
 
     Raises:
-        InputError: some are NaN or infinite, also once they are float32.
+        InputError: some rewards are NaN or infinite, or overflow float32.
     """
     with np.errstate(over="ignore"):
         stored = np.asarray(rewards, dtype=schema.STEP_DTYPES[schema.REWARD])
-    strange = int(np.count_nonzero(~np.isfinite(stored)))
-    if strange:
+    not_finite = int(np.count_nonzero(~np.isfinite(stored)))
+    if not_finite:
         raise InputError(
-            f"{strange} of {len(stored)} rewards are not finite; drop those rows or mend the "
+            f"{not_finite} of {len(stored)} rewards are not finite; drop those rows or correct the "
             "reward expression"
         )
 
@@ -229,11 +246,12 @@ def _rows(
 
 
 class _NpyFile:
-    """A .npy file that grows; numpy leaves room in the header for the final length."""
+    """A .npy file of growing length; numpy pads the header so that it can be rewritten in place."""
 
-    def __init__(self, path: Path, like: Array) -> None:
+    def __init__(self, path: Path, template: Array) -> None:
+        """Open `path` for rows of the dtype and shape of the rows of `template`."""
         self._file: IO[bytes] = path.open("wb")
-        self._dtype, self._shape = like.dtype, like.shape[1:]
+        self._dtype, self._shape = template.dtype, template.shape[1:]
         self._rows = 0
         self._write_header()
 

@@ -1,4 +1,4 @@
-"""Checkpoints: one safetensors file each, numbers about it in the file's own header."""
+"""Checkpoints: one safetensors file each, with metadata as JSON in the file's header."""
 
 import json
 from pathlib import Path
@@ -15,36 +15,36 @@ from ucfrec.files import atomic_file
 _OPTIMIZER = "optimizer."
 
 
-def save_tensors(path: Path, tensors: dict[str, Tensor], about: dict[str, Any]) -> None:
-    """Write named tensors and a JSON-able header, atomically.
+def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> None:
+    """Write named tensors and metadata that JSON can represent, atomically.
 
     Raises:
-        InputError: the disk is full, or the folder cannot be written to.
+        InputError: the disk is full, or the folder is not writable.
     """
     plain = {name: tensor.detach().contiguous().cpu() for name, tensor in tensors.items()}
     with atomic_file(path) as scratch:
         scratch.touch()
         mode = scratch.stat().st_mode
         try:
-            save_file(plain, scratch, metadata={"about": json.dumps(about)})
-            # safetensors makes files that nobody else may read; runs are shared like other outputs.
+            save_file(plain, scratch, metadata={"about": json.dumps(metadata)})
+            # safetensors restricts its files to their owner; give them the usual permissions.
             scratch.chmod(mode)
         except SafetensorError as error:
             raise InputError(
-                f"{path} cannot be written ({error}); make room and give the same command again"
+                f"{path} cannot be written ({error}); free disk space and run the command again"
             ) from None
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read what `save_tensors` wrote.
+    """Read the tensors, on the CPU, and the metadata that `save_tensors` wrote.
 
     Raises:
         InputError: the file is missing or damaged.
     """
     try:
         with safe_open(path, framework="pt") as file:
-            about = json.loads((file.metadata() or {}).get("about", "{}"))
-            return {name: file.get_tensor(name) for name in file.keys()}, about  # noqa: SIM118
+            metadata = json.loads((file.metadata() or {}).get("about", "{}"))
+            return {name: file.get_tensor(name) for name in file.keys()}, metadata  # noqa: SIM118
     except FileNotFoundError:
         raise InputError(f"{path} does not exist") from None
     except SafetensorError as error:
@@ -52,21 +52,32 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def save_training(
-    path: Path, module: nn.Module, optimizer: torch.optim.Optimizer, about: dict[str, Any]
+    path: Path, module: nn.Module, optimizer: torch.optim.Optimizer, counters: dict[str, Any]
 ) -> None:
-    """Write all that a training loop needs to go on: weights, optimizer moments, counters."""
+    """Write everything that resuming a training needs: weights, optimizer state and counters.
+
+    Raises:
+        InputError: the disk is full, or the folder is not writable.
+    """
     tensors = dict(module.state_dict())
     for index, moments in optimizer.state_dict()["state"].items():
         for key, value in moments.items():
             tensors[f"{_OPTIMIZER}{index}.{key}"] = value
-    save_tensors(path, tensors, about)
+    save_tensors(path, tensors, counters)
 
 
 def load_training(
     path: Path, module: nn.Module, optimizer: torch.optim.Optimizer
 ) -> dict[str, Any]:
-    """Restore what `save_training` wrote, in place; returns the counters."""
-    tensors, about = load_tensors(path)
+    """Restore `module` and `optimizer`, in place, from a file that `save_training` wrote.
+
+    Returns:
+        The counters.
+
+    Raises:
+        InputError: the file is missing or damaged, or holds weights of another architecture.
+    """
+    tensors, counters = load_tensors(path)
     state: dict[int, dict[str, Tensor]] = {}
     for name in [name for name in tensors if name.startswith(_OPTIMIZER)]:
         index, key = name.removeprefix(_OPTIMIZER).split(".")
@@ -74,17 +85,20 @@ def load_training(
     load_weights(path, module, tensors)
     groups = optimizer.state_dict()["param_groups"]
     optimizer.load_state_dict({"state": state, "param_groups": groups})
-    return about
+    return counters
 
 
 def load_weights(path: Path, module: nn.Module, tensors: dict[str, Tensor]) -> None:
-    """Put `tensors`, read from `path`, into `module`.
+    """Load `tensors` into `module`; `path`, where they were read from, is for the message.
 
     Raises:
-        InputError: they are another architecture's.
+        InputError: they are the weights of another architecture.
     """
     try:
         module.load_state_dict(tensors)
     except RuntimeError as error:
         first = str(error).splitlines()[1].strip() if "\n" in str(error) else str(error)
-        raise InputError(f"{path} holds weights of another architecture: {first}") from None
+        raise InputError(
+            f"{path} holds weights of another architecture ({first}); use the settings that it was "
+            "trained with, or another folder"
+        ) from None

@@ -1,4 +1,4 @@
-"""The one training loop, of reward model, generator and every policy."""
+"""The training loop shared by reward model, generator and every policy."""
 
 import math
 import time
@@ -31,47 +31,54 @@ Batch = TypeVar("Batch")
 
 @settings_table("train")
 class LoopConfig:
-    """How long and how fast to learn.
+    """Length of a training and settings of its optimizer (AdamW).
 
-    Policy defaults are the paper's Table 8; `steps` and the rest are ours.
+    The defaults are those of policies in the paper's Table 8; settings that it does not give, such
+    as `steps`, are our choice.
     """
 
     steps: Count = 10_000
-    """Updates in all."""
+    """Number of updates."""
     batch_size: BatchSize = 64
-    """Windows of an update."""
+    """Windows per update."""
     learning_rate: LearningRate = 1e-4
-    """Step size of the updates, once warm."""
+    """Learning rate after the warm-up."""
     weight_decay: WeightDecay = 1e-4
-    """AdamW's pull of the weights towards 0."""
+    """Weight decay of AdamW."""
     warmup_steps: Annotated[int, Field(ge=0, le=10**12)] = 500
-    """Steps in which the learning rate rises linearly; then it stays, or falls along a cosine. A
-    training of fewer steps ends before it has risen."""
+    """Steps over which the learning rate rises linearly from 0 to `learning_rate`; a training with
+    fewer steps ends before it reaches that."""
     cosine: bool = False
-    """After the warm-up, fall to 0 at the last step instead of staying constant."""
+    """After the warm-up, lower the learning rate along a cosine, to 0 at the last step, instead of
+    keeping it constant."""
     clip_norm: Annotated[float, Field(ge=0, le=1e6)] = 0.25
-    """Largest gradient norm; 0 clips nothing."""
+    """Norm to which larger gradients are clipped; 0 disables clipping."""
     validate_every: Count = 500
     """Steps between validations, checkpoints and log lines."""
     patience: Annotated[int, Field(ge=0, le=10**9)] = 0
-    """Validations without a better one before stopping early; 0 never stops early."""
+    """Number of consecutive validations without improvement after which training stops early; 0
+    disables early stopping."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """What a training loop ended with."""
+    """The outcome of a training."""
 
     steps: int
+    """Last step, which early stopping can put before `LoopConfig.steps`."""
     best_step: int
+    """Step of the weights with the lowest validation loss; the last without validation."""
     best_validation: float
     """Lowest validation loss; NaN without validation."""
     seconds: float
+    """Wall-clock time up to the last checkpoint, summed over all resumptions."""
 
 
 def step_generator(seed: int, step: int) -> np.random.Generator:
-    """The generator from which everything random of one training step is drawn.
+    """The generator for all random draws of one training step.
 
-    Step i needs no history: a run resumed at i draws the same as an uninterrupted one.
+    It depends on nothing but `seed` and `step`, so a resumed training draws the same batches as an
+    uninterrupted one.
     """
     return np.random.default_rng([seed, step])
 
@@ -90,19 +97,19 @@ def fit(
 ) -> Fit:
     """Minimise `loss` over batches from `draw`, resuming from `folder` if it holds a checkpoint.
 
-    Writes `last.safetensors` (all that resuming needs), `best.safetensors` (weights with the lowest
-    validation loss, else the last), `metrics.jsonl` and TensorBoard events to `folder`. A run
-    killed at any moment and started again ends with the same weights as an uninterrupted one (same
-    machine and device). The global random state is as before when it returns or raises.
+    Writes `last.safetensors` (to resume), `best.safetensors` (weights with the lowest validation
+    loss, else the last), `metrics.jsonl` and TensorBoard events to `folder`. A training killed and
+    resumed ends with the weights of an uninterrupted one. The global random state is restored.
 
     Args:
-        module: what is trained, in place; holds the best weights on return.
-        draw: a batch from a generator.
-        loss: the scalar to minimise and scalars to log.
-        validate: the loss on held-out data, in evaluation mode and without gradients.
+        module: trained in place; holds the best weights on return.
+        draw: draws a batch with the given generator.
+        loss: the scalar to minimise, and scalars to log by name, of a batch.
+        validate: the validation loss; called in evaluation mode without gradients.
+        describe: name of the training in progress and error messages.
 
     Raises:
-        InputError: the loss is no longer finite.
+        InputError: a loss or gradient is not finite, or a checkpoint is damaged or does not fit.
     """
     folder.mkdir(parents=True, exist_ok=True)
     last, best = folder / "last.safetensors", folder / "best.safetensors"
@@ -112,7 +119,7 @@ def fit(
         counters.update(load_training(last, module, optimizer))
     step = int(counters["step"])
     clock, log = _Clock(step, counters["seconds"]), MetricsLog(folder, step)
-    for step, shown in _steps(counters, config, describe):
+    for step, bar in _steps(counters, config, describe):
         generator = step_generator(seed, step)
         with clock.waiting():
             batch = draw(generator)
@@ -128,7 +135,7 @@ def fit(
         logged |= {name: scalar.item() for name, scalar in scalars.items()}
         logged |= _keep_best(module, validate, counters, step, best, describe)
         log.add(step, logged)
-        shown.update(0, loss=logged["loss"])
+        bar.update(0, loss=logged["loss"])
         counters |= {"step": step, "seconds": clock.total()}
         save_training(last, module, optimizer, counters)
         clock.restart(step)
@@ -142,13 +149,13 @@ def fit(
 def _steps(
     counters: Mapping[str, float], config: LoopConfig, describe: str
 ) -> Iterator[tuple[int, Progress]]:
-    """Number the steps that are left until the end or an early stop, and show how fast they go."""
+    """Yield the remaining steps, until the last or an early stop, with their progress display."""
     step = int(counters["step"])
-    with progress(config.steps, describe, "steps", step) as shown:
+    with progress(config.steps, describe, "steps", step) as bar:
         while step < config.steps and not 0 < config.patience <= counters["stale"]:
             step += 1
-            yield step, shown
-            shown.update()
+            yield step, bar
+            bar.update()
 
 
 def _optimizer(module: nn.Module, config: LoopConfig) -> torch.optim.Optimizer:
@@ -167,7 +174,7 @@ def _descend(
     config: LoopConfig,
     step: int,
 ) -> Tensor:
-    """One step down the gradient of `value`; returns the gradient's norm before clipping."""
+    """One optimizer step on the loss `value`; returns the gradient norm before clipping."""
     optimizer.zero_grad(set_to_none=True)
     value.backward()  # type: ignore[no-untyped-call]
     norm = nn.utils.clip_grad_norm_(module.parameters(), config.clip_norm or math.inf)
@@ -178,46 +185,47 @@ def _descend(
 
 
 class _Clock:
-    """Time spent, and how much of it waiting for data."""
+    """Measures training time and the share of it spent waiting for data."""
 
     def __init__(self, step: int, seconds: float) -> None:
-        self._began = time.perf_counter() - seconds
+        self._start = time.perf_counter() - seconds
         self.restart(step)
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
-        began = time.perf_counter()
+        start = time.perf_counter()
         yield
-        self._waited += time.perf_counter() - began
+        self._waited += time.perf_counter() - start
 
     def rates(self, step: int, config: LoopConfig) -> dict[str, float]:
-        """Samples a second and the share of time waiting for data, since the last restart."""
-        elapsed = time.perf_counter() - self._since
+        """Samples per second and share of time spent waiting for data, since the last restart."""
+        elapsed = time.perf_counter() - self._interval_start
         return {
             "samples_per_second": (step - self._step) * config.batch_size / elapsed,
             "waiting_for_data": self._waited / elapsed,
         }
 
     def restart(self, step: int) -> None:
-        """Count from here: what validation and checkpoints take is neither."""
-        self._since, self._step, self._waited = time.perf_counter(), step, 0.0
+        """Start a new interval for `rates`, which thus excludes validations and checkpoints."""
+        self._interval_start, self._step, self._waited = time.perf_counter(), step, 0.0
 
     def total(self) -> float:
-        return time.perf_counter() - self._began
+        """Seconds since the training began, including earlier processes."""
+        return time.perf_counter() - self._start
 
 
 def _learning_rate(config: LoopConfig, step: int) -> float:
-    warm = min(1.0, step / max(1, config.warmup_steps))
+    warmup = min(1.0, step / max(1, config.warmup_steps))
     if not config.cosine or step < config.warmup_steps:
-        return config.learning_rate * warm
+        return config.learning_rate * warmup
     done = (step - config.warmup_steps) / max(1, config.steps - config.warmup_steps)
-    return config.learning_rate * warm * (1 + math.cos(math.pi * done)) / 2
+    return config.learning_rate * warmup * (1 + math.cos(math.pi * done)) / 2
 
 
-def _require_finite(value: float, what: str, step: int) -> None:
+def _require_finite(value: float, quantity: str, step: int) -> None:
     if not math.isfinite(value):
         raise InputError(
-            f"{what} is {value} at step {step}; lower the learning rate or "
+            f"{quantity} is {value} at step {step}; lower the learning rate or "
             "look for extreme values in the store (`ucfrec prepare --validate`)"
         )
 
@@ -230,10 +238,10 @@ def _keep_best(
     best: Path,
     describe: str,
 ) -> dict[str, float]:
-    """Save the weights if their validation loss is the lowest yet, or if there is no validation.
+    """Save the weights if their validation loss is the lowest so far, or without validation.
 
     Returns:
-        The validation loss, to log.
+        The validation loss, for the log; empty without validation.
     """
     if validate is None:
         counters["best_step"] = step

@@ -1,4 +1,4 @@
-"""`metrics.jsonl`: the scalars of a training, one JSON object a line."""
+"""`metrics.jsonl`: the scalars logged by a training, one JSON object per line."""
 
 import json
 import math
@@ -12,54 +12,55 @@ from ucfrec.fitting.tensorboard import Events
 METRICS = "metrics.jsonl"
 _STEP = "step"
 _LARGEST_STEP = 2**53
-"""Steps up to here are exact as floats."""
+"""The largest range of integers that floats represent exactly."""
 
 
 class MetricsLog:
-    """Writes scalars to `metrics.jsonl` and to TensorBoard's event files.
+    """Writes scalars to `metrics.jsonl` and to a TensorBoard event file.
 
-    Both are on disk when `add` returns, so a killed training loses nothing that it logged. A line
-    is `{"step": 500, "loss": 1.25, …}`; a value that is not finite is written as null.
+    Both are written to disk before `add` returns, so a killed training loses nothing that it
+    logged. A line is `{"step": 500, "loss": 1.25, …}`; a value that is not finite becomes null.
 
     Args:
-        folder: of both files; it exists.
-        start: the step that training resumes from; 0 at the beginning.
+        folder: of both files; must exist.
+        start: the step that training resumes from; 0 for a new training.
     """
 
     def __init__(self, folder: Path, start: int) -> None:
         self._path = folder / METRICS
         if self._path.exists():
-            _drop_torn_line(self._path)
+            _drop_incomplete_line(self._path)
         self._events = Events(folder, start)
 
     def add(self, step: int, scalars: Mapping[str, float]) -> None:
-        """Log `scalars` by their names; none is called `step`."""
+        """Log named scalars; the name `step` is reserved."""
         finite = {name: x if math.isfinite(x) else None for name, x in scalars.items()}
         with self._path.open("a", encoding="utf-8") as file:
             file.write(json.dumps({_STEP: step} | finite, allow_nan=False) + "\n")
         self._events.add(step, scalars)
 
     def close(self) -> None:
-        """End the event file."""
+        """Close the event file."""
         self._events.close()
 
 
 def read_metrics(folder: Path) -> dict[str, dict[int, float]]:
-    """Read `metrics.jsonl` in `folder`; no scalars where there is no such file.
+    """Read `metrics.jsonl` in `folder`, also while the training is running.
 
-    A resumed training may log a step again: the later line counts. A last line that was cut off is
-    left out, so a training can be read while it runs.
+    If a resumed training logged a step again, the later line is used. An incomplete last line is
+    ignored.
 
     Returns:
-        {name: {step: value}}, steps in order; NaN for a value that was not finite.
+        {name: {step: value}}, steps in ascending order, NaN for a value that was not finite; empty
+        if the file does not exist.
 
     Raises:
-        InputError: a line is something else.
+        InputError: a line is not an object of a step and numbers.
     """
     path = folder / METRICS
     if not path.exists():
         return {}
-    *lines, _torn = path.read_bytes().split(b"\n")
+    *lines, _incomplete = path.read_bytes().split(b"\n")
     scalars: dict[str, dict[int, float]] = {}
     for number, line in enumerate(lines, start=1):
         step, values = _parsed(line, f"{path}, line {number},")
@@ -72,12 +73,12 @@ def _parsed(line: bytes, where: str) -> tuple[int, dict[str, float]]:
     try:
         values = json.loads(line)
     except (ValueError, RecursionError):
-        raise _wrong(where, "is not JSON") from None
+        raise _bad_line(where, "is not JSON") from None
     if not isinstance(values, dict):
-        raise _wrong(where, "is no JSON object")
+        raise _bad_line(where, "is not a JSON object")
     step = values.pop(_STEP, None)
     if type(step) is not int or not 0 <= step <= _LARGEST_STEP:
-        raise _wrong(where, f"has no whole number from 0 as {_STEP!r}")
+        raise _bad_line(where, f"has no whole number of 0 or more as {_STEP!r}")
     return step, {name: _number(name, value, where) for name, value in values.items()}
 
 
@@ -85,21 +86,21 @@ def _number(name: str, value: Any, where: str) -> float:
     if value is None:
         return math.nan
     if type(value) not in (int, float):
-        raise _wrong(where, f"has no number as {name!r}")
+        raise _bad_line(where, f"has no number as {name!r}")
     try:
         return float(value)
     except OverflowError:
-        raise _wrong(where, f"has too large a number as {name!r}") from None
+        raise _bad_line(where, f"has too large a number as {name!r}") from None
 
 
-def _wrong(where: str, what: str) -> InputError:
-    return InputError(f"{where} {what}; delete the line, or restore the file")
+def _bad_line(where: str, problem: str) -> InputError:
+    return InputError(f"{where} {problem}; delete the line, or restore the file")
 
 
-def _drop_torn_line(path: Path) -> None:
-    """Cut off what a killed process left of its last line."""
+def _drop_incomplete_line(path: Path) -> None:
+    """Remove an incomplete last line, which a killed process left."""
     content = path.read_bytes()
-    whole = content.rfind(b"\n") + 1
-    if whole < len(content):
+    complete = content.rfind(b"\n") + 1
+    if complete < len(content):
         with path.open("r+b") as file:
-            file.truncate(whole)
+            file.truncate(complete)

@@ -1,4 +1,4 @@
-"""Training seeds global generators; its caller must not notice."""
+"""Restoring the global random state, so that seeding inside a function does not affect callers."""
 
 import random
 from collections.abc import Iterator
@@ -10,15 +10,16 @@ import torch
 
 @contextmanager
 def random_state_kept() -> Iterator[None]:
-    """Leave the global generators of torch (every device), numpy and `random` as they were found.
+    """Restore the global generators of torch (every device), numpy and `random` on exit.
 
-    What is inside may seed them and draw from them. A `with` block or, called, a decorator.
+    The code inside may seed them and draw from them. Usable in a `with` statement and as the
+    decorator `@random_state_kept()`.
     """
-    ours, theirs = random.getstate(), np.random.get_state()  # noqa: NPY002
+    python_state, numpy_state = random.getstate(), np.random.get_state()  # noqa: NPY002
     devices = range(torch.cuda.device_count())
     try:
         with torch.random.fork_rng(devices=devices):
             yield
     finally:
-        random.setstate(ours)
-        np.random.set_state(theirs)  # noqa: NPY002
+        random.setstate(python_state)
+        np.random.set_state(numpy_state)  # noqa: NPY002

@@ -1,4 +1,4 @@
-"""Scalars as TensorBoard's event files."""
+"""Writing scalars to a TensorBoard event file."""
 
 import time
 from collections.abc import Mapping
@@ -10,30 +10,31 @@ from tensorboardX.proto.summary_pb2 import Summary
 
 
 class Events:
-    """Writes an event file for TensorBoard; nothing in ucfrec reads it.
+    """Writes an event file for TensorBoard; ucfrec itself never reads it.
 
-    `tensorboardX.SummaryWriter` hands events to a thread and cannot say when they are written. This
-    writes them itself: they are on disk when `add` returns.
+    `tensorboardX.SummaryWriter` writes in a thread and does not report when an event is on disk;
+    this class writes synchronously, before `add` returns.
 
     Args:
-        folder: of the event file.
-        start: the step that training resumes from; 0 at the beginning.
+        folder: of the event file; must exist.
+        start: the step that training resumes from; 0 for a new training.
     """
 
     def __init__(self, folder: Path, start: int) -> None:
-        # The names that tensorboardX gives differ by the second only; two runs must not share one.
+        # tensorboardX names files by the second; the suffix keeps a quick resumption from reusing
+        # the name.
         self._writer = EventsWriter(str(folder / "events"), f".{start:09d}")
-        if start:  # tells TensorBoard to forget what was logged after the checkpoint
+        if start:  # makes TensorBoard discard events that were logged after the checkpoint
             log = SessionLog(status=SessionLog.START)
             self._writer.write_event(Event(wall_time=time.time(), step=start + 1, session_log=log))
 
     def add(self, step: int, scalars: Mapping[str, float]) -> None:
-        """Log `scalars` by their names."""
+        """Log named scalars."""
         values = [Summary.Value(tag=name, simple_value=x) for name, x in scalars.items()]
         summary = Summary(value=values)
         self._writer.write_event(Event(wall_time=time.time(), step=step, summary=summary))
         self._writer.flush()
 
     def close(self) -> None:
-        """End the file."""
+        """Close the file."""
         self._writer.close()

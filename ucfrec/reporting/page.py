@@ -11,7 +11,7 @@ import pyarrow as pa
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ucfrec import __version__
-from ucfrec.counterfactual.reward_model import fit_warning
+from ucfrec.counterfactual.reward_model_fit import fit_warning
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_file, read_json
 from ucfrec.fitting.metrics_log import read_metrics

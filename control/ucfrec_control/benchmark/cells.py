@@ -89,7 +89,7 @@ def code_of(learner: str, *more: str) -> str:
     is_rl = learner in ALGORITHMS
     own = rl if is_rl else policy_class(learner).__module__
     parts = ("ucfrec_control.learners.train", "ucfrec_control.learners.evaluate")
-    return code_version(__name__, *parts, own, *more, apart=() if is_rl else (rl,))
+    return code_version(__name__, *parts, own, *more, exclude=() if is_rl else (rl,))
 
 
 def key(cell: Cell) -> RowKey:

@@ -44,7 +44,7 @@ def preset_of(dataset: Mapping[str, Any], policy: str) -> Preset:
 def as_seen(store: EpisodeStore, dataset: Mapping[str, Any]) -> EpisodeStore:
     """What a policy sees of `store`, `dataset` being that of its run's record."""
     unseen = dataset.get(UNSEEN)
-    return store.without_observed(unseen) if unseen else store
+    return store.without_observation_dimensions(unseen) if unseen else store
 
 
 def train_control(

@@ -222,7 +222,7 @@ def _code(worlds: Iterable[World], *learner: str) -> str:
     """The version of the code that a cell in `worlds` runs through."""
     apart = [] if any(isinstance(world, DistractorWorld) for world in worlds) else [_DISTRACTOR]
     return code_version(
-        cells.__name__, *learner, *(_module(world.name) for world in worlds), apart=apart
+        cells.__name__, *learner, *(_module(world.name) for world in worlds), exclude=apart
     )
 
 

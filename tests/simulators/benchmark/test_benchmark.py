@@ -83,7 +83,7 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     assert suite.show(["main", "sweeps"], rows) in said
     # Code that a row runs through has changed: trained and played again.
     monkeypatch.setattr(plan, "METHODS", {"popular": METHODS["popular"]})
-    monkeypatch.setattr(plan, "code_version", lambda *roots, apart=(): "other")
+    monkeypatch.setattr(plan, "code_version", lambda *roots, exclude=(): "other")
     suite.run(request)
     again = read_rows(results)[len(rows) :]
     assert {row.code_version for row in again} == {"other"}

@@ -1,0 +1,245 @@
+"""Fitting the causal reward model (Algorithm 2) and measuring its quality on held-out steps."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, kl_to_prior
+from ucfrec.episodes.windows import Transitions
+from ucfrec.errors import InputError
+from ucfrec.fitting.loop import LoopConfig, fit
+from ucfrec.fitting.random_state import random_state_kept
+
+_ACTIVE_NATS = 0.01
+_LEAK = 0.1
+_PREDICTS_NOTHING = 0.02
+"""R² on held-out steps at or below which a reward model counts as useless."""
+_QUANTILES = (0.5, 0.9, 0.95, 0.99)
+_CONSTANT = 1e-6
+_VALIDATION_LIMIT = 20_000
+
+
+@dataclass(frozen=True)
+class CRMReport:
+    """Quality of the reward model, measured on held-out steps."""
+
+    train_transitions: int
+    """Number of transitions trained on."""
+    validation_transitions: int
+    """Number of held-out transitions."""
+    reward_std: float
+    """Standard deviation of the training rewards, in reward units."""
+    r2: float
+    """R² of f̂_r(s, a, z) with the abduced z, which is computed from the reward itself."""
+    r2_without_z: float
+    """R² of f̂_r(s, a, 0), with z at its prior mean: what state and action alone predict."""
+    z_share: float
+    """Share of the reward's variance due to z (Sobol's total effect of z on f̂_r)."""
+    z_leak: float
+    """Largest |correlation| of an active z_i with f̂_r(s, a, 0); 0 for a true disturbance."""
+    latent_dim: int
+    """Number of latent dimensions."""
+    active_dimensions: int
+    """Number of latent dimensions with a mean KL above 0.01 nats."""
+    kl: tuple[float, ...]
+    """(latent_dim,) mean KL(q(z_i | s, a, r) ‖ p(z_i)) in nats."""
+    delta: Mapping[str, float]
+    """Quantiles of |f̂_r(s, a, z) − r| in reward units: Proposition 1's δ at factual states."""
+    warning: str = ""
+    """A warning about the abduction of z; empty if there is no problem."""
+
+
+@random_state_kept()
+def fit_crm(
+    train: Transitions, validation: Transitions, config: CRMConfig, folder: Path, seed: int
+) -> tuple[CausalRewardModel, CRMReport]:
+    """Train the reward model (Algorithm 2) with early stopping on held-out steps.
+
+    Args:
+        train: transitions to train on.
+        validation: held-out transitions, never trained on.
+        config: architecture and training.
+        folder: of the checkpoints, which training resumes from.
+        seed: of sampling, initialisation and training.
+
+    Returns:
+        The model with the lowest validation loss, in evaluation mode, and its quality.
+
+    Raises:
+        InputError: all training rewards are equal, or one of the two sets is empty.
+    """
+    rng = np.random.default_rng(seed)
+    train = _at_most(train, config.max_transitions, rng)
+    held_out = _at_most(validation, _VALIDATION_LIMIT, rng)
+    torch.manual_seed(seed)
+    model = CausalRewardModel(train.states.shape[1], train.actions.shape[1], config)
+    _set_statistics(model, train, held_out)
+    if config.mean_first:
+        _fit_mean(model, train, held_out, folder / "mean", seed)
+    _fit_elbo(model, train, held_out, folder / "cvae", seed)
+    return model, _report(model, len(train.rewards), held_out)
+
+
+def _fit_mean(
+    model: CausalRewardModel, train: Transitions, held_out: Transitions, folder: Path, seed: int
+) -> None:
+    def draw(generator: np.random.Generator) -> tuple[Tensor, Tensor, Tensor]:
+        rows = torch.from_numpy(generator.integers(len(train.rewards), size=batch_size))
+        return train.states[rows], train.actions[rows], train.rewards[rows]
+
+    def loss(batch: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Mapping[str, Tensor]]:
+        return model.residual(*batch).square().mean(), {}
+
+    def validate() -> float:
+        whole = (held_out.states, held_out.actions, held_out.rewards)
+        return float(model.residual(*whole).square().mean())
+
+    batch_size, loop = model.config.batch_size, _loop(model.config, len(train.rewards))
+    fit(
+        model.expected, draw, loss, loop, folder, seed=seed, validate=validate,
+        describe="expected reward",
+    )  # fmt: skip
+    model.expected.requires_grad_(False)
+    model.surprise_std.fill_(max(validate(), 1e-8) ** 0.5)
+
+
+def _fit_elbo(
+    model: CausalRewardModel, train: Transitions, held_out: Transitions, folder: Path, seed: int
+) -> None:
+    config = model.config
+
+    def draw(generator: np.random.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        rows = torch.from_numpy(generator.integers(len(train.rewards), size=config.batch_size))
+        noise = _noise(generator, config.batch_size, config.latent_dim)
+        return train.states[rows], train.actions[rows], train.rewards[rows], noise
+
+    def loss(batch: tuple[Tensor, Tensor, Tensor, Tensor]) -> tuple[Tensor, Mapping[str, Tensor]]:
+        log_likelihood, kl = (term.mean() for term in model.elbo(*batch))
+        parts = {"log_likelihood": log_likelihood.detach(), "kl": kl.detach()}
+        return config.beta * kl - log_likelihood, parts
+
+    fixed = _noise(np.random.default_rng(seed), len(held_out.rewards), config.latent_dim)
+
+    def validate() -> float:
+        return float(loss((held_out.states, held_out.actions, held_out.rewards, fixed))[0])
+
+    loop = _loop(config, len(train.rewards))
+    fit(model, draw, loss, loop, folder, seed=seed, validate=validate, describe="reward model")
+
+
+def _loop(config: CRMConfig, transitions: int) -> LoopConfig:
+    epoch = max(1, transitions // config.batch_size)
+    return LoopConfig(
+        steps=config.epochs * epoch,
+        batch_size=config.batch_size,
+        learning_rate=config.learning_rate,
+        weight_decay=config.weight_decay,
+        warmup_steps=0,
+        clip_norm=0.0,
+        validate_every=epoch,
+        patience=config.patience,
+    )
+
+
+@torch.no_grad()
+def _report(model: CausalRewardModel, n_train: int, held_out: Transitions) -> CRMReport:
+    s, a, r = held_out.states, held_out.actions, held_out.rewards
+    q = model.encode(s, a, r)
+    with_z = model.predict(s, a, q.mean)
+    without_z = model.predict(s, a, torch.zeros_like(q.mean))
+    # Rows are in random order, so the z of the next row is a draw from the marginal distribution,
+    # as Jansen's estimator of the total effect needs.
+    other_z = model.predict(s, a, q.mean.roll(1, dims=0))
+    variance = float(r.var(correction=0)) or math.nan
+    kl = kl_to_prior(q).mean(dim=0)
+    active = kl > _ACTIVE_NATS
+    columns = torch.cat([without_z.unsqueeze(1), q.mean[:, active]], dim=1)
+    leak = torch.corrcoef(columns.T).nan_to_num().abs().reshape(columns.shape[1], -1)[0, 1:]
+    errors = (with_z - r).abs().double()
+    report = CRMReport(
+        train_transitions=n_train,
+        validation_transitions=len(r),
+        reward_std=float(model.reward_std),
+        r2=1 - float((with_z - r).square().mean()) / variance,
+        r2_without_z=1 - float((without_z - r).square().mean()) / variance,
+        z_share=0.5 * float((with_z - other_z).square().mean()) / variance,
+        z_leak=float(leak.max()) if len(leak) else 0.0,
+        latent_dim=kl.numel(),
+        active_dimensions=int(active.sum()),
+        kl=tuple(kl.tolist()),
+        delta={f"{level:g}": float(errors.quantile(level)) for level in _QUANTILES},
+    )
+    return replace(report, warning=_warning(report))
+
+
+def fit_warning(r2_without_z: float) -> str:
+    """A warning if the reward model predicts nothing, i.e. R² ≤ 0.02 or NaN; otherwise empty.
+
+    Args:
+        r2_without_z: `CRMReport.r2_without_z`.
+    """
+    if r2_without_z > _PREDICTS_NOTHING:
+        return ""
+    return (
+        f"the reward model predicts nothing: from state and action its R² on held-out steps is "
+        f"{r2_without_z:.2f} (0 is what the mean reward alone reaches), so an edit that keeps its "
+        "prediction may still change the true reward"
+    )
+
+
+def _warning(report: CRMReport) -> str:
+    alone = f"state and action alone predict {report.r2_without_z:.1%} of the reward's variance"
+    if report.active_dimensions == 0:
+        return (
+            f"latent collapse: none of {report.latent_dim} latent dimensions is used, so nothing "
+            f"is abduced; {alone}"
+        )
+    if report.z_share < 0.01:
+        return (
+            f"latent near collapse: z accounts for only {report.z_share:.2%} of the reward's "
+            f"variance, so abduction hardly matters; {alone}"
+        )
+    if report.z_leak > max(_LEAK, 4 / report.validation_transitions**0.5):
+        return (
+            f"latent leak: z correlates by {report.z_leak:.2f} with what state and action predict, "
+            "so it is not a disturbance, and edits that change the reward may pass the gate"
+        )
+    return ""
+
+
+def _set_statistics(model: CausalRewardModel, train: Transitions, held_out: Transitions) -> None:
+    for name, transitions in (("training", train), ("held-out", held_out)):
+        if len(transitions.rewards) == 0:
+            raise InputError(f"the reward model has no {name} transitions; check the store's split")
+    for name in ("state", "action", "reward"):
+        mean, std = _statistics(getattr(train, f"{name}s"))
+        model.get_buffer(f"{name}_mean").copy_(mean)
+        model.get_buffer(f"{name}_std").copy_(std)
+    if float(model.reward_std) == 0:
+        raise InputError(
+            f"all {len(train.rewards)} training rewards equal {float(train.rewards[0]):g}: there "
+            "is nothing to model; check the reward expression"
+        )
+
+
+def _statistics(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation over rows, in float64; rounding errors in the latter become 0."""
+    values = values.double()
+    mean, std = values.mean(dim=0), values.std(dim=0, correction=0)
+    return mean, torch.where(std > _CONSTANT * mean.abs().clamp(min=1.0), std, 0.0)
+
+
+def _at_most(transitions: Transitions, limit: int, rng: np.random.Generator) -> Transitions:
+    rows = torch.from_numpy(rng.permutation(len(transitions.rewards))[:limit])
+    return Transitions(*(getattr(transitions, field.name)[rows] for field in fields(transitions)))
+
+
+def _noise(generator: np.random.Generator, rows: int, size: int) -> Tensor:
+    values: npt.NDArray[np.float32] = generator.standard_normal((rows, size), dtype=np.float32)
+    return torch.from_numpy(values)

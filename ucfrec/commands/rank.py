@@ -1,4 +1,4 @@
-"""`ucfrec rank`: how policies rank what users were shown and clicked later."""
+"""`ucfrec rank`: measure how well policies rank items that users were shown and clicked later."""
 
 import argparse
 from pathlib import Path
@@ -23,24 +23,36 @@ _SHOWN = ("hit_rate_shown", "hit_rate_liked", "ndcg_liked", "recall_liked", "gau
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `rank` takes."""
+    """Add the options of `ucfrec rank`."""
     log_options(parser)
-    parser.add_argument("--k", type=int, default=10, help="items recommended at a step (10)")
-    target_options(parser)
-    parser.add_argument("--seed", type=int, default=0, help="of resampled users and `random`")
-    parser.add_argument("--json", type=Path, help="write the result rows here")
-    parser.usage = "%(prog)s RUN... [LOGS...] [options]"
-    parser.epilog = (
-        "Without LOGS, the test split of the store that the first run was trained on is ranked."
+    parser.add_argument(
+        "--k", type=int, default=10, help="items recommended at each step (default: 10)"
     )
+    target_options(parser)
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=0,
+        help="seed of the bootstrap over users and of the random baseline (default: 0)",
+    )
+    parser.add_argument(
+        "--json", type=Path, metavar="FILE", help="also write the rows, with intervals, as JSON"
+    )
+    parser.usage = "%(prog)s RUN... [LOGS...] [options]"
+    parser.epilog = "Without LOGS, the policies rank the test split of the store of the first run."
 
 
 def run(options: argparse.Namespace) -> None:
-    """`ucfrec rank`."""
+    """Run `ucfrec rank` and print one row per policy.
+
+    Raises:
+        InputError: a run or log cannot be used, the runs have different stores, or there is no
+            test split to rank.
+    """
     runs = [Path(path) for path in options.logs if (Path(path) / RUN).is_file()]
     options.logs = [path for path in options.logs if Path(path) not in runs]
     if not runs:
-        raise InputError("name a run folder of `ucfrec train` first, then the logs")
+        raise InputError("no run is named; give run folders of `ucfrec train`, then the logs")
     if options.k < 1:
         raise InputError(f"--k is {options.k}; recommend at least 1 item")
     trained = [TrainedPolicy.load(run, options.checkpoint) for run in runs]
@@ -54,7 +66,7 @@ def run(options: argparse.Namespace) -> None:
     else:
         if train is None:
             raise InputError(
-                f"{runs[0]}: its store {trained[0].record['store']} is gone or another by now; "
+                f"{runs[0]}: its store {trained[0].record['store']} is missing or has changed; "
                 "name the logs to rank"
             )
         test = train.split("test")
@@ -71,7 +83,9 @@ def run(options: argparse.Namespace) -> None:
 def _require_one_catalogue(runs: list[Path], trained: list[TrainedPolicy]) -> None:
     for run, policy in zip(runs, trained, strict=True):
         if policy.item_states is None:
-            raise InputError(f"{run}: the actions of this policy are vectors; there is no ranking")
+            raise InputError(
+                f"{run}: the actions of this policy are vectors; rank needs a policy over items"
+            )
         if policy.record["fingerprint"] != trained[0].record["fingerprint"]:
             raise InputError(
                 f"{run} was trained on another store than {runs[0]}; rank them one by one"
@@ -79,7 +93,7 @@ def _require_one_catalogue(runs: list[Path], trained: list[TrainedPolicy]) -> No
 
 
 def _training_store(trained: TrainedPolicy) -> EpisodeStore | None:
-    """The store that the run was trained on, where it still lies there."""
+    """The store that the run was trained on; None if it is missing or has changed."""
     path = Path(trained.record["store"])
     if not (path / "meta.json").is_file():
         return None
@@ -92,7 +106,7 @@ def _rows(
     runs: list[Path],
     trained: list[TrainedPolicy],
     train: EpisodeStore | None,
-    judged: EpisodeStore,
+    evaluated: EpisodeStore,
     users: Any,
 ) -> list[dict[str, Any]]:
     counts = trained[0].counts
@@ -100,31 +114,31 @@ def _rows(
     policies = [
         PolicyRanker(policy, target_given(options, policy), policy.name) for policy in trained
     ]
-    floors = baselines(counts, None if train is None else train.split("train"), options.seed)
-    named = rankers_named([*policies, *floors])
+    references = baselines(counts, None if train is None else train.split("train"), options.seed)
+    named = rankers_named([*policies, *references])
     k = min(options.k, len(counts.shown))
-    ranked = {name: rank_steps(ranker, judged, k) for name, ranker in named.items()}
-    period = Period.of(judged, np.asarray(users))
+    ranked = {name: rank_steps(ranker, evaluated, k) for name, ranker in named.items()}
+    period = Period.of(evaluated, np.asarray(users))
     reference = next(iter(named))
-    about = {
+    common = {
         "k": k,
         "steps": len(period.items),
         "users": len(np.unique(period.users)),
         "reference": reference,
         "seed": options.seed,
         "checkpoint": options.checkpoint,
-        "fingerprint": judged.meta["fingerprint"],
+        "fingerprint": evaluated.meta["fingerprint"],
         "train_fingerprint": trained[0].record["fingerprint"],
         **provenance(),
     }
     rows = []
-    for found in compare(period, ranked, k, reference, options.seed):
-        row: dict[str, Any] = {"policy": found.name, "coverage": found.coverage}
+    for comparison in compare(period, ranked, k, reference, options.seed):
+        row: dict[str, Any] = {"policy": comparison.name, "coverage": comparison.coverage}
         for name in MEASURES:
-            row[name] = found.values[name]
-            row[f"{name}_interval"] = list(found.intervals[name])
-            row[f"{name}_less_{reference}"] = list(found.differences[name])
-        rows.append(row | about)
+            row[name] = comparison.values[name]
+            row[f"{name}_interval"] = list(comparison.intervals[name])
+            row[f"{name}_less_{reference}"] = list(comparison.differences[name])
+        rows.append(row | common)
     return rows
 
 

@@ -25,7 +25,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--budget",
         choices=["small", "full"],
         default="small",
-        help="size of the measurements: small for a quick check, full for published numbers "
+        help="small (for two CPU cores) or full (larger logs, more seeds and training steps) "
         "(default: small)",
     )
     parser.add_argument(

@@ -62,9 +62,7 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.reporting.tables import format_rows
 
     print(format_rows(demo(options.out, options.seed, DemoConfig())))
-    print(
-        f"\nreport: {options.out / 'report.html'}; results, logs, stores and runs are in the same folder"
-    )
+    print(f"\nreport: {options.out / 'report.html'}; its folder has results, logs and runs")
 
 
 def demo(out: Path, seed: int, config: DemoConfig) -> list[dict[str, Any]]:

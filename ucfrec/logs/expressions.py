@@ -112,7 +112,7 @@ class Expression(str):
             InputError: `text` is not a string.
         """
         if not isinstance(text, str):
-            raise InputError(f"{origin}: {_quoted(text)} is not text; write a SQL expression")
+            raise InputError(f"{origin}: {_quote(text)} is not text; write a SQL expression")
         expression = super().__new__(cls, text)
         expression.origin = origin
         return expression
@@ -134,7 +134,7 @@ def refused(what: str, given: str, over: str, reason: str) -> InputError:
     origin = f"{given.origin}: " if isinstance(given, Expression) else ""
     reason = "".join(char if char.isprintable() else " " for char in reason)
     return InputError(
-        f"{origin}{what.partition(';')[0]}: {_quoted(given)} is no scalar SQL expression over the "
+        f"{origin}{what.partition(';')[0]}: {_quote(given)} is no scalar SQL expression over the "
         f"columns of {over}: {reason}"
     )
 
@@ -271,24 +271,22 @@ def _require_listed(node: dict[str, Any]) -> None:
         raise NotScalarError(f"it calls 'grouping'; {_ALLOWED}")
     if kind == "TYPE" and (node["type_name"].upper() not in TYPES or _is_qualified(node)):
         raise NotScalarError(
-            f"it casts to {_quoted(node['type_name'])}; cast to numbers, text, BOOLEAN, UUID, JSON, "
+            f"it casts to {_quote(node['type_name'])}; cast to numbers, text, BOOLEAN, UUID, JSON, "
             "dates and times, or lists of those"
         )
     if kind == "FUNCTION":
         name = node["function_name"].lower()
         if name not in FUNCTIONS or _is_qualified(node):
-            raise NotScalarError(f"it calls {_quoted(name)}; {_ALLOWED}")
+            raise NotScalarError(f"it calls {_quote(name)}; {_ALLOWED}")
         plain = not (node["distinct"] or node["filter"] or node["export_state"])
         if not plain or node["order_bys"]["orders"] or any(a["name"] for a in node["arguments"]):
-            raise NotScalarError(
-                f"it calls {_quoted(name)} as an aggregate or with named arguments"
-            )
+            raise NotScalarError(f"it calls {_quote(name)} as an aggregate or with named arguments")
 
 
 def _is_qualified(node: dict[str, Any]) -> bool:
     return bool(node["catalog"] or node["schema"] or len(node["qualified_name"]["path"]) != 1)
 
 
-def _quoted(given: object) -> str:
+def _quote(given: object) -> str:
     quoted = repr(str(given)) if isinstance(given, str) else repr(given)
     return quoted if len(quoted) <= _MAX_QUOTED else f"{quoted[: _MAX_QUOTED - 1]}…"

@@ -108,15 +108,16 @@ def _categories(
     found = connection.sql(f"""
         WITH cases AS (SELECT number, train_count, {value} AS value FROM {joined}),
         kept AS (
-            SELECT value, row_number() OVER (ORDER BY count(*) DESC, value) - 1 AS column_number
+            SELECT value, row_number() OVER (ORDER BY count(*) DESC, value) - 1 AS column_index
             FROM cases WHERE train_count > 0 AND value IS NOT NULL
-            GROUP BY value ORDER BY column_number LIMIT {CATEGORIES}
+            GROUP BY value ORDER BY column_index LIMIT {CATEGORIES}
         )
-        SELECT number, column_number FROM cases JOIN kept USING (value) ORDER BY number, column_number
+        SELECT number, column_index FROM cases JOIN kept USING (value)
+        ORDER BY number, column_index
     """).fetchnumpy()
-    size = int(found["column_number"].max()) + 1 if len(found["column_number"]) else 0
+    size = int(found["column_index"].max()) + 1 if len(found["column_index"]) else 0
     ones = np.ones(len(found["number"]), dtype=np.float32)
-    return _sparse(ones, found["number"], found["column_number"], (count, size))
+    return _sparse(ones, found["number"], found["column_index"], (count, size))
 
 
 def _sparse(values: Array, rows: Array, columns: Array, shape: tuple[int, int]) -> Features:

@@ -25,9 +25,9 @@ OPTIONAL_COLUMNS: Final = (
 class FeatureTable:
     """Features of items or users, one row per item or user (but see `first_by`).
 
-    The type of a column decides how it is encoded: numbers are standardised, dates count as days, text and
-    booleans are categories, lists of text or integers are tags, lists of floats are vectors. A
-    cast turns a number into a category: `music_type::VARCHAR`.
+    The type of a column decides how it is encoded: numbers are standardised, dates count as days,
+    text and booleans are categories, lists of text or integers are tags, lists of floats are
+    vectors. A cast turns a number into a category: `music_type::VARCHAR`.
     """
 
     files: tuple[str | Path, ...]

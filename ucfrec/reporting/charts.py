@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 WIDTH, HEIGHT = 360, 220
-"""Size of line charts and histograms; bar charts have the same width. About the width of a phone, so
+"""Size of line charts and histograms; bar charts have the same width. A phone is about as wide, so
 that text is not scaled there."""
 LEFT, RIGHT, TOP, BOTTOM = 52, 22, 16, 40
 """Margins around the plot area."""

@@ -30,7 +30,7 @@ REFERENCES = {"uniform": "all items alike", "popularity": "items by popularity"}
 
 
 def trained_on(logged: Curves, config: Mapping[str, Any]) -> Curves:
-    """The curves to draw: without losses of weight 0, and without a total equal to a single term."""
+    """The curves to draw: no loss of weight 0, and no total loss that equals a single term."""
     policy = config["policy"]
     off = {loss for loss, weight in _SWITCHES.items() if policy.get(weight) == 0}
     kept = {name: curve for name, curve in logged.items() if name not in off}

@@ -21,7 +21,7 @@ Cell = TypeVar("Cell")
 
 @dataclass(frozen=True)
 class Measurement(Generic[Cell]):
-    """How the cells of a benchmark are measured; its functions are module-level, to be picklable."""
+    """How the cells of a benchmark are measured, by picklable (module-level) functions."""
 
     key: Callable[[Cell], RowKey]
     """Identifies the cell's rows among all others; `config_hash` is filled in by `run_grid`."""
@@ -85,8 +85,8 @@ def run_grid(
         found |= measured
         if failed:
             raise InputError(
-                f"{len(failed)} of {len(missing)} cells failed; run the same command again to retry. "
-                f"The first: {failed[0]}"
+                f"{len(failed)} of {len(missing)} cells failed; run the command again to retry "
+                f"them. The first: {failed[0]}"
             )
     return [row for rows in found.values() for row in rows]
 
@@ -165,7 +165,7 @@ def chosen(known: Iterable[str], wanted: Sequence[str], what: str) -> list[str]:
     """
     known = list(known)
     if unknown := [name for name in wanted if name not in known]:
-        raise InputError(f"no {what} is called {', '.join(unknown)}; use {', '.join(known)}")
+        raise InputError(f"no {what} is called {', '.join(unknown)}; there are {', '.join(known)}")
     return [name for name in known if name in wanted or not wanted]
 
 

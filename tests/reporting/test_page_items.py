@@ -89,7 +89,7 @@ def test_no_curve_of_a_loss_that_is_switched_off(folder: Path, tmp_path: Path) -
 
 
 def test_learning_nothing_of_users_is_a_warning(folder: Path, tmp_path: Path) -> None:
-    says = "is not below 2.3, what showing items by their popularity alone reaches"
+    says = "is not below 2.3, the loss of showing items by popularity"
     for best, warned in ((2.3, True), (2.2, False)):
         policy = record_of(folder / "ucf")["policy"] | {"best_validation": best}
         losses = {"uniform": 2.4, "popularity": 2.3}

@@ -55,7 +55,7 @@ def test_intervals_that_overlap_leave_it_open() -> None:
 def test_seeds_of_training_are_taken_together() -> None:
     rows = [earned("ucf", value, train_seed=seed) for seed, value in enumerate((3.0, 4.0, 5.0))]
     said = of_world(*rows, earned("random", 3.5), earned("bad", 1.0))
-    assert "4 in the mean of 3 trainings (their 95% intervals together: 2.9 to 5.1)" in said
+    assert "4 in the mean of 3 trainings (their 95% intervals span 2.9 to 5.1)" in said
     assert "more than bad (1)" in said
     assert "less than random (3.5) is open" in said
     assert "trained once" not in said
@@ -81,8 +81,8 @@ def test_built_in_policies_alone_say_nothing_of_trained_ones() -> None:
         (2.0, 3.0, "Every weighted estimate (IPS and DR) says that it earns more"),
         (0.2, 0.1, "Every weighted estimate (IPS and DR) says that it earns less"),
         (1.1, 0.9, "No weighted estimate (IPS and DR) distinguishes it from the logging policy"),
-        (2.0, 1.0, "do not agree (DR more than the logging policy, of IPS and DR)"),
-        (2.0, 0.1, "do not agree (DR more; IPS less than the logging policy, of IPS and DR)"),
+        (2.0, 1.0, "disagree (DR more than the logging policy, of IPS and DR)"),
+        (2.0, 0.1, "disagree (DR more; IPS less than the logging policy, of IPS and DR)"),
     ],
 )
 def test_estimates_conclude_only_where_all_of_them_do(dr: float, ips: float, says: str) -> None:
@@ -102,4 +102,6 @@ def test_models_alone_conclude_nothing() -> None:
     said = of_logs(estimated("DM", 5.0), estimated("FQE", 6.0), warnings=("no propensity",))
     assert "allow no weighted estimate (no propensity)" in said
     assert "Models alone (no conclusion): DM 5 [4.9, 5.1] and FQE 6 [5.9, 6.1]." in said
-    assert "is not among the rows" in of_logs(estimated("DR", 5.0), logged=False)
+    assert "The rows lack the return of the logged sessions" in of_logs(
+        estimated("DR", 5.0), logged=False
+    )

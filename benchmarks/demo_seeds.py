@@ -1,8 +1,8 @@
-"""The demo over several seeds: mean and spread of every policy.
+"""Run the demo with several seeds: mean and standard deviation of every policy.
 
     python benchmarks/demo_seeds.py --out runs/demos --seeds 0 1 2
 
-Appends the rows to results.jsonl in --out, or to --results, and prints a table. A seed draws its
+Appends the rows to results.jsonl in --out, or to --results, and prints a table. Each seed has its
 own logs, trainings and episodes.
 """
 
@@ -21,31 +21,36 @@ from ucfrec.reporting.tables import markdown_table, mean_and_sd
 from ucfrec.runs.trained_policy import read_record
 
 
-def row_of(found: Mapping[str, Any], seed: int, code: str) -> ResultRow:
-    name = found["policy"]
+def row_of(evaluation: Mapping[str, Any], seed: int, code: str) -> ResultRow:
+    """The result row of an evaluation of the demo with `seed`, run by code version `code`."""
+    name = evaluation["policy"]
     trained = name in LEARNERS
     key = RowKey(
         suite="demo",
         table="demo",
-        task=found["world"],
+        task=evaluation["world"],
         method=name,
         policy=LEARNERS[name][0] if trained else BEHAVIORS[name],
         training_seed=seed if trained else None,
         log_seed=seed,
-        evaluation_seed=found["seed"],
-        config_hash=found["config"],
+        evaluation_seed=evaluation["seed"],
+        config_hash=evaluation["config"],
         code_version=code,
-        data_fingerprint=found["fingerprint"],
+        data_fingerprint=evaluation["fingerprint"],
     )
     rule = "target return: the largest of training" if trained else None
-    return evaluation_row(found, key, rule=rule)
+    return evaluation_row(evaluation, key, rule=rule)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, required=True, help="folder of the runs; resumed")
-    parser.add_argument("--results", type=Path, help="result rows (results.jsonl in --out)")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--out", type=Path, required=True, help="folder for the runs; resumed")
+    parser.add_argument(
+        "--results", type=Path, help="file of result rows (default: results.jsonl in --out)"
+    )
+    parser.add_argument(
+        "--seeds", type=int, nargs="+", default=[0, 1, 2], help="demo seeds (default: 0 1 2)"
+    )
     options = parser.parse_args()
     results = options.results or options.out / "results.jsonl"
     learners = {policy_class(learner).__module__ for learner, *_ in LEARNERS.values()}
@@ -53,10 +58,10 @@ def main() -> None:
     code = code_version("ucfrec.commands.demo", *sorted(learners), *simulators)
     rows = []
     for seed in options.seeds:
-        # Runs of other code are not gone on with.
+        # The code version is in the name, so that runs of other code are not resumed.
         folder = options.out / f"seed-{seed}-{code}"
-        for found in demo(folder, seed, DemoConfig()):
-            row = row_of(found, seed, code)
+        for evaluation in demo(folder, seed, DemoConfig()):
+            row = row_of(evaluation, seed, code)
             rows.append(row)
             if not any(row.covers(known) for known in read_rows(results)):
                 run = folder / row.task / row.method
@@ -65,9 +70,9 @@ def main() -> None:
     lines = []
     for world in WORLDS:
         for policy in ("random", "logging", *LEARNERS, "optimal"):
-            earned = [row.value for row in rows if (row.task, row.method) == (world, policy)]
-            each = ", ".join(f"{value:.2f}" for value in earned)
-            lines.append((world, policy, mean_and_sd(earned), each))
+            returns = [row.value for row in rows if (row.task, row.method) == (world, policy)]
+            values = ", ".join(f"{value:.2f}" for value in returns)
+            lines.append((world, policy, mean_and_sd(returns), values))
     print(markdown_table(("world", "policy", "R_cum, mean ± sd over seeds", "each seed"), lines))
 
 

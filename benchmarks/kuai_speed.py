@@ -1,11 +1,11 @@
-"""A step of 4,096 users in one `kuairand` world against one user in a Python-loop environment.
+"""Time per user-step: 4,096 users in one `kuairand` world against one user in a Python loop.
 
     python -m benchmarks.kuai_speed --world FOLDER
 
-Both play the same table, tags and exit rule; the one user under Gymnasium's `SyncVectorEnv`, as the
-many are a vector environment. They take turns. FOLDER is the `world` that `ucfrec benchmark
-recommendation` makes in its task folder. Appends a row to runs/kuai_speed/results.jsonl, or to
---results.
+Both use the same rewards, tags and exit rule. The single user runs under Gymnasium's
+`SyncVectorEnv`, so that both are vector environments. They are timed in turn. FOLDER is the `world`
+that `ucfrec benchmark recommendation` makes in its task folder. Appends a row to
+runs/kuai_speed/results.jsonl, or to --results.
 """
 
 import argparse
@@ -28,7 +28,7 @@ USERS = 4096
 
 
 def seconds_a_step(env: Any, steps: int, generator: np.random.Generator, n_items: int) -> float:
-    """CPU seconds of a step of one user."""
+    """CPU seconds per step and user, over `steps` steps with random items."""
     env.reset(seed=0)
     actions = generator.integers(n_items, size=(steps, env.num_envs))
     began = time.process_time()
@@ -40,8 +40,10 @@ def seconds_a_step(env: Any, steps: int, generator: np.random.Generator, n_items
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--world", type=Path, required=True, help="folder of the kuairand world")
-    parser.add_argument("--rounds", type=int, default=9)
-    parser.add_argument("--results", type=Path, default=RESULTS, help=f"result rows ({RESULTS})")
+    parser.add_argument("--rounds", type=int, default=9, help="timed rounds (default: 9)")
+    parser.add_argument(
+        "--results", type=Path, default=RESULTS, help=f"file of result rows (default: {RESULTS})"
+    )
     options = parser.parse_args()
     many = kuairand(USERS, options.world)
     one = SyncVectorEnv(
@@ -56,7 +58,7 @@ def main() -> None:
         if turn:  # the first turn warms up
             ratios.append(slow[-1] / fast[-1])
     low, middle, high = np.quantile(ratios, [0.1, 0.5, 0.9])
-    print(f"{USERS} users in one world: 1/{middle:.0f} [1/{low:.0f}, 1/{high:.0f}] a user-step")
+    print(f"{USERS} users in one world: 1/{middle:.0f} [1/{low:.0f}, 1/{high:.0f}] per user-step")
     row = ResultRow(
         suite="kuai-speed",
         table="kuai-speed",

@@ -1,10 +1,10 @@
-"""Which policy settings predict held-out actions best: the choice of λ and the weight of a_{t−1}.
+"""Validation loss of UCF by mask loss weight λ and by weight of the parent action a_{t−1}.
 
     python benchmarks/policy_settings.py --store STORE... --out runs/settings
 
-Trains UCF without copies on each store with each pair of settings and compares the validation
-loss, never a simulator. Appends the rows to results.jsonl in --out, or to --results, and prints a
-table.
+Trains UCF without edited copies on each store with each pair of settings and compares validation
+losses only; no simulator is used. Appends the rows to results.jsonl in
+--out, or to --results, and prints a table.
 """
 
 import argparse
@@ -27,6 +27,8 @@ DEMO_SIZE = ("policy.dim=64", "policy.context=10", "train.learning_rate=1e-3", "
 
 @dataclass(frozen=True)
 class Cell:
+    """One training: a store and a pair of settings."""
+
     store: Path
     out: Path
     lambda_mask: float
@@ -35,6 +37,7 @@ class Cell:
 
     @property
     def config(self) -> Config:
+        """Training configuration of the cell."""
         given = [f"policy.lambda_mask={self.lambda_mask}"]
         given += [f"policy.parent_action={self.parent_action}", f"train.steps={self.steps}"]
         return resolve_config("ucf", None, [*DEMO_SIZE, *given])
@@ -58,23 +61,39 @@ def config(cell: Cell) -> dict[str, Any]:
     return asdict(cell.config)
 
 
-def measure(cell: Cell, own: RowKey) -> list[ResultRow]:
-    name = f"{cell.lambda_mask}-{cell.parent_action}-{own.code_version}"
+def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
+    name = f"{cell.lambda_mask}-{cell.parent_action}-{row_key.code_version}"
     folder = cell.out / cell.store.parent.name / name
     record = train_run(EpisodeStore.open(cell.store), folder, cell.config)
     loss = {"validation_loss": record["policy"]["best_validation"]}
     given = {"metric": "validation_loss", "metrics": loss, "wall_time_s": record["wall_time_s"]}
-    return [ResultRow(**vars(own), **given, **provenance())]
+    return [ResultRow(**vars(row_key), **given, **provenance())]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--store", type=Path, nargs="+", required=True)
-    parser.add_argument("--out", type=Path, required=True, help="folder of the runs; resumed")
-    parser.add_argument("--results", type=Path, help="result rows (results.jsonl in --out)")
-    parser.add_argument("--lambda-mask", type=float, nargs="+", default=[0, 0.01, 0.03, 0.1])
-    parser.add_argument("--parent-action", type=float, nargs="+", default=[0, 0.3])
-    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--store", type=Path, nargs="+", required=True, help="episode stores")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the runs; resumed")
+    parser.add_argument(
+        "--results", type=Path, help="file of result rows (default: results.jsonl in --out)"
+    )
+    parser.add_argument(
+        "--lambda-mask",
+        type=float,
+        nargs="+",
+        default=[0, 0.01, 0.03, 0.1],
+        help="values of policy.lambda_mask (default: 0 0.01 0.03 0.1)",
+    )
+    parser.add_argument(
+        "--parent-action",
+        type=float,
+        nargs="+",
+        default=[0, 0.3],
+        help="values of policy.parent_action (default: 0 0.3)",
+    )
+    parser.add_argument(
+        "--steps", type=int, default=1000, help="steps of each training (default: 1000)"
+    )
     options = parser.parse_args()
     pairs = list(itertools.product(options.lambda_mask, options.parent_action))
     cells = [

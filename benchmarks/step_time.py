@@ -1,9 +1,9 @@
-"""A training step of every sequence policy, timed in turn on one thread, as ratios to DT's.
+"""Time of a training step of every policy on one thread, as a ratio to that of DT.
 
     python benchmarks/step_time.py --dim 128 --context 20
 
 Appends the rows to runs/step_time/results.jsonl, or to --results, and prints a table. Only ratios
-are kept: the policies take turns, so a machine that slows down slows all of them.
+are kept: the policies are timed in turn, so a slower machine slows all of them.
 """
 
 import argparse
@@ -29,6 +29,7 @@ LEARNERS = ("dt", "dc", "lsdt", "ucf", "dt4rec", "cdt4rec", "edt4rec", "sasrec",
 
 
 def windows(batch: int, context: int) -> Windows:
+    """Random windows of (batch, context) steps."""
     return Windows(
         states=torch.randn(batch, context, SIZES["state"]),
         actions=torch.rand(batch, context, SIZES["action"]) * 2 - 1,
@@ -40,6 +41,7 @@ def windows(batch: int, context: int) -> Windows:
 
 
 def step_seconds(policy: SequencePolicy, optimizer: torch.optim.Optimizer, batch: Windows) -> float:
+    """Wall seconds of one training step."""
     began = time.perf_counter()
     value, _ = policy.loss(batch)
     optimizer.zero_grad()
@@ -50,11 +52,13 @@ def step_seconds(policy: SequencePolicy, optimizer: torch.optim.Optimizer, batch
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--dim", type=int, default=128)
-    parser.add_argument("--context", type=int, default=20)
-    parser.add_argument("--batch", type=int, default=64)
-    parser.add_argument("--rounds", type=int, default=20)
-    parser.add_argument("--results", type=Path, default=RESULTS, help=f"result rows ({RESULTS})")
+    parser.add_argument("--dim", type=int, default=128, help="width of the policies (default: 128)")
+    parser.add_argument("--context", type=int, default=20, help="steps of a window (default: 20)")
+    parser.add_argument("--batch", type=int, default=64, help="windows of a batch (default: 64)")
+    parser.add_argument("--rounds", type=int, default=20, help="timed rounds (default: 20)")
+    parser.add_argument(
+        "--results", type=Path, default=RESULTS, help=f"file of result rows (default: {RESULTS})"
+    )
     options = parser.parse_args()
     torch.set_num_threads(1)
     torch.manual_seed(0)

@@ -1,1 +1,1 @@
-"""Datasets that `ucfrec prepare --dataset NAME` knows: what their files and columns mean."""
+"""File and column mappings of the datasets of `ucfrec prepare --dataset NAME`."""

@@ -1,4 +1,4 @@
-"""Anybody's logs: columns named by the user, features beside the log."""
+"""Any log: columns mapped by the user, features in files next to the log."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,18 +9,19 @@ from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, log_files
 
 
 def _resolve(paths: Sequence[str | Path], given: LogMapping) -> tuple[tuple[Path, ...], LogMapping]:
+    """Files called `items.*` and `users.*` are feature tables, all others logs."""
     files = log_files(paths)
     kinds = [file.name.partition(".")[0] for file in files]
     items = tuple(f for f, kind in zip(files, kinds, strict=True) if kind == "items")
     users = tuple(f for f, kind in zip(files, kinds, strict=True) if kind == "users")
-    found = LogMapping(
+    defaults = LogMapping(
         item_features=(FeatureTable(items, schema.ITEM_ID),) if items else (),
         user_features=(FeatureTable(users, schema.USER_ID),) if users else (),
     )
-    return tuple(f for f in files if f not in items + users), given.over(found)
+    return tuple(f for f in files if f not in items + users), given.over(defaults)
 
 
 DATASET: Final = Dataset(
-    summary="any Parquet or CSV log, columns mapped by name; items.* and users.* hold features",
+    summary="any Parquet or CSV log, columns mapped by name; features in items.* and users.*",
     resolve=_resolve,
 )

@@ -1,4 +1,4 @@
-"""KuaiRand (Pure, 1K and 27K): the official files, as CSV or Parquet, features joined."""
+"""KuaiRand (Pure, 1K and 27K; Gao et al., 2022): official CSV or Parquet files, with features."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +21,7 @@ USER_COLUMNS: Final = (
     "ln(1 + register_days)",
     *(f"onehot_feat{n}::VARCHAR" for n in (0, 1, 2, 4, 5, 6, *range(9, 18))),
 )
-"""Left out: onehot features 3, 7 and 8, of 1,471, 118 and 454 values among 27,285 users."""
+"""Without onehot features 3, 7 and 8, which have 1,471, 118 and 454 values among 27,285 users."""
 
 BASIC_COLUMNS: Final = (
     "video_type",
@@ -47,52 +47,52 @@ STATISTIC_COLUMNS: Final = (
     "share_cnt / play_cnt",
     "collect_cnt / play_cnt",
 )
-"""Daily means over the whole month that the logs cover, later windows included: whoever joins them
-lets the embeddings see a little of the days they are judged on."""
+"""Daily means over the whole month of the logs, validation and test split included: with them, the
+item embeddings contain some information on the days of the evaluation."""
 
 MAPPING: Final = LogMapping(
     columns={"item_id": "video_id", "timestamp": "time_ms", "is_random": "is_rand"},
     reward="is_click",
-    # The releases hold a user's rows about a sample of videos, not whole visits: by silences of
-    # half an hour, 87% of the sessions would be a single row.
+    # The releases have only a user's rows on a sample of videos, not whole visits: with pauses of
+    # half an hour, 87% of the sessions would have a single row.
     session_by="user",
 )
 
 
 def _resolve(paths: Sequence[str | Path], given: LogMapping) -> tuple[tuple[Path, ...], LogMapping]:
-    """All logs named or in the folders named; user and basic features among them or beside them.
+    """All given logs, with user and basic video features of the same paths or the logs' folder.
 
-    The statistics are joined only where a path names them.
+    Video statistics are used only if a path names their file.
     """
     named = log_files(paths)
     logs = tuple(file for file in named if file.name.startswith(LOGS))
     if not logs:
         raise InputError(
-            f"no KuaiRand log among {len(named)} file(s) such as {named[0]}; they are called "
-            f"{'* and '.join(LOGS)}*"
+            f"no KuaiRand log among {len(named)} file(s) such as {named[0]}; name files called "
+            f"{'* or '.join(LOGS)}*"
         )
-    around = (*named, *log_files([logs[0].parent]))
+    candidates = (*named, *log_files([logs[0].parent]))
     wanted = [path for path in paths if Path(path).name.startswith(STATISTIC)]
     statistics = log_files(wanted) if wanted else ()
-    found = LogMapping(
+    defaults = LogMapping(
         item_features=(
-            *_table(around, BASIC, "video_id", BASIC_COLUMNS),
+            *_table(candidates, BASIC, "video_id", BASIC_COLUMNS),
             *_table(statistics, STATISTIC, "video_id", STATISTIC_COLUMNS),
         ),
-        user_features=_table(around, USERS, "user_id", USER_COLUMNS),
+        user_features=_table(candidates, USERS, "user_id", USER_COLUMNS),
     )
-    return logs, given.over(found).over(MAPPING)
+    return logs, given.over(defaults).over(MAPPING)
 
 
 def _table(
     files: Sequence[Path], prefix: str, key: str, columns: tuple[str, ...]
 ) -> tuple[FeatureTable, ...]:
-    """The files of one kind as one table; of files with the same name, the first."""
-    named: dict[str, Path] = {}
+    """The files of one kind as one table; of files with the same name, only the first."""
+    by_name: dict[str, Path] = {}
     for file in files:
         if file.name.startswith(prefix):
-            named.setdefault(file.name.partition(".")[0], file)
-    return (FeatureTable(tuple(named.values()), key, columns),) if named else ()
+            by_name.setdefault(file.name.partition(".")[0], file)
+    return (FeatureTable(tuple(by_name.values()), key, columns),) if by_name else ()
 
 
 DATASET: Final = Dataset(

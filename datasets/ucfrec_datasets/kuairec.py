@@ -1,4 +1,4 @@
-"""KuaiRec: the official CSV files, features joined."""
+"""KuaiRec (Gao et al., 2022): official CSV files, with features."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Final
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, log_files
 
-TRAINING, JUDGING = "big_matrix", "small_matrix"
+TRAINING, EVALUATION = "big_matrix", "small_matrix"
 USERS, CATEGORIES, DAILY = "user_features", "item_categories", "item_daily_features"
 
 USER_COLUMNS: Final = (
@@ -32,21 +32,21 @@ DAILY_COLUMNS: Final = (
     "video_width > video_height",
     "video_tag_id::VARCHAR",
 )
-"""What stays the same from day to day. The 45 statistics are left out: those of a later day know
-how the video was received on the days that a policy is judged on."""
+"""Features that do not change from day to day. The 45 statistics are left out: those of a later day
+contain how users received the video on the days of the evaluation."""
 
 MAPPING: Final = LogMapping(
     columns={"item_id": "video_id", "timestamp": "timestamp * 1000"},
     reward="least(watch_ratio, 5)",
-    # Users saw 1,700 videos each in two months; their visits, not the months, are what ends.
+    # A user saw about 1,700 videos in two months, so sessions are visits rather than users.
     session_by="gap",
 )
 
 
 def _resolve(paths: Sequence[str | Path], given: LogMapping) -> tuple[tuple[Path, ...], LogMapping]:
-    """The matrices named, or of the folders named `big_matrix` only; features beside them.
+    """The given matrices, or `big_matrix` of a given folder, with features of the logs' folder.
 
-    `small_matrix` is what the `kuairec` world is made of: only who names it reads it.
+    `small_matrix` is read only if a path names it, because the `kuairec` simulator is made from it.
     """
     named = log_files(paths)
     folders = [Path(path) for path in paths if Path(path).is_dir()]
@@ -54,28 +54,28 @@ def _resolve(paths: Sequence[str | Path], given: LogMapping) -> tuple[tuple[Path
         file
         for file in named
         if file.name.startswith(TRAINING)
-        or (file.name.startswith(JUDGING) and file.parent not in folders)
+        or (file.name.startswith(EVALUATION) and file.parent not in folders)
     )
     if not logs:
         raise InputError(
-            f"no KuaiRec log among {len(named)} file(s) such as {named[0]}; they are called "
-            f"{TRAINING} and {JUDGING} (the latter to be named itself)"
+            f"no KuaiRec log among {len(named)} file(s) such as {named[0]}; name a folder or file "
+            f"with {TRAINING}, or the file {EVALUATION}"
         )
-    around = (*named, *log_files([logs[0].parent]))
-    found = LogMapping(
+    candidates = (*named, *log_files([logs[0].parent]))
+    defaults = LogMapping(
         item_features=(
-            *_table(around, CATEGORIES, "video_id", CATEGORY_COLUMNS),
-            *_table(around, DAILY, "video_id", DAILY_COLUMNS, first_by="date"),
+            *_table(candidates, CATEGORIES, "video_id", CATEGORY_COLUMNS),
+            *_table(candidates, DAILY, "video_id", DAILY_COLUMNS, first_by="date"),
         ),
-        user_features=_table(around, USERS, "user_id", USER_COLUMNS),
+        user_features=_table(candidates, USERS, "user_id", USER_COLUMNS),
     )
-    return logs, given.over(found).over(MAPPING)
+    return logs, given.over(defaults).over(MAPPING)
 
 
 def _table(
     files: Sequence[Path], prefix: str, key: str, columns: tuple[str, ...], first_by: str = ""
 ) -> tuple[FeatureTable, ...]:
-    """The first file of one kind, or nothing."""
+    """The first file of one kind as a table; empty if there is none."""
     named = [file for file in files if file.name.partition(".")[0] == prefix]
     return (FeatureTable((named[0],), key, columns, first_by),) if named else ()
 

@@ -269,7 +269,7 @@ def test_score_and_ope_refuse_what_they_cannot_use(
     out = str(tmp_path / "out")
     assert "not a density" in refused(["ope", run, density, "--json", out], capsys)
     for command in (["score", run, "--out", out], ["ope", run, "--json", out]):
-        assert "item is none of the store's" in refused([*command, other], capsys)
+        assert "item is not in the store" in refused([*command, other], capsys)
         assert "trained with observations of 16 numbers" in refused([*command, blind], capsys)
         vectors = str(folder / "synthetic-taobao-run")
         assert "are vectors" in refused([command[0], vectors, *command[2:], str(logs)], capsys)

@@ -74,7 +74,7 @@ def test_official_files(tmp_path: Path, name: str) -> None:
 
 def test_features_alone_are_refused(tmp_path: Path) -> None:
     official(tmp_path)
-    with pytest.raises(InputError, match="holds features, no impressions"):
+    with pytest.raises(InputError, match="has features, not impressions"):
         DATASET.resolve([tmp_path / "item_context.csv"], LogMapping())
 
 

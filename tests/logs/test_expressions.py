@@ -390,7 +390,7 @@ def test_what_is_no_text_is_refused(
         assert "run.json" in capsys.readouterr().err
     for line in ("reward = 3", "[columns]\nuser_id = 3", "[columns]\nuser_id = ['a']"):
         (tmp_path / "m.toml").write_text(line)
-        with pytest.raises(InputError, match=r"m.toml: .* is no text"):
+        with pytest.raises(InputError, match=r"m.toml: .* is not text"):
             main(["--debug", "prepare", log, "--mapping", str(tmp_path / "m.toml"), "--validate"])
 
 

@@ -137,7 +137,7 @@ def test_reward_scale_of_the_training_window(tmp_path: Path) -> None:
 def test_equal_rewards_in_the_training_window_are_an_error(tmp_path: Path) -> None:
     log = make_log()
     log.loc[log["timestamp"] < START + 3000, "reward"] = 1.0
-    with pytest.raises(InputError, match=r"all 3000 rewards of the training window equal 1"):
+    with pytest.raises(InputError, match=r"all 3000 rewards of the training split equal 1"):
         learn(tmp_path / "a", log)
     assert not (tmp_path / "a" / "s").exists()
 

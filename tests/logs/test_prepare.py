@@ -411,7 +411,7 @@ FAULTS: dict[str, tuple[Change, PrepareOptions, str]] = {
     "no training": (
         lambda log: None,
         PrepareOptions(split=(5.0, 6.0)),
-        r"training window",
+        r"training split",
     ),
     "aggregate": (lambda log: None, PrepareOptions(reward="sum(reward)"), r"no scalar SQL"),
     "window": (

@@ -155,7 +155,7 @@ def test_items_the_run_does_not_know_are_counted(folder: Path, tmp_path: Path) -
         assert sum(map(len, score(trained, logged, TARGET))) == len(log)
     strange.to_parquet(tmp_path / "log.parquet")
     with (
-        pytest.raises(InputError, match=r"no row is left \(4 rows: item is none of the store's"),
+        pytest.raises(InputError, match=r"no row is left \(4 rows: item is not in the store"),
         logged_sessions(folder / "run", trained, files, LogMapping()),
     ):
         pass

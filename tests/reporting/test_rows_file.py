@@ -39,7 +39,7 @@ def test_configurations_lie_once_beside_the_rows(tmp_path: Path) -> None:
         append_rows(tmp_path / "b.jsonl", [result_row(training_seed=seed)])
     assert read_configurations(tmp_path) == {named: config}
     assert len((tmp_path / CONFIGURATIONS).read_text().splitlines()) == 1
-    with pytest.raises(InputError, match="name a configuration that they were not measured with"):
+    with pytest.raises(InputError, match="have the hash of another configuration"):
         append_rows(tmp_path / "a.jsonl", [result_row(config_hash="other")], config)
 
 
@@ -64,7 +64,7 @@ def test_a_line_that_is_no_row_is_named_and_kept(tmp_path: Path, torn: bytes) ->
 def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "rows.jsonl"
     path.write_bytes(b"\xff\xfe\n")
-    with pytest.raises(InputError, match=r"rows\.jsonl is no text"):
+    with pytest.raises(InputError, match=r"rows\.jsonl is not UTF-8 text"):
         read_rows(path)
 
 

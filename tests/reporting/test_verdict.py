@@ -31,7 +31,7 @@ def of_logs(*rows: dict[str, Any], warnings: tuple[str, ...] = (), logged: bool 
 
 def test_without_results_nothing_is_said_of_earnings() -> None:
     assert verdict(Results({}, ())) == [NO_RESULTS]
-    assert "nothing is known of what these policies earn" in NO_RESULTS
+    assert "the returns of these policies are unknown" in NO_RESULTS
 
 
 def test_the_best_is_named_with_its_interval_and_what_it_lies_above() -> None:
@@ -49,13 +49,13 @@ def test_the_best_is_named_with_its_interval_and_what_it_lies_above() -> None:
 def test_intervals_that_overlap_leave_it_open() -> None:
     said = of_world(earned("dt", 2.9, train_seed=0), earned("ucf", 3.0, train_seed=0))
     assert "overlaps that of dt (2.9): which of them earns more is open" in said
-    assert "nothing to compare" in said
+    assert "to compare it with" in said
 
 
 def test_seeds_of_training_are_taken_together() -> None:
     rows = [earned("ucf", value, train_seed=seed) for seed, value in enumerate((3.0, 4.0, 5.0))]
     said = of_world(*rows, earned("random", 3.5), earned("bad", 1.0))
-    assert "4 in the mean of 3 trainings (their 95% intervals together: 2.9 to 5.1)" in said
+    assert "4 in the mean of 3 trainings (their 95% intervals span 2.9 to 5.1)" in said
     assert "more than bad (1)" in said
     assert "less than random (3.5) is open" in said
     assert "trained once" not in said
@@ -71,7 +71,7 @@ def test_checkpoints_of_one_run_are_no_seeds() -> None:
 
 def test_built_in_policies_alone_say_nothing_of_trained_ones() -> None:
     assert of_world(earned("random", 1.0)) == (
-        "In a, only built-in policies were played: random (1)."
+        "In a, only built-in policies were evaluated: random (1)."
     )
 
 
@@ -80,9 +80,9 @@ def test_built_in_policies_alone_say_nothing_of_trained_ones() -> None:
     [
         (2.0, 3.0, "Every weighted estimate (IPS and DR) says that it earns more"),
         (0.2, 0.1, "Every weighted estimate (IPS and DR) says that it earns less"),
-        (1.1, 0.9, "No weighted estimate (IPS and DR) tells it from the logging policy"),
-        (2.0, 1.0, "do not agree (DR more than the logging policy, of IPS and DR)"),
-        (2.0, 0.1, "do not agree (DR more; IPS less than the logging policy, of IPS and DR)"),
+        (1.1, 0.9, "No weighted estimate (IPS and DR) distinguishes it from the logging policy"),
+        (2.0, 1.0, "disagree (DR more than the logging policy, of IPS and DR)"),
+        (2.0, 0.1, "disagree (DR more; IPS less than the logging policy, of IPS and DR)"),
     ],
 )
 def test_estimates_conclude_only_where_all_of_them_do(dr: float, ips: float, says: str) -> None:
@@ -94,12 +94,14 @@ def test_estimates_conclude_only_where_all_of_them_do(dr: float, ips: float, say
 
 def test_an_estimate_with_warnings_is_not_relied_on() -> None:
     said = of_logs(estimated("DR", 5.0), warnings=("effective sample 3",))
-    assert "DR estimates 5 [4.9, 5.1] a session, which is not to be relied on: effective" in said
+    assert "DR estimates 5 [4.9, 5.1] per session, which is not reliable: effective" in said
     assert "earns more" not in said
 
 
 def test_models_alone_conclude_nothing() -> None:
     said = of_logs(estimated("DM", 5.0), estimated("FQE", 6.0), warnings=("no propensity",))
     assert "allow no weighted estimate (no propensity)" in said
-    assert "DM 5 [4.9, 5.1] and FQE 6 [5.9, 6.1]: that supports no conclusion" in said
-    assert "is not among the rows" in of_logs(estimated("DR", 5.0), logged=False)
+    assert "Models alone (no conclusion): DM 5 [4.9, 5.1] and FQE 6 [5.9, 6.1]." in said
+    assert "The rows lack the return of the logged sessions" in of_logs(
+        estimated("DR", 5.0), logged=False
+    )

@@ -1,4 +1,4 @@
-"""`ucfrec benchmark`: tables of every method."""
+"""`ucfrec benchmark`: measure every method of a benchmark suite and print its tables."""
 
 import argparse
 import os
@@ -14,17 +14,35 @@ from ucfrec.reporting.grid import chosen
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `benchmark` takes."""
-    parser.add_argument("suite", help="recommendation, or one that a package announces")
-    parser.add_argument("--budget", choices=["small", "full"], default="small")
-    parser.add_argument("--table", action="append", default=[], help="only this one; repeatable")
-    parser.add_argument("--log-seed", type=int, default=0, help="of the logs that are simulated")
+    """Add the options of `ucfrec benchmark`."""
+    parser.add_argument(
+        "suite",
+        metavar="SUITE",
+        help="recommendation, or a suite of another installed package (entry point "
+        "ucfrec.benchmarks)",
+    )
+    parser.add_argument(
+        "--budget",
+        choices=["small", "full"],
+        default="small",
+        help="small (for two CPU cores) or full (larger logs, more seeds and training steps) "
+        "(default: small)",
+    )
+    parser.add_argument(
+        "--table",
+        action="append",
+        default=[],
+        help="measure and print only this table; repeatable (default: all tables)",
+    )
+    parser.add_argument(
+        "--log-seed", type=int, default=0, help="seed of the simulated logs (default: 0)"
+    )
     evaluation_seed_option(parser)
     grid_options(parser, "runs/benchmark", os.cpu_count() or 1)
 
 
 def run(options: argparse.Namespace) -> None:
-    """`ucfrec benchmark`."""
+    """Run `ucfrec benchmark`: measure what is missing, then print the tables."""
     suite: Benchmark = load_plugin("benchmarks", options.suite)
     tables, results = chosen(suite.tables, options.table, "table"), results_given(options)
     if options.show_only:

@@ -1,7 +1,7 @@
-"""The command line. Only the module of the command that is called is imported.
+"""The command-line parser, which imports only the module of the called command.
 
-Such a module imports what its command works with inside `run`, so that `--help` answers at once
-and no command loads what only another one needs.
+Command modules import heavy dependencies inside `run`, so that `--help` answers at once and no
+command loads what only another one needs.
 """
 
 import argparse
@@ -20,48 +20,52 @@ from ucfrec.errors import InputError
 
 @dataclass(frozen=True)
 class Program:
-    """A command line of several commands."""
+    """A command-line program with several commands."""
 
     name: str
     summary: str
     package: str
-    """Holds one module a command, with `add_options(parser)` and `run(options)`."""
+    """Package with one module per command, each with `add_options(parser)` and `run(options)`."""
     commands: Mapping[str, str]
-    """One line for `--help`, by the command's name."""
+    """Command name to its one-line summary in `--help`."""
 
 
 UCFREC = Program(
     "ucfrec",
-    "Train recommender policies from Parquet logs and judge what they would earn.",
+    "Train recommender policies from Parquet logs and estimate the return they would earn.",
     "ucfrec.commands",
     {
-        "demo": "everything on simulated logs, ends in a report",
-        "collect": "play sessions in a simulator, as Parquet logs",
-        "prepare": "logs to an episode store",
-        "train": "train a policy on a store; resumes",
-        "settings": "every setting of a training: default, range, meaning",
-        "evaluate": "what a policy earns in a simulator",
-        "rank": "how policies rank what users were shown and clicked later",
-        "recommend": "the next items for users of a log",
-        "score": "a policy's probability of every choice of a log",
-        "ope": "what a policy would have earned, from logs alone",
-        "report": "one HTML page about runs",
-        "benchmark": "tables of every method; resumes",
+        "demo": "run every step on simulated logs and write a report; resumes",
+        "collect": "simulate sessions and write them as Parquet logs",
+        "prepare": "turn logs into an episode store",
+        "train": "train a policy on an episode store; resumes",
+        "settings": "list every training setting: default, range, meaning",
+        "evaluate": "measure the return of policies in a simulator",
+        "rank": "measure how well policies rank items shown and clicked later",
+        "recommend": "recommend the next items to the users of a log",
+        "score": "write a policy's probability of every logged choice",
+        "ope": "estimate a policy's return from logs alone (off-policy evaluation)",
+        "report": "write one HTML page about training runs",
+        "benchmark": "measure every method and print tables; resumes",
     },
 )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns its exit status.
+    """Run one `ucfrec` command.
 
-    0 is success, 2 an input that cannot be used (one line on stderr says what to do), 130 an
-    interruption; a command that was interrupted goes on where it was when given again.
+    Args:
+        arguments: command-line arguments without the program name; None for `sys.argv`.
+
+    Returns:
+        Exit status: 0 for success, 2 for an unusable input or a full disk (one line on stderr says
+        what to do), 130 for an interruption. An interrupted command that is run again resumes.
     """
     return run(UCFREC, arguments)
 
 
 def run(program: Program, arguments: Sequence[str] | None) -> int:
-    """Run one command of `program`, this one or a sibling's; `main` tells the status."""
+    """Run one command of `program`; returns the exit status as `main` does."""
     arguments = sys.argv[1:] if arguments is None else arguments
     options = build_parser(program, arguments).parse_args(arguments)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -71,25 +75,28 @@ def run(program: Program, arguments: Sequence[str] | None) -> int:
     except InputError as error:
         return _failed(options, f"{name}: {error}")
     except BrokenPipeError:
-        # Whoever read the output, as `head` does, has read enough.
+        # The reader of a pipe, such as `head`, closed it: that is no failure.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
         if error.errno != errno.ENOSPC:
             raise
         where = f" for {error.filename}" if error.filename else ""
-        message = f"no space is left on disk{where}; nothing was written. Free some and run again"
+        message = f"no space is left on disk{where}; nothing was written. Free space and run again"
         return _failed(options, f"{name}: {message}")
     except KeyboardInterrupt:
-        print("\ninterrupted; the same command goes on from the last checkpoint", file=sys.stderr)
+        print(
+            "\ninterrupted; run the same command again to resume from the last checkpoint",
+            file=sys.stderr,
+        )
         return 130
     return 0
 
 
 def build_parser(program: Program, arguments: Sequence[str]) -> argparse.ArgumentParser:
-    """All commands, and the options of the one that `arguments` call.
+    """Parser of all commands, with the options of only the command that `arguments` name.
 
-    The others' are left out: their modules would have to be imported, which takes seconds.
+    Options of the other commands would need their modules, whose imports take seconds.
     """
     parser = argparse.ArgumentParser(prog=program.name, description=program.summary)
     parser.add_argument("--version", action="version", version=f"ucfrec {__version__}")
@@ -104,7 +111,7 @@ def build_parser(program: Program, arguments: Sequence[str]) -> argparse.Argumen
 
 
 class _Command(Protocol):
-    """What a module of a command has."""
+    """Interface of a command module."""
 
     def add_options(self, parser: argparse.ArgumentParser) -> None: ...
 

@@ -1,4 +1,4 @@
-"""`ucfrec collect`: sessions played in a simulator, as Parquet logs."""
+"""`ucfrec collect`: simulate sessions and write them as Parquet logs."""
 
 import argparse
 from pathlib import Path
@@ -8,15 +8,25 @@ from ucfrec.errors import InputError
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `collect` takes."""
+    """Add the options of `ucfrec collect`."""
     world_options(parser)
-    parser.add_argument("--behavior", default="mixture", help="logging policy (mixture)")
-    parser.add_argument("--sessions", type=int, default=20_000)
+    parser.add_argument(
+        "--behavior",
+        default="mixture",
+        help="built-in policy that acts in the sessions (default: mixture)",
+    )
+    parser.add_argument(
+        "--sessions", type=int, default=20_000, help="number of sessions (default: 20000)"
+    )
     parser.add_argument("--out", type=Path, required=True, help="new folder for the logs")
 
 
 def run(options: argparse.Namespace) -> None:
-    """`ucfrec collect`."""
+    """Run `ucfrec collect`.
+
+    Raises:
+        InputError: the simulator has no such logging policy, or --out exists.
+    """
     from ucfrec.evaluation.collect import collect
     from ucfrec.evaluation.world import World
 

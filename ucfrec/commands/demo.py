@@ -1,4 +1,4 @@
-"""`ucfrec demo`: everything on simulated logs, in two worlds, from `collect` to `report`."""
+"""`ucfrec demo`: every step from `collect` to `report`, on the logs of two simulated worlds."""
 
 import argparse
 import os
@@ -18,20 +18,23 @@ LEARNERS: dict[str, tuple[str, ...]] = {
     "ucf-no-augmentation": ("ucf", "augment.copies=0"),
     "ucf": ("ucf",),
 }
-"""What is trained, by the name in the results: learner, then settings beside the demo's own."""
+"""Name in the results to the learner and the settings that it has besides `DemoConfig.settings`."""
 BEHAVIORS = {"logging": "mixture", "random": "random", "optimal": "optimal"}
-"""Built-in policies evaluated beside, by the name in the results."""
+"""Name in the results to the built-in policy that is evaluated for comparison."""
 EVALUATION_SEED = 1_000_000
-"""Added to the seed of the logs, so that no evaluated session was logged."""
+"""Added to the log seed, so that no evaluated session is one of the logged sessions."""
 
 
 @dataclass(frozen=True)
 class DemoConfig:
-    """Small enough for minutes on two cores."""
+    """Sizes of the demo: minutes on two cores."""
 
     sessions: int = 6000
+    """Logged sessions of each world."""
     episodes: int = 1000
+    """Evaluated episodes of each policy."""
     target_quantile: float = 1.0
+    """Quantile of the training returns that is the target return."""
     settings: Sequence[str] = (
         "train.steps=1500",
         "train.learning_rate=1e-3",
@@ -42,25 +45,34 @@ class DemoConfig:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `demo` takes."""
-    parser.add_argument("--out", type=Path, default=Path("demo-out"), help="folder (demo-out)")
-    parser.add_argument("--seed", type=int, default=0)
+    """Add the options of `ucfrec demo`."""
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("demo-out"),
+        help="folder for logs, stores, runs and the report; resumed (default: demo-out)",
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, help="seed of the logs and trainings (default: 0)"
+    )
 
 
 def run(options: argparse.Namespace) -> None:
-    """`ucfrec demo`."""
+    """Run `ucfrec demo` and print its result table."""
     from ucfrec.reporting.tables import format_rows
 
     print(format_rows(demo(options.out, options.seed, DemoConfig())))
-    print(f"\nreport: {options.out / 'report.html'}; rows, logs, stores and runs lie beside it")
+    print(f"\nreport: {options.out / 'report.html'}; its folder has results, logs and runs")
 
 
 def demo(out: Path, seed: int, config: DemoConfig) -> list[dict[str, Any]]:
-    """Run the demo in the folder `out`; returns the rows of `out/results.json`.
+    """Run the demo in the folder `out`; an interrupted demo that is run again resumes.
 
-    `out/report.html` is a page about them and the runs. Each world leaves its logs, store and runs
-    in `out/<world>`, ready for the other commands. Given again after an interruption, it goes on
-    where it was.
+    Writes `out/results.json`, `out/report.html` and, in `out/<world>`, the logs, store and runs of
+    each world, for use with the other commands.
+
+    Returns:
+        The rows of `out/results.json`: one per world and policy, worlds in the order of `WORLDS`.
     """
     from ucfrec.evaluation.evaluate import evaluate_behavior
     from ucfrec.evaluation.simulated_store import simulated_store
@@ -94,7 +106,7 @@ def demo(out: Path, seed: int, config: DemoConfig) -> list[dict[str, Any]]:
 
 
 def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> dict[str, Any]:
-    """Train one learner and play it; in a process of its own."""
+    """Train and evaluate the learner `name` in the world `folder.name`, in a worker process."""
     import torch
 
     from ucfrec.episodes.store import EpisodeStore

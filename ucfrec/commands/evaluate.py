@@ -1,4 +1,4 @@
-"""`ucfrec evaluate`: what policies earn in a simulated world."""
+"""`ucfrec evaluate`: measure the return of policies in a simulated world."""
 
 import argparse
 from pathlib import Path
@@ -8,22 +8,31 @@ from ucfrec.errors import InputError
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `evaluate` takes."""
-    parser.add_argument("runs", nargs="*", type=Path, metavar="RUN")
+    """Add the options of `ucfrec evaluate`."""
+    parser.add_argument(
+        "runs", nargs="*", type=Path, metavar="RUN", help="run folders of `ucfrec train`"
+    )
     world_options(parser)
-    parser.add_argument("--episodes", type=int, default=1000)
+    parser.add_argument(
+        "--episodes", type=int, default=1000, help="episodes of each policy (default: 1000)"
+    )
     parser.add_argument(
         "--behavior",
         action="append",
         default=[],
-        help="a built-in policy to evaluate beside, e.g. random; repeatable",
+        help="also evaluate this built-in policy of the simulator, e.g. random; repeatable "
+        "(default: none)",
     )
     target_options(parser)
-    parser.add_argument("--json", type=Path, help="write the result rows here")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the rows as JSON")
 
 
 def run(options: argparse.Namespace) -> None:
-    """`ucfrec evaluate`."""
+    """Run `ucfrec evaluate` and print one row per policy.
+
+    Raises:
+        InputError: neither a run nor a built-in policy is named, or one of them cannot be used.
+    """
     from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
     from ucfrec.evaluation.world import World
     from ucfrec.files import write_json

@@ -1,4 +1,4 @@
-"""Frames to Parquet."""
+"""Write pandas data frames to Parquet."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,7 +11,11 @@ from ucfrec.files import atomic_file
 
 
 def write_frames(out: Path, frames: Iterable[pd.DataFrame]) -> int:
-    """Write frames as one Parquet file, atomically; returns the rows."""
+    """Write `frames` one after the other as a single Parquet file, atomically.
+
+    Returns:
+        Number of rows written.
+    """
     rows, writer = 0, None
     with atomic_file(out) as scratch:
         for frame in frames:

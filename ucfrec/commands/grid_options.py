@@ -1,4 +1,4 @@
-"""Options that every benchmark takes, of `ucfrec` and of `ucfrec-control`."""
+"""Options shared by the benchmark commands of `ucfrec` and `ucfrec-control`."""
 
 import argparse
 from collections.abc import Sequence
@@ -10,43 +10,51 @@ from ucfrec.reporting.rows_file import latest, read_rows
 
 
 def grid_options(parser: argparse.ArgumentParser, out: str, workers: int) -> None:
-    """Where a benchmark keeps what it makes, and how it is run.
+    """Add --out, --results, --workers and --show-only.
 
     Args:
-        out: the folder where none is given.
-        workers: as many processes where no number is given.
+        out: default of --out.
+        workers: default of --workers.
     """
     parser.add_argument(
-        "--out", type=Path, default=Path(out), help=f"logs, stores, runs and rows ({out})"
+        "--out",
+        type=Path,
+        default=Path(out),
+        help=f"folder for logs, stores, runs and result rows; resumed (default: {out})",
     )
     parser.add_argument(
         "--results",
         type=Path,
         metavar="JSONL",
-        help="result rows; read, and appended to (results.jsonl in --out)",
+        help="file of result rows: measured cells are read from it, new ones appended to it "
+        "(default: results.jsonl in --out)",
     )
     parser.add_argument(
-        "--workers", type=int, default=workers, help=f"processes of one thread each ({workers})"
+        "--workers",
+        type=int,
+        default=workers,
+        help=f"parallel processes, one thread each (default: {workers})",
     )
     parser.add_argument(
         "--show-only",
         action="store_true",
-        help="print the tables of the rows in --results; measure nothing",
+        help="print the tables from the rows in --results without measuring anything",
     )
 
 
 def evaluation_seed_option(parser: argparse.ArgumentParser) -> None:
-    """What episodes are reported."""
+    """Add --evaluation-seed."""
     parser.add_argument(
         "--evaluation-seed",
         type=int,
         metavar="SEED",
-        help="of the reported episodes, the same for every training seed (the budget's)",
+        help="seed of the evaluated episodes, the same for every training seed (default: set by "
+        "--budget)",
     )
 
 
 def results_given(options: argparse.Namespace) -> Path:
-    """The file of result rows."""
+    """Path of the file of result rows: --results, or `results.jsonl` in --out."""
     given: Path = options.results or options.out / "results.jsonl"
     return given
 
@@ -54,17 +62,18 @@ def results_given(options: argparse.Namespace) -> Path:
 def rows_given(
     options: argparse.Namespace, suite: str, tables: Sequence[str] = ()
 ) -> list[ResultRow]:
-    """The rows that `--show-only` is about: of those that measure the same, the last.
+    """The rows that `--show-only` prints: the last of each measurement.
 
     Args:
-        tables: of the suite; empty for all.
+        suite: benchmark suite of the rows.
+        tables: tables of the suite; empty for all.
 
     Raises:
-        InputError: there are none, or the file holds something else.
+        InputError: the file has no such row, or a line of it is not a result row.
     """
     path = results_given(options)
-    own = [row for row in latest(read_rows(path)) if row.suite == suite]
-    if rows := [row for row in own if not tables or row.table in tables]:
+    of_suite = [row for row in latest(read_rows(path)) if row.suite == suite]
+    if rows := [row for row in of_suite if not tables or row.table in tables]:
         return rows
     wanted = ", ".join([suite, *tables])
-    raise InputError(f"{path} has no rows of {wanted}; name a file that has with --results")
+    raise InputError(f"{path} has no rows of {wanted}; name a file that has them with --results")

@@ -1,4 +1,4 @@
-"""Options that several commands share, and what they stand for."""
+"""Options that several commands share, and the objects made from them."""
 
 import argparse
 from pathlib import Path
@@ -10,40 +10,78 @@ if TYPE_CHECKING:
 
 
 def world_options(parser: argparse.ArgumentParser) -> None:
-    """A simulated world and the seed of its sessions."""
+    """Add --env, --env-folder and --seed."""
     parser.add_argument("--env", required=True, help="simulator, e.g. synthetic-taobao")
-    parser.add_argument("--env-folder", type=Path, help="folder of the simulator's weights")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--env-folder",
+        type=Path,
+        metavar="FOLDER",
+        help="folder with the simulator's files, e.g. its weights (default: none)",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of the sessions (default: 0)")
 
 
 def log_options(parser: argparse.ArgumentParser) -> None:
-    """Where logs are and what their columns mean: every command that reads them."""
-    parser.add_argument("logs", nargs="+", metavar="LOGS", help="files, folders or globs")
-    parser.add_argument("--dataset", default="generic", help="generic (default), kuairand, …")
+    """Add LOGS, --dataset, --column and --mapping."""
+    parser.add_argument(
+        "logs",
+        nargs="+",
+        metavar="LOGS",
+        help="log files (.parquet, .csv, .csv.gz), folders or globs",
+    )
+    parser.add_argument(
+        "--dataset",
+        default="generic",
+        metavar="NAME",
+        help="kind of logs: generic, kuairand, kuairec, obd, … (default: generic)",
+    )
     parser.add_argument(
         "--column",
         action="append",
         default=[],
         metavar="NAME=COLUMN",
-        help="where a log column is found, e.g. user_id=uid; repeatable",
+        help="file column or SQL expression for a log column, e.g. user_id=uid; repeatable "
+        "(default: the column of the same name)",
     )
-    parser.add_argument("--mapping", type=Path, metavar="TOML", help="column mapping as TOML")
+    parser.add_argument(
+        "--mapping",
+        type=Path,
+        metavar="TOML",
+        help="file with column mapping, reward and feature tables; --column overrides it "
+        "(default: none)",
+    )
 
 
 def target_options(parser: argparse.ArgumentParser) -> None:
-    """Which weights act, and their target return."""
-    parser.add_argument("--checkpoint", choices=["best", "last"], default="best")
-    parser.add_argument("--target-return", type=float, help="target return of an episode")
+    """Add --checkpoint, --target-return and --target-quantile."""
+    parser.add_argument(
+        "--checkpoint",
+        choices=["best", "last"],
+        default="best",
+        help="policy weights: of the lowest validation loss, or the last ones (default: best)",
+    )
+    parser.add_argument(
+        "--target-return",
+        type=float,
+        metavar="RETURN",
+        help="target return of an episode, in units of the reward (default: by --target-quantile)",
+    )
     parser.add_argument(
         "--target-quantile",
         type=float,
         default=1.0,
-        help="else this quantile of the training returns (1: the largest)",
+        metavar="QUANTILE",
+        help="without --target-return: this quantile of the training returns, 0 to 1 "
+        "(default: 1, the largest)",
     )
 
 
 def logs_given(options: argparse.Namespace) -> "tuple[tuple[Path, ...], LogMapping]":
-    """Files and column mapping of a command that reads logs."""
+    """Log files and full column mapping that `log_options` name.
+
+    Raises:
+        InputError: a file is missing, or the dataset, a --column or the mapping file is unusable.
+    """
     from ucfrec.logs.mapping import LogMapping, columns_given, read_mapping
     from ucfrec.plugins import load_plugin
 
@@ -55,7 +93,7 @@ def logs_given(options: argparse.Namespace) -> "tuple[tuple[Path, ...], LogMappi
 
 
 def target_given(options: argparse.Namespace, trained: "TrainedPolicy") -> float:
-    """The target return that `target_options` name."""
+    """Target return (reward units) that `target_options` name."""
     if options.target_return is not None:
         return float(options.target_return)
     return trained.target_return(options.target_quantile)

@@ -1,4 +1,4 @@
-"""`ucfrec prepare`: logs to an episode store."""
+"""`ucfrec prepare`: turn logs into an episode store."""
 
 import argparse
 from pathlib import Path
@@ -8,22 +8,45 @@ from ucfrec.errors import InputError
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `prepare` takes."""
+    """Add the options of `ucfrec prepare`."""
     log_options(parser)
     parser.add_argument("--out", type=Path, metavar="STORE", help="new folder for the store")
-    parser.add_argument("--reward", help="SQL over feedback columns, e.g. is_click")
     parser.add_argument(
-        "--session-by", choices=["gap", "user", "session_id"], help="how rows make sessions"
+        "--reward",
+        metavar="SQL",
+        help="scalar SQL expression over the log's columns, e.g. is_click (default: of the "
+        "dataset or --mapping, else the column reward)",
     )
-    parser.add_argument("--gap-minutes", type=float, help="pause that ends a session (30)")
     parser.add_argument(
-        "--split", metavar="TRAIN,VALIDATION,TEST", help="shares in order of time (0.8,0.1,0.1)"
+        "--session-by",
+        choices=["gap", "user", "session_id"],
+        help="start a new session after a pause, once per user, or with a new session_id "
+        "(default: of the dataset or --mapping, else session_id if the log has it, else gap)",
     )
-    parser.add_argument("--validate", action="store_true", help="only check, write nothing")
+    parser.add_argument(
+        "--gap-minutes",
+        type=float,
+        metavar="MINUTES",
+        help="with --session-by gap: a longer pause of the user ends the session, in minutes "
+        "(default: 30)",
+    )
+    parser.add_argument(
+        "--split",
+        metavar="TRAIN,VALIDATION,TEST",
+        help="shares of the rows in order of time, or two ISO times (UTC) at which validation and "
+        "test begin (default: 0.8,0.1,0.1)",
+    )
+    parser.add_argument(
+        "--validate", action="store_true", help="check the logs without writing a store"
+    )
 
 
 def run(options: argparse.Namespace) -> None:
-    """`ucfrec prepare`."""
+    """Run `ucfrec prepare` and print what was read, dropped and kept.
+
+    Raises:
+        InputError: the logs cannot be used, or neither --out nor --validate is given.
+    """
     from ucfrec.logs.expressions import Expression
     from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, validate
     from ucfrec.logs.summary import format_report
@@ -40,6 +63,6 @@ def run(options: argparse.Namespace) -> None:
         print(format_report(validate(files, mapping, prepared)))
         return
     if options.out is None:
-        raise InputError("name the store with --out, or only check with --validate")
+        raise InputError("no store is named; add --out STORE, or --validate to only check the logs")
     print(format_report(prepare(files, mapping, options.out, prepared)))
     print(f"\nstore: {options.out}")

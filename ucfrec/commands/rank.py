@@ -15,22 +15,32 @@ _SHOWN = ("hit_rate_shown", "hit_rate_liked", "ndcg_liked", "recall_liked", "gau
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `rank` takes."""
+    """Add the options of `ucfrec rank`."""
     log_options(parser)
-    parser.add_argument("--k", type=int, default=10, help="items recommended at a step (10)")
+    parser.add_argument(
+        "--k", type=int, default=10, help="items recommended at each step (default: 10)"
+    )
     target_options(parser)
     parser.add_argument(
-        "--seed", type=int, default=0, help="of resampled users and of the random baseline (0)"
+        "--seed",
+        type=int,
+        default=0,
+        help="seed of the bootstrap over users and of the random baseline (default: 0)",
     )
-    parser.add_argument("--json", type=Path, help="write the rows, with intervals, here")
+    parser.add_argument(
+        "--json", type=Path, metavar="FILE", help="also write the rows, with intervals, as JSON"
+    )
     parser.usage = "%(prog)s RUN... [LOGS...] [options]"
-    parser.epilog = (
-        "Without LOGS, the test split of the store that the first run was trained on is ranked."
-    )
+    parser.epilog = "Without LOGS, the policies rank the test split of the store of the first run."
 
 
 def run(options: argparse.Namespace) -> None:
-    """`ucfrec rank`."""
+    """Run `ucfrec rank` and print one row per policy.
+
+    Raises:
+        InputError: a run or log cannot be used, the runs have different stores, or there is no
+            test split to rank.
+    """
     from ucfrec.evaluation.ranking import MEASURES
     from ucfrec.evaluation.ranking_table import require_one_catalogue, training_store
     from ucfrec.files import write_json

@@ -1,4 +1,4 @@
-"""`ucfrec recommend`: the next items for users of a log."""
+"""`ucfrec recommend`: recommend the next items to the users of a log."""
 
 import argparse
 from collections.abc import Iterator
@@ -13,22 +13,30 @@ if TYPE_CHECKING:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `recommend` takes."""
-    parser.add_argument("run", type=Path, metavar="RUN")
+    """Add the options of `ucfrec recommend`."""
+    parser.add_argument("run", type=Path, metavar="RUN", help="run folder of `ucfrec train`")
     log_options(parser)
-    parser.add_argument("--k", type=int, default=10, help="items for each user (10)")
+    parser.add_argument("--k", type=int, default=10, help="items for each user (default: 10)")
     parser.add_argument(
-        "--keep-seen", action="store_true", help="recommend also items that the user has seen"
+        "--keep-seen",
+        action="store_true",
+        help="also recommend items that the user has seen (default: leave them out)",
     )
     parser.add_argument(
-        "--skip-unknown", action="store_true", help="ignore rows of items the run does not know"
+        "--skip-unknown",
+        action="store_true",
+        help="ignore rows with items outside the catalogue of the run (default: an error)",
     )
     target_options(parser)
-    parser.add_argument("--out", type=Path, required=True, help="Parquet file")
+    parser.add_argument("--out", type=Path, required=True, help="Parquet file to write")
 
 
 def run(options: argparse.Namespace) -> None:
-    """`ucfrec recommend`."""
+    """Run `ucfrec recommend`: write the recommendations as Parquet.
+
+    Raises:
+        InputError: the run or the logs cannot be used.
+    """
     from ucfrec.commands.frames import write_frames
     from ucfrec.recommending.histories import histories_of_files
     from ucfrec.recommending.recommend import recommend

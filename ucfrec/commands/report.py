@@ -1,12 +1,14 @@
-"""`ucfrec report`: one HTML page about runs."""
+"""`ucfrec report`: write one HTML page about training runs."""
 
 import argparse
 from pathlib import Path
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `report` takes."""
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
+    """Add the options of `ucfrec report`."""
+    parser.add_argument(
+        "runs", nargs="+", type=Path, metavar="RUN", help="run folders of `ucfrec train`"
+    )
     parser.add_argument(
         "--results",
         nargs="+",
@@ -14,19 +16,31 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         default=[],
         metavar="FILE",
-        help="rows that `ucfrec evaluate`, `ucfrec ope` or the demo wrote, JSON or JSON lines",
+        help="results to show: JSON or JSON lines (.jsonl) of `ucfrec evaluate --json`, "
+        "`ucfrec ope --json` or `ucfrec demo` (default: none)",
     )
     parser.add_argument(
         "--items",
         type=Path,
         metavar="FILE",
-        help="item features to show beside sample recommendations, Parquet or CSV with item_id",
+        help="item features to show with the sample recommendations: Parquet or CSV with a column "
+        "item_id (default: none)",
     )
-    parser.add_argument("--out", type=Path, default=Path("report.html"), help="(report.html)")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("report.html"),
+        metavar="FILE",
+        help="HTML file to write (default: report.html)",
+    )
 
 
 def run(options: argparse.Namespace) -> None:
-    """`ucfrec report`."""
+    """Run `ucfrec report`.
+
+    Raises:
+        InputError: a run, result or item file cannot be used.
+    """
     from ucfrec.reporting.page import write_report
 
     write_report(options.out, options.runs, options.results, options.items)

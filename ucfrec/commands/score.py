@@ -1,4 +1,4 @@
-"""`ucfrec score`: a policy's probability of every logged choice."""
+"""`ucfrec score`: write a policy's probability of every logged choice."""
 
 import argparse
 from pathlib import Path
@@ -7,15 +7,19 @@ from ucfrec.commands.options import log_options, logs_given, target_given, targe
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `score` takes."""
-    parser.add_argument("run", type=Path, metavar="RUN")
+    """Add the options of `ucfrec score`."""
+    parser.add_argument("run", type=Path, metavar="RUN", help="run folder of `ucfrec train`")
     log_options(parser)
     target_options(parser)
-    parser.add_argument("--out", type=Path, required=True, help="Parquet file")
+    parser.add_argument("--out", type=Path, required=True, help="Parquet file to write")
 
 
 def run(options: argparse.Namespace) -> None:
-    """`ucfrec score`."""
+    """Run `ucfrec score`: write the probabilities as Parquet.
+
+    Raises:
+        InputError: the run or the logs cannot be used.
+    """
     from ucfrec.commands.frames import write_frames
     from ucfrec.logs.summary import format_report
     from ucfrec.off_policy.score import logged_sessions, score

@@ -1,4 +1,4 @@
-"""`ucfrec settings`: every setting with its default, range and meaning."""
+"""`ucfrec settings`: list every training setting with its default, range and meaning."""
 
 import argparse
 import inspect
@@ -13,36 +13,44 @@ if TYPE_CHECKING:
     from ucfrec.settings import Setting
 
 _NARROWEST: Final = 40
-"""Columns that the meaning needs beside the rest; with fewer it stands beneath."""
+"""Terminal columns that the meaning needs; with fewer it goes on a line of its own below."""
 _BENEATH: Final = " " * 6
 _WIDEST: Final = 160
-"""Columns of a whole line, at most."""
+"""Most terminal columns of a line."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `settings` takes."""
+    """Add the options of `ucfrec settings`."""
     parser.add_argument(
         "--policy",
         default="ucf",
         metavar="NAME",
-        help=f"whose settings: {', '.join(policy_names())} (ucf)",
+        help=f"learner whose settings to list: {', '.join(policy_names())} (default: ucf)",
     )
 
 
 def run(options: argparse.Namespace) -> None:
-    """`ucfrec settings`."""
+    """Run `ucfrec settings`."""
     print(settings_text(options.policy, shutil.get_terminal_size().columns))
 
 
 def settings_text(policy: str, width: int) -> str:
-    """Every setting of a training of `policy`, a section a table, in lines of `width` columns."""
+    """Every setting of a training of `policy`, one section per table.
+
+    Args:
+        policy: name of the learner.
+        width: terminal columns of a line.
+
+    Raises:
+        InputError: no learner has this name.
+    """
     from ucfrec.runs.config import TABLES, resolve_config
     from ucfrec.settings import describe
 
     config, width = resolve_config(policy), min(width, _WIDEST)
     tables = {name: list(describe(name, getattr(config, name))) for name in TABLES}
-    shown = [_cells(setting) for settings in tables.values() for setting in settings]
-    widths = [max(len(row[i]) for row in shown) for i in range(3)]
+    cells = [_cells(setting) for settings in tables.values() for setting in settings]
+    widths = [max(len(row[i]) for row in cells) for i in range(3)]
     text = textwrap.wrap(
         f"Settings of `ucfrec train --policy {policy}`: --set KEY=VALUE, or a TOML file "
         "(--config FILE) with a table for each section.",
@@ -56,7 +64,7 @@ def settings_text(policy: str, width: int) -> str:
 
 
 def _summary(table: Any) -> str:
-    """The first paragraph of what a table's class says of itself."""
+    """First paragraph of the docstring of the table's class."""
     return inspect.cleandoc(type(table).__doc__ or "").partition("\n\n")[0]
 
 
@@ -65,7 +73,7 @@ def _cells(setting: "Setting") -> tuple[str, str, str, str]:
 
 
 def _as_toml(value: Any) -> str:
-    """A value as `--set` takes it; "unset" stands for none."""
+    """A value as `--set` takes it; "unset" for None."""
     if value is None:
         return "unset"
     if isinstance(value, bool):

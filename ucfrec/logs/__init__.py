@@ -1,4 +1,4 @@
-"""Logs to episodes: files, mapping, cleaning, sessions, embeddings, store."""
+"""Turn logs into episodes: files, mapping, cleaning, sessions, item embeddings, store."""
 
 from ucfrec.logs.histories import read_histories
 from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping

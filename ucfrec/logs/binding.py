@@ -1,4 +1,4 @@
-"""Log and feature files as DuckDB sees them: opened, columns bound, faults explained."""
+"""Log and feature files in DuckDB: opening, binding columns, explaining errors."""
 
 import difflib
 import errno
@@ -27,20 +27,20 @@ MAX_FLOAT = 3.4028235e38
 
 @dataclass(frozen=True)
 class Table:
-    """Files with the same columns, read as one, in their order."""
+    """Files with the same columns, read one after the other as a single table."""
 
     files: tuple[Path, ...]
     types: tuple[tuple[str, str], ...]
-    """Names and DuckDB types of the columns."""
+    """(name, DuckDB type) of each column."""
 
     @property
     def columns(self) -> dict[str, str]:
-        """Type by name."""
+        """Column name to DuckDB type."""
         return dict(self.types)
 
     @property
     def sql(self) -> str:
-        """The table function that reads the files."""
+        """SQL call of the DuckDB table function that reads the files."""
         files = ", ".join(text(glob_pattern(file)) for file in self.files)
         if self.files[0].suffix == ".parquet":
             return f"read_parquet([{files}])"
@@ -49,12 +49,12 @@ class Table:
 
 
 def glob_pattern(file: Path) -> str:
-    """The pattern that DuckDB, which takes every path for one, finds this file alone with."""
+    """Glob pattern that matches only `file`: DuckDB treats every path as a pattern."""
     return _MAGIC.sub(r"[\g<0>]", str(file))
 
 
 def text(value: str) -> str:
-    """`value` as a SQL string."""
+    """`value` as a SQL string literal."""
     return "'" + value.replace("'", "''") + "'"
 
 
@@ -79,10 +79,13 @@ def is_vector(kind: str) -> bool:
 
 
 def open_tables(connection: duckdb.DuckDBPyConnection, files: Sequence[Path]) -> list[Table]:
-    """Look at every file and put neighbours with equal columns together.
+    """Read the columns of every file and group consecutive files with equal columns.
+
+    Returns:
+        Tables in the order of `files`.
 
     Raises:
-        InputError: a file is empty, truncated or not what its name says.
+        InputError: a file is empty, truncated or not of the kind that its suffix says.
     """
     tables: list[Table] = []
     for file in files:
@@ -101,12 +104,12 @@ def _columns(connection: duckdb.DuckDBPyConnection, file: Path) -> tuple[tuple[s
     source = Table((file,), ()).sql.replace(", types = {}", "")
     try:
         types = connection.sql(f"DESCRIBE SELECT * FROM {source}").fetchall()
-        some = connection.sql(f"SELECT 1 FROM {source} LIMIT 1").fetchall()
+        first_row = connection.sql(f"SELECT 1 FROM {source} LIMIT 1").fetchall()
     except duckdb.Error as error:
         raise InputError(
             f"{file} cannot be read, it may be truncated ({_first_line(error)}); fetch it again"
         ) from None
-    if not some:
+    if not first_row:
         raise InputError(f"{file} is empty (0 rows); remove it from the input or fetch it again")
     return tuple((str(name), str(kind)) for name, kind, *_ in types)
 
@@ -114,16 +117,17 @@ def _columns(connection: duckdb.DuckDBPyConnection, file: Path) -> tuple[tuple[s
 def bind(
     connection: duckdb.DuckDBPyConnection, table: Table, what: str, given: str
 ) -> tuple[str, str]:
-    """Make SQL of a column name or scalar expression.
+    """Resolve a column name or scalar expression against the columns of `table`.
 
     Args:
-        what: what the expression is for, in messages.
+        what: purpose of the expression, for messages.
+        given: column name (case does not matter) or SQL expression.
 
     Returns:
         The SQL and its DuckDB type.
 
     Raises:
-        InputError: it names no column of the table, or is no scalar expression.
+        InputError: a name is not a column of the table, or `given` is not a scalar expression.
     """
     names = {name.casefold(): name for name in table.columns}
     if given.casefold() in names:
@@ -134,7 +138,7 @@ def bind(
     sql = f"({given}\n)"
     like = ", ".join(f"CAST(NULL AS {kind}) AS {quoted(name)}" for name, kind in table.types)
     try:
-        # Names that are no columns might stand for the user or the time to DuckDB.
+        # DuckDB would read some names that are not columns as the current user or time.
         for name in columns_of(connection, given):
             if name.casefold() not in names:
                 raise InputError(_missing(table, what, name))
@@ -153,7 +157,14 @@ def _missing(table: Table, what: str, name: str) -> str:
 
 
 def wrong_type(table: Table, what: str, given: str, kind: str, wanted: str) -> InputError:
-    """The error for a column whose type will not do."""
+    """Error for a column of an unsupported type.
+
+    Args:
+        what: log column or feature.
+        given: its column name or expression.
+        kind: its DuckDB type.
+        wanted: remedy, for the message.
+    """
     return InputError(f"{table.files[0]}: {what} ({given}) is {kind}; {wanted}")
 
 
@@ -161,10 +172,14 @@ def wrong_type(table: Table, what: str, given: str, kind: str, wanted: str) -> I
 def explained(
     connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], folder: Path
 ) -> Iterator[None]:
-    """Turn faults of files, memory and disk that surface while reading into `InputError`.
+    """Turn errors of files, memory and disk that occur in the block into `InputError`.
 
     Args:
-        folder: where the disk would run full.
+        tables: tables that the block reads.
+        folder: folder named when its disk is full.
+
+    Raises:
+        InputError: the memory limit or disk is exhausted, or a file or value cannot be read.
     """
     try:
         yield
@@ -197,13 +212,13 @@ def explained(
 def _is_disk_full(error: Exception) -> bool:
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         return True
-    # In the words of safetensors and DuckDB, of DuckDB's own limit, and of numpy.
-    said = ("No space left", "max_temp_directory_size", "requested and")
-    return any(words in str(error) for words in said)
+    # Messages of safetensors and DuckDB, of DuckDB's own disk limit, and of numpy.
+    phrases = ("No space left", "max_temp_directory_size", "requested and")
+    return any(phrase in str(error) for phrase in phrases)
 
 
 def _disk_full(folder: Path) -> InputError:
-    return InputError(f"no space left on the disk of {folder}; free some or write elsewhere")
+    return InputError(f"no space left on the disk of {folder}; free space or write elsewhere")
 
 
 def _unreadable(
@@ -211,9 +226,9 @@ def _unreadable(
 ) -> Iterator[tuple[Path, str]]:
     for table in tables:
         for file in table.files:
-            one = Table((file,), table.types)
+            single = Table((file,), table.types)
             try:
-                connection.sql(f"SELECT max(hash(t)) FROM {one.sql} AS t").fetchall()
+                connection.sql(f"SELECT max(hash(t)) FROM {single.sql} AS t").fetchall()
             except duckdb.Error as error:
                 yield file, _first_line(error)
 

@@ -1,4 +1,4 @@
-"""The SQL that reads, checks and de-duplicates log rows: shared by `prepare` and `recommend`."""
+"""SQL that reads, checks and de-duplicates log rows, shared by `prepare` and `recommend`."""
 
 import time
 from collections.abc import Sequence
@@ -26,46 +26,47 @@ from ucfrec.logs.binding import (
 from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping
 
 EARLIEST_MS: Final = 946_684_800_000
-"""2000-01-01 UTC: earlier rows come from a clock that is wrong."""
+"""2000-01-01 UTC in ms; rows with an earlier time are dropped as clock errors."""
 DAY_MS: Final = 86_400_000
+"""One day in ms."""
 
 REASONS: Final = {
     "null_key": "user, item or action, time or session is missing",
     "clock_out_of_range": "time before 2000 or more than a day ahead of now",
     "vector_not_finite": "action or observation is missing or holds NaN or infinity",
-    "unknown_item": "item is none of the store's",
-    "duplicate": "repeats the user, item or action, and time of a row that is kept",
+    "unknown_item": "item is not in the store",
+    "duplicate": "repeats user, item or action, and time of another row, which is kept",
     "reward_not_finite": "reward is missing, NaN or infinite",
 }
-"""Why rows are dropped; each row for the first reason that applies."""
+"""Reason to its description; a row is dropped for the first reason that applies."""
 
 
 @dataclass(frozen=True)
 class CleanLog:
-    """A log whose rows lie checked in the table `rows` of `connection`, in file order.
+    """A log with its checked rows in the table `rows` of `connection`.
 
-    `rows` has the log columns of `columns`, `reward`, `row` (its place in the files), `reason`
-    (why the row is dropped, NULL for rows to keep) and `conflict` (of duplicates: their reward is
-    another than that of the row kept). The rows kept are the view `clean`.
+    `rows` has the log columns of `columns`, `reward`, `row` (position in the files), `reason` (key
+    of `REASONS` for dropped rows, NULL for kept rows) and `conflict` (whether a duplicate has a
+    different reward from the row that is kept). The view `clean` has the kept rows.
     """
 
     connection: duckdb.DuckDBPyConnection
     tables: tuple[Table, ...]
     columns: tuple[str, ...]
-    """Log columns present, `user_id` first."""
+    """Log columns that the files have, `user_id` first."""
     vector_size: dict[str, int]
-    """Size of `action` and `observation`, where present."""
+    """Dimensions of `action` and `observation`, if the log has them."""
     session_by: str
     """"session_id", "gap" or "user"."""
 
     @property
     def key(self) -> str:
-        """`item_id` or `action`."""
+        """Column of the choice: `item_id` or `action`."""
         return schema.ITEM_ID if schema.ITEM_ID in self.columns else schema.ACTION
 
     @property
     def payload(self) -> tuple[str, ...]:
-        """Columns beyond user, key and time."""
+        """Log columns other than user, choice and time."""
         return tuple(c for c in self.columns if c not in (schema.USER_ID, self.key, "timestamp"))
 
     def id_type(self, name: str) -> str:
@@ -73,7 +74,7 @@ class CleanLog:
         return str(self.one(f"SELECT typeof({name}) FROM rows LIMIT 1")[0])
 
     def one(self, sql: str) -> tuple[Any, ...]:
-        """The single row that `sql` gives."""
+        """The first row of the result of `sql`."""
         row: tuple[Any, ...] = self.connection.sql(sql).fetchall()[0]
         return row
 
@@ -89,24 +90,27 @@ def read_log(
 ) -> CleanLog:
     """Read and check every row of `files`.
 
-    Of rows that repeat a key (user, item or action, time) the one with the highest reward is kept
-    (feedback that came late adds to an impression), ties broken by the other columns, so that the
-    order of rows and files does not matter.
+    Of rows with the same key (user, item or action, time) the one with the highest reward is kept,
+    because late feedback is logged as a second row of an impression. Ties are broken by the other
+    columns, so that the order of rows and files does not matter.
 
     Args:
+        connection: engine that may open `files` and `known_items`.
+        files: log files.
+        mapping: log columns to the files' columns.
         reward: scalar SQL expression over the files' columns.
-        session_by: "session_id", "gap" or "user"; None for session_id where there is one, or gap.
-        known_items: a store's `items.parquet`, whose items alone are kept.
-        folder: named when its disk is full.
+        session_by: "session_id", "gap" or "user"; None for session_id if the log has it, else gap.
+        known_items: `items.parquet` of a store: rows with other items are dropped; None for all.
+        folder: folder named when its disk is full.
 
     Raises:
         InputError: a file, column or type makes the log unusable.
     """
     tables = tuple(open_tables(connection, files))
-    return judge_rows(connection, tables, mapping, reward, session_by, known_items, folder)
+    return check_rows(connection, tables, mapping, reward, session_by, known_items, folder)
 
 
-def judge_rows(
+def check_rows(
     connection: duckdb.DuckDBPyConnection,
     tables: tuple[Table, ...],
     mapping: LogMapping,
@@ -115,7 +119,7 @@ def judge_rows(
     known_items: Path | None,
     folder: Path,
 ) -> CleanLog:
-    """`read_log` of tables that are open already."""
+    """`read_log` of tables that are already open."""
     columns = _present(tables, mapping, session_by)
     selects = [_select(connection, table, mapping, columns, reward) for table in tables]
     with explained(connection, tables, folder):
@@ -144,7 +148,7 @@ def judge_rows(
 def _present(
     tables: Sequence[Table], mapping: LogMapping, session_by: str | None
 ) -> tuple[str, ...]:
-    """Log columns of the files; required ones are always listed, binding explains a missing one."""
+    """Log columns that every file has, and the required ones, which `bind` reports if missing."""
     named = {name: value for name, value in mapping.columns.items() if value}
     switched_off = mapping.columns.keys() - named.keys()
     everywhere = set.intersection(*({c.casefold() for c in t.columns} for t in tables))
@@ -160,7 +164,7 @@ def _present(
 
 
 Select = dict[str, tuple[str, str]]
-"""Log column to (SQL, DuckDB type)."""
+"""Log column to its (SQL, DuckDB type)."""
 
 
 def _select(
@@ -177,14 +181,14 @@ def _select(
         select[name] = _typed(table, name, given, *bind(connection, table, what, given))
     sql, kind = bind(connection, table, "for the reward", reward)
     if not (is_number(kind) or kind == "BOOLEAN"):
-        raise wrong_type(table, "reward", reward, kind, "give an expression that is a number")
-    # A fault in one row (division by zero, a cast) makes that row's reward undefined, no more.
+        raise wrong_type(table, "reward", reward, kind, "use a numeric or boolean expression")
+    # An error in one row (division by zero, a cast) makes only that row's reward undefined.
     select[schema.REWARD] = (f"TRY(CAST({sql} AS DOUBLE))", "DOUBLE")
     return select
 
 
 def _typed(table: Table, name: str, given: str, sql: str, kind: str) -> tuple[str, str]:
-    """SQL that brings a column to the type of the schema, and its type."""
+    """SQL that casts a column to its type in the schema, and that DuckDB type."""
     if name in (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID):
         if is_integer(kind) or kind in ("VARCHAR", "UUID"):
             return sql, kind
@@ -201,8 +205,8 @@ def _typed(table: Table, name: str, given: str, sql: str, kind: str) -> tuple[st
         wanted = f"use a list of numbers, e.g. --column {name}='{given}::FLOAT[]'"
     elif name == schema.PROPENSITY:
         if is_number(kind):
-            good = f"{sql} > 0 AND {sql} <= {MAX_FLOAT}"
-            return f"CAST(CASE WHEN {good} THEN {sql} END AS FLOAT)", "FLOAT"
+            valid = f"{sql} > 0 AND {sql} <= {MAX_FLOAT}"
+            return f"CAST(CASE WHEN {valid} THEN {sql} END AS FLOAT)", "FLOAT"
         wanted = "use a number above 0"
     else:
         if is_number(kind) or kind == "BOOLEAN":
@@ -212,7 +216,7 @@ def _typed(table: Table, name: str, given: str, sql: str, kind: str) -> tuple[st
 
 
 def _unify_ids(selects: list[Select], name: str) -> None:
-    """Ids are BIGINT where every file has such, text otherwise; session ids only order rows."""
+    """Cast ids to BIGINT if every file has integers that fit, else to text."""
     if name not in selects[0]:
         return
     wide = {"UBIGINT", "HUGEINT", "UHUGEINT"}
@@ -237,7 +241,9 @@ def _vector_sizes(
             lengths = ", ".join(f"{n} rows of {size}" for size, n in counts)
             raise InputError(f"{name} has lists of unequal length: {lengths}; make them equal")
         if not counts or counts[0][0] == 0:
-            raise InputError(f"{name} has no values in any row; map another column or none")
+            raise InputError(
+                f"{name} is empty in every row; map another column or --column {name}="
+            )
         sizes[name] = int(counts[0][0])
     return sizes
 

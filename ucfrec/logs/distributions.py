@@ -1,4 +1,4 @@
-"""How session lengths, rewards and item popularity are spread: small enough for `meta.json`."""
+"""Distributions of session lengths, rewards and item popularity, compact enough for `meta.json`."""
 
 from typing import Any, Final
 
@@ -9,38 +9,39 @@ from ucfrec.logs.clean import CleanLog
 
 QUANTILES: Final = (0.0, 0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 1.0)
 FEW_VALUES: Final = 20
-"""Rewards with at most this many values are counted by value, others in this many bins."""
+"""Rewards with at most this many distinct values are counted by value, others in as many bins."""
 SAMPLE_ROWS: Final = 100_000
-"""Quantiles of rewards come from about this many steps; those of a smaller log are exact."""
+"""Reward quantiles are of a sample of about this many steps; a smaller log is used whole."""
 
 Distribution = dict[str, Any]
-"""`counts`, with `values` or else `edges` (one more than counts; a bin has its left edge and not
-its right one), and `quantiles` by share, as in `{"0.5": 3}`."""
+"""`counts` (N), either `values` (N) or bin `edges` (N + 1; a bin includes its left edge but not its
+right one), and `quantiles` by share, e.g. `{"0.5": 3}`."""
 
 
 def distributions(log: CleanLog) -> dict[str, Distribution]:
-    """Distributions over the table `steps`, JSON-able.
+    """Distributions over the table `steps`, as JSON values.
 
     Returns:
-        `session_lengths`, the episodes by steps (a session cut at a split counts as its pieces),
-        in bins that double; `rewards`, the steps by reward, where the first and last bin also take
-        what lies beyond them; and, of logs with items, `item_popularity`, the items by the steps
-        that show them, never shown ones of the feature tables included, in bins that double.
+        `session_lengths`: episodes by length in steps (each piece of a session that a split cuts
+        counts as one), in bins of doubling width. `rewards`: steps by reward; the first and last
+        bin include the values beyond them. `item_popularity` (logs with items only): items by the
+        number of steps that show them, in bins of doubling width; items that only the feature
+        tables list have 0.
     """
     user, item = schema.USER_ID, schema.ITEM_ID
     lengths = f"SELECT count(*) AS value FROM steps GROUP BY {user}, episode"
-    found = {"session_lengths": _counts(log, lengths), "rewards": _rewards(log)}
+    result = {"session_lengths": _counts(log, lengths), "rewards": _rewards(log)}
     if log.key == item:
         shown = f"SELECT {item}, count(*) AS value FROM steps GROUP BY {item}"
         popularity = (
             f"SELECT coalesce(value, 0) AS value FROM items LEFT JOIN ({shown}) USING ({item})"
         )
-        found["item_popularity"] = _counts(log, popularity)
-    return found
+        result["item_popularity"] = _counts(log, popularity)
+    return result
 
 
 def _counts(log: CleanLog, query: str) -> Distribution:
-    """Of whole numbers `value` ≥ 0, in bins 0, 1, 2–3, 4–7, …"""
+    """Distribution of the integers `value` ≥ 0 of `query`, in bins 0, 1, 2–3, 4–7, …"""
     rows = log.connection.sql(
         f"SELECT value, count(*) FROM ({query}) GROUP BY value ORDER BY value"
     ).fetchall()
@@ -48,18 +49,19 @@ def _counts(log: CleanLog, query: str) -> Distribution:
     edges = [0, *(2**power for power in range(int(values[-1]).bit_length() + 1))]
     edges = edges[1:] if values[0] > 0 else edges
     binned, _ = np.histogram(values, edges, weights=counts)
-    below = np.cumsum(counts)
-    places = np.searchsorted(below, np.ceil(np.array(QUANTILES) * below[-1]).clip(min=1))
+    cumulative = np.cumsum(counts)
+    ranks = np.ceil(np.array(QUANTILES) * cumulative[-1]).clip(min=1)
+    positions = np.searchsorted(cumulative, ranks)
     return {
         "edges": edges,
         "counts": binned.astype(np.int64).tolist(),
-        "quantiles": _by_share(values[places].tolist()),
+        "quantiles": _by_share(values[positions].tolist()),
     }
 
 
 def _rewards(log: CleanLog) -> Distribution:
     (rows,) = log.one("SELECT count(*) FROM steps")
-    # By hash, so that the order of rows in the files does not matter.
+    # Sampled by hash, so that the order of rows in the files does not matter.
     every = max(1, round(rows / SAMPLE_ROWS))
     keys = f"hash({schema.USER_ID}, {log.key}, {schema.TIMESTAMP})"
     sample = f"SELECT reward FROM steps WHERE {keys} % {every} = 0"
@@ -68,26 +70,26 @@ def _rewards(log: CleanLog) -> Distribution:
     )
     by_share = {"quantiles": _by_share(quantiles)}
     if distinct <= FEW_VALUES:
-        found = log.connection.sql(
+        counted = log.connection.sql(
             "SELECT reward, count(*) FROM steps GROUP BY reward ORDER BY reward "
             f"LIMIT {FEW_VALUES + 1}"
         ).fetchall()
-        if len(found) <= FEW_VALUES:
-            values, counts = map(list, zip(*found, strict=True))
+        if len(counted) <= FEW_VALUES:
+            values, counts = map(list, zip(*counted, strict=True))
             return {"values": values, "counts": counts, **by_share}
     low, high = quantiles[1], quantiles[-2]
     if not low < high:
         low, high = log.one("SELECT min(reward), max(reward) FROM steps")
     width = (high - low) / FEW_VALUES
-    place = f"greatest(0, least({FEW_VALUES - 1}, floor((reward - {low}) / {width})))"
+    bin_number = f"greatest(0, least({FEW_VALUES - 1}, floor((reward - {low}) / {width})))"
     binned = dict(
         log.connection.sql(
-            f"SELECT CAST({place} AS INT) AS bin, count(*) FROM steps GROUP BY bin"
+            f"SELECT CAST({bin_number} AS INT) AS bin, count(*) FROM steps GROUP BY bin"
         ).fetchall()
     )
     return {
         "edges": np.linspace(low, high, FEW_VALUES + 1).tolist(),
-        "counts": [binned.get(place, 0) for place in range(FEW_VALUES)],
+        "counts": [binned.get(number, 0) for number in range(FEW_VALUES)],
         **by_share,
     }
 

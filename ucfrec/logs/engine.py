@@ -1,4 +1,4 @@
-"""The DuckDB that logs are read with: closed to everything but its inputs and a scratch folder."""
+"""DuckDB connections that can open nothing but their inputs and a scratch folder."""
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -16,7 +16,7 @@ _CLOSED: Final = {
     "allow_persistent_secrets": False,
     "autoinstall_known_extensions": False,
     "autoload_known_extensions": False,
-    # Otherwise the name of a Python variable is a table.
+    # Otherwise SQL could read any Python variable as a table.
     "python_enable_replacements": False,
 }
 
@@ -25,18 +25,19 @@ _CLOSED: Final = {
 def engine(
     inputs: Iterable[Path], folder: Path, memory_limit: str | None = None
 ) -> Iterator[duckdb.DuckDBPyConnection]:
-    """A DuckDB that works on disk.
+    """A DuckDB connection with a database on disk.
 
-    It opens the inputs and files of its own scratch folder, nothing else; it loads no extension;
-    and its configuration cannot be changed any more. Every connection of ucfrec is made here.
+    It can open only the inputs and files in its scratch folder, loads no extension, and its
+    configuration is locked. Every DuckDB connection of ucfrec is made in this module.
 
     Args:
         inputs: files that will be read.
-        folder: where it makes its scratch folder, removed at the end.
-        memory_limit: e.g. "2GB"; None for DuckDB's own.
+        folder: parent of the scratch folder, which is removed at the end.
+        memory_limit: size such as "2GB", beyond which rows spill to disk; None for DuckDB's
+            default.
 
     Raises:
-        InputError: the limit is none.
+        InputError: `memory_limit` is not a size.
     """
     with TemporaryDirectory(prefix=".ucfrec-", dir=folder) as work:
         spill = str(Path(work) / "spill")
@@ -48,8 +49,10 @@ def engine(
                 if memory_limit is not None:
                     connection.execute("SET memory_limit = ?", [memory_limit])
             except duckdb.Error:
-                raise InputError(f"memory_limit {memory_limit!r}: write e.g. 2GB") from None
-            _settle(connection)
+                raise InputError(
+                    f"memory_limit {memory_limit!r} is no size; write e.g. 2GB"
+                ) from None
+            _set_semantics(connection)
             _close(connection, inputs, work)
             yield connection
         finally:
@@ -58,24 +61,24 @@ def engine(
 
 @contextmanager
 def engine_in_memory() -> Iterator[duckdb.DuckDBPyConnection]:
-    """The same for tables registered with it: it opens no file and never touches the disk."""
+    """A DuckDB connection for registered tables only: it opens no file and never uses the disk."""
     connection = duckdb.connect(":memory:", config={**_CLOSED, "temp_directory": ""})
     try:
-        _settle(connection)
+        _set_semantics(connection)
         _close(connection, (), None)
         yield connection
     finally:
         connection.close()
 
 
-def _settle(connection: duckdb.DuckDBPyConnection) -> None:
-    """What expressions mean, the same in every engine and on every machine."""
+def _set_semantics(connection: duckdb.DuckDBPyConnection) -> None:
+    """Make expressions mean the same in every connection and on every machine."""
     connection.execute("SET enable_progress_bar = false")
     connection.execute("SET error_on_division_by_zero = false")
-    # Times with a zone are cast to times without one in this zone.
+    # Casts from TIMESTAMPTZ to TIMESTAMP use this zone.
     connection.execute("SET TimeZone = 'UTC'")
-    # SQL's own least(x, 5) is 5 where x is NULL, NaN or infinite: a video of unknown length
-    # would count as watched five times. Undefined parts make a reward undefined instead.
+    # DuckDB's least(x, 5) is 5 if x is NULL, NaN or infinite: a video of unknown length would
+    # count as watched five times. Here an undefined argument makes the result NULL.
     for name, sign in (("least", "<"), ("greatest", ">")):
         connection.execute(
             f"CREATE TEMP MACRO {name}(a, b) AS CASE WHEN isfinite(a::DOUBLE) AND "
@@ -85,8 +88,8 @@ def _settle(connection: duckdb.DuckDBPyConnection) -> None:
 
 
 def _close(connection: duckdb.DuckDBPyConnection, inputs: Iterable[Path], work: str | None) -> None:
-    """Shut the file system and lock every setting; later settings fail, so this comes last."""
-    # A path is looked up as a pattern first, then opened as the file it stands for.
+    """Forbid access to other files and lock the settings; must come after every other setting."""
+    # DuckDB first looks a path up as a glob pattern, then opens the file that it matches.
     allowed = {path for file in inputs for path in (str(file), glob_pattern(file))}
     paths = ", ".join(map(text, sorted(allowed)))
     if work is not None:

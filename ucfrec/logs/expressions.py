@@ -1,8 +1,8 @@
-"""Which SQL a log may be read with: one scalar expression over its columns, and nothing else.
+"""Check that SQL text is one scalar expression over the columns of a log.
 
 Rewards and column mappings are text from command lines, mapping files, run folders and stores.
-DuckDB would run any of it, so each text is parsed first (DuckDB's own parser, as a tree) and every
-node of the tree must be of a kind listed here.
+DuckDB would run any SQL in it, so each text is parsed first (DuckDB's own parser returns a syntax
+tree) and every node of the tree must be of a kind listed here.
 """
 
 import json
@@ -15,15 +15,17 @@ if TYPE_CHECKING:
     import duckdb
 
 MAX_LENGTH: Final = 4000
-"""Characters of an expression."""
+"""Most characters of an expression."""
 MAX_NESTING: Final = 100
-"""Levels of an expression: brackets, calls, operators."""
+"""Most nested levels of an expression: brackets, calls, operators."""
 MAX_SIZE: Final = 20_000
-"""Nodes of an expression as DuckDB evaluates it, arguments that it copies counted every time."""
+"""Most nodes of an expression as DuckDB evaluates it, counting each copy of copied arguments."""
 _MAX_TREE: Final = 2_000_000
-"""Characters of a tree that is looked at."""
+"""Most characters of the JSON of a syntax tree."""
 _MAX_COPIED: Final = 1_000_000
-_SHOWN: Final = 120
+"""Most characters after `CASE x WHEN` copied x."""
+_MAX_QUOTED: Final = 120
+"""Most characters of an expression in a message."""
 
 _KINDS = "BETWEEN CASE CAST COLUMN_REF COMPARISON CONJUNCTION CONSTANT FUNCTION OPERATOR TYPE"
 _NODES: Final = frozenset(_KINDS.split())
@@ -44,10 +46,10 @@ _SCALARS = """
     TIMESTAMP TIMESTAMP_S TIMESTAMP_MS TIMESTAMP_US TIMESTAMP_NS TIMESTAMPTZ
 """
 TYPES: Final = frozenset(_SCALARS.split()) | {"TIMESTAMP WITH TIME ZONE", "LIST"}
-"""Types to cast to, as the parser names them; LIST is any of the others with [] behind it."""
+"""Types that a cast may name, as the parser writes them; LIST is one of the others with []."""
 
-# No function here reads files, settings, the clock or a random number, gives several rows, or makes
-# text much longer than its arguments are (replace, repeat, lpad and format do).
+# No function here reads files, settings, the clock or a random number, returns several rows, or
+# returns text much longer than its arguments (replace, repeat, lpad and format would).
 _MATHS = """
     abs sign round floor ceil ceiling trunc even sqrt cbrt exp ln log log2 log10 pow power pi mod
     gcd lcm sin cos tan asin acos atan atan2 sinh cosh tanh degrees radians bit_count
@@ -82,9 +84,9 @@ _OPERATORS = """
     ~~ !~~ ~~* !~~* ~~~ like_escape not_like_escape ilike_escape not_ilike_escape
 """
 FUNCTIONS: Final = frozenset(" ".join((_MATHS, _TEXTS, _TIMES, _LISTS, _OPERATORS)).split())
-"""Functions and, as the parser calls them, operators (~~ is LIKE)."""
+"""Allowed functions, and operators by the parser's names (~~ is LIKE)."""
 COPYING: Final = frozenset({"least", "greatest", "nullif", "split_part", "array_to_string"})
-"""Macros: DuckDB writes each argument out up to three times, or nine with three arguments."""
+"""Macros: DuckDB copies each argument up to three times, or nine times with three arguments."""
 _SIMPLE_CASE: Final = re.compile(r"\bcase\b(?!\s+when\b)", re.IGNORECASE)
 _WHEN: Final = re.compile(r"\bwhen\b", re.IGNORECASE)
 _ALLOWED: Final = (
@@ -94,56 +96,63 @@ _ALLOWED: Final = (
 
 
 class Expression(str):
-    """SQL text that knows where it was written, for messages."""
+    """SQL text with its origin, for messages."""
 
     origin: str
+    """File or option that the text comes from."""
 
     def __new__(cls, text: object, origin: str) -> Self:
-        """`text` as it is.
+        """Make an expression of `text`.
 
         Args:
-            origin: a file or option.
+            text: SQL; not parsed here.
+            origin: file or option that it comes from.
 
         Raises:
-            InputError: it is not text.
+            InputError: `text` is not a string.
         """
         if not isinstance(text, str):
-            raise InputError(f"{origin}: {_shown(text)} is no text; write a SQL expression")
+            raise InputError(f"{origin}: {_quote(text)} is not text; write a SQL expression")
         expression = super().__new__(cls, text)
         expression.origin = origin
         return expression
 
 
 class NotScalarError(Exception):
-    """Why a text is not a scalar expression that may be evaluated."""
+    """A text is not an allowed scalar expression; the message says why."""
 
 
 def refused(what: str, given: str, over: str, reason: str) -> InputError:
-    """The error for an expression that cannot be used: one line.
+    """One-line error for an expression that cannot be used.
 
     Args:
-        what: what it is for, such as "for the reward".
-        over: whose columns it is over.
+        what: purpose of the expression, e.g. "for the reward".
+        given: the expression.
+        over: file or table whose columns it may use.
+        reason: why it cannot be used.
     """
     origin = f"{given.origin}: " if isinstance(given, Expression) else ""
     reason = "".join(char if char.isprintable() else " " for char in reason)
     return InputError(
-        f"{origin}{what.partition(';')[0]}: {_shown(given)} is no scalar SQL expression over the "
+        f"{origin}{what.partition(';')[0]}: {_quote(given)} is no scalar SQL expression over the "
         f"columns of {over}: {reason}"
     )
 
 
 def columns_of(connection: "duckdb.DuckDBPyConnection", given: str) -> tuple[str, ...]:
-    """Check that `given` is one scalar expression, and name the columns that it reads.
+    """Check that `given` is one allowed scalar expression, without evaluating it.
 
-    Nothing of it is evaluated, and columns and types of arguments are not looked up.
+    Whether its columns exist and its types match is not checked.
+
+    Returns:
+        Names of the columns that it reads, each once, in order of appearance.
 
     Raises:
         NotScalarError: it is anything else, too long, too large, or nested too deep.
     """
     _require_small(given)
-    # By itself and in the brackets in which it is used: only a text that closes all that it opens,
-    # and opens all that it closes, is the same expression in both.
+    # Parsed alone and in the brackets in which it will be used: a text with an unmatched bracket,
+    # quote or comment cannot give the same tree both times.
     alone, bracketed = _parse(connection, f"{given}\n"), _parse(connection, f"({given}\n)")
     if alone != bracketed:
         raise NotScalarError(f"it is not one whole expression; {_ALLOWED}")
@@ -154,7 +163,7 @@ def columns_of(connection: "duckdb.DuckDBPyConnection", given: str) -> tuple[str
 
 
 def _require_small(given: str) -> None:
-    """Spare the parser what it is slow on: length, deep brackets, and CASE within CASE."""
+    """Refuse text that would make the parser slow: long, deeply bracketed, or nested CASE."""
     if len(given) > MAX_LENGTH:
         raise NotScalarError(f"it has {len(given):,} characters; {MAX_LENGTH:,} are allowed")
     depth = 0
@@ -162,8 +171,8 @@ def _require_small(given: str) -> None:
         depth += (char in "([{") - (char in ")]}")
         if depth > MAX_NESTING:
             raise _too_deep()
-    # CASE x WHEN … copies x for every WHEN, so that one within the other multiply; an even share
-    # of the WHENs gives the most copies.
+    # CASE x WHEN … copies x for every WHEN, so nested ones multiply. The product of the copies is
+    # largest if every CASE has the same number of WHENs.
     cases, whens = len(_SIMPLE_CASE.findall(given)), len(_WHEN.findall(given))
     if cases and (whens / cases) ** cases * len(given) > _MAX_COPIED:
         raise NotScalarError(
@@ -181,7 +190,7 @@ def _too_large() -> NotScalarError:
 
 
 def _parse(connection: "duckdb.DuckDBPyConnection", given: str) -> dict[str, Any]:
-    """The tree of the only value that `SELECT given` selects from nothing."""
+    """Syntax tree of the single value of `SELECT given`."""
     node, value = _select(connection, given)
     plain, _ = _select(connection, "1")
     if node != plain or value["alias"]:
@@ -192,15 +201,15 @@ def _parse(connection: "duckdb.DuckDBPyConnection", given: str) -> dict[str, Any
 def _select(
     connection: "duckdb.DuckDBPyConnection", given: str
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """`SELECT given` parsed: the query without its value, and the value."""
+    """Syntax trees of `SELECT given`: the query without its value, and the value."""
     from duckdb import Error
 
     try:
         query = "SELECT json_serialize_sql(?)"
-        (told,) = connection.execute(query, [f"SELECT {given}"]).fetchall()[0]
-        if len(told) > _MAX_TREE:
+        (tree,) = connection.execute(query, [f"SELECT {given}"]).fetchall()[0]
+        if len(tree) > _MAX_TREE:
             raise _too_large()
-        parsed = _without_places(json.loads(told))
+        parsed = _without_locations(json.loads(tree))
     except RecursionError:
         raise _too_deep() from None
     except (Error, UnicodeError) as error:
@@ -216,13 +225,13 @@ def _select(
     return {**node, "statement": parsed["statements"][0]}, values[0]
 
 
-def _without_places(tree: Any) -> Any:
-    """A tree without the places in the text, so that equal expressions are equal trees."""
+def _without_locations(tree: Any) -> Any:
+    """A tree without locations in the text, so that equal expressions have equal trees."""
     if isinstance(tree, list):
-        return [_without_places(part) for part in tree]
+        return [_without_locations(part) for part in tree]
     if isinstance(tree, dict):
-        places = ("query_location", "query_location_length")
-        return {key: _without_places(part) for key, part in tree.items() if key not in places}
+        locations = ("query_location", "query_location_length")
+        return {k: _without_locations(part) for k, part in tree.items() if k not in locations}
     return tree
 
 
@@ -230,11 +239,11 @@ def _walk(tree: Any, depth: int, columns: dict[str, None]) -> int:
     """Check every node of a tree.
 
     Args:
-        depth: nodes above it.
-        columns: takes the names of the columns that it reads.
+        depth: number of nodes above it.
+        columns: the names of the columns that the tree reads are added to it.
 
     Returns:
-        Its nodes, those that DuckDB copies counted every time.
+        Number of its nodes, counting every copy of those that DuckDB copies.
     """
     if isinstance(tree, list):
         return sum(_walk(part, depth, columns) for part in tree)
@@ -254,7 +263,7 @@ def _walk(tree: Any, depth: int, columns: dict[str, None]) -> int:
 
 
 def _require_listed(node: dict[str, Any]) -> None:
-    """See that a node is of a kind that is allowed."""
+    """Refuse a node of a kind, type or function that is not allowed."""
     kind = node["class"]
     if kind not in _NODES:
         raise NotScalarError(f"it has {_OTHER_NODES.get(kind, f'a {kind.lower()}')}; {_ALLOWED}")
@@ -262,22 +271,22 @@ def _require_listed(node: dict[str, Any]) -> None:
         raise NotScalarError(f"it calls 'grouping'; {_ALLOWED}")
     if kind == "TYPE" and (node["type_name"].upper() not in TYPES or _is_qualified(node)):
         raise NotScalarError(
-            f"it casts to {_shown(node['type_name'])}; cast to numbers, text, BOOLEAN, UUID, JSON, "
+            f"it casts to {_quote(node['type_name'])}; cast to numbers, text, BOOLEAN, UUID, JSON, "
             "dates and times, or lists of those"
         )
     if kind == "FUNCTION":
         name = node["function_name"].lower()
         if name not in FUNCTIONS or _is_qualified(node):
-            raise NotScalarError(f"it calls {_shown(name)}; {_ALLOWED}")
+            raise NotScalarError(f"it calls {_quote(name)}; {_ALLOWED}")
         plain = not (node["distinct"] or node["filter"] or node["export_state"])
         if not plain or node["order_bys"]["orders"] or any(a["name"] for a in node["arguments"]):
-            raise NotScalarError(f"it calls {_shown(name)} as an aggregate or with named arguments")
+            raise NotScalarError(f"it calls {_quote(name)} as an aggregate or with named arguments")
 
 
 def _is_qualified(node: dict[str, Any]) -> bool:
     return bool(node["catalog"] or node["schema"] or len(node["qualified_name"]["path"]) != 1)
 
 
-def _shown(given: object) -> str:
-    told = repr(str(given)) if isinstance(given, str) else repr(given)
-    return told if len(told) <= _SHOWN else f"{told[: _SHOWN - 1]}…"
+def _quote(given: object) -> str:
+    quoted = repr(str(given)) if isinstance(given, str) else repr(given)
+    return quoted if len(quoted) <= _MAX_QUOTED else f"{quoted[: _MAX_QUOTED - 1]}…"

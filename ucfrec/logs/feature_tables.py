@@ -1,4 +1,4 @@
-"""Features of items and users, read into DuckDB tables."""
+"""Read the features of items and users into DuckDB tables."""
 
 from collections.abc import Sequence
 
@@ -18,18 +18,20 @@ def load_features(
     """Read feature tables into DuckDB tables `<kind>_features_0`, …, with columns `id`, `f0`, ….
 
     Args:
+        connection: engine that may open the tables' files.
+        tables: feature tables of the mapping.
         kind: "item_id" or "user_id".
-        id_type: DuckDB type of the log's ids.
+        id_type: DuckDB type of the log's ids; rows whose key cannot be cast to it are left out.
 
     Returns:
-        Names of the tables.
+        Names of the DuckDB tables, one per feature table.
 
     Raises:
-        InputError: a file or column cannot be used, or an id occurs twice.
+        InputError: a file or column cannot be used, or a table repeats an id.
     """
     names = []
-    for place, table in enumerate(tables):
-        name, selects = f"{kind}_features_{place}", []
+    for number, table in enumerate(tables):
+        name, selects = f"{kind}_features_{number}", []
         for opened in open_tables(connection, log_files(table.files)):
             key, _ = bind(connection, opened, f"key of {kind} features", table.key)
             given = table.columns or tuple(c for c in opened.columns if c != table.key)
@@ -44,10 +46,10 @@ def load_features(
             id_sql, first = f"TRY_CAST({key} AS {id_type})", ""
             if table.first_by:
                 by, _ = bind(connection, opened, f"first_by of {kind} features", table.first_by)
-                # Ties go by the features, so that the order of rows does not matter.
+                # Ties are broken by the features, so that the order of rows does not matter.
                 order = ", ".join([by, *columns])
                 first = f" QUALIFY row_number() OVER (PARTITION BY {id_sql} ORDER BY {order}) = 1"
-            named = ", ".join(f"{sql} AS f{number}" for number, sql in enumerate(columns))
+            named = ", ".join(f"{sql} AS f{index}" for index, sql in enumerate(columns))
             selects.append(f"SELECT {id_sql} AS id, {named} FROM {opened.sql}{first}")
         connection.execute(
             f"CREATE TABLE {name} AS SELECT * FROM ({' UNION ALL BY NAME '.join(selects)}) "
@@ -59,14 +61,14 @@ def load_features(
         if rows != ids:
             raise InputError(
                 f"{', '.join(map(str, table.files))}: {rows - ids} of {rows} rows "
-                f"repeat a {table.key}; keep one row a {kind}"
+                f"repeat a {table.key}; keep one row per {kind}"
             )
         names.append(name)
     return names
 
 
 def _comparable(sql: str, kind: str) -> str | None:
-    """SQL that brings a feature to DOUBLE, VARCHAR, VARCHAR[] or FLOAT[]; None where none can."""
+    """SQL that casts a feature to DOUBLE, VARCHAR, VARCHAR[] or FLOAT[]; None if no cast does."""
     if is_number(kind):
         return f"CAST({sql} AS DOUBLE)"
     if kind == "DATE" or kind.startswith("TIMESTAMP"):

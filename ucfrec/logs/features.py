@@ -1,4 +1,4 @@
-"""Features of items and users, encoded as sparse matrices."""
+"""Encode the features of items and users as sparse matrices."""
 
 from collections.abc import Sequence
 from typing import Any, Final, TypeAlias
@@ -11,9 +11,9 @@ from scipy import sparse
 from ucfrec.errors import InputError
 
 CATEGORIES: Final = 200
-"""Categories and tags kept of one column: the most frequent in the training window."""
+"""Most categories or tags of one column: the most frequent among trained ids are kept."""
 CLIP: Final = 5.0
-"""Standardised numbers are clipped here."""
+"""Standardised numbers are clipped to ± this many standard deviations."""
 
 Array = npt.NDArray[Any]
 Features: TypeAlias = sparse.csr_matrix
@@ -22,14 +22,23 @@ Features: TypeAlias = sparse.csr_matrix
 def encode_features(
     connection: duckdb.DuckDBPyConnection, names: Sequence[str], ids: str, id_column: str
 ) -> Features | None:
-    """Encode feature tables, one row an id of the table `ids`, in the order of its `number`.
+    """Encode feature tables; row i belongs to the id with `number` i in the table `ids`.
 
-    Means, deviations and the choice of categories come from ids of the training window
-    (`train_count` above 0). Numbers are standardised and clipped, 0 where missing; categories and
-    tags are one-hot.
+    Numbers are standardised and clipped, with 0 for missing ones; categories and tags are one-hot.
+    Means, standard deviations and the kept categories come only from ids that occur in the
+    training split (`train_count` above 0).
+
+    Args:
+        connection: engine with the tables.
+        names: feature tables of `load_features`.
+        ids: table with `number`, `train_count` and the ids.
+        id_column: column of the ids in it.
 
     Returns:
-        (n_ids, F) float32; None without any feature.
+        (n_ids, F) float32; None if no column has a feature.
+
+    Raises:
+        InputError: the vectors of a column differ in length.
     """
     ((count,),) = connection.sql(f"SELECT count(*) FROM {ids}").fetchall()
     blocks = []
@@ -99,15 +108,16 @@ def _categories(
     found = connection.sql(f"""
         WITH cases AS (SELECT number, train_count, {value} AS value FROM {joined}),
         kept AS (
-            SELECT value, row_number() OVER (ORDER BY count(*) DESC, value) - 1 AS place
+            SELECT value, row_number() OVER (ORDER BY count(*) DESC, value) - 1 AS column_index
             FROM cases WHERE train_count > 0 AND value IS NOT NULL
-            GROUP BY value ORDER BY place LIMIT {CATEGORIES}
+            GROUP BY value ORDER BY column_index LIMIT {CATEGORIES}
         )
-        SELECT number, place FROM cases JOIN kept USING (value) ORDER BY number, place
+        SELECT number, column_index FROM cases JOIN kept USING (value)
+        ORDER BY number, column_index
     """).fetchnumpy()
-    size = int(found["place"].max()) + 1 if len(found["place"]) else 0
+    size = int(found["column_index"].max()) + 1 if len(found["column_index"]) else 0
     ones = np.ones(len(found["number"]), dtype=np.float32)
-    return _sparse(ones, found["number"], found["place"], (count, size))
+    return _sparse(ones, found["number"], found["column_index"], (count, size))
 
 
 def _sparse(values: Array, rows: Array, columns: Array, shape: tuple[int, int]) -> Features:

@@ -1,4 +1,4 @@
-"""What each user of a log was shown, from files or from a frame in memory."""
+"""The item history of each user of a log, from files or from a data frame."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -12,7 +12,7 @@ import pyarrow as pa
 from ucfrec import schema
 from ucfrec.errors import InputError
 from ucfrec.logs.binding import Table, explained, quoted
-from ucfrec.logs.clean import REASONS, CleanLog, judge_rows, read_log
+from ucfrec.logs.clean import REASONS, CleanLog, check_rows, read_log
 from ucfrec.logs.engine import engine, engine_in_memory
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.prepare import BATCH_ROWS
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     import pandas as pd
 
 HISTORIES: Final = "histories"
-"""Name of a frame in messages."""
+"""Name of a data frame in messages and in the engine."""
 
 
 @dataclass(frozen=True)
 class _Frame(Table):
-    """A frame in memory, under its name in the engine."""
+    """A data frame registered with the engine; `files` holds its name."""
 
     @property
     def sql(self) -> str:
@@ -42,20 +42,20 @@ def read_histories(
     memory_limit: str = "2GB",
     session_by: str = "user",
 ) -> Iterator[pa.RecordBatch]:
-    """What each user of a log was shown, cleaned as `prepare` cleans it.
+    """Read the history of each user of a log, cleaned as `prepare` cleans it.
 
     Args:
         paths: log files, folders and globs.
-        mapping: what their columns mean.
-        reward: scalar SQL expression over their columns.
-        last: how many of each user's most recent rows to give.
-        memory_limit: beyond it, rows spill to disk.
-        session_by: "session_id" gives `session_ids`, too.
+        mapping: log columns to the files' columns.
+        reward: scalar SQL expression over the files' columns.
+        last: most rows of each user, the most recent ones.
+        memory_limit: size such as "2GB", beyond which rows spill to disk.
+        session_by: with "session_id", batches have the column `session_ids`.
 
     Yields:
-        Batches of users in sorted order: `user_id`; `item_ids`, `rewards` (float32) and
-        `timestamps` (ms), lists of at most `last`, the most recent last; `seen`, all of the user's
-        item_ids, sorted; and, where it is logged, the most recent `observation`.
+        Batches of users in sorted order: `user_id`; `item_ids`, `rewards` (float32), `timestamps`
+        (ms) and perhaps `session_ids`, lists of at most `last` with the most recent last; `seen`,
+        all item ids of the user, sorted; and, if the log has it, the most recent `observation`.
 
     Raises:
         InputError: the input cannot be used.
@@ -71,44 +71,56 @@ def read_histories(
 def frame_histories(
     frame: "pd.DataFrame", mapping: LogMapping, reward: str, last: int, session_by: str = "user"
 ) -> Iterator[pa.RecordBatch]:
-    """The same of a log in memory, by the same rules and without touching the disk.
+    """`read_histories` of a log in memory, without using the disk.
 
-    Rows that `prepare` would drop are refused here, but for those that repeat a user, item and
-    time.
+    Of rows with the same user, item and time one is kept, as in `read_histories`; any other row
+    that `prepare` would drop is an error.
+
+    Args:
+        frame: one row per interaction.
+        mapping: log columns to the frame's columns.
+        reward: scalar SQL expression over the frame's columns.
+        last: most rows of each user, the most recent ones.
+        session_by: with "session_id", batches have the column `session_ids`.
+
+    Yields:
+        Batches as of `read_histories`.
 
     Raises:
-        InputError: `frame` is no frame or has no rows, a column is missing, doubled or of a wrong
-            type, or rows cannot be used.
+        InputError: `frame` is no data frame or has no rows, a column is missing, repeated or of a
+            wrong type, or a row cannot be used.
     """
     columns = log_table(frame, HISTORIES)
     with engine_in_memory() as connection:
         connection.register(HISTORIES, columns)
         described = connection.sql(f"DESCRIBE {HISTORIES}").fetchall()
         table = _Frame((Path(HISTORIES),), tuple((row[0], row[1]) for row in described))
-        log = judge_rows(connection, (table,), mapping, reward, session_by, None, Path(HISTORIES))
+        log = check_rows(connection, (table,), mapping, reward, session_by, None, Path(HISTORIES))
         _require_clean(log)
         with explained(connection, log.tables, Path(HISTORIES)):
             yield from _by_user(log, last)
 
 
 def log_table(frame: "pd.DataFrame", name: str) -> pa.Table:
-    """The columns of a frame of logs that a log file could hold.
+    """Convert a data frame to Arrow, leaving out columns of mixed Python objects.
 
     Args:
-        name: of the frame, in messages.
+        frame: one row per interaction.
+        name: name of the frame in messages.
 
     Raises:
-        InputError: it is no frame, has no rows, or two columns of one name.
+        InputError: `frame` is no data frame or has no rows, two columns have the same name, or a
+            key column has values of several types.
     """
     import pandas as pd
 
     if not isinstance(frame, pd.DataFrame):
         raise InputError(
-            f"{name}: a {type(frame).__name__} is not a pandas DataFrame; give one with a row for "
-            "every interaction"
+            f"{name}: a {type(frame).__name__} is not a pandas DataFrame; give one with one row "
+            "per interaction"
         )
     if frame.empty:
-        raise InputError(f"{name}: the frame has no rows; give one for every interaction")
+        raise InputError(f"{name}: the frame has no rows; give one row per interaction")
     names = Counter(str(column).casefold() for column in frame.columns)
     if twice := [column for column, n in names.items() if n > 1]:
         raise InputError(
@@ -124,7 +136,7 @@ def log_table(frame: "pd.DataFrame", name: str) -> pa.Table:
                 raise InputError(
                     f"{name}: {column} holds values of several types ({reason}); make them one"
                 ) from None
-            # Any other column of Python objects is none that a reward could be made of.
+            # A reward expression cannot use another column of mixed Python objects.
     return pa.table(columns)
 
 
@@ -139,7 +151,7 @@ def _require_clean(log: CleanLog) -> None:
 
 def _by_user(log: CleanLog, last: int) -> Iterator[pa.RecordBatch]:
     if log.key != schema.ITEM_ID:
-        raise InputError(f"{log.tables[0].files[0]}: its actions are vectors, not items")
+        raise InputError(f"{log.tables[0].files[0]}: its actions are vectors; map item_id instead")
     lists = {
         "item_ids": schema.ITEM_ID,
         "rewards": f"CAST({schema.REWARD} AS FLOAT)",

@@ -1,4 +1,4 @@
-"""What the columns of a log mean: mappings written as data, and the datasets that bring them."""
+"""Column mappings of logs, written as data, and the datasets that supply them."""
 
 import glob
 import tomllib
@@ -23,38 +23,39 @@ OPTIONAL_COLUMNS: Final = (
 
 @dataclass(frozen=True)
 class FeatureTable:
-    """Features of items or of users, one row each (but see `first_by`).
+    """Features of items or users, one row per item or user (but see `first_by`).
 
-    The type of a column says what it is: numbers are standardised, dates count as days, text and
-    booleans are categories, lists of text or integers are tags, lists of floats are vectors. A
-    cast makes a category of a number: `music_type::VARCHAR`.
+    The type of a column decides how it is encoded: numbers are standardised, dates count as days,
+    text and booleans are categories, lists of text or integers are tags, lists of floats are
+    vectors. A cast turns a number into a category: `music_type::VARCHAR`.
     """
 
     files: tuple[str | Path, ...]
     key: str
-    """Column (or SQL expression) equal to the log's item_id or user_id."""
+    """Column or SQL expression whose values are the item_id or user_id of the log."""
     columns: tuple[str, ...] = ()
-    """Columns or SQL expressions; none means all but the key."""
+    """Columns or SQL expressions; empty for all columns except the key."""
     first_by: str = ""
-    """Of rows that repeat a key, the one with the lowest value of this column or expression counts,
-    such as the first day of daily features; without it, keys may not repeat."""
+    """Of rows with the same key, keep the one with the lowest value of this column or expression,
+    e.g. the first day of daily features. Empty: a repeated key is an error."""
 
 
 @dataclass(frozen=True)
 class LogMapping:
-    """What the columns of a log mean.
+    """Which columns of the files are the log columns, the reward and the features.
 
     Example: `LogMapping({"item_id": "video_id", "timestamp": "time_s * 1000"}, reward="is_click")`.
     """
 
     columns: Mapping[str, str] = field(default_factory=dict)
-    """Log column of `ucfrec.schema` to a file's column or a SQL expression over its columns. What
-    is not named here has its own name in the file; "" says that the log has no such column. Times
-    are milliseconds, or dates and timestamps (UTC)."""
+    """Log column of `ucfrec.schema` to a column of the file or a SQL expression over its columns.
+    A log column that is not named here has the same name in the file; "" means that the log does
+    not have it. Times are milliseconds, or dates and timestamps (UTC)."""
     reward: str | None = None
-    """Reward unless `PrepareOptions` names another."""
+    """SQL expression of the reward; `PrepareOptions.reward` overrides it."""
     session_by: str | None = None
-    """How rows make sessions, unless `PrepareOptions` says: "session_id", "gap" or "user"."""
+    """How rows form sessions ("session_id", "gap" or "user"); `PrepareOptions.session_by` overrides
+    it."""
     item_features: tuple[FeatureTable, ...] = ()
     user_features: tuple[FeatureTable, ...] = ()
 
@@ -62,10 +63,10 @@ class LogMapping:
         known = (*KEY_COLUMNS, *OPTIONAL_COLUMNS)
         for name in self.columns:
             if name not in known:
-                raise InputError(f"{name!r} is no log column; those are {', '.join(known)}")
+                raise InputError(f"{name!r} is no log column; use one of {', '.join(known)}")
 
     def over(self, defaults: "LogMapping") -> "LogMapping":
-        """This mapping, with the fields of `defaults` where it leaves them empty."""
+        """This mapping, with its empty fields filled from `defaults`."""
         return LogMapping(
             {**defaults.columns, **self.columns},
             self.reward or defaults.reward,
@@ -82,14 +83,14 @@ class Dataset:
     summary: str
     """One line for `--help`."""
     resolve: Callable[[Sequence[str | Path], LogMapping], tuple[tuple[Path, ...], LogMapping]]
-    """(files, folders and globs, the user's own mapping) to (log files, full mapping)."""
+    """Maps (files, folders and globs; the user's mapping) to (log files; full mapping)."""
 
 
 def columns_given(assignments: Sequence[str]) -> dict[str, str]:
     """Read `--column` arguments: "user_id=uid" is {"user_id": "uid"}.
 
     Raises:
-        InputError: one of them has no "=".
+        InputError: an argument has no "=".
     """
     pairs: dict[str, str] = {}
     for assignment in assignments:
@@ -101,9 +102,9 @@ def columns_given(assignments: Sequence[str]) -> dict[str, str]:
 
 
 def read_mapping(path: Path) -> LogMapping:
-    """Read a mapping written in TOML.
+    """Read a TOML file with the fields of `LogMapping`.
 
-    It has the fields of `LogMapping`; files of features are relative to its folder::
+    Paths of feature files are relative to its folder::
 
         reward = "is_click"
         session_by = "gap"
@@ -149,20 +150,23 @@ def read_mapping(path: Path) -> LogMapping:
 
 
 def log_files(paths: Sequence[str | Path]) -> tuple[Path, ...]:
-    """Files that `paths` (files, folders, globs) stand for, each once, by name within a path.
+    """List the log files among files, folders and globs, each once.
+
+    Returns:
+        Files in the order of `paths`; those of one folder or glob by name.
 
     Raises:
-        InputError: one of them is missing, matches nothing, or is of an unknown kind.
+        InputError: a path is missing, matches no log file, or is a file of another kind.
     """
-    found: dict[Path, None] = {}
+    files: dict[Path, None] = {}
     for path in paths:
         matches = _matches(Path(path))
         if not matches:
             raise InputError(f"{path} matches no {' or '.join(SUFFIXES)} file; check the path")
-        found |= dict.fromkeys(matches)
-    if not found:
+        files |= dict.fromkeys(matches)
+    if not files:
         raise InputError("no log was named; give Parquet or CSV files, folders or globs")
-    return tuple(found)
+    return tuple(files)
 
 
 def _matches(path: Path) -> list[Path]:
@@ -178,5 +182,5 @@ def _matches(path: Path) -> list[Path]:
 
 
 def is_table(path: Path) -> bool:
-    """Whether the name is that of a file `prepare` reads."""
+    """Whether `path` is a file with a suffix that `prepare` reads."""
     return path.is_file() and path.name.endswith(SUFFIXES)

@@ -1,7 +1,7 @@
-"""Logs to episodes: Parquet and CSV files, cleaned, cut into sessions, written as a store.
+"""Turn Parquet and CSV logs into an episode store: clean rows, form sessions, write episodes.
 
-One SQL pipeline on an embedded DuckDB, out of core: rows are read and checked (`clean`), fall
-into sessions, and stream sorted into the store.
+One SQL pipeline on an embedded DuckDB, out of core: rows are read and checked (`clean`), grouped
+into sessions (`sessions`) and written in order to the store.
 """
 
 import hashlib
@@ -44,41 +44,46 @@ from ucfrec.logs.summary import build_report, drop_counts, require_variety
 from ucfrec.progress import progress
 
 BATCH_ROWS: Final = 2**17
+"""Rows of a batch read from DuckDB."""
 
 
 @dataclass(frozen=True)
 class PrepareOptions:
-    """How logs become episodes."""
+    """How `prepare` turns logs into episodes.
+
+    Raises:
+        InputError: a value is out of range.
+    """
 
     reward: str | None = None
-    """Scalar SQL expression over the files' columns; None for the mapping's, or `reward`. Where a
-    part of it is undefined (missing, NaN, infinite, division by zero), so is the reward, inside
-    `least` and `greatest` too; `coalesce` gives a default."""
+    """Scalar SQL expression over the files' columns; None for that of the mapping, else the column
+    `reward`. If a part of it is undefined (missing, NaN, infinite, division by zero), the reward is
+    undefined, even inside `least` and `greatest`; `coalesce` gives a default."""
     session_by: str | None = None
-    """"session_id", "gap" or "user" (one session each); None for the mapping's, or session_id where
-    the log has one, or gap."""
+    """"session_id", "gap" or "user" (one session per user); None for that of the mapping, else
+    session_id if the log has it, else gap."""
     gap_minutes: float = 30.0
-    """With "gap", a longer silence of the user ends the session."""
+    """With "gap": a longer pause of the user ends the session, in minutes."""
     min_steps: int = 1
-    """Shorter episodes are dropped."""
+    """Episodes with fewer steps are dropped."""
     split: tuple[float, ...] = (0.8, 0.1, 0.1)
-    """Three shares of the rows in order of time, or two times (ms) at which validation and test
-    begin."""
+    """Shares of the rows for train, validation and test in order of time, or the two times (ms) at
+    which validation and test begin."""
     embedding_size: int = 32
-    """Of items, at most."""
+    """Most dimensions of an item embedding."""
     memory_limit: str = "2GB"
-    """Beyond it, rows spill to disk."""
+    """Memory of DuckDB, e.g. "2GB"; beyond it, rows spill to disk."""
     temp_folder: Path | None = None
-    """Where rows spill; None for beside the store, or the system's when only checking."""
+    """Folder for spilled rows; None for the parent of the store (the system's for `validate`)."""
 
     def __post_init__(self) -> None:
         if self.session_by not in (None, *SESSIONS):
             raise InputError(f"session_by is {self.session_by!r}; use {', '.join(SESSIONS)}")
         if not self.gap_minutes > 0 or self.min_steps < 1 or self.embedding_size < 1:
-            raise InputError("gap_minutes, min_steps and embedding_size are above 0")
-        cuts = len(self.split) == 2 and self.split[0] <= self.split[1]
+            raise InputError("gap_minutes, min_steps and embedding_size must be above 0")
+        times = len(self.split) == 2 and self.split[0] <= self.split[1]
         shares = len(self.split) == 3 and min(self.split) >= 0 and self.split[0] > 0
-        if not cuts and not (shares and abs(sum(self.split) - 1) < 1e-9):
+        if not times and not (shares and abs(sum(self.split) - 1) < 1e-9):
             raise InputError(
                 f"split is {self.split}: give three shares that add up to 1, the first above 0, or "
                 "two times in order"
@@ -86,10 +91,13 @@ class PrepareOptions:
 
 
 def parse_split(given: str) -> tuple[float, ...]:
-    """Read "0.8,0.1,0.1", or the two times "2022-04-28,2022-04-29T12:00" (UTC), as a split.
+    """Read a split: "0.8,0.1,0.1", or two times "2022-04-28,2022-04-29T12:00" (UTC by default).
+
+    Returns:
+        Three shares, or two times in ms, as in `PrepareOptions.split`.
 
     Raises:
-        InputError: it is neither.
+        InputError: `given` is neither.
     """
     parts = given.split(",")
     try:
@@ -111,24 +119,27 @@ def prepare(
     like: Path | None = None,
     keep_unknown: bool = False,
 ) -> dict[str, Any]:
-    """Write the logs as an `EpisodeStore` at `out`, whole or not at all.
+    """Write the logs as an `EpisodeStore` at `out`, atomically.
 
     Users and items are those of the log and of the feature tables, in sorted order: rows of
     `users.parquet` (user_id) and `items.parquet` (item_id), each with its train_count. A session
-    that a boundary between splits falls into is cut there: its pieces are episodes, all but the
-    last not terminated. The same rows, in whatever order, give the same fingerprint.
+    that spans a split boundary is cut there: each piece is an episode, and only the last one is
+    terminated. The same rows give the same fingerprint in any order.
 
     Args:
         paths: log files, folders and globs.
-        like: a store, or a run on it, whose users, items and item states are taken over, to judge
-            a policy trained on it by other logs. Rows with items it does not know are dropped
-            unless `keep_unknown` says to keep them, as item −1;
-            users it does not know have number −1 (`episode_users.parquet` names the user of every
-            episode), and all episodes are uncut and of the split "train".
+        mapping: log columns to the files' columns.
+        out: new folder for the store.
+        options: None for the defaults.
+        like: a store, or a run trained on it, whose users, items and item states are reused, to
+            evaluate the policy on other logs. Rows with other items are dropped, other users have
+            number −1 (`episode_users.parquet` has the user of every episode), and every session is
+            one episode of the split "train".
+        keep_unknown: with `like`, keep rows with other items, as item −1.
 
     Returns:
-        What was read, dropped and written, for `format_report`; also in the store's `meta.json`
-        under "source".
+        Counts of what was read, dropped and written, for `format_report`; also in the store's
+        `meta.json` under "source".
 
     Raises:
         InputError: the input cannot be used, `out` exists, or the disk is full.
@@ -163,10 +174,15 @@ def prepare(
 def validate(
     paths: Sequence[str | Path], mapping: LogMapping, options: PrepareOptions | None = None
 ) -> dict[str, Any]:
-    """Check the logs as `prepare` does, and write nothing.
+    """Check the logs as `prepare` does, without writing a store.
+
+    Args:
+        paths: log files, folders and globs.
+        mapping: log columns to the files' columns.
+        options: None for the defaults.
 
     Returns:
-        The report that `prepare` would give.
+        The report that `prepare` would return.
 
     Raises:
         InputError: the input cannot be used.
@@ -178,7 +194,7 @@ def validate(
 
 
 Features = dict[str, list[str]]
-"""By id column, the DuckDB tables that hold features."""
+"""Id column to the names of its DuckDB feature tables."""
 
 
 @contextmanager
@@ -190,11 +206,11 @@ def _episodes(
     like: Path | None,
     keep_unknown: bool = False,
 ) -> Iterator[tuple[CleanLog, dict[str, Any], Features]]:
-    """The log in sessions, what there is to report of it, and the features."""
+    """The log with its table `steps`, the report on it, and the feature tables."""
     reward = options.reward or mapping.reward or schema.REWARD
     session_by = options.session_by or mapping.session_by
     known = None if like is None or keep_unknown else like / ITEMS_FILE
-    inputs = (*files, *_further_inputs(mapping, like))
+    inputs = (*files, *_other_inputs(mapping, like))
     with engine(inputs, spill, options.memory_limit) as connection:
         with progress(4, "check the logs", "stages") as stage:
             log = read_log(connection, files, mapping, reward, session_by, known, spill)
@@ -223,8 +239,8 @@ def _episodes(
         yield log, report, features
 
 
-def _further_inputs(mapping: LogMapping, like: Path | None) -> Iterator[Path]:
-    """Files that are read beside the logs."""
+def _other_inputs(mapping: LogMapping, like: Path | None) -> Iterator[Path]:
+    """Files that are read in addition to the logs."""
     if like is not None:
         yield from (like / file for _, _, file in ID_TABLES)
         return
@@ -246,7 +262,7 @@ def _append(writer: StoreWriter, batch: pa.RecordBatch, log: CleanLog) -> None:
 
 
 def _write_ids(log: CleanLog, folder: Path) -> dict[str, list[Any]]:
-    """Write the tables of users and items; returns a digest of each for the fingerprint."""
+    """Write `users.parquet` and `items.parquet`; returns a digest of each for the fingerprint."""
     digests: dict[str, list[Any]] = {}
     for name, table, file in ID_TABLES:
         if name not in log.columns:
@@ -261,7 +277,7 @@ def _write_ids(log: CleanLog, folder: Path) -> dict[str, list[Any]]:
 
 
 def _copy(log: CleanLog, query: str, file: Path) -> None:
-    # Not by DuckDB's COPY: it may write nowhere but in its scratch folder.
+    # DuckDB's COPY cannot write here: its connection may open only the scratch folder.
     reader = log.connection.sql(query).to_arrow_reader(BATCH_ROWS)
     with pq.ParquetWriter(file, reader.schema) as writer:
         for batch in reader:
@@ -271,8 +287,8 @@ def _copy(log: CleanLog, query: str, file: Path) -> None:
 def _write_states(
     log: CleanLog, folder: Path, features: Features, size: int, like: Path | None
 ) -> None:
-    """Learn how states are made of items, or take it over from the store `like`."""
-    # torch and scikit-learn take seconds: only here, and never to check a log.
+    """Learn the item states, or copy those of the store `like`."""
+    # Importing torch and scikit-learn takes seconds, which only checking a log must not cost.
     from ucfrec.episodes.store import ITEM_STATES
     from ucfrec.logs.features import encode_features
     from ucfrec.logs.items import write_item_states

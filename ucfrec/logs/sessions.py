@@ -1,4 +1,4 @@
-"""The SQL that cuts clean log rows into episodes and numbers their users and items."""
+"""SQL that cuts clean log rows into episodes and numbers their users and items."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,54 +16,62 @@ ID_TABLES: Final = (
     (schema.USER_ID, "users", USERS_FILE),
     (schema.ITEM_ID, "items", ITEMS_FILE),
 )
-"""Id column, its table of numbers, and that table's file in the store."""
+"""Id column, its DuckDB table of ids and numbers, and the file of that table in the store."""
 SESSIONS: Final = (schema.SESSION_ID, "gap", "user")
+"""Ways in which rows form sessions."""
 
 
 @dataclass(frozen=True)
 class Cut:
-    """How rows fall into episodes."""
+    """How rows form episodes."""
 
     session_by: str
+    """One of `SESSIONS`."""
     gap_ms: int
+    """With "gap": a longer pause (ms) ends the session."""
     min_steps: int
+    """Episodes with fewer steps are dropped."""
     bounds: tuple[int, int]
-    """Times (ms) at which validation and test begin."""
+    """Times (ms) at which the validation and the test split begin."""
 
 
 def split_bounds(log: CleanLog, split: tuple[float, ...]) -> tuple[int, int]:
-    """Times at which validation and test begin.
+    """Times (ms) at which the validation and the test split begin.
 
     Args:
-        split: three shares of the rows in order of time, or the two times.
+        log: clean log.
+        split: three shares of the rows in order of time, or the two times (ms).
     """
     if len(split) == 2:
         return int(split[0]), int(split[1])
     (rows, last) = log.one(f"SELECT count(*), max({schema.TIMESTAMP}) FROM clean")
-    places = [round(rows * split[0]), round(rows * (split[0] + split[1]))]
-    # An exact quantile in bounded memory: the aggregate would hold every time.
+    positions = [round(rows * split[0]), round(rows * (split[0] + split[1]))]
+    # An exact quantile in bounded memory: DuckDB's aggregate would keep every time in memory.
     begin, end = (
         last + 1
-        if place >= rows
+        if position >= rows
         else log.one(
             f"SELECT {schema.TIMESTAMP} FROM clean ORDER BY {schema.TIMESTAMP} "
-            f"LIMIT 1 OFFSET {place}"
+            f"LIMIT 1 OFFSET {position}"
         )[0]
-        for place in places
+        for position in positions
     )
     return begin, end
 
 
 def cut_episodes(log: CleanLog, cut: Cut) -> None:
-    """Make the table `steps`: rows that stay, with `split`, `starts` (of a session), `first` (of an
-    episode), `episode` (number within the user) and `terminated`.
+    """Create the table `steps` of the rows in episodes of `cut.min_steps` or more.
+
+    It has the columns of `clean` except `row`, and `split` (0 train, 1 validation, 2 test),
+    `starts` (first step of a session), `first` (first step of an episode), `episode` (number within
+    the user) and `terminated`.
 
     Raises:
-        InputError: nothing stays, or nothing of the training window.
+        InputError: no episode remains, or none in the training split.
     """
     time, user = schema.TIMESTAMP, schema.USER_ID
     if cut.session_by == schema.SESSION_ID:
-        # Sessions of one user may overlap: each is kept together, placed by its first row.
+        # Sessions of one user may overlap: each stays whole, ordered by its first row.
         source = (
             f"SELECT *, min({time}) OVER (PARTITION BY {user}, {schema.SESSION_ID}) AS began "
             "FROM clean"
@@ -105,23 +113,24 @@ def cut_episodes(log: CleanLog, cut: Cut) -> None:
         )
     if training == 0:
         raise InputError(
-            f"no row falls into the training window (before {cut.bounds[0]} ms); move the split"
+            f"no row is in the training split (before {cut.bounds[0]} ms); choose a later split"
         )
 
 
 def number_ids(log: CleanLog, listed: dict[str, list[str]], like: Path | None) -> None:
-    """Make the tables `users` and `items`: id, its `number` in sorted order, `train_count`.
+    """Create the tables `users` and `items`: id, its `number` in sorted order, `train_count`.
 
     Args:
-        listed: tables with a column `id` that list further users and items, by log column.
-        like: a store whose numbers are taken over instead.
+        log: log with the table `steps`.
+        listed: log column to feature tables whose column `id` lists more users or items.
+        like: a store whose numbers are reused instead (without `train_count`); None for none.
     """
     for name, table, file in ID_TABLES:
         if name not in log.columns:
             continue
         if like is not None:
             source = f"read_parquet({text(glob_pattern(like / file))}, file_row_number = true)"
-            # The store's ids may be integers where these are text, or the other way round.
+            # Ids may be integers in the store and text in the log, or vice versa.
             known = f"TRY_CAST({name} AS {log.id_type(name)}) AS {name}"
             log.connection.execute(
                 f"CREATE TABLE {table} AS SELECT {known}, file_row_number AS number FROM {source}"
@@ -140,7 +149,7 @@ def number_ids(log: CleanLog, listed: dict[str, list[str]], like: Path | None) -
 
 
 def ordered_steps(log: CleanLog) -> str:
-    """The query that gives the steps in the order of the store, numbers in place of ids."""
+    """Query of the steps in the order of the store, with numbers in place of ids."""
     columns = ["coalesce(users.number, -1) AS user", "split", "terminated", "first"]
     joins = f"LEFT JOIN users USING ({schema.USER_ID})"
     if log.key == schema.ITEM_ID:
@@ -156,5 +165,5 @@ def ordered_steps(log: CleanLog) -> str:
 
 
 def episode_users() -> str:
-    """The query that gives the user of every episode, in the order of the store."""
+    """Query of the user of every episode, in the order of the store."""
     return f"SELECT {schema.USER_ID} FROM steps WHERE first ORDER BY {schema.USER_ID}, episode"

@@ -1,4 +1,4 @@
-"""What `prepare` read, dropped and kept, as a dictionary and as a table."""
+"""Report on what `prepare` read, dropped and kept, as a dictionary and as a text table."""
 
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -10,19 +10,21 @@ from ucfrec.logs.clean import REASONS, CleanLog
 from ucfrec.logs.distributions import distributions
 from ucfrec.logs.sessions import Cut
 
-CONFLICT: Final = "of these have another reward than the row kept: the highest is kept"
-"""How rows that repeat a key but differ are settled; ties go by the other columns."""
+CONFLICT: Final = "duplicates with a different reward from the kept row, which has the highest"
+"""Describes `conflicting_duplicates` of the report."""
 
 
 def drop_counts(log: CleanLog) -> dict[str, int]:
-    """Rows dropped by reason.
+    """Number of dropped rows for each of `ucfrec.logs.clean.REASONS`.
 
     Raises:
-        InputError: none is left.
+        InputError: every row is dropped.
     """
-    found = dict(log.connection.sql("SELECT reason, count(*) FROM rows GROUP BY reason").fetchall())
-    dropped = {reason: int(found.get(reason, 0)) for reason in REASONS}
-    if None not in found:
+    counts = dict(
+        log.connection.sql("SELECT reason, count(*) FROM rows GROUP BY reason").fetchall()
+    )
+    dropped = {reason: int(counts.get(reason, 0)) for reason in REASONS}
+    if None not in counts:
         reasons = "; ".join(f"{n} rows: {REASONS[reason]}" for reason, n in dropped.items() if n)
         hint = "; is the time in milliseconds?" if dropped["clock_out_of_range"] else ""
         raise InputError(
@@ -32,7 +34,7 @@ def drop_counts(log: CleanLog) -> dict[str, int]:
 
 
 def require_variety(log: CleanLog) -> None:
-    """Check that rewards differ.
+    """Check that the clean rows do not all have the same reward.
 
     Raises:
         InputError: all rewards are equal.
@@ -52,7 +54,7 @@ def _named(log: CleanLog) -> str:
 
 
 def count_unsorted(log: CleanLog) -> int:
-    """Rows earlier than a row of the same user before them in the files."""
+    """Number of rows that follow a later row of the same user in the files."""
     (unsorted,) = log.one(f"""
         SELECT count(*) FILTER (WHERE {schema.TIMESTAMP} < latest) FROM (
             SELECT {schema.TIMESTAMP}, max({schema.TIMESTAMP}) OVER (
@@ -65,7 +67,16 @@ def count_unsorted(log: CleanLog) -> int:
 
 
 def build_report(log: CleanLog, cut: Cut, dropped: Mapping[str, int]) -> dict[str, Any]:
-    """Figures of the tables `rows`, `clean` and `steps`, all of them JSON-able."""
+    """Counts and statistics of the tables `rows`, `clean` and `steps`, as JSON values.
+
+    Times are in ms, `reward_statistics` in units of the reward; `summary` is of
+    `ucfrec.logs.distributions`.
+
+    Args:
+        log: log with the table `steps`.
+        cut: how its episodes were cut.
+        dropped: result of `drop_counts`.
+    """
     read, conflicts = log.one("SELECT count(*), count_if(conflict) FROM rows")
     (clean,) = log.one("SELECT count(*) FROM clean")
     steps, episodes, users, sessions, cuts, first_ms, last_ms = log.one(f"""
@@ -110,7 +121,7 @@ def build_report(log: CleanLog, cut: Cut, dropped: Mapping[str, int]) -> dict[st
 
 
 def format_report(report: Mapping[str, Any]) -> str:
-    """The report as a short table."""
+    """The report of `prepare` as a text table with one count per line."""
     reward = report["reward_statistics"]
     lines = [("rows read", f"{report['rows_read']:,} from {len(report['files'])} file(s)")]
     for reason, rows in report["dropped"].items():

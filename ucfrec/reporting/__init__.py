@@ -1,1 +1,1 @@
-"""Tables, charts and the report page."""
+"""Result rows, tables, charts and the report page."""

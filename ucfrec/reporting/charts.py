@@ -1,4 +1,4 @@
-"""Charts as geometry: what the report's template draws as SVG."""
+"""Chart geometry that the report's template draws as SVG; lengths are in SVG user units."""
 
 import math
 import textwrap
@@ -7,26 +7,27 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 WIDTH, HEIGHT = 360, 220
-"""Of line charts and histograms, in units of the drawing; bar charts are as wide. About as wide as
-a phone, so that text keeps its size there."""
+"""Size of line charts and histograms; bar charts have the same width. A phone is about as wide, so
+that text is not scaled there."""
 LEFT, RIGHT, TOP, BOTTOM = 52, 22, 16, 40
-"""Margins around what is plotted."""
+"""Margins around the plot area."""
 BAR_BOTTOM = 26
-"""Of bar charts, whose axis needs no name."""
+"""Bottom margin of bar charts, whose axis has no label."""
 LEFT_OF_BARS = 14
-"""Margin at both sides of a bar chart, whose names stand above their bars."""
+"""Left and right margin of bar charts, whose names are above the bars."""
 NAME, _BAR, _GAP = 16, 18, 10
-"""Height of a line of a bar's name, of the bar, and of the space below it."""
+"""Heights of one line of a bar's name, of the bar, and of the gap below it."""
 _NAME_CHARACTERS = 48
+"""Most characters in a line of a bar's name."""
 _LABEL = 14
 """Height of a label."""
 _X_LABELS = 6
-"""Labels below a histogram, at most."""
+"""Most labels below a histogram."""
 
 
 @dataclass(frozen=True)
 class Tick:
-    """A value on an axis and where it is drawn."""
+    """A labelled position on an axis."""
 
     at: float
     label: str
@@ -37,26 +38,26 @@ class Line:
     """One curve."""
 
     summary: str
-    """Its name, ends and lowest value, for those who cannot see it."""
+    """Text alternative: name, first, last and lowest value."""
     style: int
-    """Color and dashes; a run has the same in all charts."""
+    """Number of the color and dashes; a run has the same in all charts."""
     points: str
-    """As SVG takes them."""
+    """Value of the SVG attribute `points`."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """A value that curves are compared with, drawn across."""
+    """A reference value, drawn as a horizontal line."""
 
     y: float
     label: str
     label_y: float
-    """Above the line, or below it where another label stands above."""
+    """Baseline of the label: above the line, or below it if another label is there."""
 
 
 @dataclass(frozen=True)
 class LineChart:
-    """Curves over one pair of axes."""
+    """Curves that share axes."""
 
     title: str
     x_label: str
@@ -68,10 +69,10 @@ class LineChart:
 
 @dataclass(frozen=True)
 class Bar:
-    """A value and its interval, drawn along x under its name."""
+    """A horizontal bar with an interval, drawn below its name."""
 
     name: tuple[str, ...]
-    """In lines."""
+    """Lines of the name."""
     summary: str
     top: float
     y: float
@@ -84,7 +85,7 @@ class Bar:
 
 @dataclass(frozen=True)
 class BarChart:
-    """Bars that share an axis with 0 on it."""
+    """Bars that share an axis, which includes 0."""
 
     title: str
     height: float
@@ -107,7 +108,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Histogram:
-    """Counts of neighbouring bins, all drawn equally wide."""
+    """Counts of consecutive bins, all drawn with the same width."""
 
     title: str
     summary: str
@@ -118,12 +119,12 @@ class Histogram:
 
 
 class _Scale:
-    """Values to places, linearly, with ticks at round values."""
+    """Linear map from values to positions, with ticks at round values."""
 
     def __init__(self, values: Iterable[float], start: float, end: float) -> None:
-        known = list(values)
-        low, high = min(known), max(known)
-        if low == high:  # one value alone lies in the middle
+        listed = list(values)
+        low, high = min(listed), max(listed)
+        if low == high:  # a single value is drawn in the middle
             low, high = low - (abs(low) or 1.0) / 2, high + (abs(high) or 1.0) / 2
         self._step = _round_step((high - low) / 4)
         self._low = math.floor(low / self._step) * self._step
@@ -141,7 +142,7 @@ class _Scale:
 
 
 def _label(value: float, step: float) -> str:
-    """A value of an axis whose ticks are `step` apart; in thousands or millions if all are."""
+    """Label of a tick; in thousands or millions if the distance `step` of the ticks is."""
     for size, unit in ((1e6, "M"), (1e3, "k")):
         if step >= size and value:
             return f"{value / size:,.0f}{unit}"
@@ -149,7 +150,7 @@ def _label(value: float, step: float) -> str:
 
 
 def _round_step(least: float) -> float:
-    """The smallest of 1, 2 and 5 times a power of ten that is `least` or more."""
+    """The smallest number ≥ `least` that is 1, 2 or 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(least))
     return next(m * power for m in (1, 2, 5, 10) if m * power >= least * (1 - 1e-9))
 
@@ -160,10 +161,13 @@ def line_chart(
     curves: Sequence[tuple[str, int, Mapping[float, float]]],
     levels: Mapping[str, float] | None = None,
 ) -> LineChart:
-    """Curves (name, style, {x: y}) overlaid; each has a point at least, and y is finite.
+    """Draw curves in one chart.
 
     Args:
-        levels: finite values to compare the curves with, by name.
+        title: title of the chart.
+        x_label: label of the x-axis.
+        curves: (name, style, {x: y}) of each; at least one point, y finite.
+        levels: name to a finite reference value, drawn as a horizontal line.
     """
     levels = levels or {}
     values = [value for _, _, curve in curves for value in curve.values()]
@@ -189,13 +193,18 @@ def _line(name: str, style: int, curve: Mapping[float, float], x: _Scale, y: _Sc
         f"{name}: {ordered[0][1]:.4g} at {ordered[0][0]:g}, {ordered[-1][1]:.4g} at "
         f"{ordered[-1][0]:g}, lowest {lowest[1]:.4g} at {lowest[0]:g}"
     )
-    # The first point comes twice: a lone point is then a stroke of no length, drawn as a dot.
-    places = [f"{x.at(at)},{y.at(value)}" for at, value in (ordered[0], *ordered)]
-    return Line(summary, style, " ".join(places))
+    # The first point is repeated, so that a single point is a line of length 0, drawn as a dot.
+    positions = [f"{x.at(at)},{y.at(value)}" for at, value in (ordered[0], *ordered)]
+    return Line(summary, style, " ".join(positions))
 
 
 def bar_chart(title: str, bars: Sequence[tuple[str, float, float, float]]) -> BarChart:
-    """Bars (name, value, low, high) one below the other, each under its whole name."""
+    """Draw horizontal bars one below the other.
+
+    Args:
+        title: title of the chart.
+        bars: (name, value, low, high) of each, with the ends of its 95% interval.
+    """
     values = [0.0, *(end for bar in bars for end in bar[1:])]
     x = _Scale(values, LEFT_OF_BARS, WIDTH - LEFT_OF_BARS)
     drawn, top = [], float(TOP)
@@ -216,11 +225,14 @@ def histogram(
     edges: Sequence[float] | None = None,
     values: Sequence[float] | None = None,
 ) -> Histogram:
-    """Columns of `counts` (N,), all equally wide: bins that widen show a long tail.
+    """Draw counts as columns of equal width, whatever the width of their bins.
 
     Args:
-        edges: (N + 1,) of the bins, rising; the left one belongs to the bin, the right one not.
-        values: (N,) what is counted, where there are no bins.
+        title: title of the chart.
+        x_label: label of the x-axis.
+        counts: (N,).
+        edges: (N + 1,) ascending bin edges; a bin includes its left edge but not its right one.
+        values: (N,) counted values, instead of `edges`.
     """
     y = _Scale([0.0, *counts], HEIGHT - BOTTOM, TOP)
     width = (WIDTH - LEFT - RIGHT) / len(counts)
@@ -238,7 +250,7 @@ def histogram(
         )
         for i, (name, count) in enumerate(zip(names, counts, strict=True))
     )
-    # Edges are labelled where they lie, values below the middle of their column.
+    # Labels of edges are at the edges, those of values below the middle of their column.
     labels, shift = (edges, 0.0) if edges is not None else (values or (), width / 2)
     labelled = range(0, len(labels), -(-len(labels) // _X_LABELS))
     ticks = tuple(Tick(round(LEFT + i * width + shift, 2), _short(labels[i])) for i in labelled)

@@ -1,4 +1,4 @@
-"""Reward model and edited copies, as the report shows them."""
+"""Table and chart of the reward model and edited copies in the report."""
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -12,7 +12,7 @@ Report = Mapping[str, Any]
 
 
 def copies_table(runs: Sequence[tuple[str, Report]]) -> Table:
-    """What the edited copies of runs, by name, rest on."""
+    """Quality of the reward model and of the edits, one column per run (name, report)."""
     reports = [report for _, report in runs]
     models, moves = [r["reward_model"] for r in reports], [r["moves"] for r in reports]
     rows: list[tuple[str, list[Any]]] = [
@@ -35,19 +35,19 @@ def copies_table(runs: Sequence[tuple[str, Report]]) -> Table:
         ("median length of a move ‖Δ‖₂", [m["length_quantiles"].get("0.5") for m in moves]),
     ]  # fmt: skip
     body = [(name, [shown(value) for value in values]) for name, values in rows]
-    caption = "What the edited copies rest on, on held-out steps; δ, ε_r in units of the reward"
+    caption = "Reward model and edited copies, on held-out steps; δ, ε_r in units of the reward"
     return Table(caption, "", [name for name, _ in runs], body)
 
 
 def moves_chart(runs: Sequence[tuple[str, int, Report]]) -> charts.LineChart | None:
-    """Distribution of ‖Δ‖₂ in runs (name, style, report); None without any edit."""
+    """Distribution of the edit length ‖Δ‖₂ in runs (name, style, report); None without any edit."""
     curves = []
     for name, style, report in runs:
         moves = report["moves"]
         if not moves["edits"]:
             continue
-        middles = [(a + b) / 2 for a, b in pairwise(moves["histogram_edges"])]
+        centers = [(a + b) / 2 for a, b in pairwise(moves["histogram_edges"])]
         shares = [count / moves["edits"] for count in moves["histogram_counts"]]
-        curves.append((name, style, dict(zip(middles, shares, strict=True))))
+        curves.append((name, style, dict(zip(centers, shares, strict=True))))
     title = "Accepted edits by the length of their move"
     return charts.line_chart(title, "‖Δ‖₂", curves) if curves else None

@@ -1,4 +1,4 @@
-"""What `prepare` read, dropped and kept, as the report shows it."""
+"""Tables and charts of what `prepare` read, dropped and kept."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ _DISTRIBUTIONS = {
     "rewards": ("Steps by reward", "reward"),
     "item_popularity": ("Items by popularity", "steps that show the item"),
 }
-"""Title and x-axis of what `prepare` summarises, by its name there."""
-_MIDDLE = ("0", "0.25", "0.5", "0.75", "0.99", "1")
+"""Name of a distribution in the `summary` of `prepare` to its title and x-axis label."""
+_LEVELS = ("0", "0.25", "0.5", "0.75", "0.99", "1")
 _COUNTS = {
     "rows_read": "rows read",
     "unsorted_rows": "rows out of order (sorted)",
@@ -29,35 +29,35 @@ _COUNTS = {
 
 @dataclass(frozen=True)
 class DataQuality:
-    """Tables and pictures of the rows that a store was made of."""
+    """Tables and charts of the logs that a store was made from."""
 
     rows: Table | None
-    """None where nothing is recorded: runs from before, and stores not made by `prepare`."""
+    """None if nothing is recorded, as for stores not made by `prepare`."""
     dropped: Table | None
     quantiles: Table | None
     pictures: list[tuple[charts.Histogram, Table]]
 
 
 def data_quality(record: Mapping[str, Any]) -> DataQuality:
-    """From the record of a run."""
+    """Tables and charts from the record of a run (`read_record`)."""
     source = record.get("data") or {}
     if "rows_read" not in source:
         return DataQuality(None, None, None, [])
     rows = [(name, [shown(source[key])]) for key, name in _COUNTS.items() if key in source]
     summary = source.get("summary") or {}
-    found = {name: summary[name] for name in _DISTRIBUTIONS if name in summary}
+    distributions = {name: summary[name] for name in _DISTRIBUTIONS if name in summary}
     return DataQuality(
         Table("Rows of the logs", "", ["count"], rows),
         _dropped(source["dropped"], source["rows_read"]),
-        _quantiles(found),
-        [_picture(name, one) for name, one in found.items() if any(one["counts"])],
+        _quantiles(distributions),
+        [_picture(name, one) for name, one in distributions.items() if any(one["counts"])],
     )
 
 
 def _dropped(dropped: Mapping[str, int], read: int) -> Table:
     reasons = {
         **REASONS,
-        "short_episode": "its session, or the piece of it in one split, is too short",
+        "short_episode": "its session, or the part of it in one split, is too short",
     }
     body = [
         (
@@ -69,10 +69,10 @@ def _dropped(dropped: Mapping[str, int], read: int) -> Table:
     return Table("Rows dropped, by reason", "", ["rows", "share of rows read"], body)
 
 
-def _quantiles(found: Mapping[str, Mapping[str, Any]]) -> Table | None:
+def _quantiles(distributions: Mapping[str, Mapping[str, Any]]) -> Table | None:
     body = [
-        (_DISTRIBUTIONS[name][0], [shown(one["quantiles"].get(level)) for level in _MIDDLE])
-        for name, one in found.items()
+        (_DISTRIBUTIONS[name][0], [shown(one["quantiles"].get(level)) for level in _LEVELS])
+        for name, one in distributions.items()
     ]
     columns = ["smallest", "25%", "median", "75%", "99%", "largest"]
     return Table("Quantiles", "", columns, body) if body else None

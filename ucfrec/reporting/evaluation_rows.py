@@ -1,4 +1,4 @@
-"""What `ucfrec evaluate` and the demo measured, as result rows and back."""
+"""Convert rows of `ucfrec evaluate` and `ucfrec demo` to result rows and back."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,20 +9,22 @@ from ucfrec.files import read_json
 from ucfrec.reporting.result_row import ResultRow, RowKey, row_from_json
 from ucfrec.reporting.rows_file import read_lines
 
-_ABOUT: Final = (
+_NOT_METRICS: Final = (
     *("world", "policy", "seed", "train_seed", "fingerprint", "config", "wall_time_s"),
     *("command", "commit", "versions", "target_return", "run", "checkpoint"),
 )
-"""Keys of an evaluation that are no numbers of its episodes."""
+"""Keys of an evaluation row that are not statistics of its episodes."""
 
 
-def evaluation_row(found: Mapping[str, Any], key: RowKey, **more: Any) -> ResultRow:
-    """A row of `ucfrec.evaluation.evaluate` as the result row of a measurement.
+def evaluation_row(evaluation: Mapping[str, Any], key: RowKey, **more: Any) -> ResultRow:
+    """Convert a row of `ucfrec.evaluation.evaluate` to the result row of a measurement.
 
     Args:
-        more: further fields of the row, or others than `found` has.
+        evaluation: row with R_cum, its interval, the other metrics and their origin.
+        key: the measurement.
+        more: further fields of the result row; they override those of `evaluation`.
     """
-    numbers = {k: v for k, v in found.items() if k not in _ABOUT and v is not None}
+    numbers = {k: v for k, v in evaluation.items() if k not in _NOT_METRICS and v is not None}
     low, high = numbers.pop("R_cum_low"), numbers.pop("R_cum_high")
     episodes = numbers.pop("episodes")
     given = vars(key) | {
@@ -30,15 +32,15 @@ def evaluation_row(found: Mapping[str, Any], key: RowKey, **more: Any) -> Result
         "metric": "R_cum",
         "metrics": numbers,
         "interval": (low, high),
-        "world": found["world"],
-        "target_return": found.get("target_return"),
-        **{name: found[name] for name in ("wall_time_s", "command", "commit", "versions")},
+        "world": evaluation["world"],
+        "target_return": evaluation.get("target_return"),
+        **{name: evaluation[name] for name in ("wall_time_s", "command", "commit", "versions")},
     }
     return ResultRow(**given | more)
 
 
 def as_evaluation(row: ResultRow) -> dict[str, Any]:
-    """A result row with the keys of `ucfrec evaluate --json`: `seed` is that of the evaluation."""
+    """A result row with the keys of `ucfrec evaluate --json`; `seed` is the evaluation seed."""
     return {
         **row.as_line(),
         "world": row.world or row.task,
@@ -52,17 +54,22 @@ def as_evaluation(row: ResultRow) -> dict[str, Any]:
 
 
 def read_evaluations(path: Path) -> list[Any]:
-    """Rows with the keys of `ucfrec evaluate --json`, from its JSON, the demo's, JSON lines of such
-    rows, or a file of result rows; what else their values are is not looked at.
+    """Read rows with the keys of `ucfrec evaluate --json`; their values are not checked.
+
+    Args:
+        path: JSON of `ucfrec evaluate` or `ucfrec demo`, or JSON lines (.jsonl) of such rows or of
+            result rows.
 
     Raises:
-        InputError: the file is missing or holds no list.
+        InputError: the file is missing, is not JSON, or does not hold a list.
     """
     if path.suffix == ".jsonl" and path.exists():
         return [_evaluation(value, f"{path}, line {n}") for n, value in read_lines(path)]
     rows = read_json(path)
     if not isinstance(rows, list):
-        raise InputError(f"{path} holds no list of result rows; give what `ucfrec evaluate` wrote")
+        raise InputError(
+            f"{path} holds no list of result rows; give a file that `ucfrec evaluate` wrote"
+        )
     return rows
 
 

@@ -1,4 +1,4 @@
-"""Many measurements, side by side and resumable: what every benchmark is run through."""
+"""Run the measurements of a benchmark in parallel processes, resumably."""
 
 import json
 import multiprocessing
@@ -21,19 +21,19 @@ Cell = TypeVar("Cell")
 
 @dataclass(frozen=True)
 class Measurement(Generic[Cell]):
-    """How the cells of a benchmark are measured; its functions are those of modules."""
+    """How the cells of a benchmark are measured, by picklable (module-level) functions."""
 
     key: Callable[[Cell], RowKey]
-    """What tells a cell's rows from all others, but for the hash of its configuration."""
+    """Identifies the cell's rows among all others; `config_hash` is filled in by `run_grid`."""
     config: Callable[[Cell], Mapping[str, Any] | None]
-    """The configuration of the cell's training; None where nothing is trained."""
+    """Training configuration of the cell; None if nothing is trained."""
     measure: Callable[[Cell, RowKey], list[ResultRow]]
-    """The cell's rows, each with the key given; runs in a process of one thread."""
+    """Measures the cell; returns its rows, all with the given key. Runs in a one-thread process."""
 
 
 @dataclass(frozen=True)
 class _Task(Generic[Cell]):
-    """A cell on its way to a process."""
+    """A cell to be measured in a worker process."""
 
     cell: Cell
     key: RowKey
@@ -50,19 +50,24 @@ def run_grid(
     workers: int,
     describe: str = "benchmark",
 ) -> list[ResultRow]:
-    """Measure every cell that has no row in `results` yet; returns the rows of all, in order.
+    """Measure every cell that has no row in `results` yet.
 
-    A cell's rows are appended as soon as it is measured, so an interruption loses none. A cell that
-    fails does not stop the others: it is reported when they are done. Cells with the same key are
-    measured once, also where several processes share `results`.
+    The rows of a cell are appended as soon as it is measured, so an interruption loses none. A cell
+    that fails does not stop the others and is reported at the end. Cells with the same key are
+    measured once, even if several processes share `results`.
 
     Args:
-        cells: picklable.
-        results: JSON lines; rows of other measurements in it are left alone.
-        workers: processes.
+        cells: picklable cells.
+        how: how a cell is measured.
+        results: file of result rows (JSON lines); its other rows are kept.
+        workers: number of worker processes.
+        describe: name of the benchmark in progress output.
+
+    Returns:
+        The rows of all cells, in the order of `cells`.
 
     Raises:
-        InputError: `results` holds something else, or cells failed.
+        InputError: a line of `results` is no result row, or at least one cell failed.
     """
     tasks: dict[str, _Task[Cell]] = {}
     for cell in cells:
@@ -80,8 +85,8 @@ def run_grid(
         found |= measured
         if failed:
             raise InputError(
-                f"{len(failed)} of {len(missing)} cells failed; the same command tries them again. "
-                f"The first: {failed[0]}"
+                f"{len(failed)} of {len(missing)} cells failed; run the command again to retry "
+                f"them. The first: {failed[0]}"
             )
     return [row for rows in found.values() for row in rows]
 
@@ -89,7 +94,7 @@ def run_grid(
 def _measure_all(
     tasks: Mapping[str, _Task[Cell]], workers: int, describe: str
 ) -> tuple[dict[str, list[ResultRow]], list[str]]:
-    """Rows by the name of their task, and a line for every task that failed."""
+    """Rows by task name, and an error line for every failed task."""
     found: dict[str, list[ResultRow]] = {}
     failed: list[str] = []
     spawn = multiprocessing.get_context("spawn")
@@ -97,7 +102,7 @@ def _measure_all(
     waiting: dict[Future[list[ResultRow] | None], str] = {}
     try:
         waiting = {pool.submit(_measure, task): name for name, task in tasks.items()}
-        # What another process is measuring is waited for at the end.
+        # Tasks that another process is measuring are waited for at the end.
         elsewhere: dict[Future[list[ResultRow] | None], str] = {}
         with progress(len(tasks), describe, "cells") as bar:
             for done in chain.from_iterable(map(as_completed, (waiting, elsewhere))):
@@ -114,7 +119,7 @@ def _measure_all(
                     found[name] = rows
                 bar.update()
     except BaseException:
-        # Whoever stops a benchmark does not wait for its cells, which go on where they were.
+        # An interrupted benchmark ends at once; its cells resume from their checkpoints.
         for child in multiprocessing.active_children():
             child.terminate()
         raise
@@ -124,14 +129,16 @@ def _measure_all(
 
 
 def _one_thread() -> None:
-    import torch  # takes a second, and who only shows rows has no need of it
+    import torch  # takes a second, and is not needed to print tables
 
     torch.set_num_threads(1)
 
 
 def _measure(task: _Task[Cell]) -> list[ResultRow] | None:
-    """The rows of a cell, measured and kept here unless they are in the file by now; None where
-    another process is measuring it and `wait` is not given."""
+    """Measure a cell and append its rows, unless the file has them by now; returns the rows.
+
+    Returns None if another process is measuring the cell and `task.wait` is false.
+    """
     with measuring(task.results, task.key, task.wait) as held:
         if not held:
             return None
@@ -146,13 +153,15 @@ def _measure(task: _Task[Cell]) -> list[ResultRow] | None:
 
 
 def chosen(known: Iterable[str], wanted: Sequence[str], what: str) -> list[str]:
-    """Which of `known` are wanted, in the order of `known`; all of them where none is named.
+    """The names of `known` that are in `wanted`, in the order of `known`.
 
     Args:
-        what: they are, for the message: "method", "table".
+        known: available names.
+        wanted: selected names; empty for all.
+        what: what the names stand for, for the message: "method", "table".
 
     Raises:
-        InputError: something else is wanted.
+        InputError: `wanted` has a name that `known` lacks.
     """
     known = list(known)
     if unknown := [name for name in wanted if name not in known]:
@@ -161,6 +170,6 @@ def chosen(known: Iterable[str], wanted: Sequence[str], what: str) -> list[str]:
 
 
 def _plain(config: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
-    """A configuration as it is after JSON: with lists for tuples."""
+    """A configuration after a JSON round trip, which turns tuples into lists."""
     plain: Mapping[str, Any] | None = json.loads(json.dumps(config))
     return plain

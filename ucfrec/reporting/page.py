@@ -1,4 +1,4 @@
-"""One HTML page about runs: what their results allow to conclude, and how they came about."""
+"""The HTML report on runs: conclusions from their results, and how they were trained."""
 
 import json
 import os
@@ -28,11 +28,13 @@ from ucfrec.runs.trained_policy import AUGMENTATION, learner_of, read_record
 
 @dataclass(frozen=True)
 class _Run:
+    """A run folder as the report reads it."""
+
     folder: Path
     name: str
     record: Mapping[str, Any]
     copies: Mapping[str, Any] | None
-    """The augmentation report; None without edited copies, or before they are made."""
+    """The augmentation report as JSON; None if the run has no edited copies (yet)."""
     logged: Curves
 
     @property
@@ -45,7 +47,7 @@ class _Run:
 
     @property
     def references(self) -> Mapping[str, float]:
-        """Losses to compare its loss with; none where its loss is not the items' log-likelihood."""
+        """Reference losses (nats); none if the run's loss is not the items' log-likelihood."""
         comparable = "action_loss" in self.logged
         return self.record.get("reference_losses", {}) if comparable else {}
 
@@ -53,25 +55,28 @@ class _Run:
 def write_report(
     out: Path, runs: Sequence[Path], results: Sequence[Path] = (), items: Path | None = None
 ) -> None:
-    """Write one self-contained page about `runs` to `out`, atomically.
+    """Write a self-contained HTML page about `runs`, atomically.
 
-    Runs on the same data share a section, their curves overlaid. A run that is still in training
-    is shown as far as it is.
+    Runs on the same data share a section and charts. A run that is still in training is shown up to
+    its last logged step.
 
     Args:
+        out: HTML file to write.
+        runs: run folders.
         results: rows of `ucfrec evaluate --json`, `ucfrec ope --json` or `ucfrec demo`; JSON, or
             JSON lines if the name ends in `.jsonl`.
-        items: features to show beside sample recommendations, Parquet or CSV with `item_id`.
+        items: item features to show with the sample recommendations, Parquet or CSV with a column
+            `item_id`; None for none.
 
     Raises:
-        InputError: a folder is no run, a file holds no such rows, or `out` is a folder.
+        InputError: a folder is no run, a file has no such rows or features, or `out` is a folder.
     """
     if out.is_dir():
         raise InputError(f"{out} is a folder; name a file with --out, e.g. {out / 'report.html'}")
-    of_data: dict[str, list[_Run]] = {}
+    by_data: dict[str, list[_Run]] = {}
     for run in _read_runs(runs):
-        of_data.setdefault(run.record["fingerprint"], []).append(run)
-    found = read_results(results)
+        by_data.setdefault(run.record["fingerprint"], []).append(run)
+    evidence = read_results(results)
     features = None if items is None else read_features(items)
     loader = PackageLoader("ucfrec.reporting", "")
     environment = Environment(
@@ -79,18 +84,21 @@ def write_report(
     )
     page = environment.get_template("report.html").render(
         version=__version__,
-        verdict=verdict(found),
+        verdict=verdict(evidence),
         warnings=[
-            (run.name, text) for of in of_data.values() for run in of for text in _warnings(run)
+            (run.name, text)
+            for group in by_data.values()
+            for run in group
+            for text in _warnings(run)
         ],
-        sections=[_section(of, features) for of in of_data.values()],
-        worlds=worlds(found),
-        estimates=estimates(found),
+        sections=[_section(group, features) for group in by_data.values()],
+        worlds=worlds(evidence),
+        estimates=estimates(evidence),
         layout=charts,
         points=POINTS,
     )
     with atomic_file(out) as scratch:
-        # Folder names need not be Unicode.
+        # Folder names may have bytes that are not valid Unicode.
         scratch.write_text(page, encoding="utf-8", errors="backslashreplace")
 
 
@@ -110,30 +118,30 @@ def _read_runs(folders: Sequence[Path]) -> list[_Run]:
 
 
 def _warnings(run: _Run) -> list[str]:
-    """What a reader must know before relying on a run."""
-    said = [] if "policy" in run.record else [run.status]
+    """Reasons why the results of a run may be unreliable."""
+    warnings = [] if "policy" in run.record else [run.status]
     if run.copies is not None:
         model = run.copies["reward_model"]
-        # Runs from before recorded no warning of the fit.
-        said += dict.fromkeys([*run.copies["warnings"], fit_warning(model["r2_without_z"])])
-        means_something = run.copies["bound"] < model["reward_std"]
-        if not (means_something and run.copies["moves"]["edits"]):
-            said.append(run.copies["verdict"])
+        # Runs of older versions have no fit warning in their record.
+        warnings += dict.fromkeys([*run.copies["warnings"], fit_warning(model["r2_without_z"])])
+        bound_is_useful = run.copies["bound"] < model["reward_std"]
+        if not (bound_is_useful and run.copies["moves"]["edits"]):
+            warnings.append(run.copies["verdict"])
     best = run.record.get("policy", {}).get("best_validation")
     popularity = run.references.get("popularity")
     if best is not None and popularity is not None and not best < popularity:
-        said.append(
-            f"the best validation loss, {best:.4g}, is not below {popularity:.4g}, what showing "
-            "items by their popularity alone reaches: nothing is learned of users"
+        warnings.append(
+            f"the best validation loss, {best:.4g}, is not below {popularity:.4g}, the loss of "
+            "showing items by popularity: the policy learned nothing about users"
         )
-    return [text for text in said if text]
+    return [text for text in warnings if text]
 
 
 def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
-    """What the template shows of runs on the same data."""
+    """Template variables of the section on runs with the same data."""
     names = [run.name for run in runs]
     edited = [(run.name, run.copies) for run in runs if run.copies is not None]
-    of_items = [run for run in runs if run.record["sizes"]["items"]]
+    item_runs = [run for run in runs if run.record["sizes"]["items"]]
     styled = [(run.name, style, run.copies) for style, run in enumerate(runs) if run.copies]
     return {
         "names": names,
@@ -148,7 +156,7 @@ def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
         "verdicts": [(name, copies["verdict"]) for name, copies in edited],
         "copies": copies_table(edited) if edited else None,
         "moves": moves_chart(styled),
-        "samples": [(run.name, sample_tables(run.folder, features)) for run in of_items],
+        "samples": [(run.name, sample_tables(run.folder, features)) for run in item_runs],
         "differences": _differences(runs),
         "records": [(run.name, json.dumps(run.record, indent=2)) for run in runs],
     }
@@ -194,7 +202,7 @@ def _of_runs(caption: str, runs: Sequence[_Run], rows: Sequence[tuple[str, list[
 
 
 def _differences(runs: Sequence[_Run]) -> Table | None:
-    """Settings and versions that are not the same in all runs; None if all are."""
+    """Settings and versions that differ between runs; None if there are none."""
     flat = [
         _flat(run.record["config"]) | _flat({"version": run.record["versions"]}) for run in runs
     ]

@@ -1,4 +1,4 @@
-"""What policies earned or would have earned, as the report shows it."""
+"""Results of `ucfrec evaluate` and `ucfrec ope` in the report."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -23,13 +23,13 @@ _WEIGHTS = ("effective_sessions", "largest_weight", "sessions", "overlap")
 
 @dataclass(frozen=True)
 class Estimates:
-    """What the estimators of one `ucfrec ope` say about one policy."""
+    """The estimates of one `ucfrec ope` for one policy."""
 
     name: str
     logged: Row | None
-    """What the logged sessions earned."""
+    """Row of the logged sessions' own return."""
     rows: Sequence[Row]
-    """One an estimator, `logged` left out."""
+    """One row per estimator, without `logged`."""
     warnings: tuple[str, ...]
 
 
@@ -38,15 +38,15 @@ class Results:
     """The result rows of a report."""
 
     worlds: Mapping[str, Sequence[Row]]
-    """By world, rows of `ucfrec evaluate` or of the demo."""
+    """World to its rows of `ucfrec evaluate` or `ucfrec demo`."""
     estimates: Sequence[Estimates]
 
 
 def read_results(paths: Sequence[Path]) -> Results:
-    """Read result rows; JSON lines from files whose name ends in `.jsonl`, else JSON.
+    """Read result rows from JSON lines (files named `.jsonl`) or JSON.
 
     Raises:
-        InputError: a file is missing or holds something else.
+        InputError: a file is missing or has a row without the required fields.
     """
     worlds: dict[str, list[Row]] = {}
     estimates: list[Estimates] = []
@@ -89,16 +89,16 @@ def _finite(value: Any) -> bool:
 
 
 def _estimates(rows: Sequence[Row]) -> list[Estimates]:
-    """Rows of one file by the `ucfrec ope` that wrote them, each beginning with `logged`."""
+    """Group the rows of one file by `ucfrec ope` call; the rows of a call begin with `logged`."""
     groups: list[list[Row]] = []
     for row in rows:
         if row["estimator"] == LOGGED or not groups:
             groups.append([])
         groups[-1].append(row)
-    return [_judged(group) for group in groups]
+    return [_policy_estimates(group) for group in groups]
 
 
-def _judged(group: Sequence[Row]) -> Estimates:
+def _policy_estimates(group: Sequence[Row]) -> Estimates:
     logged = next((row for row in group if row["estimator"] == LOGGED), None)
     rows = [row for row in group if row is not logged]
     policy = rows[0] if rows else group[0]
@@ -111,7 +111,7 @@ def _judged(group: Sequence[Row]) -> Estimates:
 
 
 def worlds(results: Results) -> list[tuple[charts.BarChart, Table]]:
-    """Bars and table of every world's rows."""
+    """Bar chart and table of each world."""
     return [_world(world, rows) for world, rows in results.worlds.items()]
 
 
@@ -127,7 +127,7 @@ def _world(world: str, rows: Sequence[Row]) -> tuple[charts.BarChart, Table]:
 
 
 def estimates(results: Results) -> list[tuple[Estimates, charts.BarChart, Table]]:
-    """Bars and table of every policy that was judged from logs."""
+    """Bar chart and table of each policy with estimates from logs."""
     drawn = []
     for one in results.estimates:
         rows = [*([one.logged] if one.logged else []), *one.rows]
@@ -164,7 +164,7 @@ def interval(row: Row) -> str:
 
 
 def _row_names(rows: Sequence[Row]) -> list[str]:
-    """The policies; where one has several rows, with the fields that differ between them."""
+    """Policy of each row, with the fields that differ if a policy has several rows."""
     names = []
     for row in rows:
         same = [other for other in rows if other["policy"] == row["policy"]]

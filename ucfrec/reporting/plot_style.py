@@ -1,6 +1,6 @@
-"""One look for all figures: colors that the color-blind tell apart, sizes of a paper's columns.
+"""Style of all figures: a color-blind-safe palette and the column widths of a paper.
 
-Matplotlib (extra `plots`) is imported when a figure is drawn.
+Matplotlib (extra `plots`) is imported only when a figure is drawn.
 """
 
 from collections.abc import Callable, Iterable
@@ -18,18 +18,18 @@ P = ParamSpec("P")
 Drawn = TypeVar("Drawn")
 
 COLUMN, PAGE = 3.4, 7.0
-"""Widths of one column and of both, in inches."""
+"""Widths of one column and of the whole page, in inches."""
 FACTUAL, EDITED = "#0072B2", "#D55E00"
 PLAIN, OURS, LIGHT = "#8C8C8C", "#D55E00", "#56B4E9"
-"""Of every method but UCF, of UCF, and of a third bar."""
+"""Colors of other methods, of UCF, and of a third bar."""
 MAP = "cividis"
-# Okabe and Ito's colors, which stay apart for the color-blind.
+# The color-blind-safe palette of Okabe and Ito (2008).
 _PALETTE = (
     *("#0072B2", "#E69F00", "#009E73", "#D55E00"),
     *("#CC79A7", "#56B4E9", "#000000", "#8C8C8C"),
 )
-# What comes in several figures has one color in all.
-_OWN = {
+# A method or condition has the same color in all figures.
+_FIXED = {
     "bc": "#8C8C8C",
     "dt": "#0072B2",
     "dc": "#56B4E9",
@@ -75,14 +75,14 @@ _RC: Final[Any] = {
     "lines.linewidth": 1.3,
     "lines.markersize": 3.5,
     "image.cmap": MAP,
-    # Text stays text, and the same picture is the same file.
+    # Text stays text in SVG, and equal figures give identical files.
     "svg.fonttype": "none",
     "svg.hashsalt": "ucfrec",
 }
 
 
 def styled(draw: Callable[P, Drawn]) -> Callable[P, Drawn]:
-    """Decorates what draws or saves a figure."""
+    """Decorator for functions that draw or save a figure: applies the style."""
 
     @wraps(draw)
     def drawn(*args: P.args, **kwargs: P.kwargs) -> Drawn:
@@ -95,26 +95,26 @@ def styled(draw: Callable[P, Drawn]) -> Callable[P, Drawn]:
 
 
 def label(name: str) -> str:
-    """How a method or a condition is called in figures."""
+    """Display name of a method or condition in figures."""
     return _LABELS.get(name, name)
 
 
 def colors(names: Iterable[str]) -> dict[str, str]:
-    """A color for each of `names`: its own, or one that is left over."""
+    """Name to color: the fixed color of the name, else an unused color of the palette."""
     wanted = list(names)
-    taken = {_OWN.get(name) for name in wanted}
+    taken = {_FIXED.get(name) for name in wanted}
     free = cycle([color for color in _PALETTE if color not in taken] or _PALETTE)
-    return {name: _OWN.get(name) or next(free) for name in wanted}
+    return {name: _FIXED.get(name) or next(free) for name in wanted}
 
 
 @styled
 def save(figure: "Figure", folder: Path, name: str) -> list[Path]:
-    """Write `figure` as PNG and SVG; returns the two files."""
+    """Write `figure` as `name.png` and `name.svg` in `folder`, atomically; returns both paths."""
     files = []
     for kind in ("png", "svg"):
         path = folder / f"{name}.{kind}"
         with atomic_file(path) as scratch:
-            # What the date would be in the SVG's metadata differs between equal pictures.
+            # A date in the metadata would make the SVG files of equal figures differ.
             metadata = {"Date": None} if kind == "svg" else None
             figure.savefig(scratch, format=kind, metadata=metadata)
         files.append(path)

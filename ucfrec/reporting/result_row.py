@@ -1,4 +1,4 @@
-"""The one kind of result row: what was measured, of what, by which code, and what came of it."""
+"""Result rows of all benchmarks: the measurement, its numbers and their origin."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -12,35 +12,36 @@ Scalar = str | int | float | bool | None
 
 @dataclass(frozen=True, kw_only=True)
 class RowKey:
-    """What is measured: rows that agree in it, code version included, are the same measurement."""
+    """Identifies a measurement, including its code version; equal keys are the same measurement."""
 
     suite: str
-    """The benchmark, e.g. recommendation, control, robustness, step-time."""
+    """The benchmark suite, e.g. recommendation, control, robustness, step-time."""
     table: str
+    """Table of the suite."""
     task: str
-    """Benchmark task or data file: what is learned from, and what that is played in."""
+    """Benchmark task or data file: the training data and the world of the evaluation."""
     method: str
-    """Line of the table."""
+    """Row of the table."""
     policy: str
-    """The learner, or the built-in policy of a world, that `method` is made of."""
+    """Learner, or built-in policy of a world, that `method` uses."""
     training_seed: int | None = None
     log_seed: int | None = None
-    """Of simulated logs; None where logs are given."""
+    """Seed of simulated logs; None for real logs."""
     evaluation_seed: int | None = None
-    """Of the episodes that are reported; the same for every training seed."""
+    """Seed of the evaluated episodes; the same for every training seed."""
     conditions: Mapping[str, Scalar] = field(default_factory=dict)
-    """Whatever else tells measurements apart: budget, episodes, distractor, …"""
+    """Other settings of the measurement: budget, episodes, distractor, …"""
     config_hash: str | None = None
-    """Of the training's configuration; what it stands for lies in `configurations.jsonl`."""
+    """Hash of the training configuration, which `configurations.jsonl` holds."""
     code_version: str | None = None
-    """See `ucfrec.code_version`; None of rows from before rows had one."""
+    """See `ucfrec.code_version`; None in rows of older versions."""
     data_fingerprint: str | None = None
-    """Of the store."""
+    """Fingerprint of the store."""
 
     def covers(self, row: "ResultRow") -> bool:
-        """Whether `row` is of this measurement; it may have further conditions of its own."""
-        own = {name: getattr(self, name) for name in _KEY_FIELDS}
-        return all(getattr(row, name) == value for name, value in own.items()) and all(
+        """Whether `row` is of this measurement; `row` may have more conditions."""
+        values = {name: getattr(self, name) for name in _KEY_FIELDS}
+        return all(getattr(row, name) == value for name, value in values.items()) and all(
             name in row.conditions and row.conditions[name] == value
             for name, value in self.conditions.items()
         )
@@ -51,44 +52,46 @@ _KEY_FIELDS: Final = tuple(f.name for f in fields(RowKey) if f.name != "conditio
 
 @dataclass(frozen=True, kw_only=True)
 class ResultRow(RowKey):
-    """One measurement and its numbers. A line of a rows file is this as JSON, less the defaults."""
+    """One measurement and its numbers; a line of a file of result rows is its `to_json`."""
 
     metric: str
-    """The one of `metrics` that tables are about."""
+    """Name of the metric that tables show."""
     metrics: Mapping[str, float]
-    """Finite numbers by name; what was not measured is not there."""
+    """Name to finite number, of the measured metrics only."""
     interval: tuple[float, float] | None = None
     """95% interval of the value of `metric`, over episodes."""
     world: str | None = None
-    """Where the policy was played."""
+    """Simulator of the evaluation."""
     checkpoint: str | None = None
+    """Evaluated weights, e.g. "best" or "last"."""
     target_return: float | None = None
+    """Target return of the evaluation, in reward units."""
     rule: str | None = None
     """How the policy acts and how its target return was chosen, in words."""
     details: Mapping[str, Any] = field(default_factory=dict)
-    """JSON beyond numbers, e.g. what a screening says of every dimension."""
+    """JSON values other than metrics, e.g. the screening result of each dimension."""
     wall_time_s: float | None = None
-    """Of the evaluation; that of the training is the metric `train_wall_time_s`."""
+    """Wall time of the evaluation in seconds; that of the training is `train_wall_time_s`."""
     peak_memory_mib: float | None = None
-    """Most resident memory of the process while the row's cell was measured."""
+    """Peak resident memory of the process during the measurement, in MiB."""
     command: str = ""
     commit: str | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def value(self) -> float:
-        """The number that tables are about."""
+        """Value of `metric`, which tables show."""
         return self.metrics[self.metric]
 
     def as_line(self) -> dict[str, Any]:
-        """Every field, condition and metric in one flat mapping, for tables and pictures."""
-        own = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _NESTED}
+        """Every field, condition and metric in one flat mapping, for tables and figures."""
+        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _NESTED}
         low, high = self.interval or (None, None)
         ends = {f"{self.metric}_low": low, f"{self.metric}_high": high}
-        return {**own, **self.conditions, **ends, **self.metrics}
+        return {**plain, **self.conditions, **ends, **self.metrics}
 
     def to_json(self) -> dict[str, Any]:
-        """The row as JSON has it; fields at their default are left out."""
+        """The row as JSON values, without fields at their default."""
         written = {}
         for each in fields(self):
             value = getattr(self, each.name)
@@ -103,13 +106,14 @@ _NESTED: Final = ("conditions", "metrics", "interval", "details", "versions")
 
 
 def row_from_json(value: object, where: str) -> ResultRow:
-    """The row that `to_json` made into `value`.
+    """Inverse of `ResultRow.to_json`.
 
     Args:
-        where: what `value` was read from, for messages.
+        value: JSON value.
+        where: origin of `value` (file and line), for messages.
 
     Raises:
-        InputError: it is no mapping, or a field is missing, unknown or of another kind.
+        InputError: `value` is no object, or a field is missing, unknown or of a wrong type.
     """
     if not isinstance(value, dict):
         raise InputError(f"{where} is no result row; delete it to measure it again")
@@ -118,11 +122,11 @@ def row_from_json(value: object, where: str) -> ResultRow:
     if lacking := [name for name in _REQUIRED if name not in value]:
         raise InputError(f"{where} is no result row: it has no {lacking[0]}")
     given: dict[str, Any] = {}
-    for name, found in value.items():
+    for name, content in value.items():
         try:
-            given[name] = _READERS[name](found)
+            given[name] = _READERS[name](content)
         except (TypeError, ValueError, OverflowError):
-            raise InputError(f"{where} is no result row: its {name} is {found!r:.60}") from None
+            raise InputError(f"{where} is no result row: its {name} is {content!r:.60}") from None
     row = ResultRow(**given)
     if row.metric not in row.metrics:
         raise InputError(f"{where} is no result row: its metrics lack {row.metric!r:.60}")
@@ -144,9 +148,9 @@ def _seed(value: object) -> int:
 def _number(value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise TypeError
-    if not math.isfinite(found := float(value)):
+    if not math.isfinite(number := float(value)):
         raise ValueError
-    return found
+    return number
 
 
 def _scalar(value: object) -> Scalar:
@@ -163,7 +167,7 @@ def _interval(value: object) -> tuple[float, float]:
 
 
 def _json(value: object) -> object:
-    """JSON in which every number is finite."""
+    """Check that every number of a JSON value is finite."""
     if isinstance(value, list):
         return [_json(item) for item in value]
     if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""Files of result rows: JSON lines, read and written here alone."""
+"""Read and write files of result rows (JSON lines)."""
 
 import hashlib
 import json
@@ -14,62 +14,64 @@ from ucfrec.provenance import config_hash
 from ucfrec.reporting.result_row import ResultRow, RowKey, row_from_json
 
 CONFIGURATIONS: Final = "configurations.jsonl"
-"""Beside the rows: every configuration that they name by its hash, once."""
+"""File next to the rows with each of their configurations, by hash."""
 _WRITING, _MEASURING = ".writing.lock", ".measuring.lock"
-"""Locks of the folder: of who appends to a file in it, and of who measures what."""
+"""Lock files of the folder: for appending to its files, and for running measurements."""
 
 
 def read_rows(path: Path) -> list[ResultRow]:
-    """Rows of a file; none where it does not exist.
+    """Read the rows of a file; none if it does not exist.
 
     Raises:
-        InputError: a line is no result row, or the file is no text.
+        InputError: a line is no result row, or the file is not UTF-8 text.
     """
     return [row_from_json(value, f"{path}, line {n}") for n, value in read_lines(path)]
 
 
 def read_lines(path: Path) -> list[tuple[int, object]]:
-    """Number and content of every line of a file of JSON lines; none where it does not exist.
+    """Read (line number, JSON value) of every line that is not blank; none if there is no file.
 
     Raises:
-        InputError: a line is no JSON, or the file is no text.
+        InputError: a line is not JSON, or the file is not UTF-8 text.
     """
-    found: list[tuple[int, object]] = []
+    values: list[tuple[int, object]] = []
     if not path.exists():
-        return found
+        return values
     try:
         lines = path.read_text(encoding="utf-8").split("\n")
     except UnicodeDecodeError:
-        raise InputError(f"{path} is no text in UTF-8, so it holds no result rows") from None
+        raise InputError(f"{path} is not UTF-8 text; name a file of result rows") from None
     for number, line in enumerate(lines, start=1):
         if not line.strip():
             continue
         try:
-            found.append((number, json.loads(line)))
+            values.append((number, json.loads(line)))
         except (ValueError, RecursionError):
             raise InputError(
                 f"{path}, line {number} is no result row; delete the line to measure it again"
             ) from None
-    return found
+    return values
 
 
 def append_rows(
     path: Path, rows: Sequence[ResultRow], config: Mapping[str, Any] | None = None
 ) -> None:
-    """Add rows to a file, and their configuration to the one beside it.
+    """Append rows to a file, and their configuration to `configurations.jsonl` next to it.
 
-    All of them appear or none, whatever interrupts it: the file is replaced by a longer one.
-    Whoever else appends to a file of the folder waits.
+    Atomic: after an interruption either all rows are in the file or none. Other processes that
+    append to a file of the folder wait.
 
     Args:
-        config: what the rows' `config_hash` stands for.
+        path: file of result rows; made if missing.
+        rows: rows of one configuration.
+        config: configuration with the rows' `config_hash`; None for rows without one.
 
     Raises:
-        InputError: a row's numbers are not finite, or its `config_hash` is not that of `config`.
+        InputError: a row has a number that is not finite, or another `config_hash` than `config`.
     """
     named = None if config is None else config_hash(config)
     if any(row.config_hash != named for row in rows):
-        raise InputError(f"rows for {path} name a configuration that they were not measured with")
+        raise InputError(f"rows for {path} have the hash of another configuration; pass their own")
     for row in rows:
         row_from_json(json.loads(json.dumps(row.to_json())), f"a row for {path}")
     with file_lock(path.with_name(_WRITING)):
@@ -79,25 +81,25 @@ def append_rows(
 
 
 def read_configurations(folder: Path) -> dict[str, Mapping[str, Any]]:
-    """The configurations that rows in `folder` name, by their hash.
+    """Read the configurations of the rows in `folder`: hash to configuration.
 
     Raises:
-        InputError: a line is none.
+        InputError: a line is no configuration, or its hash does not match.
     """
     path = folder / CONFIGURATIONS
-    found: dict[str, Mapping[str, Any]] = {}
+    configurations: dict[str, Mapping[str, Any]] = {}
     for number, value in read_lines(path):
         config = value.get("config") if isinstance(value, dict) else None
         if not isinstance(config, dict) or not isinstance(value, dict):
             raise InputError(f"{path}, line {number}, is no configuration")
         if value.get("hash") != config_hash(config):
             raise InputError(f"{path}, line {number}, has another hash than its configuration")
-        found[config_hash(config)] = config
-    return found
+        configurations[config_hash(config)] = config
+    return configurations
 
 
 def latest(rows: Sequence[ResultRow]) -> list[ResultRow]:
-    """Of rows that measure the same, with whatever code, data and configuration, the last."""
+    """The last row of each measurement, regardless of code version, data and configuration."""
     last = {
         (*(getattr(row, name) for name in _SAME), str(sorted(row.conditions.items()))): row
         for row in rows
@@ -113,16 +115,18 @@ _SAME: Final = (
 
 @contextmanager
 def measuring(path: Path, key: RowKey, wait: bool) -> Iterator[bool]:
-    """Hold the lock of one measurement for the rows file `path`, so that nobody measures it twice.
+    """Lock one measurement of the file `path`, so that no two processes run it at once.
 
     Args:
-        wait: until it is free, or give up at once.
+        path: file of result rows.
+        key: the measurement.
+        wait: wait until the lock is free, instead of giving up at once.
 
     Yields:
         Whether the lock is held.
     """
     name = f"{path.name} {key}".encode()
-    # One byte of the file stands for a measurement.
+    # Each measurement locks one byte of the lock file.
     byte = int.from_bytes(hashlib.sha256(name).digest()[:7])
     with file_lock(path.with_name(_MEASURING), byte, wait) as held:
         yield held

@@ -1,4 +1,4 @@
-"""Tables as text and as Markdown, and how numbers are written in them."""
+"""Text and Markdown tables, and the number formats in them."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -8,7 +8,7 @@ from typing import Any
 from ucfrec.reporting.statistics import Summary, summary
 
 NONE = "–"
-"""In the place of a value that there is not."""
+"""Cell of a missing value."""
 _EVALUATION = (
     *("world", "policy", "R_cum", "R_avg_pooled", "R_avg_episode", "length", "episodes", "seed"),
 )
@@ -16,16 +16,18 @@ _EVALUATION = (
 
 @dataclass(frozen=True)
 class Table:
-    """Cells as the report shows them; every row has one for each column."""
+    """A table of the report."""
 
     caption: str
     corner: str
+    """Head of the column of row names."""
     columns: Sequence[str]
     rows: Sequence[tuple[str, Sequence[str]]]
+    """(name, one cell per column) of each row."""
 
 
 def text_table(head: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
-    """An aligned table for a terminal; the first two columns to the left, the others right."""
+    """An aligned table for a terminal; the first two columns are left-aligned, others right."""
     table = [list(head), *([_text(cell) for cell in line] for line in lines)]
     widths = [max(len(line[i]) for line in table) for i in range(len(head))]
     written = []
@@ -37,37 +39,39 @@ def text_table(head: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
 
 
 def markdown_table(head: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
-    """A table of GitHub's Markdown."""
+    """A table in GitHub Markdown."""
     body = [head, ["---"] * len(head), *([_text(cell) for cell in line] for line in lines)]
     return "\n".join("| " + " | ".join(line) + " |" for line in body)
 
 
 def format_rows(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = _EVALUATION) -> str:
-    """`columns` of rows as an aligned table; a value with `_low` and `_high` beside it, as R_cum of
-    `evaluate`, with its interval."""
+    """The `columns` of rows as an aligned text table.
+
+    A value `x` of a row that also has `x_low` and `x_high`, such as R_cum, gets its interval.
+    """
     return text_table(columns, [[_cell(row, name) for name in columns] for row in rows])
 
 
 def number(value: float) -> str:
-    """Three decimals, or, of click rates and the like, three digits."""
+    """`value` with three decimals, or three significant digits if it is below 0.1."""
     return f"{value:.3f}" if value == 0 or abs(value) >= 0.1 else f"{value:#.3g}"
 
 
 def mean_and_sd(values: Iterable[float]) -> str:
-    """Mean ± standard deviation; of one value the value alone, of none a dash."""
-    found = summary(values)
-    if not found.count:
+    """Mean ± standard deviation; a single value without ±, a dash for no values."""
+    sample = summary(values)
+    if not sample.count:
         return NONE
-    return f"{found.mean:.4g}" + (f" ± {found.sd:.2g}" if found.count > 1 else "")
+    return f"{sample.mean:.4g}" + (f" ± {sample.sd:.2g}" if sample.count > 1 else "")
 
 
-def signed_difference(found: Summary) -> str:
-    """A mean difference with its sign ± its standard error."""
-    return f"{found.mean:+.3g} ± {found.standard_error:.2g}"
+def signed_difference(differences: Summary) -> str:
+    """Mean difference with its sign ± its standard error."""
+    return f"{differences.mean:+.3g} ± {differences.standard_error:.2g}"
 
 
 def shown(value: Any) -> str:
-    """`value` for a reader: four digits of a number, a dash for none."""
+    """Cell text of `value`: floats with four significant digits, a dash if missing or infinite."""
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return NONE
     if isinstance(value, float):

@@ -1,7 +1,7 @@
-"""What the results of a report allow to conclude, in sentences.
+"""Conclusions from the results of a report, as sentences.
 
-Two things are called different only where their 95% intervals do not overlap, which is stricter
-than a test of the difference at 5%.
+Two results count as different only if their 95% intervals do not overlap, which is stricter than a
+test of the difference at 5%.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,30 +12,31 @@ from ucfrec.reporting.page_results import Estimates, Results, Row, interval
 from ucfrec.reporting.tables import shown
 
 NO_RESULTS = (
-    "No result is given, so nothing is known of what these policies earn. A validation loss says "
-    "how well logged choices are predicted, and that is not what they earn. Play the policies "
-    "(ucfrec evaluate --json) or judge them from logs (ucfrec ope --json), and give the rows with "
+    "No results are given, so the returns of these policies are unknown. A validation loss "
+    "measures how well logged choices are predicted, not the return. Evaluate the policies in a "
+    "simulator (ucfrec evaluate --json) or from logs (ucfrec ope --json), and give the rows with "
     "--results."
 )
 
 
 @dataclass(frozen=True)
 class _Earned:
-    """What one policy earned in one world, over all its rows there."""
+    """Return of one policy in one world, over all its rows."""
 
     policy: str
     trained: bool
     rows: int
     trainings: int
-    """Different training seeds."""
+    """Number of distinct training seeds."""
     value: float
-    """Mean over rows."""
+    """Mean R_cum over rows."""
     low: float
-    """Lowest end of the rows' intervals."""
+    """Lowest end of the rows' 95% intervals."""
     high: float
+    """Highest end of the rows' 95% intervals."""
 
     def above(self, other: "_Earned") -> bool:
-        """Whether all intervals lie above all of the other's."""
+        """Whether all intervals are above all intervals of `other`."""
         return self.low > other.high
 
     def __str__(self) -> str:
@@ -43,10 +44,10 @@ class _Earned:
 
 
 def verdict(results: Results) -> list[str]:
-    """A paragraph for every world and every policy judged from logs."""
-    said = [_of_world(world, rows) for world, rows in results.worlds.items()]
-    said += [_of_estimates(one) for one in results.estimates]
-    return said or [NO_RESULTS]
+    """One paragraph per world, then one per policy with estimates from logs."""
+    paragraphs = [_of_world(world, rows) for world, rows in results.worlds.items()]
+    paragraphs += [_of_estimates(one) for one in results.estimates]
+    return paragraphs or [NO_RESULTS]
 
 
 def _of_world(world: str, rows: Sequence[Row]) -> str:
@@ -54,24 +55,23 @@ def _of_world(world: str, rows: Sequence[Row]) -> str:
     trained = sorted((one for one in earned if one.trained), key=lambda one: -one.value)
     references = [one for one in earned if not one.trained]
     if not trained:
-        return f"In {world}, only built-in policies were played: {_listed(references)}."
+        return f"In {world}, only built-in policies were evaluated: {_listed(references)}."
     best, *others = trained
-    said = [_best(world, best, others)]
+    sentences = [_best(world, best, others)]
     if references:
-        said.append(_against(best, references))
+        sentences.append(_against(best, references))
     else:
-        said.append(
-            "No random, logging or best built-in policy was played, so there is nothing to "
-            "compare that with."
+        sentences.append(
+            "No built-in policy (random, logging or best) was evaluated to compare it with."
         )
     if max(one.trainings for one in trained) < 2:
         one = "It was" if not others else "Each policy was"
-        said.append(f"{one} trained once; what another training seed would give is not known.")
-    return " ".join(said)
+        sentences.append(f"{one} trained once; the spread over training seeds is unknown.")
+    return " ".join(sentences)
 
 
 def _earned(rows: Sequence[Row]) -> list[_Earned]:
-    """A policy's rows of one checkpoint as one, in order of first appearance."""
+    """One summary per policy and checkpoint, in order of first appearance."""
     groups: dict[tuple[str, str | None], list[Row]] = {}
     for row in rows:
         groups.setdefault((row["policy"], row.get("checkpoint")), []).append(row)
@@ -94,23 +94,23 @@ def _best(world: str, best: _Earned, others: Sequence[_Earned]) -> str:
     if best.trainings > 1:
         how = (
             f"{shown(best.value)} in the mean of {best.trainings} trainings (their 95% intervals "
-            f"together: {shown(best.low)} to {shown(best.high)})"
+            f"span {shown(best.low)} to {shown(best.high)})"
         )
     else:
         how = f"{shown(best.value)} (95% interval {shown(best.low)} to {shown(best.high)})"
     if not others:
-        return f"In {world}, {best.policy} earned {how} an episode."
-    said = f"In {world}, {best.policy} earned most of {len(others) + 1} trained policies: {how}"
-    said += " an episode."
+        return f"In {world}, {best.policy} earned {how} per episode."
+    text = f"In {world}, {best.policy} earned most of {len(others) + 1} trained policies: {how}"
+    text += " per episode."
     close = [one for one in others if not best.above(one)]
     if close:
-        said += f" Its interval overlaps that of {_listed(close)}:"
-        return f"{said} which of them earns more is open."
-    return f"{said} Its interval lies above those of the others, the next being {others[0]}."
+        text += f" Its interval overlaps that of {_listed(close)}:"
+        return f"{text} which of them earns more is open."
+    return f"{text} Its interval lies above those of the others, the next being {others[0]}."
 
 
 def _against(best: _Earned, references: Sequence[_Earned]) -> str:
-    """How the best trained policy compares with built-in ones."""
+    """Compare the best trained policy with the built-in policies."""
     above = [one for one in references if best.above(one)]
     below = [one for one in references if one.above(best)]
     open_ = [one for one in references if one not in above and one not in below]
@@ -119,10 +119,10 @@ def _against(best: _Earned, references: Sequence[_Earned]) -> str:
         parts.append(f"more than {_listed(above)}")
     if below:
         parts.append(f"less than {_listed(below)}")
-    said = f"It earned {', and '.join(parts)}." if parts else ""
+    text = f"It earned {', and '.join(parts)}." if parts else ""
     if open_:
-        said += f" Whether it earns more or less than {_listed(open_)} is open: intervals overlap."
-    return said.strip()
+        text += f" Whether it earns more or less than {_listed(open_)} is open: intervals overlap."
+    return text.strip()
 
 
 def _of_estimates(one: Estimates) -> str:
@@ -134,15 +134,15 @@ def _of_estimates(one: Estimates) -> str:
     if not weighted:
         models = _listed([f"{row['estimator']} {interval(row)}" for row in one.rows])
         because = f" ({warnings})" if warnings else ""
-        said = f"For {one.name}, these logs allow no weighted estimate{because}."
-        return f"{said} Models alone say {models}: that supports no conclusion." if models else said
+        text = f"For {one.name}, these logs allow no weighted estimate{because}."
+        return f"{text} Models alone (no conclusion): {models}." if models else text
     named = {row["estimator"]: row for row in weighted}
     quoted = named.get("DR") or named.get("SNIPS") or weighted[0]
-    figure = f"{quoted['estimator']} estimates {interval(quoted)} a session"
+    figure = f"{quoted['estimator']} estimates {interval(quoted)} per session"
     if warnings:
-        return f"For {one.name}, {figure}, which is not to be relied on: {warnings}."
+        return f"For {one.name}, {figure}, which is not reliable: {warnings}."
     if one.logged is None:
-        return f"For {one.name}, {figure}. What the logged sessions earned is not among the rows."
+        return f"For {one.name}, {figure}. The rows lack the return of the logged sessions."
     return f"For {one.name}, {figure}; the logged sessions earned {interval(one.logged)}. " + (
         _compared(weighted, one.logged)
     )
@@ -156,14 +156,14 @@ def _compared(weighted: Sequence[Row], logged: Row) -> str:
         if len(names) == len(weighted):
             return (
                 f"Every weighted estimate ({everyone}) says that it earns {more} than the logging "
-                "policy, as far as the logged propensities are right."
+                "policy, provided that the logged propensities are right."
             )
     if not above and not below:
-        return f"No weighted estimate ({everyone}) tells it from the logging policy."
+        return f"No weighted estimate ({everyone}) distinguishes it from the logging policy."
     sides: Mapping[str, list[str]] = {"more": above, "less": below}
     parts = [f"{_listed(names)} {more}" for more, names in sides.items() if names]
     return (
-        f"The weighted estimates do not agree ({'; '.join(parts)} than the logging policy, of "
+        f"The weighted estimates disagree ({'; '.join(parts)} than the logging policy, of "
         f"{everyone}), so whether it earns more is open."
     )
 

@@ -128,7 +128,7 @@ def test_unknown_tables_and_budgets_are_named(
     assert main([*arguments, "--table", "table-2"]) == 2
     assert "no table is called table-2; there are main, distractor" in capsys.readouterr().err
     suite: Benchmark = load_plugin("benchmarks", "recommendation")
-    with pytest.raises(InputError, match="no budget is called huge"):
+    with pytest.raises(InputError, match="unknown budget huge"):
         suite.run(BenchmarkRequest("huge", ["main"], tmp_path, tmp_path / "rows.jsonl", 1))
     assert not (tmp_path / "out").exists()
 

@@ -146,14 +146,14 @@ class Rotation(Memoryless):
 
     With the true probabilities it is optimal. Proof:
 
-    Let m₁ ≥ m₂ ≥ … be the user's best probability in
-    each tag, N the boredom window, T = `max_turn`, and S(t) the sum of the first t terms of
-    m₁, …, m_N, m₁, …. Clicks do not affect later steps, so fixed sequences of items suffice.
-    If a sequence ends with step t ≤ T, its first t − 1 steps did not end the session, so any N
-    successive ones of them have different tags. Cut into blocks of N from the start, they earn at
-    most S(t − 1) in expectation, and the last step at most m₁. As S grows with t, no
-    sequence earns more than S(T − 1) + m₁. The favourites in turn for T − 1 steps never repeat a tag too soon and earn
-    S(T − 1); the last step may end the session and earns m₁.
+    Let m₁ ≥ m₂ ≥ … be the user's best probability in each tag, N the boredom window, T =
+    `max_turn`, and S(t) the sum of the first t terms of m₁, …, m_N, m₁, …. Clicks do not affect
+    later steps, so fixed sequences of items suffice. If a sequence ends with step t ≤ T, its
+    first t − 1 steps did not end the session, so any N successive ones of them have different
+    tags. Cut into blocks of N from the start, they earn at most S(t − 1) in expectation, and
+    the last step at most m₁. As S grows with t, no sequence earns more than S(T − 1) + m₁. The
+    favourites in turn for T − 1 steps never repeat a tag too soon and earn S(T − 1); the last
+    step may end the session and earns m₁.
     """
 
     def __init__(self, world: SyntheticCatalog, favourites: IntArray) -> None:

@@ -99,7 +99,7 @@ class ScreeningReport:
 
 @random_state_kept()
 def screen(store: EpisodeStore, config: ScreeningConfig, seed: int) -> ScreeningReport:
-    """Test the effect of every dimension of the observed states on the training episodes of `store`.
+    """Test the effect of every observed state dimension on the training episodes of `store`.
 
     Raises:
         InputError: states are made of items, or there are too few trajectories to hold some out.

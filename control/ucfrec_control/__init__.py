@@ -1,1 +1,1 @@
-"""Offline control benchmarks (D4RL, AntMaze) on the core of ucfrec."""
+"""Offline control benchmarks (D4RL, AntMaze) with the policies of ucfrec."""

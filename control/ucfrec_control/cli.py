@@ -7,19 +7,19 @@ from ucfrec.commands.cli import Program, run
 
 CONTROL = Program(
     "ucfrec-control",
-    "Train and judge policies on D4RL and Minari datasets.",
+    "Train and evaluate policies on D4RL and Minari datasets.",
     "ucfrec_control.commands",
     {
         "prepare": "a dataset to an episode store",
         "collect": "datasets from a SAC learner; resumes",
         "convert": "D4RL HDF5 to Minari, or back",
         "distract": "a store with a distractor in its states",
-        "screen": "which state dimensions cause anything",
-        "screen-all": "screening of every zoo file, distracted; resumes",
+        "screen": "which state dimensions have an effect",
+        "screen-all": "screening of every zoo file and distractor; resumes",
         "train": "train a policy on a store; resumes",
         "evaluate": "normalised scores of trained policies",
         "benchmark": "every learner on the zoo files; resumes",
-        "robustness": "what distractors cost; resumes",
+        "robustness": "scores lost to distractors; resumes",
         "figures": "figures of runs and result rows",
     },
 )

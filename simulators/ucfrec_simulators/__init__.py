@@ -1,4 +1,4 @@
-"""Worlds that sessions are played in: Gymnasium vector environments and their built-in policies."""
+"""Simulators of sessions: Gymnasium vector environments and their built-in behavior policies."""
 
 from typing import TYPE_CHECKING, Any
 

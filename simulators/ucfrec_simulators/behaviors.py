@@ -1,4 +1,4 @@
-"""Built-in behavior policies that worlds share; each is an `ucfrec.acting.rollout.Actor`."""
+"""Built-in behavior policies shared by the worlds; each is an `ucfrec.acting.rollout.Actor`."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -15,17 +15,17 @@ Actions = npt.NDArray[Any]
 
 
 class Memoryless:
-    """An actor that looks at nothing but the present observation."""
+    """An actor whose choice depends on the current observation only."""
 
     def begin(self, rows: IntArray) -> None:
-        """Nothing is carried from step to step."""
+        """Do nothing: there is no state to reset."""
 
     def observe(self, actions: Actions, rewards: FloatArray) -> None:
-        """Nothing is carried from step to step."""
+        """Do nothing: there is no state to update."""
 
 
 class Uniform(Memoryless):
-    """Uniformly random actions, of a box or of a catalogue (with their propensity)."""
+    """Uniformly random actions: vectors in a box, or items of a catalogue with their propensity."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any], seed: int) -> None:
         self._space = env.single_action_space
@@ -33,11 +33,11 @@ class Uniform(Memoryless):
         self._forbidden: IntArray | None = None
 
     def inform(self, info: Mapping[str, Any]) -> None:
-        """Take note of the items that may not be played."""
+        """Read the (N, L) forbidden items of each session from `info`, if the world masks items."""
         self._forbidden = info.get(FORBIDDEN)
 
     def act(self, observations: FloatArray, live: BoolArray) -> tuple[Actions, FloatArray | None]:
-        """Draw (N, A) or (N,) actions."""
+        """Draw actions: (N, A) without propensities, or items (N,) with propensities (N,)."""
         count = len(observations)
         if isinstance(self._space, spaces.Discrete):
             n_items = int(self._space.n)
@@ -51,16 +51,19 @@ class Uniform(Memoryless):
         return drawn.astype(np.float32), None
 
     def _allowed_items(self, forbidden: IntArray, n_items: int) -> tuple[IntArray, FloatArray]:
-        """Draw a place among the items left, and step over each forbidden item up to it."""
-        left = n_items - (forbidden >= 0).sum(axis=1)
-        chosen = self._generator.integers(left)
+        """Draw uniformly among the allowed items; `forbidden` (N, L) is padded with −1.
+
+        A rank among the allowed items is drawn, then raised by one per forbidden item up to it.
+        """
+        n_allowed = n_items - (forbidden >= 0).sum(axis=1)
+        chosen = self._generator.integers(n_allowed)
         for item in np.sort(np.where(forbidden < 0, n_items, forbidden), axis=1).T:
             chosen += chosen >= item
-        return chosen, (1.0 / left).astype(np.float32)
+        return chosen, (1.0 / n_allowed).astype(np.float32)
 
 
 class Constant(Memoryless):
-    """The same action vector always."""
+    """The same action vector (A,) at every step."""
 
     def __init__(self, action: FloatArray) -> None:
         self._action = action
@@ -73,13 +76,16 @@ class Constant(Memoryless):
 def truncated_normal(
     mean: FloatArray, scale: float, generator: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Draw from the normal about `mean` that is cut to the box [−1, 1]^A, not clipped to it.
+    """Draw from a normal around `mean` that is truncated to the box [−1, 1]^A, not clipped to it.
 
-    Clipping would put probability on the box's faces, where no density exists; the cut normal has
-    a density everywhere in the box, and it is returned exactly, for the float32 actions returned.
+    Clipping would put probability mass on the faces of the box, where no density exists. The
+    truncated normal has a density everywhere in the box. The densities returned are exact for the
+    float32 actions returned.
 
     Args:
         mean: (N, A) inside the box.
+        scale: standard deviation of the normal before truncation.
+        generator: source of the draws.
 
     Returns:
         Actions (N, A), and their densities (N,): products over the dimensions, which may exceed 1.
@@ -107,7 +113,8 @@ class Rule(Memoryless):
 class Blend(Memoryless):
     """A policy of stated quality: `clip(q · target + (1 − q) · default + noise · ξ, −1, 1)`.
 
-    Quality 0 is an untuned default, 1 the target; ξ is standard normal, drawn anew every step.
+    `target` is the action of another actor and `default` a fixed vector (A,). Quality q is 0 for
+    the default and 1 for the target; ξ is standard normal, drawn at every step.
     """
 
     def __init__(
@@ -115,11 +122,11 @@ class Blend(Memoryless):
     ) -> None:
         self._target, self._default = target, default
         self._quality, self._noise = quality, noise
-        # The quality is part of the stream so that components of one mixture draw apart.
+        # The quality is part of the seed so that components of one mixture draw independently.
         self._generator = np.random.default_rng([seed, 2, round(1000 * quality)])
 
     def act(self, observations: FloatArray, live: BoolArray) -> tuple[Actions, None]:
-        """Blend and explore, (N, A)."""
+        """Blended actions with exploration noise, (N, A)."""
         target, _ = self._target.act(observations, live)
         explored = self._noise * self._generator.standard_normal(target.shape)
         blended = self._quality * target + (1 - self._quality) * self._default + explored
@@ -129,8 +136,8 @@ class Blend(Memoryless):
 class SessionMixture:
     """Each session is served by one of several actors, drawn when it begins.
 
-    The propensity reported is that of the actor drawn: a valid importance-sampling denominator,
-    as the draw depends on nothing in the session.
+    The reported propensity is that of the drawn actor: a valid denominator for importance sampling,
+    because the draw does not depend on what happens in the session.
     """
 
     def __init__(self, actors: Sequence[Actor], weights: Sequence[float], seed: int) -> None:
@@ -138,7 +145,7 @@ class SessionMixture:
         self._weights = np.asarray(weights, dtype=np.float64) / np.sum(weights)
         self._generator = np.random.default_rng([seed, 3])
         self.component: IntArray = np.zeros(0, dtype=np.int64)
-        """(N,) which actor serves each session now."""
+        """(N,) index of the actor that serves each session."""
 
     def begin(self, rows: IntArray) -> None:
         """Draw the actor of each session that starts."""
@@ -153,7 +160,7 @@ class SessionMixture:
             actor.begin(rows)
 
     def act(self, observations: FloatArray, live: BoolArray) -> tuple[Actions, FloatArray | None]:
-        """Let every actor choose and keep the choice of the one in charge."""
+        """Actions (N, A) or (N,) of the sessions' actors; propensities (N,) if all report them."""
         choices = [actor.act(observations, live) for actor in self._actors]
         rows = np.arange(len(observations))
         actions = np.stack([chosen for chosen, _ in choices])[self.component, rows]
@@ -163,6 +170,6 @@ class SessionMixture:
         return actions, np.stack(known)[self.component, rows]
 
     def observe(self, actions: Actions, rewards: FloatArray) -> None:
-        """Every actor sees what was played."""
+        """Pass the played actions and rewards (N,) to every actor."""
         for actor in self._actors:
             actor.observe(actions, rewards)

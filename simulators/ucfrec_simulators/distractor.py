@@ -1,7 +1,7 @@
-"""A distractor beside every page or item: in the logs it goes with the reward, it causes nothing.
+"""A distractor in the observations: correlated with the reward in the logs, without any effect.
 
-It is the first number of the observation, in planted stores and in worlds: policies read as many of
-a world's numbers as their logs had, and KuaiRand's logs have none but this one.
+It is the first number of the observation, in stores and in worlds: a policy reads as many numbers
+of a world's observation as its logs had, and KuaiRand's logs have none but the distractor.
 """
 
 from collections.abc import Callable, Mapping
@@ -32,33 +32,45 @@ ON: Final = 1.0
 def plant_distractor(
     store: EpisodeStore, out: Path, flip: float = 0.0, seed: int = 0
 ) -> EpisodeStore:
-    """Write `store`, of items or of vector actions, with a distractor before every observation.
+    """Write a copy of `store` with a distractor in front of every observation.
 
-    `meta["source"]["distractor"]` has its `rate`, the share of steps with it.
+    `meta["source"]["distractor"]` records `flip`, `seed` and `rate`, the share of steps where the
+    distractor is 1.
+
+    Args:
+        store: of items or of vector actions.
+        out: folder of the copy.
+        flip: probability that the distractor is the opposite of the reward bit.
+        seed: seed of the flips.
 
     Raises:
         InputError: as `ucfrec.episodes.distractor.reward_bit`, or `out` exists.
     """
     distractor = reward_bit(store, flip, seed)
     planted = np.column_stack([distractor, logged_observations(store)])
-    about = {"flip": flip, "seed": seed, "rate": float(distractor.mean())}
-    return with_observations(store, out, planted, {"distractor": about})
+    record = {"flip": flip, "seed": seed, "rate": float(distractor.mean())}
+    return with_observations(store, out, planted, {"distractor": record})
 
 
 class DistractorEnv(VectorWrapper[FloatArray, AnyArray, AnyArray]):
-    """A world whose observation starts with a distractor that changes nothing.
+    """A world whose observation starts with a distractor that has no effect.
 
-    Each step's distractor is drawn with probability `rate`, independently of everything else,
-    do(d ~ Bernoulli), by a generator of its own. 0 switches it off, 1 on; the training frequency
-    distinguishes a policy that is misled by it from one that needs it to be on at times.
+    In each step the distractor is 1 with probability `rate`, independently of everything else:
+    do(d ~ Bernoulli(rate)), from a separate random generator. With rate 0 it is always off, with 1
+    always on. A rate between, such as that of the training logs, distinguishes a policy that is
+    misled by the distractor from one that fails when it never occurs.
+
+    Args:
+        env: the world, with observations (N, O); those of this one are (N, 1 + O).
+        rate: probability that the distractor is on.
 
     Raises:
-        InputError: `rate` is no probability.
+        InputError: `rate` is not in [0, 1].
     """
 
     def __init__(self, env: VectorEnv[FloatArray, AnyArray, AnyArray], rate: float) -> None:
         if not 0 <= rate <= 1:
-            raise InputError(f"the distractor is shown with probability {rate}; it lies in [0, 1]")
+            raise InputError(f"the distractor's rate is {rate}; it must lie in [0, 1]")
         super().__init__(env)
         plain = env.single_observation_space
         assert isinstance(plain, spaces.Box)
@@ -75,74 +87,78 @@ class DistractorEnv(VectorWrapper[FloatArray, AnyArray, AnyArray]):
         seed: int | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[FloatArray, dict[str, Any]]:
-        """Start all sessions afresh; `seed` seeds the world and, apart from it, the distractors."""
+        """Start all sessions; `seed` seeds the world and, independently, the distractors."""
         observations, info = super().reset(seed=seed, options=options)
         if seed is not None:
             self._distractors = np.random.default_rng([seed, 31])
-        return self._shown(observations), info
+        return self._with_distractors(observations), info
 
     def step(
         self, actions: AnyArray
     ) -> tuple[FloatArray, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
-        """Play one action a session."""
+        """Play one action in each session, as the wrapped world does."""
         observations, rewards, terminated, truncated, info = self.env.step(actions)
         if "final_obs" in info:
             rows = np.flatnonzero(info["_final_obs"])
-            last = self._shown(np.stack(info["final_obs"][rows].tolist()))
+            last = self._with_distractors(np.stack(info["final_obs"][rows].tolist()))
             for row, final in zip(rows, last, strict=True):
                 info["final_obs"][row] = final
-        return self._shown(observations), rewards, terminated, truncated, info
+        return self._with_distractors(observations), rewards, terminated, truncated, info
 
-    def _shown(self, observations: FloatArray) -> FloatArray:
+    def _with_distractors(self, observations: FloatArray) -> FloatArray:
         distractors = self._distractors.random(len(observations)) < self._rate
         return np.column_stack([distractors, observations]).astype(np.float32)
 
 
-class Unaware:
-    """A behavior policy of the world without the distractor, which it does not look at."""
+class WithoutDistractor:
+    """A behavior policy of the wrapped world; it reads observations without the distractor."""
 
     def __init__(self, actor: Actor) -> None:
         self._actor = actor
         self.begin, self.observe = actor.begin, actor.observe
 
     def act(self, observations: FloatArray, live: BoolArray) -> tuple[AnyArray, FloatArray | None]:
-        """Choose by all of the observation but the distractor."""
+        """Act on observations (N, 1 + O) with the distractor removed."""
         return self._actor.act(observations[:, 1:], live)
 
     def inform(self, info: Mapping[str, Any]) -> None:
-        """Hand on what the world says."""
+        """Pass the world's `info` to the policy, if it reads it."""
         if isinstance(self._actor, Informed):
             self._actor.inform(info)
 
 
-def _unaware(
+def _without_distractor(
     behavior: Callable[[VectorEnv[Any, Any, Any], int], Actor],
     env: VectorEnv[Any, Any, Any],
     seed: int,
-) -> Unaware:
+) -> WithoutDistractor:
     assert isinstance(env, DistractorEnv)
-    return Unaware(behavior(env.env, seed))
+    return WithoutDistractor(behavior(env.env, seed))
 
 
 def with_distractor(simulator: Simulator, rate: float) -> Simulator:
-    """The simulator's world with a distractor shown with probability `rate`, and its behaviors."""
-    shown = {OFF: "off", ON: "always on"}.get(rate, f"drawn with probability {rate:g}")
+    """The simulator with a distractor that is on with probability `rate` in its world."""
+    state = {OFF: "off", ON: "always on"}.get(rate, f"drawn with probability {rate:g}")
     return replace(
         simulator,
-        summary=f"{simulator.summary}; with an idle distractor, {shown}",
+        summary=f"{simulator.summary}; with a distractor, {state}",
         make=lambda num_envs, folder: DistractorEnv(simulator.make(num_envs, folder), rate),
-        behaviors={name: partial(_unaware, own) for name, own in simulator.behaviors.items()},
+        behaviors={
+            name: partial(_without_distractor, behavior)
+            for name, behavior in simulator.behaviors.items()
+        },
     )
 
 
 @dataclass(frozen=True)
 class DistractorWorld(World):
-    """A named world without a distractor, made one with it, for `ucfrec.evaluation.evaluate`."""
+    """A named world with a distractor added, for `ucfrec.evaluation.evaluate`."""
 
     rate: float = OFF
+    """Probability that the distractor is on in a step."""
 
     def simulator(self) -> Simulator:
-        """Load the simulator that the name stands for, and show the distractor in it."""
+        """Load the simulator of this name, with the distractor added."""
         return with_distractor(super().simulator(), self.rate)
 
 

@@ -1,4 +1,4 @@
-"""Where worlds look for their files unless told."""
+"""The default folder of the worlds' files."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What every world here shares: sessions side by side, each replaced in the step it ends in."""
+"""Base classes of the worlds: parallel sessions, each replaced in the step in which it ends."""
 
 from abc import ABC, abstractmethod
 from typing import Any, SupportsFloat, cast
@@ -20,11 +20,11 @@ AnyArray = npt.NDArray[Any]
 def draw_categories(
     probabilities: npt.NDArray[np.floating[Any]], uniforms: npt.NDArray[np.float64]
 ) -> IntArray:
-    """Sample one category a row by inverting the cumulative distribution.
+    """Sample one category per row by inverting the cumulative distribution.
 
     Args:
-        probabilities: (M, K), rows proportional to probabilities.
-        uniforms: (M,) on [0, 1).
+        probabilities: (M, K) weights; each row is proportional to its probabilities.
+        uniforms: (M,) uniform draws from [0, 1).
 
     Returns:
         (M,) categories, 0 to K − 1.
@@ -37,13 +37,13 @@ def draw_categories(
 class SessionsEnv(VectorEnv[FloatArray, AnyArray, AnyArray], ABC):
     """N sessions played at once with `AutoresetMode.SAME_STEP`.
 
-    A step that ends a session returns the first observation of its successor, and the ended
-    session's own in `info["final_obs"]` and `info["final_info"]`, as `SyncVectorEnv` does. All
-    randomness comes from the one generator that `reset(seed=…)` seeds.
+    A step that ends a session returns the first observation of the next session, and the last one
+    of the ended session in `info["final_obs"]` and `info["final_info"]`, as `SyncVectorEnv` does.
+    All randomness comes from the generator that `reset(seed=…)` seeds.
 
     Raises:
-        InputError: `num_envs` is not positive; or, on a step, actions of the wrong shape, not
-            finite, or unknown.
+        InputError: `num_envs` is not positive. In `step`: actions have the wrong shape, are not
+            finite, or are not in the action space.
     """
 
     def __init__(
@@ -68,20 +68,20 @@ class SessionsEnv(VectorEnv[FloatArray, AnyArray, AnyArray], ABC):
 
     @abstractmethod
     def _play(self, actions: AnyArray) -> tuple[FloatArray, BoolArray, BoolArray]:
-        """Advance every session by a step: rewards, terminated and truncated, each (N,)."""
+        """Advance every session one step; returns rewards, terminated and truncated, each (N,)."""
 
     @abstractmethod
     def _observe(self) -> FloatArray:
-        """Observations (N, O), an array of their own."""
+        """Observations (N, O) in a new array."""
 
     @abstractmethod
     def _describe(self) -> dict[str, AnyArray]:
-        """What `info` says of every session, arrays of N rows of their own."""
+        """Entries of `info`: new arrays with one row per session."""
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[FloatArray, dict[str, Any]]:
-        """Start all sessions afresh: observations (N, O) and info."""
+        """Start all sessions; returns observations (N, O) and info."""
         super().reset(seed=seed, options=options)
         self._begin(np.arange(self.num_envs))
         self._started = True
@@ -90,7 +90,17 @@ class SessionsEnv(VectorEnv[FloatArray, AnyArray, AnyArray], ABC):
     def step(
         self, actions: AnyArray
     ) -> tuple[FloatArray, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
-        """Play one action a session: observations, rewards, terminated, truncated, info."""
+        """Play one action in each session.
+
+        Args:
+            actions: (N, A) vectors or (N,) items.
+
+        Returns:
+            Observations (N, O), rewards, terminated and truncated (N,), and info.
+
+        Raises:
+            InputError: the actions are not in the action space.
+        """
         if not self._started:
             raise ResetNeeded("call reset before the first step")
         rewards, terminated, truncated = self._play(self._checked(actions))
@@ -109,8 +119,8 @@ class SessionsEnv(VectorEnv[FloatArray, AnyArray, AnyArray], ABC):
                 "_final_info": ended,
             }
             self._begin(rows)
-        everywhere = np.ones(self.num_envs, dtype=np.bool_)
-        return self._observe(), rewards, terminated, truncated, self._info(everywhere) | final
+        all_rows = np.ones(self.num_envs, dtype=np.bool_)
+        return self._observe(), rewards, terminated, truncated, self._info(all_rows) | final
 
     def _info(self, rows: BoolArray) -> dict[str, AnyArray]:
         described = self._describe()
@@ -132,12 +142,16 @@ class SessionsEnv(VectorEnv[FloatArray, AnyArray, AnyArray], ABC):
                 )
             return actions.astype(np.int64)
         if not np.isfinite(actions).all():
-            raise InputError(f"{type(self).__name__} was given actions that are not finite")
+            raise InputError(f"{type(self).__name__} got actions that are not finite")
         return actions.astype(np.float32, copy=False)
 
 
 class SingleSession(gymnasium.Env[FloatArray, AnyArray]):
-    """One session at a time: the plain Gymnasium view of a world of one."""
+    """A plain Gymnasium environment of a world with one session.
+
+    Raises:
+        InputError: the world has more than one session.
+    """
 
     def __init__(self, world: VectorEnv[FloatArray, AnyArray, AnyArray]) -> None:
         if world.num_envs != 1:
@@ -149,7 +163,7 @@ class SingleSession(gymnasium.Env[FloatArray, AnyArray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[FloatArray, dict[str, Any]]:
-        """Start a session: observation (O,) and info."""
+        """Start a session; returns the observation (O,) and info."""
         super().reset(seed=seed, options=options)
         observations, infos = self._world.reset(seed=seed, options=options)
         return observations[0], _first(infos)
@@ -157,7 +171,7 @@ class SingleSession(gymnasium.Env[FloatArray, AnyArray]):
     def step(
         self, action: AnyArray
     ) -> tuple[FloatArray, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Play one action: observation (O,), reward, terminated, truncated, info."""
+        """Play one action; returns observation (O,), reward, terminated, truncated and info."""
         observations, rewards, terminated, truncated, infos = self._world.step(
             np.asarray(action)[None]
         )

@@ -1,4 +1,4 @@
-"""A catalogue of tagged items, users who grow bored, and an optimal policy known exactly."""
+"""A synthetic catalogue of tagged items with an exit rule and an exactly known optimal policy."""
 
 from pathlib import Path
 from typing import Any, Final
@@ -21,17 +21,24 @@ NO_TAG: Final = -1
 
 
 class SyntheticCatalog(SessionsEnv):
-    """One item a step; it is clicked or not; the same tag again too soon ends the session.
+    """One item per step, clicked or not; repeating a tag too soon ends the session.
 
-    Every item has one tag. User u clicks item i with a probability p(u, i) that never changes: a
-    logistic function of u's taste for i's tag (that of u's cluster plus u's own), of the match of
+    Every item has one tag. User u clicks item i with a fixed probability p(u, i): a logistic
+    function of u's taste for i's tag (a cluster's taste plus an individual one), of the product of
     latent factors, and of i's quality. Reward: 1 for a click, else 0. The session terminates in
     the step whose item has a tag that already occurred among the `boredom_window` − 1 items
     before (the exit rule of the Kuaishou simulators with threshold 0 and no last-step exception);
     that step's reward counts. It is truncated after `max_turn` steps. Items may repeat.
 
-    Observation (n_tags + 4,): the user's tastes and factors as the platform knows them, with noise
-    that is fixed for the user. `info["user_id"]` (N,): who is served next, 0 to n_users − 1.
+    Observation (n_tags + 4,): the user's tastes and factors plus noise that is fixed for the user.
+    `info["user_id"]` (N,): the user of the next step, 0 to n_users − 1.
+
+    Args:
+        num_envs: number of parallel sessions, N.
+        n_items, n_tags, n_users: sizes of the world.
+        boredom_window: items among which a tag may occur only once.
+        max_turn: largest number of steps of a session.
+        world_seed: seed of users and items; independent of the seed of `reset`.
 
     Raises:
         InputError: fewer tags than `boredom_window`, or fewer items than tags.
@@ -56,32 +63,32 @@ class SyntheticCatalog(SessionsEnv):
         self.tags: IntArray = world.permutation(np.arange(n_items) % n_tags)
         """(n_items,) tag of each item."""
         centres = world.normal(0, 1, (CLUSTERS, n_tags))
-        own = world.normal(0, 0.6, (n_users, n_tags))
-        tastes = centres[world.integers(CLUSTERS, size=n_users)] + own
+        individual = world.normal(0, 0.6, (n_users, n_tags))
+        tastes = centres[world.integers(CLUSTERS, size=n_users)] + individual
         factors = world.normal(0, 1, (n_users, FACTORS))
         match = factors @ world.normal(0, 1, (FACTORS, n_items)) / np.sqrt(FACTORS)
         quality = world.normal(0, 0.5, n_items)
         self.logits = -2.5 + tastes[:, self.tags] + 0.7 * match + quality
         """(n_users, n_items) log-odds of a click."""
         self.click_probabilities: npt.NDArray[np.float64] = 1 / (1 + np.exp(-self.logits))
-        """(n_users, n_items)."""
-        known = np.concatenate([tastes, factors], axis=1)
-        self._features = (known + world.normal(0, 0.5, known.shape)).astype(np.float32)
+        """(n_users, n_items) probabilities of a click."""
+        features = np.concatenate([tastes, factors], axis=1)
+        self._features = (features + world.normal(0, 0.5, features.shape)).astype(np.float32)
         self.boredom_window, self.max_turn = boredom_window, max_turn
         self.users: IntArray = np.zeros(num_envs, dtype=np.int64)
-        """(N,) who is served."""
+        """(N,) user of each session."""
         self.turns: IntArray = np.zeros(num_envs, dtype=np.int64)
-        """(N,) items shown so far."""
+        """(N,) number of items shown so far."""
         self.recent_tags: IntArray = np.full((num_envs, boredom_window - 1), NO_TAG)
-        """(N, boredom_window − 1) tags just shown, the latest last; −1 where none was."""
+        """(N, boredom_window − 1) tags of the last items, the latest last; padded with −1."""
         super().__init__(
             num_envs,
-            spaces.Box(-np.inf, np.inf, (known.shape[1],), dtype=np.float32),
+            spaces.Box(-np.inf, np.inf, (features.shape[1],), dtype=np.float32),
             spaces.Discrete(n_items),
         )
 
     def item_features(self) -> pa.Table:
-        """One row an item: `item_id` and its tag one-hot as `tag_0`, `tag_1`, …."""
+        """One row per item: `item_id` and its tag one-hot as `tag_0`, `tag_1`, …."""
         hot = np.eye(self.tags.max() + 1, dtype=np.float32)[self.tags]
         columns = {f"tag_{tag}": pa.array(column) for tag, column in enumerate(hot.T)}
         return pa.table({"item_id": pa.array(np.arange(len(self.tags))), **columns})
@@ -106,12 +113,12 @@ class SyntheticCatalog(SessionsEnv):
         return np.take_along_axis(by_tag, order[:, : self.boredom_window], axis=1)
 
     def optimal_returns(self) -> npt.NDArray[np.float64]:
-        """What `Rotation` earns in expectation from each user, (n_users,): no policy earns more."""
+        """(n_users,) expected return of `Rotation` for each user, which is the largest possible."""
         best = np.take_along_axis(
             self.click_probabilities, self.favourites(self.click_probabilities), axis=1
         )
-        places = np.arange(self.max_turn - 1) % self.boredom_window
-        return np.asarray(best[:, places].sum(axis=1) + best[:, 0])
+        ranks = np.arange(self.max_turn - 1) % self.boredom_window
+        return np.asarray(best[:, ranks].sum(axis=1) + best[:, 0])
 
     def _begin(self, rows: IntArray) -> None:
         self.users[rows] = self.np_random.integers(len(self.logits), size=len(rows))
@@ -135,38 +142,42 @@ class SyntheticCatalog(SessionsEnv):
 
 
 class Rotation(Memoryless):
-    """Each user's favourites in turn, the best again in the last step.
+    """Play each user's favourites in turn, and the best again in the last step.
 
-    With the true probabilities it is optimal. Let m₁ ≥ m₂ ≥ … be the user's best probability in
-    each tag, N the boredom window, T = `max_turn`, and S(t) the sum of the first t terms of
-    m₁, …, m_N, m₁, …. Clicks do not change what comes next, so fixed sequences of items suffice.
-    If a sequence ends with step t ≤ T, its first t − 1 steps bored nobody, so any N successive
-    ones of them have different tags: cut into blocks of N from the start, they earn at most
-    S(t − 1), and the last step earns at most m₁. As S grows with t, no sequence earns more than
-    S(T − 1) + m₁. Taking the favourites in turn for T − 1 steps bores nobody and earns S(T − 1);
-    the last step may bore and earns m₁.
+    With the true probabilities it is optimal. Proof:
+
+    Let m₁ ≥ m₂ ≥ … be the user's best probability in each tag, N the boredom window, T =
+    `max_turn`, and S(t) the sum of the first t terms of m₁, …, m_N, m₁, …. Clicks do not affect
+    later steps, so fixed sequences of items suffice. If a sequence ends with step t ≤ T, its
+    first t − 1 steps did not end the session, so any N successive ones of them have different
+    tags. Cut into blocks of N from the start, they earn at most S(t − 1) in expectation, and
+    the last step at most m₁. As S grows with t, no sequence earns more than S(T − 1) + m₁. The
+    favourites in turn for T − 1 steps never repeat a tag too soon and earn S(T − 1); the last
+    step may end the session and earns m₁.
     """
 
     def __init__(self, world: SyntheticCatalog, favourites: IntArray) -> None:
         self._world, self._favourites = world, favourites
 
     def act(self, observations: FloatArray, live: BoolArray) -> tuple[IntArray, FloatArray | None]:
-        """The next favourite of each user, (N,), with certainty."""
+        """The next favourite (N,) of each session's user; propensities (N,) are 1."""
         world = self._world
         last = world.turns == world.max_turn - 1
-        place = np.where(last, 0, world.turns % world.boredom_window)
-        chosen = self._favourites[world.users, place]
+        rank = np.where(last, 0, world.turns % world.boredom_window)
+        chosen = self._favourites[world.users, rank]
         return chosen, np.ones(len(chosen), dtype=np.float32)
 
 
 class SoftmaxGuess(Memoryless):
-    """Epsilon-greedy softmax over log-odds misjudged by a fixed error, exact propensities.
+    """Softmax policy over erroneous log-odds with uniform exploration; its propensities are exact.
 
     Args:
-        error: standard deviation of the platform's error about each (user, item) log-odds.
-        temperature: of the softmax.
-        epsilon: share of uniform exploration.
-        variety: log-odds taken off items whose tag was just shown.
+        world: the world that it acts in.
+        seed: seed of its draws.
+        error: standard deviation of the fixed error of each (user, item) log-odds.
+        temperature: temperature of the softmax.
+        epsilon: probability of a uniformly drawn item.
+        variety: penalty, in log-odds, of items whose tag was shown recently.
     """
 
     def __init__(
@@ -181,12 +192,12 @@ class SoftmaxGuess(Memoryless):
         self._world = world
         self._temperature, self._epsilon, self._variety = temperature, epsilon, variety
         self._generator = np.random.default_rng([seed, 4, round(1000 * error)])
-        # The error belongs to the policy: the seed moves its draws, not its quality.
-        misjudged = np.random.default_rng([0, 5, round(1000 * error)])
-        self._guess = world.logits + error * misjudged.standard_normal(world.logits.shape)
+        # The error does not depend on the seed, so the seed does not change the policy's quality.
+        errors = np.random.default_rng([0, 5, round(1000 * error)])
+        self._guess = world.logits + error * errors.standard_normal(world.logits.shape)
 
     def probabilities(self) -> npt.NDArray[np.float64]:
-        """What each session is shown next, (N, n_items)."""
+        """(N, n_items) probability of each item in each session's next step."""
         world = self._world
         shown = (world.recent_tags[:, :, None] == world.tags).any(axis=1)
         scores = (self._guess[world.users] - self._variety * shown) / self._temperature
@@ -195,7 +206,7 @@ class SoftmaxGuess(Memoryless):
         return np.asarray((1 - self._epsilon) * greedy + self._epsilon / scores.shape[1])
 
     def act(self, observations: FloatArray, live: BoolArray) -> tuple[IntArray, FloatArray]:
-        """Draw an item a session, (N,)."""
+        """Draw items (N,); returns them and their propensities (N,)."""
         probabilities = self.probabilities()
         chosen = draw_categories(probabilities, self._generator.random(len(probabilities)))
         return chosen, probabilities[np.arange(len(chosen)), chosen].astype(np.float32)
@@ -208,16 +219,24 @@ def _catalog(env: VectorEnv[Any, Any, Any]) -> SyntheticCatalog:
 
 
 def optimal(env: VectorEnv[Any, Any, Any], seed: int) -> Rotation:
-    """Rotate each user's own favourites."""
+    """The optimal policy: `Rotation` with the true probabilities; `seed` is unused.
+
+    Raises:
+        InputError: `env` is not a SyntheticCatalog.
+    """
     world = _catalog(env)
     return Rotation(world, world.favourites(world.click_probabilities))
 
 
 def popular(env: VectorEnv[Any, Any, Any], seed: int) -> Rotation:
-    """Rotate the favourites of the mean user: the best that knows nobody."""
+    """`Rotation` by mean probabilities over users: a non-personalised policy; `seed` is unused.
+
+    Raises:
+        InputError: `env` is not a SyntheticCatalog.
+    """
     world = _catalog(env)
-    everybody = world.favourites(world.click_probabilities.mean(axis=0, keepdims=True))
-    return Rotation(world, np.tile(everybody, (len(world.logits), 1)))
+    favourites = world.favourites(world.click_probabilities.mean(axis=0, keepdims=True))
+    return Rotation(world, np.tile(favourites, (len(world.logits), 1)))
 
 
 QUALITIES: Final = (
@@ -225,13 +244,16 @@ QUALITIES: Final = (
     (1.5, 0.7, 0.2, 2.0, 0.30),
     (1.0, 0.5, 0.1, 4.0, 0.20),
 )
-"""Guesses of the mixture: error, temperature, epsilon, variety, share of sessions."""
+"""Error, temperature, epsilon, variety and share of sessions of each policy of the mixture."""
 
 
 def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
-    """A logging policy of mediocre mean quality and wide variance between sessions.
+    """A logging policy of medium mean quality and high variance between sessions.
 
-    A fifth of the sessions get uniform items, the others guesses of rising quality (`QUALITIES`).
+    A fifth of the sessions get uniform items, the others one of the policies of `QUALITIES`.
+
+    Raises:
+        InputError: `env` is not a SyntheticCatalog.
     """
     world = _catalog(env)
     guesses: list[Actor] = [SoftmaxGuess(world, seed, *knobs) for *knobs, _ in QUALITIES]

@@ -89,7 +89,7 @@ def test_clicks_that_are_the_rule_are_high_and_equal_rewards_are_refused(tmp_pat
         else:
             with pytest.raises(InputError, match="no bit can be correlated"):
                 reward_bit(store)
-    with pytest.raises(InputError, match=r"lies in \[0, 1\]"):
+    with pytest.raises(InputError, match=r"lie in \[0, 1\]"):
         reward_bit(store, flip=1.5)
 
 
@@ -119,7 +119,7 @@ def test_the_distractor_causes_nothing(kuairand_folder: Path, name: str) -> None
                 assert final in env.single_observation_space
             distractors.append(mine[0][:, 0])
         assert np.mean(distractors) == pytest.approx(rate, abs=0.08 if 0 < rate < 1 else 0)
-    with pytest.raises(InputError, match=r"lies in \[0, 1\]"):
+    with pytest.raises(InputError, match=r"lie in \[0, 1\]"):
         DistractorEnv(plain, 2.0)
 
 

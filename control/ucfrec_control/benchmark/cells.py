@@ -1,4 +1,4 @@
-"""One cell of the control tables: a training, and the rows it gives."""
+"""One cell of the control tables: a training and its result rows."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -29,13 +29,13 @@ from ucfrec_control.learners.rl_baselines import (
 from ucfrec_control.learners.train import dataset_of, preset_of, train_control
 
 SCORES, ROBUSTNESS = "control", "robustness"
-"""The suites."""
+"""Suites of the rows."""
 _RULE: Final = "target return: the first of the preset"
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One training, and the rows it gives."""
+    """One training and its evaluation."""
 
     suite: str
     table: str
@@ -45,55 +45,56 @@ class Cell:
     learner: str
     """One of `ucfrec.policies.registry.policy_names`, or one of `ALGORITHMS`."""
     settings: tuple[str, ...]
-    """Over the presets."""
+    """Settings over the presets."""
     store: Path
     run: Path
     seed: int
-    """Of the training."""
+    """Training seed."""
     episodes: int
     evaluation_seed: int
     code_version: str
     rl_steps: int = 0
     rl_batch_size: int = 0
-    """Of IQL and CQL."""
+    """Updates, and transitions per update, of IQL and CQL."""
     distractor: str | None = None
-    """A key of `DISTRACTORS`, of the robustness suite."""
+    """A key of `DISTRACTORS`; None outside the robustness suite."""
     screening: str | None = None
     """As in `train_control`."""
 
     @property
     def config(self) -> Config:
-        """All that decides the training of a sequence policy, with its data."""
+        """The resolved configuration of a sequence policy's training."""
         tables = preset_of(dataset_of(EpisodeStore.open(self.store)), self.learner).tables
         return resolve_config(self.learner, None, self.settings, self.seed, tables)
 
     @property
     def rl_config(self) -> RLConfig:
-        """The same of IQL and CQL."""
+        """The configuration of an IQL or CQL training."""
         dataset = dataset_of(EpisodeStore.open(self.store))
         return rl_config(dataset, self.learner, self.rl_steps, self.rl_batch_size)
 
     @property
     def targets(self) -> Sequence[float]:
-        """The return that the policy is given."""
+        """The target return, the preset's first; empty if there is none."""
         return preset_of(dataset_of(EpisodeStore.open(self.store)), self.learner).targets[:1]
 
 
 def code_of(learner: str, *more: str) -> str:
-    """The version of the code that a cell of `learner` runs through.
+    """The version of the code that a cell of `learner` depends on.
 
     Args:
-        more: modules that the measurement uses beside training and evaluation.
+        learner: as `Cell.learner`.
+        more: further modules that the measurement uses.
     """
     rl = "ucfrec_control.learners.rl_baselines"
     is_rl = learner in ALGORITHMS
-    own = rl if is_rl else policy_class(learner).__module__
+    learner_module = rl if is_rl else policy_class(learner).__module__
     parts = ("ucfrec_control.learners.train", "ucfrec_control.learners.evaluate")
-    return code_version(__name__, *parts, own, *more, exclude=() if is_rl else (rl,))
+    return code_version(__name__, *parts, learner_module, *more, exclude=() if is_rl else (rl,))
 
 
 def key(cell: Cell) -> RowKey:
-    """What tells the cell's rows from others."""
+    """The key under which the cell's rows are stored."""
     conditions: dict[str, str | int] = {"budget": cell.budget, "episodes": cell.episodes}
     if cell.distractor is not None:
         conditions["distractor"] = cell.distractor
@@ -118,26 +119,29 @@ def config(cell: Cell) -> dict[str, Any]:
     return asdict(cell.config)
 
 
-def measure_scores(cell: Cell, own: RowKey) -> list[ResultRow]:
-    """Train, and evaluate every checkpoint that is kept."""
+def measure_scores(cell: Cell, row_key: RowKey) -> list[ResultRow]:
+    """Train, and evaluate every kept checkpoint; returns one row for each."""
     store = EpisodeStore.open(cell.store)
     if cell.learner in ALGORITHMS:
         train_rl(store, cell.run, cell.rl_config, cell.seed)
     else:
         train_control(store, cell.run, cell.config)
-    found = evaluate_run(
+    evaluations = evaluate_run(
         cell.run, episodes=cell.episodes, seed=cell.evaluation_seed, targets=cell.targets
     )
-    return [score_row(row, own, rule=_RULE, **provenance(PACKAGES)) for row in found]
+    return [
+        score_row(evaluation, row_key, rule=_RULE, **provenance(PACKAGES))
+        for evaluation in evaluations
+    ]
 
 
-def measure_robustness(cell: Cell, own: RowKey) -> list[ResultRow]:
-    """Train with the distractor, and evaluate where it is fixed to 0 and to 1."""
+def measure_robustness(cell: Cell, row_key: RowKey) -> list[ResultRow]:
+    """Train with the distractor, and evaluate with it fixed to 0 and to 1; returns one row."""
     store = EpisodeStore.open(cell.store)
     record = train_control(store, cell.run, cell.config, screening=cell.screening)
-    # The last checkpoint: the best on validation was chosen where the distractor still varies.
-    # Every method plays the same starts, with and without distractor.
-    found = [
+    # The last checkpoint: the best one is chosen on data in which the distractor varies.
+    # All evaluations have the same initial states, with and without distractor.
+    evaluations = [
         evaluate_run(
             cell.run,
             episodes=cell.episodes,
@@ -149,10 +153,10 @@ def measure_robustness(cell: Cell, own: RowKey) -> list[ResultRow]:
         for value in ((0.0,) if cell.distractor == CLEAN else (0.0, 1.0))
     ]
     losses = held_out_losses(TrainedPolicy.load(cell.run, "last"), store)
-    metrics = {"score_at_one": found[-1]["score"], **losses}
+    metrics = {"score_at_one": evaluations[-1]["score"], **losses}
     details = {"screening": verdicts(record["screening"], store)} if cell.screening else {}
-    given = {"metrics": metrics, "details": details, "rule": _RULE}
-    return [score_row(found[0], own, **given, **provenance(PACKAGES))]
+    fields = {"metrics": metrics, "details": details, "rule": _RULE}
+    return [score_row(evaluations[0], row_key, **fields, **provenance(PACKAGES))]
 
 
 SCORE_MEASUREMENT: Final = Measurement(key, config, measure_scores)

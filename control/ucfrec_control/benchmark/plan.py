@@ -28,13 +28,13 @@ METHODS: Methods = {
 }
 """Learner and settings by the name of the table's row; the last two are Table 3's ablations.
 
-UCF's preset tells its policy no time, DT's does; `ucf-w-time` and `dt-wo-time` are the other way
-round.
+UCF's preset has no embedding of time steps and DT's has one; `ucf-w-time` and `dt-wo-time` are the
+reverse.
 """
 
 _FAITHFUL, _NOISE = "csg.kind=faithful", "csg.kind=noise"
 _NO_GATE = "augment.epsilon_r=1e9"
-"""Every change of the reward passes; the limit on a move's length stays."""
+"""Disables the gate on the change of the reward; the limit on a move's length stays."""
 _ALGORITHM_5 = ("augment.copies=3", "augment.edits_per_copy=1", "augment.reward_quantile=0.0")
 MAIN = "main"
 TABLES: dict[str, Methods] = {
@@ -51,7 +51,7 @@ TABLES: dict[str, Methods] = {
         "faithful": ("ucf", (_FAITHFUL,)),
         "faithful-wo-gate": ("ucf", (_FAITHFUL, _NO_GATE)),
     },
-    # Table 10: λ_band is of the paper's network; of tangent moves, the band is widened instead.
+    # Table 10: λ_band exists for the paper's network only; for tangent moves the band is widened.
     "band": {
         "ucf": ("ucf", ()),
         "ucf-wide": ("ucf", ("csg.band=[0.2, 2.0]",)),
@@ -60,18 +60,18 @@ TABLES: dict[str, Methods] = {
         "faithful-wo-band": ("ucf", (_FAITHFUL, "csg.lambda_band=0.0")),
         "faithful-wo-lower": ("ucf", (_FAITHFUL, "csg.band=[0.0, 0.5]")),
     },
-    # Does augmentation help at all? Each generator, reading of the copies, with and without gate.
+    # Does augmentation help? Each generator and variant of the copies, with and without gate.
     "augmentation": {
         "ucf-wo-count": ("ucf", ("augment.copies=0",)),
         **{
-            f"{name}{reading}{gate}": ("ucf", (*kind, *copies, *open_))
+            f"{name}{variant}{gate}": ("ucf", (*kind, *copies, *gate_settings))
             for name, kind, gates in (
                 ("ucf", (), (("", ()), ("-wo-gate", (_NO_GATE,)))),
                 ("faithful", (_FAITHFUL,), (("", ()), ("-wo-gate", (_NO_GATE,)))),
                 ("noise", (_NOISE,), (("-wo-gate", (_NO_GATE,)),)),
             )
-            for reading, copies in (("", ()), ("-algorithm-5", _ALGORITHM_5))
-            for gate, open_ in gates
+            for variant, copies in (("", ()), ("-algorithm-5", _ALGORITHM_5))
+            for gate, gate_settings in gates
         },
     },
 }
@@ -80,31 +80,32 @@ TABLES: dict[str, Methods] = {
 
 @dataclass(frozen=True)
 class Budget:
-    """What is cut from the paper's size, and what is not."""
+    """The size of a benchmark; every budget measures all methods."""
 
     files: tuple[str, ...]
     seeds: int
     episodes: int
     settings: tuple[str, ...]
-    """Over the presets; none is the authors' size."""
+    """Settings over the presets; without any, trainings have the authors' size."""
     memoryless: tuple[str, ...] = ()
-    """Over those, of `bc`."""
+    """Further settings of `bc`."""
     rl_steps: int = 1_000_000
-    """Of IQL and CQL, of `rl_batch_size` transitions each."""
+    """Updates of IQL and CQL."""
     rl_batch_size: int = 256
+    """Transitions per update of IQL and CQL."""
     evaluation_seed: int = 1000
-    """Of the episodes that are reported; the same for all training seeds and methods."""
+    """Seed of the reported episodes; the same for all training seeds and methods."""
 
     def settings_of(self, learner: str) -> tuple[str, ...]:
-        """What the budget sets for a sequence policy or `bc`."""
+        """The budget's settings for a sequence policy or `bc`."""
         return (*self.settings, *(self.memoryless if learner == "bc" else ()))
 
 
 _TASKS, _KINDS = ("halfcheetah", "hopper", "walker2d"), ("medium", "mixed", "medium-expert")
 BUDGETS = {
-    # Batches, steps and width are cut most, then files and seeds; no method is left out. One
-    # learning rate for all, since the authors' are meant for 25 times as many steps. Batch size,
-    # rate and schedule were chosen by the validation loss of DT and UCF (`benchmarks/LOG.md`).
+    # Batches, steps and width are reduced most, then files and seeds; no method is left out. All
+    # methods share one learning rate, as the authors' are for 25 times as many steps. Batch size,
+    # learning rate and schedule were chosen by validation loss (`benchmarks/LOG.md`).
     "small": Budget(
         ("hopper_medium-zoo", "hopper_mixed-zoo", "walker2d_medium-expert-zoo"),
         2,
@@ -120,9 +121,9 @@ BUDGETS = {
             "crm.epochs=3",
             "csg.epochs=5",
         ),
-        # As many predictions a step as 16 windows of 20; cheap enough to keep its width.
+        # As many predictions per update as 16 windows of 20 steps; cheap enough for the full width.
         memoryless=("train.batch_size=320", "policy.dim=128"),
-        # A quarter of the authors' batch, as the others have.
+        # A quarter of the authors' batch size, as for the other methods.
         rl_steps=5000,
         rl_batch_size=64,
     ),
@@ -131,14 +132,14 @@ BUDGETS = {
 
 _SMALL, _FULL = BUDGETS["small"], BUDGETS["full"]
 SWEEPS = {
-    # One file and half the steps, but twice the seeds: a sweep compares UCF with itself, and seeds
-    # differ more than settings do.
+    # One file and half the steps, but twice the seeds: the settings of a sweep differ less in score
+    # than seeds do.
     "small": replace(
         _SMALL, files=_SMALL.files[:1], seeds=4, settings=(*_SMALL.settings, "train.steps=2000")
     ),
     "full": replace(_FULL, files=("hopper_medium-zoo", "halfcheetah_medium-zoo")),
 }
-"""Of every table but the main one."""
+"""Budgets of every table but the main one."""
 
 
 def benchmark(
@@ -151,35 +152,36 @@ def benchmark(
     table: str = MAIN,
     methods: Sequence[str] = (),
 ) -> list[ResultRow]:
-    """Train and evaluate whatever has no row in `results` yet; returns the rows of all cells.
+    """Train and evaluate the cells without a row in `results`; returns the rows of all cells.
 
     Args:
         data: folder of the HDF5 files.
         folder: where stores and runs are kept.
-        results: JSON lines.
-        name: of the budget, for the rows.
-        workers: processes, of one thread each.
+        results: file of JSON lines.
+        budget: size of the benchmark.
+        name: name of the budget, for the rows.
+        workers: number of processes, of one thread each.
         table: a key of `TABLES`.
         methods: rows of the table; empty for all.
 
     Raises:
-        InputError: a file is missing, a method is none of the table's, `results` holds something
-            else, or cells failed.
+        InputError: a file is missing, a method is not in the table, `results` has other content,
+            or cells failed.
     """
-    known = chosen(TABLES[table], methods, "method")
-    cells = list(_cells(data, folder, budget, name, table, known))
+    selected = chosen(TABLES[table], methods, "method")
+    cells = list(_cells(data, folder, budget, name, table, selected))
     return run_grid(cells, SCORE_MEASUREMENT, results, workers, f"benchmark {table}")
 
 
 def _cells(
     data: Path, folder: Path, budget: Budget, name: str, table: str, methods: Sequence[str]
 ) -> Iterator[Cell]:
-    # One method of two sweeps is one run: trained once, evaluated for the rows of each.
+    # A method of two sweeps shares one run: trained once, evaluated for the rows of both.
     runs = folder / name / (MAIN if table == MAIN else "sweeps")
     for file in budget.files:
         store = zoo_store(data, stores_of(folder), file)
         for method in methods:
-            learner, own = TABLES[table][method]
+            learner, method_settings = TABLES[table][method]
             code = code_of(learner)
             for seed in range(budget.seeds):
                 yield Cell(
@@ -189,7 +191,7 @@ def _cells(
                     file=file,
                     method=method,
                     learner=learner,
-                    settings=(*budget.settings_of(learner), *own),
+                    settings=(*budget.settings_of(learner), *method_settings),
                     store=store,
                     run=runs / file / run_name(method, code, seed),
                     seed=seed,
@@ -202,10 +204,10 @@ def _cells(
 
 
 def stores_of(folder: Path) -> Path:
-    """Where the stores are that today's code writes."""
+    """The folder of the stores that this version of the code writes."""
     return folder / "stores" / code_version(zoo_store.__module__)
 
 
 def run_name(method: str, code: str, seed: int) -> str:
-    """The folder of a run: other code does not go on with it."""
+    """The folder name of a run, with the code's version: other code must not resume it."""
     return f"{method}-{code}-{seed}"

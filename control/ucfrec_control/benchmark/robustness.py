@@ -1,8 +1,8 @@
-"""What a distractor costs the learners that were trained with it (Figures 3 and 4, Appendix G.4).
+"""Scores lost by methods that were trained with a distractor (Figures 3 and 4, Appendix G.4).
 
-Every learner is trained on the plain data and on the same data with a distractor in its states, and
-evaluated where the distractor is fixed to 0. Two such trainings differ by their luck too; what one
-policy earns where it is fixed to 1 instead tells of the distractor alone.
+Every method is trained on the clean data and on the same data with a distractor in the states, and
+evaluated with the distractor fixed to 0. Two trainings also differ by chance. Evaluating the same
+policy with the distractor fixed to 1 instead isolates the effect of the distractor.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,12 +19,12 @@ from ucfrec_control.benchmark.plan import Budget, run_name, stores_of
 from ucfrec_control.data.distractor import CLEAN, DISTRACTORS, zoo_store
 
 SCREENED = {"ucf-screened": "copies", "ucf-dropped": "drop"}
-"""UCF with copies that intervene on what screening flags, and UCF that is not shown it."""
+"""UCF with copies that intervene on flagged dimensions, and UCF trained without them."""
 METHODS = ("dt", "dc", "lsdt", "ucf", "ucf-wo-count", "ucf-wo-arch", *SCREENED)
-"""Rows of `ucfrec_control.benchmark.plan`, and those."""
+"""Methods of `ucfrec_control.benchmark.plan`, and `SCREENED`."""
 
 BUDGETS = {
-    # As the benchmark's, with fewer seeds and steps and half the history; no method and no
+    # As the benchmark's, with fewer seeds and steps and half the context; no method and no
     # distractor is left out.
     "small": replace(
         SCORE_BUDGETS["small"],
@@ -36,7 +36,7 @@ BUDGETS = {
 SHOWN = ("clean", "score", "drop", "score_at_one")
 SHOWN_LOSSES = ("loss", "loss_at_zero", "rise")
 _CODE = (zoo_store.__module__, "ucfrec_control.learners.held_out_losses")
-"""Beside what every cell runs through."""
+"""Further modules that the cells depend on."""
 
 
 def robustness(
@@ -48,18 +48,19 @@ def robustness(
     workers: int,
     methods: Sequence[str] = (),
 ) -> list[ResultRow]:
-    """Train and evaluate whatever has no row in `results` yet; returns the rows of all cells.
+    """Train and evaluate the cells without a row in `results`; returns the rows of all cells.
 
     Args:
         data: folder of the HDF5 files.
         folder: where stores and runs are kept.
-        results: JSON lines.
-        name: of the budget, for the rows.
-        workers: processes, of one thread each.
-        methods: of `METHODS`; empty for all.
+        results: file of JSON lines.
+        budget: size of the benchmark.
+        name: name of the budget, for the rows.
+        workers: number of processes, of one thread each.
+        methods: some of `METHODS`; empty for all.
 
     Raises:
-        InputError: a file is missing, a method is unknown, `results` holds something else, or cells
+        InputError: a file is missing, a method is unknown, `results` has other content, or cells
             failed.
     """
     cells = list(_cells(data, folder, budget, name, chosen(METHODS, methods, "method")))
@@ -74,8 +75,7 @@ def _cells(
             store = zoo_store(data, stores_of(folder), file, distractor)
             runs = folder / f"robustness-{name}" / file / distractor
             for method in methods:
-                # A line of the score tables is trained.
-                learner, own = LEARNERS["ucf" if method in SCREENED else method]
+                learner, method_settings = LEARNERS["ucf" if method in SCREENED else method]
                 code = code_of(learner, *_CODE)
                 for seed in range(budget.seeds):
                     yield Cell(
@@ -85,7 +85,7 @@ def _cells(
                         file=file,
                         method=method,
                         learner=learner,
-                        settings=(*budget.settings_of(learner), *own),
+                        settings=(*budget.settings_of(learner), *method_settings),
                         store=store,
                         run=runs / run_name(method, code, seed),
                         seed=seed,
@@ -98,33 +98,36 @@ def _cells(
 
 
 def drops(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
-    """What every distractor took from a method, where a dataset and seed has a clean row too.
+    """The score that each method lost to each distractor, where there is a clean row too.
 
-    `clean` and `score` are the normalised scores without and with the distractor, which is fixed to
-    0, `drop` the share of `clean` that is lost, in percent: negative where nothing was lost, NaN
-    where `clean` is not above 0. `score_at_one` is what the policy of `score` earns, of the same
-    starts, where it is fixed to 1. Of rows that say the same, the last counts.
+    `clean` and `score` are the normalised scores of the policies trained without and with the
+    distractor, which is fixed to 0. `drop` is the loss in percent of `clean`: negative for a gain,
+    NaN if `clean` is not above 0. `score_at_one` is the score of the second policy, from the same
+    initial states, with the distractor fixed to 1. The last of several equal keys counts.
 
     Args:
-        rows: what `robustness` returns, of one budget.
+        rows: of one budget, as returned by `robustness`.
+
+    Returns:
+        One mapping per dataset, method, seed and distractor, with these and the values of `SHOWN`.
     """
     last = {(_pair(row), row.conditions["distractor"]): row.metrics for row in rows}
-    found = []
+    lines = []
     for (pair, distractor), metrics in last.items():
-        plain = last.get((pair, CLEAN))
-        if distractor == CLEAN or plain is None:
+        clean_metrics = last.get((pair, CLEAN))
+        if distractor == CLEAN or clean_metrics is None:
             continue
-        clean, score = plain["score"], metrics["score"]
-        lost = 100 * (clean - score) / clean if clean > 0 else float("nan")
-        values = (clean, score, lost, metrics.get("score_at_one"))
+        clean, score = clean_metrics["score"], metrics["score"]
+        drop = 100 * (clean - score) / clean if clean > 0 else float("nan")
+        values = (clean, score, drop, metrics.get("score_at_one"))
         names = ("task", "method", "training_seed", "distractor")
-        found.append(dict(zip((*names, *SHOWN), (*pair, distractor, *values), strict=True)))
-    return found
+        lines.append(dict(zip((*names, *SHOWN), (*pair, distractor, *values), strict=True)))
+    return lines
 
 
 def loss_rises(rows: Sequence[ResultRow]) -> list[Mapping[str, Any]]:
-    """Rows with a distractor, and as `rise` by how many percent of `loss` fixing it to 0 raises the
-    held-out action loss."""
+    """Lines of rows with a distractor, and `rise`: by how many percent the held-out action loss
+    rises when the distractor is fixed to 0."""
     return [
         {**row.as_line(), "rise": 100 * (row.metrics["loss_at_zero"] / row.metrics["loss"] - 1)}
         for row in rows
@@ -133,5 +136,5 @@ def loss_rises(rows: Sequence[ResultRow]) -> list[Mapping[str, Any]]:
 
 
 def _pair(row: ResultRow) -> tuple[str, str, int | None]:
-    """What a row with and one without a distractor have in common."""
+    """Dataset, method and seed, which are equal for a row with and one without a distractor."""
     return row.task, row.method, row.training_seed

@@ -1,4 +1,4 @@
-"""What `ucfrec-control evaluate` measured, as result rows."""
+"""Results of `ucfrec-control evaluate` as result rows."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,7 +10,7 @@ from ucfrec.reporting.result_row import ResultRow, RowKey, row_from_json
 from ucfrec.reporting.rows_file import read_rows
 
 EVALUATE: Final = "evaluate"
-"""The suite of rows that come from `evaluate --json`."""
+"""Suite of the rows of `evaluate --json`."""
 _METRICS: Final = (
     *("score", "score_std", "return", "length", "steps", "best_step", "validation_loss"),
     *("acceptance", "train_wall_time_s"),
@@ -19,66 +19,68 @@ _CONDITIONS: Final = ("episodes", "distractor_fixed_to", "lambda_mask")
 _DETAILS: Final = ("distractors", "dataset_versions", "warnings")
 
 
-def score_row(found: Mapping[str, Any], key: RowKey, **more: Any) -> ResultRow:
-    """A row of `ucfrec_control.learners.evaluate.evaluate_run` as that of a measurement.
+def score_row(evaluation: Mapping[str, Any], key: RowKey, **fields: Any) -> ResultRow:
+    """Convert a row of `ucfrec_control.learners.evaluate.evaluate_run` to a result row.
 
     Args:
-        more: further fields of the row, of which `metrics` and `details` are added to its own.
+        evaluation: the row of `evaluate_run`.
+        key: key of the result row.
+        fields: further fields; `metrics` and `details` are added to those of `evaluation`.
     """
-    conditions = {**key.conditions, **_known(found, _CONDITIONS)}
-    metrics = _known(found, _METRICS) | more.pop("metrics", {})
-    details = _known(found, _DETAILS) | more.pop("details", {})
-    given = vars(key) | {
+    conditions = {**key.conditions, **_values(evaluation, _CONDITIONS)}
+    metrics = _values(evaluation, _METRICS) | fields.pop("metrics", {})
+    details = _values(evaluation, _DETAILS) | fields.pop("details", {})
+    row = vars(key) | {
         "conditions": conditions,
         "metric": "score",
         "metrics": {name: float(value) for name, value in metrics.items()},
-        "interval": (found["score_low"], found["score_high"]),
-        "world": found["env_id"],
-        "checkpoint": found["checkpoint"],
-        "target_return": found["target_return"],
+        "interval": (evaluation["score_low"], evaluation["score_high"]),
+        "world": evaluation["env_id"],
+        "checkpoint": evaluation["checkpoint"],
+        "target_return": evaluation["target_return"],
         "details": {name: value for name, value in details.items() if value},
-        "wall_time_s": found["wall_time_s"],
+        "wall_time_s": evaluation["wall_time_s"],
     }
-    return ResultRow(**given | more)
+    return ResultRow(**row | fields)
 
 
 def read_scores(path: Path) -> list[ResultRow]:
     """Rows of a benchmark (`.jsonl`), or of `ucfrec-control evaluate --json` (`.json`).
 
     Raises:
-        InputError: the file is missing or holds something else.
+        InputError: the file is missing or has other content.
     """
     if path.suffix != ".json":
         return read_rows(path)
     rows = read_json(path)
     if not isinstance(rows, list):
         raise InputError(
-            f"{path} holds no list of rows; `ucfrec-control evaluate --json` makes one"
+            f"{path} is not a list of rows; write one with `ucfrec-control evaluate --json`"
         )
     return [_evaluated(row, f"{path}, row {n}") for n, row in enumerate(rows, start=1)]
 
 
-def _evaluated(found: object, where: str) -> ResultRow:
+def _evaluated(evaluation: object, where: str) -> ResultRow:
     try:
-        assert isinstance(found, dict)
+        assert isinstance(evaluation, dict)
         key = RowKey(
             suite=EVALUATE,
             table=EVALUATE,
-            task=found["dataset"],
-            method=found["method"],
-            policy=found["config"]["policy_name"],
-            training_seed=found["seed"],
-            evaluation_seed=found["evaluation_seed"],
-            config_hash=found["config_hash"],
-            data_fingerprint=found["fingerprint"],
+            task=evaluation["dataset"],
+            method=evaluation["method"],
+            policy=evaluation["config"]["policy_name"],
+            training_seed=evaluation["seed"],
+            evaluation_seed=evaluation["evaluation_seed"],
+            config_hash=evaluation["config_hash"],
+            data_fingerprint=evaluation["fingerprint"],
         )
-        row = score_row(found, key).to_json()
+        row = score_row(evaluation, key).to_json()
     except (AssertionError, AttributeError, KeyError, TypeError, ValueError):
         raise InputError(
-            f"{where}, is none of `ucfrec-control evaluate --json`; measure it again"
+            f"{where}, is not a row of `ucfrec-control evaluate --json`; evaluate the run again"
         ) from None
     return row_from_json(row, where)
 
 
-def _known(found: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
-    return {name: found[name] for name in names if found.get(name) is not None}
+def _values(evaluation: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
+    return {name: evaluation[name] for name in names if evaluation.get(name) is not None}

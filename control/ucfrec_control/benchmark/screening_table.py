@@ -1,4 +1,4 @@
-"""Whether screening flags distractors, and nothing else, on every file (resumable)."""
+"""Screening of every file: are distractors flagged, and only these? (resumable)"""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -22,12 +22,12 @@ SHOWN = (
 )
 SEED = 0
 SCREENING: Final = "screening"
-"""The suite."""
+"""Suite of the rows."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One screening."""
+    """One screening of one store."""
 
     file: str
     distractor: str
@@ -38,17 +38,20 @@ class Cell:
 def screening_table(
     data: Path, stores: Path, files: Sequence[str], results: Path, workers: int
 ) -> list[ResultRow]:
-    """Screen every file, plain and with each distractor, that has no row in `results` yet.
+    """Screen every file, clean and with each distractor, that has no row in `results` yet.
 
     Args:
         data: folder of the HDF5 files.
         stores: where stores are kept.
-        files: of `data`, without their ending.
-        results: JSON lines.
-        workers: processes, of one thread each.
+        files: names of files in `data`, without their ending.
+        results: file of JSON lines.
+        workers: number of processes, of one thread each.
+
+    Returns:
+        The rows of all screenings.
 
     Raises:
-        InputError: a file is missing, `results` holds something else, or cells failed.
+        InputError: a file is missing, `results` has other content, or cells failed.
     """
     cells = [
         Cell(file, distractor, zoo_store(data, stores, file, distractor), ScreeningConfig())
@@ -76,21 +79,21 @@ def _config(cell: Cell) -> dict[str, Any]:
     return asdict(cell.config)
 
 
-def _measure(cell: Cell, own: RowKey) -> list[ResultRow]:
+def _measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     store = EpisodeStore.open(cell.store)
     began = time.perf_counter()
     report = asdict(screen(store, cell.config, SEED))
-    found = verdicts(report, store)
-    wrong = sum(each["flagged"] and not each["distractor"] for each in found)
+    dimensions = verdicts(report, store)
+    wrong = sum(each["flagged"] and not each["distractor"] for each in dimensions)
     row = ResultRow(
-        **vars(own),
+        **vars(row_key),
         metric="true_flagged",
         metrics={
             "true_flagged": float(wrong),
             "reward_r2": report["reward_r2"],
             "transitions": float(report["transitions"]),
         },
-        details={"screening": found},
+        details={"screening": dimensions},
         wall_time_s=time.perf_counter() - began,
         **provenance(PACKAGES),
     )
@@ -101,7 +104,7 @@ _MEASUREMENT: Final = Measurement(_key, _config, _measure)
 
 
 def verdicts(report: Mapping[str, Any], store: EpisodeStore) -> list[dict[str, Any]]:
-    """What a screening report, as a mapping, says of each dimension of `store`'s states."""
+    """The verdict of a screening report (as a mapping) on each state dimension of `store`."""
     added = {each["dimension"] for each in store.meta["source"].get("distractors", [])}
     return [
         {
@@ -115,19 +118,20 @@ def verdicts(report: Mapping[str, Any], store: EpisodeStore) -> list[dict[str, A
 
 
 def screening_rows(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
-    """For each row with a screening: what was flagged, and how far the verdicts are apart.
+    """One line per row with a screening: flagged dimensions and estimated effects.
 
-    `effect` is the distractor's effect on the next state, `reward_effect` that on the reward; of
-    the true dimensions, the weakest cause has the larger of its two effects as `weakest_true`.
+    `effect` and `reward_effect` are those of the distractor on the next state and on the reward.
+    `weakest_true` is the smallest effect among the true dimensions, of each the larger one of the
+    two.
     """
-    found = []
+    lines = []
     for row in rows:
         verdicts = row.details.get("screening")
         if verdicts is None:
             continue
         added = [d for d in verdicts if d["distractor"]]
         true = [d for d in verdicts if not d["distractor"]]
-        found.append(
+        lines.append(
             {
                 "task": row.task,
                 "distractor": row.conditions["distractor"],
@@ -139,4 +143,4 @@ def screening_rows(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
                 "weakest_true": min(max(d["effect"], d["reward_effect"]) for d in true),
             }
         )
-    return found
+    return lines

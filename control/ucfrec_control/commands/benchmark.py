@@ -20,7 +20,7 @@ from ucfrec_control.learners.evaluate import CHECKPOINTS
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `benchmark` takes."""
+    """Add the options of `benchmark`."""
     parser.add_argument(
         "data", nargs="?", type=Path, metavar="DATA", help="folder of the HDF5 files"
     )
@@ -35,7 +35,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """`ucfrec-control benchmark`."""
+    """Run `ucfrec-control benchmark`."""
     if options.show_only:
         rows = rows_given(options, SCORES, [options.table])
     else:
@@ -76,5 +76,5 @@ _SHOWN = (
 
 
 def _line(row: ResultRow) -> dict[str, object]:
-    """A row as it is printed; what it does not have is a dash."""
+    """A row as it is printed; missing values are None, printed as a dash."""
     return dict.fromkeys(_SHOWN) | row.as_line()

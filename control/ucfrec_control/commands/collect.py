@@ -9,7 +9,7 @@ from ucfrec_control.data.collect import CollectConfig, collect
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `collect` takes."""
+    """Add the options of `collect`."""
     parser.add_argument("--env", required=True, help="Gymnasium environment, e.g. Hopper-v5")
     parser.add_argument("--out", type=Path, required=True, metavar="FOLDER")
     parser.add_argument("--steps", type=int, default=1_000_000, help="of training (1000000)")
@@ -26,7 +26,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """`ucfrec-control collect`."""
+    """Run `ucfrec-control collect`."""
     config = CollectConfig(
         steps=options.steps, every=options.every, fraction=options.fraction, size=options.size
     )

@@ -10,7 +10,7 @@ from ucfrec_control.data.minari import write_minari
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `convert` takes."""
+    """Add the options of `convert`."""
     source_options(parser)
     parser.add_argument(
         "target", metavar="TARGET", help="FILE.hdf5, or a Minari identifier such as hopper/mine-v0"
@@ -18,7 +18,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """`ucfrec-control convert`."""
+    """Run `ucfrec-control convert`."""
     trajectories = read_source(options)
     if options.target.endswith((".hdf5", ".h5")):
         written = Path(options.target)

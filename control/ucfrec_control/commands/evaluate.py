@@ -16,9 +16,9 @@ from ucfrec_control.learners.video import record_episode
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `evaluate` takes."""
+    """Add the options of `evaluate`."""
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
-    parser.add_argument("--env", help="environment (that of the data)")
+    parser.add_argument("--env", help="environment to play (that of the data)")
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
@@ -26,20 +26,23 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=float,
         action="append",
         default=[],
-        help="return asked of an episode; repeatable (the preset's)",
+        help="target return; repeatable (the preset's)",
     )
     parser.add_argument("--checkpoint", choices=["both", "best", "last"], default="both")
     parser.add_argument(
-        "--distractor", type=float, default=0.0, help="what distractors are fixed to (0)"
+        "--distractor", type=float, default=0.0, help="value that distractors are fixed to (0)"
     )
     parser.add_argument(
-        "--video", type=Path, metavar="MP4", help="show an episode: FILE.mp4, or folder for frames"
+        "--video",
+        type=Path,
+        metavar="MP4",
+        help="record an episode: FILE.mp4, or folder for frames",
     )
     parser.add_argument("--json", type=Path, help="write the result rows here")
 
 
 def run(options: argparse.Namespace) -> None:
-    """`ucfrec-control evaluate`."""
+    """Run `ucfrec-control evaluate`."""
     if options.video is not None:
         _record(options)
     rows: list[dict[str, Any]] = []
@@ -62,8 +65,8 @@ def run(options: argparse.Namespace) -> None:
 
 def _record(options: argparse.Namespace) -> None:
     if len(options.runs) != 1:
-        raise InputError(f"--video shows one run; {len(options.runs)} were given")
-    earned = record_episode(
+        raise InputError(f"--video records one run; {len(options.runs)} were given")
+    episode_return = record_episode(
         options.runs[0],
         options.video,
         seed=options.seed,
@@ -72,4 +75,4 @@ def _record(options: argparse.Namespace) -> None:
         target=next(iter(options.target), None),
         distractor=options.distractor,
     )
-    print(f"{options.video}: an episode of return {earned:.1f}\n")
+    print(f"{options.video}: an episode of return {episode_return:.1f}\n")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `figures` takes."""
+    """Add the options of `figures`."""
     parser.add_argument(
         "--runs", nargs="*", type=Path, default=[], metavar="RUN", help="runs, or folders of runs"
     )
@@ -15,12 +15,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """`ucfrec-control figures`."""
+    """Run `ucfrec-control figures`."""
     from ucfrec_control.figures.figures import (
         make_figures,  # matplotlib takes half a second to import
     )
 
     made, missing = make_figures(options.runs, options.results, options.out)
     print("\n".join(map(str, made)))
-    for what in missing:
-        print(f"missing: {what}", file=sys.stderr)
+    for line in missing:
+        print(f"missing: {line}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""Options that several commands share, and what they stand for."""
+"""Options that several commands share, and their values."""
 
 import argparse
 import dataclasses
@@ -16,61 +16,65 @@ from ucfrec_control.worlds.scores import find_task
 
 
 def source_options(parser: argparse.ArgumentParser) -> None:
-    """A dataset that is read."""
+    """Add the options that name a dataset to read."""
     parser.add_argument(
         "source", metavar="SOURCE", help="HDF5 file, Minari identifier, or folder of one"
     )
-    parser.add_argument("--env", help="environment that the data is of, if it does not say so")
+    parser.add_argument("--env", help="environment of the data, if the file does not name it")
     parser.add_argument("--download", action="store_true", help="let Minari fetch the dataset")
 
 
 def budget_options(parser: argparse.ArgumentParser) -> None:
-    """What of a benchmark is measured."""
+    """Add the options that select what a benchmark measures."""
     parser.add_argument("--budget", default="small", choices=["small", "full"])
     parser.add_argument(
         "--file",
         action="append",
         default=[],
-        help="of the data folder, without its ending; repeatable (the budget's)",
+        help="file of the data folder, without its ending; repeatable (the budget's)",
     )
     parser.add_argument(
         "--method", action="append", default=[], help="row of the table; repeatable (all)"
     )
-    parser.add_argument("--seeds", type=int, help="how many, from 0 (the budget's)")
+    parser.add_argument("--seeds", type=int, help="number of training seeds, from 0 (the budget's)")
     evaluation_seed_option(parser)
 
 
 def data_option(parser: argparse.ArgumentParser) -> None:
-    """Where the data of a benchmark is."""
-    parser.add_argument("--data", type=Path, metavar="FOLDER", help="of the HDF5 files")
+    """Add the option for the folder of a benchmark's data."""
+    parser.add_argument("--data", type=Path, metavar="FOLDER", help="folder of the HDF5 files")
 
 
 def data_given(options: argparse.Namespace) -> Path:
     """The folder of the HDF5 files.
 
     Raises:
-        InputError: none is named.
+        InputError: no folder is given.
     """
     if options.data is None:
         raise InputError("name the folder of the HDF5 files, or --show-only for rows at hand")
-    given: Path = options.data
-    return given
+    folder: Path = options.data
+    return folder
 
 
 def control_grid_options(parser: argparse.ArgumentParser) -> None:
-    """Where a benchmark keeps its runs and rows."""
+    """Add the options for where a benchmark keeps its runs and rows."""
     grid_options(parser, "runs/control", 1)
 
 
 def read_source(options: argparse.Namespace) -> Trajectories:
-    """The trajectories that `source_options` name."""
+    """Read the dataset that the options of `source_options` name.
+
+    Raises:
+        InputError: it is missing, damaged or of another format.
+    """
     if is_minari(options.source):
         return read_minari(options.source, options.env, options.download)
     return read_d4rl(Path(options.source), options.env)
 
 
 def describe_source(trajectories: Trajectories) -> str:
-    """What a dataset holds, and what of it was dropped."""
+    """A text with a dataset's size, mean return, score and dropped steps."""
     source, returns = trajectories.source, trajectories.returns
     task = find_task(source["env_id"], source["dataset"])
     score = f", normalised {task.score(returns.mean()):.2f}" if task else ""
@@ -83,17 +87,21 @@ def describe_source(trajectories: Trajectories) -> str:
 
 
 def budget_given(known: Mapping[str, Budget], options: argparse.Namespace) -> Budget:
-    """The budget that is named, with the files and seeds that are given."""
+    """The budget named by the options, with their files and seeds.
+
+    Raises:
+        InputError: `--seeds` is below 1.
+    """
     budget = known[options.budget]
     seeds = budget.seeds if options.seeds is None else options.seeds
     if seeds < 1:
         raise InputError(f"--seeds is {seeds}; at least one is needed")
-    evaluation = options.evaluation_seed
+    evaluation_seed = options.evaluation_seed
     return dataclasses.replace(
         budget,
         files=tuple(options.file) or budget.files,
         seeds=seeds,
-        evaluation_seed=budget.evaluation_seed if evaluation is None else evaluation,
+        evaluation_seed=budget.evaluation_seed if evaluation_seed is None else evaluation_seed,
     )
 
 
@@ -101,5 +109,5 @@ def shown_score(row: Mapping[str, Any]) -> dict[str, Any]:
     """A row of `evaluate_run` with its score, interval and target as text."""
     interval = f"{row['score']:.1f} [{row['score_low']:.1f}, {row['score_high']:.1f}]"
     target = "none" if row["target_return"] is None else f"{row['target_return']:g}"
-    earned = f"{row['return']:.1f}"
-    return {**row, "score": interval, "target_return": target, "return": earned}
+    mean_return = f"{row['return']:.1f}"
+    return {**row, "score": interval, "target_return": target, "return": mean_return}

@@ -7,13 +7,13 @@ from ucfrec_control.commands.options import describe_source, read_source, source
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `prepare` takes."""
+    """Add the options of `prepare`."""
     source_options(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="STORE")
 
 
 def run(options: argparse.Namespace) -> None:
-    """`ucfrec-control prepare`."""
+    """Run `ucfrec-control prepare`."""
     trajectories = read_source(options)
     trajectories.write_store(options.out)
     print(f"{describe_source(trajectories)}\n\nstore: {options.out}")

@@ -1,4 +1,4 @@
-"""`ucfrec-control robustness`: what distractors cost; resumes."""
+"""`ucfrec-control robustness`: scores lost to distractors; resumes."""
 
 import argparse
 
@@ -21,14 +21,14 @@ from ucfrec_control.commands.options import (
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `robustness` takes."""
+    """Add the options of `robustness`."""
     data_option(parser)
     budget_options(parser)
     control_grid_options(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    """`ucfrec-control robustness`."""
+    """Run `ucfrec-control robustness`."""
     if options.show_only:
         rows = rows_given(options, ROBUSTNESS)
     else:
@@ -42,7 +42,7 @@ def run(options: argparse.Namespace) -> None:
             options.method,
         )
     by = ("task", "distractor", "method")
-    for found, values in ((drops(rows), SHOWN_DROPS), (loss_rises(rows), SHOWN_LOSSES)):
-        print(f"{format_rows(over_seeds(found, by, values), (*by, *values))}\n")
+    for lines, values in ((drops(rows), SHOWN_DROPS), (loss_rises(rows), SHOWN_LOSSES)):
+        print(f"{format_rows(over_seeds(lines, by, values), (*by, *values))}\n")
     print(format_rows(screening_rows(rows), SHOWN_SCREENING))
     print(f"\nrows: {results_given(options)}")

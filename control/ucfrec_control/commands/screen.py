@@ -1,4 +1,4 @@
-"""`ucfrec-control screen`: which state dimensions cause anything."""
+"""`ucfrec-control screen`: which state dimensions have an effect."""
 
 import argparse
 import dataclasses
@@ -12,14 +12,14 @@ from ucfrec_control.learners.screening import ScreeningConfig, describe_screenin
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `screen` takes."""
+    """Add the options of `screen`."""
     parser.add_argument("store", type=Path, metavar="STORE")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, help="write the report here")
 
 
 def run(options: argparse.Namespace) -> None:
-    """`ucfrec-control screen`."""
+    """Run `ucfrec-control screen`."""
     report = screen(EpisodeStore.open(options.store), ScreeningConfig(), options.seed)
     print(describe_screening(report))
     if options.json is not None:

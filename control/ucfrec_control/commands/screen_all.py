@@ -11,17 +11,18 @@ from ucfrec_control.commands.options import control_grid_options, data_given, da
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `screen-all` takes."""
+    """Add the options of `screen-all`."""
     data_option(parser)
     control_grid_options(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    """`ucfrec-control screen-all`."""
+    """Run `ucfrec-control screen-all`."""
     if options.show_only:
         rows = rows_given(options, SCREENING)
     else:
         files, stores = BUDGETS["full"].files, stores_of(options.out)
-        given = (data_given(options), stores, files, results_given(options), options.workers)
-        rows = screening_table(*given)
+        rows = screening_table(
+            data_given(options), stores, files, results_given(options), options.workers
+        )
     print(f"{format_rows(screening_rows(rows), SHOWN_SCREENING)}\n\nrows: {results_given(options)}")

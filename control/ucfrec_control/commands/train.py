@@ -12,17 +12,17 @@ from ucfrec_control.learners.train import SCREENINGS, dataset_of, preset_of, tra
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `train` takes."""
+    """Add the options of `train`."""
     train_options(parser)
     parser.add_argument(
         "--screen",
         choices=["copies", "drop"],
-        help="screen the state: intervene on what causes nothing, or leave it out",
+        help="screen the state; dimensions without effect: copies intervene on them, or drop",
     )
 
 
 def run(options: argparse.Namespace) -> None:
-    """`ucfrec-control train`."""
+    """Run `ucfrec-control train`."""
     if options.threads is not None:
         torch.set_num_threads(options.threads)
     store = EpisodeStore.open(options.store)
@@ -33,6 +33,6 @@ def run(options: argparse.Namespace) -> None:
     record = train_control(store, options.out, config, screening=options.screen)
     print(describe_run(record))
     if options.screen:
-        found = ", ".join(map(str, record["dataset"][SCREENINGS[options.screen]])) or "none"
-        print(f"screening     dimensions that cause nothing: {found}")
+        dimensions = ", ".join(map(str, record["dataset"][SCREENINGS[options.screen]])) or "none"
+        print(f"screening     dimensions without effect: {dimensions}")
     print(f"\nrun: {options.out}; TensorBoard reads it too")

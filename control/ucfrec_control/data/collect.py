@@ -1,4 +1,4 @@
-"""Datasets by D4RL's protocol (Fu et al., 2020, section 5), from a SAC learner of one's own."""
+"""Datasets by D4RL's protocol (Fu et al., 2020, section 5), from a SAC learner trained here."""
 
 import json
 from collections.abc import Mapping
@@ -127,7 +127,7 @@ def _claim(file: Path, described: Mapping[str, Any]) -> None:
         write_json(file, described)
     elif read_json(file) != described:
         raise InputError(
-            f"{file.parent} was begun with other settings; repeat those of {file.name}, or name "
+            f"{file.parent} was started with other settings; repeat those of {file.name}, or name "
             "another output folder"
         )
 
@@ -155,8 +155,10 @@ def _train(env_id: str, folder: Path, seed: int, config: CollectConfig) -> _Trai
         raise InputError(f"{env_id} has no step limit, so its episodes may never end")
     learner = SacLearner(env, seed, config.steps + limit, config.sac)
     _claim(folder / "config.json", {"env": env_id, "seed": seed, **asdict(config)})
-    judged = make_env(env_id, min(config.episodes, SIDE_BY_SIDE))
-    random_return = _mean_return(judged, _Uniform(judged, seed), config.episodes, (seed, 2))
+    evaluation_env = make_env(env_id, min(config.episodes, SIDE_BY_SIDE))
+    random_return = _mean_return(
+        evaluation_env, _Uniform(evaluation_env, seed), config.episodes, (seed, 2)
+    )
     training = _Training(learner, folder, random_return, [])
     if training.checkpoint.exists():
         training.evaluations.extend(learner.load(training.checkpoint)["evaluations"])
@@ -166,18 +168,18 @@ def _train(env_id: str, folder: Path, seed: int, config: CollectConfig) -> _Trai
             learner.play_episode(bar)
             due = learner.steps // config.every > began // config.every
             if due or learner.steps >= config.steps:
-                _evaluate(training, judged, seed, config.episodes)
+                _evaluate(training, evaluation_env, seed, config.episodes)
                 bar.update(0, mean_return=training.evaluations[-1]["return"])
     env.close()
-    judged.close()
+    evaluation_env.close()
     return training
 
 
 def _evaluate(training: _Training, env: VectorEnv[Any, Any, Any], seed: int, episodes: int) -> None:
-    """Judge and keep the present policy, and checkpoint the learner."""
+    """Evaluate and save the current policy, and checkpoint the learner."""
     learner, index = training.learner, len(training.evaluations)
-    earned = _mean_return(env, learner, episodes, (seed, 3, index))
-    training.evaluations.append({"steps": learner.steps, "return": earned})
+    mean_return = _mean_return(env, learner, episodes, (seed, 3, index))
+    training.evaluations.append({"steps": learner.steps, "return": mean_return})
     learner.save_policy(training.policy(index), training.evaluations[-1])
     learner.save(training.checkpoint, {"evaluations": training.evaluations})
 

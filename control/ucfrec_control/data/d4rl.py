@@ -1,4 +1,4 @@
-"""D4RL's HDF5 layout: read with all its quirks, written without them.
+"""D4RL's HDF5 layout: read in all its variants, written in one.
 
 Source: https://github.com/Farama-Foundation/D4RL, `offline_env.py`; the files of this project's
 data folder have the same layout.
@@ -30,7 +30,7 @@ def read_d4rl(path: Path, env_id: str | None = None) -> Trajectories:
     `next_observations` that the next row does not begin with.
 
     Args:
-        env_id: environment that the data is of; None takes the file's own word, or D4RL's
+        env_id: environment that the data is of; None for the one that the file names, or D4RL's
             environment for the task in the file's name.
 
     Raises:
@@ -87,10 +87,10 @@ def write_d4rl(
 ) -> None:
     """Write a D4RL HDF5 file, atomically.
 
-    `next_observations` are written where it is known what each trajectory's last action led to.
+    `next_observations` are written if the final observations are known.
 
     Args:
-        metadata: what else the file says of itself, as D4RL's `metadata/NAME`.
+        metadata: further entries, written as D4RL's `metadata/NAME`.
     """
     ends = np.cumsum(trajectories.lengths) - 1
     timeouts = np.zeros(len(trajectories.rewards), dtype=bool)
@@ -117,9 +117,9 @@ def write_d4rl(
 def _next_observations(trajectories: Trajectories, ends: IntArray) -> FloatArray | None:
     if trajectories.final_observations is None:
         return None
-    following = np.roll(trajectories.observations, -1, axis=0)
-    following[ends] = trajectories.final_observations
-    return following
+    next_observations = np.roll(trajectories.observations, -1, axis=0)
+    next_observations[ends] = trajectories.final_observations
+    return next_observations
 
 
 def _opened(path: Path) -> Any:

@@ -1,4 +1,4 @@
-"""A distractor: a bit in the state that goes with the reward and causes nothing (Appendix G.4)."""
+"""A distractor: a bit in the state, correlated with the reward, without effect (Appendix G.4)."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,7 +19,7 @@ DISTRACTORS: dict[str, Mapping[str, Any] | None] = {
     "early": {"flip": 0.0, "early": True},
 }
 """Arguments of `add_distractor` by the name in the rows; the first two distractors are the paper's,
-the last tells of the next reward, which the action at hand still has a part in."""
+the last indicates the next reward, which still depends on the current action."""
 
 
 def add_distractor(

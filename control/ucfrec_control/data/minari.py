@@ -39,7 +39,7 @@ def read_minari(source: str, env_id: str | None = None, download: bool = False) 
 
     Args:
         source: identifier, or folder of a dataset.
-        env_id: environment that the data is of; None takes the dataset's own word.
+        env_id: environment that the data is of; None for the one that the dataset names.
         download: fetch the dataset with Minari if it is not here.
 
     Raises:
@@ -99,7 +99,7 @@ def write_minari(trajectories: Trajectories, identifier: str, env_id: str | None
     requirements = [
         f"{name}=={version}" for name, version in trajectories.source["versions"].items()
     ]
-    told = trajectories.final_observations is not None
+    has_final = trajectories.final_observations is not None
     spec = _spec(env)
     try:
         with warnings.catch_warnings():
@@ -112,7 +112,7 @@ def write_minari(trajectories: Trajectories, identifier: str, env_id: str | None
                 observation_space=_box(trajectories.observations.shape[1]),
                 action_space=_box(trajectories.actions.shape[1]),
                 description=f"Converted by ucfrec from {trajectories.source['where']}."
-                + ("" if told else " Final observations are unknown and repeat the last one."),
+                + ("" if has_final else " Final observations are unknown and repeat the last one."),
                 requirements=requirements,
             )
     except BaseException:

@@ -1,4 +1,4 @@
-"""A soft actor-critic learner that can be stopped and goes on as if it had not been.
+"""A soft actor-critic learner that can be stopped and resumed with the same results.
 
 Stable-Baselines3 (extra `collect`) holds the networks, the replay buffer and the update; episodes
 are played here. Every episode begins with all random streams seeded from the seed and the episode's
@@ -111,17 +111,17 @@ class SacLearner:
             "timeouts": timeouts,
         }
 
-    def save_policy(self, path: Path, about: dict[str, Any]) -> None:
+    def save_policy(self, path: Path, metadata: dict[str, Any]) -> None:
         """Write the policy's weights."""
-        save_tensors(path, dict(self._model.actor.state_dict()), about)
+        save_tensors(path, dict(self._model.actor.state_dict()), metadata)
 
     def load_policy(self, path: Path) -> dict[str, Any]:
-        """Play with the weights of `save_policy` from now on; returns what was said about them."""
-        tensors, about = load_tensors(path)
+        """Play with the weights of `save_policy` from now on; returns their metadata."""
+        tensors, metadata = load_tensors(path)
         self._model.actor.load_state_dict(tensors)
-        return about
+        return metadata
 
-    def save(self, path: Path, about: dict[str, Any]) -> None:
+    def save(self, path: Path, metadata: dict[str, Any]) -> None:
         """Write all that the learner needs to go on, atomically."""
         tensors = {"log_ent_coef": self._model.log_ent_coef}
         for name, state in self._model.get_parameters().items():
@@ -131,11 +131,11 @@ class SacLearner:
                 tensors |= {f"{name}/{prefix}{key}": value for key, value in group.items()}
         for name in _COLUMNS:
             tensors[f"replay/{name}"] = torch.from_numpy(getattr(self._buffer, name)[: self.steps])
-        save_tensors(path, tensors, about | {"episode": self.episode})
+        save_tensors(path, tensors, metadata | {"episode": self.episode})
 
     def load(self, path: Path) -> dict[str, Any]:
-        """Go on from what `save` wrote, in place; returns what was said about it."""
-        tensors, about = load_tensors(path)
+        """Go on from what `save` wrote, in place; returns its metadata."""
+        tensors, metadata = load_tensors(path)
         for name in _COLUMNS:
             rows = tensors.pop(f"replay/{name}").numpy()
             getattr(self._buffer, name)[: len(rows)] = rows
@@ -150,8 +150,8 @@ class SacLearner:
             else:
                 parameters[name][key] = value
         self._model.set_parameters(parameters)
-        self.episode = about.pop("episode")
-        return about
+        self.episode = metadata.pop("episode")
+        return metadata
 
     def begin(self, rows: IntArray) -> None:
         """As an `ucfrec.acting.rollout.Actor` the policy looks at nothing but the observation."""

@@ -1,4 +1,4 @@
-"""What a finished run's edits and attention look like: read back, nothing is trained."""
+"""Edits and attention of a finished run, read from its folder without any training."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ from ucfrec.policies.ucf import UCFPolicy
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.run import training_views
 from ucfrec.runs.trained_policy import RUN, TrainedPolicy
-from ucfrec_control.learners.train import as_seen
+from ucfrec_control.learners.train import without_dropped
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -39,16 +39,16 @@ _ROUNDING = 1e-5
 
 
 def store_of(run: Path) -> EpisodeStore:
-    """What a run was trained on.
+    """The store that a run was trained on, without dropped dimensions.
 
     Raises:
-        InputError: it is no longer where it was, or has changed.
+        InputError: the store was moved, removed or changed.
     """
     record = read_json(run / RUN)
     store = EpisodeStore.open(record["store"])
     if store.meta["fingerprint"] != record["fingerprint"]:
         raise InputError(f"{store.path} is no longer the store that {run} was trained on")
-    return as_seen(store, record["dataset"])
+    return without_dropped(store, record["dataset"])
 
 
 def has_copies(run: Path) -> bool:
@@ -70,7 +70,7 @@ def edited_states(run: Path, seed: int = 0) -> tuple[FloatArray, FloatArray]:
     episodes = overlay.copy_source[overlay.edit_copy[rows]]
     factual = store.windows(episodes, overlay.edit_step[rows], 1).states[:, 0]
     mean, std = training_views(store)[0].state_statistics
-    # What never varies was never edited.
+    # Constant dimensions are never edited.
     varies = std > 0
     scaled = [
         ((states - mean) / std)[:, varies].double().numpy()
@@ -81,7 +81,7 @@ def edited_states(run: Path, seed: int = 0) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True)
 class Editing:
-    """What a run's edits were made with, on steps drawn from its training episodes."""
+    """The models that made a run's edits, and steps drawn from its training episodes."""
 
     crm: CausalRewardModel
     generator: TangentGenerator | CounterfactualStateGenerator

@@ -1,1 +1,1 @@
-"""Training, screening and judging on a control store."""
+"""Training, screening and evaluation on a control store."""

@@ -1,4 +1,4 @@
-"""What a trained policy earns in its environment, on D4RL's scale."""
+"""Evaluation of trained policies in their environment, with D4RL's normalised scores."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ from ucfrec.reporting.statistics import summary
 from ucfrec.runs.trained_policy import RUN, TrainedPolicy, learner_of
 from ucfrec_control.learners.presets import find_preset
 from ucfrec_control.learners.rl_baselines import RLPolicy, is_rl
-from ucfrec_control.learners.train import SCREENINGS, UNSEEN
+from ucfrec_control.learners.train import DROPPED_DIMENSIONS, SCREENINGS
 from ucfrec_control.worlds.environments import SIDE_BY_SIDE, Wrap, make_env, mismatches
 from ucfrec_control.worlds.scores import find_kind, require_task
 
@@ -41,16 +41,17 @@ def evaluate_run(
 ) -> list[dict[str, Any]]:
     """One result row for each checkpoint and target return.
 
-    All rows play the same starts. A policy trained with distractors sees them fixed. IQL and CQL
-    have a last checkpoint only, and no target return.
+    All rows have the same initial states. Distractors are fixed. IQL and CQL keep only their last
+    checkpoint and take no target return.
 
     Args:
         run: a run folder on a control store.
-        episodes: episodes a row.
-        seed: of the environments and the bootstrap.
-        env_id: None for the environment of the data.
+        episodes: episodes of a row.
+        seed: seed of the environments and the bootstrap.
+        env_id: environment to play; None for that of the data.
         targets: target returns; empty for those of the preset.
-        distractor: what every distractor is fixed to (Appendix G.4: 0).
+        checkpoints: "last", "best" or both.
+        distractor: value that every distractor is fixed to (Appendix G.4: 0).
 
     Raises:
         InputError: the run is not on a control store, or keeps none of `checkpoints`, or its
@@ -61,8 +62,8 @@ def evaluate_run(
     rows: list[dict[str, Any]] = []
     for checkpoint in _kept(run, checkpoints):
         trained = load_run(run, checkpoint)
-        learned = trained.record["policy"]
-        if rows and learned["best_step"] == learned["steps"]:
+        training = trained.record["policy"]
+        if rows and training["best_step"] == training["steps"]:
             # The best checkpoint is the last: the same weights would play the same episodes.
             rows += [{**row, "checkpoint": checkpoint} for row in rows]
             continue
@@ -86,7 +87,7 @@ def load_run(run: Path, checkpoint: str) -> Trained:
     """The policy of a run on a control store.
 
     Raises:
-        InputError: it is no such run, or has no such checkpoint.
+        InputError: `run` is not on a control store, or has no such checkpoint.
     """
     rl = _is_rl_run(run)
     if rl and checkpoint != "last":
@@ -100,10 +101,10 @@ def load_run(run: Path, checkpoint: str) -> Trained:
 
 
 def world_of(trained: Trained, env_id: str | None) -> str:
-    """The environment given, or that of the data.
+    """`env_id`, or the environment of the data if it is None.
 
     Raises:
-        InputError: neither is known.
+        InputError: the environment of the data is unknown too.
     """
     dataset = trained.record["dataset"]
     world: str | None = env_id or dataset["env_id"]
@@ -122,18 +123,28 @@ def open_world(
     distractor: float = 0.0,
     **settings: Any,
 ) -> VectorEnv[Any, Any, Any]:
-    """`count` environments as the data has them, every distractor fixed to `distractor`.
+    """`count` environments with the state that the policy was trained on.
+
+    Distractors are fixed to `distractor`; dimensions dropped by screening are left out.
+
+    Args:
+        trained: the policy.
+        env_id: environment to make.
+        count: number of parallel environments.
+        wrappers: wrappers around each of them.
+        distractor: value that every distractor is fixed to.
+        settings: arguments of the environment, over those of the data.
 
     Raises:
-        InputError: `env_id` cannot be made, or is not of the sizes that the policy was trained on.
+        InputError: `env_id` cannot be made, or its sizes are not those of the training.
     """
     record, dataset = trained.record, trained.record["dataset"]
-    own = dataset.get("env_settings", {}) if env_id == dataset["env_id"] else {}
+    data_settings = dataset.get("env_settings", {}) if env_id == dataset["env_id"] else {}
     appended = [distractor] * len(dataset.get("distractors", []))
-    unseen = dataset.get(UNSEEN, [])
-    env = make_env(env_id, count, appended, unseen, {**own, **settings}, wrappers)
-    shown = int(np.prod(env.single_observation_space.shape or ()))
-    sizes = (shown, *(env.single_action_space.shape or ()))
+    dropped = dataset.get(DROPPED_DIMENSIONS, [])
+    env = make_env(env_id, count, appended, dropped, {**data_settings, **settings}, wrappers)
+    observation_size = int(np.prod(env.single_observation_space.shape or ()))
+    sizes = (observation_size, *(env.single_action_space.shape or ()))
     wanted = (record["sizes"]["state"], record["sizes"]["action"])
     if sizes != wanted:
         env.close()
@@ -145,16 +156,16 @@ def open_world(
 
 
 def method_of(record: Mapping[str, Any]) -> str:
-    """Name of what the run of `record` trained, with what was done about screened dimensions."""
+    """Name of the method of a run, with a suffix for how screening treated dimensions."""
     name = record["config"]["policy_name"] if is_rl(record) else learner_of(record)
-    done = {SCREENINGS["copies"]: "-screened", SCREENINGS["drop"]: "-dropped"}
-    return name + "".join(ending for key, ending in done.items() if record["dataset"].get(key))
+    suffixes = {SCREENINGS["copies"]: "-screened", SCREENINGS["drop"]: "-dropped"}
+    return name + "".join(suffix for key, suffix in suffixes.items() if record["dataset"].get(key))
 
 
 def targets_of(
     trained: Trained, env_id: str, given: Sequence[float] = ()
 ) -> Sequence[float | None]:
-    """The targets given, or those of the preset."""
+    """The target returns given, else those of the preset; (None,) for IQL and CQL."""
     if isinstance(trained, RLPolicy):
         return (None,)
     if given:

@@ -1,4 +1,4 @@
-"""How far a trained policy's held-out loss leans on a distractor."""
+"""How much a trained policy's held-out loss depends on a distractor."""
 
 from dataclasses import replace
 
@@ -8,24 +8,26 @@ import torch
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.runs.run import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec_control.learners.train import UNSEEN, as_seen
+from ucfrec_control.learners.train import DROPPED_DIMENSIONS, without_dropped
 
 _BATCHES, _BATCH = 8, 512
 
 
 @torch.no_grad()
 def held_out_losses(trained: TrainedPolicy, store: EpisodeStore) -> dict[str, float]:
-    """Action loss at 4,096 steps of held-out episodes: `loss` with the states as they are logged,
-    `loss_at_zero` with every distractor fixed to 0.
+    """Mean action loss at 4,096 steps of validation episodes.
 
-    Unlike scores, these do not vary with how episodes happen to end.
+    Unlike scores, the losses do not vary with the course of played episodes.
+
+    Returns:
+        `loss` with the logged states, and `loss_at_zero` with every distractor fixed to 0.
     """
     dataset = trained.record["dataset"]
-    _, validation = training_views(as_seen(store, dataset))
+    _, validation = training_views(without_dropped(store, dataset))
     generator = np.random.default_rng(0)
-    unseen = dataset.get(UNSEEN, [])
+    dropped = dataset.get(DROPPED_DIMENSIONS, [])
     added = [each["dimension"] for each in dataset.get("distractors", [])]
-    dimensions = [d - sum(u < d for u in unseen) for d in added if d not in unseen]
+    dimensions = [d - sum(other < d for other in dropped) for d in added if d not in dropped]
     losses = []
     for _ in range(_BATCHES):
         steps = validation.draw_steps(generator, _BATCH)

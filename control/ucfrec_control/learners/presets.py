@@ -9,12 +9,12 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Preset:
-    """What the rules that hold for a run add up to."""
+    """The combination of all rules that match a run."""
 
     tables: Mapping[str, Mapping[str, Any]]
     """Configuration by table, as in TOML."""
     targets: tuple[float, ...]
-    """Returns to ask of an episode; empty for a task that no rule knows."""
+    """Target returns; empty if no rule matches the task."""
 
 
 def find_preset(task: str, kind: str, policy: str) -> Preset:
@@ -22,15 +22,15 @@ def find_preset(task: str, kind: str, policy: str) -> Preset:
 
     Args:
         task: name of a `ucfrec_control.worlds.scores.Task`; "" for none.
-        kind: as `ucfrec_control.worlds.scores.find_kind` tells it.
+        kind: as `ucfrec_control.worlds.scores.find_kind` returns it.
         policy: one of `ucfrec.policies.registry.policy_names`.
     """
-    here = {"task": task, "kind": kind, "policy": policy}
+    run = {"task": task, "kind": kind, "policy": policy}
     tables: dict[str, dict[str, Any]] = {}
     targets: list[float] = []
     text = files("ucfrec_control.learners").joinpath("presets.toml").read_text(encoding="utf-8")
     for rule in tomllib.loads(text)["rule"]:
-        if any(rule.get(key, value) != value for key, value in here.items()):
+        if any(rule.get(key, value) != value for key, value in run.items()):
             continue
         for table, values in rule.get("set", {}).items():
             tables[table] = tables.get(table, {}) | values

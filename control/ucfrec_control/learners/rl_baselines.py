@@ -35,22 +35,22 @@ _HOPPER_NARROW = ("medium", "medium-replay", "mixed")
 
 @settings_table("rl")
 class RLConfig:
-    """All that decides a training, with its data."""
+    """Settings of a training."""
 
     algorithm: Literal["iql", "cql"]
-    """Of d3rlpy."""
+    """Algorithm of d3rlpy."""
     steps: Count
-    """Updates in all."""
+    """Number of updates."""
     task: str
-    """Name of a `ucfrec_control.worlds.scores.Task`, or "": decides CORL's settings."""
+    """Name of a `ucfrec_control.worlds.scores.Task`, or ""; selects CORL's settings."""
     kind: str
-    """Of the dataset, as `ucfrec_control.worlds.scores.find_kind` tells it; the same."""
+    """Kind of dataset (`ucfrec_control.worlds.scores.find_kind`); selects CORL's settings."""
     batch_size: BatchSize = 256
     """Transitions of an update."""
 
 
 class RLPolicy:
-    """An actor read back from its run folder; plays without a target return."""
+    """The trained actor of a run folder; it takes no target return."""
 
     def __init__(self, run: Path) -> None:
         """Raises:
@@ -67,14 +67,14 @@ class RLPolicy:
         load_weights(run / _ACTOR, self._learner.impl.modules.policy, tensors)
 
     def actor(self, episodes: int, target_return: float | None) -> "RLPolicy":
-        """Itself: it remembers nothing, and asks for nothing."""
+        """Itself: it has no memory and ignores the target return."""
         return self
 
     def begin(self, rows: IntArray) -> None:
         """See `ucfrec.acting.rollout.Actor`."""
 
     def act(self, observations: FloatArray, live: BoolArray) -> tuple[npt.NDArray[Any], None]:
-        """The policy's mean actions."""
+        """The policy's mean actions (N, A)."""
         return self._learner.predict(_normalised(observations, self._mean, self._std)), None
 
     def observe(self, actions: npt.NDArray[Any], rewards: FloatArray) -> None:
@@ -96,7 +96,7 @@ def rl_config(
 
 
 def plain_config(config: RLConfig, seed: int) -> dict[str, Any]:
-    """`config` as a run's record has it."""
+    """`config` and `seed` in the form of a run's record."""
     return {"policy_name": config.algorithm, "policy": asdict(config), "seed": seed}
 
 
@@ -114,13 +114,15 @@ def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dic
     """
     d3rlpy = _d3rlpy()
     if (out / RUN).exists():
-        known: dict[str, Any] = read_json(out / RUN)
+        existing: dict[str, Any] = read_json(out / RUN)
         wanted = (plain_config(config, seed), store.meta["fingerprint"])
-        if (known["config"], known["fingerprint"]) != wanted:
-            raise InputError(f"{out} was trained otherwise; remove it or name another run folder")
-        if "policy" in known:
-            return known
-    begun = perf_counter()
+        if (existing["config"], existing["fingerprint"]) != wanted:
+            raise InputError(
+                f"{out} has a run with other settings or data; remove it or name another folder"
+            )
+        if "policy" in existing:
+            return existing
+    started = perf_counter()
     d3rlpy.seed(seed)
     train = store.split("train")
     if not train.n_episodes:
@@ -137,7 +139,7 @@ def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dic
     log = MetricsLog(out, step)
     with progress(config.steps, config.algorithm, "steps", done=step) as bar:
         while step < config.steps:
-            if step:  # a seed of its own after each checkpoint: no generator's state need be kept
+            if step:  # a new seed after each checkpoint, so no generator's state is saved
                 d3rlpy.seed(seed + step)
             steps = min(CHECKPOINT_EVERY, config.steps - step)
             ((_, losses),) = learner.fit(
@@ -150,12 +152,12 @@ def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dic
             )
             step += steps
             log.add(step, losses)
-            _save(out / _CHECKPOINT, learner, step, seconds + perf_counter() - begun)
+            _save(out / _CHECKPOINT, learner, step, seconds + perf_counter() - started)
     log.close()
     actor = learner.impl.modules.policy.state_dict()
     save_tensors(out / _ACTOR, {**actor, "state.mean": mean, "state.std": std}, {})
     record["policy"] = {"steps": config.steps, "best_step": None}
-    record["wall_time_s"] = seconds + perf_counter() - begun
+    record["wall_time_s"] = seconds + perf_counter() - started
     write_json(out / RUN, record)
     (out / _CHECKPOINT).unlink(missing_ok=True)
     return record
@@ -289,8 +291,8 @@ def _d3rlpy() -> Any:
         raise InputError(
             "IQL and CQL need d3rlpy, which is not installed; install ucfrec[control,rl]"
         ) from None
-    # What it says of every training, on stdout, is not what was asked for; nor is its warning that
-    # networks exist already, which after a checkpoint they must.
+    # It logs every training to stdout, and warns that networks exist already, which is intended
+    # after a checkpoint.
     level = structlog.make_filtering_bound_logger(logging.ERROR)
     structlog.configure(wrapper_class=level)
     return d3rlpy

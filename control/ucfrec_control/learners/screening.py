@@ -1,13 +1,14 @@
 """Causal screening: which state dimensions cause nothing, and copies that intervene on them.
 
 A dimension that, once the other dimensions and the action are known, helps predict neither the
-reward nor the rest of the next state is no cause of anything (assumption A3, minimality).
+reward nor the rest of the next state has no effect (assumption A3, minimality).
 
-Both halves are judged on held-out trajectories. For the next state the reward is given as well: a
-dimension that measures the reward, as distractors do, then has nothing to add, however imperfect
-the predictors are. For the reward that way out is barred, so help must be worth a share of the
-reward's whole variance; a measurement of it explains no more than the predictor's own error. The
-largest errors of the next state are capped: a few falls must not decide.
+Both predictions are evaluated on held-out trajectories. The next state is predicted with the reward
+as a further input: a dimension that measures the reward, as distractors do, then adds nothing even
+if the predictors are imperfect. For the reward this is not possible. There the improvement must be
+a minimum share of the reward's whole variance; a measurement of the reward explains no more than
+the predictor's error. The largest errors of the next state are capped, so that a few falls do not
+decide the test.
 """
 
 from collections.abc import Callable, Sequence
@@ -50,7 +51,7 @@ class ScreeningConfig:
     learning_rate: LearningRate = 3e-3
     """Highest step size of the updates; a third of it for the copies."""
     max_transitions: Annotated[int, Field(ge=100, le=10**9)] = 100_000
-    """Most transitions to judge by; of more, that many are drawn."""
+    """Largest number of transitions used; of more, that many are drawn."""
     min_effect: Share = 0.01
     """Least share of a next dimension's unexplained variance that counts as help."""
     capped: Share = 0.005
@@ -92,13 +93,13 @@ class ScreeningReport:
 
     @property
     def flagged(self) -> tuple[int, ...]:
-        """Dimensions that cause nothing."""
+        """Dimensions without effect."""
         return tuple(d.dimension for d in self.dimensions if not d.causes)
 
 
 @random_state_kept()
 def screen(store: EpisodeStore, config: ScreeningConfig, seed: int) -> ScreeningReport:
-    """Judge every dimension of the observed states, on the training episodes of `store`.
+    """Test the effect of every observed state dimension on the training episodes of `store`.
 
     Raises:
         InputError: states are made of items, or there are too few trajectories to hold some out.
@@ -145,12 +146,12 @@ class _Transitions:
         found = view.transitions(episodes[inner], steps[inner])
         mean, std = view.state_statistics
         states = (found.states - mean) / torch.where(std > 1e-6, std, 1.0)
-        following = (found.next_states - mean) / torch.where(std > 1e-6, std, 1.0)
+        next_states = (found.next_states - mean) / torch.where(std > 1e-6, std, 1.0)
         return cls(
             states=states.clamp(-_CLIP, _CLIP),
             actions=_standardised(found.actions),
             rewards=_standardised(found.rewards.unsqueeze(1)),
-            changes=_standardised(following - states),
+            changes=_standardised(next_states - states),
             episodes=episodes[inner],
             held_out=episodes[inner] % _HELD_OUT_EVERY == _HELD_OUT_EVERY // 2,
         )
@@ -195,7 +196,7 @@ class _Pair(nn.Module):
         self.next_state, self.reward = next_state, reward
 
     def errors(self, data: _Transitions, rows: Tensor, missing: Tensor) -> tuple[Tensor, Tensor]:
-        """Squared errors (M, B, S) and (M, B); `missing`, (M, 1 or B, S), is 1 where unseen."""
+        """Squared errors (M, B, S) and (M, B); `missing` (M, 1 or B, S) is 1 where missing."""
         missing = missing.expand(-1, len(rows), -1)
 
         def spread(values: Tensor) -> Tensor:
@@ -228,8 +229,8 @@ def _fitted(data: _Transitions, config: ScreeningConfig) -> _Pair:
 
     _optimise(pair, data, some_missing, config.shared_steps, config.learning_rate, config)
     pair = _Pair(pair.next_state.repeated(size + 1), pair.reward.repeated(size + 1))
-    own = absences.unsqueeze(1)
-    _optimise(pair, data, lambda: own, config.own_steps, config.learning_rate / 3, config)
+    one_missing = absences.unsqueeze(1)
+    _optimise(pair, data, lambda: one_missing, config.own_steps, config.learning_rate / 3, config)
     return pair
 
 
@@ -357,4 +358,4 @@ def describe_screening(report: ScreeningReport) -> str:
         for d in report.dimensions
     ]
     flagged = ", ".join(map(str, report.flagged)) or "none"
-    return "\n".join([*lines, "", f"dimensions that cause nothing: {flagged}"])
+    return "\n".join([*lines, "", f"dimensions without effect: {flagged}"])

@@ -1,4 +1,4 @@
-"""Training on a control store: presets beneath, the data's origin in the record."""
+"""Training on a control store, with presets and screening."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -17,21 +17,23 @@ from ucfrec_control.learners.presets import Preset, find_preset
 from ucfrec_control.learners.screening import ScreeningConfig, interventions, screen
 from ucfrec_control.worlds.scores import find_kind, find_task
 
-UNSEEN = "unseen"
-SCREENINGS = {"copies": "screened", "drop": UNSEEN}
-"""What is done about dimensions that cause nothing, and where a run's record of its dataset lists
-those that it was done to."""
+DROPPED_DIMENSIONS = "unseen"
+SCREENINGS = {"copies": "screened", "drop": DROPPED_DIMENSIONS}
+"""How dimensions without effect are treated, and the key of `dataset` in a run's record that lists
+them."""
 
 
 def dataset_of(store: EpisodeStore) -> Mapping[str, Any]:
-    """Where the trajectories of `store` come from.
+    """The `source` of a control store: dataset, environment and versions.
 
     Raises:
-        InputError: it is not a control store.
+        InputError: `store` is not a control store.
     """
     source: Mapping[str, Any] = store.meta["source"]
     if "env_id" not in source:
-        raise InputError(f"{store.path} was not written by `ucfrec-control prepare`")
+        raise InputError(
+            f"{store.path} is not a control store; write one with `ucfrec-control prepare`"
+        )
     return source
 
 
@@ -41,10 +43,10 @@ def preset_of(dataset: Mapping[str, Any], policy: str) -> Preset:
     return find_preset(task.name if task else "", find_kind(dataset["dataset"]), policy)
 
 
-def as_seen(store: EpisodeStore, dataset: Mapping[str, Any]) -> EpisodeStore:
-    """What a policy sees of `store`, `dataset` being that of its run's record."""
-    unseen = dataset.get(UNSEEN)
-    return store.without_observation_dimensions(unseen) if unseen else store
+def without_dropped(store: EpisodeStore, dataset: Mapping[str, Any]) -> EpisodeStore:
+    """`store` without the dimensions that `dataset`, of a run's record, lists as dropped."""
+    dropped = dataset.get(DROPPED_DIMENSIONS)
+    return store.without_observation_dimensions(dropped) if dropped else store
 
 
 def train_control(
@@ -53,38 +55,45 @@ def train_control(
     """`ucfrec.runs.run.train_run` on a control store.
 
     Args:
-        screening: screen the state's dimensions, and of those which cause nothing add copies that
-            intervene on them ("copies"), or train as if they were not there ("drop").
+        store: a control store.
+        out: run folder; an interrupted run resumes.
+        config: of the training.
+        screening: None, or how to treat state dimensions that screening finds without effect: add
+            copies of the episodes that intervene on them ("copies"), or train without these
+            dimensions ("drop").
+
+    Returns:
+        The run's record.
 
     Raises:
-        InputError: as `train_run`, the store is not a control store, or screening finds nothing in
-            the state that causes anything.
+        InputError: as `train_run`; the store is not a control store; the run was started with
+            another `screening`; or screening finds no dimension with an effect.
     """
     dataset, copies = dict(dataset_of(store)), None
-    about: dict[str, Any] = {"dataset": dataset, "versions": versions(PACKAGES)}
-    begun = read_json(out / RUN) if (out / RUN).exists() else None
-    if begun is not None and (before := _screening_of(begun["dataset"])) != screening:
+    record: dict[str, Any] = {"dataset": dataset, "versions": versions(PACKAGES)}
+    started = read_json(out / RUN) if (out / RUN).exists() else None
+    if started is not None and (before := _screening_of(started["dataset"])) != screening:
         raise InputError(
-            f"{out} was begun with{f' --screen {before}' if before else 'out --screen'}; name "
+            f"{out} was started with{f' --screen {before}' if before else 'out --screen'}; name "
             "another run folder, or give the same options to resume"
         )
     if screening:
         key = SCREENINGS[screening]
-        if begun is None:
+        if started is None:
             report = screen(store, ScreeningConfig(), config.seed)
-            about["screening"] = asdict(report)
+            record["screening"] = asdict(report)
             dataset[key] = list(report.flagged)
             if len(report.flagged) == len(report.dimensions):
                 raise InputError(
-                    f"{store.path}: screening found no cause of anything among the "
+                    f"{store.path}: screening found no effect of any of the "
                     f"{len(report.flagged)} state dimensions; {report.transitions:,} transitions "
                     "are too few, or too noisy, to tell: train without --screen"
                 )
         else:
-            dataset = begun["dataset"]
+            dataset = started["dataset"]
         if screening == "copies" and dataset[key]:
             copies = interventions(training_views(store)[0], dataset[key], config.seed)
-    return train_run(as_seen(store, dataset), out, config, about, copies)
+    return train_run(without_dropped(store, dataset), out, config, record, copies)
 
 
 def _screening_of(dataset: Mapping[str, Any]) -> str | None:

@@ -1,4 +1,4 @@
-"""An episode to look at: a video, or a folder of frames."""
+"""Recording an episode as a video or as a folder of frames."""
 
 import os
 import warnings
@@ -22,7 +22,7 @@ from ucfrec_control.learners.evaluate import load_run, open_world, targets_of, w
 Frame = npt.NDArray[np.uint8]
 """(height, width, 3)."""
 Take = Callable[[Frame, float], None]
-"""Of a frame, and how many of them are a second of the world."""
+"""Called with a frame and the frames per second."""
 _VIDEO = ".mp4"
 
 
@@ -36,38 +36,45 @@ def record_episode(
     target: float | None,
     distractor: float = 0.0,
 ) -> float:
-    """Play one episode, which starts as the first that `evaluate_run` plays, and keep its frames.
+    """Play one episode, with the initial state of the first of `evaluate_run`, and keep its frames.
 
     Args:
         run: a run folder on a control store.
-        out: `NAME.mp4`, or a folder for `frame-00000.png`, …; the first frame is the start. Appears
-            when the episode has ended.
-        target: return to ask for; None for the preset's first.
-        distractor: what every distractor is fixed to.
+        out: `NAME.mp4`, or a folder for `frame-00000.png`, …; the first frame is the initial state.
+            It is written when the episode has ended.
+        seed: seed of the environment.
+        checkpoint: "last" or "best".
+        env_id: environment to play; None for that of the data.
+        target: target return; None for the preset's first.
+        distractor: value that every distractor is fixed to.
 
     Returns:
         The return of the episode.
 
     Raises:
-        InputError: as `evaluate_run`, or `out` exists, or nothing can be drawn here.
+        InputError: as `evaluate_run`, or `out` exists, or the environment cannot be rendered.
     """
     if out.suffix not in ("", _VIDEO):
-        raise InputError(f"{out} names neither an {_VIDEO} nor, with a dot, a folder for frames")
+        raise InputError(
+            f"{out} is neither an {_VIDEO} file nor a folder name without a dot; rename it"
+        )
     if out.exists():
         raise InputError(f"{out} exists already; remove it or name another with --video")
     trained = load_run(run, checkpoint)
     world = world_of(trained, env_id)
-    asked: Any = targets_of(trained, world, () if target is None else (target,))[0]
+    target_return: Any = targets_of(trained, world, () if target is None else (target,))[0]
     if not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")
     with (_video if out.suffix == _VIDEO else _frames)(out) as take:
-        with _drawing(world):
+        with _rendering(world):
             recorder = partial(_Recorder, take=take)
             env = open_world(
                 trained, world, 1, [recorder], distractor=distractor, render_mode="rgb_array"
             )
         try:
-            played = rollout(env, trained.actor(1, asked), 1, seed, describe="episode to look at")
+            played = rollout(
+                env, trained.actor(1, target_return), 1, seed, describe="record episode"
+            )
         finally:
             env.close()
     return float(played.returns[0])
@@ -82,26 +89,26 @@ class _Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._ended = False
 
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
-        shown = super().reset(**options)
-        self._show()
-        return shown
+        result = super().reset(**options)
+        self._record()
+        return result
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         outcome = super().step(action)
-        self._show()
+        self._record()
         self._ended = outcome[2] or outcome[3]
         return outcome
 
-    def _show(self) -> None:
+    def _record(self) -> None:
         if not self._ended:
-            with _drawing(str(self.spec.id) if self.spec else "the environment"):
+            with _rendering(str(self.spec.id) if self.spec else "the environment"):
                 frame = self.env.render()
             self._take(np.asarray(frame), self.metadata["render_fps"])
 
 
 @contextmanager
-def _drawing(world: str) -> Iterator[None]:
-    """Whatever goes wrong with OpenGL, which raises all sorts of errors, in one line."""
+def _rendering(world: str) -> Iterator[None]:
+    """Turn any error of rendering, for which OpenGL has no common class, into an InputError."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -111,7 +118,7 @@ def _drawing(world: str) -> Iterator[None]:
     except Exception as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(
-            f"{world} cannot be drawn here ({reason}); install OpenGL (libegl1, or libosmesa6) and "
+            f"{world} cannot be rendered ({reason}); install OpenGL (libegl1, or libosmesa6) and "
             "set MUJOCO_GL to egl, or osmesa"
         ) from error
 

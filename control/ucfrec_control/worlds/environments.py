@@ -1,4 +1,4 @@
-"""Environments to judge in: vectorised, of the version that the data was made in."""
+"""Vectorised environments for evaluation, of the version that the data was made in."""
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -26,23 +26,25 @@ def make_env(
     env_id: str,
     count: int,
     appended: Sequence[float] = (),
-    unseen: Sequence[int] = (),
+    dropped: Sequence[int] = (),
     settings: Mapping[str, Any] | None = None,
     wrappers: Sequence[Wrap] = (),
 ) -> VectorEnv[Any, Any, Any]:
-    """`count` environments in one process that reset within the step.
+    """`count` environments in one process, with `AutoresetMode.SAME_STEP`.
 
-    In one process because MuJoCo's steps cost less than talking to others (measured). AntMaze shows
-    D4RL's vectors and returns 1 for success and else 0.
+    They share one process because MuJoCo's steps cost less than communication between processes
+    (measured). AntMaze has D4RL's observation vectors and a return of 1 for success, else 0.
 
     Args:
-        appended: constants after every observation, where a policy was trained with distractors.
-        unseen: dimensions of that observation which are left out.
+        env_id: Gymnasium's identifier.
+        count: number of environments.
+        appended: constants appended to every observation, for distractors.
+        dropped: dimensions of the resulting observation that are left out.
         settings: arguments of the environment.
-        wrappers: around each of them.
+        wrappers: wrappers around each environment.
 
     Raises:
-        InputError: the environment is not registered or cannot be started here.
+        InputError: the environment is not registered or cannot be made.
     """
     settings, wrappers = dict(settings or {}), list(wrappers)
     if is_antmaze(env_id):
@@ -50,8 +52,8 @@ def make_env(
         wrappers = [GoalObservations, *wrappers]
     if len(appended):
         wrappers.append(partial(AppendedConstants, constants=appended))
-    if len(unseen):
-        wrappers.append(partial(WithoutDimensions, unseen=unseen))
+    if len(dropped):
+        wrappers.append(partial(WithoutDimensions, dropped=dropped))
     try:
         with warnings.catch_warnings():
             # D4RL's data is of v4: the version is old on purpose.
@@ -73,7 +75,7 @@ def make_env(
 
 
 class AppendedConstants(gymnasium.ObservationWrapper[Any, Any, Any]):
-    """Appends the same numbers to every observation, whatever happens (Appendix G.4)."""
+    """Appends constants to every observation (Appendix G.4)."""
 
     def __init__(self, env: gymnasium.Env[Any, Any], constants: Sequence[float]) -> None:
         super().__init__(env)
@@ -89,42 +91,45 @@ class AppendedConstants(gymnasium.ObservationWrapper[Any, Any, Any]):
 
 
 class WithoutDimensions(gymnasium.ObservationWrapper[Any, Any, Any]):
-    """Leaves some numbers of every observation out."""
+    """Leaves out some dimensions of every observation."""
 
-    def __init__(self, env: gymnasium.Env[Any, Any], unseen: Sequence[int]) -> None:
+    def __init__(self, env: gymnasium.Env[Any, Any], dropped: Sequence[int]) -> None:
         super().__init__(env)
         space = env.observation_space
         assert isinstance(space, Box)
-        self._kept = np.setdiff1d(np.arange(len(space.low)), unseen)
+        self._kept = np.setdiff1d(np.arange(len(space.low)), dropped)
         self.observation_space = Box(
             space.low[self._kept], space.high[self._kept], dtype=np.float64
         )
 
     def observation(self, observation: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """(O,) to (O − unseen,)."""
+        """(O,) to (O − dropped,)."""
         return observation[self._kept]
 
 
 def mismatches(dataset: Mapping[str, Any], env_id: str) -> list[str]:
-    """What sets the environment here apart from the one that `dataset` was made in, in words.
+    """Warnings about differences between this environment and the one that the data was made in.
 
     Args:
         dataset: `source` of a control store.
+        env_id: environment of the evaluation.
     """
-    found = []
+    warnings_ = []
     if dataset["env_id"] not in (None, env_id):
-        found.append(f"the data is of {dataset['env_id']}, it is judged in {env_id}")
+        warnings_.append(f"the data is of {dataset['env_id']}, the evaluation is in {env_id}")
     if is_rebuilt(env_id):
-        found.append(
-            f"{env_id} is rebuilt from D4RL's code on MuJoCo {version('mujoco')}; nobody has "
-            "replayed D4RL's trajectories in it"
+        warnings_.append(
+            f"{env_id} is rebuilt from D4RL's code on MuJoCo {version('mujoco')}; it was not "
+            "verified by replaying D4RL's trajectories"
         )
     for package in ("gymnasium", "mujoco", "gymnasium-robotics"):
         made_with = dataset["versions"].get(package)
         try:
-            here = version(package)
+            installed = version(package)
         except PackageNotFoundError:
             continue
-        if made_with not in (None, here):
-            found.append(f"the data was made with {package} {made_with}, here is {here}")
-    return found
+        if made_with not in (None, installed):
+            warnings_.append(
+                f"the data was made with {package} {made_with}, {installed} is installed"
+            )
+    return warnings_

@@ -1,1 +1,1 @@
-"""The recommendation benchmark: Table 2 of the paper, its ablations, sweeps and the distractor."""
+"""The recommendation benchmark: Table 2 of the paper, ablations, sweeps and a distractor."""

@@ -1,4 +1,4 @@
-"""One cell of the tables, a method trained on a task or a built-in policy, and its rows."""
+"""One cell of the tables (a trained method or a built-in policy on a task) and its result rows."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -26,19 +26,20 @@ class EvaluationPlan:
     """How policies are evaluated."""
 
     episodes: int
+    """Episodes of each reported result."""
     validation_episodes: int
-    """Played to choose the target return; never reported as a result."""
+    """Episodes played to choose the target return; never reported as a result."""
     quantiles: tuple[float, ...]
-    """Of the training returns: the targets to choose from, where there are several."""
+    """Quantiles of the training returns that are candidates for the target return."""
     seed: int = 1_000_000
-    """Of the episodes that are reported; the same for all training seeds."""
+    """Seed of the reported episodes; the same for all training seeds."""
     validation_seed: int = 2_000_000
-    """Of those that choose a target."""
+    """Seed of the validation episodes."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """What gives the rows of one method, in one task, from one training seed."""
+    """One method on one benchmark task with one training seed."""
 
     table: str
     budget: str
@@ -50,24 +51,27 @@ class Cell:
     evaluation: EvaluationPlan
     code_version: str
     log_seed: int | None
-    """Of the logs, where they are simulated."""
+    """Seed of simulated logs; None where the logs are given."""
     training_seed: int | None = None
-    """None, as are the next two, for a built-in policy of the worlds."""
+    """None for a built-in policy, as are `store` and `run`."""
     store: Path | None = None
-    """What is learned from."""
+    """Episode store that the method is trained on."""
     run: Path | None = None
+    """Run folder."""
     settings: tuple[str, ...] = ()
+    """Settings of the training, as for `--set`."""
     conditioned: bool = False
+    """Whether the method takes a target return."""
 
     @property
     def config(self) -> Config:
-        """All that decides the training, with its data."""
+        """The resolved configuration of the training."""
         assert self.training_seed is not None
         return resolve_config(self.policy, None, self.settings, self.training_seed)
 
 
 def key(cell: Cell) -> RowKey:
-    """What tells the cell's rows from others."""
+    """The key under which the cell's rows are stored."""
     conditions: dict[str, str | int] = {
         "budget": cell.budget,
         "episodes": cell.evaluation.episodes,
@@ -96,69 +100,77 @@ def quantile_names(quantiles: tuple[float, ...]) -> str:
     return " ".join(f"{quantile:g}" for quantile in quantiles)
 
 
-def measure(cell: Cell, own: RowKey) -> list[ResultRow]:
-    """Train where there is something to train, and evaluate in every world of the task.
+def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
+    """Train the method, unless it is a built-in policy, and evaluate it in every world of the task.
 
-    The target return of a conditioned method is the one, of a few quantiles of the training
-    returns, that earned most in other sessions than those reported.
+    A conditioned method is given the target return, among a few quantiles of the training returns,
+    with the highest mean return in validation episodes. Those are not the reported episodes.
+
+    Args:
+        cell: what to train and evaluate.
+        row_key: key of the rows.
+
+    Returns:
+        One row for each world and, for trained methods, each of `CHECKPOINTS`.
     """
     episodes, seed = cell.evaluation.episodes, cell.evaluation.seed
     if cell.store is None or cell.run is None:
         return [
-            _row(evaluate_behavior(world, cell.policy, episodes, seed), own, world)
+            _row(evaluate_behavior(world, cell.policy, episodes, seed), row_key, world)
             for world in cell.worlds
         ]
-    # Cells that differ in their evaluation alone share a run.
+    # Cells that differ only in their evaluation share a run.
     with file_lock(cell.run.with_name(f".{cell.run.name}.lock")):
         record = train_run(EpisodeStore.open(cell.store), cell.run, cell.config)
-    learned, rows = _learned(record), []
+    training_metrics, rows = _training_metrics(record), []
     for world in cell.worlds:
-        target, tried = _target(cell, world)
-        rule = _rule(cell, tried)
+        target, validation_returns = _target(cell, world)
+        rule = _rule(cell, validation_returns)
         for checkpoint in CHECKPOINTS:
             trained = TrainedPolicy.load(cell.run, checkpoint)
-            found = evaluate_policy(world, trained, cell.method, episodes, seed, target)
-            details = {"validation": tried} if tried else {}
-            more = {"checkpoint": checkpoint, "rule": rule, "details": details}
-            rows.append(_row(found | learned, own, world, **more))
+            metrics = evaluate_policy(world, trained, cell.method, episodes, seed, target)
+            details = {"validation": validation_returns} if validation_returns else {}
+            fields = {"checkpoint": checkpoint, "rule": rule, "details": details}
+            rows.append(_row(metrics | training_metrics, row_key, world, **fields))
     return rows
 
 
-def _row(found: Mapping[str, Any], own: RowKey, world: World, **more: Any) -> ResultRow:
-    row = evaluation_row(found, own, **more)
+def _row(metrics: Mapping[str, Any], row_key: RowKey, world: World, **fields: Any) -> ResultRow:
+    row = evaluation_row(metrics, row_key, **fields)
     distractor = world.rate if isinstance(world, DistractorWorld) else None
     return ResultRow(**vars(row) | {"conditions": {**row.conditions, "distractor": distractor}})
 
 
-def _learned(record: Mapping[str, Any]) -> dict[str, float]:
-    """What the training reports of itself."""
-    about = {
+def _training_metrics(record: Mapping[str, Any]) -> dict[str, float]:
+    """Metrics that the run's record holds about its training."""
+    metrics = {
         "train_wall_time_s": record["wall_time_s"],
         "validation_loss": record["policy"]["best_validation"],
     }
     if "augmentation" not in record:
-        return about
+        return metrics
     augmentation = record["augmentation"]
     model = augmentation["reward_model"]
-    return about | {
+    return metrics | {
         "acceptance": augmentation["acceptance"],
         "crm_r2": model["r2"],
         "crm_r2_without_z": model["r2_without_z"],
     }
 
 
-def _rule(cell: Cell, tried: Mapping[str, float] | None) -> str:
+def _rule(cell: Cell, validation_returns: Mapping[str, float] | None) -> str:
     """How the policy's target return was chosen."""
     if not cell.conditioned:
         return "no target return"
-    if tried is None:
+    if validation_returns is None:
         return f"target return: quantile {quantile_names(cell.evaluation.quantiles)} of training"
     plan = cell.evaluation
-    return f"target return: best of {len(tried)} in {plan.validation_episodes} other episodes"
+    candidates, episodes = len(validation_returns), plan.validation_episodes
+    return f"target return: best of {candidates} in {episodes} other episodes"
 
 
 def _target(cell: Cell, world: World) -> tuple[float, dict[str, float] | None]:
-    """The target that earns most on the validation seed, and what each earned there."""
+    """The target return with the highest mean validation return, and that mean for each target."""
     assert cell.run is not None
     trained, plan = TrainedPolicy.load(cell.run), cell.evaluation
     if not cell.conditioned:
@@ -166,16 +178,17 @@ def _target(cell: Cell, world: World) -> tuple[float, dict[str, float] | None]:
     targets = dict.fromkeys(trained.target_return(q) for q in plan.quantiles)
     if len(targets) == 1:
         return next(iter(targets)), None
-    given = (plan.validation_episodes, plan.validation_seed)
-    tried = {
-        target: float(evaluate_policy(world, trained, cell.method, *given, target)["R_cum"])
+    validation = (plan.validation_episodes, plan.validation_seed)
+    returns = {
+        target: float(evaluate_policy(world, trained, cell.method, *validation, target)["R_cum"])
         for target in targets
     }
-    return max(tried, key=lambda target: tried[target]), {f"{t:g}": r for t, r in tried.items()}
+    best = max(returns, key=lambda target: returns[target])
+    return best, {f"{target:g}": value for target, value in returns.items()}
 
 
 def config(cell: Cell) -> dict[str, Any] | None:
-    """The configuration of the cell's training, if it has one."""
+    """The configuration of the cell's training; None for a built-in policy."""
     return None if cell.store is None else asdict(cell.config)
 
 

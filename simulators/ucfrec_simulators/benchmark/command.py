@@ -1,4 +1,4 @@
-"""`ucfrec benchmark recommendation`: every table of it, resumable, cells side by side."""
+"""`ucfrec benchmark recommendation`: its tables; resumable, cells run in parallel processes."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -29,15 +29,18 @@ TABLES: Final = ("main", "distractor", "sweeps")
 
 
 def run(request: BenchmarkRequest) -> str:
-    """Measure the cells of the tables that have no row yet; returns the tables as Markdown.
+    """Measure the cells of the tables that have no row yet.
 
-    Pictures of them appear in `out/budget/plots` where matplotlib is installed.
+    Plots are written to `out/budget/plots` if matplotlib is installed.
+
+    Returns:
+        The tables as Markdown.
 
     Raises:
-        InputError: an unknown budget, or cells that failed.
+        InputError: the budget is unknown, or cells failed.
     """
     if request.budget not in BUDGETS:
-        raise InputError(f"no budget is called {request.budget}; there are {', '.join(BUDGETS)}")
+        raise InputError(f"unknown budget {request.budget}; choose one of {', '.join(BUDGETS)}")
     folder, budget = request.out / request.budget, BUDGETS[request.budget]
     if request.evaluation_seed is not None:
         evaluation = replace(budget.evaluation, seed=request.evaluation_seed)
@@ -57,9 +60,9 @@ def run(request: BenchmarkRequest) -> str:
 
 
 def show(tables: Sequence[str], rows: Sequence[ResultRow]) -> str:
-    """The tables that `rows` have something for, as Markdown; nothing is measured."""
-    found = {table: [row for row in rows if row.table == table] for table in tables}
-    return "\n\n".join(_shown(table, rows) for table, rows in found.items() if rows)
+    """The tables that have rows in `rows`, as Markdown; nothing is measured."""
+    by_table = {table: [row for row in rows if row.table == table] for table in tables}
+    return "\n\n".join(_shown(table, rows) for table, rows in by_table.items() if rows)
 
 
 def _shown(table: str, rows: Sequence[ResultRow]) -> str:
@@ -81,7 +84,7 @@ _SHOWN: Final[Mapping[str, tuple[_Shown, ...]]] = {
 }
 
 BENCHMARK: Final = Benchmark(
-    summary="Table 2 of the paper with floors, its ablations, sweeps of UCF, a planted distractor",
+    summary="Table 2 of the paper with built-in policies, ablations, sweeps of UCF, a distractor",
     tables=TABLES,
     run=run,
     show=show,

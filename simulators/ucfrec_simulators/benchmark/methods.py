@@ -1,4 +1,4 @@
-"""The lines of the tables."""
+"""The methods of the tables."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,15 +7,16 @@ from typing import Final
 
 @dataclass(frozen=True)
 class Method:
-    """A row of a table."""
+    """A policy and its settings: one line of a table."""
 
     policy: str
     """One of `ucfrec.policies.registry.policy_names`."""
     settings: tuple[str, ...] = ()
+    """Settings over the defaults, as for `--set`."""
     conditioned: bool = True
-    """Whether it is given a target return."""
+    """Whether it takes a target return."""
     vectors: bool = True
-    """Whether it also acts where actions are vectors."""
+    """Whether it also supports action vectors; False for policies of items only."""
 
 
 METHODS: Final[Mapping[str, Method]] = {
@@ -34,4 +35,4 @@ METHODS: Final[Mapping[str, Method]] = {
     "ucf-wo-arch": Method("dt", ("augment.copies=1",)),
     "ucf": Method("ucf"),
 }
-"""By the name in the tables; the two before the last are the ablations of the paper's Table 3."""
+"""Methods by their name in the tables; `ucf-wo-count` and `ucf-wo-arch` are Table 3's ablations."""

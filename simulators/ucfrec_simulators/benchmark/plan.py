@@ -21,24 +21,25 @@ from ucfrec_simulators.folders import data_folder
 
 @dataclass(frozen=True)
 class Budget:
-    """What is cut for small machines, and what is not: no method is."""
+    """The size of a benchmark; every budget measures all methods."""
 
     seeds: int
+    """Training seeds of the main table."""
     sessions: int
-    """Collected, where logs are simulated."""
+    """Sessions collected where logs are simulated."""
     settings: tuple[str, ...]
-    """Of all methods, over their defaults."""
+    """Settings of all methods, over their defaults."""
     cuts: Mapping[str, tuple[str, ...]]
-    """Of single learners, by name (`ucfrec.policies.registry.policy_names`)."""
+    """Further settings of single policies, by name (`ucfrec.policies.registry.policy_names`)."""
     evaluation: EvaluationPlan
     sweep_seeds: int
-    """Of the sweeps and of the distractor."""
+    """Training seeds of the sweeps and of the distractor table."""
 
 
 TARGETS: Final = (0.5, 0.9, 0.99, 1.0)
 BUDGETS: Final[Mapping[str, Budget]] = {
-    # Sized for two cores: width, steps and logs are cut, and two costly parts of baselines; methods
-    # and seeds are not.
+    # Sized for two cores: smaller width, fewer steps, smaller logs, and cheaper settings of two
+    # baselines; methods and seeds are not reduced.
     "small": Budget(
         seeds=3,
         sessions=6000,
@@ -64,12 +65,12 @@ BUDGETS: Final[Mapping[str, Budget]] = {
     ),
 }
 _CONTEXT: Final = {"kuairand": 5}
-"""K of all methods with a memory, where it is not 10: KuaiRand's sessions are of two steps."""
+"""Context length K (steps) where it is not 10: KuaiRand's sessions have about two steps."""
 
 LAMBDAS: Final = (0.0, 0.05, 0.1, 0.25, 0.5, 1.0)
 BANDS: Final = ((0.05, 0.2), (0.2, 0.5), (0.5, 1.0), (1.0, 2.0))
 GATES: Final = (0.02, 0.1, 0.5, 1e6)
-"""ε_r in standard deviations of the rewards; the last one is no gate."""
+"""ε_r in standard deviations of the rewards; the last value disables the gate."""
 DISTRACTOR_METHODS: Final = tuple(
     name for name, method in METHODS.items() if method.conditioned or name == "bc"
 )
@@ -77,12 +78,12 @@ DISTRACTOR_TARGETS: Final = (1.0, 0.99)
 """Quantiles of the training returns: the default target, and one nearer to the logs."""
 MAIN: Final = ("kuairand", "kuairec", "virtual-taobao", "synthetic-catalog")
 SWEPT: Final = ("synthetic-catalog", "synthetic-taobao")
-"""Worlds with room: in VirtualTaobao every sequence policy is at the ceiling."""
+"""Tasks of the sweeps. Not VirtualTaobao: there all sequence policies reach the maximum return."""
 _REAL: Final = {"kuairand": "kuairand", "kuairec": "kuairec", "virtual-taobao": "virtualtaobao"}
-"""What needs files that are not part of the package, and their folder in the data folder."""
+"""Tasks that need files outside the package, and the subfolder of the data folder with them."""
 _DISTRACTED_WORLDS: Final = {"synthetic-taobao": 0, "kuairand": 2}
-"""Where a distractor is planted: task, and which of its worlds is played (of KuaiRand NX_10, whose
-sessions are of one length, so that boredom does not drown the distractor)."""
+"""Tasks with a distractor, and the index of the world that is played. KuaiRand is played as NX_10:
+all its sessions have the same length, so early exits do not hide the distractor's effect."""
 _DISTRACTOR: Final = DistractorWorld.__module__
 _MEMORYLESS: Final = ("bc", "popular", "crm-greedy")
 
@@ -93,16 +94,17 @@ class Plan:
     def __init__(self, folder: Path, budget: Budget, name: str = "", log_seed: int = 0) -> None:
         """Args:
         folder: where logs, stores, worlds and runs are kept.
-        name: of the budget, for the rows.
-        log_seed: of the logs that are simulated.
+        budget: size of the benchmark.
+        name: name of the budget, for the rows.
+        log_seed: seed of simulated logs.
         """
         self._folder, self._budget, self._name = folder, budget, name
         self._log_seed = log_seed
         self._tasks: dict[str, BenchmarkTask] = {}
 
     def main(self) -> Iterator[Cell]:
-        """Table 2, with the floors; Table 3's ablations are rows of it."""
-        for name in self._known(MAIN):
+        """Cells of Table 2 with Table 3's ablations, and of the worlds' built-in policies."""
+        for name in self._available(MAIN):
             task = self._task(name)
             for behavior in task.behaviors:
                 code = _code(task.worlds)
@@ -115,8 +117,8 @@ class Plan:
                     yield from self._trained("main", name, task, method, METHODS[method], seed)
 
     def sweeps(self) -> Iterator[Cell]:
-        """UCF with other λ, bands and gates; the default stands in the main table."""
-        for name in self._known(SWEPT):
+        """Cells of UCF with other λ, bands and gates; the main table has the defaults."""
+        for name in self._available(SWEPT):
             task = self._task(name)
             task = replace(task, worlds=task.worlds[:1])
             spread = _reward_spread(task.store)
@@ -131,47 +133,48 @@ class Plan:
                     yield from self._trained("sweeps", name, task, f"ucf, {label}", method, seed)
 
     def distractor(self) -> Iterator[Cell]:
-        """A planted distractor: trained without it, and with it and played with it off and on.
+        """Cells of the distractor table: methods trained without and with a distractor in the logs.
 
-        Every method is given the same target returns: one chosen where the distractor is off would
-        know of the intervention.
+        Those trained with it are evaluated with the distractor off and on. Every method is given
+        the same target returns: choosing the target in validation episodes with the distractor off
+        would use knowledge of the intervention.
         """
         plans = [replace(self._budget.evaluation, quantiles=(q,)) for q in DISTRACTOR_TARGETS]
-        for name, at in _DISTRACTED_WORLDS.items():
-            if name not in self._known(_DISTRACTED_WORLDS):
+        for name, world_index in _DISTRACTED_WORLDS.items():
+            if name not in self._available(_DISTRACTED_WORLDS):
                 continue
             clean = self._task(name)
-            world = clean.worlds[at]
+            world = clean.worlds[world_index]
             planted = clean.store.with_name("distractor-store")
             if not planted.exists():
                 plant_distractor(EpisodeStore.open(clean.store), planted)
-            shown = tuple(DistractorWorld(world.name, world.folder, rate) for rate in (OFF, ON))
-            distracted = BenchmarkTask(planted, shown, ())
+            worlds = tuple(DistractorWorld(world.name, world.folder, rate) for rate in (OFF, ON))
+            distracted = BenchmarkTask(planted, worlds, ())
             both = {name: clean, f"{name}, distractor": distracted}
             for seed in range(self._budget.sweep_seeds):
                 for method in DISTRACTOR_METHODS:
                     for plan in plans:
                         for title, task in both.items():
-                            given = (title, task, method, METHODS[method], seed, plan)
-                            yield from self._trained("distractor", *given)
+                            arguments = (title, task, method, METHODS[method], seed, plan)
+                            yield from self._trained("distractor", *arguments)
 
     def missing(self) -> list[str]:
-        """Environments that are left out, for lack of their data."""
-        return [name for name in MAIN if name not in self._known(MAIN)]
+        """Tasks of the main table that are left out because their data files are missing."""
+        return [name for name in MAIN if name not in self._available(MAIN)]
 
-    def _known(self, names: Iterable[str]) -> list[str]:
+    def _available(self, names: Iterable[str]) -> list[str]:
         return [name for name in names if name not in _REAL or data_folder(_REAL[name]).is_dir()]
 
     def _task(self, name: str) -> BenchmarkTask:
         if name not in self._tasks:
-            # Other code may write other logs: a folder for each.
+            # Another version of the code may write different logs, so each version has its folder.
             code = code_version(tasks.__name__, *map(_module, tasks.LOGGED.get(name, (name,))))
             folder = self._folder / "tasks" / f"{name}-{self._log_seed}-{code}"
             self._tasks[name] = TASKS[name](folder, self._budget.sessions, self._log_seed)
         return self._tasks[name]
 
     def _seed_of_logs(self, name: str) -> int | None:
-        """None where the logs are given."""
+        """Seed of the logs; None where they are given, not simulated."""
         return None if name in tasks.LOGGED else self._log_seed
 
     def _trained(
@@ -184,22 +187,21 @@ class Plan:
         seed: int,
         evaluation: EvaluationPlan | None = None,
     ) -> Iterator[Cell]:
-        """The cell of a trained method, unless it cannot act in the task.
+        """The cell of a trained method; none if the method does not support the task's actions.
 
-        Args:
-            evaluation: the budget's unless given.
+        `evaluation` is the budget's unless given.
         """
         store = EpisodeStore.open(task.store)
         if not (store.has_items or method.vectors):
             return
-        plain = name.partition(",")[0]
-        context = _CONTEXT.get(plain, 10)
+        task_name = name.partition(",")[0]
+        context = _CONTEXT.get(task_name, 10)
         memory = () if method.policy in _MEMORYLESS else (f"policy.context={context}",)
         cuts = self._budget.cuts.get(method.policy, ())
         settings = (*self._budget.settings, *memory, *cuts, *method.settings)
         code = _code(task.worlds, policy_class(method.policy).__module__)
-        given = {"policy": method.policy, "settings": settings}
-        named = config_hash(given | {"code": code, "data": store.meta["fingerprint"]})
+        identity = {"policy": method.policy, "settings": settings, "code": code}
+        run_hash = config_hash(identity | {"data": store.meta["fingerprint"]})
         yield Cell(
             table=table,
             budget=self._name,
@@ -209,17 +211,17 @@ class Plan:
             worlds=task.worlds,
             evaluation=evaluation or self._budget.evaluation,
             code_version=code,
-            log_seed=self._seed_of_logs(plain),
+            log_seed=self._seed_of_logs(task_name),
             training_seed=seed,
             store=task.store,
-            run=self._folder / "runs" / name / f"{method.policy}-{named}-{seed}",
+            run=self._folder / "runs" / name / f"{method.policy}-{run_hash}-{seed}",
             settings=settings,
             conditioned=method.conditioned,
         )
 
 
 def _code(worlds: Iterable[World], *learner: str) -> str:
-    """The version of the code that a cell in `worlds` runs through."""
+    """The version of the code that a cell in `worlds` depends on."""
     apart = [] if any(isinstance(world, DistractorWorld) for world in worlds) else [_DISTRACTOR]
     return code_version(
         cells.__name__, *learner, *(_module(world.name) for world in worlds), exclude=apart
@@ -232,5 +234,5 @@ def _module(world: str) -> str:
 
 def _reward_spread(store: Path) -> float:
     """Standard deviation of the rewards of a store."""
-    opened = EpisodeStore.open(store)
-    return float(opened.step_values(schema.REWARD, *opened.all_steps()).std())
+    episodes = EpisodeStore.open(store)
+    return float(episodes.step_values(schema.REWARD, *episodes.all_steps()).std())

@@ -1,4 +1,4 @@
-"""Rows to pictures, where matplotlib is installed (extra `plots`)."""
+"""Plots of result rows; needs matplotlib (extra `plots`)."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -9,7 +9,7 @@ import numpy as np
 from ucfrec.reporting.plot_style import LIGHT, OURS, PLAIN, save, styled
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.statistics import grouped, summary
-from ucfrec_simulators.benchmark.tables import DISTRACTOR_RATES, earned_by_target, of_checkpoint
+from ucfrec_simulators.benchmark.tables import DISTRACTOR_RATES, of_checkpoint, returns_by_target
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,60 +19,63 @@ _Rows = Sequence[ResultRow]
 
 
 def plot_methods(rows: _Rows, folder: Path) -> list[Path]:
-    """A picture a world: what every method earned, mean and standard deviation over seeds."""
+    """One plot per world: return of every method, mean and standard deviation over seeds."""
     return _by_world("methods", _bars, rows, folder)
 
 
 def plot_sweeps(rows: _Rows, folder: Path) -> list[Path]:
-    """The same of UCF's settings."""
+    """One plot per world: return of UCF with each setting, as in `plot_methods`."""
     return _by_world("sweeps", _bars, rows, folder)
 
 
 def plot_targets(rows: _Rows, folder: Path) -> list[Path]:
-    """A picture a world: target returns against what they earned in validation sessions."""
-    tried = [row for row in rows if row.details.get("validation")]
-    return _by_world("targets", _lines, tried, folder)
+    """One plot per world: mean return of validation sessions over target return."""
+    validated = [row for row in rows if row.details.get("validation")]
+    return _by_world("targets", _lines, validated, folder)
 
 
 def plot_distractor(rows: _Rows, folder: Path) -> list[Path]:
-    """A picture a world in which a distractor was planted: returns without it, with it off and on,
-    where the target is the largest return."""
+    """One plot per world with a distractor: returns without it, with it off, and with it on.
+
+    Only rows whose target return is the largest training return are shown.
+    """
     rows = [row for row in rows if row.conditions["quantiles"] == "1"]
     planted = {row.world for row in rows if row.conditions["distractor"] is not None}
     return _by_world("distractor", _triples, [r for r in rows if r.world in planted], folder)
 
 
 def _bars(axes: "Axes", rows: _Rows) -> None:
-    named = list(grouped(rows, lambda row: row.method).items())[::-1]
-    earned = [summary(row.value for row in own) for _, own in named]
-    colors = [OURS if name == "ucf" else PLAIN for name, _ in named]
-    means, spreads = [found.mean for found in earned], [found.sd for found in earned]
-    axes.barh([name for name, _ in named], means, xerr=spreads, color=colors, height=0.7)
+    by_method = list(grouped(rows, lambda row: row.method).items())[::-1]
+    returns = [summary(row.value for row in group) for _, group in by_method]
+    colors = [OURS if name == "ucf" else PLAIN for name, _ in by_method]
+    means, spreads = [each.mean for each in returns], [each.sd for each in returns]
+    axes.barh([name for name, _ in by_method], means, xerr=spreads, color=colors, height=0.7)
     axes.set_xlabel("return of a session (mean ± sd over training seeds)")
 
 
 def _lines(axes: "Axes", rows: _Rows) -> None:
-    for name, own in grouped(rows, lambda row: row.method).items():
-        earned = earned_by_target(own)
-        means = [summary(values).mean for values in earned.values()]
-        wide = 2.5 if name == "ucf" else 1
-        axes.plot(list(earned), means, marker="o", linewidth=wide, label=name)
+    for name, group in grouped(rows, lambda row: row.method).items():
+        returns = returns_by_target(group)
+        means = [summary(values).mean for values in returns.values()]
+        width = 2.5 if name == "ucf" else 1
+        axes.plot(list(returns), means, marker="o", linewidth=width, label=name)
     axes.set_xlabel("target return")
     axes.set_ylabel("return of a session, validation")
     axes.legend()
 
 
 def _triples(axes: "Axes", rows: _Rows) -> None:
-    named = list(grouped(rows, lambda row: row.method).items())[::-1]
-    shown = zip(DISTRACTOR_RATES, DISTRACTOR_NAMES, (PLAIN, OURS, LIGHT), strict=True)
-    for place, (rate, label, color) in enumerate(shown):
-        earned = [
-            summary(row.value for row in own if row.conditions["distractor"] == rate)
-            for _, own in named
+    by_method = list(grouped(rows, lambda row: row.method).items())[::-1]
+    conditions = zip(DISTRACTOR_RATES, DISTRACTOR_NAMES, (PLAIN, OURS, LIGHT), strict=True)
+    for index, (rate, label, color) in enumerate(conditions):
+        returns = [
+            summary(row.value for row in group if row.conditions["distractor"] == rate)
+            for _, group in by_method
         ]
-        at = np.arange(len(named)) + 0.25 * (1 - place)
-        axes.barh(at, [found.mean for found in earned], height=0.25, color=color, label=label)
-    axes.set_yticks(range(len(named)), [name for name, _ in named])
+        positions = np.arange(len(by_method)) + 0.25 * (1 - index)
+        means = [each.mean for each in returns]
+        axes.barh(positions, means, height=0.25, color=color, label=label)
+    axes.set_yticks(range(len(by_method)), [name for name, _ in by_method])
     axes.set_xlabel("return of a session (mean over training seeds)")
     axes.legend()
 
@@ -83,8 +86,8 @@ def _by_world(
     worlds = grouped(of_checkpoint(rows, "best"), lambda row: row.world)
     return [
         path
-        for world, own in worlds.items()
-        for path in _saved(folder, f"{kind}-{world}", draw, own)
+        for world, group in worlds.items()
+        for path in _saved(folder, f"{kind}-{world}", draw, group)
     ]
 
 

@@ -1,4 +1,4 @@
-"""Rows to tables: mean and spread over seeds, as Markdown."""
+"""Tables of result rows: mean and standard deviation over seeds, as Markdown."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -8,42 +8,46 @@ from ucfrec.reporting.statistics import grouped
 from ucfrec.reporting.tables import NONE, markdown_table, mean_and_sd
 
 DISTRACTOR_RATES: Final = (None, 0.0, 1.0)
-"""How a row's distractor was shown: there was none, never, always."""
+"""Probability that the distractor is on in an evaluation; None: a world without a distractor."""
 _SHOWN: Final = ("R_cum", "R_avg_pooled", "R_avg_episode", "length")
 
 
 def method_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
-    """One line a world and method, in the order of the rows (Tables 2 and 3 of the paper)."""
+    """One line per world and method, in the order of the rows (Tables 2 and 3 of the paper)."""
     head = ("world", "method", "seeds", *_SHOWN, "coverage", "target")
     lines = []
-    for (world, method), own in grouped(of_checkpoint(rows, checkpoint), _line).items():
-        spread = [mean_and_sd(numbers(own, name)) for name in (*_SHOWN, "coverage")]
-        lines.append((world, method, len(own), *spread, _targets(own)))
+    for (world, method), group in grouped(of_checkpoint(rows, checkpoint), _line).items():
+        spread = [mean_and_sd(numbers(group, name)) for name in (*_SHOWN, "coverage")]
+        lines.append((world, method, len(group), *spread, _targets(group)))
     return markdown_table(head, lines)
 
 
 def sweep_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
-    """One line a world and setting of UCF, with its worth on validation data beside."""
+    """One line per world and setting of UCF: return, validation loss and acceptance rate."""
     head = ("world", "setting", "seeds", "R_cum", "validation loss", "acceptance")
     lines = []
-    for (world, method), own in grouped(of_checkpoint(rows, checkpoint), _line).items():
+    for (world, method), group in grouped(of_checkpoint(rows, checkpoint), _line).items():
         shown = ("R_cum", "validation_loss", "acceptance")
-        spread = [mean_and_sd(numbers(own, name)) for name in shown]
-        lines.append((world, method, len(own), *spread))
+        spread = [mean_and_sd(numbers(group, name)) for name in shown]
+        lines.append((world, method, len(group), *spread))
     return markdown_table(head, lines)
 
 
 def target_table(rows: Sequence[ResultRow]) -> str:
-    """What each target return earned on validation sessions, mean over seeds."""
+    """One line per world, method and target return: validation return, mean over seeds."""
     lines = []
-    for (world, method), own in grouped(of_checkpoint(rows, "best"), _line).items():
-        for target, earned in earned_by_target(own).items():
-            lines.append((world, method, f"{target:g}", len(earned), mean_and_sd(earned)))
+    for (world, method), group in grouped(of_checkpoint(rows, "best"), _line).items():
+        for target, returns in returns_by_target(group).items():
+            lines.append((world, method, f"{target:g}", len(returns), mean_and_sd(returns)))
     return markdown_table(("world", "method", "target return", "seeds", "R_cum, validation"), lines)
 
 
 def distractor_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
-    """Per target and method: trained without the distractor; trained with it, played off and on."""
+    """One line per world, target and method: returns without, with it off, and with it on.
+
+    "off" and "on" are of policies trained with the distractor. `drop` is by how many percent the
+    return with the distractor off is below that of the policy trained without a distractor.
+    """
 
     def key(row: ResultRow) -> tuple[str, float, str]:
         # Worlds together, the largest target first; methods stay in their order.
@@ -51,16 +55,16 @@ def distractor_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str
 
     groups = grouped(of_checkpoint(rows, checkpoint), key)
     lines = []
-    for (world, quantile, method), own in sorted(groups.items(), key=lambda group: group[0][:2]):
+    for (world, quantile, method), group in sorted(groups.items(), key=lambda item: item[0][:2]):
         by_seed = [
-            {r.training_seed: r.value for r in own if r.conditions["distractor"] == rate}
+            {r.training_seed: r.value for r in group if r.conditions["distractor"] == rate}
             for rate in DISTRACTOR_RATES
         ]
         seeds = [s for s in by_seed[0] if all(s in other for other in by_seed)]
         if not seeds:  # a world in which no distractor was planted
             continue
         clean, off, on = ([values[seed] for seed in seeds] for values in by_seed)
-        drop = [100 * (1 - there / plain) for there, plain in zip(off, clean, strict=True)]
+        drop = [100 * (1 - with_it / without) for with_it, without in zip(off, clean, strict=True)]
         spread = [mean_and_sd(values) for values in (clean, off, on, drop)]
         lines.append((world, f"{-quantile:g}", method, len(seeds), *spread))
     shown = ("no distractor", "distractor off", "distractor on", "drop, %")
@@ -68,22 +72,22 @@ def distractor_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str
 
 
 def of_checkpoint(rows: Sequence[ResultRow], checkpoint: str) -> list[ResultRow]:
-    """Rows of built-in policies and of one checkpoint."""
+    """The rows of built-in policies, and those of one checkpoint of trained ones."""
     return [row for row in rows if row.checkpoint in (None, checkpoint)]
 
 
 def numbers(rows: Sequence[ResultRow], name: str) -> list[float]:
-    """A metric of all rows that have it."""
+    """Values of metric `name` of the rows that have it."""
     return [row.metrics[name] for row in rows if name in row.metrics]
 
 
-def earned_by_target(rows: Sequence[ResultRow]) -> dict[float, list[float]]:
-    """What target returns earned in validation sessions, from the lowest."""
-    earned: dict[float, list[float]] = {}
+def returns_by_target(rows: Sequence[ResultRow]) -> dict[float, list[float]]:
+    """Validation returns of each row by target return, in rising order of the target."""
+    returns: dict[float, list[float]] = {}
     for row in rows:
         for target, value in row.details.get("validation", {}).items():
-            earned.setdefault(float(target), []).append(value)
-    return dict(sorted(earned.items()))
+            returns.setdefault(float(target), []).append(value)
+    return dict(sorted(returns.items()))
 
 
 def _line(row: ResultRow) -> tuple[str | None, str]:
@@ -91,6 +95,6 @@ def _line(row: ResultRow) -> tuple[str | None, str]:
 
 
 def _targets(rows: Sequence[ResultRow]) -> str:
-    tried = [row for row in rows if row.details.get("validation")]
-    chosen = {f"{row.target_return:g}" for row in tried if row.target_return is not None}
+    validated = [row for row in rows if row.details.get("validation")]
+    chosen = {f"{row.target_return:g}" for row in validated if row.target_return is not None}
     return ", ".join(sorted(chosen, key=float)) or NONE

@@ -1,4 +1,4 @@
-"""What is learned from and what is played: a store, and the worlds of its policies."""
+"""The benchmark tasks: a store to train on, and the worlds to evaluate in."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -23,48 +23,52 @@ from ucfrec_simulators.kuai.logs import cut_by_exit, window, write_log
 
 KUAIRAND: Final = ("kuairand", "kuairand-nx0", "kuairand-nx10")
 KUAIREC: Final = ("kuairec", "kuairec-nx0", "kuairec-nx10")
-# Midnight in China. The column `date` will not do: it changes as much as an hour too early.
+# Midnight in China (ms). The column `date` changes up to an hour too early, so it is not used.
 _APRIL_22, _APRIL_28 = 1_650_556_800_000, 1_651_075_200_000
 
 
 @dataclass(frozen=True)
 class BenchmarkTask:
-    """One environment of the table."""
+    """One benchmark task."""
 
     store: Path
+    """Episode store that methods are trained on."""
     worlds: tuple[World, ...]
-    """Where its policies play; the first is the table's."""
+    """Worlds that policies are evaluated in; the first is the one of the sweeps."""
     behaviors: tuple[str, ...]
-    """Built-in policies of the worlds that are evaluated beside."""
+    """Built-in policies of the worlds that are evaluated as references."""
 
 
 def virtual_taobao(folder: Path, sessions: int, log_seed: int) -> BenchmarkTask:
-    """The original networks, logged by the mixture of behaviors."""
+    """VirtualTaobao's published networks, with logs of the mixture of behaviors."""
     world = World("virtual-taobao")
     store = simulated_store(world, folder, sessions, log_seed)
     return BenchmarkTask(store, (world,), ("random", "mixture", "best-constant"))
 
 
 def synthetic_taobao(folder: Path, sessions: int, log_seed: int) -> BenchmarkTask:
-    """Built-in shoppers, logged by the mixture of behaviors; the optimum is known."""
+    """SyntheticTaobao, with logs of the mixture of behaviors; the optimal policy is known."""
     world = World("synthetic-taobao")
     store = simulated_store(world, folder, sessions, log_seed)
     return BenchmarkTask(store, (world,), ("random", "mixture", "best-constant", "optimal"))
 
 
 def synthetic_catalog(folder: Path, sessions: int, log_seed: int) -> BenchmarkTask:
-    """Tagged items and boredom, logged by the mixture of behaviors; the optimum is known."""
+    """SyntheticCatalog, with logs of the mixture of behaviors; the optimal policy is known."""
     world = World("synthetic-catalog")
     store = simulated_store(world, folder, sessions, log_seed)
     return BenchmarkTask(store, (world,), ("random", "mixture", "optimal"))
 
 
 def kuairand(folder: Path, sessions: int, log_seed: int) -> BenchmarkTask:
-    """KuaiRand's logs: what came first to learn from, cut by the exit rule; what came after filled
-    in to make the worlds.
+    """KuaiRand: trained on the earlier logs, evaluated in worlds completed from the later logs.
 
-    With the random exposure at hand the standard log up to 21 April is learned from and the worlds
-    are made of the random rows, as in the public experiments; else the log is split at 28 April.
+    The training logs are cut into sessions by the exit rule. If the data folder has the random
+    exposures, training uses the standard log up to 21 April and the worlds are made from the random
+    rows, as in the public experiments. Otherwise the log is split at 28 April.
+
+    Raises:
+        InputError: the data folder lacks the official files.
     """
     source = data_folder("kuairand")
     files = log_files([source])
@@ -75,7 +79,7 @@ def kuairand(folder: Path, sessions: int, log_seed: int) -> BenchmarkTask:
         learn, play = f"time_ms < {_APRIL_28}", f"time_ms >= {_APRIL_28}"
     basic = [file for file in files if file.name.startswith("video_features_basic_")]
     features = [*basic, *(file for file in files if file.name.startswith("user_features_"))]
-    tags = {video: own for file in basic for video, own in read_tags(file).items()}
+    tags = {video: tag for file in basic for video, tag in read_tags(file).items()}
     store, filled = folder / "store", folder / "world"
     if not store.exists():
         rows = cut_by_exit(window(logs, "time_ms", learn), tags, EXITS["easyrl4rec-kuairand"])
@@ -92,7 +96,11 @@ def kuairand(folder: Path, sessions: int, log_seed: int) -> BenchmarkTask:
 
 
 def kuairec(folder: Path, sessions: int, log_seed: int) -> BenchmarkTask:
-    """KuaiRec: the big matrix to learn from, cut by the exit rule; the small one to play in."""
+    """KuaiRec: trained on the big matrix, cut by the exit rule; evaluated on the small matrix.
+
+    Raises:
+        InputError: the data folder lacks the official files.
+    """
     source = data_folder("kuairec")
     files = log_files([source])
     logs = [file for file in files if file.name.startswith("big_matrix")]
@@ -108,7 +116,7 @@ def kuairec(folder: Path, sessions: int, log_seed: int) -> BenchmarkTask:
 
 
 def _prepare(dataset: str, rows: pa.Table, log: Path, features: list[Path], store: Path) -> None:
-    """A window as a log, and as a store; sessions are those it was cut into, else users."""
+    """Write `rows` to `log` and as a store; an episode is a session, or a user without sessions."""
     write_log(rows, log)
     adapter: Dataset = load_plugin("datasets", dataset)
     by = SESSION_ID if SESSION_ID in rows.column_names else "user"
@@ -123,7 +131,7 @@ TASKS: Final[Mapping[str, Callable[[Path, int, int], BenchmarkTask]]] = {
     "synthetic-taobao": synthetic_taobao,
     "synthetic-catalog": synthetic_catalog,
 }
-"""By name; each made from (folder to keep it in, sessions to collect and their seed where logs are
-simulated)."""
+"""Makers of the tasks by name. Arguments: folder to keep it in; sessions to collect and their seed,
+where logs are simulated."""
 LOGGED: Final[Mapping[str, tuple[str, ...]]] = {"kuairand": KUAIRAND, "kuairec": KUAIREC}
-"""The tasks whose logs are given, with their worlds; others are of the world of their name."""
+"""Worlds of the tasks whose logs are given; any other task has the one world of its name."""

@@ -1,1 +1,1 @@
-"""Worlds made from the Kuaishou logs."""
+"""Worlds made from the Kuaishou logs, KuaiRec and KuaiRand."""

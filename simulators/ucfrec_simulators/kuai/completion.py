@@ -1,4 +1,4 @@
-"""A click table filled in: who would click what, from the rows of one window of a log."""
+"""Completion of a user × item click table from the rows of one time window of a log."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -31,7 +31,7 @@ BINS: Final = 10
 class CompletionConfig:
     """Size and training of the completion model.
 
-    Chosen on the rows that stop the training, never on those reported, of 28–30 April of KuaiRand.
+    The defaults were chosen on the validation rows of KuaiRand's 28–30 April, not on the test rows.
     """
 
     factors: int = 4
@@ -44,18 +44,19 @@ class CompletionConfig:
 
 @dataclass(frozen=True)
 class CompletionReport:
-    """How far the filled-in table can be believed: on rows after those it was fitted to."""
+    """Accuracy of the completed table on test rows, which are later than the fitted rows."""
 
     rows: int
     held_out_rows: int
     auc: float
     log_loss: float
+    """Nats per row."""
     base_log_loss: float
-    """Of the fitted rows' click rate for everybody."""
+    """Log loss (nats) of predicting the fitted rows' mean click rate for every pair."""
     calibration_error: float
-    """Expected: mean over tenths of the held-out rows of |predicted − observed| click rate."""
+    """Expected calibration error: mean of |predicted − observed| click rate over `calibration`."""
     calibration: list[tuple[float, float]]
-    """(predicted, observed) click rate of each tenth, by rising prediction."""
+    """(predicted, observed) click rate of each tenth of the test rows, by rising prediction."""
     users: int
     items: int
 
@@ -71,7 +72,7 @@ class CompletionModel(nn.Module):
     ) -> None:
         """Build for features (n_users, F) and (n_items, G)."""
         super().__init__()
-        size = config.factors + 1  # the last place is the bias
+        size = config.factors + 1  # the last component is the bias
         self.register_buffer("user_features", user_features)
         self.register_buffer("item_features", item_features)
         self.user_vectors = nn.Embedding(len(user_features), size)
@@ -84,7 +85,7 @@ class CompletionModel(nn.Module):
             nn.init.normal_(table.weight, std=0.05)
 
     def forward(self, users: Tensor, items: Tensor) -> Tensor:
-        """Log-odds of a click, (M,), of users (M,) and items (M,)."""
+        """Log-odds (M,) of a click of users (M,) on items (M,)."""
         user = self.user_vectors(users) + self.user_features[users] @ self.of_user
         item = self.item_vectors(items) + self.item_features[items] @ self.of_item
         match = (self.dropout(user[:, :-1]) * item[:, :-1]).sum(-1)
@@ -92,7 +93,7 @@ class CompletionModel(nn.Module):
 
     @torch.no_grad()
     def factors(self) -> tuple[FloatArray, FloatArray]:
-        """Users' and items' vectors, (n, factors + 2), whose products are the log-odds."""
+        """Vectors (n, factors + 2) of users and of items; their inner products are the log-odds."""
         user = self.user_vectors.weight + self.user_features @ self.of_user
         item = self.item_vectors.weight + self.item_features @ self.of_item
         one_user, one_item = torch.ones(len(user), 1), torch.ones(len(item), 1)
@@ -102,7 +103,7 @@ class CompletionModel(nn.Module):
 
 
 class Completed:
-    """The table, filled in where it is looked at: indexed like an array (`kuai.Rewards`)."""
+    """The completed table, computed on access and indexed like an array (see `Rewards`)."""
 
     def __init__(self, users: FloatArray, items: FloatArray) -> None:
         """
@@ -114,7 +115,7 @@ class Completed:
         self.shape = (len(users), len(items))
 
     def __getitem__(self, pairs: tuple[IntArray, IntArray]) -> npt.NDArray[Any]:
-        """Probabilities of a click of aligned users (...) and items (...)."""
+        """Click probabilities (...) of aligned users (...) and items (...)."""
         users, items = pairs
         logits = np.einsum("...d,...d->...", self._users[users], self._items[items])
         return np.asarray(1 / (1 + np.exp(-logits)))
@@ -130,19 +131,26 @@ def complete(
 ) -> CompletionReport:
     """Fit the completion model on the rows of `store` and write the world's files to `out`.
 
-    The store's training rows are fitted, its validation rows stop the training, its test rows,
-    later than both, are what the report is about. Make the store of the evaluation window only:
-    what a policy learns from must not be in it.
+    The model is fitted on the store's training rows, with early stopping on its validation rows.
+    The report is of its test rows, which are later than both. The store must hold the evaluation
+    window only, and no rows that a policy is trained on.
 
     Writes `users.parquet` (user_id, vector), `items.parquet` (item_id, vector, tags) and
-    `completion.json`, atomically. A pair's click probability is the logistic function of the
-    product of its vectors.
+    `completion.json`, atomically. The click probability of a pair is the logistic function of the
+    inner product of its vectors.
+
+    Args:
+        store: logs of items with clicks (0 or 1) as rewards, split in time.
+        tags: tags of each video id; a missing video has no tags.
+        out: folder to write.
+        config: size and training of the model.
+        seed: seed of the initial weights and of the batches.
 
     Raises:
         InputError: rewards are not clicks, a split is empty, or `out` exists.
     """
     config = config or CompletionConfig()
-    fitted, stopping, held_out = (_rows(store.split(name)) for name in schema.SPLITS)
+    fitted, validation, test = (_rows(store.split(name)) for name in schema.SPLITS)
     torch.manual_seed(seed)
     states = store.item_states
     model = CompletionModel(states.user_features, states.embeddings, config)
@@ -168,19 +176,19 @@ def complete(
     )
     with atomic_folder(out) as folder:
         with TemporaryDirectory(dir=folder) as work:
-            validate = lambda: float(loss(stopping)[0])  # noqa: E731
+            validate = lambda: float(loss(validation)[0])  # noqa: E731
             fit(model, draw, loss, loop, Path(work), seed=seed, validate=validate, describe="fill")
-        report = _judge(model, fitted[2], held_out)
+        report = _evaluate(model, fitted[2], test)
         _write(store, model, tags, folder)
-        about = {"fingerprint": store.meta["fingerprint"], "seed": seed, "config": asdict(config)}
-        write_json(folder / REPORT_FILE, asdict(report) | about)
+        origin = {"fingerprint": store.meta["fingerprint"], "seed": seed, "config": asdict(config)}
+        write_json(folder / REPORT_FILE, asdict(report) | origin)
     return report
 
 
 def _rows(store: EpisodeStore) -> tuple[Tensor, Tensor, Tensor]:
-    """Users, items and clicks of every step."""
+    """Users, items and clicks of every step, (M,) each."""
     if not store.n_episodes:
-        raise InputError(f"{store.path} lacks a split; prepare it with three shares")
+        raise InputError(f"{store.path} has an empty split; prepare it with three shares")
     episodes, steps = store.all_steps()
     clicks = store.step_values(schema.REWARD, episodes, steps)
     if not np.isin(clicks, (0, 1)).all():
@@ -191,20 +199,20 @@ def _rows(store: EpisodeStore) -> tuple[Tensor, Tensor, Tensor]:
 
 
 @torch.no_grad()
-def _judge(
-    model: CompletionModel, fitted: Tensor, held_out: tuple[Tensor, Tensor, Tensor]
+def _evaluate(
+    model: CompletionModel, fitted: Tensor, test: tuple[Tensor, Tensor, Tensor]
 ) -> CompletionReport:
-    users, items, clicks = held_out
+    users, items, clicks = test
     predicted = torch.sigmoid(model(users, items))
     order = torch.argsort(predicted)
     tenths = [(float(predicted[t].mean()), float(clicks[t].mean())) for t in order.chunk(BINS)]
-    everybody = fitted.mean().expand(len(clicks))
+    base_rate = fitted.mean().expand(len(clicks))
     return CompletionReport(
         rows=len(fitted),
         held_out_rows=len(clicks),
         auc=float(roc_auc_score(clicks, predicted)),
         log_loss=float(F.binary_cross_entropy(predicted, clicks)),
-        base_log_loss=float(F.binary_cross_entropy(everybody, clicks)),
+        base_log_loss=float(F.binary_cross_entropy(base_rate, clicks)),
         calibration_error=float(np.mean([abs(p - o) for p, o in tenths])),
         calibration=tenths,
         users=len(model.user_features),
@@ -221,13 +229,13 @@ def _write(
     users, items = model.factors()
     user_ids = pq.read_table(store.path / "users.parquet").column(schema.USER_ID)
     item_ids = pq.read_table(store.path / "items.parquet").column(schema.ITEM_ID)
-    own = [list(tags.get(item, ())) for item in item_ids.to_pylist()]
+    item_tags = [list(tags.get(item, ())) for item in item_ids.to_pylist()]
     tables = {
         USERS_FILE: {schema.USER_ID: user_ids, "vector": _lists(users)},
         ITEMS_FILE: {
             schema.ITEM_ID: item_ids,
             "vector": _lists(items),
-            "tags": pa.array(own, type=pa.list_(pa.int64())),
+            "tags": pa.array(item_tags, type=pa.list_(pa.int64())),
         },
     }
     for name, columns in tables.items():

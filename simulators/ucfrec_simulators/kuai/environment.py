@@ -1,6 +1,6 @@
-"""The Kuaishou worlds: a user, an item a step, a user × item table of rewards, boredom by tags.
+"""The Kuaishou worlds: one item per step, rewards from a user × item table, exit by repeated tags.
 
-Facts: `BaseEnv`, `KuaiEnv` and `KuaiRandEnv` of EasyRL4Rec, and their relatives in DORL and CIRS.
+Source: `BaseEnv`, `KuaiEnv` and `KuaiRandEnv` of EasyRL4Rec, and their versions in DORL and CIRS.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,29 +19,31 @@ from ucfrec_simulators.behaviors import Memoryless
 from ucfrec_simulators.session_env import AnyArray, SessionsEnv
 
 UNTAGGED: Final = -1
-"""The tag that all items without one share; it bores like any other."""
+"""The tag of all items without one; it counts for the exit rule like any other."""
 NOT_SHOWN: Final = -1
 
 
 @dataclass(frozen=True)
 class ExitRule:
-    """When a user leaves: a tag of the item shown occurred too often just before.
+    """When a user leaves: a tag of the current item occurred too often in the items just before.
 
-    In step t > 0 (t = 0 never ends a session by this rule) the user leaves if any tag of the item
-    occurs more than `threshold` times among the tags, pooled, of the `window` items before it.
+    In step t > 0 the user leaves if any tag of the item occurs more than `threshold` times among
+    the pooled tags of the `window` items before it. Step t = 0 never ends a session by this rule.
     """
 
     window: int
+    """Number of previous items that count."""
     threshold: int
+    """Occurrences of a tag in the window that a user tolerates."""
     max_turn: int
-    """Steps after which a session is over in any case."""
+    """Largest number of steps of a session."""
     sliced: bool = False
-    """Windows of the original code: its slice `shown[t − window : t]` starts at a negative number
-    for t < window, which Python counts from the end, so that step t looks back at only
+    """Use the windows of the original code. Its slice `shown[t − window : t]` starts below 0 for
+    t < window, which Python counts from the end, so that step t looks back at only
     min(t, window − t) items instead of t."""
 
     def reach(self, turns: IntArray) -> IntArray:
-        """How many items back the user remembers before step `turns`."""
+        """(N,) number of previous items that count in steps `turns` (N,)."""
         early = np.minimum(turns, self.window - turns) if self.sliced else turns
         return np.where(turns < self.window, early, self.window)
 
@@ -55,8 +57,8 @@ EXITS: Final = {
     "dorl-main-explore": ExitRule(window=4, threshold=0, max_turn=30),
     "cirs": ExitRule(window=1, threshold=0, max_turn=30),
 }
-"""Published settings by name. `dorl-main-explore` is that of its UCB and ε-greedy scripts. With
-`dataclasses.replace(rule, sliced=True)` they are what the published code computes."""
+"""Published settings by name; `dorl-main-explore` is that of DORL's UCB and ε-greedy scripts. Use
+`dataclasses.replace(rule, sliced=True)` for exactly what the published code computes."""
 
 
 @dataclass(frozen=True)
@@ -64,46 +66,49 @@ class Regime:
     """How an evaluation is played."""
 
     masked: bool
-    """Items may be recommended once a session only."""
+    """Whether an item may be recommended only once per session."""
     steps: int | None = None
-    """Sessions of exactly so many steps, whatever the exit rule; None leaves them to it."""
+    """Fixed number of steps of a session; None: sessions end by the exit rule."""
 
 
 REGIMES: Final = {"FB": Regime(False), "NX_0": Regime(True), "NX_10": Regime(True, 10)}
+"""The evaluation settings of the public experiments, by their name."""
 
 
 class Rewards(Protocol):
-    """What every user pays for every item."""
+    """The reward of every user for every item."""
 
     @property
     def shape(self) -> tuple[int, ...]:
         """(n_users, n_items)."""
 
     def __getitem__(self, pairs: tuple[IntArray, IntArray]) -> npt.NDArray[Any]:
-        """Rewards of aligned users (...) and items (...), as of a NumPy array."""
+        """Rewards (...) of aligned users (...) and items (...), indexed as a NumPy array."""
 
 
 class KuaiEnv(SessionsEnv):
-    """One item a step to a user drawn uniformly; the reward is the table's entry.
+    """One item per step to a user drawn uniformly; the reward is the table's entry.
 
-    A session terminates in the step whose item bores (`ExitRule`), that step's reward counting, and
-    is truncated at its longest. Where the regime masks, an item played twice is an error:
-    `info["forbidden"]` (N, longest) lists the items already shown, −1 where there is none.
+    A session terminates in the step whose item triggers the `ExitRule`, and the reward of that step
+    counts. It is truncated at its maximum length. If the regime masks items, playing an item twice
+    in a session is an error: `info["forbidden"]` (N, maximum length) lists the items already shown,
+    padded with −1.
 
-    Observation (2,): number of the user, number of the last item (n_items before the first).
-    `info["user_id"]` (N,): whom the next step serves. Numbers count rows and columns of the table.
+    Observation (2,): row of the user in the table, and column of the last item (n_items before the
+    first). `info["user_id"]` (N,): id of the user of the next step.
 
     Args:
-        num_envs: sessions side by side, N.
-        rewards: (n_users, n_items), an array or something that is indexed like one.
-        tags: of each item; none stands for the tag −1.
+        num_envs: number of parallel sessions, N.
+        rewards: (n_users, n_items), an array or an object indexed like one.
+        tags: tags of each item; an item without any gets the tag −1.
         exit_rule: when users leave.
-        regime: how it is played.
-        user_ids, item_ids: what the logs call them.
+        regime: masking and length of sessions.
+        user_ids, item_ids: (n_users,) and (n_items,) ids in the logs; row and column numbers if
+            None.
 
     Raises:
-        InputError: tags or ids do not fit the table, or fewer items than a masked session shows.
-            On a step, a masked item.
+        InputError: tags or ids do not match the table, or there are fewer items than steps of a
+            masked session. In `step`: a masked item was played.
     """
 
     def __init__(
@@ -122,20 +127,22 @@ class KuaiEnv(SessionsEnv):
         given = (len(self.user_ids), len(self.item_ids), len(tags))
         if given != (n_users, n_items, n_items):
             raise InputError(
-                f"a table of {n_users} users × {n_items} items came with {given[0]} user ids, "
-                f"{given[1]} item ids and tags of {given[2]} items"
+                f"the table has {n_users} users × {n_items} items, but there are {given[0]} user "
+                f"ids, {given[1]} item ids and tags of {given[2]} items; give the same numbers"
             )
         longest = exit_rule.max_turn if regime.steps is None else regime.steps
         if regime.masked and n_items < longest:
-            raise InputError(f"{n_items} items cannot fill a session of {longest} without repeats")
+            raise InputError(
+                f"{n_items} items are too few for a session of {longest} steps without repeats"
+            )
         self.rewards, self.exit_rule, self.regime = rewards, exit_rule, regime
-        self.tags = [tuple(own) or (UNTAGGED,) for own in tags]
-        """Of each item; at least one."""
+        self.tags = [tuple(item_tags) or (UNTAGGED,) for item_tags in tags]
+        """Tags of each item; at least one."""
         self._codes, self._n_tags = _coded(self.tags)
         self.users: IntArray = np.zeros(num_envs, dtype=np.int64)
-        """(N,) who is served."""
+        """(N,) table row of each session's user."""
         self.turns: IntArray = np.zeros(num_envs, dtype=np.int64)
-        """(N,) items shown so far."""
+        """(N,) number of items shown so far."""
         self._shown: IntArray = np.full((num_envs, longest), NOT_SHOWN)
         high = np.array([n_users - 1, n_items], dtype=np.float32)
         super().__init__(
@@ -145,26 +152,26 @@ class KuaiEnv(SessionsEnv):
         )
 
     def item_features(self) -> pa.Table:
-        """One row an item, in the order of their numbers: `item_id` and the list `tags`."""
+        """One row per item, in the order of the table's columns: `item_id` and the list `tags`."""
         return pa.table({"item_id": pa.array(self.item_ids), "tags": pa.array(self.tags)})
 
     def boring(self) -> BoolArray:
-        """Which items would end each session now, (N, n_items)."""
+        """(N, n_items) whether each item would end each session by the exit rule in this step."""
         tiresome = self._tiresome()
-        found = np.zeros((self.num_envs, len(self._codes)), dtype=np.bool_)
-        for place in self._codes.T:
-            found |= tiresome[:, place]
-        return found
+        boring = np.zeros((self.num_envs, len(self._codes)), dtype=np.bool_)
+        for codes in self._codes.T:
+            boring |= tiresome[:, codes]
+        return boring
 
     def _tiresome(self) -> BoolArray:
-        """(N, n_tags + 1) tags that users have seen too often; the last one stands for none."""
+        """(N, n_tags + 1) whether each tag occurred too often; the last column is padding."""
         size, reach = self._n_tags + 1, self.exit_rule.reach(self.turns)
-        # One entry a remembered item: its session, and its place in the session from the first.
+        # One entry per remembered item: its session, and its step in that session.
         rows = np.repeat(np.arange(self.num_envs), reach)
-        places = np.arange(len(rows)) + np.repeat(self.turns - np.cumsum(reach), reach)
-        remembered = self._shown[rows, places]
-        seen = rows[:, None] * size + self._codes[remembered]
-        counts = np.bincount(seen.ravel(), minlength=self.num_envs * size)
+        steps = np.arange(len(rows)) + np.repeat(self.turns - np.cumsum(reach), reach)
+        remembered = self._shown[rows, steps]
+        cells = rows[:, None] * size + self._codes[remembered]
+        counts = np.bincount(cells.ravel(), minlength=self.num_envs * size)
         tiresome: BoolArray = counts.reshape(self.num_envs, size) > self.exit_rule.threshold
         tiresome[:, -1] = False
         return tiresome
@@ -188,11 +195,11 @@ class KuaiEnv(SessionsEnv):
         return rewards, bored, np.asarray((self.turns >= self._shown.shape[1]) & ~bored)
 
     def _require_new(self, actions: AnyArray) -> None:
-        again = (self._shown == actions[:, None]).any(axis=1)
-        if again.any():
+        repeated = (self._shown == actions[:, None]).any(axis=1)
+        if repeated.any():
             raise InputError(
-                f"{again.sum()} of {self.num_envs} sessions were shown an item again (such as "
-                f'{actions[again][0]}), which this regime masks; heed info["{FORBIDDEN}"]'
+                f"{repeated.sum()} of {self.num_envs} sessions repeat an item (such as "
+                f'{actions[repeated][0]}), which this regime masks; avoid info["{FORBIDDEN}"]'
             )
 
     def _observe(self) -> FloatArray:
@@ -201,14 +208,14 @@ class KuaiEnv(SessionsEnv):
         return np.stack([self.users, last], axis=1).astype(np.float32)
 
     def _describe(self) -> dict[str, AnyArray]:
-        told: dict[str, AnyArray] = {USER_IDS: self.user_ids[self.users]}
-        return told | {FORBIDDEN: self._shown.copy()} if self.regime.masked else told
+        info: dict[str, AnyArray] = {USER_IDS: self.user_ids[self.users]}
+        return info | {FORBIDDEN: self._shown.copy()} if self.regime.masked else info
 
 
 def _coded(tags: Sequence[Sequence[int]]) -> tuple[IntArray, int]:
-    """Tags numbered from 0, (n_items, most tags of an item), filled up with their count."""
-    lengths = np.array([len(own) for own in tags])
-    flat = np.array([tag for own in tags for tag in own], dtype=np.int64)
+    """(n_items, most tags of an item) tags numbered from 0, padded with their count; the count."""
+    lengths = np.array([len(item_tags) for item_tags in tags])
+    flat = np.array([tag for item_tags in tags for tag in item_tags], dtype=np.int64)
     known, numbers = np.unique(flat, return_inverse=True)
     codes = np.full((len(tags), lengths.max()), len(known), dtype=np.int64)
     codes[np.arange(codes.shape[1]) < lengths[:, None]] = numbers
@@ -216,37 +223,40 @@ def _coded(tags: Sequence[Sequence[int]]) -> tuple[IntArray, int]:
 
 
 class Oracle(Memoryless):
-    """The dearest item that is neither forbidden nor boring, as only the world itself knows it.
+    """The item of highest true reward that is not masked and does not end the session.
 
-    Not the optimum, as it plans no further than the step, but out of a recommender's reach. Where
-    every item left would bore, the dearest of them ends the session.
+    It reads the world's rewards, which no recommender can. It is greedy and so not optimal: it does
+    not plan beyond the current step. If every item left ends the session, it plays the one of
+    highest reward.
     """
 
     def __init__(self, world: KuaiEnv) -> None:
         self._world = world
 
     def act(self, observations: FloatArray, live: BoolArray) -> tuple[IntArray, None]:
-        """Choose an item a session, (N,)."""
+        """The best item of each session, (N,)."""
         world, items = self._world, np.arange(len(self._world.item_ids))
         users = np.broadcast_to(world.users[:, None], (world.num_envs, len(items)))
-        paid = np.array(world.rewards[users, np.broadcast_to(items, users.shape)], dtype=np.float64)
+        rewards = np.array(
+            world.rewards[users, np.broadcast_to(items, users.shape)], dtype=np.float64
+        )
         if world.regime.steps is None:
-            # Anything that bores comes after anything that does not.
-            paid -= world.boring() * (1 + np.ptp(paid))
+            # Shift boring items below all others, so that they are chosen last.
+            rewards -= world.boring() * (1 + np.ptp(rewards))
         if world.regime.masked:
             rows, places = np.nonzero(world._shown != NOT_SHOWN)
-            paid[rows, world._shown[rows, places]] = -np.inf
-        return paid.argmax(axis=1), None
+            rewards[rows, world._shown[rows, places]] = -np.inf
+        return rewards.argmax(axis=1), None
 
     def inform(self, info: Mapping[str, Any]) -> None:
-        """It knows all that already."""
+        """Do nothing: the world itself is read instead of `info`."""
 
 
 def oracle(env: VectorEnv[Any, Any, Any], seed: int) -> Oracle:
-    """The greedy policy of one who knows every reward.
+    """The greedy policy that knows every reward; `seed` is unused.
 
     Raises:
-        InputError: it is not a Kuaishou world.
+        InputError: `env` is not a Kuaishou world.
     """
     if not isinstance(env.unwrapped, KuaiEnv):
         raise InputError(f"this behavior policy serves KuaiEnv, not {type(env).__name__}")

@@ -1,4 +1,4 @@
-"""Logged sequences cut where an exit rule would have ended them."""
+"""Cutting logged sequences into sessions where an exit rule would have ended them."""
 
 from collections.abc import Sequence
 
@@ -11,15 +11,17 @@ from ucfrec_simulators.kuai.environment import ExitRule, KuaiEnv
 def sessions_by_exit(
     users: IntArray, items: IntArray, tags: Sequence[Sequence[int]], exit_rule: ExitRule
 ) -> IntArray:
-    """Replay what users were shown through an exit rule, as the public code makes its episodes.
+    """Replay logged items through an exit rule, as the public code (EasyRL4Rec) makes its episodes.
 
-    A row that ends a session, by boredom or by the rule's longest, is its last; the user's next row
-    begins another. All users are replayed at once, a row each a step.
+    The row at which the rule ends a session, or at which the session has its maximum length, is the
+    session's last; the user's next row starts a new session. All users are replayed in parallel,
+    one row each per step.
 
     Args:
-        users: (N,) whose row it is; rows of a user lie together, in order of time.
-        items: (N,) number of the item shown, a place in `tags`.
-        tags: of each item; none stands for the tag −1.
+        users: (N,) user of each row; rows of a user are contiguous and in order of time.
+        items: (N,) index into `tags` of the item shown.
+        tags: tags of each item; an item without any gets the tag −1.
+        exit_rule: when users leave.
 
     Returns:
         (N,) session of each row, numbered from 0 in the order of the rows.
@@ -29,10 +31,10 @@ def sessions_by_exit(
     world.reset(seed=0)
     last = np.zeros(len(users), dtype=np.bool_)
     for step in range(lengths.max()):
-        # Users whose rows are over go on with their last one, which is ended below in any case.
-        at = starts + np.minimum(step, lengths - 1)
-        _, _, terminated, truncated, _ = world.step(items[at])
-        there = step < lengths
-        last[at[there]] = (terminated | truncated)[there]
+        # Users without further rows repeat their last one, whose session is ended below anyway.
+        rows = starts + np.minimum(step, lengths - 1)
+        _, _, terminated, truncated, _ = world.step(items[rows])
+        active = step < lengths
+        last[rows[active]] = (terminated | truncated)[active]
     last[starts + lengths - 1] = True
     return np.concatenate([[0], np.cumsum(last)[:-1]])

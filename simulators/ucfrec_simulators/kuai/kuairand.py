@@ -1,4 +1,4 @@
-"""The KuaiRand world: users whose clicks are filled in from the rows of an evaluation window.
+"""The KuaiRand world: click probabilities completed from the rows of an evaluation window.
 
 `python -m ucfrec_simulators.kuai.kuairand STORE VIDEO_FEATURES_BASIC --out FOLDER` makes its files
 from a store of that window.
@@ -35,12 +35,14 @@ def kuairand(
     exit_rule: ExitRule = EXITS["easyrl4rec-kuairand"],
     regime: Regime = REGIMES["FB"],
 ) -> KuaiEnv:
-    """The world of all users × all videos that KuaiRand describes; the reward is the probability of
-    a click.
+    """The world of KuaiRand's users × videos; the reward is the probability of a click.
 
     Args:
-        folder: what `ucfrec_simulators.kuai.completion.complete` wrote; None for `kuairand-world`
+        num_envs: number of parallel sessions, N.
+        folder: written by `ucfrec_simulators.kuai.completion.complete`; None for `kuairand-world`
             in the data folder.
+        exit_rule: when users leave.
+        regime: masking and length of sessions.
 
     Raises:
         InputError: a file is missing.
@@ -71,17 +73,17 @@ def read_tags(path: Path) -> dict[int, tuple[int, ...]]:
     """Tags of each video of a `video_features_basic` file; a video may have none.
 
     Raises:
-        InputError: it is not the official file.
+        InputError: the file is missing or is not the official one.
     """
     table = read_columns(path, ["video_id", "tag"], SOURCE)
     tags = table["tag"].fillna("").astype(str)
-    return {video: parse_tags(own) for video, own in zip(table["video_id"], tags, strict=True)}
+    return {video: parse_tags(text) for video, text in zip(table["video_id"], tags, strict=True)}
 
 
 def simulator(regime: str) -> Simulator:
-    """The world under one regime, for the command line."""
+    """The world under one of `REGIMES`, for the command line."""
     return Simulator(
-        summary=f"KuaiRand's users and videos, click probabilities filled in; regime {regime}",
+        summary=f"KuaiRand's users and videos, completed click probabilities; regime {regime}",
         make=partial(kuairand, regime=REGIMES[regime]),
         behaviors={"random": Uniform, "oracle": oracle},
         feedback="is_click",
@@ -94,11 +96,11 @@ SIMULATOR_NX_10: Final = simulator("NX_10")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Make the world's files; returns the exit status."""
+    """Write the world's files from the command line; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m ucfrec_simulators.kuai.kuairand")
     parser.add_argument("store", type=Path, help="store of the evaluation window, reward is_click")
     parser.add_argument("video_features_basic", type=Path, help="the official file, for the tags")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the world")
+    parser.add_argument("--out", type=Path, required=True, help="folder to write")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(arguments)
     try:
@@ -110,7 +112,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(
         f"{options.out}: {report.users} users × {report.items} items from {report.rows} rows; on "
         f"{report.held_out_rows} later rows AUC {report.auc:.3f}, log loss {report.log_loss:.4f} "
-        f"(everybody alike {report.base_log_loss:.4f}), calibration error "
+        f"(constant click rate {report.base_log_loss:.4f}), calibration error "
         f"{report.calibration_error:.3f}"
     )
     return 0

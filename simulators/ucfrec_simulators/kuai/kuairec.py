@@ -1,4 +1,4 @@
-"""The KuaiRec world: users who watched nearly every video of `small_matrix`."""
+"""The KuaiRec world: the nearly fully observed users × videos of `small_matrix`."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -27,12 +27,15 @@ def kuairec(
 ) -> KuaiEnv:
     """The world of 1,411 users × 3,327 videos.
 
-    The reward is the raw `watch_ratio`, clipped at 5; the 0.4% of pairs that were never observed
-    pay 0.
+    The reward is the raw `watch_ratio`, clipped at 5, and 0 for the 0.4% of pairs that were never
+    observed.
 
     Args:
-        folder: holds `small_matrix.csv` and `item_categories.csv`; None for `kuairec` in the data
+        num_envs: number of parallel sessions, N.
+        folder: has `small_matrix.csv` and `item_categories.csv`; None for `kuairec` in the data
             folder.
+        exit_rule: when users leave.
+        regime: masking and length of sessions.
 
     Raises:
         InputError: a file is missing or is not the official one, or a video has no categories.
@@ -44,8 +47,8 @@ def kuairec(
     users, rows = np.unique(watched["user_id"].to_numpy(), return_inverse=True)
     items, columns = np.unique(watched["video_id"].to_numpy(), return_inverse=True)
     rewards = np.zeros((len(users), len(items)), dtype=np.float32)
-    paid = np.nan_to_num(watched["watch_ratio"].to_numpy(), nan=0.0)
-    rewards[rows, columns] = np.clip(paid, 0.0, REWARD_CAP)
+    watch_ratios = np.nan_to_num(watched["watch_ratio"].to_numpy(), nan=0.0)
+    rewards[rows, columns] = np.clip(watch_ratios, 0.0, REWARD_CAP)
     categories = read_categories(folder)
     missing = [item for item in items if item not in categories]
     if missing:
@@ -60,18 +63,18 @@ def read_categories(folder: Path) -> dict[int, tuple[int, ...]]:
     """Categories of every video of the official `item_categories.csv` in `folder`.
 
     Raises:
-        InputError: it is missing or is not the official file.
+        InputError: the file is missing or is not the official one.
     """
     table = read_columns(folder / CATEGORIES, ["video_id", "feat"], SOURCE)
-    feats = (parse_tags(text.strip("[]")) for text in table["feat"])
-    return dict(zip(table["video_id"], feats, strict=True))
+    categories = (parse_tags(text.strip("[]")) for text in table["feat"])
+    return dict(zip(table["video_id"], categories, strict=True))
 
 
 def read_columns(path: Path, columns: Sequence[str], source: str) -> pd.DataFrame:
-    """Columns of a CSV file.
+    """Read columns of a CSV file; `source` is where to get it, for the error message.
 
     Raises:
-        InputError: it is missing or lacks a column.
+        InputError: the file is missing or lacks a column.
     """
     try:
         return pd.read_csv(path, usecols=list(columns))
@@ -83,12 +86,12 @@ def read_columns(path: Path, columns: Sequence[str], source: str) -> pd.DataFram
 
 
 def parse_tags(text: str) -> tuple[int, ...]:
-    """Numbers between commas: "27, 9" is (27, 9)."""
+    """Parse numbers separated by commas: "27, 9" gives (27, 9)."""
     return tuple(int(tag) for tag in text.split(",") if tag.strip())
 
 
 def simulator(regime: str) -> Simulator:
-    """The world under one regime, for the command line."""
+    """The world under one of `REGIMES`, for the command line."""
     return Simulator(
         summary=f"KuaiRec's fully observed users and videos, watch ratio up to 5; regime {regime}",
         make=partial(kuairec, regime=REGIMES[regime]),

@@ -1,4 +1,4 @@
-"""Kuaishou logs as the public experiments use them: windows apart, sessions cut by an exit rule."""
+"""Kuaishou logs as the public experiments use them: time windows, and sessions by an exit rule."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,12 +20,12 @@ USER, VIDEO = "user_id", "video_id"
 
 
 def window(files: Sequence[Path], time: str, where: str) -> pa.Table:
-    """Rows of a window of the logs: each (user, video, time) once, by user and time.
+    """Rows of a window of the logs, ordered by user and time, without repeated (user, video, time).
 
     Args:
-        files: Parquet or CSV, of the same columns.
-        time: the column of times.
-        where: SQL condition.
+        files: Parquet or CSV files with the same columns.
+        time: name of the time column.
+        where: SQL condition that selects the window.
 
     Raises:
         InputError: no row is in the window.
@@ -39,19 +39,21 @@ def window(files: Sequence[Path], time: str, where: str) -> pa.Table:
             f"QUALIFY row_number() OVER (PARTITION BY {key}) = 1 ORDER BY {USER}, {time}, {VIDEO}"
         ).to_arrow_table()
     if not rows.num_rows:
-        raise InputError(f"{files[0]}: no row has {where}; are these the official logs?")
+        raise InputError(f"{files[0]}: no row satisfies {where}; give the official logs")
     return rows
 
 
 def cut_by_exit(rows: pa.Table, tags: Mapping[int, Sequence[int]], exit_rule: ExitRule) -> pa.Table:
-    """The rows of `window` with a `session_id`: a session ends where the user would have left.
+    """Add a `session_id` to the rows: a session ends where the user would have left.
 
     Args:
-        tags: of each video; one without any need not be there.
+        rows: as returned by `window`.
+        tags: tags of each video; videos without tags may be missing.
+        exit_rule: when users leave.
     """
     videos, numbers = np.unique(np.asarray(rows[VIDEO]), return_inverse=True)
-    own: list[Sequence[int]] = [tags.get(int(video), ()) for video in videos]
-    sessions = sessions_by_exit(np.asarray(rows[USER]), numbers, own, exit_rule)
+    video_tags: list[Sequence[int]] = [tags.get(int(video), ()) for video in videos]
+    sessions = sessions_by_exit(np.asarray(rows[USER]), numbers, video_tags, exit_rule)
     return rows.append_column(SESSION_ID, pa.array(sessions))
 
 

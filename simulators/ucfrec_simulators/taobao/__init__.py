@@ -1,1 +1,1 @@
-"""Worlds of pages and shoppers: VirtualTaobao and one of our own."""
+"""Worlds of ranked result pages: VirtualTaobao and the synthetic SyntheticTaobao."""

@@ -1,4 +1,4 @@
-"""VirtualTaobao with the exit rule of CIRS (Gao et al., TOIS 2023): sameness ends a session."""
+"""VirtualTaobao with the exit rule of CIRS (Gao et al., TOIS 2023): repeated actions end it."""
 
 from pathlib import Path
 from typing import Final
@@ -29,19 +29,18 @@ MAX_TURN: Final = 50
 
 
 class CirsTaobao(VirtualTaobao):
-    """The published users and clicks; the user leaves when a page is ranked much as one before.
+    """VirtualTaobao's users and clicks; the user leaves when two pages are ranked too similarly.
 
     A session terminates in the step whose action is within a Euclidean distance of `threshold` of
-    one of the `window` − 1 actions before it, and is truncated after `max_turn` pages; the leave
-    network has no say.
+    one of the `window` − 1 actions before it, and is truncated after `max_turn` pages. The leave
+    network is not used.
 
-    Observation (118,): 88 user bits, all zero from the second page on, when the last action (27,
-    zero on the first page) stands in their place; clicks on the last page, its index, and pages
-    turned.
+    Observation (118,): 88 user bits, zero from the second page on; the last action (27), zero on
+    the first page; clicks on the last page, its index, and pages turned.
 
     Args:
-        folder, num_envs: as of `VirtualTaobao`.
-        window, threshold, max_turn: published values.
+        folder, num_envs: as for `VirtualTaobao`.
+        window, threshold, max_turn: of the exit rule; the defaults are the published values.
     """
 
     def __init__(
@@ -54,7 +53,7 @@ class CirsTaobao(VirtualTaobao):
     ) -> None:
         super().__init__(folder, num_envs)
         self._threshold, self._max_turn = threshold, max_turn
-        # What was never played is infinitely far from everything.
+        # Infinity: an empty entry has an infinite distance from every action.
         self._recent = np.full((num_envs, window - 1, ACTION_DIM), np.inf, dtype=np.float32)
         limits = np.array([MAX_CLICKS, PAGE_INDICES - 1, max_turn], dtype=np.float32)
         high = np.concatenate([np.ones(USER_BITS + ACTION_DIM, dtype=np.float32), limits])
@@ -83,7 +82,7 @@ class CirsTaobao(VirtualTaobao):
 
 
 SIMULATOR: Final = Simulator(
-    summary="VirtualTB-v0 with the exit rule of CIRS: pages ranked alike end the session",
+    summary="VirtualTB-v0 with the exit rule of CIRS: similarly ranked pages end the session",
     make=lambda num_envs, folder: CirsTaobao(folder or data_folder("virtualtaobao"), num_envs),
     behaviors={
         "random": Uniform,

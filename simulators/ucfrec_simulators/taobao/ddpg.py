@@ -1,8 +1,7 @@
-"""A DDPG learner's sessions in a Taobao world: while it learns, of its snapshots, of its best.
+"""DDPG behavior policies in the Taobao worlds: a learner in training, its snapshots, the last one.
 
-Stable-Baselines3 (extra `collect`) holds the networks, the replay buffer and the update; the
-sessions are played by `ucfrec.acting.rollout`, many side by side, so that what it learns from and
-what is logged are the same steps.
+Stable-Baselines3 (extra `collect`) provides the networks, the replay buffer and the update. The
+sessions are played by `ucfrec.acting.rollout`, so that the steps learned from are those logged.
 """
 
 import hashlib
@@ -30,54 +29,58 @@ from ucfrec_simulators.taobao.environment import ACTION_DIM, MAX_CLICKS, TaobaoE
 
 @dataclass(frozen=True)
 class DdpgConfig:
-    """How the learner trains; a step is one of one session."""
+    """Settings of the training; one step is one step of one session."""
 
     sessions: int = 40_000
-    """Training sessions behind the snapshots and the expert."""
+    """Training sessions."""
     snapshots: int = 10
-    """Taken after equal shares of the training sessions."""
+    """Number of snapshots, taken after equal shares of the training sessions."""
     warm_up: int = 25_600
     """Steps with uniform actions before the first update."""
     updates: float = 1 / 16
-    """Gradient updates for each step after that."""
+    """Gradient updates per step after the warm-up."""
     batch_size: int = 256
     buffer_size: int = 1_000_000
     hidden: int = 128
     learning_rate: float = 1e-3
     discount: float = 0.2
-    """Small, since actions hardly move what comes later in these worlds."""
+    """Discount γ; small, since actions hardly affect later steps in these worlds."""
     target_rate: float = 0.02
+    """Polyak rate τ of the target networks."""
     noise: float = 0.1
-    """Scale σ of the exploration noise, in training and of every snapshot."""
+    """Standard deviation of the exploration noise, before truncation; also used by snapshots."""
 
 
 DEFAULT: Final = DdpgConfig()
 
 
 class Noisy(Memoryless):
-    """A deterministic network of observations, explored about by a truncated normal."""
+    """A deterministic policy network with truncated normal exploration noise."""
 
     def __init__(self, network: nn.Module, high: FloatArray, noise: float, seed: list[int]) -> None:
         self._network, self._high, self._noise = network, high, noise
         self._generator = np.random.default_rng(seed)
 
     def act(self, observations: FloatArray, live: BoolArray) -> tuple[Actions, FloatArray]:
-        """Draw actions (N, A) and give their densities (N,)."""
+        """Draw actions (N, A); returns them and their densities (N,)."""
         mean = _forward(self._network, observations / self._high)
         return truncated_normal(mean, self._noise, self._generator)
 
 
 class Learner:
-    """DDPG (Lillicrap et al., 2016) as an actor: each step played is a step learned from.
+    """DDPG (Lillicrap et al., 2016) as an actor that learns from every step played.
 
-    It serves all N sessions with its present network and noise, after a uniform warm-up; the
-    propensity is the density of the action. It learns from the live rows only, so from nothing that
-    is not in the log.
+    After a uniform warm-up, it serves all N sessions with its current network and noise; the
+    propensity is the density of the action. It learns from the live rows only, which are those that
+    are logged. The value after the end of a session is 0, whether it terminated or was truncated.
 
-    A session that ends has no value beyond its end, be it terminated or truncated.
+    Args:
+        env: the Taobao world.
+        seed: seed of the networks, the noise and the batches.
+        config: settings of the training.
 
     Raises:
-        InputError: the world is no Taobao world, or Stable-Baselines3 is not installed.
+        InputError: `env` is not a Taobao world, or Stable-Baselines3 is not installed.
     """
 
     def __init__(self, env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig) -> None:
@@ -92,16 +95,20 @@ class Learner:
 
     @property
     def network(self) -> nn.Module:
-        """Scaled observations (N, O) to actions (N, A), as it is now."""
+        """The current policy network: scaled observations (N, O) to actions (N, A)."""
         network: nn.Module = self._model.actor.mu
         return network
 
     def begin(self, rows: IntArray) -> None:
-        """The sessions that these followed have ended."""
+        """Mark that the previous sessions in `rows` have ended."""
         self._ended[rows] = True
 
     def act(self, observations: FloatArray, live: BoolArray) -> tuple[Actions, FloatArray]:
-        """Learn from the step before, which led to `observations`; then draw (N, A) actions."""
+        """Learn from the previous step, whose next observations are `observations`; then act.
+
+        Returns:
+            Actions (N, A) and their densities (N,).
+        """
         scaled = observations / self._high
         if self._played is not None:
             self._learn(self._played, scaled)
@@ -117,19 +124,19 @@ class Learner:
         return actions, density
 
     def observe(self, actions: Actions, rewards: FloatArray) -> None:
-        """Keep the step until it is known what it led to."""
+        """Keep the step until its next observations are known."""
         assert self._played is not None
         self._played.actions, self._played.rewards = actions, rewards / np.float32(MAX_CLICKS)
 
-    def _learn(self, played: "_Played", after: FloatArray) -> None:
+    def _learn(self, played: "_Played", next_observations: FloatArray) -> None:
         buffer, rows, config = self._model.replay_buffer, played.rows, self._config
-        # `ReplayBuffer.add` takes one step of each session; here the M live ones enter at once.
-        places = (buffer.pos + np.arange(len(rows))) % buffer.buffer_size
-        buffer.observations[places, 0] = played.observations[rows]
-        buffer.next_observations[places, 0] = after[rows]
-        buffer.actions[places, 0] = played.actions[rows]
-        buffer.rewards[places, 0] = played.rewards[rows]
-        buffer.dones[places, 0] = self._ended[rows]
+        # `ReplayBuffer.add` takes steps of all N sessions; only the M live ones may enter.
+        slots = (buffer.pos + np.arange(len(rows))) % buffer.buffer_size
+        buffer.observations[slots, 0] = played.observations[rows]
+        buffer.next_observations[slots, 0] = next_observations[rows]
+        buffer.actions[slots, 0] = played.actions[rows]
+        buffer.rewards[slots, 0] = played.rewards[rows]
+        buffer.dones[slots, 0] = self._ended[rows]
         buffer.full |= buffer.pos + len(rows) >= buffer.buffer_size
         buffer.pos = (buffer.pos + len(rows)) % buffer.buffer_size
         self._steps += len(rows)
@@ -142,18 +149,18 @@ class Learner:
 
 @dataclass
 class _Played:
-    """A step whose outcome is not known yet."""
+    """A step whose next observations are not known yet."""
 
     observations: FloatArray
     """(N, O), scaled."""
     rows: IntArray
-    """(M,) those that count."""
+    """(M,) live rows."""
     actions: Actions = field(init=False)
     rewards: FloatArray = field(init=False)
 
 
 class _Spaces(gymnasium.Env[FloatArray, Actions]):
-    """All that Stable-Baselines3 needs of a world whose sessions `rollout` plays."""
+    """The spaces that Stable-Baselines3 needs; the sessions themselves are played by `rollout`."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
         self.observation_space = gymnasium.spaces.Box(-1, 1, env.single_observation_space.shape)
@@ -185,7 +192,7 @@ def _sb3_model(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig) -> 
 
 
 def _network(observation_size: int, hidden: int) -> nn.Sequential:
-    """The network of Stable-Baselines3's DDPG actor, as its own code lays it out."""
+    """The network of Stable-Baselines3's DDPG actor, with the same layers and parameter names."""
     return nn.Sequential(
         nn.Linear(observation_size, hidden),
         nn.ReLU(),
@@ -203,7 +210,7 @@ def _forward(network: nn.Module, scaled: FloatArray) -> FloatArray:
 
 
 def _high(env: VectorEnv[Any, Any, Any]) -> FloatArray:
-    """(O,) largest observations, which scale them to [−1, 1]."""
+    """(O,) upper bounds of the observations, which scale them to [−1, 1]."""
     space = env.single_observation_space
     assert isinstance(space, gymnasium.spaces.Box)
     return np.asarray(space.high, dtype=np.float32)
@@ -211,11 +218,14 @@ def _high(env: VectorEnv[Any, Any, Any]) -> FloatArray:
 
 @random_state_kept()
 def snapshots(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig) -> list[nn.Module]:
-    """Networks of one training, after equal shares of its sessions, weakest stage first.
+    """Policy networks of one training after equal shares of its sessions, earliest first.
 
-    Trained at the first use and kept as safetensors in `$UCFREC_CACHE` (`~/.cache/ucfrec`), under
-    a name made of the world's own answers, the configuration, the seed and the libraries'
-    versions. The training is apart from every session that is logged later.
+    They are trained at the first use and cached as safetensors in `$UCFREC_CACHE`
+    (`~/.cache/ucfrec`). The file's name is a hash of responses of the world, the configuration, the
+    seed and the libraries' versions. No logged session is a training session.
+
+    Raises:
+        InputError: `env` is not a Taobao world, or Stable-Baselines3 is not installed.
     """
     folder = Path(os.environ.get("UCFREC_CACHE", Path.home() / ".cache" / "ucfrec"))
     file = folder / f"ddpg-{_fingerprint(taobao(env), seed, config)}.safetensors"
@@ -227,9 +237,9 @@ def snapshots(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig) -> l
     networks: list[nn.Module] = []
     for index in range(config.snapshots):
         prefix = f"{index}."
-        chosen = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+        weights = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
         network = _network(_high(env).size, config.hidden)
-        load_weights(file, network, chosen)
+        load_weights(file, network, weights)
         networks.append(network)
     return networks
 
@@ -247,9 +257,9 @@ def _train(
         while ended * config.snapshots >= (len(taken) + 1) * config.sessions:
             taken.append({k: v.clone() for k, v in learner.network.state_dict().items()})
 
-    # Users of a stream of their own, so that no logged session was trained on.
-    users = int(np.random.SeedSequence([seed, 52]).generate_state(1)[0])
-    rollout(env, learner, config.sessions, users, watch, describe="train DDPG")
+    # A separate random stream, so that no logged session is a training session.
+    users_seed = int(np.random.SeedSequence([seed, 52]).generate_state(1)[0])
+    rollout(env, learner, config.sessions, users_seed, watch, describe="train DDPG")
     return taken
 
 
@@ -257,32 +267,32 @@ def _fingerprint(world: TaobaoEnv, seed: int, config: DdpgConfig) -> str:
     generator = np.random.default_rng(53)
     users, lengths = world.sample_users(256, generator)
     actions = generator.uniform(-1, 1, (256, ACTION_DIM)).astype(np.float32)
-    answers = world.expected_clicks(users, np.zeros(256, dtype=np.int64), actions)
-    known = {
+    clicks = world.expected_clicks(users, np.zeros(256, dtype=np.int64), actions)
+    identity = {
         "world": [type(world).__name__, world.num_envs, lengths.tolist()],
-        "answers": answers.round(4).tolist(),
+        "answers": clicks.round(4).tolist(),
         "config": asdict(config) | {"seed": seed},
         "versions": versions(["stable-baselines3"]),
     }
-    return hashlib.sha256(json.dumps(known).encode()).hexdigest()[:16]
+    return hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:16]
 
 
 def training(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig = DEFAULT) -> Learner:
-    """A learner's whole training: the sessions logged are those it learns from."""
+    """A learner from its first step on: the logged sessions are its training sessions."""
     return Learner(env, seed, config)
 
 
 def snapshot_mixture(
     env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig = DEFAULT
 ) -> SessionMixture:
-    """Each session is served by one snapshot of a training, drawn evenly when it begins."""
+    """Each session is served by one snapshot, drawn uniformly when the session starts."""
     high, networks = _high(env), snapshots(env, seed, config)
     actors = [Noisy(n, high, config.noise, [seed, 54, i]) for i, n in enumerate(networks)]
     return SessionMixture(actors, [1.0] * len(actors), seed)
 
 
 def expert(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig = DEFAULT) -> Noisy:
-    """The last snapshot of a training, with the same noise as in training."""
+    """The last snapshot, with the same noise as in training."""
     return Noisy(snapshots(env, seed, config)[-1], _high(env), config.noise, [seed, 55])
 
 

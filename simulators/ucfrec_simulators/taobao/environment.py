@@ -1,4 +1,4 @@
-"""The interface that both Taobao worlds have, and what can be said of either through it."""
+"""The interface of the Taobao worlds, and the behavior policies that need only this interface."""
 
 from abc import abstractmethod
 from typing import Any, Final
@@ -14,7 +14,7 @@ from ucfrec_simulators.behaviors import Constant
 from ucfrec_simulators.session_env import AnyArray, SessionsEnv
 
 ATTRIBUTES: Final = (8, 8, 11, 11, 11, 11, 2, 2, 3, 18, 3)
-"""Values of each of the eleven user attributes; one-hot, they are the 88 user bits."""
+"""Number of values of each of the eleven user attributes; one-hot, they give the 88 user bits."""
 USER_BITS: Final = sum(ATTRIBUTES)
 ACTION_DIM: Final = 27
 MAX_CLICKS: Final = 10
@@ -23,12 +23,12 @@ LONGEST_SESSION: Final = 100
 
 
 class TaobaoEnv(SessionsEnv):
-    """A shopper turns pages; each page is ranked by a weight vector and earns 0 to 10 clicks.
+    """A user turns pages; each page is ranked by a weight vector and gets 0 to 10 clicks.
 
     Observation (91,): 88 one-hot user bits, clicks on the last page, the last page index (0–9, a
     second output of the user's model), pages turned so far. Action (27,) in [−1, 1]. Reward: the
     page's clicks. A session terminates when the user has turned as many pages as drawn at its
-    start; it is never truncated. `info["CTR"]`: clicks per ten items shown, so far.
+    start; it is never truncated. `info["CTR"]` (N,): clicks so far divided by items shown.
     """
 
     def __init__(self, num_envs: int) -> None:
@@ -47,21 +47,21 @@ class TaobaoEnv(SessionsEnv):
     def sample_users(
         self, count: int, generator: np.random.Generator
     ) -> tuple[FloatArray, IntArray]:
-        """Draw users and how many pages they turn: (M, 88) one-hot bits, (M,) at least 1."""
+        """Draw M = `count` users: one-hot bits (M, 88), and pages they turn (M,), at least 1."""
 
     @abstractmethod
     def expected_clicks(
         self, users: FloatArray, pages: AnyArray, actions: FloatArray
     ) -> npt.NDArray[np.float64]:
-        """Expected clicks of a page, exactly.
+        """Exact expected clicks on a page.
 
         Args:
             users: (M, 88) one-hot bits.
-            pages: (M,) pages turned before, from 0.
-            actions: (M, 27).
+            pages: (M,) pages turned before this one.
+            actions: (M, 27) weight vectors.
 
         Returns:
-            (M,), 0 to 10.
+            (M,) expected clicks, 0 to 10.
         """
 
     @abstractmethod
@@ -91,15 +91,15 @@ class TaobaoEnv(SessionsEnv):
 
 
 def split_observations(observations: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Users (M, 88) and pages turned (M,) of observations (M, 91)."""
+    """Split observations (M, 91) into user bits (M, 88) and pages turned (M,)."""
     return observations[:, :USER_BITS], observations[:, -1]
 
 
 def taobao(env: VectorEnv[Any, Any, Any]) -> TaobaoEnv:
-    """The environment as one whose users can be read.
+    """The Taobao world within `env`.
 
     Raises:
-        InputError: it is not a Taobao world.
+        InputError: `env` is not a Taobao world.
     """
     if not isinstance(env.unwrapped, TaobaoEnv):
         raise InputError(f"this behavior policy serves Taobao worlds, not {type(env).__name__}")
@@ -107,7 +107,7 @@ def taobao(env: VectorEnv[Any, Any, Any]) -> TaobaoEnv:
 
 
 def default_action() -> FloatArray:
-    """A weight vector (27,) that nobody tuned: one uniform draw from the box, always the same."""
+    """An untuned weight vector (27,): one fixed uniform draw from [−1, 1]^27."""
     return np.random.default_rng([0, 11]).uniform(-1, 1, ACTION_DIM).astype(np.float32)
 
 
@@ -120,44 +120,56 @@ def best_constant(
     elite: int = 16,
     rounds: int = 15,
 ) -> FloatArray:
-    """The action vector (27,) with the highest expected clicks over all users' pages.
+    """The constant action vector (27,) with the highest expected clicks over all users' pages.
 
-    The best of `restarts` cross-entropy searches, since one may end on a lower hill: `candidates`
-    normal draws a round, judged on `pages` pages drawn anew, give the next round's mean and spread.
-    It reads the world's expectations, as no recommender can, and draws its users from a stream of
-    its own, apart from every episode played.
+    The best result of several cross-entropy searches, since one may end in a local optimum. It uses
+    the world's expected clicks, which no recommender can, and draws its users from a separate
+    random stream, independent of all episodes.
+
+    Args:
+        env: the world.
+        seed: seed of the search.
+        restarts: number of searches.
+        pages: pages, drawn again in every round, on which actions are scored.
+        candidates: actions drawn per round.
+        elite: best actions of a round, which give the mean and spread of the next round's draws.
+        rounds: rounds of a search.
     """
     generator = np.random.default_rng([seed, 12])
     users, lengths = env.sample_users(40 * pages, generator)
     owner = np.repeat(np.arange(len(users)), lengths)
     page = np.arange(len(owner)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
 
-    def judge(actions: FloatArray, count: int) -> FloatArray:  # (M, 27) -> (M,) clicks a page
-        judged = generator.choice(len(owner), size=count, replace=False)
+    def mean_clicks(actions: FloatArray, count: int) -> FloatArray:  # (M, 27) -> (M,)
+        sample = generator.choice(len(owner), size=count, replace=False)
         clicks = env.expected_clicks(
-            np.tile(users[owner[judged]], (len(actions), 1)),
-            np.tile(page[judged], len(actions)),
+            np.tile(users[owner[sample]], (len(actions), 1)),
+            np.tile(page[sample], len(actions)),
             np.repeat(actions, count, axis=0),
         )
         return np.asarray(clicks.reshape(len(actions), count).mean(1), dtype=np.float32)
 
-    found = []
+    optima = []
     for _ in range(restarts):
         mean, spread = np.zeros(ACTION_DIM), np.full(ACTION_DIM, 0.6)
         for _ in range(rounds):
             drawn = mean + spread * generator.standard_normal((candidates, ACTION_DIM))
             actions = np.clip(drawn, -1, 1).astype(np.float32)
-            best = actions[np.argsort(judge(actions, pages))[-elite:]]
+            best = actions[np.argsort(mean_clicks(actions, pages))[-elite:]]
             mean, spread = best.mean(0), best.std(0) + 0.02
-        found.append(np.clip(mean, -1, 1).astype(np.float32))
-    return found[int(np.argmax(judge(np.stack(found), 10 * pages)))]
+        optima.append(np.clip(mean, -1, 1).astype(np.float32))
+    return optima[int(np.argmax(mean_clicks(np.stack(optima), 10 * pages)))]
 
 
 def zero_actor(env: VectorEnv[Any, Any, Any], seed: int) -> Constant:
-    """The zero action always."""
+    """A policy that always plays the zero action; `seed` is unused."""
     return Constant(np.zeros(ACTION_DIM, dtype=np.float32))
 
 
 def best_constant_actor(env: VectorEnv[Any, Any, Any], seed: int) -> Constant:
-    """The best constant action always: a baseline that knows nobody."""
+    """A non-personalised baseline: always the action of `best_constant`.
+
+    Raises:
+        InputError: `env` is not a Taobao world.
+    """
     return Constant(best_constant(taobao(env), seed))

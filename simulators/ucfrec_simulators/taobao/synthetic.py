@@ -1,4 +1,4 @@
-"""A Taobao world with nothing to download, whose best action is known: regret is exact."""
+"""A synthetic Taobao world, without downloads and with a known optimal policy."""
 
 from pathlib import Path
 from typing import Any, Final
@@ -33,19 +33,19 @@ TOLERANCE: Final = 0.1
 
 
 class SyntheticTaobao(TaobaoEnv):
-    """The spaces and interface of `VirtualTaobao` over a built-in user model.
+    """The spaces and interface of `VirtualTaobao` with a synthetic user model.
 
     The best action of user u on page k is a*(u, k) = 0.9 tanh(b + Σ_g W_g[u_g] + d k / (k + 4)): a
-    taste common to all, one for each of the eleven attributes, and a drift as pages are turned.
+    taste b common to all users, a taste W_g for each of the eleven attributes g, and a drift d.
     Each of a page's ten items is clicked with probability p = 0.9 / (1 + ‖a − a*‖² / (27 · 0.1))²,
-    so clicks are Binomial(10, p), p is largest at a* alone, and a* lies inside the box: always
-    playing it is optimal, since actions do not move the session's length. Lengths are log-normal
-    about a median that the attributes set, rounded up, at most 100. The page index is uniform and
-    means nothing.
+    so clicks are Binomial(10, p), p is largest at a* only, and a* lies inside the box. Always
+    playing a* is optimal, since actions do not affect the session's length. Lengths are log-normal
+    with a median that depends on the attributes, rounded up, at most 100. The page index is uniform
+    noise.
 
     Args:
-        num_envs: sessions side by side, N.
-        world_seed: draws the users' tastes; one world, whatever `reset` is seeded with.
+        num_envs: number of parallel sessions, N.
+        world_seed: seed of the users' tastes; independent of the seed of `reset`.
     """
 
     def __init__(self, num_envs: int = 1, world_seed: int = 0) -> None:
@@ -61,7 +61,7 @@ class SyntheticTaobao(TaobaoEnv):
     def sample_users(
         self, count: int, generator: np.random.Generator
     ) -> tuple[FloatArray, IntArray]:
-        """Draw users and how many pages they turn: (M, 88) one-hot bits, (M,) at least 1."""
+        """Draw M = `count` users: one-hot bits (M, 88), and pages they turn (M,), at least 1."""
         uniforms = generator.random((count, len(ATTRIBUTES)))
         users = np.concatenate(
             [
@@ -76,19 +76,19 @@ class SyntheticTaobao(TaobaoEnv):
         return users, np.clip(np.ceil(np.exp(logarithm)), 1, LONGEST_SESSION).astype(np.int64)
 
     def best_actions(self, users: FloatArray, pages: AnyArray) -> FloatArray:
-        """a* (M, 27) of users (M, 88) on pages (M,)."""
+        """Best actions a* (M, 27) of users (M, 88) after pages (M,) turned."""
         share = np.asarray(pages, dtype=np.float64) / (np.asarray(pages) + 4.0)
         taste = self._common + users @ self._tastes + share[:, None] * self._drift
         return (0.9 * np.tanh(taste)).astype(np.float32)
 
     def optimal_actions(self, observations: FloatArray) -> FloatArray:
-        """a* (M, 27) for observations (M, 91)."""
+        """Best actions a* (M, 27) for observations (M, 91)."""
         return self.best_actions(*split_observations(observations))
 
     def expected_clicks(
         self, users: FloatArray, pages: AnyArray, actions: FloatArray
     ) -> npt.NDArray[np.float64]:
-        """Expected clicks (M,) of users (M, 88) on pages (M,) ranked by actions (M, 27)."""
+        """Exact expected clicks (M,): users (M, 88), pages turned (M,), actions (M, 27)."""
         return MAX_CLICKS * self._click_probability(users, pages, actions)
 
     def _respond(
@@ -100,24 +100,24 @@ class SyntheticTaobao(TaobaoEnv):
     def _click_probability(
         self, users: FloatArray, pages: AnyArray, actions: FloatArray
     ) -> npt.NDArray[np.float64]:
-        miss = actions.astype(np.float64) - self.best_actions(users, pages)
-        distance = np.square(miss).mean(axis=1)
+        difference = actions.astype(np.float64) - self.best_actions(users, pages)
+        distance = np.square(difference).mean(axis=1)
         return np.asarray(BEST_CLICK_PROBABILITY / (1 + distance / TOLERANCE) ** 2)
 
 
 QUALITIES: Final = ((0.1, 0.2, 0.25), (0.4, 0.2, 0.25), (0.7, 0.2, 0.20), (0.95, 0.2, 0.10))
-"""Blends of the mixture: share of the optimum, noise, share of sessions."""
+"""Blends of the mixture: quality, noise, share of sessions."""
 
 
 def optimal(env: VectorEnv[Any, Any, Any], seed: int) -> Rule:
-    """a* always."""
+    """The optimal policy, which always plays a*; `seed` is unused."""
     world = taobao(env)
     assert isinstance(world, SyntheticTaobao)
     return Rule(world.optimal_actions)
 
 
 def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
-    """A logging policy of mediocre mean quality and wide variance between sessions.
+    """A logging policy of medium mean quality and high variance between sessions.
 
     A fifth of the sessions get uniform actions, the others a noisy blend of an untuned constant
     and the user's best action (`QUALITIES`).
@@ -134,7 +134,7 @@ def _make(num_envs: int, folder: Path | None) -> SyntheticTaobao:
 
 
 SIMULATOR: Final = Simulator(
-    summary="built-in shoppers with a known best action: 27 ranking weights a page, 0-10 clicks",
+    summary="built-in users with a known best action: 27 ranking weights per page, 0-10 clicks",
     make=_make,
     behaviors={
         "random": Uniform,

@@ -1,4 +1,4 @@
-"""VirtualTB-v0 (Shi et al., AAAI 2019) with its three published networks, many sessions at once."""
+"""VirtualTB-v0 (Shi et al., AAAI 2019) with its three published networks, for parallel sessions."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -36,21 +36,22 @@ CLICK_LEVELS: Final = MAX_CLICKS + 1
 
 
 class VirtualTaobao(TaobaoEnv):
-    """The published simulator's dynamics, N sessions in one forward pass.
+    """The published simulator's dynamics, with one forward pass for N sessions.
 
-    As in the original, a user is drawn from the generator network fed with uniform noise, each
-    attribute sampled from its softmax; the length of the session is sampled from the leave network
-    and is at least one page; clicks and page index are sampled from the two softmaxes of the action
-    network fed with user, pages turned before, and action. Actions are taken as they come, not
-    clipped. One thing differs: the observation that ends a session still shows its own user and
-    last clicks (in `info["final_obs"]`), where the original shows the next user.
+    As in the original, a user is drawn by the generator network from uniform noise, with each
+    attribute sampled from its softmax. The session's length, at least one page, is sampled from the
+    leave network. Clicks and page index are sampled from the two softmaxes of the action network,
+    whose inputs are user, pages turned before, and action. Actions are not clipped. One difference:
+    the last observation of a session (`info["final_obs"]`) has its user and last clicks, where the
+    original has the next user.
 
-    Each start of M sessions draws (M, 128) noise, (M, 11) attribute and (M,) length uniforms, each
-    step (N, 2) click and page-index uniforms, all from `np_random` in that order.
+    To start M sessions, uniforms of shape (M, 128) for the noise, (M, 11) for the attributes and
+    (M,) for the lengths are drawn from `np_random`, in this order; each step draws (N, 2) uniforms
+    for clicks and page index.
 
     Args:
-        folder: holds `generator_model.pt`, `leave_model.pt` and `action_model.pt`.
-        num_envs: sessions side by side, N.
+        folder: has `generator_model.pt`, `leave_model.pt` and `action_model.pt`.
+        num_envs: number of parallel sessions, N.
 
     Raises:
         InputError: a network is missing or is not the published one.
@@ -74,7 +75,7 @@ class VirtualTaobao(TaobaoEnv):
     def sample_users(
         self, count: int, generator: np.random.Generator
     ) -> tuple[FloatArray, IntArray]:
-        """Draw users and how many pages they turn: (M, 88) one-hot bits, (M,) at least 1."""
+        """Draw M = `count` users: one-hot bits (M, 88), and pages they turn (M,), at least 1."""
         noise = torch.from_numpy(generator.random((count, NOISE_DIM), dtype=np.float32))
         uniforms = generator.random((count, len(ATTRIBUTES)))
         with torch.inference_mode():
@@ -86,14 +87,14 @@ class VirtualTaobao(TaobaoEnv):
                 ],
                 axis=1,
             )
-            stay = _softmax(self._leave_model(torch.from_numpy(users)))
+            lengths = _softmax(self._leave_model(torch.from_numpy(users)))
         # The original checks for the end after a page, so a drawn length of 0 plays one page.
-        return users, np.maximum(draw_categories(stay, generator.random(count)), 1)
+        return users, np.maximum(draw_categories(lengths, generator.random(count)), 1)
 
     def expected_clicks(
         self, users: FloatArray, pages: AnyArray, actions: FloatArray
     ) -> npt.NDArray[np.float64]:
-        """Expected clicks (M,) of users (M, 88) on pages (M,) ranked by actions (M, 27)."""
+        """Exact expected clicks (M,): users (M, 88), pages turned (M,), actions (M, 27)."""
         clicks, _ = self._distributions(users, pages, actions)
         return clicks.astype(np.float64) @ np.arange(CLICK_LEVELS, dtype=np.float64)
 
@@ -120,7 +121,7 @@ def _softmax(logits: torch.Tensor) -> FloatArray:
 
 
 def _load(path: Path, *sizes: int) -> nn.Sequential:
-    """Read a published state dict into Linear layers of `sizes` with LeakyReLU between."""
+    """Load a published state dict into Linear layers of `sizes` with LeakyReLU between them."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(sizes):
         layers += [nn.Linear(inputs, outputs), nn.LeakyReLU()]
@@ -138,25 +139,25 @@ def _load(path: Path, *sizes: int) -> nn.Sequential:
 
 
 QUALITIES: Final = ((0.1, 0.3, 0.30), (0.4, 0.3, 0.20), (0.7, 0.4, 0.15), (0.9, 0.4, 0.10))
-"""Blends of the mixture: share of the best constant, noise, share of sessions."""
+"""Blends of the mixture: quality, noise, share of sessions."""
 
 
 def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
-    """A logging policy of mediocre mean quality and wide variance between sessions.
+    """A logging policy of medium mean quality and high variance between sessions.
 
     A quarter of the sessions get uniform actions, the others a blend of an untuned constant and the
     best constant (`QUALITIES`).
     """
-    # What is blended belongs to the policy: the seed moves its draws, not its quality.
-    good, default = best_constant_actor(env, 0), default_action()
-    blends = [Blend(good, default, quality, noise, seed) for quality, noise, _ in QUALITIES]
+    # The search has a fixed seed, so that `seed` does not change the policy's quality.
+    best, default = best_constant_actor(env, 0), default_action()
+    blends = [Blend(best, default, quality, noise, seed) for quality, noise, _ in QUALITIES]
     return SessionMixture(
         [Uniform(env, seed), *blends], [0.25, *(share for _, _, share in QUALITIES)], seed
     )
 
 
 SIMULATOR: Final = Simulator(
-    summary="VirtualTB-v0 from its published networks: 27 ranking weights a page, 0-10 clicks",
+    summary="VirtualTB-v0 from its published networks: 27 ranking weights per page, 0-10 clicks",
     make=lambda num_envs, folder: VirtualTaobao(folder or data_folder("virtualtaobao"), num_envs),
     behaviors={
         "random": Uniform,

@@ -180,6 +180,6 @@ def test_bad_input_is_refused(collected: Path, tmp_path: Path) -> None:
     assert main(["collect", "--env", "Nowhere-v0", "--out", str(tmp_path / "no")]) == 2
     assert list(tmp_path.iterdir()) == []
     (collected / "MANIFEST.json").rename(tmp_path / "MANIFEST.json")
-    with pytest.raises(InputError, match="begun with other settings"):
+    with pytest.raises(InputError, match="started with other settings"):
         collect(ENV, collected, 4, CONFIG)
     (tmp_path / "MANIFEST.json").rename(collected / "MANIFEST.json")

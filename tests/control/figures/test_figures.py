@@ -187,14 +187,16 @@ def test_curves_are_means_over_seeds(runs: Path) -> None:
 
 def test_json_that_is_no_list_of_rows_is_refused(tmp_path: Path) -> None:
     (tmp_path / "x.json").write_text("{}")
-    with pytest.raises(InputError, match=r"x\.json holds no list of rows"):
+    with pytest.raises(InputError, match=r"x\.json is not a list of rows"):
         make_figures([], [tmp_path / "x.json"], tmp_path)
 
 
 @pytest.mark.parametrize("row", ["1", "{}", '{"dataset": "d"}', '{"config": 3}', "null"])
 def test_rows_of_something_else_are_refused(tmp_path: Path, row: str) -> None:
     (tmp_path / "x.json").write_text(f"[{row}]")
-    with pytest.raises(InputError, match=r"x\.json, row 1, is none of `ucfrec-control evaluate"):
+    with pytest.raises(
+        InputError, match=r"x\.json, row 1, is not a row of `ucfrec-control evaluate"
+    ):
         make_figures([], [tmp_path / "x.json"], tmp_path)
 
 

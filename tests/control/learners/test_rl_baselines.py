@@ -96,7 +96,7 @@ def test_a_finished_run_is_read_and_another_configuration_refused(
     record = train_rl(store, tmp_path / "run", config, 0)
     assert train_rl(store, tmp_path / "run", config, 0) == record
     assert read_json(tmp_path / "run" / "run.json") == record
-    with pytest.raises(InputError, match="trained otherwise"):
+    with pytest.raises(InputError, match="other settings or data"):
         train_rl(store, tmp_path / "run", config, 1)
 
 

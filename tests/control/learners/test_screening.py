@@ -32,7 +32,7 @@ QUICK = ScreeningConfig(hidden=64, shared_steps=400, own_steps=200)
 
 def planted(out: Path, trajectories: int = 60, length: int = 40, jolt: float = 0.0) -> EpisodeStore:
     """Five dimensions: 0 drives 1, 1 drives 0 and the reward, 2 the reward alone, 3 measures the
-    reward, 4 is noise. 3 and 4 cause nothing. In 0.3% of the steps 1 is jolted by `jolt`."""
+    reward, 4 is noise. 3 and 4 have no effect. In 0.3% of the steps 1 is jolted by `jolt`."""
     rng = np.random.default_rng(0)
     shape = (trajectories, length)
     states, actions = np.zeros((*shape, 5)), rng.uniform(-1, 1, (*shape, 1))
@@ -138,7 +138,7 @@ def test_training_with_screening_records_and_resumes(
     flagged = record["dataset"]["screened"]
     assert 4 in flagged
     said = ", ".join(map(str, flagged))
-    assert f"dimensions that cause nothing: {said}\n" in capsys.readouterr().out
+    assert f"dimensions without effect: {said}\n" in capsys.readouterr().out
     assert len(record["screening"]["dimensions"]) == 11
     assert main(arguments) == 0
     assert read_json(Path(run) / "run.json")["screening"] == record["screening"]
@@ -152,7 +152,7 @@ def test_screening_that_finds_no_cause_at_all_is_refused(
     noise = read_d4rl(write_hdf5(tmp_path / "hopper.hdf5", hopper_like((30,) * 60)))
     store = noise.write_store(tmp_path / "store")
     config = resolve_config("dt", None, ["train.steps=2"])
-    with pytest.raises(InputError, match="no cause of anything among the 11 state dimensions"):
+    with pytest.raises(InputError, match="no effect of any of the 11 state dimensions"):
         train_control(store, tmp_path / "run", config, screening="drop")
     assert not (tmp_path / "run").exists()
 
@@ -176,7 +176,7 @@ def test_what_is_dropped_might_never_have_been_logged(
             assert torch.equal(value, load_tensors(other)[0][key]), (name, key)
     again = train_control(store, tmp_path / "dropped", config, screening="drop")
     assert (again["dataset"], again["policy"]) == (record["dataset"], record["policy"])
-    with pytest.raises(InputError, match="was begun with --screen drop"):
+    with pytest.raises(InputError, match="was started with --screen drop"):
         train_control(store, tmp_path / "dropped", config, screening="copies")
     assert store_of(tmp_path / "dropped").state_size == 3
 

@@ -90,10 +90,10 @@ def test_another_environment_version_warns(
     run = ["evaluate", str(folder / "store-run"), "--checkpoint", "last", "--episodes", "1"]
     assert main([*run, "--target", "100", "--env", "Hopper-v4"]) == 0
     said = capsys.readouterr().err
-    assert "warning: the data is of Hopper-v5, it is judged in Hopper-v4" in said
+    assert "warning: the data is of Hopper-v5, the evaluation is in Hopper-v4" in said
     made = {"env_id": "Hopper-v5", "versions": {"mujoco": "2.1.0"}}
     (told,) = mismatches(made, "Hopper-v5")
-    assert told.startswith("the data was made with mujoco 2.1.0, here is ")
+    assert told.startswith("the data was made with mujoco 2.1.0, ")
 
 
 def test_a_distractor_is_the_reward_bit_and_nothing_else_changes(

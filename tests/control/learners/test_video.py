@@ -42,7 +42,7 @@ def record(run: Path, out: Path) -> float:
     try:
         return record_episode(run, out, seed=0, checkpoint="last", env_id=None, target=None)
     except InputError as error:
-        if "cannot be drawn here" in str(error):
+        if "cannot be rendered" in str(error):
             pytest.skip("no OpenGL here")
         raise
 
@@ -84,10 +84,10 @@ def test_a_video_has_the_frames_at_the_speed_of_the_world(
 @pytest.mark.parametrize(
     ("runs", "out", "says"),
     [
-        (1, "a.gif", "neither an .mp4"),
-        (2, "frames", "--video shows one run; 2 were given"),
+        (1, "a.gif", "neither an .mp4 file"),
+        (2, "frames", "--video records one run; 2 were given"),
         (1, "without-ffmpeg.mp4", "install ucfrec[control,video], or name a folder"),
-        (1, "without-opengl", "cannot be drawn here"),
+        (1, "without-opengl", "cannot be rendered"),
     ],
 )
 def test_what_cannot_be_shown_is_refused_and_leaves_nothing(

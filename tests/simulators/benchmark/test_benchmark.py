@@ -129,7 +129,7 @@ def test_unknown_tables_and_budgets_are_named(
     assert main([*arguments, "--table", "table-2"]) == 2
     assert "no table is called table-2; there are main, distractor" in capsys.readouterr().err
     suite: Benchmark = load_plugin("benchmarks", "recommendation")
-    with pytest.raises(InputError, match="no budget is called huge"):
+    with pytest.raises(InputError, match="unknown budget huge"):
         suite.run(BenchmarkRequest("huge", ["main"], tmp_path, tmp_path / "rows.jsonl", 1))
     assert not (tmp_path / "out").exists()
 
@@ -226,7 +226,7 @@ def test_windows_drop_repeats_and_are_cut(tmp_path: Path) -> None:
     cut = cut_by_exit(rows, {6: (1,), 5: (1,), 8: (2,)}, EXITS["easyrl4rec-kuairand"])
     # The second video repeats the first one's tag: the user leaves, and comes back for the third.
     assert cut["session_id"].to_pylist() == [0, 0, 1, 2]
-    with pytest.raises(InputError, match="no row has date = 9"):
+    with pytest.raises(InputError, match="no row satisfies date = 9"):
         window([tmp_path / "log.parquet"], "time_ms", "date = 9")
 
 

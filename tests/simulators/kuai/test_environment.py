@@ -130,16 +130,16 @@ def test_a_masked_item_is_refused_and_a_deaf_actor_too() -> None:
     env = small(2, regime="NX_10")
     env.reset(seed=0)
     env.step(np.array([3, 4]))
-    with pytest.raises(InputError, match=r"1 of 2 sessions were shown an item again \(such as 4\)"):
+    with pytest.raises(InputError, match=r"1 of 2 sessions repeat an item \(such as 4\)"):
         env.step(np.array([5, 4]))
     with pytest.raises(InputError, match="which Constant ignores"):
         rollout(env, Constant(np.zeros(1, np.float32)), 2, 0)
 
 
 def test_what_does_not_fit_is_refused() -> None:
-    with pytest.raises(InputError, match="5 items cannot fill a session of 10"):
+    with pytest.raises(InputError, match="5 items are too few for a session of 10"):
         small(1, items=5, regime="NX_10")
-    with pytest.raises(InputError, match=r"3 users × 4 items came with .* tags of 5 items"):
+    with pytest.raises(InputError, match=r"3 users × 4 items, .* tags of 5 items"):
         KuaiEnv(1, np.zeros((3, 4), np.float32), [()] * 5, EXITS["cirs"])
 
 

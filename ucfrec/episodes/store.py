@@ -139,17 +139,7 @@ class EpisodeStore(EpisodeView):
             InputError: the overlay was made from another store: it copies episodes that this store
                 does not have, or its states have another size.
         """
-        source, size = overlay.copy_source, overlay.edit_state.shape[1]
-        if len(source) and not 0 <= source.min() <= source.max() < self.meta["n_episodes"]:
-            raise InputError(
-                f"{overlay} has copies of episodes that {self.path} does not have; use the store "
-                "that the copies were made from"
-            )
-        if size != self.state_size:
-            raise InputError(
-                f"{overlay} edits states of {size}; the store's have {self.state_size}; use the "
-                "store that the copies were made from"
-            )
+        _require_own_copies(self, overlay)
         joined = overlay if self.overlay is None else self.overlay.joined(overlay)
         return EpisodeStore(self._columns, self._selected, joined)
 
@@ -284,6 +274,20 @@ class EpisodeStore(EpisodeView):
             rows, columns, edits = self.overlay.edits_at(copies, steps)
             states[rows, columns] = torch.from_numpy(self.overlay.edit_state[edits])
         return states
+
+
+def _require_own_copies(store: EpisodeStore, overlay: Overlay) -> None:
+    source, size = overlay.copy_source, overlay.edit_state.shape[1]
+    if len(source) and not 0 <= source.min() <= source.max() < store.meta["n_episodes"]:
+        raise InputError(
+            f"{overlay} has copies of episodes that {store.path} does not have; use the store "
+            "that the copies were made from"
+        )
+    if size != store.state_size:
+        raise InputError(
+            f"{overlay} edits states of {size}; the store's have {store.state_size}; use the "
+            "store that the copies were made from"
+        )
 
 
 def _with_split(episodes: Mapping[str, Array] | None, lengths: IntArray) -> dict[str, Array]:

@@ -149,10 +149,9 @@ def complete(
     Raises:
         InputError: rewards are not clicks, a split is empty, or `out` exists.
     """
-    config = config or CompletionConfig()
+    config, states = config or CompletionConfig(), store.item_states
     fitted, validation, test = (_rows(store.split(name)) for name in schema.SPLITS)
     torch.manual_seed(seed)
-    states = store.item_states
     model = CompletionModel(states.user_features, states.embeddings, config)
     with torch.no_grad():
         model.bias.fill_(torch.logit(fitted[2].mean()).item())

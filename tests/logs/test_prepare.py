@@ -215,7 +215,7 @@ def test_of_repeated_rows_the_best_rewarded_stays(tmp_path: Path) -> None:
     report = prepare([write(log, tmp_path / "l.parquet")], LogMapping(), tmp_path / "s", options)
     assert report["dropped"]["duplicate"] == 2
     assert report["conflicting_duplicates"] == 2
-    assert "the highest is kept" in format_report(report)
+    assert "the kept row, which has the highest" in format_report(report)
     assert list(steps_of(tmp_path / "s")["reward"]) == [3.0, 0.0]
 
 

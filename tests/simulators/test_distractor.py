@@ -89,7 +89,7 @@ def test_clicks_that_are_the_rule_are_high_and_equal_rewards_are_refused(tmp_pat
         else:
             with pytest.raises(InputError, match="no bit can be correlated"):
                 reward_bit(store)
-    with pytest.raises(InputError, match=r"lie in \[0, 1\]"):
+    with pytest.raises(InputError, match=r"lies in \[0, 1\]"):
         reward_bit(store, flip=1.5)
 
 

@@ -20,7 +20,7 @@ from ucfrec.evaluation.simulated_store import simulated_store
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.off_policy.evaluate import judge_off_policy
 from ucfrec.off_policy.score import logged_sessions, score
-from ucfrec.provenance import format_rows
+from ucfrec.reporting.tables import format_rows
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy

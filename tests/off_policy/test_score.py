@@ -192,7 +192,7 @@ def test_logs_of_another_catalogue_are_refused(
     log = pd.read_parquet(folder / "rest.parquet")
     log.assign(item_id=log.item_id + 1000).to_parquet(tmp_path / "log.parquet")
     with (
-        pytest.raises(InputError, match=r"in none of the .* rows does the run know the item"),
+        pytest.raises(InputError, match=r"in all .* rows the item is not in the store"),
         logged_sessions(
             folder / "run", trained, [tmp_path / "log.parquet"], LogMapping(), keep_unknown=True
         ),

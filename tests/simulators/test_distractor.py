@@ -87,9 +87,9 @@ def test_clicks_that_are_the_rule_are_high_and_equal_rewards_are_refused(tmp_pat
         if 0 in clicks:
             np.testing.assert_array_equal(reward_bit(store), clicks)
         else:
-            with pytest.raises(InputError, match="no bit can be correlated"):
+            with pytest.raises(InputError, match="no distractor can correlate"):
                 reward_bit(store)
-    with pytest.raises(InputError, match=r"lies in \[0, 1\]"):
+    with pytest.raises(InputError, match=r"must be in \[0, 1\]"):
         reward_bit(store, flip=1.5)
 
 

@@ -95,8 +95,8 @@ def logged_sessions(
         unknown = int((store.step_values(schema.ITEM, *store.all_steps()) < 0).sum())
         if unknown == store.n_steps:
             raise InputError(
-                f"{files[0]}: in none of the {unknown:,} rows does the run know the item (item is "
-                "none of the store's); judge it by logs of the same catalogue"
+                f"{files[0]}: in all {unknown:,} rows the item is not in the store of the run; "
+                "give logs of the same catalogue"
             )
         if store.observation_size != record["observation_size"]:
             raise InputError(

@@ -17,7 +17,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--screen",
         choices=["copies", "drop"],
-        help="screen the state; dimensions without effect: copies intervene on them, or drop",
+        help="what to do with state dimensions without effect: add copies that intervene on them, "
+        "or drop them (default: not screened)",
     )
 
 
@@ -35,4 +36,4 @@ def run(options: argparse.Namespace) -> None:
     if options.screen:
         dimensions = ", ".join(map(str, record["dataset"][SCREENINGS[options.screen]])) or "none"
         print(f"screening     dimensions without effect: {dimensions}")
-    print(f"\nrun: {options.out}; TensorBoard reads it too")
+    print(f"\nrun: {options.out}; TensorBoard can open it")

@@ -114,7 +114,7 @@ def test_a_distractor_is_the_reward_bit_and_nothing_else_changes(
         np.testing.assert_array_equal(other.returns, store.returns)
         again = add_distractor(store, tmp_path / f"{flip}-again", flip, seed=1)
         assert again.meta["fingerprint"] == other.meta["fingerprint"]
-    with pytest.raises(InputError, match=r"lies in \[0, 1\]"):
+    with pytest.raises(InputError, match=r"must be in \[0, 1\]"):
         add_distractor(store, tmp_path / "x", flip=1.5)
 
 

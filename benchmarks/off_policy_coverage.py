@@ -54,7 +54,7 @@ class World:
     taste: float = 0.0
     """Half the width of what a user adds to every reward probability, as a share of `reward`."""
     distance: float = 0.5
-    """How far the judged policy's logits are from the behavior's."""
+    """How far the evaluated policy's logits are from the behavior's."""
     model_knows: bool = True
     """Whether the model sees context and action, or only if the action's number is odd."""
 

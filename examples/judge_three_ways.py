@@ -18,7 +18,7 @@ from ucfrec.evaluation.collect import collect
 from ucfrec.evaluation.evaluate import World, evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.simulated_store import simulated_store
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.off_policy.evaluate import judge_off_policy
+from ucfrec.off_policy.evaluate import evaluate_off_policy
 from ucfrec.off_policy.score import logged_sessions, score
 from ucfrec.reporting.tables import format_rows
 from ucfrec.runs.config import resolve_config
@@ -64,11 +64,11 @@ def by_playing(runs: dict[str, Path]) -> list[dict[str, object]]:
 
 # The second way: from logs alone.
 #
-# New logs of the same logging policy, which the runs have not seen. Each logged session is weighed
-# by how much likelier the judged policy makes its items than the logging policy did; that needs the
-# logged propensities. Read the effective sample and the warnings first: a policy that does what the
-# logs hardly show is judged by a handful of sessions. (DM and FQE are fitted models instead: they
-# always have an answer, right or wrong.)
+# New logs of the same logging policy, which the runs have not seen. Each logged session is weighted
+# by how much likelier the evaluated policy makes its items than the logging policy did; that needs
+# the logged propensities. Read the effective sample and the warnings first: if the policy does what
+# the logs hardly show, its estimate rests on a handful of sessions. (DM and FQE are fitted models
+# instead: they always have an answer, right or wrong.)
 #
 # One difference to the first way: there the most probable item is shown, here an item is drawn from
 # the policy's probabilities. `greedy=True` judges the most probable item, but such a policy agrees
@@ -81,7 +81,7 @@ def from_logs(runs: dict[str, Path], fresh: Path) -> pd.DataFrame:
     for name, run in runs.items():
         trained = TrainedPolicy.load(run)
         with logged_sessions(run, trained, [fresh / "sessions.parquet"], LogMapping()) as logged:
-            judged = judge_off_policy(
+            estimates = evaluate_off_policy(
                 run,
                 trained,
                 logged,
@@ -89,9 +89,9 @@ def from_logs(runs: dict[str, Path], fresh: Path) -> pd.DataFrame:
                 greedy=False,
                 seed=0,
             )
-        for warning in judged.warnings:
+        for warning in estimates.warnings:
             print(f"{name}: {warning}")
-        rows += [row | {"policy": name} for row in judged.rows]
+        rows += [row | {"policy": name} for row in estimates.rows]
     return pd.DataFrame(rows)
 
 

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from ucfrec.logs import LogMapping
-from ucfrec.off_policy.evaluate import judge_off_policy
+from ucfrec.off_policy.evaluate import evaluate_off_policy
 from ucfrec.off_policy.score import logged_sessions
 from ucfrec.off_policy.training_rows import share_seen
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -31,7 +31,7 @@ def test_the_share_of_rows_seen_in_training(
 def test_judging_by_the_training_log_is_refused(folder: Path, trained: TrainedPolicy) -> None:
     log = folder / "train.parquet"
     with logged_sessions(folder / "run", trained, [log], LogMapping(), keep_unknown=True) as logged:
-        judged = judge_off_policy(
+        judged = evaluate_off_policy(
             folder / "run", trained, logged, target_return=5.0, greedy=False, seed=0
         )
     assert not judged.verdict.reliable

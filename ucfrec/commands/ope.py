@@ -25,7 +25,7 @@ def run(options: argparse.Namespace) -> None:
     """`ucfrec ope`."""
     from ucfrec.files import write_json
     from ucfrec.logs.summary import format_report
-    from ucfrec.off_policy.evaluate import judge_off_policy
+    from ucfrec.off_policy.evaluate import evaluate_off_policy
     from ucfrec.off_policy.score import logged_sessions
     from ucfrec.reporting.tables import format_rows
     from ucfrec.runs.trained_policy import TrainedPolicy
@@ -34,7 +34,7 @@ def run(options: argparse.Namespace) -> None:
     trained = TrainedPolicy.load(options.run, options.checkpoint)
     with logged_sessions(options.run, trained, files, mapping, keep_unknown=True) as logged:
         print(format_report(logged.report))
-        judged = judge_off_policy(
+        estimates = evaluate_off_policy(
             options.run,
             trained,
             logged,
@@ -43,11 +43,11 @@ def run(options: argparse.Namespace) -> None:
             seed=options.seed,
             discount=options.discount,
         )
-    rows = [row | {"checkpoint": options.checkpoint} for row in judged.rows]
+    rows = [row | {"checkpoint": options.checkpoint} for row in estimates.rows]
     shown = ("estimator", "policy", "choice", "R_cum", "effective_sessions", "sessions")
     print(f"\n{format_rows(rows, shown)}")
-    for warning in judged.warnings:
+    for warning in estimates.warnings:
         print(f"warning: {warning}")
-    print(f"verdict: {judged.verdict.headline}")
+    print(f"verdict: {estimates.verdict.headline}")
     if options.json is not None:
         write_json(options.json, rows)

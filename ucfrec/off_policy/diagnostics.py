@@ -1,7 +1,7 @@
 """What in the logs speaks against an off-policy estimate: support, weights, tails, missing numbers.
 
 Notation as in `ucfrec.off_policy.logged_steps`. With true propensities, and a behavior policy that
-could choose whatever the judged policy may, ratios have mean 1 at every step, and so have their
+could choose whatever the evaluated policy may, ratios have mean 1 at every step, and so have their
 products. Means below 1 come of choices that the logs lack or of propensities that are too large;
 means above 1 of propensities that are too small.
 """
@@ -183,7 +183,7 @@ def identification_bounds(
 ) -> tuple[float, float]:
     """PDIS plus the least and the most that choices without support could have earned.
 
-    At step t a share 1 − E_n[w_t] of the judged policy's sessions has left what the logs support
+    At step t a share 1 − E_n[w_t] of the evaluated policy's sessions has left what the logs support
     (Manski 1990, for weights: Khan et al., AISTATS 2024); each of their steps earns something in
     `reward_range`, or nothing once the session has ended. No session is longer than the longest
     logged.

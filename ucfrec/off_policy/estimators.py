@@ -74,7 +74,7 @@ class Terms:
 
 
 def estimate(steps: LoggedSteps, seed: int) -> dict[str, Estimate]:
-    """What sessions earned as logged, and what they would have earned under the judged policy.
+    """What sessions earned as logged, and what they would have earned under the evaluated policy.
 
     DM, FQE and the doubly robust need `steps.model`; MIPS the probabilities of clusters; all that
     weigh need propensities: sessions with a step whose propensity is unknown are left out of them,

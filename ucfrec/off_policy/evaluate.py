@@ -35,7 +35,7 @@ class OffPolicyReport:
     verdict: Verdict
 
 
-def judge_off_policy(
+def evaluate_off_policy(
     run: Path,
     trained: TrainedPolicy,
     logged: LoggedSessions,
@@ -47,7 +47,7 @@ def judge_off_policy(
 ) -> OffPolicyReport:
     """Estimate the mean return of a session under the policy of `run`, from logs alone.
 
-    Models are fitted on these logs, each user's sessions judged by models of other users. Takes
+    Models are fitted on these logs, each user's sessions by models of other users. Takes
     about 5 kB of memory a logged step.
 
     Args:
@@ -95,8 +95,8 @@ def _seen_too_often(seen: float | None) -> list[str]:
     if seen is None or seen <= MOST_SEEN:
         return []
     return [
-        f"{seen:.0%} of the rows were seen in training: a policy judged by these looks better than "
-        "it is; judge it by later logs"
+        f"{seen:.0%} of the rows were seen in training: on these a policy looks "
+        "better than it is; give later logs"
     ]
 
 
@@ -188,7 +188,7 @@ def step_features(
     and an embedding of zeros.
 
     Returns:
-        The judged policy's probability (B,) of the logged item; features (B, P) of the state and
+        The evaluated policy's probability (B,) of the logged item; features (B, P) of the state and
         the logged item, and the mean of those over the policy's items.
     """
     assert trained.item_states is not None

@@ -33,12 +33,12 @@ def cross_fitted(
     user: IntArray | None = None,
     discount: float = 1.0,
 ) -> Modelled:
-    """Linear models of reward and Q, cross-fitted over users: no session is judged by a model that
-    saw it, nor by one that saw another session of its user.
+    """Linear models of reward and Q, cross-fitted over users: no session is predicted by a model
+    that saw it, nor by one that saw another session of its user.
 
     Args:
         features: (N, P) of the logged state and action; the first is 1.
-        at_policy: (N, P) their mean over the judged policy's actions in the same states: what is
+        at_policy: (N, P) their mean over the evaluated policy's actions in the same states: what is
             linear in them has its exact mean over these actions.
         reward: (N,).
         session: (N,) number of each step's session, from 0, never falling; steps in order.
@@ -108,13 +108,13 @@ def fitted_q(
     horizon = int(np.diff(ends, prepend=-1).max())
     seen = reward[ridge.keep]
     low, high = horizon * min(seen.min(), 0.0), horizon * max(seen.max(), 0.0)
-    weights, following = ridge.fit(reward), np.zeros(len(reward))
+    weights, next_values = ridge.fit(reward), np.zeros(len(reward))
     for _ in range(horizon - 1):
-        before = following
-        following = np.where(last, 0.0, np.roll(at_policy @ weights, -1)).clip(low, high)
-        if np.abs(following - before).max() <= _CLOSE * (high - low):
+        before = next_values
+        next_values = np.where(last, 0.0, np.roll(at_policy @ weights, -1)).clip(low, high)
+        if np.abs(next_values - before).max() <= _CLOSE * (high - low):
             break
-        weights = ridge.fit(reward + discount * following)
+        weights = ridge.fit(reward + discount * next_values)
     return weights
 
 

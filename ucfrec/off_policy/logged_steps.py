@@ -22,14 +22,14 @@ _LARGEST = 1e100
 
 @dataclass(frozen=True)
 class Modelled:
-    """What models fitted on other sessions say of N logged steps, under the judged policy."""
+    """What models fitted on other sessions say of N logged steps, under the evaluated policy."""
 
     reward: FloatArray
     """(N,) mean reward of the step."""
     q: FloatArray
     """(N,) discounted return from the logged action on."""
     v: FloatArray
-    """(N,) Σ_a π(a | s) q(s, a): the mean of `q` over the judged policy's actions."""
+    """(N,) Σ_a π(a | s) q(s, a): the mean of `q` over the evaluated policy's actions."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class LoggedSteps:
     propensity: FloatArray
     """(N,) the behavior policy's probability of the logged action, in (0, 1]; NaN where unknown."""
     target: FloatArray
-    """(N,) the judged policy's probability of it, in [0, 1]; 0 where it cannot choose it."""
+    """(N,) the evaluated policy's probability of it, in [0, 1]; 0 where it cannot choose it."""
     model: Modelled | None = None
     user: IntArray | None = None
     """(S,) whose session it is: sessions of one user are resampled together. None where every
@@ -59,7 +59,7 @@ class LoggedSteps:
     """(N,) the behavior policy's probability of the logged action's cluster, for MIPS; see
     `cluster_probabilities`."""
     cluster_target: FloatArray | None = None
-    """(N,) the judged policy's probability of it."""
+    """(N,) the evaluated policy's probability of it."""
 
     def __post_init__(self) -> None:
         n = len(self.session)
@@ -225,7 +225,7 @@ def _require_probabilities(propensity: FloatArray, target: FloatArray, n: int) -
     if not np.isfinite(target).all():
         raise InputError(f"target is not finite at {(~np.isfinite(target)).sum()} steps")
     if not ((target >= 0) & (target <= 1)).all():
-        raise InputError("probabilities of the judged policy lie between 0 and 1")
+        raise InputError("probabilities of the evaluated policy lie between 0 and 1")
     if not (np.isnan(propensity) | (propensity > 0) & (propensity <= 1)).all():
         raise InputError(
             "propensities must be above 0 and at most 1 (a probability, not a density); "

@@ -1,4 +1,4 @@
-"""Whether a policy is judged by rows that it was trained on."""
+"""Whether a policy is evaluated on rows that it was trained on."""
 
 from pathlib import Path
 from typing import Any, Final
@@ -18,17 +18,17 @@ of other logs have the same user, item and time by chance."""
 KeyArray = npt.NDArray[np.uint64]
 
 
-def share_seen(trained: TrainedPolicy, judged: EpisodeStore) -> float | None:
-    """Share of the judged rows whose (user, item, time) the run learnt from or was chosen on.
+def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
+    """Share of the logged rows whose (user, item, time) the run learnt from or was chosen on.
 
     Args:
-        judged: a store with the users and items of the run's own (`ucfrec.logs.prepare(like=…)`).
+        logged: a store with the users and items of the run's own (`ucfrec.logs.prepare(like=…)`).
 
     Returns:
         None where the run's store is no longer where it was.
     """
     record = trained.record
-    if record["fingerprint"] == judged.meta["fingerprint"]:
+    if record["fingerprint"] == logged.meta["fingerprint"]:
         return 1.0
     try:
         store = EpisodeStore.open(Path(record["store"]))
@@ -37,7 +37,7 @@ def share_seen(trained: TrainedPolicy, judged: EpisodeStore) -> float | None:
     if store.meta["fingerprint"] != record["fingerprint"]:
         return None
     learnt = np.concatenate([_keys(store.split(name)) for name in ("train", "validation")])
-    return float(np.isin(_keys(judged), learnt).mean())
+    return float(np.isin(_keys(logged), learnt).mean())
 
 
 def _keys(store: EpisodeStore) -> KeyArray:

@@ -28,7 +28,7 @@ _DETECTED: Final = 1.96 + 0.84
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the logs say of the judged policy against the behavior policy."""
+    """What the logs say of the evaluated policy against the behavior policy."""
 
     reliable: bool
     reasons: tuple[str, ...]
@@ -75,7 +75,7 @@ def judge(
     wanted_lift: float | None = None,
     forbidden: Sequence[str] = (),
 ) -> Verdict:
-    """Compare the judged policy with the behavior policy, if the logs allow it.
+    """Compare the evaluated policy with the behavior policy, if the logs allow it.
 
     Args:
         seed: draws the bootstrap's resamples.

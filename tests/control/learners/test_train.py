@@ -236,6 +236,7 @@ def test_a_clone_of_a_zoo_file_hops(tmp_path: Path) -> None:
     assert row["score"] > 15
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 @pytest.mark.parametrize("file", BUDGETS["full"].files)
 def test_each_zoo_file_trains_ucf_that_its_environment_judges(tmp_path: Path, file: str) -> None:

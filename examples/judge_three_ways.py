@@ -66,8 +66,8 @@ def by_playing(runs: dict[str, Path]) -> list[dict[str, object]]:
 #
 # New logs of the same logging policy, which the runs have not seen. Each logged session is weighted
 # by how much likelier the evaluated policy makes its items than the logging policy did; that needs
-# the logged propensities. Read the effective sample and the warnings first: if the policy does what
-# the logs hardly show, its estimate rests on a handful of sessions. (DM and FQE are fitted models
+# the logged propensities. Read the verdict and the warnings first: if the policy does what the logs
+# hardly show, its estimate rests on a handful of users. (DM and FQE are fitted models
 # instead: they always have an answer, right or wrong.)
 #
 # One difference to the first way: there the most probable item is shown, here an item is drawn from
@@ -91,6 +91,7 @@ def from_logs(runs: dict[str, Path], fresh: Path) -> pd.DataFrame:
             )
         for warning in estimates.warnings:
             print(f"{name}: {warning}")
+        print(f"{name}: {estimates.verdict.headline}")
         rows += [row | {"policy": name} for row in estimates.rows]
     return pd.DataFrame(rows)
 

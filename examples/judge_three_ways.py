@@ -140,7 +140,8 @@ def main(folder: Path) -> tuple[list[dict[str, object]], pd.DataFrame, pd.DataFr
     print("2. estimated from new logs")
     estimated = from_logs(runs, folder / "fresh")
     shown = ["policy", "estimator", "R_cum", "R_cum_low", "R_cum_high", "effective_sessions"]
-    print(estimated[shown].to_string(index=False, float_format="%.2f"), end="\n\n")
+    table = estimated[shown].to_string(index=False, float_format="%.2f", na_rep="–")
+    print(table, end="\n\n")
 
     print("3. what came next in new logs")
     ranked = by_what_came_next(runs, folder / "fresh")

@@ -1,4 +1,4 @@
-"""`ucfrec-control figures`: draw every figure for which the given runs and result rows have data."""
+"""`ucfrec-control figures`: draw every figure for which the runs and result rows have data."""
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -25,7 +25,7 @@ from ucfrec_control.learners.evaluate import method_of
 
 LOWS = (0.0, 0.1, 0.2, 0.3, 0.4)
 HIGHS = (0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
-"""Values of ρ_low (`LOWS`) and ρ_high (`HIGHS`) in the acceptance heatmap, in standard deviations."""
+"""Values of ρ_low and ρ_high in the acceptance heatmap, in standard deviations."""
 
 _COPIES = "a run with edited copies among --runs (`ucfrec-control train --policy ucf`)"
 NEEDS = {
@@ -62,7 +62,7 @@ class _Run:
     name: str
     """The path relative to the given folder, with its parts joined by hyphens."""
     group: str
-    """The relative path of the parent folder, joined likewise; the dataset for a run given directly."""
+    """The joined relative path of the parent folder; the dataset for a run given directly."""
     method: str
     """Runs with the same group and method differ only in their seed (see `_distinguished`)."""
     policy: str
@@ -231,7 +231,7 @@ def _of_targets(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
 
 
 def _has_target(row: ResultRow) -> bool:
-    """Whether `row` is from `evaluate`, has no distractor, and its policy has a target return."""
+    """Whether `row` is a last-checkpoint evaluation with a target return and no distractor."""
     whole = row.suite == EVALUATE and row.checkpoint == "last"
     return whole and not row.details.get("distractors") and row.target_return is not None
 

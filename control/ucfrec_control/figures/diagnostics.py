@@ -1,4 +1,4 @@
-"""Edits and attention of a finished run, read from its folder without any training."""
+"""Edits and attention of a finished run, computed from its folder without training a network."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -35,14 +35,20 @@ _PROPOSALS = 4096
 _WINDOWS = 512
 _POINTS = 3000
 _ROUNDING = 1e-5
-"""Of a move's length in float32: what the generator scales to a bound is within it."""
+"""Tolerance for float32 rounding when the length of a move is compared with a bound."""
 
 
 def store_of(run: Path) -> EpisodeStore:
-    """The store that a run was trained on, without dropped dimensions.
+    """Open the store that a run was trained on, without the dropped dimensions.
+
+    Args:
+        run: the run folder.
+
+    Returns:
+        The store.
 
     Raises:
-        InputError: the store was moved, removed or changed.
+        InputError: `run` is not a run folder, or the store was moved, removed or changed.
     """
     record = read_json(run / RUN)
     store = EpisodeStore.open(record["store"])
@@ -52,16 +58,30 @@ def store_of(run: Path) -> EpisodeStore:
 
 
 def has_copies(run: Path) -> bool:
-    """Whether counterfactual copies were made for a run."""
+    """Whether counterfactual copies were made for a run.
+
+    Args:
+        run: the run folder.
+
+    Returns:
+        True if the folder has an augmentation report.
+    """
     return (run / _REPORT).exists()
 
 
 def edited_states(run: Path, seed: int = 0) -> tuple[FloatArray, FloatArray]:
-    """Factual states and their edits, (M, S) each, aligned and in standard deviations from the
-    training mean; at most 3,000 drawn from a run's counterfactual copies.
+    """Draw up to 3,000 edits from the counterfactual copies of a run.
+
+    Args:
+        run: the run folder.
+        seed: seed of the draw.
+
+    Returns:
+        The factual states and the edited states, (M, S) each, row by row the same steps. Values are
+        in standard deviations from the training mean; S excludes constant dimensions.
 
     Raises:
-        InputError: the run made no copies, or its store is gone.
+        InputError: the run made no copies, or its store is missing or changed.
     """
     _augmentation(run)
     store, overlay = store_of(run), Overlay.load(run / "overlay.safetensors")
@@ -81,7 +101,7 @@ def edited_states(run: Path, seed: int = 0) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True)
 class Editing:
-    """The models that made a run's edits, and steps drawn from its training episodes."""
+    """The models that made the edits of a run, and steps drawn from its training episodes."""
 
     crm: CausalRewardModel
     generator: TangentGenerator | CounterfactualStateGenerator
@@ -91,10 +111,17 @@ class Editing:
 
     @classmethod
     def of(cls, run: Path, seed: int = 0) -> "Editing":
-        """Read back the models of `run`, and draw 4,096 of the steps that it could have edited.
+        """Load the models of a run, and draw up to 4,096 of the steps that it could have edited.
+
+        Args:
+            run: the run folder.
+            seed: seed of the draw.
+
+        Returns:
+            The models and the steps.
 
         Raises:
-            InputError: the run made no copies, or its models or its store are gone.
+            InputError: the run made no copies, or its models or its store are missing or changed.
         """
         record = read_json(run / RUN)
         report, config = _augmentation(run), config_from_dict(record["config"])
@@ -113,11 +140,17 @@ class Editing:
         return cls(crm, _generator(run, fitted, crm, config), factual, report["epsilon_r"])
 
     def acceptance(self, band: tuple[float, float], seed: int = 0) -> float:
-        """Share of proposals under `band` (ρ_low, ρ_high) that pass both gates of Eq. 4 and move
-        by ρ_low or more.
+        """Share of proposals that pass both gates of Eq. 4 and whose move is at least ρ_low long.
 
-        The tangent generator proposes moves of this band; the faithful network proposes what it
-        learned to, whatever the band.
+        The tangent generator proposes moves within `band`; the proposals of the faithful network do
+        not depend on it.
+
+        Args:
+            band: (ρ_low, ρ_high) in standard deviations.
+            seed: seed of the proposals.
+
+        Returns:
+            The share, from 0 to 1.
         """
         generator = self.generator
         if isinstance(generator, TangentGenerator):
@@ -134,10 +167,18 @@ class Editing:
 
 
 def acceptance_grid(run: Path, lows: Sequence[float], highs: Sequence[float]) -> FloatArray:
-    """(lows, highs) acceptance under every band; NaN where ρ_low is not below ρ_high.
+    """Compute the share of accepted proposals for each band.
+
+    Args:
+        run: the run folder.
+        lows: (L,) values of ρ_low, in standard deviations.
+        highs: (H,) values of ρ_high, in standard deviations.
+
+    Returns:
+        (L, H) shares from 0 to 1; NaN where ρ_low is not below ρ_high.
 
     Raises:
-        InputError: as `Editing.of`.
+        InputError: the run made no copies, or its models or its store are missing or changed.
     """
     editing = Editing.of(run)
     return np.array(
@@ -146,7 +187,14 @@ def acceptance_grid(run: Path, lows: Sequence[float], highs: Sequence[float]) ->
 
 
 def move_histogram(run: Path) -> tuple[list[float], list[int], tuple[float, float]]:
-    """Edges, counts and the band (ρ_low, ρ_high) of a run's accepted edits, by ‖Δ‖₂.
+    """Read the histogram of the move lengths ‖Δ‖₂ of the accepted edits of a run.
+
+    Args:
+        run: the run folder.
+
+    Returns:
+        The B + 1 edges of the bins, in standard deviations; the B counts; and the band
+        (ρ_low, ρ_high) of the run, in standard deviations.
 
     Raises:
         InputError: the run made no copies.
@@ -157,12 +205,21 @@ def move_histogram(run: Path) -> tuple[list[float], list[int], tuple[float, floa
 
 
 def attention(run: Path, seed: int = 0) -> FloatArray:
-    """(K, 3, K) attention of a UCF run from s_t to R, s and a of every step.
+    """Compute the mean attention of a UCF policy from each state token to all tokens of a window.
 
-    The mean over heads and over full windows of validation episodes; a row sums to one.
+    The mean is over heads and over up to 512 full windows of validation episodes.
+
+    Args:
+        run: the run folder.
+        seed: seed with which the windows are drawn.
+
+    Returns:
+        (K, 3, K) probabilities: querying step; returns-to-go, states or actions; step attended to.
+        They sum to one for each querying step.
 
     Raises:
-        InputError: the learner is not UCF, no episode fills a window, or the store is gone.
+        InputError: the policy is not UCF or has no checkpoint, no validation episode fills a
+            window, or the store is missing or changed.
     """
     trained = TrainedPolicy.load(run)
     if not isinstance(trained.policy, UCFPolicy):
@@ -184,8 +241,8 @@ def attention(run: Path, seed: int = 0) -> FloatArray:
 def _augmentation(run: Path) -> Mapping[str, Any]:
     if not has_copies(run):
         raise InputError(f"{run} has no edited copies; train it with augment.copies of 1 or more")
-    found: Mapping[str, Any] = read_json(run / _REPORT)
-    return found
+    report: Mapping[str, Any] = read_json(run / _REPORT)
+    return report
 
 
 def _generator(
@@ -196,10 +253,10 @@ def _generator(
         weights = run / "csg" / "best.safetensors"
         load_weights(weights, network, load_tensors(weights)[0])
         return network.eval()
-    # Nothing of the tangent generator is learned but covariances, the same for the same seed.
-    made = make_generator(fitted, crm, config.csg, run / "csg", config.seed)
-    assert isinstance(made, TangentGenerator)
-    return made
+    # The tangent generator only estimates covariances, which are equal for equal seeds.
+    generator = make_generator(fitted, crm, config.csg, run / "csg", config.seed)
+    assert isinstance(generator, TangentGenerator)
+    return generator
 
 
 def _at(steps: Transitions, rows: torch.Tensor) -> Transitions:

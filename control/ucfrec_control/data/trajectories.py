@@ -46,8 +46,8 @@ class Trajectories:
     final_observations: FloatArray | None
     """(E, S) observation after the last action; None if the source does not contain it."""
     source: Mapping[str, Any]
-    """Provenance: `where` the data was read from, name of the `dataset`, `env_id` (None if unknown),
-    package `versions` that the data was generated with, and counts of what was `dropped`."""
+    """Provenance: `where` the data was read from, name of the `dataset`, `env_id` (None if
+    unknown), package `versions` that generated the data, and counts of what was `dropped`."""
 
     def __post_init__(self) -> None:
         where, n, e = self.source["where"], len(self.rewards), len(self.lengths)

@@ -216,7 +216,7 @@ def _final_observations(
 
 
 def _made_with(path: Path) -> dict[str, str]:
-    """Package versions from the MANIFEST.json next to `path`; empty if it does not list the file."""
+    """Package versions from the MANIFEST.json that lists the file; empty if there is none."""
     manifest = path.parent / "MANIFEST.json"
     if not manifest.is_file():
         return {}

@@ -1,4 +1,4 @@
-"""Datasets by D4RL's protocol (Fu et al., 2020, section 5), from a SAC learner trained here."""
+"""Collect datasets by D4RL's protocol (Fu et al., 2020, section 5) with a SAC learner."""
 
 import json
 from collections.abc import Mapping
@@ -59,20 +59,30 @@ class CollectConfig:
 def collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[dict[str, Any]]:
     """Train SAC and write `medium`, `medium-replay`, `expert` and `medium-expert` to `out`.
 
-    *expert* is the evaluated policy with the highest return, *medium* the first whose return is at
-    least random + `fraction` · (expert − random): on the scale where the random policy has 0, as in
-    D4RL's scores, since a share of a negative return would mean nothing. Evaluations and rollouts
-    sample the policy, as training does. `medium-replay` is every training step up to the medium
-    policy; `medium-expert` is the two files one after the other. The training's own record and
-    checkpoints stay in `out/training`: given the same command again, an interrupted training goes
-    on from the last evaluation, to the same numbers. `out/MANIFEST.json` is written last.
+    The *expert* is the evaluated policy with the highest mean return. The *medium* policy is the
+    first whose mean return is at least random + `fraction` · (expert − random). As in D4RL's
+    scores, the random policy is the zero of this scale, because a fraction of a negative return
+    would be meaningless. Evaluations and rollouts sample from the policy, as training does.
+
+    `medium-replay` contains every training step up to the medium policy, and `medium-expert` is
+    `medium` followed by `expert`. Training settings, policies and checkpoints are kept in
+    `out/training`: repeating the call resumes an interrupted training from its last evaluation,
+    with the same results. `out/MANIFEST.json` is written last.
+
+    Args:
+        env_id: Gymnasium environment with a `Box` action space and a step limit.
+        out: output folder.
+        seed: seed of training, evaluations and rollouts.
+        config: training and rollout settings.
 
     Returns:
-        One row a dataset.
+        One row per dataset: `file`, `dataset`, numbers of `trajectories` and `steps`, and
+        undiscounted `mean_return`.
 
     Raises:
-        InputError: `out` is complete already or of another configuration, the environment cannot be
-            made or has no step limit, or the learner never beat the random policy.
+        InputError: `out` is complete or was started with other settings, the environment cannot be
+            created or has no step limit, its action space is not a `Box`, Stable-Baselines3 is not
+            installed, or no policy beat the random policy.
     """
     if (out / "MANIFEST.json").exists():
         raise InputError(f"{out} is complete already; remove it or name another output folder")
@@ -101,8 +111,8 @@ def collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[di
 def _write(
     out: Path, parts: Mapping[str, Trajectories], recorded: Mapping[str, Any]
 ) -> list[dict[str, Any]]:
-    """One file a dataset, and the manifest; returns a row a dataset."""
-    made = provenance((*PACKAGES, "stable-baselines3"))
+    """Write one file per dataset and the manifest, and return one row per dataset."""
+    run_provenance = provenance((*PACKAGES, "stable-baselines3"))
     task = recorded["env_id"].split("/")[-1].rsplit("-v", 1)[0].lower()
     rows = []
     for kind, trajectories in parts.items():
@@ -114,18 +124,18 @@ def _write(
             "steps": len(trajectories.rewards),
             "mean_return": float(trajectories.returns.mean()),
         }
-        metadata = {**recorded, **row, "versions": json.dumps(made["versions"])}
+        metadata = {**recorded, **row, "versions": json.dumps(run_provenance["versions"])}
         write_d4rl(trajectories, out / f"{name}.hdf5", metadata)
         rows.append(row)
-    write_json(out / "MANIFEST.json", {**made, **recorded, "files": rows})
+    write_json(out / "MANIFEST.json", {**run_provenance, **recorded, "files": rows})
     return rows
 
 
-def _claim(file: Path, described: Mapping[str, Any]) -> None:
-    """Make the folder of `file` this collection's, or see that it is."""
+def _claim(file: Path, settings: Mapping[str, Any]) -> None:
+    """Write the settings to `file`, or check that an existing file has the same settings."""
     if not file.exists():
-        write_json(file, described)
-    elif read_json(file) != described:
+        write_json(file, settings)
+    elif read_json(file) != settings:
         raise InputError(
             f"{file.parent} was started with other settings; repeat those of {file.name}, or name "
             "another output folder"
@@ -138,7 +148,7 @@ class _Training:
     folder: Path
     random_return: float
     evaluations: list[dict[str, Any]]
-    """`steps` and mean `return` of every policy kept."""
+    """Training `steps` and mean `return` of every saved policy."""
 
     def policy(self, index: int) -> Path:
         return self.folder / f"policy-{index:04d}.safetensors"
@@ -164,9 +174,9 @@ def _train(env_id: str, folder: Path, seed: int, config: CollectConfig) -> _Trai
         training.evaluations.extend(learner.load(training.checkpoint)["evaluations"])
     with progress(config.steps, "train SAC", "steps", done=learner.steps) as bar:
         while learner.steps < config.steps:
-            began = learner.steps
+            steps_before = learner.steps
             learner.play_episode(bar)
-            due = learner.steps // config.every > began // config.every
+            due = learner.steps // config.every > steps_before // config.every
             if due or learner.steps >= config.steps:
                 _evaluate(training, evaluation_env, seed, config.episodes)
                 bar.update(0, mean_return=training.evaluations[-1]["return"])
@@ -176,7 +186,7 @@ def _train(env_id: str, folder: Path, seed: int, config: CollectConfig) -> _Trai
 
 
 def _evaluate(training: _Training, env: VectorEnv[Any, Any, Any], seed: int, episodes: int) -> None:
-    """Evaluate and save the current policy, and checkpoint the learner."""
+    """Evaluate and save the current policy, and save a checkpoint of the learner."""
     learner, index = training.learner, len(training.evaluations)
     mean_return = _mean_return(env, learner, episodes, (seed, 3, index))
     training.evaluations.append({"steps": learner.steps, "return": mean_return})
@@ -190,32 +200,32 @@ def _mean_return(
     episodes: int,
     key: tuple[int, ...],
 ) -> float:
-    played = rollout(env, actor, episodes, seed_all(*key), describe="evaluate")
-    return float(played.returns.mean())
+    result = rollout(env, actor, episodes, seed_all(*key), describe="evaluate")
+    return float(result.returns.mean())
 
 
 class _Uniform:
-    """Uniformly random actions."""
+    """Actor that chooses uniformly random actions."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any], seed: int) -> None:
         self._space = env.action_space
         self._space.seed(seed)
 
     def begin(self, rows: IntArray) -> None:
-        """Nothing is carried from step to step."""
+        """Do nothing: the actor has no state."""
 
     def act(self, observations: FloatArray, live: BoolArray) -> tuple[npt.NDArray[Any], None]:
-        """Draw (N, A) actions."""
+        """Return (N, A) random actions, and None."""
         return self._space.sample(), None
 
     def observe(self, actions: npt.NDArray[Any], rewards: FloatArray) -> None:
-        """Nothing is carried from step to step."""
+        """Do nothing: the actor has no state."""
 
 
 def _choose(
     evaluations: list[dict[str, Any]], random_return: float, fraction: float
 ) -> tuple[int, int]:
-    """Positions of the medium and the expert policy."""
+    """Return the indices of the medium and the expert policy in `evaluations`."""
     returns = np.array([row["return"] for row in evaluations])
     expert = int(returns.argmax())
     if returns[expert] <= random_return:
@@ -223,8 +233,8 @@ def _choose(
             f"the best policy earns {returns[expert]:.1f}, random play {random_return:.1f}; train "
             "for more --steps into another folder"
         )
-    wanted = random_return + fraction * (returns[expert] - random_return)
-    return int((returns >= wanted).argmax()), expert
+    threshold = random_return + fraction * (returns[expert] - random_return)
+    return int((returns >= threshold).argmax()), expert
 
 
 def _replay(training: _Training, medium: int, env_id: str) -> Trajectories:
@@ -242,12 +252,12 @@ def _replay(training: _Training, medium: int, env_id: str) -> Trajectories:
 
 
 def _roll_out(training: _Training, index: int, env_id: str, seed: int, size: int) -> Trajectories:
-    """Whole episodes of a kept policy, at least `size` steps.
+    """Roll out whole episodes of a saved policy, with at least `size` steps in total.
 
-    They are played in rounds of a fixed number of episodes, so that short ones are not preferred.
+    Every round has a fixed number of episodes, so that short episodes are not overrepresented.
     """
     training.learner.load_policy(training.policy(index))
-    # Few steps need few episodes at once: a thousand steps is these tasks' usual limit.
+    # A small `size` needs few parallel episodes: the usual step limit of these tasks is 1000.
     env = make_env(env_id, min(SIDE_BY_SIDE, max(1, size // 1000)))
     rounds: list[Trajectories] = []
     with progress(size, f"roll out policy {index}", "steps") as bar:
@@ -262,7 +272,7 @@ def _roll_out(training: _Training, index: int, env_id: str, seed: int, size: int
 
 
 def _by_episode(steps: list[Step], env_id: str) -> Trajectories:
-    """Steps of episodes played side by side, brought into the order of the episodes."""
+    """Reorder the steps of episodes that ran in parallel so that each episode is contiguous."""
 
     def column(name: str) -> npt.NDArray[Any]:
         return np.concatenate([getattr(step, name) for step in steps])
@@ -282,7 +292,7 @@ def _by_episode(steps: list[Step], env_id: str) -> Trajectories:
 
 
 def _joined(*parts: Trajectories) -> Trajectories:
-    """Trajectories one after the other."""
+    """Concatenate trajectories; the source is that of the first."""
 
     def column(name: str) -> Any:
         return np.concatenate([getattr(part, name) for part in parts])

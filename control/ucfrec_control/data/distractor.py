@@ -1,4 +1,4 @@
-"""A distractor: a bit in the state, correlated with the reward, without effect (Appendix G.4)."""
+"""Distractors: a state bit that correlates with the reward but has no effect (Appendix G.4)."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,17 +18,29 @@ DISTRACTORS: dict[str, Mapping[str, Any] | None] = {
     "stochastic": {"flip": 0.15},
     "early": {"flip": 0.0, "early": True},
 }
-"""Arguments of `add_distractor` by the name in the rows; the first two distractors are the paper's,
-the last indicates the next reward, which still depends on the current action."""
+"""Arguments of `add_distractor` by the name used in result rows; None means no distractor.
+
+`deterministic` and `stochastic` are the paper's. `early` indicates the next reward, which still
+depends on the current action."""
 
 
 def add_distractor(
     store: EpisodeStore, out: Path, flip: float = 0.0, seed: int = 0, early: bool = False
 ) -> EpisodeStore:
-    """Write `store` with `ucfrec.episodes.distractor.reward_bit` after every observation.
+    """Write a copy of `store` with a reward-indicating bit appended to every observation.
+
+    Args:
+        store: store with observed states; (N, S) observations become (N, S + 1).
+        out: folder to create.
+        flip: probability that the bit is flipped; see `ucfrec.episodes.distractor.reward_bit`.
+        seed: seed of the random flips.
+        early: indicate the next reward, as `reward_bit` does.
+
+    Returns:
+        The new store.
 
     Raises:
-        InputError: as `reward_bit`, the store's states are made of items, or `out` exists.
+        InputError: `reward_bit` rejects the arguments, the store holds item logs, or `out` exists.
     """
     if store.has_items:
         raise InputError(f"{store.path} is of item logs; distractors are for observed states")
@@ -43,7 +55,21 @@ def add_distractor(
 
 
 def zoo_store(data: Path, stores: Path, file: str, distractor: str = CLEAN) -> Path:
-    """The store of `data / FILE.hdf5`, with a key of `DISTRACTORS`; written where it is not yet."""
+    """Return the store of a D4RL file with a distractor, writing the store if it does not exist.
+
+    Args:
+        data: folder with the HDF5 files.
+        stores: folder with the stores.
+        file: name of the HDF5 file without its extension.
+        distractor: key of `DISTRACTORS`.
+
+    Returns:
+        Folder of the store.
+
+    Raises:
+        InputError: the HDF5 file is missing or invalid, or the distractor cannot be added.
+        KeyError: `distractor` is not a key of `DISTRACTORS`.
+    """
     clean = stores / file
     if not clean.exists():
         read_d4rl(data / f"{file}.hdf5").write_store(clean)

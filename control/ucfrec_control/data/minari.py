@@ -1,4 +1,4 @@
-"""Minari datasets, local or downloaded by Minari itself, both ways."""
+"""Read Minari datasets, local or downloaded by Minari itself, and write local ones."""
 
 import os
 import re
@@ -24,7 +24,15 @@ _IDENTIFIER = re.compile(r"([\w./-]+/)?[\w-]+-v\d+")
 
 
 def is_minari(source: str) -> bool:
-    """Whether `source` is a Minari identifier (`mujoco/hopper/medium-v0`) or dataset folder."""
+    """Return whether `source` names a Minari dataset.
+
+    Args:
+        source: Minari identifier such as `mujoco/hopper/medium-v0`, or a path.
+
+    Returns:
+        True for a folder of a Minari dataset, and for a valid identifier that is not an existing
+        path.
+    """
     folder = Path(source)
     return (folder / "data").is_dir() or (
         not folder.exists() and _IDENTIFIER.fullmatch(source) is not None
@@ -34,25 +42,30 @@ def is_minari(source: str) -> bool:
 def read_minari(source: str, env_id: str | None = None, download: bool = False) -> Trajectories:
     """Read a Minari dataset.
 
-    Episodes that neither terminated nor were truncated are unfinished and are dropped. Of
-    goal observations, the position and the rest stay, in D4RL's order, and the goal goes.
+    Episodes that were neither terminated nor truncated are unfinished and are dropped. Goal-based
+    observations become the achieved position followed by the other observations, as in D4RL; the
+    desired goal is left out.
 
     Args:
-        source: identifier, or folder of a dataset.
-        env_id: environment that the data is of; None for the one that the dataset names.
-        download: fetch the dataset with Minari if it is not here.
+        source: identifier or folder of a dataset.
+        env_id: environment that the data comes from; None for the one recorded in the dataset.
+        download: download the dataset with Minari if it is not available locally.
+
+    Returns:
+        The complete trajectories, with float32 observations, actions and rewards.
 
     Raises:
-        InputError: there is no such dataset, or it is damaged, or its observations are no vectors.
+        InputError: the dataset is missing or damaged, or its observations or actions are not
+            vectors.
     """
     dataset = _load(source, download)
     try:
         episodes = list(dataset.iterate_episodes())
     except (OSError, KeyError, ValueError, RuntimeError) as error:
         raise InputError(f"{source}: an episode cannot be read ({error}); fetch it again") from None
-    whole = [e for e in episodes if len(e) and (e.terminations[-1] or e.truncations[-1])]
-    observations = [_vectors(e.observations, source) for e in whole]
-    for episode, seen in zip(whole, observations, strict=True):
+    complete = [e for e in episodes if len(e) and (e.terminations[-1] or e.truncations[-1])]
+    observations = [_vectors(e.observations, source) for e in complete]
+    for episode, seen in zip(complete, observations, strict=True):
         if len(seen) != len(episode) + 1:
             raise InputError(
                 f"{source}: episode {episode.id} has {len(seen)} observations for {len(episode)} "
@@ -61,10 +74,10 @@ def read_minari(source: str, env_id: str | None = None, download: bool = False) 
     spec = dataset.env_spec
     return Trajectories(
         observations=_joined([seen[:-1] for seen in observations]),
-        actions=_joined([_vectors(e.actions, source) for e in whole]),
-        rewards=_joined([e.rewards for e in whole]).reshape(-1),
-        lengths=np.array([len(e) for e in whole], dtype=np.int64),
-        terminated=np.array([bool(e.terminations[-1]) for e in whole]),
+        actions=_joined([_vectors(e.actions, source) for e in complete]),
+        rewards=_joined([e.rewards for e in complete]).reshape(-1),
+        lengths=np.array([len(e) for e in complete], dtype=np.int64),
+        terminated=np.array([bool(e.terminations[-1]) for e in complete]),
         final_observations=_joined([seen[-1:] for seen in observations]),
         source={
             "where": source,
@@ -74,7 +87,7 @@ def read_minari(source: str, env_id: str | None = None, download: bool = False) 
             "env_settings": {} if env_id or spec is None else _settings(spec),
             "versions": _made_with(dataset.storage.metadata),
             "dropped": {
-                "unfinished_steps": sum(map(len, episodes)) - sum(map(len, whole)),
+                "unfinished_steps": sum(map(len, episodes)) - sum(map(len, complete)),
                 "one_step_trajectories": 0,
             },
         },
@@ -82,13 +95,21 @@ def read_minari(source: str, env_id: str | None = None, download: bool = False) 
 
 
 def write_minari(trajectories: Trajectories, identifier: str, env_id: str | None = None) -> Path:
-    """Write a local Minari dataset; returns its folder.
+    """Write a local Minari dataset.
 
-    Minari keeps the observation after an episode's last action; where the source did not tell it,
-    the last one known is repeated, and the description says so.
+    Minari stores the observation after an episode's last action. If `trajectories` does not contain
+    it, the last known observation is repeated, and the dataset's description says so.
+
+    Args:
+        trajectories: trajectories to write.
+        identifier: Minari identifier of the new dataset, such as `mujoco/hopper/medium-v0`.
+        env_id: environment to record; None for the one recorded in `trajectories`.
+
+    Returns:
+        Folder of the dataset.
 
     Raises:
-        InputError: `identifier` is not one, is taken, or the environment is not known here.
+        InputError: `identifier` is invalid or already exists, or the environment is not registered.
     """
     if _IDENTIFIER.fullmatch(identifier) is None:
         raise InputError(f"{identifier!r} is no Minari identifier, such as mujoco/hopper/medium-v0")
@@ -103,7 +124,7 @@ def write_minari(trajectories: Trajectories, identifier: str, env_id: str | None
     spec = _spec(env)
     try:
         with warnings.catch_warnings():
-            # Minari asks for authors and evaluation environments, which are not ours to name.
+            # Minari warns about missing authors and evaluation environments, which are unknown.
             warnings.filterwarnings("ignore", category=UserWarning, module="minari")
             minari.create_dataset_from_buffers(
                 identifier,
@@ -154,20 +175,20 @@ def _load(source: str, download: bool) -> minari.MinariDataset:
             raise InputError(
                 f"the Minari dataset {source} is not in {_root()}; fetch it with --download"
             )
-        stated = MinariStorage.read_raw_metadata(folder / "data")
-        if not {"observation_space", "action_space"} <= stated.keys():
-            # Minari would import and start whatever environment the file names.
+        metadata = MinariStorage.read_raw_metadata(folder / "data")
+        if not {"observation_space", "action_space"} <= metadata.keys():
+            # Without the spaces, Minari would import and start any environment that the file names.
             raise InputError(f"{source}: its metadata states no observation and action space")
         return minari.MinariDataset(folder / "data")
     except InputError:
         raise
-    except Exception as error:  # Minari and its downloads raise whatever they like
+    except Exception as error:  # Minari and its downloads raise arbitrary types
         message = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"the Minari dataset {source} cannot be opened ({message})") from None
 
 
 def _root() -> Path:
-    """Where Minari keeps its datasets."""
+    """Return the folder in which Minari stores its datasets."""
     return Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets")
 
 
@@ -183,7 +204,7 @@ def _spec(env_id: str | None) -> gymnasium.envs.registration.EnvSpec | None:
 
 
 def _settings(spec: gymnasium.envs.registration.EnvSpec) -> dict[str, Any]:
-    """What else than its name makes the environment, as the maze of AntMaze."""
+    """Return the arguments that configure the environment, such as the maze of AntMaze."""
     return {name: value for name, value in spec.kwargs.items() if name != "render_mode"}
 
 
@@ -204,7 +225,7 @@ def _joined(parts: list[npt.NDArray[Any]]) -> npt.NDArray[np.float32]:
 
 
 def _made_with(metadata: Mapping[str, Any]) -> dict[str, str]:
-    stated = [str(text).partition("==") for text in metadata.get("requirements", [])]
+    requirements = [str(text).partition("==") for text in metadata.get("requirements", [])]
     return {"minari": str(metadata["minari_version"])} | {
-        name: version for name, equal, version in stated if equal
+        name: version for name, separator, version in requirements if separator
     }

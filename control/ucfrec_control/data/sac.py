@@ -1,9 +1,9 @@
 """A soft actor-critic learner that can be stopped and resumed with the same results.
 
-Stable-Baselines3 (extra `collect`) holds the networks, the replay buffer and the update; episodes
-are played here. Every episode begins with all random streams seeded from the seed and the episode's
-number, and checkpoints are taken between episodes, so no state of a generator or of an environment
-need be stored.
+Stable-Baselines3 (extra `collect`) provides the networks, the replay buffer and the update; this
+module runs the episodes. At the start of every episode, all random generators are seeded from the
+seed and the episode's number, and checkpoints are saved between episodes. Checkpoints therefore
+need no state of a random generator or an environment.
 """
 
 from pathlib import Path
@@ -23,7 +23,7 @@ from ucfrec.progress import Progress
 from ucfrec.settings import BatchSize, LearningRate, Share, Width, settings_table
 
 _COLUMNS: Final = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
-"""Arrays of the replay buffer, each (capacity, 1, …)."""
+"""Names of the replay buffer's arrays, each of shape (capacity, 1, …)."""
 
 
 @settings_table("sac")
@@ -45,14 +45,19 @@ class SacConfig:
 
 
 class SacLearner:
-    """Plays whole episodes in one environment and learns at every step.
+    """SAC learner that plays whole episodes in one environment and learns at every step.
+
+    It implements `ucfrec.acting.rollout.Actor`, so its policy can be evaluated with `rollout`.
 
     Args:
-        env: a vector environment of one, with `AutoresetMode.SAME_STEP` and actions in a box.
-        capacity: steps that the replay buffer holds; all that are ever played must fit.
+        env: vector environment of size one, with `AutoresetMode.SAME_STEP` and a `Box` action
+            space.
+        seed: seed of the networks, the exploration and the environment.
+        capacity: size of the replay buffer in steps; every step ever played must fit.
+        config: hyperparameters.
 
     Raises:
-        InputError: actions are no box, or Stable-Baselines3 is not installed.
+        InputError: the action space is not a `Box`, or Stable-Baselines3 is not installed.
     """
 
     def __init__(
@@ -66,11 +71,17 @@ class SacLearner:
 
     @property
     def steps(self) -> int:
-        """Steps played so far, all of them in the replay buffer."""
+        """Number of steps played so far, all of them in the replay buffer."""
         return int(self._buffer.pos)
 
     def play_episode(self, bar: Progress) -> None:
-        """Play one episode to its end, learning; uniform actions before `learning_starts`."""
+        """Play one complete episode, with one update per step.
+
+        Before `learning_starts`, actions are uniformly random and there are no updates.
+
+        Args:
+            bar: progress bar, advanced by one per step.
+        """
         reset_seed = seed_all(self._seed, 1, self.episode)
         generator = np.random.default_rng(reset_seed)
         observations, _ = self._env.reset(seed=reset_seed)
@@ -78,8 +89,8 @@ class SacLearner:
         while not ended:
             before = observations.astype(np.float32)
             scaled = self._explore(before, generator)
-            played = self._model.policy.unscale_action(scaled)
-            observations, rewards, terminated, truncated, info = self._env.step(played)
+            actions = self._model.policy.unscale_action(scaled)
+            observations, rewards, terminated, truncated, info = self._env.step(actions)
             ended = bool(terminated[0] or truncated[0])
             after = info["final_obs"][0][None] if ended else observations
             timeout = {"TimeLimit.truncated": bool(truncated[0] and not terminated[0])}
@@ -90,7 +101,7 @@ class SacLearner:
         self.episode += 1
 
     def _explore(self, observations: FloatArray, generator: np.random.Generator) -> FloatArray:
-        """An action (1, A) on the scale [−1, 1]."""
+        """Return an action of shape (1, A), scaled to [−1, 1]."""
         if self.steps < self._config.learning_starts:
             shape = (1, *(self._env.single_action_space.shape or ()))
             return generator.uniform(-1, 1, shape).astype(np.float32)
@@ -98,7 +109,15 @@ class SacLearner:
         return np.asarray(self._model.policy.scale_action(drawn), dtype=np.float32)
 
     def replay(self, steps: int) -> dict[str, npt.NDArray[Any]]:
-        """The first `steps` steps played: columns named as in D4RL, actions as they were played."""
+        """Return the first steps played, with D4RL's column names.
+
+        Args:
+            steps: number N of steps.
+
+        Returns:
+            `observations` and `next_observations` (N, S), `actions` (N, A) in the units of the
+            environment, `rewards`, `terminals` and `timeouts` (N,).
+        """
         columns = {name: getattr(self._buffer, name)[:steps, 0] for name in _COLUMNS}
         actions = self._model.policy.unscale_action(columns["actions"])
         timeouts = columns["timeouts"] > 0
@@ -112,17 +131,34 @@ class SacLearner:
         }
 
     def save_policy(self, path: Path, metadata: dict[str, Any]) -> None:
-        """Write the policy's weights."""
+        """Write the policy's weights.
+
+        Args:
+            path: safetensors file.
+            metadata: JSON values stored with the weights.
+        """
         save_tensors(path, dict(self._model.actor.state_dict()), metadata)
 
     def load_policy(self, path: Path) -> dict[str, Any]:
-        """Play with the weights of `save_policy` from now on; returns their metadata."""
+        """Replace the policy's weights by those that `save_policy` wrote.
+
+        Args:
+            path: safetensors file.
+
+        Returns:
+            The metadata given to `save_policy`.
+        """
         tensors, metadata = load_tensors(path)
         self._model.actor.load_state_dict(tensors)
         return metadata
 
     def save(self, path: Path, metadata: dict[str, Any]) -> None:
-        """Write all that the learner needs to go on, atomically."""
+        """Write a checkpoint from which training can resume, atomically.
+
+        Args:
+            path: safetensors file.
+            metadata: JSON values stored with the checkpoint.
+        """
         tensors = {"log_ent_coef": self._model.log_ent_coef}
         for name, state in self._model.get_parameters().items():
             moments = state.get("state")
@@ -134,7 +170,14 @@ class SacLearner:
         save_tensors(path, tensors, metadata | {"episode": self.episode})
 
     def load(self, path: Path) -> dict[str, Any]:
-        """Go on from what `save` wrote, in place; returns its metadata."""
+        """Restore, in place, a checkpoint that `save` wrote.
+
+        Args:
+            path: safetensors file.
+
+        Returns:
+            The metadata given to `save`.
+        """
         tensors, metadata = load_tensors(path)
         for name in _COLUMNS:
             rows = tensors.pop(f"replay/{name}").numpy()
@@ -154,21 +197,32 @@ class SacLearner:
         return metadata
 
     def begin(self, rows: IntArray) -> None:
-        """As an `ucfrec.acting.rollout.Actor` the policy looks at nothing but the observation."""
+        """Do nothing: the policy depends only on the current observation."""
 
     def act(self, observations: FloatArray, live: BoolArray) -> tuple[FloatArray, None]:
-        """Sample the policy, (N, A), as in training."""
+        """Sample actions from the policy, as in training.
+
+        Args:
+            observations: (N, S) current observations.
+            live: (N,) running episodes; ignored, every row gets an action.
+
+        Returns:
+            (N, A) actions in the units of the environment, and None.
+        """
         return self._model.predict(observations.astype(np.float32), deterministic=False)[0], None
 
     def observe(self, actions: npt.NDArray[Any], rewards: FloatArray) -> None:
-        """Nothing is learned from what is played through `rollout`."""
+        """Do nothing: the learner does not learn from `rollout`."""
 
 
 def seed_all(*key: int) -> int:
-    """Seed the global generators of numpy and torch, which Stable-Baselines3 draws from, by `key`.
+    """Seed the global random generators of numpy and torch, which Stable-Baselines3 uses.
+
+    Args:
+        key: non-negative integers from which the seed is derived.
 
     Returns:
-        The seed, for what has a generator of its own.
+        The derived seed, for components with their own random generator.
     """
     seed = int(np.random.SeedSequence(key).generate_state(1)[0])
     np.random.seed(seed)  # noqa: NPY002
@@ -177,7 +231,7 @@ def seed_all(*key: int) -> int:
 
 
 class _Spaces(gymnasium.Env[FloatArray, FloatArray]):
-    """All that Stable-Baselines3 needs of an environment that is played elsewhere."""
+    """Environment with spaces only, for Stable-Baselines3; the episodes run in another one."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
         shape = env.single_observation_space.shape

@@ -1,4 +1,4 @@
-"""Trajectories of a control dataset in memory: what every format is read to and written from."""
+"""In-memory trajectories of a control dataset, the common form of all file formats."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,34 +17,37 @@ IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
 VALIDATION_EVERY = 20
-"""One trajectory in this many is for validation."""
+"""One trajectory in this many belongs to the validation split."""
 PACKAGES = ("gymnasium", "mujoco", "gymnasium-robotics", "minari", "h5py")
-"""Packages, beside the core's, whose versions decide numbers."""
+"""Packages, besides those of the core, whose versions affect numerical results."""
 
 
 @dataclass(frozen=True)
 class Trajectories:
-    """Whole trajectories, one after the other.
+    """Complete trajectories, concatenated along the first axis.
+
+    E trajectories have N steps in total, with S-dimensional observations and A-dimensional
+    actions.
 
     Raises:
-        InputError: arrays disagree, or hold what is not finite.
+        InputError: there is no trajectory, array shapes disagree, or a value is not finite.
     """
 
     observations: FloatArray
-    """(N, S)."""
+    """(N, S) observation before each action."""
     actions: FloatArray
-    """(N, A)."""
+    """(N, A) action of each step, in the units of the environment."""
     rewards: FloatArray
-    """(N,)."""
+    """(N,) reward of each step."""
     lengths: IntArray
-    """(E,) steps of each trajectory, adding up to N."""
+    """(E,) number of steps of each trajectory; the sum is N."""
     terminated: BoolArray
-    """(E,) ended by failure or success, not by the step limit."""
+    """(E,) whether the trajectory ended by failure or success rather than by the step limit."""
     final_observations: FloatArray | None
-    """(E, S) what the last action led to; None where the source does not tell."""
+    """(E, S) observation after the last action; None if the source does not contain it."""
     source: Mapping[str, Any]
-    """`where` it was read, `dataset`, `env_id` (None if unknown), `versions` it was made with,
-    and what was `dropped`."""
+    """Provenance: `where` the data was read from, name of the `dataset`, `env_id` (None if
+    unknown), package `versions` that generated the data, and counts of what was `dropped`."""
 
     def __post_init__(self) -> None:
         where, n, e = self.source["where"], len(self.rewards), len(self.lengths)
@@ -56,30 +59,37 @@ class Trajectories:
             "rewards": (self.rewards, (n,)),
         }
         if self.final_observations is not None:
-            wanted = (e, *self.observations.shape[1:])
-            shapes["final observations"] = (self.final_observations, wanted)
+            expected_shape = (e, *self.observations.shape[1:])
+            shapes["final observations"] = (self.final_observations, expected_shape)
         for name, (values, shape) in shapes.items():
             if values.shape != shape:
                 raise InputError(f"{where}: {name} have shape {values.shape} instead of {shape}")
-            strange = int(np.count_nonzero(~np.isfinite(values)))
-            if strange:
-                raise InputError(f"{where}: {strange} numbers of its {name} are not finite")
+            non_finite = int(np.count_nonzero(~np.isfinite(values)))
+            if non_finite:
+                raise InputError(f"{where}: {non_finite} numbers of its {name} are not finite")
 
     @property
     def returns(self) -> npt.NDArray[np.float64]:
-        """(E,) return of each trajectory."""
+        """(E,) undiscounted return, the sum of rewards, of each trajectory."""
         starts = np.cumsum(self.lengths) - self.lengths
         return np.add.reduceat(self.rewards.astype(np.float64), starts)
 
     def write_store(self, out: Path) -> EpisodeStore:
-        """Write an episode store, atomically.
+        """Write the trajectories as an episode store, atomically.
 
-        One trajectory in 20, evenly spaced, is for validation. Trajectories of control data are
-        independent, so nothing is gained by holding out the last ones; and files are ordered by
-        behaviour, often weakest to best, so the last ones would be of one behaviour only.
+        One trajectory in 20, evenly spaced, belongs to the validation split. Trajectories of
+        control data are independent, so holding out the last ones has no advantage. Files are also
+        often ordered by behaviour policy, from weakest to best, so the last trajectories would
+        represent a single policy.
+
+        Args:
+            out: folder to create.
+
+        Returns:
+            The new store.
 
         Raises:
-            InputError: `out` exists.
+            InputError: `out` already exists.
         """
         held_out = np.arange(len(self.lengths)) % VALIDATION_EVERY == VALIDATION_EVERY // 2
         return EpisodeStore.write(

@@ -29,7 +29,7 @@ def make_env(
     settings: Mapping[str, Any] | None = None,
     wrappers: Sequence[Wrap] = (),
 ) -> VectorEnv[Any, Any, Any]:
-    """Make `count` copies of an environment, which reset themselves in the step that ends an episode.
+    """Make `count` copies of an environment that reset in the step that ends an episode.
 
     They share one process because measurements showed that a MuJoCo step costs less than
     communication between processes. AntMaze gets D4RL's observation vectors, and its episodes

@@ -18,8 +18,8 @@ class Task:
 
     name: str
     pattern: str
-    """Text contained in the names of its environments and datasets, once these are in lower case and
-    without `-`, `_`, `/` and spaces."""
+    """Text contained in the names of its environments and datasets, once these are in lower case
+    and without `-`, `_`, `/` and spaces."""
     sizes: tuple[int, int]
     """Number of state dimensions and of action dimensions in D4RL's datasets, (S, A)."""
     low: float

@@ -49,8 +49,8 @@ def evaluate_off_policy(
 ) -> OffPolicyReport:
     """Estimate the mean return of a session under the policy of `run`, from logs alone.
 
-    Reward models are fitted on these logs; each user's sessions are predicted by models fitted on
-    other users. Needs about 5 kB of memory per logged step.
+    Models of future reward are fitted on these logs; each user's sessions are predicted by models
+    fitted on other users. Needs about 5 kB of memory per logged step.
 
     Args:
         run: folder of the run, named in the rows.
@@ -248,9 +248,9 @@ def _features(states: Tensor, items: Tensor) -> Float32Array:
 
     They are a constant 1, the states, the embeddings, and products of the two.
 
-    The three embeddings at the start of a state (`ucfrec.episodes.states.ItemStates`) are multiplied with
-    the item's own; the rest (user, observation) is multiplied with as many of its first dimensions as `_PRODUCTS`
-    allows.
+    The three embeddings at the start of a state (`ucfrec.episodes.states.ItemStates`) are
+    multiplied with the item's own, dimension by dimension. The rest (user, observation) is
+    multiplied with as many of the item's first dimensions as `_PRODUCTS` allows.
     """
     dim = items.shape[1]
     led_by, rest = states[:, : 3 * dim], states[:, 3 * dim :]

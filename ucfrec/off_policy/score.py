@@ -143,7 +143,7 @@ def scored_steps(
         for begin in range(0, total, at_once):
             episodes, steps = store.locate(np.arange(begin, min(begin + at_once, total)))
             windows = store.windows(episodes, steps, trained.policy.config.context)
-            # The windows hold the session's own return minus its reward so far; this is to be added.
+            # A window's return-to-go starts from the session's own return; shift it to the target.
             more = torch.from_numpy(target_return - store.returns[episodes])
             # Steps after an unknown item (−1) have weight 0, so any known item can replace it here.
             known = replace(windows, actions=windows.actions.clamp(min=0))

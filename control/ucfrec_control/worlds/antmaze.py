@@ -33,7 +33,7 @@ def is_antmaze(env_id: str) -> bool:
 
 
 def is_rebuilt(env_id: str) -> bool:
-    """Return whether `env_id` names a D4RL AntMaze that `ucfrec_control.worlds.d4rl_antmaze` rebuilds."""
+    """Return whether `env_id` names a maze of `ucfrec_control.worlds.d4rl_antmaze`."""
     return env_id in _REBUILT
 
 

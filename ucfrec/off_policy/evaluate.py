@@ -1,4 +1,4 @@
-"""What a trained policy would have earned on logs: the logs read, modelled, weighed, reported."""
+"""Estimates from logs what a trained policy would have earned, and reports how reliable that is."""
 
 import math
 from dataclasses import asdict, dataclass, replace
@@ -28,10 +28,12 @@ Float32Array = npt.NDArray[np.float32]
 
 @dataclass(frozen=True)
 class OffPolicyReport:
-    """Result rows, one an estimator, and whether to believe them."""
+    """The estimates, and whether to believe them."""
 
     rows: list[dict[str, Any]]
+    """One result row for each estimator."""
     warnings: list[str]
+    """The verdict's reasons, cautions, and remarks on the logs."""
     verdict: Verdict
 
 
@@ -47,19 +49,25 @@ def evaluate_off_policy(
 ) -> OffPolicyReport:
     """Estimate the mean return of a session under the policy of `run`, from logs alone.
 
-    Models are fitted on these logs, each user's sessions by models of other users. Takes
-    about 5 kB of memory a logged step.
+    Models of future reward are fitted on these logs; each user's sessions are predicted by models
+    fitted on other users. Needs about 5 kB of memory per logged step.
 
     Args:
-        logged: read with `keep_unknown`: the policy would never show an item that it does not
-            know, so such a step weighs 0.
+        run: folder of the run, named in the rows.
+        trained: the policy of the run.
+        logged: logs read with `keep_unknown`. The policy would never show an item that it does not
+            know, so such a step has weight 0.
+        target_return: the return that the policy is asked for, in units of the reward.
         greedy: judge the policy that shows its most probable item; otherwise the one that draws
             items from its softmax.
-        seed: draws the folds and the bootstrap's resamples.
-        discount: γ of the returns that are estimated.
+        seed: seed of the folds and of the bootstrap.
+        discount: discount factor γ of the estimated returns.
+
+    Returns:
+        The estimates, the warnings and the verdict.
 
     Raises:
-        InputError: propensities are no probabilities, or there is only one user.
+        InputError: propensities are not probabilities, or there is only one user.
     """
     steps = logged_steps(trained, logged, target_return, greedy, seed, discount)
     found, diagnosis = estimate(steps, seed), diagnose(steps)
@@ -116,8 +124,16 @@ def _of_the_logs(seen: float | None, logged: LoggedSessions) -> list[str]:
 
 
 def as_row(name: str, found: Estimate) -> dict[str, Any]:
-    """An estimate as a result row; the mean return is R_cum, as in `ucfrec.evaluation.metrics`.
-    Without an interval its ends are None."""
+    """Turn an estimate into a result row.
+
+    Args:
+        name: name of the estimator.
+        found: its estimate.
+
+    Returns:
+        The row. `R_cum` is the mean return, as in `ucfrec.evaluation.metrics`; the ends of its
+        interval are None if there is no interval.
+    """
     return {
         "estimator": name,
         "R_cum": found.value,
@@ -158,7 +174,22 @@ def logged_steps(
     seed: int,
     discount: float = 1.0,
 ) -> LoggedSteps:
-    """The logged steps with the policy's probabilities and models of what it would earn."""
+    """Collect the logged steps, the policy's probabilities and models of what it would earn.
+
+    Args:
+        trained: a policy that chooses items.
+        logged: logs read with `keep_unknown`.
+        target_return: the return that the policy is asked for, in units of the reward.
+        greedy: judge the policy that shows its most probable item, instead of drawing items.
+        seed: seed of the folds.
+        discount: discount factor γ of the returns.
+
+    Returns:
+        The N logged steps, in order.
+
+    Raises:
+        InputError: propensities are not probabilities, or there is only one user.
+    """
     store = logged.store
     assert trained.item_states is not None
     one_state, one_item = torch.zeros(1, store.state_size), trained.item_states.embeddings[:1]
@@ -175,7 +206,7 @@ def logged_steps(
     if schema.PROPENSITY in store.meta["columns"]:
         propensity = store.step_values(schema.PROPENSITY, episodes, steps).astype(np.float64)
     user = np.unique(logged.users, return_inverse=True)[1]
-    # What cannot be weighed is found out before anything is fitted.
+    # This checks the propensities before the slow fitting starts.
     unmodelled = LoggedSteps(episodes, reward, propensity, target, user=user, discount=discount)
     model = cross_fitted(features, at_policy, reward, episodes, seed, user, discount)
     return replace(unmodelled, model=model)
@@ -184,12 +215,18 @@ def logged_steps(
 def step_features(
     trained: TrainedPolicy, batch: ScoredSteps, greedy: bool
 ) -> tuple[npt.NDArray[Any], Float32Array, Float32Array]:
-    """What models see of B logged steps. An item that the run does not know (−1) has probability 0
-    and an embedding of zeros.
+    """Compute the policy's probability and the models' inputs for B logged steps.
+
+    An item that the run does not know (−1) has probability 0 and an embedding of zeros.
+
+    Args:
+        trained: a policy that chooses items.
+        batch: the steps, scored by the policy.
+        greedy: judge the policy that shows its most probable item, instead of drawing items.
 
     Returns:
         The evaluated policy's probability (B,) of the logged item; features (B, P) of the state and
-        the logged item, and the mean of those over the policy's items.
+        the logged item; and the mean (B, P) of such features over the items that the policy shows.
     """
     assert trained.item_states is not None
     embeddings = trained.item_states.embeddings
@@ -207,11 +244,13 @@ def step_features(
 
 
 def _features(states: Tensor, items: Tensor) -> Float32Array:
-    """(B, P) of states and item embeddings (B, D), linear in the latter: 1, both, and products.
+    """Features (B, P) of states (B, S) and item embeddings (B, D), linear in the embeddings.
 
-    The three embeddings that lead a state (`ucfrec.episodes.states.ItemStates`) are multiplied with
-    the item's own; the rest (user, observation) with as many of its first dimensions as `_PRODUCTS`
-    allows.
+    They are a constant 1, the states, the embeddings, and products of the two.
+
+    The three embeddings at the start of a state (`ucfrec.episodes.states.ItemStates`) are
+    multiplied with the item's own, dimension by dimension. The rest (user, observation) is
+    multiplied with as many of the item's first dimensions as `_PRODUCTS` allows.
     """
     dim = items.shape[1]
     led_by, rest = states[:, : 3 * dim], states[:, 3 * dim :]

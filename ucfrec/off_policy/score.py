@@ -1,4 +1,4 @@
-"""How probable a policy finds every choice of a log."""
+"""The probability that a policy gives to each logged choice."""
 
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -34,27 +34,29 @@ IntArray = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class LoggedSessions:
-    """Logs as a policy reads them: its items and users, its reward, its sessions."""
+    """Logs with items, users, reward and sessions defined as in a policy's training logs."""
 
     store: EpisodeStore
     users: npt.NDArray[Any]
-    """(E,) identifier of each session's user."""
+    """(E,): identifier of each session's user."""
     report: dict[str, Any]
-    """What was read and dropped, for `ucfrec.logs.summary.format_report`."""
+    """Counts of what was read and dropped, for `ucfrec.logs.summary.format_report`."""
     unknown_items: int = 0
-    """Steps that show an item which the run does not know."""
+    """Number of steps that show an item which the run does not know."""
 
 
 @dataclass(frozen=True)
 class ScoredSteps:
-    """B logged steps and what the policy makes of them."""
+    """B logged steps with the policy's probabilities of all items."""
 
     episodes: IntArray
+    """(B,): number of each step's session."""
     steps: IntArray
+    """(B,): position of each step in its session, from 0."""
     windows: Windows
-    """The steps and what came before."""
+    """Each step, last in its window, with the steps before it that the policy sees."""
     log_probabilities: Tensor
-    """(B, n_items) of what the policy would show."""
+    """(B, n_items): natural logarithm of the probability that the policy shows each item."""
 
 
 @contextmanager
@@ -65,10 +67,22 @@ def logged_sessions(
     mapping: LogMapping,
     keep_unknown: bool = False,
 ) -> Iterator[LoggedSessions]:
-    """Read logs as the training logs of `run` were read; they lie on disk until the block ends.
+    """Read logs in the same way as the training logs of `run`.
+
+    The result is a context manager; the prepared logs are on disk until its block ends.
 
     Rows of items that the run does not know are dropped and counted in the report; with
     `keep_unknown` they stay, as item −1, and `LoggedSessions.unknown_items` counts them.
+
+    Args:
+        run: folder of the run.
+        trained: the policy of the run.
+        files: the log files.
+        mapping: which columns of the logs mean what.
+        keep_unknown: keep rows whose item the run does not know.
+
+    Yields:
+        The prepared logs.
 
     Raises:
         InputError: the policy's actions are vectors, the logs cannot be used, none of their items
@@ -83,7 +97,7 @@ def logged_sessions(
     if not record["observation_size"]:
         mapping = LogMapping({schema.OBSERVATION: ""}).over(mapping)
     gap_ms = record["session_gap_ms"]
-    # Runs from before `session_by` was recorded tell the gap at least.
+    # Older runs did not record `session_by`, but they did record the gap.
     session_by = record.get("session_by") or (None if gap_ms is None else "gap")
     options = PrepareOptions(Expression(record["reward"], str(run / RUN)), session_by)
     if gap_ms is not None:
@@ -110,9 +124,17 @@ def logged_sessions(
 def scored_steps(
     trained: TrainedPolicy, store: EpisodeStore, target_return: float
 ) -> Iterator[ScoredSteps]:
-    """Every step of `store` in order, a batch at a time, as the policy would see it when acting.
+    """Compute the policy's probabilities at every step of `store`, in order and in batches.
 
-    Its return-to-go is `target_return` less what the session has earned so far.
+    The return-to-go at a step is `target_return` minus the session's reward before that step.
+
+    Args:
+        trained: a policy that chooses items.
+        store: the logged steps.
+        target_return: the return that the policy is asked for, in units of the reward.
+
+    Yields:
+        Batches of scored steps.
     """
     assert trained.item_ids is not None
     at_once = max(1, min(_STEPS_AT_ONCE, _LOGITS_AT_ONCE // len(trained.item_ids)))
@@ -121,9 +143,9 @@ def scored_steps(
         for begin in range(0, total, at_once):
             episodes, steps = store.locate(np.arange(begin, min(begin + at_once, total)))
             windows = store.windows(episodes, steps, trained.policy.config.context)
-            # A logged return-to-go is the session's return less what it has earned so far.
+            # A window's return-to-go starts from the session's own return; shift it to the target.
             more = torch.from_numpy(target_return - store.returns[episodes])
-            # What follows an unknown item (−1) has no weight: any known item may stand for it.
+            # Steps after an unknown item (−1) have weight 0, so any known item can replace it here.
             known = replace(windows, actions=windows.actions.clamp(min=0))
             log_probabilities = trained.log_probabilities(known, more.unsqueeze(1))
             yield ScoredSteps(episodes, steps, windows, log_probabilities)
@@ -133,7 +155,12 @@ def scored_steps(
 def score(
     trained: TrainedPolicy, logged: LoggedSessions, target_return: float
 ) -> Iterator[pd.DataFrame]:
-    """The policy's probability of every logged choice.
+    """Compute the policy's probability of every logged choice.
+
+    Args:
+        trained: a policy that chooses items.
+        logged: the logs, without unknown items.
+        target_return: the return that the policy is asked for, in units of the reward.
 
     Yields:
         Frames, one row a logged step, in order of user, session and time: `user_id`, `session`

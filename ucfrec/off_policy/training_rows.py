@@ -1,4 +1,4 @@
-"""Whether a policy is evaluated on rows that it was trained on."""
+"""Finds out whether a policy is evaluated on rows that it was trained on."""
 
 from pathlib import Path
 from typing import Any, Final
@@ -12,20 +12,24 @@ from ucfrec.errors import InputError
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 MOST_SEEN: Final = 0.05
-"""Share of rows seen in training above which no estimate stands. Where clocks are coarse, some rows
-of other logs have the same user, item and time by chance."""
+"""Largest share of rows seen in training with which an estimate is accepted. It is above 0 because
+with coarse timestamps some rows of other logs have the same user, item and time by chance."""
 
 KeyArray = npt.NDArray[np.uint64]
 
 
 def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
-    """Share of the logged rows whose (user, item, time) the run learnt from or was chosen on.
+    """Compute the share of logged rows that are in the run's training or validation data.
+
+    Rows are the same if their user, item and time are.
 
     Args:
-        logged: a store with the users and items of the run's own (`ucfrec.logs.prepare(like=…)`).
+        trained: the policy, with the record of its run.
+        logged: a store that numbers users and items as the run's store does
+            (`ucfrec.logs.prepare(like=…)`).
 
     Returns:
-        None where the run's store is no longer where it was.
+        The share, from 0 to 1, or None if the run's store has been moved, deleted or changed.
     """
     record = trained.record
     if record["fingerprint"] == logged.meta["fingerprint"]:
@@ -41,7 +45,7 @@ def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
 
 
 def _keys(store: EpisodeStore) -> KeyArray:
-    """(N,) one number for each step's (user, item, time); a user never seen has a new one."""
+    """Hash the (user, item, time) of each step to one number, (N,)."""
     if not store.n_episodes:
         return np.zeros(0, dtype=np.uint64)
     episodes, steps = store.all_steps()
@@ -57,7 +61,7 @@ def _keys(store: EpisodeStore) -> KeyArray:
 
 
 def _mixed(keys: KeyArray) -> KeyArray:
-    """Different numbers for different numbers, spread over all 64 bits (SplitMix64)."""
+    """Spread numbers over all 64 bits; different inputs give different outputs (SplitMix64)."""
     keys = keys + np.uint64(0x9E3779B97F4A7C15)
     keys = (keys ^ (keys >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     keys = (keys ^ (keys >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

@@ -1,4 +1,4 @@
-"""AntMaze (extra `antmaze`): which environment, and its goal observations as D4RL's vectors."""
+"""AntMaze environments (extra `antmaze`), with observations in the layout of D4RL's datasets."""
 
 from collections.abc import Mapping
 from contextlib import redirect_stderr
@@ -27,24 +27,30 @@ for _id, (_maze, _limit) in _REBUILT.items():
 
 
 def is_antmaze(env_id: str) -> bool:
-    """Whether `env_id` is an AntMaze, of D4RL or of gymnasium-robotics."""
+    """Return whether `env_id` names an AntMaze, D4RL's or one of gymnasium-robotics."""
     task = find_task(env_id)
     return task is not None and task.name == "antmaze"
 
 
 def is_rebuilt(env_id: str) -> bool:
-    """Whether `env_id` is D4RL's AntMaze as `ucfrec_control.worlds.d4rl_antmaze` rebuilds it."""
+    """Return whether `env_id` names a maze of `ucfrec_control.worlds.d4rl_antmaze`."""
     return env_id in _REBUILT
 
 
 def antmaze_settings(env_id: str) -> Mapping[str, Any]:
-    """Arguments with which an episode of AntMaze returns 1 for success and else 0.
+    """Prepare an AntMaze for `gymnasium.make` and return the arguments that it needs.
+
+    Also registers the environments of gymnasium-robotics.
+
+    Returns:
+        Keyword arguments with which the return of an episode is 1 for success and 0 otherwise;
+        empty for D4RL's rebuilt mazes, which always work this way.
 
     Raises:
         InputError: gymnasium-robotics is not installed.
     """
     try:
-        # On import it prints a notice on other environments.
+        # The import prints a notice about environments that are not used here.
         with redirect_stderr(StringIO()):
             import gymnasium_robotics
     except ImportError:
@@ -57,7 +63,10 @@ def antmaze_settings(env_id: str) -> Mapping[str, Any]:
 
 
 class GoalObservations(gymnasium.ObservationWrapper[Any, Any, Any]):
-    """Position, then the rest, without the goal: the vector that D4RL's datasets have (29,)."""
+    """Flattens AntMaze's dictionary observations to the vectors (29,) of D4RL's datasets.
+
+    A vector holds the position (x, y) and then the rest of the ant's state. It leaves out the goal.
+    """
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
         super().__init__(env)
@@ -66,10 +75,19 @@ class GoalObservations(gymnasium.ObservationWrapper[Any, Any, Any]):
         sizes = [shown[name].shape or () for name in ("achieved_goal", "observation")]
         self.observation_space = Box(-np.inf, np.inf, (sum(size[0] for size in sizes),))
         self._origin = getattr(env.unwrapped, "origin", np.zeros(2))
-        # gymnasium-robotics has read this file and leaves it behind.
+        # gymnasium-robotics has finished with this temporary file but does not delete it.
         Path(getattr(env.unwrapped, "tmp_xml_file_path", "")).unlink(missing_ok=True)
 
     def observation(self, observation: Mapping[str, Any]) -> npt.NDArray[np.float32]:
-        """Goal observation to (O,)."""
+        """Flatten one observation.
+
+        Args:
+            observation: the dictionary with `achieved_goal` (2,), which is the ant's position, and
+                `observation` (O − 2,).
+
+        Returns:
+            Vector (O,); its position is relative to the start of D4RL's mazes if the environment
+            has an `origin`.
+        """
         position = observation["achieved_goal"] - self._origin
         return np.concatenate([position, observation["observation"]]).astype(np.float32)

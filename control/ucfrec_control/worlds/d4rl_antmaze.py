@@ -1,10 +1,11 @@
-"""D4RL's AntMaze, rebuilt on that of gymnasium-robotics.
+"""D4RL's AntMaze, rebuilt on the AntMaze of gymnasium-robotics.
 
-No version of gymnasium-robotics has the world of D4RL's datasets: there the maze is mirrored and
-its origin is the center, a step lasts half as long, the motors are five times as strong, and start
-and goal are drawn from all cells. What is changed here follows D4RL's public code
+No version of gymnasium-robotics reproduces the environment of D4RL's datasets. In its version the
+maze is mirrored, the origin is the center of the maze, a step lasts half as long, the motors are
+five times as strong, and start and goal are drawn from all cells. This module changes these points
+to match D4RL's public code
 (https://github.com/Farama-Foundation/D4RL, d4rl/locomotion: maze_env.py, ant.py,
-goal_reaching_env.py, assets/ant.xml); what MuJoCo itself changed since 2.0 stays.
+goal_reaching_env.py, assets/ant.xml). Changes in MuJoCo itself since version 2.0 are not undone.
 """
 
 import xml.etree.ElementTree as ET
@@ -27,14 +28,14 @@ _MAZES = {
     "medium": (maps.MEDIUM_MAZE, (6, 6)),
     "large": (maps.LARGE_MAZE, (7, 9)),
 }
-"""Walls, and the cell (row, column) of the goal; the start is one for all."""
+"""For each maze, its walls and the cell (row, column) of the goal. All mazes start in `_START`."""
 _GOAL_RADIUS = 0.5
 
 
 class D4RLAntMaze(AntMazeEnv):
-    """`antmaze-{umaze,medium,large}` of D4RL, version 2: the goal is drawn at every reset.
+    """`antmaze-{umaze,medium,large}` of D4RL, version 2, in which every reset draws the goal.
 
-    The reward is 1 at the goal, where the episode ends, and else 0.
+    The reward is 1 at the goal, where the episode ends, and 0 everywhere else.
     """
 
     def __init__(self, maze: str, render_mode: str | None = None) -> None:
@@ -46,14 +47,14 @@ class D4RLAntMaze(AntMazeEnv):
         with TemporaryDirectory() as folder:
             super().__init__(
                 render_mode=render_mode,
-                # D4RL's y grows with the row, here it falls.
+                # y grows with the row in D4RL but falls with it in gymnasium-robotics.
                 maze_map=walls[::-1],
                 reward_type="sparse",
                 continuing_task=False,
                 xml_file=_d4rl_ant(Path(folder)),
                 include_cfrc_ext_in_observation=False,
             )
-        # gymnasium-robotics passes 0 and takes no other value.
+        # gymnasium-robotics always passes 0 to the ant and has no argument to change it.
         self.ant_env._reset_noise_scale = 0.1
         self.metadata = {**AntMazeEnv.metadata, "render_fps": round(1 / self.ant_env.dt)}
         self.origin = self._center(_START)
@@ -66,39 +67,59 @@ class D4RLAntMaze(AntMazeEnv):
         return center
 
     def generate_target_goal(self) -> FloatArray:
-        """Beside the center of the goal's cell, on the side away from the start."""
+        """Draw the goal near the center of its cell.
+
+        Returns:
+            Position (2,), in the maze's units of length; each coordinate is at or above the
+            center's, by less than 3/8 of a cell's side.
+        """
         quarter = self.maze.maze_size_scaling / 4
         offset = self.np_random.uniform(0, quarter, 2) + self.np_random.uniform(0, quarter / 2, 2)
         goal: FloatArray = self._center(self._goal_cell) + offset
         return goal
 
     def generate_reset_pos(self) -> FloatArray:
-        """The start; the ant's own noise moves it."""
+        """Return the start position (2,), without noise; the ant adds its own when it is reset."""
         return self.origin.copy()
 
     def add_xy_position_noise(self, xy_pos: FloatArray) -> FloatArray:
-        """Nothing: D4RL draws no such noise."""
+        """Return the position (2,) unchanged, because D4RL adds no noise here."""
         return xy_pos
 
     def compute_reward(self, achieved_goal: FloatArray, desired_goal: FloatArray, info: Any) -> Any:
-        """1 at the goal, else 0."""
+        """Compute the sparse reward.
+
+        Args:
+            achieved_goal: positions (..., 2) of the ant.
+            desired_goal: positions (..., 2) of the goal.
+            info: not used.
+
+        Returns:
+            Rewards (...): 1 within `_GOAL_RADIUS` of the goal, otherwise 0.
+        """
         distance = np.linalg.norm(achieved_goal - desired_goal, axis=-1)
         return (distance <= _GOAL_RADIUS).astype(np.float64)
 
     def compute_terminated(
         self, achieved_goal: FloatArray, desired_goal: FloatArray, info: Any
     ) -> bool:
-        """Whether the goal is reached."""
+        """Return whether the ant at `achieved_goal` (2,) has reached `desired_goal` (2,)."""
         return bool(self.compute_reward(achieved_goal, desired_goal, info))
 
 
 def _d4rl_ant(folder: Path) -> str:
-    """Gymnasium's ant with D4RL's clock, motors and contacts; the bodies are the same."""
+    """Write Gymnasium's ant with D4RL's time step, motors and contacts to a file in `folder`.
+
+    The bodies are the same in both.
+
+    Returns:
+        Path of the file.
+    """
     tree = ET.parse(_ANT)
     changes = {
         "option": {"timestep": "0.02"},
         "default/geom": {"solimp": ".8 .8 .01"},
-        # D4RL has ±30 without a gear, and scales actions to it.
+        # In D4RL the motors take ±30 without a gear, and actions are scaled to that range.
         "actuator/motor": {"gear": "30"},
     }
     for path, values in changes.items():

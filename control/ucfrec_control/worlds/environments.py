@@ -1,4 +1,4 @@
-"""Vectorised environments for evaluation, of the version that the data was made in."""
+"""Vectorised environments for evaluation, and warnings where they differ from the data's."""
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -16,8 +16,7 @@ from ucfrec.errors import InputError
 from ucfrec_control.worlds.antmaze import GoalObservations, antmaze_settings, is_antmaze, is_rebuilt
 
 SIDE_BY_SIDE = 50
-"""Most episodes played at once; one forward pass serves them all."""
-
+"""Largest number of episodes played at once; the policy chooses all their actions together."""
 
 Wrap = Callable[[gymnasium.Env[Any, Any]], gymnasium.Wrapper[Any, Any, Any, Any]]
 
@@ -30,18 +29,22 @@ def make_env(
     settings: Mapping[str, Any] | None = None,
     wrappers: Sequence[Wrap] = (),
 ) -> VectorEnv[Any, Any, Any]:
-    """`count` environments in one process, with `AutoresetMode.SAME_STEP`.
+    """Make `count` copies of an environment that reset in the step that ends an episode.
 
-    They share one process because MuJoCo's steps cost less than communication between processes
-    (measured). AntMaze has D4RL's observation vectors and a return of 1 for success, else 0.
+    They share one process because measurements showed that a MuJoCo step costs less than
+    communication between processes. AntMaze gets D4RL's observation vectors, and its episodes
+    return 1 for success and 0 otherwise.
 
     Args:
         env_id: Gymnasium's identifier.
         count: number of environments.
-        appended: constants appended to every observation, for distractors.
-        dropped: dimensions of the resulting observation that are left out.
-        settings: arguments of the environment.
-        wrappers: wrappers around each environment.
+        appended: constants that stand in for distractors at the end of every observation.
+        dropped: indices that are left out of the observation, counted after `appended`.
+        settings: keyword arguments of the environment.
+        wrappers: wrappers around each environment, the innermost first.
+
+    Returns:
+        The vectorised environment, with `AutoresetMode.SAME_STEP`.
 
     Raises:
         InputError: the environment is not registered or cannot be made.
@@ -56,7 +59,7 @@ def make_env(
         wrappers.append(partial(WithoutDimensions, dropped=dropped))
     try:
         with warnings.catch_warnings():
-            # D4RL's data is of v4: the version is old on purpose.
+            # D4RL's data needs v4, so the old version is intended.
             warnings.filterwarnings("ignore", message=".*is out of date")
             return gymnasium.make_vec(
                 env_id,
@@ -86,7 +89,7 @@ class AppendedConstants(gymnasium.ObservationWrapper[Any, Any, Any]):
         self.observation_space = Box(low, high, dtype=np.float64)
 
     def observation(self, observation: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """(O,) to (O + constants,)."""
+        """Return the observation (O,) with the constants at its end, (O + number of constants,)."""
         return np.append(observation, self._constants)
 
 
@@ -103,16 +106,19 @@ class WithoutDimensions(gymnasium.ObservationWrapper[Any, Any, Any]):
         )
 
     def observation(self, observation: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """(O,) to (O − dropped,)."""
+        """Return the observation (O,) without the dropped dimensions, (O − number of dropped,)."""
         return observation[self._kept]
 
 
 def mismatches(dataset: Mapping[str, Any], env_id: str) -> list[str]:
-    """Warnings about differences between this environment and the one that the data was made in.
+    """Describe how the evaluation's environment differs from the one that the data was made in.
 
     Args:
-        dataset: `source` of a control store.
-        env_id: environment of the evaluation.
+        dataset: the entry `source` of a control store.
+        env_id: Gymnasium's identifier of the evaluation's environment.
+
+    Returns:
+        One warning for each difference.
     """
     warnings_ = []
     if dataset["env_id"] not in (None, env_id):

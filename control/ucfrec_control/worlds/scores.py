@@ -18,23 +18,35 @@ class Task:
 
     name: str
     pattern: str
-    """What the names of its environments and datasets match, lower case, `_` and `-` left out."""
+    """Text contained in the names of its environments and datasets, once these are in lower case
+    and without `-`, `_`, `/` and spaces."""
     sizes: tuple[int, int]
-    """S and A in D4RL."""
+    """Number of state dimensions and of action dimensions in D4RL's datasets, (S, A)."""
     low: float
-    """D4RL's reference return of a random policy: score 0."""
+    """Return of D4RL's random reference policy; its score is 0."""
     high: float
-    """D4RL's reference return of an expert: score 100."""
+    """Return of D4RL's expert reference policy; its score is 100."""
     d4rl_envs: Mapping[str, str]
-    """Environments that D4RL's own datasets were made in, in their oldest gymnasium version, by
-    what the dataset's name matches."""
+    """Gymnasium environments that stand for those of D4RL's own datasets, in the oldest version
+    available. A key is text that the dataset's name contains (`""` matches every name)."""
 
     def score(self, returns: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """Returns on the scale where a random policy has 0 and an expert 100."""
+        """Convert returns to D4RL's normalised scores.
+
+        Args:
+            returns: undiscounted returns of episodes, of any shape.
+
+        Returns:
+            Scores of the same shape: 0 for the random reference policy, 100 for the expert.
+        """
         return 100 * (np.asarray(returns, dtype=np.float64) - self.low) / (self.high - self.low)
 
     def d4rl_env(self, dataset: str) -> str | None:
-        """The environment of a dataset of D4RL; None where its name does not tell."""
+        """Find the environment of a D4RL dataset from the dataset's name.
+
+        Returns:
+            Gymnasium's identifier of the environment, or None if no key of `d4rl_envs` matches.
+        """
         plain = _plain(dataset)
         return next((env for name, env in self.d4rl_envs.items() if name in plain), None)
 
@@ -44,9 +56,9 @@ def _plain(name: str) -> str:
 
 
 D4RL_ANTMAZE = "d4rl/antmaze-{maze}-v2"
-"""`ucfrec_control.worlds.antmaze` registers it."""
+"""Identifier of a rebuilt AntMaze; `ucfrec_control.worlds.antmaze` registers it."""
 _MAZES = {
-    # The files themselves are named otherwise (`Ant_maze_big-maze_…`) than their datasets.
+    # D4RL's files are named differently (`Ant_maze_big-maze_…`) from the datasets they hold.
     **{"umaze": "umaze", "medium": "medium", "bigmaze": "medium"},
     **{"large": "large", "hardestmaze": "large"},
 }
@@ -62,7 +74,14 @@ TASKS = (
 
 
 def find_task(*names: str | None) -> Task | None:
-    """The task that the first telling one of `names` (of environments, files, datasets) is of."""
+    """Find the task that a name belongs to.
+
+    Args:
+        names: names of environments, files or datasets, tried in this order; None is skipped.
+
+    Returns:
+        The task of the first name that matches one, or None if no name does.
+    """
     for name in names:
         for task in TASKS:
             if task.pattern in _plain(name or ""):
@@ -71,10 +90,16 @@ def find_task(*names: str | None) -> Task | None:
 
 
 def require_task(*names: str | None) -> Task:
-    """The same.
+    """Find the task that a name belongs to, as `find_task` does, or fail.
+
+    Args:
+        names: names of environments, files or datasets, tried in this order; None is skipped.
+
+    Returns:
+        The task of the first name that matches one.
 
     Raises:
-        InputError: no name tells.
+        InputError: no name matches a task.
     """
     task = find_task(*names)
     if task is None:
@@ -86,24 +111,43 @@ def require_task(*names: str | None) -> Task:
     return task
 
 
-# Most specific first: "medium" is part of the others, and a size of AntMaze's mazes.
+# The first match counts. "medium" comes after the longer names that contain it, and after
+# "diverse" because it is also the size of an AntMaze.
 _KINDS = ("diverse", "medium-replay", "medium-expert", "medium", "mixed", "expert", "random")
 
 
 def find_kind(name: str) -> str:
-    """How a dataset was collected (`medium`, `mixed`, …), told from its name; "" if it is not."""
+    """Tell from a dataset's name how the data was collected.
+
+    Returns:
+        The kind, such as `medium` or `mixed`, or "" if the name contains none.
+    """
     plain = name.lower().replace("_", "-")
     return next((kind for kind in _KINDS if kind in plain), "")
 
 
 def dataset_name(source: Path | str) -> str:
-    """Short name of a dataset from its file or identifier, as in `hopper_medium-zoo`."""
+    """Shorten the file path or identifier of a dataset to a name such as `hopper_medium-zoo`.
+
+    Returns:
+        The file's name without folder and ending for an HDF5 file; otherwise the identifier without
+        trailing slashes.
+    """
     text = str(source)
     return Path(text).stem if text.endswith((".hdf5", ".h5")) else text.rstrip("/")
 
 
 def check_sizes(task: Task | None, sizes: Sequence[Any], where: str) -> None:
-    """Raise InputError unless states and actions are of D4RL's sizes for `task`."""
+    """Check that states and actions have the sizes that D4RL has for a task.
+
+    Args:
+        task: the task; None skips the check.
+        sizes: number of state dimensions and of action dimensions, (S, A).
+        where: source of the data, which the error message starts with.
+
+    Raises:
+        InputError: the sizes differ from those of `task`.
+    """
     if task is not None and tuple(sizes) != task.sizes:
         raise InputError(
             f"{where}: observations and actions have sizes {tuple(sizes)}, those of {task.name} "

@@ -1,4 +1,4 @@
-"""Read all variants of D4RL's HDF5 layout, and write one of them.
+"""D4RL's HDF5 layout: read in all its variants, written in one.
 
 Source: https://github.com/Farama-Foundation/D4RL, `offline_env.py`; the files of this project's
 data folder have the same layout.
@@ -24,22 +24,17 @@ _FINAL = "infos/final_observations"
 def read_d4rl(path: Path, env_id: str | None = None) -> Trajectories:
     """Read a D4RL HDF5 file.
 
-    A trajectory ends where `terminals` or `timeouts` is set. Steps after the last end belong to an
-    unfinished trajectory and are dropped. In AntMaze, one-step trajectories, in which the ant is
-    still standing on the goal, are dropped too. In a file without `timeouts`, a trajectory also
-    ends where a row of `next_observations` differs from the next row of `observations`.
+    A trajectory ends at `terminals` or `timeouts`. Steps after the last end are an unfinished
+    trajectory and are dropped; in AntMaze, so are trajectories of one step, which are the ant still
+    standing on the goal. A file without `timeouts` tells where trajectories end by
+    `next_observations` that the next row does not begin with.
 
     Args:
-        path: HDF5 file.
-        env_id: environment that the data comes from; None for the one recorded in the file, or
-            else D4RL's environment for the task in the file's name.
-
-    Returns:
-        The complete trajectories, with floating-point values as float32.
+        env_id: environment that the data is of; None for the one that the file names, or D4RL's
+            environment for the task in the file's name.
 
     Raises:
-        InputError: the file is missing, damaged, not in this layout, or does not match the task's
-            observation and action sizes.
+        InputError: the file is missing, damaged or not of this layout.
     """
     with _opened(path) as file:
         missing = [name for name in _REQUIRED if name not in file]
@@ -54,22 +49,22 @@ def read_d4rl(path: Path, env_id: str | None = None) -> Trajectories:
                 steps[name] = _read(file, path, name)
         attributes = {name: str(value) for name, value in file.attrs.items()}
     _require_aligned(steps, path)
-    known_env_id = env_id or attributes.get("env_id")
-    task = find_task(known_env_id, dataset_name(path))
+    named = env_id or attributes.get("env_id")
+    task = find_task(named, dataset_name(path))
     check_sizes(None if env_id else task, _sizes(steps), str(path))
     terminals = _flags(steps["terminals"], "terminals", path)
     ends = np.flatnonzero(terminals | _timeouts(steps, path))
     finals = _final_observations(steps, ends, path)
     lengths = np.diff(ends, prepend=-1)
-    min_length = 2 if task is not None and task.name == "antmaze" else 1
-    keep = lengths >= min_length
+    shortest = 2 if task is not None and task.name == "antmaze" else 1
+    keep = lengths >= shortest
     n = int(ends[-1]) + 1 if len(ends) else 0
     rows = np.repeat(keep, lengths)
     source = {
         "where": str(path),
         "format": "d4rl",
         "dataset": dataset_name(path),
-        "env_id": known_env_id or (task.d4rl_env(dataset_name(path)) if task else None),
+        "env_id": named or (task.d4rl_env(dataset_name(path)) if task else None),
         "versions": _made_with(path),
         "dropped": {
             "unfinished_steps": len(terminals) - n,
@@ -92,12 +87,10 @@ def write_d4rl(
 ) -> None:
     """Write a D4RL HDF5 file, atomically.
 
-    The file contains `next_observations` only if the final observations are known.
+    `next_observations` are written if the final observations are known.
 
     Args:
-        trajectories: trajectories to write.
-        path: HDF5 file to write.
-        metadata: additional entries, written as D4RL's `metadata/NAME`.
+        metadata: further entries, written as D4RL's `metadata/NAME`.
     """
     ends = np.cumsum(trajectories.lengths) - 1
     timeouts = np.zeros(len(trajectories.rewards), dtype=bool)
@@ -141,10 +134,7 @@ def _opened(path: Path) -> Any:
 
 
 def _read(file: Any, path: Path, name: str) -> npt.NDArray[Any]:
-    """Read an HDF5 dataset into memory, casting floats to float32.
-
-    D4RL's medium-replay files store float64.
-    """
+    """A dataset in memory; numbers as float32, D4RL's medium-replay files have float64."""
     try:
         values = np.asarray(file[name])
     except (OSError, ValueError, TypeError, RuntimeError) as error:
@@ -167,11 +157,9 @@ def _sizes(steps: Mapping[str, npt.NDArray[Any]]) -> tuple[int, ...]:
 def _require_aligned(steps: Mapping[str, npt.NDArray[Any]], path: Path) -> None:
     n = len(steps["rewards"]) if steps["rewards"].ndim else 0
     for name, values in steps.items():
-        is_matrix = name not in ("rewards", "terminals", "timeouts")
-        if values.ndim != 1 + is_matrix:
-            raise InputError(
-                f"{path}: {name} have shape {values.shape}, not {1 + is_matrix} dimensions"
-            )
+        two = name not in ("rewards", "terminals", "timeouts")
+        if values.ndim != 1 + two:
+            raise InputError(f"{path}: {name} have shape {values.shape}, not {1 + two} dimensions")
         if name != _FINAL and len(values) != n:
             raise InputError(f"{path}: {name} have {len(values)} rows, rewards have {n}")
         if name.endswith("observations") and values.shape[1:] != steps["observations"].shape[1:]:
@@ -182,10 +170,10 @@ def _require_aligned(steps: Mapping[str, npt.NDArray[Any]], path: Path) -> None:
 
 
 def _flags(values: npt.NDArray[Any], name: str, path: Path) -> BoolArray:
-    """Convert flags to bool; some AntMaze files store them as floats."""
-    invalid = int(np.count_nonzero((values != 0) & (values != 1)))
-    if invalid:
-        raise InputError(f"{path}: {invalid} of its {name} are neither 0 nor 1")
+    """Bools; some AntMaze files store them as floats."""
+    strange = int(np.count_nonzero((values != 0) & (values != 1)))
+    if strange:
+        raise InputError(f"{path}: {strange} of its {name} are neither 0 nor 1")
     return values.astype(bool)
 
 
@@ -197,8 +185,8 @@ def _timeouts(steps: Mapping[str, npt.NDArray[Any]], path: Path) -> BoolArray:
             f"{path} has neither timeouts nor next_observations, so nothing tells where its "
             "trajectories end; use a later release of the dataset"
         )
-    continues = (steps["next_observations"][:-1] == steps["observations"][1:]).all(axis=1)
-    return np.append(~continues, False)
+    goes_on = (steps["next_observations"][:-1] == steps["observations"][1:]).all(axis=1)
+    return np.append(~goes_on, False)
 
 
 def _final_observations(
@@ -216,10 +204,10 @@ def _final_observations(
 
 
 def _made_with(path: Path) -> dict[str, str]:
-    """Package versions from the MANIFEST.json that lists the file; empty if there is none."""
+    """Versions that the MANIFEST.json beside the file states; empty without one."""
     manifest = path.parent / "MANIFEST.json"
     if not manifest.is_file():
         return {}
-    content = read_json(manifest)
-    files = [entry.get("file") for entry in content.get("files", [])]
-    return dict(content.get("versions", {})) if path.name in files else {}
+    stated = read_json(manifest)
+    files = [entry.get("file") for entry in stated.get("files", [])]
+    return dict(stated.get("versions", {})) if path.name in files else {}

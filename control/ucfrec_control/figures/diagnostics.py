@@ -1,4 +1,4 @@
-"""Edits and attention of a finished run, computed from its folder without training a network."""
+"""Edits and attention of a finished run, read from its folder without any training."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -35,20 +35,14 @@ _PROPOSALS = 4096
 _WINDOWS = 512
 _POINTS = 3000
 _ROUNDING = 1e-5
-"""Tolerance for float32 rounding when the length of a move is compared with a bound."""
+"""Of a move's length in float32: what the generator scales to a bound is within it."""
 
 
 def store_of(run: Path) -> EpisodeStore:
-    """Open the store that a run was trained on, without the dropped dimensions.
-
-    Args:
-        run: the run folder.
-
-    Returns:
-        The store.
+    """The store that a run was trained on, without dropped dimensions.
 
     Raises:
-        InputError: `run` is not a run folder, or the store was moved, removed or changed.
+        InputError: the store was moved, removed or changed.
     """
     record = read_json(run / RUN)
     store = EpisodeStore.open(record["store"])
@@ -58,30 +52,16 @@ def store_of(run: Path) -> EpisodeStore:
 
 
 def has_copies(run: Path) -> bool:
-    """Whether counterfactual copies were made for a run.
-
-    Args:
-        run: the run folder.
-
-    Returns:
-        True if the folder has an augmentation report.
-    """
+    """Whether counterfactual copies were made for a run."""
     return (run / _REPORT).exists()
 
 
 def edited_states(run: Path, seed: int = 0) -> tuple[FloatArray, FloatArray]:
-    """Draw up to 3,000 edits from the counterfactual copies of a run.
-
-    Args:
-        run: the run folder.
-        seed: seed of the draw.
-
-    Returns:
-        The factual states and the edited states, (M, S) each, row by row the same steps. Values are
-        in standard deviations from the training mean; S excludes constant dimensions.
+    """Factual states and their edits, (M, S) each, aligned and in standard deviations from the
+    training mean; at most 3,000 drawn from a run's counterfactual copies.
 
     Raises:
-        InputError: the run made no copies, or its store is missing or changed.
+        InputError: the run made no copies, or its store is gone.
     """
     _augmentation(run)
     store, overlay = store_of(run), Overlay.load(run / "overlay.safetensors")
@@ -101,7 +81,7 @@ def edited_states(run: Path, seed: int = 0) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True)
 class Editing:
-    """The models that made the edits of a run, and steps drawn from its training episodes."""
+    """The models that made a run's edits, and steps drawn from its training episodes."""
 
     crm: CausalRewardModel
     generator: TangentGenerator | CounterfactualStateGenerator
@@ -111,17 +91,10 @@ class Editing:
 
     @classmethod
     def of(cls, run: Path, seed: int = 0) -> "Editing":
-        """Load the models of a run, and draw up to 4,096 of the steps that it could have edited.
-
-        Args:
-            run: the run folder.
-            seed: seed of the draw.
-
-        Returns:
-            The models and the steps.
+        """Read back the models of `run`, and draw 4,096 of the steps that it could have edited.
 
         Raises:
-            InputError: the run made no copies, or its models or its store are missing or changed.
+            InputError: the run made no copies, or its models or its store are gone.
         """
         record = read_json(run / RUN)
         report, config = _augmentation(run), config_from_dict(record["config"])
@@ -140,17 +113,11 @@ class Editing:
         return cls(crm, _generator(run, fitted, crm, config), factual, report["epsilon_r"])
 
     def acceptance(self, band: tuple[float, float], seed: int = 0) -> float:
-        """Share of proposals that pass both gates of Eq. 4 and whose move is at least ρ_low long.
+        """Share of proposals under `band` (ρ_low, ρ_high) that pass both gates of Eq. 4 and move
+        by ρ_low or more.
 
-        The tangent generator proposes moves within `band`; the proposals of the faithful network do
-        not depend on it.
-
-        Args:
-            band: (ρ_low, ρ_high) in standard deviations.
-            seed: seed of the proposals.
-
-        Returns:
-            The share, from 0 to 1.
+        The tangent generator proposes moves of this band; the faithful network proposes what it
+        learned to, whatever the band.
         """
         generator = self.generator
         if isinstance(generator, TangentGenerator):
@@ -167,18 +134,10 @@ class Editing:
 
 
 def acceptance_grid(run: Path, lows: Sequence[float], highs: Sequence[float]) -> FloatArray:
-    """Compute the share of accepted proposals for each band.
-
-    Args:
-        run: the run folder.
-        lows: (L,) values of ρ_low, in standard deviations.
-        highs: (H,) values of ρ_high, in standard deviations.
-
-    Returns:
-        (L, H) shares from 0 to 1; NaN where ρ_low is not below ρ_high.
+    """(lows, highs) acceptance under every band; NaN where ρ_low is not below ρ_high.
 
     Raises:
-        InputError: the run made no copies, or its models or its store are missing or changed.
+        InputError: as `Editing.of`.
     """
     editing = Editing.of(run)
     return np.array(
@@ -187,14 +146,7 @@ def acceptance_grid(run: Path, lows: Sequence[float], highs: Sequence[float]) ->
 
 
 def move_histogram(run: Path) -> tuple[list[float], list[int], tuple[float, float]]:
-    """Read the histogram of the move lengths ‖Δ‖₂ of the accepted edits of a run.
-
-    Args:
-        run: the run folder.
-
-    Returns:
-        The B + 1 edges of the bins, in standard deviations; the B counts; and the band
-        (ρ_low, ρ_high) of the run, in standard deviations.
+    """Edges, counts and the band (ρ_low, ρ_high) of a run's accepted edits, by ‖Δ‖₂.
 
     Raises:
         InputError: the run made no copies.
@@ -205,21 +157,12 @@ def move_histogram(run: Path) -> tuple[list[float], list[int], tuple[float, floa
 
 
 def attention(run: Path, seed: int = 0) -> FloatArray:
-    """Compute the mean attention of a UCF policy from each state token to all tokens of a window.
+    """(K, 3, K) attention of a UCF run from s_t to R, s and a of every step.
 
-    The mean is over heads and over up to 512 full windows of validation episodes.
-
-    Args:
-        run: the run folder.
-        seed: seed with which the windows are drawn.
-
-    Returns:
-        (K, 3, K) probabilities: querying step; returns-to-go, states or actions; step attended to.
-        They sum to one for each querying step.
+    The mean over heads and over full windows of validation episodes; a row sums to one.
 
     Raises:
-        InputError: the policy is not UCF or has no checkpoint, no validation episode fills a
-            window, or the store is missing or changed.
+        InputError: the learner is not UCF, no episode fills a window, or the store is gone.
     """
     trained = TrainedPolicy.load(run)
     if not isinstance(trained.policy, UCFPolicy):
@@ -241,8 +184,8 @@ def attention(run: Path, seed: int = 0) -> FloatArray:
 def _augmentation(run: Path) -> Mapping[str, Any]:
     if not has_copies(run):
         raise InputError(f"{run} has no edited copies; train it with augment.copies of 1 or more")
-    report: Mapping[str, Any] = read_json(run / _REPORT)
-    return report
+    found: Mapping[str, Any] = read_json(run / _REPORT)
+    return found
 
 
 def _generator(
@@ -253,10 +196,10 @@ def _generator(
         weights = run / "csg" / "best.safetensors"
         load_weights(weights, network, load_tensors(weights)[0])
         return network.eval()
-    # The tangent generator only estimates covariances, which are equal for equal seeds.
-    generator = make_generator(fitted, crm, config.csg, run / "csg", config.seed)
-    assert isinstance(generator, TangentGenerator)
-    return generator
+    # Nothing of the tangent generator is learned but covariances, the same for the same seed.
+    made = make_generator(fitted, crm, config.csg, run / "csg", config.seed)
+    assert isinstance(made, TangentGenerator)
+    return made
 
 
 def _at(steps: Transitions, rows: torch.Tensor) -> Transitions:

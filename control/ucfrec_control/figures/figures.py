@@ -1,4 +1,4 @@
-"""`ucfrec-control figures`: draw every figure for which the runs and result rows have data."""
+"""`ucfrec-control figures`: every figure that stored runs and result rows have the data for."""
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -25,7 +25,7 @@ from ucfrec_control.learners.evaluate import method_of
 
 LOWS = (0.0, 0.1, 0.2, 0.3, 0.4)
 HIGHS = (0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
-"""Values of ρ_low and ρ_high in the acceptance heatmap, in standard deviations."""
+"""ρ_low and ρ_high of the acceptance heatmap."""
 
 _COPIES = "a run with edited copies among --runs (`ucfrec-control train --policy ucf`)"
 NEEDS = {
@@ -41,33 +41,31 @@ NEEDS = {
     "robustness-drops": "such rows with and without a distractor",
     "robustness-losses": "such rows with a distractor",
 }
-"""The input that each kind of figure needs, as shown to the user when it is missing."""
+"""What every kind of figure is made of."""
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """A figure to draw; its data appears to be available but has not been read completely."""
+    """A figure that there seems to be data for."""
 
     kind: str
     about: str
     draw: Callable[[], Figure]
-    """Draws the figure. Raises InputError if part of the data turns out to be missing."""
+    """Raises InputError where some of the data is missing after all."""
 
 
 @dataclass(frozen=True)
 class _Run:
-    """A run folder, and the names under which its figures and curves appear."""
-
     path: Path
     name: str
-    """The path relative to the given folder, with its parts joined by hyphens."""
+    """Its path below the folder that was given, the parts joined."""
     group: str
-    """The joined relative path of the parent folder; the dataset for a run given directly."""
+    """The same of the folder it lies in; of runs given by themselves, the dataset."""
     method: str
-    """Runs with the same group and method differ only in their seed (see `_distinguished`)."""
+    """Runs of one group that have it in common differ in their seed only."""
     policy: str
     settings: str
-    """Hash of the data fingerprint and of all training settings except the seed."""
+    """Hash of the data and of all settings of a training but the seed."""
     about: str
 
     @property
@@ -78,25 +76,23 @@ class _Run:
 def make_figures(
     runs: Sequence[Path], results: Sequence[Path], out: Path
 ) -> tuple[list[Path], list[str]]:
-    """Draw all figures for which there is data, and save each as PNG and SVG.
+    """Draw all figures into `out`, as PNG and SVG.
 
-    Among runs that differ only in their seed, the figures of edits and attention use the first.
+    Where runs differ in their seed only, edits and attention are drawn of the first.
 
     Args:
-        runs: run folders of `ucfrec-control`, or folders that contain run folders at any depth.
-        results: JSON Lines files written by `benchmark` and `robustness`, and JSON files written
-            by `evaluate`.
-        out: folder to which the figures are written.
+        runs: run folders of `ucfrec-control`, or folders that hold some at any depth.
+        results: JSON lines of `benchmark` and `robustness`, and JSON of `evaluate`.
 
     Returns:
-        The paths of the files written, and one message for each figure whose data is missing.
+        The files written, and a line for each figure that lacks its data.
 
     Raises:
-        InputError: a file in `results` is missing or has other content.
+        InputError: a file of `results` holds something else.
     """
-    all_runs = _distinguished([run for folder in runs for run in _runs(folder)])
+    found = _distinguished([run for folder in runs for run in _runs(folder)])
     rows = [row for path in results for row in read_scores(path)]
-    plans = [*_of_runs(all_runs), *_of_rows(rows)]
+    plans = [*_of_runs(found), *_of_rows(rows)]
     made: list[Path] = []
     missing = [f"{k}: needs {w}" for k, w in NEEDS.items() if k not in {p.kind for p in plans}]
     for plan in plans:
@@ -109,7 +105,6 @@ def make_figures(
 
 
 def _runs(folder: Path) -> Iterator[_Run]:
-    """Find the runs of `ucfrec-control` in `folder`, at any depth."""
     for file in sorted(folder.rglob(RUN)):
         record, path = read_json(file), file.parent
         if "dataset" not in record:
@@ -128,10 +123,7 @@ def _runs(folder: Path) -> Iterator[_Run]:
 
 
 def _distinguished(runs: Sequence[_Run]) -> list[_Run]:
-    """Rename the method of runs that share a group and a method but differ in their settings.
-
-    Such a run takes the name of its folder, without the trailing seed and settings hash.
-    """
+    """The runs, of which those with other settings go by their folder's name, less the seed."""
     settings: dict[tuple[str, str], set[str]] = {}
     for run in runs:
         settings.setdefault((run.group, run.method), set()).add(run.settings)
@@ -144,7 +136,6 @@ def _distinguished(runs: Sequence[_Run]) -> list[_Run]:
 
 
 def _of_runs(runs: Sequence[_Run]) -> Iterator[_Plan]:
-    """Plan the figures of edits and attention per method, and of training per group."""
     for run in _first(runs, lambda run: (run.group, run.method)):
         if diagnostics.has_copies(run.path):
             yield _Plan("moves", run.name, partial(_moves, run))
@@ -153,12 +144,11 @@ def _of_runs(runs: Sequence[_Run]) -> Iterator[_Plan]:
         if run.policy == "ucf":
             yield _Plan("attention", run.name, partial(_attention, run))
     for run in _first(runs, lambda run: run.group):
-        members = [other for other in runs if other.group == run.group]
-        yield _Plan("training", run.group, partial(_training, members))
+        same = [other for other in runs if other.group == run.group]
+        yield _Plan("training", run.group, partial(_training, same))
 
 
 def _first(runs: Iterable[_Run], key: Callable[[_Run], Any]) -> Iterable[_Run]:
-    """Return the first run for each value of `key`."""
     first: dict[Any, _Run] = {}
     for run in runs:
         first.setdefault(key(run), run)
@@ -195,49 +185,47 @@ def _training(runs: Sequence[_Run]) -> Figure:
 
 
 def _of_rows(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
-    """Plan the figures of result rows: robustness, target returns and the mask-loss weight."""
     yield from _of_robustness([row for row in rows if row.suite == ROBUSTNESS])
     yield from _of_targets([row for row in rows if _has_target(row)])
     swept = [row.as_line() for row in rows if _of_lambda(row)]
-    for budget, lines in grouped(swept, lambda line: line.get("budget", "rows")).items():
-        if len({line["lambda_mask"] for line in lines}) > 1:
-            yield _Plan("lambda", budget, partial(plots.lambda_curves, lines))
+    for budget, own in grouped(swept, lambda line: line.get("budget", "rows")).items():
+        if len({line["lambda_mask"] for line in own}) > 1:
+            yield _Plan("lambda", budget, partial(plots.lambda_curves, own))
 
 
 def _of_robustness(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
-    """Plan the robustness figures, one set for each budget and dataset."""
     groups = grouped(rows, lambda row: (row.conditions["budget"], row.task))
-    for (budget, task), group in groups.items():
-        suffix, bars = f"{budget}-{task}", plots.robustness_bars
-        lines = [row.as_line() for row in group]
+    for (budget, task), own in groups.items():
+        about, bars = f"{budget}-{task}", plots.robustness_bars
+        lines = [row.as_line() for row in own]
         score = partial(bars, lines, "score", "normalised score", task)
-        yield _Plan("robustness-scores", suffix, score)
-        if lost := drops(group):
+        yield _Plan("robustness-scores", about, score)
+        if lost := drops(own):
             drop = partial(bars, lost, "drop", "loss (% of the clean score)", task)
-            yield _Plan("robustness-drops", suffix, drop)
-        if rises := loss_rises(group):
+            yield _Plan("robustness-drops", about, drop)
+        if rises := loss_rises(own):
             rise = partial(bars, rises, "rise", "rise of the action loss (%)", task)
-            yield _Plan("robustness-losses", suffix, rise)
+            yield _Plan("robustness-losses", about, rise)
 
 
 def _of_targets(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
-    """Plan the figures of methods that were evaluated with more than one target return."""
+    """Of the methods that were given more than one target return."""
     methods = grouped(rows, lambda row: (row.task, row.method))
-    several = {m for m, group in methods.items() if len({row.target_return for row in group}) > 1}
+    several = {m for m, own in methods.items() if len({row.target_return for row in own}) > 1}
     kept = [row for row in rows if (row.task, row.method) in several]
-    for task, group in grouped(kept, lambda row: row.task).items():
-        lines = [row.as_line() for row in group]
+    for task, own in grouped(kept, lambda row: row.task).items():
+        lines = [row.as_line() for row in own]
         yield _Plan("returns", task, partial(plots.return_curves, lines, task))
 
 
 def _has_target(row: ResultRow) -> bool:
-    """Whether `row` is a last-checkpoint evaluation with a target return and no distractor."""
+    """Whether `row` is of no table, and of a policy with a target return."""
     whole = row.suite == EVALUATE and row.checkpoint == "last"
     return whole and not row.details.get("distractors") and row.target_return is not None
 
 
 def _of_lambda(row: ResultRow) -> bool:
-    """Whether `row` is of UCF, at any λ, with no other part left out and no distractor."""
+    """Whether `row` is UCF's, complete but for its λ."""
     whole = row.method == "ucf" or row.method.startswith("ucf-lambda")
     of_table = row.table in ("lambda", EVALUATE) and row.checkpoint == "last"
     clean = not row.details.get("distractors")

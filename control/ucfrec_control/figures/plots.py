@@ -1,4 +1,4 @@
-"""Draw rows and arrays: every public function returns one matplotlib Figure."""
+"""Rows and arrays to figures: every function returns one matplotlib Figure."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -23,17 +23,7 @@ Row = Mapping[str, Any]
 def move_histogram(
     edges: Sequence[float], counts: Sequence[int], band: tuple[float, float], title: str = ""
 ) -> Figure:
-    """Histogram of the move lengths of accepted edits, with the band (Figures 5 and 6, left).
-
-    Args:
-        edges: (B + 1,) edges of the bins, in standard deviations.
-        counts: (B,) number of accepted edits in each bin.
-        band: (ρ_low, ρ_high) in standard deviations.
-        title: title of the figure.
-
-    Returns:
-        The figure.
-    """
+    """Accepted edits by the length of their move, with the band (Figures 5 and 6, left)."""
     figure, axes = _figure(COLUMN, 2.1, title)
     shares = 100 * np.asarray(counts) / max(1, sum(counts))
     axes.bar(edges[:-1], shares, np.diff(edges), align="edge", color=FACTUAL, edgecolor="white")
@@ -58,17 +48,10 @@ def acceptance_heatmap(
     band: tuple[float, float],
     title: str = "",
 ) -> Figure:
-    """Share of accepted proposals for each band; the band of the run is outlined (Figures 5, 6).
+    """Share of accepted proposals under every band; the run's own is outlined (Figures 5 and 6).
 
     Args:
-        lows: (L,) values of ρ_low, in standard deviations.
-        highs: (H,) values of ρ_high, in standard deviations.
-        acceptance: (L, H) shares from 0 to 1; NaN where ρ_low is not below ρ_high.
-        band: (ρ_low, ρ_high) of the run, in standard deviations.
-        title: title of the figure.
-
-    Returns:
-        The figure.
+        acceptance: (lows, highs) from 0 to 1, NaN where there is no such band.
     """
     figure, axes = _figure(COLUMN, 2.6, title)
     image = axes.imshow(100 * acceptance, vmin=0, vmax=100, origin="lower", aspect="auto")
@@ -96,17 +79,11 @@ def acceptance_heatmap(
 
 @styled
 def state_overlay(factual: FloatArray, edited: FloatArray, title: str = "") -> Figure:
-    """Scatter plot of factual and edited states (Figures 5 and 6).
-
-    The axes are the first two principal components of the factual states.
+    """Factual and edited states in the factual ones' first two principal components (Figures 5, 6).
 
     Args:
-        factual: (M, S) logged states, in standard deviations.
-        edited: (M, S) the same states after their edits, in standard deviations.
-        title: title of the figure.
-
-    Returns:
-        The figure.
+        factual: (M, S) in standard deviations.
+        edited: the same states after their edits.
     """
     figure, axes = _figure(COLUMN, 2.9, title)
     centre = factual.mean(axis=0)
@@ -116,7 +93,7 @@ def state_overlay(factual: FloatArray, edited: FloatArray, title: str = "") -> F
         (factual, "logged", FACTUAL, "o"),
         (edited, "edited", EDITED, "x"),
     ):
-        # Points are rasterised in the SVG too: thousands of vector markers are slow to open.
+        # Drawn as pixels in the SVG too: thousands of points make it slow to open.
         x, y = ((states - centre) @ directions[:2].T).T
         width = 0.5 if marker == "x" else 0
         axes.scatter(
@@ -134,29 +111,23 @@ def state_overlay(factual: FloatArray, edited: FloatArray, title: str = "") -> F
 
 @styled
 def lambda_curves(rows: Sequence[Row], title: str = "") -> Figure:
-    """Normalised score against λ, with one line per dataset (Figure 2).
-
-    A line is the mean over seeds, and its band is ± one standard deviation.
+    """Normalised score over λ, a line a dataset, mean ± standard deviation over seeds (Figure 2).
 
     Args:
-        rows: lines (`ResultRow.as_line`) with `task`, `lambda_mask`, `training_seed` and `score`.
-        title: title of the figure.
-
-    Returns:
-        The figure.
+        rows: lines (`ResultRow.as_line`) that differ in `task`, `lambda_mask` and `training_seed`.
     """
     figure, axes = _figure(COLUMN, 2.5, title)
-    weights = sorted({row["lambda_mask"] for row in rows})
+    places = sorted({row["lambda_mask"] for row in rows})
     scores = _by_seed(rows, ("task", "lambda_mask"), "score")
     datasets = sorted({row["task"] for row in rows})
     for dataset, color in colors(datasets).items():
-        positions = [i for i, value in enumerate(weights) if (dataset, value) in scores]
-        summaries = [summary(scores[dataset, weights[i]]) for i in positions]
+        at = [i for i, value in enumerate(places) if (dataset, value) in scores]
+        found = [summary(scores[dataset, places[i]]) for i in at]
         mean, sd = (np.array([getattr(each, name) for each in found]) for name in ("mean", "sd"))
-        axes.plot(positions, mean, "o-", color=color, label=dataset)
-        axes.fill_between(positions, mean - sd, mean + sd, color=color, alpha=0.2, linewidth=0)
-    # Weights are evenly spaced, because a logarithmic axis cannot show 0.
-    axes.set_xticks(range(len(weights)), [f"{value:g}" for value in weights])
+        axes.plot(at, mean, "o-", color=color, label=dataset)
+        axes.fill_between(at, mean - sd, mean + sd, color=color, alpha=0.2, linewidth=0)
+    # Places stand apart evenly: 0 has no place on a logarithmic axis.
+    axes.set_xticks(range(len(places)), [f"{value:g}" for value in places])
     axes.set_xlabel(r"weight of the mask loss $\lambda$")
     axes.set_ylabel("normalised score")
     axes.grid(True, axis="y")
@@ -166,33 +137,21 @@ def lambda_curves(rows: Sequence[Row], title: str = "") -> Figure:
 
 @styled
 def return_curves(rows: Sequence[Row], title: str = "") -> Figure:
-    """Return earned against target return, with one line per method.
-
-    A line is the mean over seeds, and its band runs from the lowest to the highest seed. On the
-    dashed diagonal, the return earned equals the target.
+    """Return earned over target return, a line a method: mean over seeds, lowest to highest around
+    it. On the dashed line, the target is earned.
 
     Args:
-        rows: lines (`ResultRow.as_line`) with `method`, `target_return`, `training_seed` and
-            `return`.
-        title: title of the figure.
-
-    Returns:
-        The figure.
+        rows: lines (`ResultRow.as_line`) that differ in `method`, `target_return` and seed.
     """
     figure, axes = _figure(COLUMN, 2.5, title)
     earned = _by_seed(rows, ("method", "target_return"), "return")
     for method, color in colors(sorted({row["method"] for row in rows})).items():
-        method_targets = sorted(target for other, target in earned if other == method)
-        returns = [earned[method, target] for target in method_targets]
-        means = [summary(values).mean for values in returns]
-        axes.plot(method_targets, means, "o-", color=color, label=label(method))
+        at = sorted(target for other, target in earned if other == method)
+        found = [earned[method, target] for target in at]
+        means = [summary(values).mean for values in found]
+        axes.plot(at, means, "o-", color=color, label=label(method))
         axes.fill_between(
-            method_targets,
-            list(map(min, returns)),
-            list(map(max, returns)),
-            color=color,
-            alpha=0.2,
-            lw=0,
+            at, list(map(min, found)), list(map(max, found)), color=color, alpha=0.2, lw=0
         )
     targets, top = [row["target_return"] for row in rows], axes.get_ylim()[1]
     axes.plot([0, max(targets)], [0, max(targets)], "--", color="black", linewidth=0.9)
@@ -207,31 +166,24 @@ def return_curves(rows: Sequence[Row], title: str = "") -> Figure:
 
 @styled
 def robustness_bars(rows: Sequence[Row], value: str, ylabel: str, title: str = "") -> Figure:
-    """Bar chart of one dataset: a group per method, a bar per distractor (Figures 3 and 4).
+    """Bars of one dataset: methods side by side, a bar a distractor (Figures 3 and 4).
 
-    A bar is the mean over seeds, and its error bar is ± one standard deviation.
+    A bar is the mean over seeds, its line the standard deviation over them.
 
     Args:
-        rows: with `method`, `distractor`, `training_seed` and the key named by `value`; methods and
-            distractors are drawn in order of appearance.
-        value: the key of the quantity to draw.
-        ylabel: label of the vertical axis, with the unit.
-        title: title of the figure.
-
-    Returns:
-        The figure.
+        rows: with `method`, `distractor`, `training_seed` and `value`, in the order to be drawn.
     """
     figure, axes = _figure(PAGE, 2.4, title)
-    samples = _by_seed(rows, ("method", "distractor"), value)
+    found = _by_seed(rows, ("method", "distractor"), value)
     methods = list(dict.fromkeys(row["method"] for row in rows))
     kinds = list(dict.fromkeys(row["distractor"] for row in rows))
     width = 0.84 / len(kinds)
     for number, (kind, color) in enumerate(colors(kinds).items()):
-        positions = [i for i, method in enumerate(methods) if (method, kind) in samples]
-        values = [summary(samples[methods[i], kind]) for i in positions]
+        at = [i for i, method in enumerate(methods) if (method, kind) in found]
+        values = [summary(found[methods[i], kind]) for i in at]
         spread, left = [v.sd for v in values], (number - (len(kinds) - 1) / 2) * width
         axes.bar(
-            np.array(positions) + left, [v.mean for v in values], 0.92 * width, yerr=spread,
+            np.array(at) + left, [v.mean for v in values], 0.92 * width, yerr=spread,
             color=color, label=label(kind), error_kw={"elinewidth": 0.9, "capsize": 1.5},
         )  # fmt: skip
     axes.axhline(0, color="black", linewidth=0.8)
@@ -247,18 +199,11 @@ def robustness_bars(rows: Sequence[Row], value: str, ylabel: str, title: str = "
 def training_curves(
     curves: Mapping[str, Sequence[Mapping[int, float]]], ylabel: str, title: str = ""
 ) -> Figure:
-    """A logged value against training steps, with one line per method.
-
-    A line is the mean over seeds, and its band runs from the lowest to the highest seed.
+    """A value over training steps, a line a method: mean over seeds, lowest to highest around it.
 
     Args:
-        curves: for each method, one {step: value} mapping per seed; only steps that all seeds of
-            the method have are drawn.
-        ylabel: label of the vertical axis.
-        title: title of the figure.
-
-    Returns:
-        The figure.
+        curves: for each method, {step: value} of each seed; steps that not all seeds have are left
+            out.
     """
     figure, axes = _figure(COLUMN, 2.5, title)
     for method, color in colors(curves).items():
@@ -278,29 +223,25 @@ def training_curves(
 
 @styled
 def attention_map(weights: FloatArray, title: str = "") -> Figure:
-    """Attention from the state token of each step in a window to the tokens that it can see.
+    """How much the state token of every step of a window attends to every earlier token.
 
     Args:
-        weights: (K, 3, K) attention probabilities: querying step; returns-to-go, states or actions;
-            step attended to.
-        title: title of the figure.
-
-    Returns:
-        The figure.
+        weights: (K, 3, K): a row for each querying step, then returns-to-go, states and actions of
+            each step.
     """
     figure = Figure(figsize=(PAGE, 2.5))
     figure.suptitle(title, fontsize=8)
     panels = figure.subplots(1, 3, sharex=True, sharey=True)
     k, modalities = len(weights), ("returns-to-go", "states", "actions")
     ago = np.arange(k) - (k - 1)
-    # A square-root colour scale, because a few tokens may receive nearly all attention.
+    # A root scale: nearly all attention may lie on a few tokens.
     scale = PowerNorm(0.5, 0, float(weights.max()))
     for number, (axes, name) in enumerate(zip(panels, modalities, strict=True)):
-        # Tokens that a step cannot see stay white; a step sees only the actions before it.
+        # What a row cannot see is left white; actions are seen one step late.
         hidden = np.arange(k)[None, :] > np.arange(k)[:, None] - (name == "actions")
-        visible = np.where(hidden, np.nan, weights[:, number])
+        shown = np.where(hidden, np.nan, weights[:, number])
         box = (ago[0] - 0.5, 0.5, 0.5, ago[0] - 0.5)
-        image = axes.imshow(visible, norm=scale, extent=box)
+        image = axes.imshow(shown, norm=scale, extent=box)
         axes.set_title(f"{name}: {100 * weights[-1, number].sum():.0f}% of step 0")
         axes.set_xlabel("step attended to (0 is now)")
     panels[0].set_ylabel("acting step")
@@ -322,7 +263,7 @@ def _legend_below(figure: Figure, axes: Axes, columns: int) -> None:
 
 
 def _by_seed(rows: Sequence[Row], names: Sequence[str], value: str) -> dict[Any, list[float]]:
-    """Collect `value` over seeds for each key `names`; the last row of a repeated seed counts."""
+    """Values by their rows' `names`; of a seed that comes twice, the last counts."""
     latest: dict[Any, dict[int, float]] = defaultdict(dict)
     for row in rows:
         latest[tuple(row[name] for name in names)][row["training_seed"]] = row[value]

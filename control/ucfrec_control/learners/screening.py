@@ -1,14 +1,14 @@
-"""Causal screening: finds state dimensions without effect, and makes copies that intervene on them.
+"""Causal screening: which state dimensions cause nothing, and copies that intervene on them.
 
-A dimension has no effect if, given the other dimensions and the action, it helps to predict neither
-the reward nor the other dimensions of the next state (assumption A3, minimality).
+A dimension that, once the other dimensions and the action are known, helps predict neither the
+reward nor the rest of the next state has no effect (assumption A3, minimality).
 
-Both predictions are evaluated on held-out trajectories. The predictor of the next state also gets
-the reward as an input. A dimension that only measures the reward, as distractors do, then adds
-nothing even if the predictor is imperfect. The predictor of the reward cannot be given the reward,
-so there the improvement must reach a minimum share of the reward's whole variance; a dimension that
-only measures the reward explains no more than the predictor's error. The largest errors of the next
-state are capped, so that a few falls do not decide the test.
+Both predictions are evaluated on held-out trajectories. The next state is predicted with the reward
+as a further input: a dimension that measures the reward, as distractors do, then adds nothing even
+if the predictors are imperfect. For the reward this is not possible. There the improvement must be
+a minimum share of the reward's whole variance; a measurement of the reward explains no more than
+the predictor's error. The largest errors of the next state are capped, so that a few falls do not
+decide the test.
 """
 
 from collections.abc import Callable, Sequence
@@ -65,24 +65,21 @@ class ScreeningConfig:
 
 @dataclass(frozen=True)
 class DimensionReport:
-    """How much one state dimension adds to predictions from the others and the action."""
+    """What one state dimension adds to the others and the action."""
 
     dimension: int
-    """Index of the dimension in the state, from 0."""
     effect: float
-    """Share of the remaining error that this dimension removes when the reward is given too (partial
-    R²), averaged over the next dimensions in `helps`."""
+    """Share it explains of what the others leave unexplained of the next dimensions it helps most
+    (partial R², their mean), the reward given."""
     helps: tuple[int, ...]
-    """The next dimensions that it helps to predict most, in falling order, chosen on the trajectories
-    that the predictors were fitted on."""
+    """Those dimensions, most helped first, chosen on fitted trajectories."""
     p_value: float
-    """One-sided p-value of no help to `helps`, with held-out trajectories as independent units."""
+    """Of no help there, one-sided, over held-out trajectories."""
     reward_effect: float
-    """Share of the reward's variance that only this dimension explains."""
+    """Share it explains of the reward's variance."""
     reward_p_value: float
-    """One-sided p-value of no help to predict the reward, computed in the same way."""
     causes: bool
-    """Whether it has an effect on the next state or on the reward."""
+    """Whether either help counts."""
 
 
 @dataclass(frozen=True)
@@ -91,27 +88,18 @@ class ScreeningReport:
 
     dimensions: tuple[DimensionReport, ...]
     reward_r2: float
-    """R² of the reward predicted from all dimensions, on held-out trajectories."""
+    """Held-out R² of the reward with all dimensions known."""
     transitions: int
-    """Number of transitions used, fitted and held out."""
 
     @property
     def flagged(self) -> tuple[int, ...]:
-        """Indices of the dimensions without effect."""
+        """Dimensions without effect."""
         return tuple(d.dimension for d in self.dimensions if not d.causes)
 
 
 @random_state_kept()
 def screen(store: EpisodeStore, config: ScreeningConfig, seed: int) -> ScreeningReport:
-    """Test whether each observed state dimension has an effect, on the training episodes of `store`.
-
-    Args:
-        store: a store with observed states.
-        config: the predictors and the thresholds.
-        seed: seed of all random draws; the global random state is restored afterwards.
-
-    Returns:
-        The verdict on every dimension.
+    """Test the effect of every observed state dimension on the training episodes of `store`.
 
     Raises:
         InputError: states are made of items, or there are too few trajectories to hold some out.
@@ -136,20 +124,18 @@ def screen(store: EpisodeStore, config: ScreeningConfig, seed: int) -> Screening
 
 @dataclass(frozen=True)
 class _Transitions:
-    """N standardised steps that have a next step."""
+    """Standardised steps that have a successor."""
 
     states: Tensor
     """(N, S)."""
     actions: Tensor
-    """(N, A)."""
     rewards: Tensor
     """(N, 1)."""
     changes: Tensor
-    """(N, S): next state minus state."""
+    """(N, S) of the state until the next step."""
     episodes: IntArray
-    """(N,): number of each step's trajectory."""
     held_out: Any
-    """(N,), bool: whether the step's trajectory is held out."""
+    """(N,) bool."""
 
     @classmethod
     def of(cls, view: EpisodeStore, most: int, seed: int) -> "_Transitions":
@@ -177,7 +163,7 @@ def _standardised(values: Tensor) -> Tensor:
 
 
 class _Predictors(nn.Module):
-    """M perceptrons with the same layer sizes, computed together."""
+    """M perceptrons of one shape, side by side."""
 
     def __init__(self, sizes: Sequence[int], count: int = 1) -> None:
         super().__init__()
@@ -187,14 +173,14 @@ class _Predictors(nn.Module):
         self.biases = nn.ParameterList(torch.zeros(count, 1, o) for _, o in pairs)
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Apply each perceptron to its own inputs, (M, B, in) to (M, B, out)."""
+        """(M, B, in) to (M, B, out)."""
         hidden = inputs
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             hidden = torch.baddbmm(bias, nn.functional.silu(hidden) if layer else hidden, weight)
         return hidden
 
     def repeated(self, count: int) -> "_Predictors":
-        """Return `count` copies of this perceptron; M must be 1."""
+        """`count` copies of a single perceptron."""
         copies = _Predictors(self.sizes, count)
         with torch.no_grad():
             for copy, original in zip(copies.parameters(), self.parameters(), strict=True):
@@ -203,23 +189,14 @@ class _Predictors(nn.Module):
 
 
 class _Pair(nn.Module):
-    """Predictors of the next state (given the reward) and of the reward, with dimensions missing."""
+    """Predictors of the next state, the reward given, and of the reward, dimensions missing."""
 
     def __init__(self, next_state: _Predictors, reward: _Predictors) -> None:
         super().__init__()
         self.next_state, self.reward = next_state, reward
 
     def errors(self, data: _Transitions, rows: Tensor, missing: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute squared errors of both predictors.
-
-        Args:
-            data: the transitions.
-            rows: indices (B,) of transitions.
-            missing: (M, 1 or B, S), 1 where a dimension is hidden from the predictor, else 0.
-
-        Returns:
-            Errors (M, B, S) of the next state and (M, B) of the reward.
-        """
+        """Squared errors (M, B, S) and (M, B); `missing` (M, 1 or B, S) is 1 where missing."""
         missing = missing.expand(-1, len(rows), -1)
 
         def spread(values: Tensor) -> Tensor:
@@ -232,12 +209,12 @@ class _Pair(nn.Module):
 
 
 def _absences(size: int) -> Tensor:
-    """(S + 1, S): 1 where missing. Row j misses dimension j, and the last row misses none."""
+    """(S + 1, S): row j misses dimension j, the last row none."""
     return torch.cat([torch.eye(size), torch.zeros(1, size)])
 
 
 def _fitted(data: _Transitions, config: ScreeningConfig) -> _Pair:
-    """Fit S + 1 pairs of predictors, one for each row of `_absences`."""
+    """S + 1 pairs of predictors, one for each row of `_absences`."""
     size, width = data.states.shape[1], config.hidden
     inputs = 2 * size + data.actions.shape[1]
     pair = _Pair(
@@ -246,7 +223,7 @@ def _fitted(data: _Transitions, config: ScreeningConfig) -> _Pair:
     absences = _absences(size)
 
     def some_missing() -> Tensor:
-        # A third of the rows miss nothing, so that this case gets enough training.
+        # A third of the rows miss nothing, so that the complete predictor is not the worst trained.
         drawn = torch.randint(3 * size // 2 + 1, (config.batch_size,)).clamp(max=size)
         return absences[drawn].unsqueeze(0)
 
@@ -272,7 +249,7 @@ def _optimise(
         absent = missing()
         batch = rows[torch.randint(len(rows), (config.batch_size,))]
         next_errors, reward_errors = pair.errors(data, batch, absent)
-        # The missing dimension's own next value is not one of those it should help to predict.
+        # A missing dimension's own future is no part of the rest.
         loss = (next_errors * (1 - absent)).mean((1, 2)).sum() + reward_errors.mean(1).sum()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
@@ -282,7 +259,7 @@ def _optimise(
 
 @torch.no_grad()
 def _errors(pair: _Pair, data: _Transitions, rows: IntArray) -> tuple[Tensor, Tensor]:
-    """Squared errors of next state (S + 1, B, S) and reward (S + 1, B) at `rows` (B,)."""
+    """Squared errors at `rows`: (S + 1, B, S) and (S + 1, B)."""
     absent = _absences(data.states.shape[1]).unsqueeze(1)
     chunks = torch.split(torch.from_numpy(rows), _CHUNK)
     parts = [pair.errors(data, chunk, absent) for chunk in chunks]
@@ -331,7 +308,7 @@ def _report(
 
 
 def _p_value(differences: Tensor, episodes: IntArray) -> float:
-    """One-sided p-value of a mean of at most 0, with trajectories (not steps) as independent units."""
+    """Of a mean of at most 0, one-sided, where whole trajectories (not steps) are independent."""
     _, cluster = np.unique(episodes, return_inverse=True)
     counts = np.bincount(cluster)
     values = differences.double().numpy()
@@ -344,20 +321,13 @@ def _p_value(differences: Tensor, episodes: IntArray) -> float:
 def interventions(
     view: EpisodeStore, dimensions: Sequence[int], seed: int, copies: int = 2
 ) -> Overlay:
-    """Copy every episode of `view` with random values in some state dimensions.
+    """Copies of every episode of `view` under do(d ~ marginal), d being `dimensions`.
 
-    This is the intervention do(d ~ marginal), where d are `dimensions`. All values of one draw come
-    from the same step of the view. Copies 0, 2, … of an episode keep one draw for the whole
-    episode; copies 1, 3, … draw again at every step.
+    Values are drawn, jointly, from the steps of the view. Copies 0, 2, … draw once an episode, as
+    an intervention that stays put; copies 1, 3, … at every step.
 
     Args:
         view: a view without an overlay.
-        dimensions: indices of the state dimensions to replace.
-        seed: seed of the draws.
-        copies: number of copies of each episode.
-
-    Returns:
-        The copies, as an overlay of `view`.
     """
     rng = np.random.default_rng(seed)
     episodes, steps = view.all_steps()
@@ -379,7 +349,7 @@ def interventions(
 
 
 def describe_screening(report: ScreeningReport) -> str:
-    """Format the verdicts as a table and return its text."""
+    """The verdicts as a table."""
     lines = [f"{report.transitions:,} transitions, reward R² {report.reward_r2:.4f}", ""]
     lines.append("dimension  next state        p     reward        p  causes")
     lines += [

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from ucfrec.acting.rollout import FORBIDDEN, USER_IDS, BoolArray, FloatArray, IntArray
-from ucfrec.episodes.returns import remaining_return
 from ucfrec.episodes.states import ItemStates, SessionStates
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
@@ -105,7 +104,7 @@ class PolicyActor:
         target = torch.full_like(self._reward_sums, self._target)
         self._states = _appended(self._states, states)
         self._returns_to_go = _appended(
-            self._returns_to_go, remaining_return(target, self._reward_sums).float()
+            self._returns_to_go, (target - self._reward_sums).float()
         )
         self._mask = _appended(self._mask, torch.ones_like(self._mask[:, 0]))
         self._actions = _appended(self._actions, torch.zeros_like(self._actions[:, 0]))

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -141,6 +142,20 @@ class ExposureTerm(nn.Module):
         self.register_buffer("knots", torch.linspace(0, 1, knots))
         self.common = nn.Parameter(torch.zeros(2, knots, 1))
         self.by_lag = nn.Parameter(torch.zeros(2, knots, lags))
+
+    def start_from(self, states: ItemStates, returns: Tensor) -> None:
+        """Set how alike the items are, and the knots: quantiles of returns-to-go (N,), spread out.
+
+        Half of the knots' range lies in the upper tenth, because targets do.
+        """
+        self.likeness.start_from(states)
+        levels = 1 - torch.logspace(0, -2, len(self.knots), dtype=torch.float64)
+        levels = levels.sub(levels[0]).div(levels[-1] - levels[0])
+        knots = torch.from_numpy(np.quantile(returns.double().numpy(), levels.numpy()))
+        # Equal quantiles are moved apart, so that there is an interval between any two knots.
+        width = float(knots[-1] - knots[0]) or 1.0
+        apart = 1e-3 * width * torch.arange(len(knots), dtype=torch.float64)
+        self.knots.copy_((knots + apart).float())
 
     def weights(self, returns: Tensor) -> Tensor:
         """Weights (2, M, N) of repetition and of likeness at returns-to-go (M,)."""

@@ -46,6 +46,7 @@ class UCFConfig(PolicyConfig):
 
     def __post_init__(self) -> None:
         """Check the fields against each other."""
+        super().__post_init__()
         require_heads(self, self.heads)
 
 
@@ -106,15 +107,16 @@ class UCFPolicy(SequencePolicy):
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         """L_action + λ L_mask over all steps (Eq. 5, Algorithm 6), and scalars to log."""
         config, mask = self.config, windows.mask
-        features, attention = self.attend(self.normalized(windows))
-        action_loss = self.head.loss(features[mask], windows.actions[mask])
+        normalized = self.normalized(windows)
+        features, attention = self.attend(normalized)
+        imitation, scalars = self.imitation(features, normalized)
         targets = parent_targets(
             mask, config.parent_window, config.parent_decay, config.parent_action
         )
         supervision = mask_loss(attention, targets, mask)
         on_parents = (attention.mean(1) * (targets > 0)).sum(-1)
-        return action_loss + config.lambda_mask * supervision, {
-            "action_loss": action_loss.detach(),
+        return imitation + config.lambda_mask * supervision, {
+            **scalars,
             "mask_loss": supervision.detach(),
             "attention_on_parents": masked_mean(on_parents.detach(), mask),
         }

@@ -76,6 +76,9 @@ def train_run(
     start = time.perf_counter() - record["wall_time_s"]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     view = policy.training_view(train, config.policy, out / "view", config.seed)
+    if not config.policy.returns.per_session:
+        view = view.with_return_to_go(config.policy.returns)
+        validation = validation.with_return_to_go(config.policy.returns)
     if view is not train:
         train, policy = view, new_policy(view, config)
     policy = policy.to(device)
@@ -227,7 +230,8 @@ def _sizes(store: EpisodeStore) -> dict[str, int]:
     columns = store.meta["columns"]
     if store.has_items:
         items, dim = store.item_states.embeddings.shape
-        return {"state": store.state_size, "action": dim, "items": items}
+        tags = store.item_states.tags.shape[1]
+        return {"state": store.state_size, "action": dim, "items": items, "tags": tags}
     return {"state": store.state_size, "action": columns[schema.ACTION][0], "items": 0}
 
 
@@ -241,15 +245,20 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
     policy.state_mean.copy_(mean)
     policy.state_std.copy_(torch.where(std > 1e-6, std, 1.0))
     scale = config.policy.return_scale or float(np.abs(base.returns).max()) or 1.0
-    policy.return_scale.fill_(scale)
     episodes, steps = base.all_steps()
     returns_to_go = base.step_values(schema.RETURN_TO_GO, episodes, steps)
+    if not config.policy.returns.per_session and not config.policy.return_scale:
+        scale = float(np.abs(returns_to_go).max()) or 1.0
+    policy.return_scale.fill_(scale)
     policy.lowest_return_to_go.fill_(float(returns_to_go.min()))
     if isinstance(policy.head, ItemHead):
         counts = np.bincount(
             base.step_values(schema.ITEM, episodes, steps), minlength=len(policy.head.counts)
         )
         policy.head.start_from(base.item_states.embeddings, torch.from_numpy(counts).float())
+        if policy.head.exposure is not None:
+            scaled = torch.from_numpy(returns_to_go) / policy.return_scale
+            policy.head.exposure.start_from(base.item_states, scaled)
     else:
         actions = base.step_values(schema.ACTION, episodes, steps)
         policy.head.scale.copy_(torch.from_numpy(np.abs(actions).max(0)).clamp(min=1.0))

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from ucfrec.commands.options import target_given, target_options, world_options
+from ucfrec.commands.options import rule_given, rule_options, world_options
 from ucfrec.errors import InputError
 
 
@@ -23,7 +23,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="also evaluate this built-in policy of the simulator, e.g. random; repeatable "
         "(default: none)",
     )
-    target_options(parser)
+    rule_options(parser)
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the rows as JSON")
 
 
@@ -46,8 +46,8 @@ def run(options: argparse.Namespace) -> None:
     rows = []
     for run in options.runs:
         trained = TrainedPolicy.load(run, options.checkpoint)
-        target = target_given(options, trained)
-        row = evaluate_policy(world, trained, trained.name, options.episodes, options.seed, target)
+        rule = rule_given(options, trained)
+        row = evaluate_policy(world, trained, trained.name, options.episodes, options.seed, rule)
         rows.append(row | {"run": without_folders(str(run)), "checkpoint": options.checkpoint})
     rows += [
         evaluate_behavior(world, behavior, options.episodes, options.seed)

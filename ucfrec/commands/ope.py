@@ -3,17 +3,14 @@
 import argparse
 from pathlib import Path
 
-from ucfrec.commands.options import log_options, logs_given, target_given, target_options
+from ucfrec.commands.options import log_options, logs_given, rule_given, rule_options
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """What `ope` takes."""
     parser.add_argument("run", type=Path, metavar="RUN")
     log_options(parser)
-    target_options(parser)
-    parser.add_argument(
-        "--greedy", action="store_true", help="judge the most probable item, not the softmax"
-    )
+    rule_options(parser)
     parser.add_argument(
         "--discount", type=float, default=1.0, help="of the returns that are estimated (default 1)"
     )
@@ -38,8 +35,7 @@ def run(options: argparse.Namespace) -> None:
             options.run,
             trained,
             logged,
-            target_return=target_given(options, trained),
-            greedy=options.greedy,
+            rule=rule_given(options, trained),
             seed=options.seed,
             discount=options.discount,
         )

@@ -148,6 +148,33 @@ class EpisodeView:
             name, self._columns.starts[self._sources[episodes]] + steps
         )
 
+    def rewards_before(self, episodes: IntArray, steps: IntArray) -> npt.NDArray[np.float64]:
+        """(B,) sum of the rewards of the session before each step, in reward units.
+
+        Args:
+            episodes: (B,) positions in the view.
+            steps: (B,) steps of those episodes, from 0.
+        """
+        owner, before = self._earlier(steps)
+        rewards = self.step_values(schema.REWARD, episodes[owner], before)
+        return np.bincount(owner, rewards, minlength=len(steps)).astype(np.float64)
+
+    def items_before(self, episodes: IntArray, steps: IntArray) -> tuple[IntArray, IntArray]:
+        """(rows, items), each (M,): the items that sessions showed before the given steps.
+
+        Args:
+            episodes: (B,) positions in the view.
+            steps: (B,) steps of those episodes, from 0; `rows` are indices into the B.
+        """
+        owner, before = self._earlier(steps)
+        return owner, self.step_values(schema.ITEM, episodes[owner], before).astype(np.int64)
+
+    @staticmethod
+    def _earlier(steps: IntArray) -> tuple[IntArray, IntArray]:
+        """Row and number of every step before the given ones (B,), row by row."""
+        owner = np.repeat(np.arange(len(steps)), steps)
+        return owner, np.arange(len(owner)) - np.repeat(np.cumsum(steps) - steps, steps)
+
     def all_steps(self) -> tuple[IntArray, IntArray]:
         """(episodes, steps), each (n_steps,): every step of the view, episode by episode."""
         episodes = np.repeat(np.arange(self.n_episodes), self.lengths)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.off_policy.diagnostics import Diagnosis, diagnose
 from ucfrec.off_policy.estimators import LOGGED, Estimate, estimate
 from ucfrec.off_policy.fqe import cross_fitted
@@ -42,8 +43,7 @@ def evaluate_off_policy(
     trained: TrainedPolicy,
     logged: LoggedSessions,
     *,
-    target_return: float,
-    greedy: bool,
+    rule: DecisionRule | None = None,
     seed: int,
     discount: float = 1.0,
 ) -> OffPolicyReport:
@@ -57,9 +57,7 @@ def evaluate_off_policy(
         trained: the policy of the run.
         logged: logs read with `keep_unknown`. The policy would never show an item that it does not
             know, so such a step has weight 0.
-        target_return: the return that the policy is asked for, in units of the reward.
-        greedy: judge the policy that shows its most probable item; otherwise the one that draws
-            items from its softmax.
+        rule: the decision rule to judge; None for the run's own.
         seed: seed of the folds and of the bootstrap.
         discount: discount factor γ of the estimated returns.
 
@@ -69,13 +67,16 @@ def evaluate_off_policy(
     Raises:
         InputError: propensities are not probabilities, or there is only one user.
     """
-    steps = logged_steps(trained, logged, target_return, greedy, seed, discount)
+    rule = rule or trained.rule
+    steps = logged_steps(trained, logged, rule, seed, discount)
     found, diagnosis = estimate(steps, seed), diagnose(steps)
     seen = share_seen(trained, logged.store)
     verdict = judge(steps, seed, diagnosis=diagnosis, forbidden=_seen_too_often(seen))
     said = [*verdict.reasons, *cautions(diagnosis, found), *_of_the_logs(seen, logged)]
     about = {
-        "target_return": target_return,
+        "target_return": rule.target,
+        "rule": rule.hash,
+        "decision_rule": rule.as_dict(),
         "discount": discount,
         "sessions": len(steps.first),
         "steps": len(steps.reward),
@@ -90,7 +91,7 @@ def evaluate_off_policy(
         "seed": seed,
         **provenance(),
     }
-    who = {"policy": trained.name, "choice": "greedy" if greedy else "softmax"}
+    who = {"policy": trained.name, "choice": "softmax" if rule.temperature else "greedy"}
     behavior = {"policy": "behavior", "choice": "as logged"}
     rows = [
         as_row(name, one) | (behavior if name == LOGGED else who) | about
@@ -169,8 +170,7 @@ def _diagnosis_columns(diagnosis: Diagnosis) -> dict[str, Any]:
 def logged_steps(
     trained: TrainedPolicy,
     logged: LoggedSessions,
-    target_return: float,
-    greedy: bool,
+    rule: DecisionRule,
     seed: int,
     discount: float = 1.0,
 ) -> LoggedSteps:
@@ -179,8 +179,7 @@ def logged_steps(
     Args:
         trained: a policy that chooses items.
         logged: logs read with `keep_unknown`.
-        target_return: the return that the policy is asked for, in units of the reward.
-        greedy: judge the policy that shows its most probable item, instead of drawing items.
+        rule: the decision rule to judge.
         seed: seed of the folds.
         discount: discount factor γ of the returns.
 
@@ -196,9 +195,9 @@ def logged_steps(
     width = _features(one_state, one_item).shape[1]
     features, at_policy = np.empty((2, store.n_steps, width), dtype=np.float32)
     target, done = np.empty(store.n_steps), 0
-    for batch in scored_steps(trained, store, target_return):
+    for batch in scored_steps(trained, store, rule):
         rows = slice(done, done + len(batch.steps))
-        target[rows], features[rows], at_policy[rows] = step_features(trained, batch, greedy)
+        target[rows], features[rows], at_policy[rows] = step_features(trained, batch)
         done = rows.stop
     episodes, steps = store.all_steps()
     reward = store.step_values(schema.REWARD, episodes, steps).astype(np.float64)
@@ -213,7 +212,7 @@ def logged_steps(
 
 
 def step_features(
-    trained: TrainedPolicy, batch: ScoredSteps, greedy: bool
+    trained: TrainedPolicy, batch: ScoredSteps
 ) -> tuple[npt.NDArray[Any], Float32Array, Float32Array]:
     """Compute the policy's probability and the models' inputs for B logged steps.
 
@@ -222,7 +221,6 @@ def step_features(
     Args:
         trained: a policy that chooses items.
         batch: the steps, scored by the policy.
-        greedy: judge the policy that shows its most probable item, instead of drawing items.
 
     Returns:
         The evaluated policy's probability (B,) of the logged item; features (B, P) of the state and
@@ -232,13 +230,9 @@ def step_features(
     embeddings = trained.item_states.embeddings
     states, items = batch.windows.states[:, -1], batch.windows.actions[:, -1]
     known = items >= 0
-    if greedy:
-        best = batch.log_probabilities.argmax(1)
-        target, shown = (best == items).double(), embeddings[best]
-    else:
-        probabilities = batch.log_probabilities.exp()
-        target = probabilities.gather(1, items[:, None].clamp(min=0))[:, 0].double() * known
-        shown = probabilities @ embeddings
+    probabilities = batch.log_probabilities.exp()
+    target = probabilities.gather(1, items[:, None].clamp(min=0))[:, 0].double() * known
+    shown = probabilities @ embeddings
     chosen = _features(states, embeddings[items] * known[:, None])
     return target.clamp(0, 1).numpy(), chosen, _features(states, shown)
 

@@ -65,8 +65,7 @@ class DT4RecPolicy(DTPolicy):
 
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         """Action loss plus weighted contrastive loss over all steps, and scalars to log."""
-        config, mask = self.config, windows.mask
-        normalized = self.normalized(windows)
+        config, normalized = self.config, self.normalized(windows)
         features = self.features(normalized)
         imitation, scalars = self.imitation(features, normalized)
         if config.contrastive_weight == 0:

@@ -11,12 +11,15 @@ import numpy as np
 import torch
 
 from ucfrec import schema
+from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.counterfactual.augment import counterfactual_copies, require_rewards_vary
 from ucfrec.episodes.item_counts import TrainingCounts
+from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
-from ucfrec.episodes.windows import Overlay, Windows
+from ucfrec.episodes.windows import FloatArray, Overlay, Windows
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder, read_json, write_json
+from ucfrec.fitting.checkpoint import save_tensors
 from ucfrec.fitting.loop import Fit, fit
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
@@ -26,10 +29,11 @@ from ucfrec.provenance import command_line, versions
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.reference_losses import reference_losses
 from ucfrec.runs.samples import SAMPLES, sample_recommendations
-from ucfrec.runs.trained_policy import AUGMENTATION, COUNTS, ITEMS, RUN, USERS
+from ucfrec.runs.trained_policy import AUGMENTATION, COUNTS, ITEMS, RETURNS, RULE, RUN, USERS
 
 _VALIDATION_BATCHES = 16
 _VALIDATION_BATCH = 256
+_MOST_RETURNS = 1_000_001
 _QUANTILES = (0.5, 0.75, 0.9, 0.95, 0.99, 1.0)
 
 
@@ -160,6 +164,7 @@ def _begin(
         "observation_size": store.observation_size,
         "train_episodes": train.n_episodes,
         "train_steps": train.n_steps,
+        "return_to_go": dataclasses.asdict(config.policy.returns),
         "return_quantiles": {str(q): float(np.quantile(train.returns, q)) for q in _QUANTILES},
         "mean_return": float(train.returns.mean()),
         "data": store.meta["source"],
@@ -167,7 +172,10 @@ def _begin(
         "wall_time_s": 0.0,
         **about,
     }
+    returns = _target_returns(train, config.policy.returns)
     with atomic_folder(out) as scratch:
+        save_tensors(scratch / RETURNS, {"returns": torch.from_numpy(returns)}, {})
+        write_json(scratch / RULE, DecisionRule(float(returns[-1])).as_dict())
         for name in (ITEM_STATES, ITEMS, USERS):
             if (store.path / name).exists():
                 shutil.copyfile(store.path / name, scratch / name)
@@ -176,6 +184,20 @@ def _begin(
             counts.save(scratch / COUNTS)
             record["reference_losses"] = reference_losses(counts, validation)
         write_json(scratch / RUN, record)
+
+
+def _target_returns(train: EpisodeStore, definition: ReturnToGo) -> FloatArray:
+    """Sorted returns-to-go of sessions, or of steps if targets are set anew at every step.
+
+    Of more than a million, evenly spaced order statistics are kept, the lowest and highest too.
+    """
+    returns = train.returns
+    if not definition.per_session:
+        returns = train.with_return_to_go(definition).step_values(
+            schema.RETURN_TO_GO, *train.all_steps()
+        )
+    kept = np.linspace(0, len(returns) - 1, min(len(returns), _MOST_RETURNS)).astype(np.int64)
+    return np.asarray(np.sort(returns)[kept], dtype=np.float32)
 
 
 def _require_same(
@@ -284,10 +306,11 @@ def _validation(policy: SequencePolicy, validation: EpisodeStore, seed: int) -> 
 def _write_samples(
     out: Path, policy: SequencePolicy, validation: EpisodeStore, record: Mapping[str, Any]
 ) -> None:
-    """Save a few recommendations for the report, with the commands' default target return."""
+    """Save a few recommendations for the report, by the run's decision rule."""
     if validation.has_items:
-        target = max(record["return_quantiles"].values())
-        write_json(out / SAMPLES, sample_recommendations(policy, validation, target))
+        rule = DecisionRule.from_dict(read_json(out / RULE), str(out / RULE))
+        decider = Decider(policy, rule, ReturnToGo(**record["return_to_go"]))
+        write_json(out / SAMPLES, sample_recommendations(decider, validation))
 
 
 def describe_run(record: Mapping[str, Any]) -> str:

@@ -1,0 +1,198 @@
+"""Sessions played in a model of the users that was learned from logs."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from ucfrec import schema
+from ucfrec.acting.rollout import USER_IDS, BoolArray, FloatArray, IntArray
+from ucfrec.episodes.exposure import Likeness
+from ucfrec.episodes.states import ItemStates, SessionStates
+from ucfrec.episodes.store import EpisodeStore
+
+if TYPE_CHECKING:
+    from ucfrec.counterfactual.item_reward_model import ItemRewardModel
+
+_PENALTY = 1.0
+"""L2 penalty of the logistic regressions on standardised inputs."""
+
+
+@dataclass(frozen=True)
+class LoggedUse:
+    """Logged steps with what was known before each, and what came of it."""
+
+    states: Tensor
+    """(N, S)."""
+    shown: Tensor
+    """(N, L) int64 items shown before, most recent first; −1 before the session began."""
+    users: Tensor
+    """(N,) rows of the training store's users."""
+    items: Tensor
+    """(N,) int64 items shown at the step."""
+    rewards: npt.NDArray[np.float64]
+    """(N,) in reward units."""
+    steps: IntArray
+    """(N,) number of the step in its session."""
+    ended: BoolArray
+    """(N,) whether the session ended with the step."""
+    known: BoolArray
+    """(N,) whether it is known if the session ended with the step: false at the last step of a
+    user's last session, after which the log may simply have ended."""
+
+    @classmethod
+    def of(cls, store: EpisodeStore, lags: int, most: int, seed: int) -> "LoggedUse":
+        """Steps of a view of a store of items, at most `most` of them, drawn at random."""
+        episodes, steps = store.all_steps()
+        if len(steps) > most:
+            drawn = np.random.default_rng(seed).choice(len(steps), most, replace=False)
+            episodes, steps = episodes[np.sort(drawn)], steps[np.sort(drawn)]
+        window = store.windows(episodes, steps, lags + 1)
+        items = window.actions.masked_fill(~window.mask, -1)
+        users = store.episode_values(schema.USER).astype(np.int64)
+        ended = steps == store.lengths[episodes] - 1
+        last_of_user = np.zeros(store.n_episodes, dtype=bool)
+        last_of_user[np.unique(users[::-1], return_index=True)[1]] = True
+        return cls(
+            states=window.states[:, -1],
+            shown=items[:, :-1].flip(1),
+            users=torch.from_numpy(users[episodes]),
+            items=window.actions[:, -1],
+            rewards=window.rewards[:, -1].double().numpy(),
+            steps=steps,
+            ended=ended,
+            known=~(ended & last_of_user[::-1][episodes]),
+        )
+
+
+class SessionEnd:
+    """The probability that a session ends with a step: a logistic regression.
+
+    Inputs are the number of the step, its reward, and how often and how alike the item was shown in
+    the last 1, 3 and all of the steps before.
+    """
+
+    def __init__(self, likeness: Likeness, use: LoggedUse) -> None:
+        from sklearn.linear_model import LogisticRegression
+        from sklearn.pipeline import make_pipeline
+        from sklearn.preprocessing import StandardScaler
+
+        self._likeness = likeness
+        ended = use.ended[use.known]
+        self._rate, self._model = float(ended.mean()) if len(ended) else 0.0, None
+        if 0 < self._rate < 1:
+            inputs = self._inputs(use.shown, use.items, use.rewards, use.steps)[use.known]
+            regression = LogisticRegression(C=1 / _PENALTY, max_iter=1000)
+            self._model = make_pipeline(StandardScaler(), regression).fit(inputs, ended)
+
+    def probabilities(
+        self, shown: Tensor, items: Tensor, rewards: npt.NDArray[np.float64], steps: IntArray
+    ) -> npt.NDArray[np.float64]:
+        """Probabilities (M,) that sessions end with a step; arguments as in `LoggedUse`."""
+        if self._model is None:
+            return np.full(len(steps), self._rate)
+        inputs = self._inputs(shown, items, rewards, steps)
+        return np.asarray(self._model.predict_proba(inputs)[:, 1])
+
+    def _inputs(
+        self, shown: Tensor, items: Tensor, rewards: npt.NDArray[np.float64], steps: IntArray
+    ) -> FloatArray:
+        columns = [np.log1p(steps), steps, np.minimum(steps, 1), rewards]
+        repeated = (shown == items.unsqueeze(1)).double()
+        for reach in (1, 3, shown.shape[1]):
+            recent = shown.clone()
+            recent[:, reach:] = -1
+            profile = self._likeness.profile(recent, torch.ones(shown.shape))
+            alike = self._likeness.to_items(profile, items.unsqueeze(1))
+            columns += [repeated[:, :reach].sum(1).numpy(), alike.numpy(), (alike > 0).numpy()]
+        return np.stack(columns, axis=1).astype(np.float32)
+
+
+class LearnedSessions:
+    """N parallel sessions of logged users whose rewards and ends are drawn from models.
+
+    A session begins as a logged one did: its user, and its observations step by step. It follows
+    the interface of `gymnasium.vector.VectorEnv` as far as `ucfrec.acting.rollout.rollout` uses it.
+    """
+
+    def __init__(
+        self,
+        store: EpisodeStore,
+        reward_model: "ItemRewardModel",
+        calibration: tuple[float, float],
+        end: SessionEnd,
+        sessions: int,
+        longest: int,
+    ) -> None:
+        """
+        Args:
+            store: view of the sessions that are begun; session i is the i-th modulo their number.
+            reward_model: of rewards.
+            calibration: slope and intercept of the reward model's scores on held-out steps.
+            end: of the ends of sessions.
+            sessions: N.
+            longest: steps after which a session ends in any case.
+        """
+        from gymnasium.vector import AutoresetMode
+
+        self.num_envs, self.metadata = sessions, {"autoreset_mode": AutoresetMode.SAME_STEP}
+        self._store, self._model, self._end = store, reward_model, end
+        self._slope, self._intercept = calibration
+        self._longest = longest
+        self._states: ItemStates = store.item_states
+        self._users = store.episode_values(schema.USER).astype(np.int64)
+        rewards = np.unique(store.step_values(schema.REWARD, *store.all_steps()))
+        self._outcomes = rewards if len(rewards) == 2 else None
+
+    def reset(self, seed: int) -> tuple[FloatArray, dict[str, Any]]:
+        """Begin N sessions; all draws come from `seed`."""
+        n = self.num_envs
+        self._rng = np.random.default_rng(seed)
+        self._sessions = SessionStates(self._states, n)
+        self._shown = torch.full((n, self._model.lags), -1)
+        self._steps = np.zeros(n, dtype=np.int64)
+        self._episodes = np.arange(n) % self._store.n_episodes
+        self._sessions.users = torch.from_numpy(self._users[self._episodes])
+        return self._observe(), self._info()
+
+    def step(
+        self, actions: npt.NDArray[Any]
+    ) -> tuple[FloatArray, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
+        """Show one item in every session; those that end begin anew in the same step."""
+        items = torch.from_numpy(np.asarray(actions, dtype=np.int64))
+        states = self._sessions.current(torch.from_numpy(self._observe()))
+        scores = self._model.scores(states, self._shown, self._sessions.users)
+        scores = self._slope * scores.gather(1, items.unsqueeze(1)) + self._intercept
+        rewards = self._model.expected(scores)[:, 0].double().numpy()
+        if self._outcomes is not None:
+            low, high = self._outcomes
+            chance = (rewards - low) / (high - low)
+            rewards = np.where(self._rng.random(len(chance)) < chance, high, low)
+        ends = self._end.probabilities(self._shown, items, rewards, self._steps)
+        self._sessions.record(items, torch.from_numpy(rewards))
+        self._shown = torch.cat([items.unsqueeze(1), self._shown[:, :-1]], dim=1)
+        self._steps += 1
+        terminated = self._rng.random(len(ends)) < ends
+        truncated = (self._steps >= self._longest) & ~terminated
+        before = self._observe()
+        rows = np.flatnonzero(terminated | truncated)
+        self._sessions.begin(rows)
+        self._shown[rows], self._steps[rows] = -1, 0
+        self._episodes[rows] = (self._episodes[rows] + self.num_envs) % self._store.n_episodes
+        self._sessions.users = torch.from_numpy(self._users[self._episodes])
+        info = {**self._info(), "final_obs": before, "_final_obs": terminated | truncated}
+        return self._observe(), rewards.astype(np.float32), terminated, truncated, info
+
+    def _observe(self) -> FloatArray:
+        size = self._store.observation_size
+        if not size:
+            return np.zeros((self.num_envs, 0), dtype=np.float32)
+        steps = np.minimum(self._steps, self._store.lengths[self._episodes] - 1)
+        values = self._store.step_values(schema.OBSERVATION, self._episodes, steps)
+        return np.asarray(values, dtype=np.float32)
+
+    def _info(self) -> dict[str, Any]:
+        return {USER_IDS: self._users[self._episodes]}

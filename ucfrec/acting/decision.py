@@ -254,7 +254,8 @@ class Decider:
         exposed = Exposed.before(windows, self.reward_model.lags)
         batch, length = windows.mask.shape
         shown = exposed.items.view(batch, length, -1)[:, -1]
-        return self.reward_model.scores(windows.states[:, -1], shown, users)
+        scores: Tensor = self.reward_model.scores(windows.states[:, -1], shown, users)
+        return scores
 
     def _without_recent_tags(self, scores: Tensor, windows: Windows) -> Tensor:
         assert self.likeness is not None

@@ -57,8 +57,9 @@ class PolicyActor:
         self._absent = None if item_ids is None else torch.from_numpy(item_ids < 0)
         self._forbidden: Tensor | None = None
         self._sessions = None if item_states is None else SessionStates(item_states, n)
-        keep = self._sessions is not None and decider.rule.exclude_seen
-        self._shown = torch.zeros(n, len(policy.head.bias), dtype=torch.bool) if keep else None
+        self._shown: Tensor | None = None
+        if isinstance(policy.head, ItemHead) and decider.rule.exclude_seen:
+            self._shown = torch.zeros(n, len(policy.head.bias), dtype=torch.bool)
         self._actions = (
             torch.zeros(n, k, dtype=torch.int64)
             if isinstance(policy.head, ItemHead)

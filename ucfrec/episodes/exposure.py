@@ -59,6 +59,14 @@ class Likeness(nn.Module):
         self.register_buffer("directions", torch.zeros(n_items, size))
         self._matrix: Tensor | None = None
 
+    @classmethod
+    def of(cls, states: ItemStates) -> "Likeness":
+        """The likeness of the items of a store."""
+        items, size = states.embeddings.shape
+        likeness = cls(items, size, states.tags.shape[1])
+        likeness.start_from(states)
+        return likeness
+
     def start_from(self, states: ItemStates) -> None:
         """Set the tags, or the directions of the embeddings, of the items."""
         if self.tags.shape[1]:

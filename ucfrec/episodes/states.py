@@ -4,7 +4,7 @@ Training windows and acting both call `ItemStates.build`. It uses only element-w
 fixed order, so its results are bit-identical for every batch size.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -125,8 +125,8 @@ class ItemStates:
             InputError: the file is missing or damaged.
         """
         tensors, numbers = load_tensors(path)
-        optional = {"tags": tensors["tags"]} if "tags" in tensors else {}
-        return cls(tensors["embeddings"], tensors["user_features"], **numbers, **optional)
+        states = cls(tensors["embeddings"], tensors["user_features"], **numbers)
+        return replace(states, tags=tensors["tags"]) if "tags" in tensors else states
 
 
 def _with_zero_row(table: Tensor) -> Tensor:

@@ -127,9 +127,7 @@ class RuleSearch:
         self._decider, self._config, self._seed = decider, config, seed
         self._store, model = validation, decider.reward_model
         states = validation.item_states
-        likeness = Likeness(len(states.embeddings), states.embeddings.shape[1], states.tags.shape[1])
-        likeness.start_from(states)
-        self._likeness = likeness
+        self._likeness = likeness = Likeness.of(states)
         end = SessionEnd(likeness, LoggedUse.of(train, model.lags, _MOST_STEPS, seed))
         self.calibration = calibrate(
             model, LoggedUse.of(validation, model.lags, _MOST_STEPS, seed)

@@ -114,8 +114,7 @@ class TrainedPolicy:
         """The policy under `rule`, by default the run's own."""
         rule, likeness, states = rule or self.rule, None, self.item_states
         if rule.tag_window and states is not None:
-            likeness = Likeness(*states.embeddings.shape, states.tags.shape[1])
-            likeness.start_from(states)
+            likeness = Likeness.of(states)
         return Decider(self.policy, rule, self.returns, None, likeness)
 
     def actor(

@@ -36,7 +36,6 @@ class Budget:
     """Training seeds of the sweeps and of the distractor table."""
 
 
-TARGETS: Final = (0.5, 0.9, 0.99, 1.0)
 BUDGETS: Final[Mapping[str, Budget]] = {
     # Sized for two cores: smaller width, fewer steps, smaller logs, and cheaper settings of two
     # baselines; methods and seeds are not reduced.
@@ -52,7 +51,7 @@ BUDGETS: Final[Mapping[str, Budget]] = {
             "crm.epochs=8",
         ),
         cuts={"dt4rec": ("policy.negatives=1",), "edt4rec": ("policy.cql_steps=1000",)},
-        evaluation=EvaluationPlan(episodes=500, validation_episodes=200, quantiles=TARGETS),
+        evaluation=EvaluationPlan(episodes=500),
         sweep_seeds=2,
     ),
     "full": Budget(
@@ -60,7 +59,7 @@ BUDGETS: Final[Mapping[str, Budget]] = {
         sessions=50_000,
         settings=("train.steps=20000", "train.learning_rate=3e-4"),
         cuts={},
-        evaluation=EvaluationPlan(episodes=5000, validation_episodes=1000, quantiles=TARGETS),
+        evaluation=EvaluationPlan(episodes=5000),
         sweep_seeds=3,
     ),
 }
@@ -139,7 +138,7 @@ class Plan:
         the same target returns: choosing the target in validation episodes with the distractor off
         would use knowledge of the intervention.
         """
-        plans = [replace(self._budget.evaluation, quantiles=(q,)) for q in DISTRACTOR_TARGETS]
+        plans = [replace(self._budget.evaluation, target_quantile=q) for q in DISTRACTOR_TARGETS]
         for name, world_index in _DISTRACTED_WORLDS.items():
             if name not in self._available(_DISTRACTED_WORLDS):
                 continue

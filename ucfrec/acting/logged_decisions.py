@@ -44,5 +44,7 @@ def session_scores(
         seen = torch.zeros(len(steps), len(store.item_states.embeddings), dtype=torch.bool)
         seen[torch.from_numpy(rows[items >= 0]), torch.from_numpy(items[items >= 0])] = True
         forbidden = seen if forbidden is None else forbidden | seen
-    users = torch.from_numpy(store.episode_values(schema.USER).astype(np.int64)[episodes])
+    users = None
+    if store.has_users:
+        users = torch.from_numpy(store.episode_values(schema.USER).astype(np.int64)[episodes])
     return decider.scores(windows, collected, forbidden, users)

@@ -25,6 +25,13 @@ class World:
     item_features: str | None = field(default=None, kw_only=True)
     """File or attribute of a Gymnasium environment with features of its items; None for none."""
 
+    @property
+    def title(self) -> str:
+        """The name, and the options that belong to it as the command line has them."""
+        observe = f" --observe {','.join(self.observe)}" if self.observe else ""
+        features = f" --item-features {self.item_features}" if self.item_features else ""
+        return self.name + observe + features
+
     def simulator(self) -> Simulator:
         """Load the simulator plugin, or make the one of a Gymnasium environment.
 

@@ -105,7 +105,7 @@ def _build(policy_name: str, settings: Iterable[_Setting], seed: int) -> Config:
     if not learner.augmented:
         tables["augment"]["copies"] = 0
     sources = {}
-    for table, key, value, source in settings:
+    for table, key, value, source in (*_from_mapping(learner.presets, policy_name), *settings):
         tables[table][key] = value.item() if isinstance(value, np.generic) else value
         sources[f"{table}.{key}"] = source
     try:

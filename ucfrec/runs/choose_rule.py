@@ -129,9 +129,7 @@ class RuleSearch:
         states = validation.item_states
         self._likeness = likeness = Likeness.of(states)
         end = SessionEnd(likeness, LoggedUse.of(train, model.lags, _MOST_STEPS, seed))
-        self.calibration = calibrate(
-            model, LoggedUse.of(validation, model.lags, _MOST_STEPS, seed)
-        )
+        self.calibration = calibrate(model, LoggedUse.of(validation, model.lags, _MOST_STEPS, seed))
         self._world = LearnedSessions(
             *(validation, model, self.calibration, end, config.sessions, int(train.lengths.max()))
         )

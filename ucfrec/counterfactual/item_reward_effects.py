@@ -51,7 +51,7 @@ class Design:
     @classmethod
     def of(cls, model: ItemRewardModel, rows: RewardRows) -> "Design":
         """The design of `rows`, with the statistics of `model`."""
-        likeness, last = model.exposure.likeness, len(model.user) - 1
+        likeness, last = model.likeness, len(model.user) - 1
         n_tags = int(likeness.n_tags)
         known = (rows.users >= 0) & (rows.users < last)
         return cls(
@@ -140,7 +140,7 @@ def _exposure(model: ItemRewardModel, rows: RewardRows) -> Tensor:
     for start in range(0, len(rows), _CHUNK):
         part = slice(start, start + _CHUNK)
         items, shown = rows.items[part].unsqueeze(1), rows.shown[part]
-        likeness = model.exposure.likeness
+        likeness = model.likeness
         columns = [
             likeness.to_items(likeness.profile(earlier, torch.ones_like(earlier).float()), items)
             for earlier in shown.unsqueeze(1).unbind(2)

@@ -171,7 +171,7 @@ def _set_statistics(
     centred = states.embeddings.double() - shown.mean(0)
     length = centred[rows.items].square().sum(1).mean().sqrt()
     model.vectors.copy_(centred / length.clamp(min=_CONSTANT))
-    model.exposure.likeness.start_from(states)
+    model.likeness.start_from(states)
 
 
 def _report(
@@ -209,7 +209,15 @@ def _report(
 def _report_from(values: Mapping[str, Any]) -> ItemRewardReport:
     """The report as it was before `dataclasses.asdict` and JSON."""
     curve = values["calibration"]
-    columns = (tuple(curve[name]) for name in ("predicted", "observed", "count"))
-    effects = tuple(EffectTried(**tried) for tried in values["effects"])
-    kept = {**values, "effects": effects, "calibration": Calibration(*columns, curve["error"])}
-    return ItemRewardReport(**kept)
+    return ItemRewardReport(
+        **{
+            **values,
+            "effects": tuple(EffectTried(**tried) for tried in values["effects"]),
+            "calibration": Calibration(
+                predicted=tuple(curve["predicted"]),
+                observed=tuple(curve["observed"]),
+                count=tuple(curve["count"]),
+                error=curve["error"],
+            ),
+        }
+    )

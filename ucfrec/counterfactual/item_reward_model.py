@@ -6,7 +6,7 @@ from typing import Final
 import torch
 from torch import Tensor, nn
 
-from ucfrec.episodes.exposure import Exposed, ExposureTerm, Likeness
+from ucfrec.episodes.exposure import Likeness
 
 FITTED: Final = "item_reward.safetensors"
 """File of a fitted model in its folder."""
@@ -24,7 +24,7 @@ class ItemRewardModel(nn.Module):
         η = item_i + user_u + state · x + (affinity_u + interactionᵀ x) · e_i + exposure_i,
 
     x being the standardised state, e_i the centred embedding of the item, and exposure_i what
-    repeating an item, or showing one like it, n steps after the last time adds (`ExposureTerm`).
+    repeating an item, or showing one like it, n steps after the last time adds (`Likeness`).
     Item effects include those of tags and embeddings, which items without training rows have too.
     For rewards of two values the model is logistic: η is the log-odds of the higher one. Otherwise
     η is the standardised reward.
@@ -45,6 +45,7 @@ class ItemRewardModel(nn.Module):
     affinity: Tensor
     state: Tensor
     interaction: Tensor
+    exposure: Tensor
 
     def __init__(self, sizes: Mapping[str, int]) -> None:
         """Args:
@@ -70,8 +71,8 @@ class ItemRewardModel(nn.Module):
         self.register_buffer("affinity", torch.zeros(users + 1, dim))
         self.register_buffer("state", torch.zeros(state))
         self.register_buffer("interaction", torch.zeros(state, dim))
-        self.exposure = ExposureTerm(LAGS, 1, Likeness(items, dim, sizes.get("tags", 0)))
-        self.exposure.requires_grad_(False)
+        self.register_buffer("exposure", torch.zeros(2, LAGS))
+        self.likeness = Likeness(items, dim, sizes.get("tags", 0))
 
     def scores(self, states: Tensor, shown: Tensor, users: Tensor | None = None) -> Tensor:
         """Linear predictors of all items, (B, n_items).
@@ -87,16 +88,23 @@ class ItemRewardModel(nn.Module):
             Log-odds of the higher reward if rewards have two values; otherwise rewards in standard
             deviations from their mean.
         """
-        query, exposed = self._given(states, shown, users)
-        added = query @ self.vectors.T + self.exposure.to_all(exposed)
+        repeated, alike = self.exposure
+        shown = self._lagged(shown)
+        added = self.likeness.to_all(self.likeness.profile(shown, alike.expand(shown.shape)))
+        rows, lags = torch.nonzero(shown >= 0, as_tuple=True)
+        added = added.index_put((rows, shown[rows, lags]), repeated[lags], accumulate=True)
+        added = added + self._query(states, users) @ self.vectors.T
         return self.item + self.level(states, users).unsqueeze(1) + added
 
     def score(self, states: Tensor, shown: Tensor, users: Tensor | None, items: Tensor) -> Tensor:
         """Linear predictors (B,) of one item each, int64 (B,); see `scores`."""
-        query, exposed = self._given(states, shown, users)
-        added = (query * self.vectors[items]).sum(1)
-        added = added + self.exposure.to_items(exposed, items.unsqueeze(1))
-        return self.item[items] + self.level(states, users) + added
+        repeated, alike = self.exposure
+        shown, each = self._lagged(shown), items.unsqueeze(1)
+        profile = self.likeness.profile(shown, alike.expand(shown.shape))
+        added = self.likeness.to_items(profile, each) + (shown == each).float() @ repeated
+        added = added + (self._query(states, users) * self.vectors[items]).sum(1)
+        scores: Tensor = self.item[items] + self.level(states, users) + added
+        return scores
 
     def level(self, states: Tensor, users: Tensor | None) -> Tensor:
         """The part (B,) of the scores that all items share, in states (B, S) of users (B,)."""
@@ -118,13 +126,12 @@ class ItemRewardModel(nn.Module):
             effects: by the names of `ucfrec.counterfactual.item_reward_effects.EFFECTS`.
             of_content: effects (n_items,) of the items' tags and embeddings, from those of content.
         """
-        for name in ("user", "affinity", "state", "interaction"):
-            self.get_buffer(name).copy_(effects.get(name, torch.zeros(())))
+        for name in ("user", "affinity", "state", "interaction", "exposure"):
+            buffer = self.get_buffer(name)
+            buffer.copy_(effects.get(name, torch.zeros(buffer.shape)).view(buffer.shape))
         self.item.copy_(effects["mean"] + effects.get("item", torch.zeros(())))
         if "content" in effects:
             self.item.add_(of_content(effects["content"]))
-        exposure = effects.get("exposure", torch.zeros(2 * self.lags)).view(2, 1, self.lags)
-        self.exposure.set_weights(exposure)
 
     def target(self, rewards: Tensor) -> Tensor:
         """What η predicts: whether rewards (...) are the higher one, or standardised rewards."""
@@ -143,10 +150,12 @@ class ItemRewardModel(nn.Module):
             return torch.full((len(states),), last, device=states.device)
         return torch.where((users >= 0) & (users < last), users, last)
 
-    def _given(self, states: Tensor, shown: Tensor, users: Tensor | None) -> tuple[Tensor, Exposed]:
-        """What multiplies the vector of every item (B, D), and the items shown before."""
-        x = self.standardised(states)
+    def _query(self, states: Tensor, users: Tensor | None) -> Tensor:
+        """What multiplies the vector of every item, (B, D)."""
+        interaction = self.standardised(states) @ self.interaction
+        return self.affinity[self._known(users, states)] + interaction
+
+    def _lagged(self, shown: Tensor) -> Tensor:
+        """(B, lags) of items (B, N) shown before, most recent first."""
         missing = max(0, self.lags - shown.shape[1])
-        earlier = nn.functional.pad(shown[:, : self.lags], (0, missing), value=-1)
-        query = self.affinity[self._known(users, states)] + x @ self.interaction
-        return query, Exposed(earlier, x.new_zeros(len(x)))
+        return nn.functional.pad(shown[:, : self.lags], (0, missing), value=-1)

@@ -13,7 +13,7 @@ import torch
 from ucfrec import schema
 from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.counterfactual.augment import counterfactual_copies, require_rewards_vary
-from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model
+from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model, reward_model_sizes
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
@@ -266,10 +266,7 @@ def _counterfactuals(
 def _sizes(store: EpisodeStore) -> dict[str, int]:
     columns = store.meta["columns"]
     if store.has_items:
-        items, dim = store.item_states.embeddings.shape
-        users, tags = len(store.item_states.user_features), store.item_states.tags.shape[1]
-        catalogue = {"items": items, "tags": tags, "users": users}
-        return {"state": store.state_size, "action": dim, **catalogue}
+        return reward_model_sizes(store)
     return {"state": store.state_size, "action": columns[schema.ACTION][0], "items": 0}
 
 

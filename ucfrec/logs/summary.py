@@ -193,5 +193,5 @@ def _returns_to_go(report: Mapping[str, Any]) -> str:
     return f"{text}, which is chance where sessions are users: policies learn the next step's"
 
 
-def _clock(def _clock(milliseconds: int) -> str:
+def _clock(milliseconds: int) -> str:
     return datetime.fromtimestamp(milliseconds / 1000, UTC).strftime("%Y-%m-%d %H:%M:%S")

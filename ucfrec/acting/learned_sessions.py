@@ -22,15 +22,11 @@ _PENALTY = 1.0
 
 
 @dataclass(frozen=True)
-class LoggedUse:
-    """Logged steps with what was known before each, and what came of it."""
+class LoggedEnds:
+    """Logged steps, what was shown before each, and whether it ended its session."""
 
-    states: Tensor
-    """(N, S)."""
     shown: Tensor
     """(N, L) int64 items shown before, most recent first; −1 before the session began."""
-    users: Tensor
-    """(N,) rows of the training store's users."""
     items: Tensor
     """(N,) int64 items shown at the step."""
     rewards: npt.NDArray[np.float64]
@@ -38,34 +34,27 @@ class LoggedUse:
     steps: IntArray
     """(N,) number of the step in its session."""
     ended: BoolArray
-    """(N,) whether the session ended with the step."""
-    known: BoolArray
-    """(N,) whether it is known if the session ended with the step: false at the last step of a
-    user's last session, after which the log may simply have ended."""
+    """(N,)."""
 
     @classmethod
-    def of(cls, store: EpisodeStore, lags: int, most: int, seed: int) -> "LoggedUse":
-        """Steps of a view of a store of items, at most `most` of them, drawn at random."""
+    def of(cls, store: EpisodeStore, lags: int, most: int, seed: int) -> "LoggedEnds":
+        """Steps of a view of a store of items, at most `most` of them, drawn at random.
+
+        The last step of a user's last session is left out: the log may simply have ended there.
+        """
         episodes, steps = store.all_steps()
-        if len(steps) > most:
-            drawn = np.random.default_rng(seed).choice(len(steps), most, replace=False)
-            episodes, steps = episodes[np.sort(drawn)], steps[np.sort(drawn)]
+        ended = steps == store.lengths[episodes] - 1
+        users = store.episode_values(schema.USER) if store.has_users else np.arange(len(store))
+        last_session = np.zeros(len(store), dtype=bool)
+        last_session[len(store) - 1 - np.unique(users[::-1], return_index=True)[1]] = True
+        kept = np.flatnonzero(~(ended & last_session[episodes]))
+        if len(kept) > most:
+            kept = np.sort(np.random.default_rng(seed).choice(kept, most, replace=False))
+        episodes, steps, ended = episodes[kept], steps[kept], ended[kept]
         window = store.windows(episodes, steps, lags + 1)
         items = window.actions.masked_fill(~window.mask, -1)
-        users = store.episode_values(schema.USER).astype(np.int64)
-        ended = steps == store.lengths[episodes] - 1
-        last_of_user = np.zeros(store.n_episodes, dtype=bool)
-        last_of_user[np.unique(users[::-1], return_index=True)[1]] = True
-        return cls(
-            states=window.states[:, -1],
-            shown=items[:, :-1].flip(1),
-            users=torch.from_numpy(users[episodes]),
-            items=window.actions[:, -1],
-            rewards=window.rewards[:, -1].double().numpy(),
-            steps=steps,
-            ended=ended,
-            known=~(ended & last_of_user[::-1][episodes]),
-        )
+        rewards = window.rewards[:, -1].double().numpy()
+        return cls(items[:, :-1].flip(1), window.actions[:, -1], rewards, steps, ended)
 
 
 class SessionEnd:
@@ -75,23 +64,23 @@ class SessionEnd:
     the last 1, 3 and all of the steps before.
     """
 
-    def __init__(self, likeness: Likeness, use: LoggedUse) -> None:
+    def __init__(self, likeness: Likeness, logged: LoggedEnds) -> None:
         from sklearn.linear_model import LogisticRegression
         from sklearn.pipeline import make_pipeline
         from sklearn.preprocessing import StandardScaler
 
         self._likeness = likeness
-        ended = use.ended[use.known]
+        ended = logged.ended
         self._rate, self._model = float(ended.mean()) if len(ended) else 0.0, None
         if 0 < self._rate < 1:
-            inputs = self._inputs(use.shown, use.items, use.rewards, use.steps)[use.known]
+            inputs = self._inputs(logged.shown, logged.items, logged.rewards, logged.steps)
             regression = LogisticRegression(C=1 / _PENALTY, max_iter=1000)
             self._model = make_pipeline(StandardScaler(), regression).fit(inputs, ended)
 
     def probabilities(
         self, shown: Tensor, items: Tensor, rewards: npt.NDArray[np.float64], steps: IntArray
     ) -> npt.NDArray[np.float64]:
-        """Probabilities (M,) that sessions end with a step; arguments as in `LoggedUse`."""
+        """Probabilities (M,) that sessions end with a step; arguments as in `LoggedEnds`."""
         if self._model is None:
             return np.full(len(steps), self._rate)
         inputs = self._inputs(shown, items, rewards, steps)
@@ -143,7 +132,9 @@ class LearnedSessions:
         self._slope, self._intercept = calibration
         self._longest = longest
         self._states: ItemStates = store.item_states
-        self._users = store.episode_values(schema.USER).astype(np.int64)
+        self._users = np.full(len(store), -1)
+        if store.has_users:
+            self._users = store.episode_values(schema.USER).astype(np.int64)
         rewards = np.unique(store.step_values(schema.REWARD, *store.all_steps()))
         self._outcomes = rewards if len(rewards) == 2 else None
 
@@ -164,9 +155,9 @@ class LearnedSessions:
         """Show one item in every session; those that end begin anew in the same step."""
         items = torch.from_numpy(np.asarray(actions, dtype=np.int64))
         states = self._sessions.current(torch.from_numpy(self._observe()))
-        scores = self._model.scores(states, self._shown, self._sessions.users)
-        scores = self._slope * scores.gather(1, items.unsqueeze(1)) + self._intercept
-        rewards = self._model.expected(scores)[:, 0].double().numpy()
+        scores = self._model.score(states, self._shown, self._sessions.users, items)
+        scores = self._slope * scores + self._intercept
+        rewards = self._model.expected(scores).double().numpy()
         if self._outcomes is not None:
             low, high = self._outcomes
             chance = (rewards - low) / (high - low)
@@ -177,13 +168,16 @@ class LearnedSessions:
         self._steps += 1
         terminated = self._rng.random(len(ends)) < ends
         truncated = (self._steps >= self._longest) & ~terminated
-        before = self._observe()
-        rows = np.flatnonzero(terminated | truncated)
+        ended = terminated | truncated
+        info: dict[str, Any] = {}
+        if ended.any():
+            info = {"final_obs": self._observe(), "_final_obs": ended}
+        rows = np.flatnonzero(ended)
         self._sessions.begin(rows)
         self._shown[rows], self._steps[rows] = -1, 0
         self._episodes[rows] = (self._episodes[rows] + self.num_envs) % self._store.n_episodes
         self._sessions.users = torch.from_numpy(self._users[self._episodes])
-        info = {**self._info(), "final_obs": before, "_final_obs": terminated | truncated}
+        info |= self._info()
         return self._observe(), rewards.astype(np.float32), terminated, truncated, info
 
     def _observe(self) -> FloatArray:

@@ -42,7 +42,9 @@ def session_scores(
     if decider.rule.exclude_seen:
         seen = seen_before(store, episodes, steps)
         forbidden = seen if forbidden is None else forbidden | seen
-    users = torch.from_numpy(store.episode_values(schema.USER).astype(np.int64)[episodes])
+    users = None
+    if store.has_users:
+        users = torch.from_numpy(store.episode_values(schema.USER).astype(np.int64)[episodes])
     return decider.scores(windows, collected, forbidden, users)
 
 

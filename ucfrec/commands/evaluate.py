@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from ucfrec.commands.options import rule_given, rule_options, world_options
+from ucfrec.commands.options import rule_given, rule_options, world_given, world_options
 from ucfrec.errors import InputError
 
 
@@ -34,13 +34,12 @@ def run(options: argparse.Namespace) -> None:
         InputError: neither a run nor a built-in policy is named, or one of them cannot be used.
     """
     from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
-    from ucfrec.evaluation.world import World
     from ucfrec.files import write_json
     from ucfrec.provenance import without_folders
     from ucfrec.reporting.tables import format_rows
     from ucfrec.runs.trained_policy import TrainedPolicy
 
-    world = World(options.env, options.env_folder)
+    world = world_given(options)
     if not options.runs and not options.behavior:
         raise InputError("name a run folder, or a built-in policy with --behavior")
     rows = []

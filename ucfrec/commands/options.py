@@ -7,20 +7,51 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
+    from ucfrec.evaluation.world import World
     from ucfrec.logs.mapping import Dataset, LogMapping
     from ucfrec.runs.trained_policy import TrainedPolicy
 
 
 def world_options(parser: argparse.ArgumentParser) -> None:
-    """Add --env, --env-folder and --seed."""
-    parser.add_argument("--env", required=True, help="simulator, e.g. synthetic-taobao")
+    """Add --env with the options that belong to it, and --seed."""
+    env_options(parser, required=True)
+    parser.add_argument("--seed", type=int, default=0, help="seed of the sessions (default: 0)")
+
+
+def env_options(parser: argparse.ArgumentParser, required: bool, use: str = "") -> None:
+    """Add --env, --env-folder, --observe and --item-features.
+
+    Args:
+        required: whether --env must be given.
+        use: what the world is used for, for the help of --env.
+    """
+    parser.add_argument(
+        "--env",
+        required=required,
+        help=f"simulator, e.g. synthetic-taobao, or gymnasium:ID, any Gymnasium environment "
+        f"(gymnasium:MODULE:ID imports MODULE first){use}",
+    )
     parser.add_argument(
         "--env-folder",
         type=Path,
         metavar="FOLDER",
         help="folder with the simulator's files, e.g. its weights (default: none)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of the sessions (default: 0)")
+    parser.add_argument(
+        "--observe",
+        default="",
+        metavar="KEY[,KEY…]",
+        help="of gymnasium:ID with a dict observation: entries that are observed, one after the "
+        "other as one vector (default: none, states come from the items shown and their rewards; "
+        "worlds of vector actions need one)",
+    )
+    parser.add_argument(
+        "--item-features",
+        metavar="SOURCE",
+        help="of gymnasium:ID with items: their features, from an attribute of the environment or "
+        "a file .npy (a row for each item) or .parquet (with a column item_id from 0) (default: "
+        "none)",
+    )
 
 
 def log_options(parser: argparse.ArgumentParser) -> None:
@@ -146,3 +177,12 @@ def logs_given(options: argparse.Namespace) -> "tuple[tuple[Path, ...], LogMappi
     if options.mapping is not None:
         given = given.over(read_mapping(options.mapping))
     return dataset.resolve(options.logs, given)
+
+
+def world_given(options: argparse.Namespace) -> "World":
+    """The world that `env_options` name."""
+    from ucfrec.evaluation.world import World
+
+    observe = tuple(key for key in options.observe.split(",") if key)
+    features = options.item_features
+    return World(options.env, options.env_folder, observe=observe, item_features=features)

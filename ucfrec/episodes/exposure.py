@@ -169,6 +169,12 @@ class ExposureTerm(nn.Module):
         apart = 1e-3 * width * torch.arange(len(knots), dtype=torch.float64)
         self.knots.copy_((knots + apart).float())
 
+    @torch.no_grad()
+    def set_weights(self, weights: Tensor) -> None:
+        """Set the weights (2, knots, lags) of repetition and of likeness at each knot and lag."""
+        self.common.zero_()
+        self.by_lag.copy_(weights / _GAIN)
+
     def weights(self, returns: Tensor) -> Tensor:
         """Weights (2, M, N) of repetition and of likeness at returns-to-go (M,)."""
         table = _GAIN * (self.common + self.by_lag)

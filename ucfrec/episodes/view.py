@@ -99,6 +99,11 @@ class EpisodeView:
         return self._columns.has_items
 
     @property
+    def has_users(self) -> bool:
+        """Whether the store names the user of every episode."""
+        return self._columns.has_users
+
+    @property
     def item_states(self) -> ItemStates:
         """Builds states from items; for stores of items only.
 

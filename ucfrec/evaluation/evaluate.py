@@ -104,7 +104,7 @@ def _row(
         variety = variety_columns(env, recommended, counts, numbers)
     env.close()
     return {
-        "world": world.name,
+        "world": world.title,
         "policy": name,
         **asdict(session_metrics(played, seed)),
         **variety,
@@ -123,8 +123,8 @@ def _item_numbers(world: World, env: Any, trained: TrainedPolicy) -> IntArray | 
     expected = trained.record["observation_size"]
     if expected > provided:
         raise InputError(
-            f"the policy observes {expected} numbers, {world.name} shows {provided}; train it on "
-            f"logs of {world.name}"
+            f"the policy observes {expected} numbers, {world.title} shows {provided}; train it on "
+            f"logs of {world.name}, collected with the same --observe"
         )
     if not isinstance(space, spaces.Discrete):
         if sizes["items"] or space.shape != (sizes["action"],):

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
 from pydantic import Field
@@ -89,6 +89,8 @@ class SequencePolicy(nn.Module, ABC):
     Config: ClassVar[type[PolicyConfig]] = PolicyConfig
     augmented: ClassVar[bool] = False
     """Whether the default of `augment.copies` is above 0 for this learner."""
+    presets: ClassVar[Mapping[str, Any]] = {}
+    """Defaults of this learner for settings outside the table `policy`, by `table.field`."""
 
     state_mean: Tensor
     state_std: Tensor

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 BUILT_IN: Final = {
     "ucf": "ucf:UCFPolicy",
+    "ucf-paper": "ucf:UCFPaperPolicy",
     "dt": "dt:DTPolicy",
     "dc": "dc:DCPolicy",
     "lsdt": "lsdt:LSDTPolicy",

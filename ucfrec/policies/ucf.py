@@ -43,11 +43,24 @@ class UCFConfig(PolicyConfig):
     """Weight of the parent s_{t−k} is this to the power k."""
     parent_action: Weight = 0.3
     """Weight of the parent a_{t−1}."""
+    exposure: bool = True
+    """Whether the logits of items depend on what the session was shown lately: on repetitions, and
+    on shared tags or, without tags, on similar embeddings."""
 
     def __post_init__(self) -> None:
         """Check the fields against each other."""
         super().__post_init__()
         require_heads(self, self.heads)
+
+
+@settings_table("policy")
+class UCFPaperConfig(UCFConfig):
+    """Settings of the policy as read in the paper: attention is supervised."""
+
+    lambda_mask: Weight = 0.1
+    """λ, weight of the mask loss, which supervises attention (Table 7)."""
+    exposure: bool = False
+    """Whether the logits of items depend on what the session was shown lately."""
 
 
 class UCFPolicy(SequencePolicy):
@@ -120,6 +133,17 @@ class UCFPolicy(SequencePolicy):
             "mask_loss": supervision.detach(),
             "attention_on_parents": masked_mean(on_parents.detach(), mask),
         }
+
+
+class UCFPaperPolicy(UCFPolicy):
+    """UCF as read in the paper, without what later measurements added.
+
+    λ 0.1, a plain CVAE as reward model, the paper's generator, the return of the whole rest, and
+    the most probable action at the largest training return.
+    """
+
+    Config = UCFPaperConfig
+    presets = {"crm.mean_first": False, "csg.kind": "faithful", "rule.choose": False}
 
 
 class ConvStream(nn.Module):

@@ -8,56 +8,25 @@ the training log shows often enough, and to more than a handful of them.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
-from pydantic import Field
-from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import Decider, DecisionRule
-from ucfrec.acting.learned_sessions import LearnedSessions, LoggedUse, SessionEnd
+from ucfrec.acting.learned_sessions import LearnedSessions, LoggedEnds, SessionEnd
 from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.rollout import Step, rollout
 from ucfrec.counterfactual.item_reward_model import ItemRewardModel
+from ucfrec.counterfactual.item_reward_report import scores_of
+from ucfrec.counterfactual.item_reward_rows import RewardRows
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.settings import Count, Share, settings_table
+from ucfrec.runs.rule_config import RuleConfig
 
 _MOST_STEPS = 100_000
 """Logged steps that the models of the users are fitted to at most."""
-
-
-@settings_table("rule")
-class RuleConfig:
-    """How the decision rule of a run is chosen.
-
-    Only policies of items with a reward model choose; the rule of others takes the target quantile
-    `default_quantile` and the best item.
-    """
-
-    choose: bool = True
-    """Whether the rule is chosen on validation sessions; otherwise it is the default one."""
-    default_quantile: Share = 1.0
-    """Quantile of the training returns that is the default rule's target."""
-    quantiles: tuple[Share, ...] = (0.9, 1.0)
-    """Candidates for the target, as quantiles of the training returns; each with and without a
-    floor at the same value."""
-    temperatures: tuple[Annotated[float, Field(ge=0, le=100)], ...] = (0.0, 0.5, 1.0)
-    """Candidates for the temperature."""
-    tilts: tuple[Annotated[float, Field(ge=0, le=1000)], ...] = (0.0, 1.0, 2.0, 4.0)
-    """Candidates for β, the weight of the reward model."""
-    sessions: Count = 200
-    """Sessions played of each candidate."""
-    least_impressions: Count = 10
-    """Training impressions from which on the log supports an item."""
-    least_support: Share = 0.9
-    """Smallest share of a rule's decisions that the log must support."""
-    least_items: Annotated[float, Field(ge=1, le=10**9)] = 20.0
-    """Smallest effective number of items that a rule must show, the exponential of their entropy;
-    at most a quarter of the items that the log supports."""
 
 
 @dataclass(frozen=True)
@@ -128,10 +97,9 @@ class RuleSearch:
         self._store, model = validation, decider.reward_model
         states = validation.item_states
         self._likeness = likeness = Likeness.of(states)
-        end = SessionEnd(likeness, LoggedUse.of(train, model.lags, _MOST_STEPS, seed))
-        self.calibration = calibrate(
-            model, LoggedUse.of(validation, model.lags, _MOST_STEPS, seed)
-        )
+        end = SessionEnd(likeness, LoggedEnds.of(train, model.lags, _MOST_STEPS, seed))
+        rows = RewardRows.of(validation, model.lags, _MOST_STEPS, seed)
+        self.calibration = calibrate(model, rows)
         self._world = LearnedSessions(
             *(validation, model, self.calibration, end, config.sessions, int(train.lengths.max()))
         )
@@ -206,8 +174,7 @@ def choose_rule(
     learned = decider.policy.values is not None and decider.policy.config.max_return
     played = [search.play(rule) for rule in _untilted(config, targets, learned)]
     first = search.best(played)
-    for rule in _tilted(config, first.rule):
-        played.append(search.play(rule))
+    played.extend(search.play(rule) for rule in _tilted(config, first.rule))
     best = search.best(sorted(played, key=lambda candidate: candidate.rule.tilt))
     return Choice(best.rule, played, search.calibration, float(search.least_items))
 
@@ -230,32 +197,22 @@ def _tilted(config: RuleConfig, rule: DecisionRule) -> Iterator[DecisionRule]:
                 yield replace(rule, tilt=tilt, temperature=temperature)
 
 
-def calibrate(model: ItemRewardModel, use: LoggedUse) -> tuple[float, float]:
+def calibrate(model: ItemRewardModel, rows: RewardRows) -> tuple[float, float]:
     """Slope and intercept of the model's scores that fit logged rewards best.
 
     By logistic regression for rewards of two values, by least squares otherwise.
     """
     from sklearn.linear_model import LinearRegression, LogisticRegression
 
-    scores = _scores(model, use).reshape(-1, 1)
-    outcomes, places = np.unique(use.rewards, return_inverse=True)
-    if len(outcomes) < 2:
-        return 1.0, 0.0
-    if len(outcomes) == 2:
-        fitted = LogisticRegression(C=np.inf, max_iter=1000).fit(scores, places)
+    scores, _ = scores_of(model, rows)
+    inputs, outcomes = (
+        scores.double().numpy().reshape(-1, 1),
+        model.target(rows.rewards).double().numpy(),
+    )
+    if model.binary and 0 < outcomes.mean() < 1:
+        fitted = LogisticRegression(C=np.inf, max_iter=1000).fit(inputs, outcomes > 0)
         return float(fitted.coef_[0, 0]), float(fitted.intercept_[0])
-    units = model.expected(torch.tensor([0.0, 1.0])).double().numpy()
-    rewards = (use.rewards - units[0]) / (units[1] - units[0])
-    fitted = LinearRegression().fit(scores, rewards)
+    if model.binary:
+        return 1.0, 0.0
+    fitted = LinearRegression().fit(inputs, outcomes)
     return float(fitted.coef_[0]), float(fitted.intercept_)
-
-
-def _scores(model: ItemRewardModel, use: LoggedUse) -> npt.NDArray[np.float64]:
-    """The model's scores (N,) of the logged items."""
-    chunks = []
-    for first in range(0, len(use.items), 1024):
-        rows = slice(first, first + 1024)
-        with torch.no_grad():
-            scores: Tensor = model.scores(use.states[rows], use.shown[rows], use.users[rows])
-        chunks.append(scores.gather(1, use.items[rows].unsqueeze(1))[:, 0])
-    return torch.cat(chunks).double().numpy()

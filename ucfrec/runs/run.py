@@ -13,6 +13,7 @@ import torch
 from ucfrec import schema
 from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.counterfactual.augment import counterfactual_copies, require_rewards_vary
+from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model, reward_model_sizes
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
@@ -26,10 +27,21 @@ from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
 from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import command_line, versions
+from ucfrec.runs.choose_rule import choose_rule
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.reference_losses import reference_losses
 from ucfrec.runs.samples import SAMPLES, sample_recommendations
-from ucfrec.runs.trained_policy import AUGMENTATION, COUNTS, ITEMS, RETURNS, RULE, RUN, USERS
+from ucfrec.runs.trained_policy import (
+    AUGMENTATION,
+    COUNTS,
+    ITEMS,
+    RETURNS,
+    REWARD_MODEL,
+    RULE,
+    RUN,
+    USERS,
+    TrainedPolicy,
+)
 
 _VALIDATION_BATCHES = 16
 _VALIDATION_BATCH = 256
@@ -67,7 +79,7 @@ def train_run(
             too few training episodes or constant rewards, or the learner does not support its
             actions.
     """
-    train, validation = training_views(store)
+    train, validation = logged, held_out = training_views(store)
     if (out / RUN).exists():
         _require_same(read_json(out / RUN), store, out, config)
     elif config.augment.copies > 0:
@@ -93,8 +105,10 @@ def train_run(
         train = train.with_overlay(more_copies)
     fitted = _fit_policy(policy, train, validation, out, config)
     record["policy"] = dataclasses.asdict(fitted)
+    if logged.has_items and config.rule.choose:
+        record["reward_model"], record["rule"] = _rule(policy, logged, held_out, out, config)
     record["wall_time_s"] = time.perf_counter() - start
-    _write_samples(out, policy, validation, record)
+    _write_samples(out, held_out)
     write_json(out / RUN, record)
     return dict(record)
 
@@ -175,7 +189,8 @@ def _begin(
     returns = _target_returns(train, config.policy.returns)
     with atomic_folder(out) as scratch:
         save_tensors(scratch / RETURNS, {"returns": torch.from_numpy(returns)}, {})
-        write_json(scratch / RULE, DecisionRule(float(returns[-1])).as_dict())
+        target = float(np.quantile(returns.astype(np.float64), config.rule.default_quantile))
+        write_json(scratch / RULE, DecisionRule(target).as_dict())
         for name in (ITEM_STATES, ITEMS, USERS):
             if (store.path / name).exists():
                 shutil.copyfile(store.path / name, scratch / name)
@@ -251,9 +266,7 @@ def _counterfactuals(
 def _sizes(store: EpisodeStore) -> dict[str, int]:
     columns = store.meta["columns"]
     if store.has_items:
-        items, dim = store.item_states.embeddings.shape
-        tags = store.item_states.tags.shape[1]
-        return {"state": store.state_size, "action": dim, "items": items, "tags": tags}
+        return reward_model_sizes(store)
     return {"state": store.state_size, "action": columns[schema.ACTION][0], "items": 0}
 
 
@@ -303,14 +316,26 @@ def _validation(policy: SequencePolicy, validation: EpisodeStore, seed: int) -> 
     return loss
 
 
-def _write_samples(
-    out: Path, policy: SequencePolicy, validation: EpisodeStore, record: Mapping[str, Any]
-) -> None:
+def _rule(
+    policy: SequencePolicy, train: EpisodeStore, validation: EpisodeStore, out: Path, config: Config
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Fit the reward model of items and choose the rule; returns the reports of both."""
+    model, report = fit_item_reward_model(train, validation, out / REWARD_MODEL, config.seed)
+    trained = TrainedPolicy.load(out)
+    targets = {quantile: trained.target_return(quantile) for quantile in config.rule.quantiles}
+    default = DecisionRule(trained.target_return(config.rule.default_quantile))
+    decider = Decider(policy, default, trained.returns, model)
+    choice = choose_rule(decider, targets, train, validation, config.rule, config.seed)
+    write_json(out / RULE, choice.rule.as_dict())
+    return dataclasses.asdict(report), choice.as_dict()
+
+
+def _write_samples(out: Path, validation: EpisodeStore) -> None:
     """Save a few recommendations for the report, by the run's decision rule."""
     if validation.has_items:
-        rule = DecisionRule.from_dict(read_json(out / RULE), str(out / RULE))
-        decider = Decider(policy, rule, ReturnToGo(**record["return_to_go"]))
-        write_json(out / SAMPLES, sample_recommendations(decider, validation))
+        write_json(
+            out / SAMPLES, sample_recommendations(TrainedPolicy.load(out).decider(), validation)
+        )
 
 
 def describe_run(record: Mapping[str, Any]) -> str:

@@ -13,6 +13,7 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
+from ucfrec.counterfactual.item_reward_model import FITTED, ItemRewardModel
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.returns import ReturnToGo
@@ -31,6 +32,7 @@ ITEMS, USERS = "items.parquet", "users.parquet"
 COUNTS = "training_counts.safetensors"
 RETURNS = "training_returns.safetensors"
 RULE = "decision_rule.json"
+REWARD_MODEL = "reward_model"
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,8 @@ class TrainedPolicy:
     of steps if a target is set anew at every step (`ReturnToGo.per_session`)."""
     rule: DecisionRule
     """The decision rule of the run."""
+    reward_model: ItemRewardModel | None = None
+    """Of the rewards of items, for decision rules with a tilt; None if the run fitted none."""
     counts: TrainingCounts | None = None
     """Item counts of the training steps; None if actions are vectors or the run lacks the file."""
 
@@ -84,6 +88,7 @@ class TrainedPolicy:
             _ids(run / USERS, schema.USER_ID),
             load_tensors(run / RETURNS)[0]["returns"].numpy(),
             _rule(run / RULE),
+            _reward_model(run / REWARD_MODEL / FITTED, record["sizes"]),
             TrainingCounts.load(run / COUNTS) if (run / COUNTS).exists() else None,
         )
 
@@ -115,7 +120,7 @@ class TrainedPolicy:
         rule, likeness, states = rule or self.rule, None, self.item_states
         if rule.tag_window and states is not None:
             likeness = Likeness.of(states)
-        return Decider(self.policy, rule, self.returns, None, likeness)
+        return Decider(self.policy, rule, self.returns, self.reward_model, likeness)
 
     def actor(
         self,
@@ -190,6 +195,14 @@ def _rule(path: Path) -> DecisionRule:
     if not isinstance(values, Mapping):
         raise InputError(f"{path} is not a decision rule; train the policy again")
     return DecisionRule.from_dict(values, str(path))
+
+
+def _reward_model(path: Path, sizes: Mapping[str, int]) -> ItemRewardModel | None:
+    if not path.exists():
+        return None
+    model = ItemRewardModel(sizes)
+    load_weights(path, model, load_tensors(path)[0])
+    return model.eval()
 
 
 def _ids(path: Path, column: str) -> npt.NDArray[Any]:

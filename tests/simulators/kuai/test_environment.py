@@ -19,6 +19,7 @@ from tests.support.kuai_reference import OneUser, Plain
 from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.rollout import FORBIDDEN, Step, rollout
+from ucfrec.acting.uniform import Uniform
 from ucfrec.episodes.states import ItemStates
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import collect
@@ -26,7 +27,7 @@ from ucfrec.evaluation.evaluate import _item_numbers
 from ucfrec.evaluation.world import World
 from ucfrec.plugins import Simulator
 from ucfrec.policies.dt import DTConfig, DTPolicy
-from ucfrec_simulators.behaviors import Constant, Uniform
+from ucfrec_simulators.behaviors import Constant
 from ucfrec_simulators.kuai.environment import EXITS, REGIMES, ExitRule, KuaiEnv, oracle
 from ucfrec_simulators.kuai.exit_cuts import sessions_by_exit
 from ucfrec_simulators.session_env import SingleSession

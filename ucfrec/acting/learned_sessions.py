@@ -40,14 +40,16 @@ class LoggedEnds:
     def of(cls, store: EpisodeStore, lags: int, most: int, seed: int) -> "LoggedEnds":
         """Steps of a view of a store of items, at most `most` of them, drawn at random.
 
-        The last step of a user's last session is left out: the log may simply have ended there.
+        The last step of a user's last session, and of a session that was cut, is left out: the
+        log may simply have ended there.
         """
         episodes, steps = store.all_steps()
         ended = steps == store.lengths[episodes] - 1
         users = store.episode_values(schema.USER) if store.has_users else np.arange(len(store))
         last_session = np.zeros(len(store), dtype=bool)
         last_session[len(store) - 1 - np.unique(users[::-1], return_index=True)[1]] = True
-        kept = np.flatnonzero(~(ended & last_session[episodes]))
+        unknown = last_session | ~store.terminated
+        kept = np.flatnonzero(~(ended & unknown[episodes]))
         if len(kept) > most:
             kept = np.sort(np.random.default_rng(seed).choice(kept, most, replace=False))
         episodes, steps, ended = episodes[kept], steps[kept], ended[kept]

@@ -101,7 +101,7 @@ class EpisodeView:
     @property
     def has_users(self) -> bool:
         """Whether the store names the user of every episode."""
-        return self._columns.has_users
+        return self._columns.has_episode_column(schema.USER)
 
     @property
     def item_states(self) -> ItemStates:
@@ -129,6 +129,13 @@ class EpisodeView:
             InputError: the store has no such column, or its files are damaged.
         """
         return self._columns.episode_column(name)[self._sources]
+
+    @property
+    def terminated(self) -> npt.NDArray[np.bool_]:
+        """(E + C,) whether each session is known to have ended with its last step."""
+        if not self._columns.has_episode_column(schema.TERMINATED):
+            return np.ones(self.n_episodes, dtype=bool)
+        return self.episode_values(schema.TERMINATED).astype(bool)
 
     @cached_property
     def returns(self) -> FloatArray:

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from pydantic import Field
@@ -44,9 +44,10 @@ class PolicyConfig:
     """Returns-to-go are divided by this; 0 selects the largest absolute training return."""
     max_timestep: Timesteps = 1000
     """Rows of the timestep embedding; later steps share the last row. 1 hides the time."""
-    return_to_go: Definition = "session"
+    return_to_go: Definition | Literal["auto"] = "auto"
     """What returns-to-go count: the whole rest of the `session`; the rest `discounted` by
-    `discount`; or the next `horizon` steps."""
+    `discount`; or the next `horizon` steps. `auto` is the horizon where the sessions of the log are
+    users, whose rest tells how many rows a user has left, and otherwise the session."""
     discount: Annotated[float, Field(gt=0, le=1)] = 0.9
     """γ of discounted returns-to-go."""
     horizon: Annotated[int, Field(ge=1, le=10**6)] = 1
@@ -73,10 +74,12 @@ class PolicyConfig:
             "policy.exposure_window",
         )
 
-    @property
-    def returns(self) -> ReturnToGo:
-        """The definition of the returns-to-go."""
-        return ReturnToGo(self.return_to_go, self.discount, self.horizon)
+    def returns(self, session_by: str | None) -> ReturnToGo:
+        """What returns-to-go count in a log whose sessions are made `session_by`."""
+        definition = self.return_to_go
+        if definition == "auto":
+            definition = "horizon" if session_by == "user" else "session"
+        return ReturnToGo(definition, self.discount, self.horizon)
 
 
 class SequencePolicy(nn.Module, ABC):

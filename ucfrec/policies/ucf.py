@@ -1,13 +1,14 @@
 """UCF's hybrid causal architecture (paper section 3.2)."""
 
 from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from ucfrec.episodes.returns import Definition
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import (
     Heads,
@@ -61,6 +62,8 @@ class UCFPaperConfig(UCFConfig):
     """λ, weight of the mask loss, which supervises attention (Table 7)."""
     exposure: bool = False
     """Whether the logits of items depend on what the session was shown lately."""
+    return_to_go: Definition | Literal["auto"] = "session"
+    """What returns-to-go count: the whole rest of the session (section 2.1)."""
 
 
 class UCFPolicy(SequencePolicy):
@@ -143,7 +146,11 @@ class UCFPaperPolicy(UCFPolicy):
     """
 
     Config = UCFPaperConfig
-    presets = {"crm.mean_first": False, "csg.kind": "faithful", "rule.choose": False}
+    presets: ClassVar[Mapping[str, Any]] = {
+        "crm.mean_first": False,
+        "csg.kind": "faithful",
+        "rule.choose": False,
+    }
 
 
 class ConvStream(nn.Module):

@@ -160,7 +160,7 @@ def choose_rule(
     config: RuleConfig,
     seed: int,
 ) -> Choice:
-    """Choose target, floor and temperature without a tilt, then tilt and temperature.
+    """Choose target, floor and temperature, then tilt and temperature, then tag window and tilt.
 
     Args:
         decider: the policy under its default rule, with a reward model.
@@ -175,8 +175,22 @@ def choose_rule(
     played = [search.play(rule) for rule in _untilted(config, targets, learned)]
     first = search.best(played)
     played.extend(search.play(rule) for rule in _tilted(config, first.rule))
-    best = search.best(sorted(played, key=lambda candidate: candidate.rule.tilt))
+    second = search.best(_simplest_first(played))
+    if validation.item_states.tags.shape[1]:
+        played.extend(search.play(rule) for rule in _filtered(config, second.rule))
+    best = search.best(_simplest_first(played))
     return Choice(best.rule, played, search.calibration, float(search.least_items))
+
+
+def _simplest_first(candidates: Sequence[Candidate]) -> list[Candidate]:
+    return sorted(candidates, key=lambda each: (each.rule.tag_window > 0, each.rule.tilt))
+
+
+def _filtered(config: RuleConfig, rule: DecisionRule) -> Iterator[DecisionRule]:
+    for window in config.tag_windows:
+        for tilt in config.tilts:
+            if window and (tilt >= rule.tilt or tilt == 0):
+                yield replace(rule, tag_window=window, tilt=tilt)
 
 
 def _untilted(

@@ -26,6 +26,8 @@ class RuleConfig:
     """Candidates for the temperature."""
     tilts: tuple[Annotated[float, Field(ge=0, le=1000)], ...] = (0.0, 1.0, 2.0, 4.0)
     """Candidates for β, the weight of the reward model."""
+    tag_windows: tuple[Annotated[int, Field(ge=0, le=1000)], ...] = (0, 3, 10)
+    """Candidates for the number of steps whose tags are left out, where items have tags."""
     sessions: Count = 200
     """Sessions played of each candidate."""
     least_impressions: Count = 10

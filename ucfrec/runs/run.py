@@ -92,9 +92,9 @@ def train_run(
     start = time.perf_counter() - record["wall_time_s"]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     view = policy.training_view(train, config.policy, out / "view", config.seed)
-    if not config.policy.returns.per_session:
-        view = view.with_return_to_go(config.policy.returns)
-        validation = validation.with_return_to_go(config.policy.returns)
+    returns = ReturnToGo(**record["return_to_go"])
+    if not returns.per_session:
+        view, validation = (each.with_return_to_go(returns) for each in (view, validation))
     if view is not train:
         train, policy = view, new_policy(view, config)
     policy = policy.to(device)
@@ -178,7 +178,7 @@ def _begin(
         "observation_size": store.observation_size,
         "train_episodes": train.n_episodes,
         "train_steps": train.n_steps,
-        "return_to_go": dataclasses.asdict(config.policy.returns),
+        "return_to_go": dataclasses.asdict(_returns(store, config)),
         "return_quantiles": {str(q): float(np.quantile(train.returns, q)) for q in _QUANTILES},
         "mean_return": float(train.returns.mean()),
         "data": store.meta["source"],
@@ -186,7 +186,7 @@ def _begin(
         "wall_time_s": 0.0,
         **about,
     }
-    returns = _target_returns(train, config.policy.returns)
+    returns = _target_returns(train, _returns(store, config))
     with atomic_folder(out) as scratch:
         save_tensors(scratch / RETURNS, {"returns": torch.from_numpy(returns)}, {})
         target = float(np.quantile(returns.astype(np.float64), config.rule.default_quantile))
@@ -199,6 +199,10 @@ def _begin(
             counts.save(scratch / COUNTS)
             record["reference_losses"] = reference_losses(counts, validation)
         write_json(scratch / RUN, record)
+
+
+def _returns(store: EpisodeStore, config: Config) -> ReturnToGo:
+    return config.policy.returns(store.meta["source"].get("session_by"))
 
 
 def _target_returns(train: EpisodeStore, definition: ReturnToGo) -> FloatArray:
@@ -282,7 +286,7 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
     scale = config.policy.return_scale or float(np.abs(base.returns).max()) or 1.0
     episodes, steps = base.all_steps()
     returns_to_go = base.step_values(schema.RETURN_TO_GO, episodes, steps)
-    if not config.policy.returns.per_session and not config.policy.return_scale:
+    if not _returns(base, config).per_session and not config.policy.return_scale:
         scale = float(np.abs(returns_to_go).max()) or 1.0
     policy.return_scale.fill_(scale)
     policy.lowest_return_to_go.fill_(float(returns_to_go.min()))

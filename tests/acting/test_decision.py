@@ -324,7 +324,7 @@ def test_everything_left_out_is_an_error() -> None:
     assert decider_of().scores(windows, collected, forbidden)[1].argmax() == 4
 
 
-@pytest.mark.parametrize("name", ["ucf", "dt", "dc", "lsdt", "bc"])
+@pytest.mark.parametrize("name", ["ucf", "dt", "dc", "lsdt"])
 def test_the_steps_own_action_and_reward_are_not_read(name: str) -> None:
     windows, collected = random_windows(CATALOG), torch.tensor([0.0, 1.0, 2.0]).double()
     actions, rewards = windows.actions.clone(), windows.rewards.clone()

@@ -5,15 +5,13 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-import torch
-from torch import Tensor
 
-from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.rollout import rollout
 from ucfrec.commands.cli import main
 from ucfrec.evaluation.world import World
@@ -146,7 +144,8 @@ def test_score_tells_the_probability_of_every_choice(
     log.loc[log.index[:3], "item_id"] = 987654
     log.to_parquet(tmp_path / "log.parquet")
     out = tmp_path / "scores.parquet"
-    assert main(["score", run, str(tmp_path / "log.parquet"), "--out", str(out)]) == 0
+    arguments = ["score", run, str(tmp_path / "log.parquet"), "--out", str(out)]
+    assert main([*arguments, "--temperature", "1"]) == 0
     printed = capsys.readouterr().out
     assert re.search(r"dropped: unknown_item +3 ", printed)
     scores = pd.read_parquet(out)
@@ -156,9 +155,13 @@ def test_score_tells_the_probability_of_every_choice(
     assert list(scores.columns) == columns.split()
     assert scores.session.nunique() == log[3:].session_id.nunique()
     assert scores.probability.between(0, 1, inclusive="neither").all()
+    # By default it is the run's own rule that is scored, which takes the best item.
+    assert main(arguments) == 0
+    by_rule = pd.read_parquet(out)
+    assert (by_rule.probability == (scores["rank"] == 1)).all()
 
 
-@pytest.mark.parametrize("choice", [[], ["--greedy"]])
+@pytest.mark.parametrize("choice", [["--temperature", "1"], ["--temperature", "0"]])
 def test_ope_writes_the_rows_it_prints(
     catalog: tuple[str, Path], choice: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -169,7 +172,7 @@ def test_ope_writes_the_rows_it_prints(
     printed = capsys.readouterr().out
     rows = {row["estimator"]: row for row in json.loads(out.read_text())}
     weighted = set(rows) - {"logged", "DM", "FQE"}
-    assert weighted or choice
+    assert weighted or choice == ["--temperature", "0"]
     assert not weighted or {"IPS", "SNIPS", "PDIS", "SNPDIS", "DR", "SNDR"} <= weighted
     log = pd.read_parquet(logs)
     assert rows["logged"]["R_cum"] == pytest.approx(log.is_click.sum() / 300)
@@ -194,13 +197,6 @@ def test_ope_writes_the_rows_it_prints(
     assert {row["estimator"]: row for row in json.loads(out.read_text())} == rows
 
 
-class SoftmaxActor(PolicyActor):
-    """Draws items from the policy's probabilities: what `ope` judges, played."""
-
-    def _best(self, scores: Tensor) -> Tensor:
-        return torch.multinomial(scores.softmax(-1), 1)[:, 0]
-
-
 def test_ope_tells_from_uniform_logs_what_playing_tells(
     catalog: tuple[str, Path], tmp_path: Path
 ) -> None:
@@ -208,14 +204,11 @@ def test_ope_tells_from_uniform_logs_what_playing_tells(
     collected = ["--behavior", "random", "--sessions", "3000", "--out", str(tmp_path / "logs")]
     assert main(["collect", "--env", "synthetic-catalog", *collected]) == 0
     out = tmp_path / "rows.json"
-    assert main(["ope", run, str(tmp_path / "logs/sessions.parquet"), "--json", str(out)]) == 0
+    given = ["--temperature", "1", "--json", str(out)]
+    assert main(["ope", run, str(tmp_path / "logs/sessions.parquet"), *given]) == 0
     rows = {row["estimator"]: row for row in json.loads(out.read_text())}
-    torch.manual_seed(0)
     trained = TrainedPolicy.load(Path(run))
-    target = trained.target_return(1.0)
-    size = trained.record["observation_size"]
-    numbers = (trained.item_states, trained.item_ids, trained.user_ids)
-    actor = SoftmaxActor(trained.policy, 512, target, size, *numbers)
+    actor = trained.actor(512, replace(trained.rule, temperature=1.0))
     env = World("synthetic-catalog", None).simulator().make(512, None)
     returns = rollout(env, actor, 2000, seed=0).returns
     truth, error = returns.mean(), returns.std() / 2000**0.5
@@ -242,7 +235,8 @@ def test_ope_without_propensities_has_only_models_and_without_one_leaves_a_sessi
     log.assign(propensity=log.propensity.where(log.index != 5)).to_parquet(tmp_path / "one.parquet")
     for name in ("without", "one"):
         out = tmp_path / f"{name}.json"
-        assert main(["ope", run, str(tmp_path / f"{name}.parquet"), "--json", str(out)]) == 0
+        given = ["--temperature", "1", "--json", str(out)]
+        assert main(["ope", run, str(tmp_path / f"{name}.parquet"), *given]) == 0
         rows = json.loads(out.read_text())
         printed = capsys.readouterr().out
         if name == "without":

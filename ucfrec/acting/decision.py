@@ -1,10 +1,10 @@
 """The decision rule: what turns a trained policy into what is shown, the same wherever it acts."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,6 +17,20 @@ from ucfrec.provenance import config_hash
 
 if TYPE_CHECKING:
     from ucfrec.counterfactual.item_reward_model import ItemRewardModel
+
+
+_RANGES: Final = {
+    "target": (-1e12, 1e12),
+    "floor": (-1e12, 1e12),
+    "tilt": (0.0, 1e6),
+    "temperature": (0.0, 1e6),
+    "top_k": (1, 10**9),
+    "tag_window": (0, 10**4),
+}
+_COLDEST: Final = 1e-30
+"""Temperature below which dividing by it would leave the range of float32."""
+_OPTIONAL: Final = ("target", "floor", "top_k")
+_WHOLE: Final = ("top_k", "tag_window")
 
 
 @dataclass(frozen=True)
@@ -49,18 +63,23 @@ class DecisionRule:
     """Items that share a tag with one of so many shown before are left out, unless none remain."""
 
     def __post_init__(self) -> None:
-        for name, value in self.as_dict().items():
-            if isinstance(value, float) and not math.isfinite(value):
-                raise InputError(f"the decision rule has {name} {value}; give a finite number")
-        if self.tilt < 0 or self.temperature < 0:
+        for name, (low, high) in _RANGES.items():
+            value = getattr(self, name)
+            if value is None and name in _OPTIONAL:
+                continue
+            whole, kinds = name in _WHOLE, (int, np.integer)
+            right = isinstance(value, kinds if whole else (*kinds, float, np.floating))
+            if not right or isinstance(value, bool) or not low <= value <= high:
+                number = "whole number" if whole else "finite number"
+                raise InputError(
+                    f"the decision rule has {name} {value!r}; give a {number} from {low:g} to "
+                    f"{high:g}"
+                )
+            # Equal rules have equal types, and so the same hash.
+            object.__setattr__(self, name, int(value) if whole else float(value) + 0.0)
+        if not isinstance(self.exclude_seen, bool):
             raise InputError(
-                f"the decision rule has tilt {self.tilt:g} and temperature {self.temperature:g}; "
-                "give 0 or more"
-            )
-        if (self.top_k is not None and self.top_k < 1) or self.tag_window < 0:
-            raise InputError(
-                f"the decision rule has top_k {self.top_k} and tag_window {self.tag_window}; draw "
-                "from 1 item or more, and look back 0 steps or more"
+                f"the decision rule has exclude_seen {self.exclude_seen!r}; give true or false"
             )
 
     def as_dict(self) -> dict[str, Any]:
@@ -79,17 +98,15 @@ class DecisionRule:
             InputError: a field is unknown, missing, of another type or out of range.
         """
         known = {each.name for each in fields(cls)}
-        numbers = known - {"exclude_seen"}
         if "target" not in values or not values.keys() <= known:
             raise InputError(
                 f"{source} is not a decision rule: it has the fields {', '.join(values)}; it needs "
                 f"target and knows {', '.join(sorted(known))}"
             )
-        for name, value in values.items():
-            right = (int, float, type(None)) if name in numbers else (bool,)
-            if not isinstance(value, right) or (name in numbers and isinstance(value, bool)):
-                raise InputError(f"{source}: {name} is {value!r}; give a number")
-        return cls(**values)
+        try:
+            return cls(**values)
+        except InputError as error:
+            raise InputError(f"{source}: {error}") from None
 
     def __str__(self) -> str:
         target = "the largest return expected" if self.target is None else f"{self.target:g}"
@@ -134,7 +151,9 @@ class DecisionRule:
         if self.top_k is not None and self.top_k < scores.shape[1]:
             lowest = scores.topk(self.top_k, dim=-1).values[:, -1:]
             scores = scores.masked_fill(scores < lowest, -torch.inf)
-        return (scores / self.temperature).log_softmax(-1)
+        # Relative to the best, so that no temperature makes every score −∞.
+        relative = scores - scores.amax(-1, keepdim=True)
+        return (relative / max(self.temperature, _COLDEST)).log_softmax(-1)
 
     def choose(self, scores: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Items (B,) and the probabilities (B,) with which they were chosen.
@@ -152,6 +171,8 @@ class DecisionRule:
     def ranked(self, scores: Tensor, k: int, generator: torch.Generator) -> Tensor:
         """`k` different items (B, k), best first, or drawn one after the other.
 
+        Once all of the `top_k` items have been drawn, the others follow, best first.
+
         Args:
             scores: (B, n_items) of `Decider.scores`; k at most n_items.
             k: number of items.
@@ -160,7 +181,13 @@ class DecisionRule:
         if self.temperature > 0:
             # The largest sums of log-probability and Gumbel noise are draws without replacement.
             noise = torch.rand(scores.shape, generator=generator).clamp(min=1e-30)
-            scores = self.log_probabilities(scores) - torch.log(-torch.log(noise))
+            drawn = self.log_probabilities(scores) - torch.log(-torch.log(noise))
+            found = drawn.topk(k, dim=-1)
+            if not torch.isneginf(found.values).any():
+                return found.indices
+            by_score = scores.argsort(dim=-1, descending=True)
+            places = drawn.gather(1, by_score).argsort(dim=-1, descending=True, stable=True)
+            return by_score.gather(1, places)[:, :k]
         return scores.topk(k, dim=-1).indices
 
 
@@ -189,6 +216,13 @@ class Decider:
                 "the rule leaves out items by their tags, but the store has none; give the items a "
                 "column of lists, or set the tag window to 0"
             )
+        before = self.policy.config.context - 1
+        if self.rule.tag_window > before:
+            raise InputError(
+                f"the rule looks at the tags of the last {self.rule.tag_window} items, but the "
+                f"policy remembers {before} (policy.context less 1); set the tag window to at most "
+                f"{before}"
+            )
 
     @torch.no_grad()
     def asked(self, windows: Windows, collected: Tensor) -> Windows:
@@ -198,7 +232,9 @@ class Decider:
             windows: B windows that end with the step to decide.
             collected: (B,) float64 rewards earlier in the session, also before the window.
         """
-        best = self.policy.max_return(windows).cpu() if self.rule.target is None else None
+        best = None
+        if self.rule.target is None:
+            best = self.policy.max_return(windows.to(self.policy.state_mean.device)).cpu()
         asked = self.rule.asked(self.returns, collected, best)
         returns_to_go = self.returns.before(asked, windows.rewards.cpu())
         mask = windows.mask

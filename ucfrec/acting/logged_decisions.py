@@ -40,11 +40,17 @@ def session_scores(
     windows = replace(windows, actions=windows.actions.clamp(min=0))
     collected = torch.from_numpy(store.rewards_before(episodes, steps))
     if decider.rule.exclude_seen:
-        rows, items = store.items_before(episodes, steps)
-        seen = torch.zeros(len(steps), len(store.item_states.embeddings), dtype=torch.bool)
-        seen[torch.from_numpy(rows[items >= 0]), torch.from_numpy(items[items >= 0])] = True
+        seen = seen_before(store, episodes, steps)
         forbidden = seen if forbidden is None else forbidden | seen
     users = None
     if store.has_users:
         users = torch.from_numpy(store.episode_values(schema.USER).astype(np.int64)[episodes])
     return decider.scores(windows, collected, forbidden, users)
+
+
+def seen_before(store: EpisodeStore, episodes: IntArray, steps: IntArray) -> Tensor:
+    """(B, n_items) bool: the known items that sessions showed before steps; see above."""
+    rows, items = store.items_before(episodes, steps)
+    seen = torch.zeros(len(steps), len(store.item_states.embeddings), dtype=torch.bool)
+    seen[torch.from_numpy(rows[items >= 0]), torch.from_numpy(items[items >= 0])] = True
+    return seen

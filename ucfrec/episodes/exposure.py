@@ -1,7 +1,7 @@
 """What a session was shown lately, as additions to the logits of the items that resemble it."""
 
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -84,6 +84,10 @@ class Likeness(nn.Module):
             self.directions.copy_(nn.functional.normalize(states.embeddings, dim=1))
         self._matrix = None
 
+    def _load_from_state_dict(self, *arguments: Any, **named: Any) -> None:
+        super()._load_from_state_dict(*arguments, **named)  # type: ignore[no-untyped-call]
+        self._matrix = None
+
     def profile(self, items: Tensor, weights: Tensor) -> Tensor:
         """The weighted sum (M, F) of the tags or directions of items (M, N), −1 for none.
 
@@ -129,7 +133,7 @@ class Likeness(nn.Module):
             rows, columns = torch.nonzero(self.tags >= 0, as_tuple=True)
             places = torch.stack([rows, self.tags[rows, columns]])
             shape = (len(self.tags), int(self.n_tags))
-            ones = torch.ones(len(rows), device=self.tags.device)
+            ones = torch.ones_like(rows, dtype=self.directions.dtype)
             matrix = torch.sparse_coo_tensor(places, ones, shape, check_invariants=True).coalesce()
             small = shape[0] * shape[1] <= _DENSE
             self._matrix = matrix.to_dense() if small else matrix

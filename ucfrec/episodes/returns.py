@@ -1,14 +1,15 @@
 """Returns-to-go, defined once for training, acting and scoring."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
-import torch
-from torch import Tensor
 
 from ucfrec.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Definition = Literal["session", "discounted", "horizon"]
 
@@ -76,17 +77,20 @@ class ReturnToGo:
         totals, collected = before[ends] - before[starts], before[:-1] - before[starts]
         return np.asarray(totals - collected, dtype=np.float32)
 
-    def asked(self, target: float, collected: Tensor) -> Tensor:
+    def asked(self, target: float, collected: "Tensor") -> "Tensor":
         """What is asked for at the next step, (B,) float64, in reward units.
 
         Args:
             target: of the session if `per_session`, otherwise of every step.
             collected: (B,) sum of the rewards earlier in the session.
         """
+        # Checking a log needs this module, but not the seconds that importing torch takes.
+        import torch
+
         whole = torch.full_like(collected, target, dtype=torch.float64)
         return whole - collected if self.per_session else whole
 
-    def before(self, asked: Tensor, rewards: Tensor) -> Tensor:
+    def before(self, asked: "Tensor", rewards: "Tensor") -> "Tensor":
         """Returns-to-go of all steps of a window, given what is asked for at its last step.
 
         Earlier steps count the rewards that followed them, then what is asked for: the numbers that
@@ -99,6 +103,8 @@ class ReturnToGo:
         Returns:
             (B, K) float32.
         """
+        import torch
+
         earlier = rewards[:, :-1].double()
         last = asked.double().unsqueeze(1)
         if self.definition == "session":

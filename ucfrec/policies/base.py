@@ -56,23 +56,17 @@ class PolicyConfig:
     """Whether the logits of items depend on what the session was shown lately: on repetitions, and
     on shared tags or, without tags, on similar embeddings."""
     exposure_window: Annotated[int, Field(ge=1, le=1000)] = 10
-    """Earlier steps that count as lately; `context` must be larger."""
+    """Earlier steps that count as lately, as far as `context` reaches."""
     advantage_weights: bool = False
     """Whether steps count in the loss by exp((Ĝ − V(s)) / σ), instead of all alike."""
     max_return: bool = False
     """Whether the largest return to expect in a state is learned, which decision rules can take for
     the target return."""
 
-    def __post_init__(self) -> None:
-        """Check the fields against each other."""
-        require(
-            not self.exposure or self.context > self.exposure_window,
-            f"policy.context is {self.context}; with policy.exposure it must be above "
-            f"policy.exposure_window, which is {self.exposure_window}",
-            "policy.context",
-            "policy.exposure",
-            "policy.exposure_window",
-        )
+    @property
+    def exposure_lags(self) -> int:
+        """Earlier steps that the exposure term reads; 0 for no such term."""
+        return min(self.exposure_window, self.context - 1) if self.exposure else 0
 
     def returns(self, session_by: str | None) -> ReturnToGo:
         """What returns-to-go count in a log whose sessions are made `session_by`."""
@@ -114,7 +108,7 @@ class SequencePolicy(nn.Module, ABC):
         self.register_buffer("state_std", torch.ones(sizes["state"]))
         self.register_buffer("return_scale", torch.ones(()))
         self.register_buffer("lowest_return_to_go", torch.tensor(-torch.inf))
-        self.head = head_from(sizes, config.dim, config.exposure_window if config.exposure else 0)
+        self.head = head_from(sizes, config.dim, config.exposure_lags)
         learns_values = config.advantage_weights or config.max_return
         self.values = ValueHead(sizes["state"], config.dim) if learns_values else None
 

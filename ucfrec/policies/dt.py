@@ -30,7 +30,6 @@ class DTConfig(PolicyConfig):
 
     def __post_init__(self) -> None:
         """Check the fields against each other."""
-        super().__post_init__()
         require_heads(self, self.heads)
 
 

@@ -45,7 +45,6 @@ class LSDTConfig(PolicyConfig):
 
     def __post_init__(self) -> None:
         """Check the fields against each other."""
-        super().__post_init__()
         require(
             self.dim % (2 * self.kernel_groups) == 0 and self.dim % (2 * self.heads) == 0,
             f"policy.dim is {self.dim}; half of it must split into {self.kernel_groups} "

@@ -50,7 +50,6 @@ class UCFConfig(PolicyConfig):
 
     def __post_init__(self) -> None:
         """Check the fields against each other."""
-        super().__post_init__()
         require_heads(self, self.heads)
 
 

@@ -1,7 +1,7 @@
 """Recommend next items to the users of a log, also to users who are not in the training logs."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import Decider, DecisionRule
-from ucfrec.acting.logged_decisions import session_scores
+from ucfrec.acting.logged_decisions import seen_before, session_scores
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.recommending.histories import Histories
@@ -108,6 +108,8 @@ def _recommended(
     """Items for the last step of every episode of `store`."""
     item_ids, frames = trained.item_ids, []
     assert item_ids is not None
+    rule = choice.decider.rule
+    decider = replace(choice.decider, rule=replace(rule, exclude_seen=False))
     for first in range(0, len(batch.users), _USERS_AT_ONCE):
         rows = np.arange(first, min(first + _USERS_AT_ONCE, len(batch.users)))
         left_out = torch.zeros(len(rows), len(item_ids), dtype=torch.bool)
@@ -117,11 +119,13 @@ def _recommended(
             left_out[batch.seen_owner[of_rows][known] - first, choice.seen[of_rows][known]] = True
         if choice.excluded is not None:
             left_out |= choice.excluded
+        last = store.lengths[rows] - 1
+        if rule.exclude_seen:
+            left_out |= seen_before(store, rows, last)
         # A user without any item left gets no row.
         some = ~left_out.all(1)
         left_out[~some] = False
-        last = store.lengths[rows] - 1
-        scores = session_scores(choice.decider, store, rows, last, left_out)
+        scores = session_scores(decider, store, rows, last, left_out)
         frames.append(_ranked(batch.users[rows], item_ids, scores, some, choice))
     return pd.concat(frames, ignore_index=True)
 

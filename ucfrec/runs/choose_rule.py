@@ -176,8 +176,9 @@ def choose_rule(
     first = search.best(played)
     played.extend(search.play(rule) for rule in _tilted(config, first.rule))
     second = search.best(_simplest_first(played))
+    longest = decider.policy.config.context - 1
     if validation.item_states.tags.shape[1]:
-        played.extend(search.play(rule) for rule in _filtered(config, second.rule))
+        played.extend(search.play(rule) for rule in _filtered(config, second.rule, longest))
     best = search.best(_simplest_first(played))
     return Choice(best.rule, played, search.calibration, float(search.least_items))
 
@@ -186,10 +187,11 @@ def _simplest_first(candidates: Sequence[Candidate]) -> list[Candidate]:
     return sorted(candidates, key=lambda each: (each.rule.tag_window > 0, each.rule.tilt))
 
 
-def _filtered(config: RuleConfig, rule: DecisionRule) -> Iterator[DecisionRule]:
+def _filtered(config: RuleConfig, rule: DecisionRule, longest: int) -> Iterator[DecisionRule]:
+    """Rules with a tag window, of steps that the policy remembers: `longest` of them."""
     for window in config.tag_windows:
         for tilt in config.tilts:
-            if window and (tilt >= rule.tilt or tilt == 0):
+            if 0 < window <= longest and (tilt >= rule.tilt or tilt == 0):
                 yield replace(rule, tag_window=window, tilt=tilt)
 
 

@@ -6,6 +6,12 @@ from pydantic import Field
 
 from ucfrec.settings import Count, Share, settings_table
 
+_Temperature = Annotated[float, Field(ge=0, le=100)]
+_Tilt = Annotated[float, Field(ge=0, le=1000)]
+_Steps = Annotated[int, Field(ge=0, le=1000)]
+_SOME = Field(strict=False, min_length=1)
+"""Not strict, because TOML and JSON have lists instead of tuples."""
+
 
 @settings_table("rule")
 class RuleConfig:
@@ -19,14 +25,14 @@ class RuleConfig:
     """Whether the rule is chosen on validation sessions; otherwise it is the default one."""
     default_quantile: Share = 1.0
     """Quantile of the training returns that is the default rule's target."""
-    quantiles: tuple[Share, ...] = (0.9, 1.0)
+    quantiles: Annotated[tuple[Share, ...], _SOME] = (0.9, 1.0)
     """Candidates for the target, as quantiles of the training returns; each with and without a
     floor at the same value."""
-    temperatures: tuple[Annotated[float, Field(ge=0, le=100)], ...] = (0.0, 0.5, 1.0)
+    temperatures: Annotated[tuple[_Temperature, ...], _SOME] = (0.0, 0.5, 1.0)
     """Candidates for the temperature."""
-    tilts: tuple[Annotated[float, Field(ge=0, le=1000)], ...] = (0.0, 1.0, 2.0, 4.0)
+    tilts: Annotated[tuple[_Tilt, ...], _SOME] = (0.0, 1.0, 2.0, 4.0)
     """Candidates for β, the weight of the reward model."""
-    tag_windows: tuple[Annotated[int, Field(ge=0, le=1000)], ...] = (0, 3, 10)
+    tag_windows: Annotated[tuple[_Steps, ...], _SOME] = (0, 3, 10)
     """Candidates for the number of steps whose tags are left out, where items have tags."""
     sessions: Count = 200
     """Sessions played of each candidate."""

@@ -18,6 +18,7 @@ from ucfrec.evaluation.world import World
 from ucfrec.plugins import Benchmark, BenchmarkRequest, load_plugin
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows, read_configurations, read_rows
+from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 from ucfrec_simulators.benchmark import plan, plots
 from ucfrec_simulators.benchmark.cells import EvaluationPlan
 from ucfrec_simulators.benchmark.methods import METHODS
@@ -33,7 +34,7 @@ TINY = replace(
     seeds=2,
     sessions=60,
     settings=("policy.dim=8", "train.steps=2", "train.validate_every=2", "crm.epochs=1"),
-    evaluation=EvaluationPlan(episodes=8, validation_episodes=4, quantiles=(0.5, 1.0)),
+    evaluation=EvaluationPlan(episodes=8),
     sweep_seeds=1,
 )
 
@@ -70,9 +71,11 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     assert found.interval == (played["R_cum_low"], played["R_cum_high"])
     # Whatever the training seed, the same episodes are reported.
     assert {row.evaluation_seed for row in rows} == {1_000_000}
-    tried = next(row for row in rows if row.method == "dt")
-    validation = tried.details["validation"]
-    assert tried.target_return == float(max(validation, key=lambda target: validation[target]))
+    # Each run acts by its own rule.
+    runs = {TrainedPolicy.load(path.parent).rule for path in (tmp_path / "out").rglob(RUN)}
+    assert {row.rule for row in rows if row.training_seed is not None} == set(map(str, runs))
+    assert {row.target_return for row in rows if row.method == "dt"} <= {r.target for r in runs}
+    assert {r.conditions.get("quantiles") for r in rows if r.training_seed is not None} == {"rule"}
     configurations = read_configurations(tmp_path)
     dims = {configurations[str(r.config_hash)]["policy"]["dim"] for r in rows if r.config_hash}
     assert dims == {8}
@@ -161,7 +164,7 @@ def test_every_cell_of_every_table_has_a_configuration(
     planted = EpisodeStore.open(distractors[0].store)  # type: ignore[arg-type]
     assert planted.observation_size == 92
     assert [world.rate for world in distractors[0].worlds] == [0.0, 1.0]  # type: ignore[attr-defined]
-    assert {cell.evaluation.quantiles for cell in given.distractor()} == {(1.0,), (0.99,)}
+    assert {cell.evaluation.target_quantile for cell in given.distractor()} == {1.0, 0.99}
 
 
 def test_unknown_tables_and_budgets_are_named(

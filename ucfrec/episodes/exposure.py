@@ -85,7 +85,7 @@ class Likeness(nn.Module):
         self._matrix = None
 
     def _load_from_state_dict(self, *arguments: Any, **named: Any) -> None:
-        super()._load_from_state_dict(*arguments, **named)  # type: ignore[no-untyped-call]
+        super()._load_from_state_dict(*arguments, **named)
         self._matrix = None
 
     def profile(self, items: Tensor, weights: Tensor) -> Tensor:

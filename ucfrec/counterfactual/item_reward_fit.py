@@ -32,8 +32,8 @@ from ucfrec.progress import progress
 _SPREADS: Final = tuple(0.05 * 2 ** (k / 2) for k in range(13))
 _FIRST: Final = 6
 """Index of the spread that is tried first, 0.4."""
-_OF_STATES: Final = ("exposure", "state", "interaction")
-"""Effects that are costly to fit: the others are adjusted to each other before."""
+_CHEAP: Final = ("item", "user", "content")
+"""Effects whose spreads are searched finely, and adjusted to each other."""
 _MAX_ROWS: Final = 500_000
 _CONSTANT: Final = 1e-6
 
@@ -89,9 +89,9 @@ def fit_item_reward_model(
     search = _Search(Design.of(model, rows), Design.of(model, held_out))
     with progress(len(EFFECTS), "item rewards", "effects") as bar:
         for name in EFFECTS:
-            if name == _OF_STATES[0]:
-                search.adjust()
             search.add(name)
+            if name == _CHEAP[-1]:
+                search.adjust()
             bar.update()
     model.set_effects(search.effects, search.design.of_content)
     report = _report(model, search, rows, held_out, train.item_states, start)
@@ -116,7 +116,7 @@ class _Search:
         """Add the effect `name` with the best spread, if it lowers the held-out loss."""
         if not float(self.design.squares(name).sum()):
             return
-        at, (effects, losses) = self._best(name, _FIRST, (2, 1))
+        at, (effects, losses) = self._best(name, _FIRST, (2, 1) if name in _CHEAP else (2,))
         decrease = self.losses - losses
         gain = float(decrease.mean())
         error = float(decrease.std(correction=0)) / len(decrease) ** 0.5

@@ -6,6 +6,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from ucfrec.counterfactual.item_reward_model import ItemRewardModel
+from ucfrec.episodes.exposure import Shown
 
 ITEMS, USERS, STATE, DIM = 30, 5, 6, 4
 
@@ -29,22 +30,24 @@ def planted(tags: bool, binary: bool = True) -> ItemRewardModel:
     return model
 
 
-def asked(rows: int, lags: int) -> tuple[Tensor, Tensor, Tensor]:
+def asked(rows: int, lags: int) -> tuple[Tensor, Shown, Tensor]:
     """Random states, items shown before and users."""
     random = torch.Generator().manual_seed(1)
     states = torch.randn(rows, STATE, generator=random)
-    shown = torch.randint(-1, ITEMS, (rows, lags), generator=random)
+    items = torch.randint(-1, ITEMS, (rows, lags), generator=random)
+    rewards = 3 * torch.rand(rows, lags, generator=random) - 1
+    shown = Shown(items, rewards.masked_fill(items < 0, 0.0))
     return states, shown, torch.randint(-1, USERS + 2, (rows,), generator=random)
 
 
-def score_by_hand(model: ItemRewardModel, state: Tensor, shown: Tensor, user: int, i: int) -> float:
+def score_by_hand(model: ItemRewardModel, state: Tensor, shown: Shown, user: int, i: int) -> float:
     """The sum of the model's definition, term by term."""
     x = ((state - model.state_mean) / model.state_std).clamp(-5, 5)
     row = user if 0 <= user < USERS else USERS
     query = model.affinity[row] + x @ model.interaction
     total = model.item[i] + model.user[row] + x @ model.state + query @ model.vectors[i]
     likeness = model.likeness
-    for lag, j in enumerate(shown.tolist()[: model.lags]):
+    for lag, j in enumerate(shown.items.tolist()[: model.lags]):
         if j < 0:
             continue
         if likeness.tags.shape[1]:
@@ -52,7 +55,10 @@ def score_by_hand(model: ItemRewardModel, state: Tensor, shown: Tensor, user: in
             alike = sum(mine.count(tag) * other.count(tag) for tag in set(mine) if tag >= 0)
         else:
             alike = float(likeness.directions[i] @ likeness.directions[j])
-        total = total + model.exposure[0, lag] * (i == j) + model.exposure[1, lag] * alike
+        liked = (float(shown.rewards[lag]) - -1) / 3
+        repeated, like, repeated_liked, like_liked = model.exposure[:, lag]
+        total = total + (repeated + repeated_liked * liked) * (i == j)
+        total = total + (like + like_liked * liked) * alike
     return float(total)
 
 
@@ -64,7 +70,7 @@ def test_scores_are_the_sum_of_the_effects(tags: bool) -> None:
     assert scores.shape == (7, ITEMS)
     for row in range(7):
         for item in range(0, ITEMS, 7):
-            expected = score_by_hand(model, states[row], shown[row], int(users[row]), item)
+            expected = score_by_hand(model, states[row], shown.at(row), int(users[row]), item)
             assert float(scores[row, item]) == pytest.approx(expected, abs=1e-4)
 
 
@@ -80,12 +86,13 @@ def test_one_item_scores_as_among_all(tags: bool) -> None:
 def test_missing_lags_are_steps_before_the_session_and_unknown_users_are_alike() -> None:
     model = planted(tags=True)
     states, shown, _ = asked(4, model.lags + 3)
-    few = shown[:, :4]
-    padded = torch.cat([few, torch.full((4, model.lags - 4), -1)], 1)
-    assert torch.equal(model.scores(states, few), model.scores(states, padded))
-    torch.testing.assert_close(
-        model.scores(states, shown), model.scores(states, shown[:, : model.lags])
+    few = Shown(shown.items[:, :4], shown.rewards[:, :4])
+    padded = Shown(
+        F.pad(few.items, (0, model.lags - 4), value=-1), F.pad(few.rewards, (0, model.lags - 4))
     )
+    most = Shown(shown.items[:, : model.lags], shown.rewards[:, : model.lags])
+    assert torch.equal(model.scores(states, few), model.scores(states, padded))
+    torch.testing.assert_close(model.scores(states, shown), model.scores(states, most))
     for unknown in (-1, USERS, USERS + 9):
         users = torch.full((4,), unknown)
         assert torch.equal(model.scores(states, few, users), model.scores(states, few))

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ucfrec.episodes.exposure import Exposed, Likeness
+from ucfrec.episodes.exposure import Likeness, Shown
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
@@ -287,17 +287,13 @@ class Decider:
     def rewards(self, windows: Windows, users: Tensor | None = None) -> Tensor:
         """f̂_r (B, n_items) at the last step of the windows, in the reward model's units."""
         assert self.reward_model is not None
-        exposed = Exposed.before(windows, self.reward_model.lags)
-        batch, length = windows.mask.shape
-        shown = exposed.items.view(batch, length, -1)[:, -1]
+        shown = Shown.before_last(windows)
         scores: Tensor = self.reward_model.scores(windows.states[:, -1], shown, users)
         return scores
 
     def _without_recent_tags(self, scores: Tensor, windows: Windows) -> Tensor:
         assert self.likeness is not None
-        batch, length = windows.mask.shape
-        lags = self.rule.tag_window
-        shown = Exposed.before(windows, lags).items.view(batch, length, lags)[:, -1]
+        shown = Shown.before_last(windows).items[:, : self.rule.tag_window]
         alike = self.likeness.to_all(self.likeness.profile(shown, torch.ones(shown.shape)))
         left = scores.masked_fill(alike > 0, -torch.inf)
         return torch.where(torch.isneginf(left).all(1, keepdim=True), scores, left)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.rollout import USER_IDS, BoolArray, FloatArray, IntArray
-from ucfrec.episodes.exposure import Likeness
+from ucfrec.episodes.exposure import Likeness, Shown
 from ucfrec.episodes.states import ItemStates, SessionStates
 from ucfrec.episodes.store import EpisodeStore
 
@@ -25,8 +25,8 @@ _PENALTY = 1.0
 class LoggedEnds:
     """Logged steps, what was shown before each, and whether it ended its session."""
 
-    shown: Tensor
-    """(N, L) int64 items shown before, most recent first; −1 before the session began."""
+    shown: Shown
+    """The items shown before, (N, L)."""
     items: Tensor
     """(N,) int64 items shown at the step."""
     rewards: npt.NDArray[np.float64]
@@ -54,9 +54,8 @@ class LoggedEnds:
             kept = np.sort(np.random.default_rng(seed).choice(kept, most, replace=False))
         episodes, steps, ended = episodes[kept], steps[kept], ended[kept]
         window = store.windows(episodes, steps, lags + 1)
-        items = window.actions.masked_fill(~window.mask, -1)
         rewards = window.rewards[:, -1].double().numpy()
-        return cls(items[:, :-1].flip(1), window.actions[:, -1], rewards, steps, ended)
+        return cls(Shown.before_last(window), window.actions[:, -1], rewards, steps, ended)
 
 
 class SessionEnd:
@@ -80,7 +79,7 @@ class SessionEnd:
             self._model = make_pipeline(StandardScaler(), regression).fit(inputs, ended)
 
     def probabilities(
-        self, shown: Tensor, items: Tensor, rewards: npt.NDArray[np.float64], steps: IntArray
+        self, shown: Shown, items: Tensor, rewards: npt.NDArray[np.float64], steps: IntArray
     ) -> npt.NDArray[np.float64]:
         """Probabilities (M,) that sessions end with a step; arguments as in `LoggedEnds`."""
         if self._model is None:
@@ -89,14 +88,14 @@ class SessionEnd:
         return np.asarray(self._model.predict_proba(inputs)[:, 1])
 
     def _inputs(
-        self, shown: Tensor, items: Tensor, rewards: npt.NDArray[np.float64], steps: IntArray
+        self, shown: Shown, items: Tensor, rewards: npt.NDArray[np.float64], steps: IntArray
     ) -> FloatArray:
         columns = [np.log1p(steps), steps, np.minimum(steps, 1), rewards]
-        repeated = (shown == items.unsqueeze(1)).double()
-        for reach in (1, 3, shown.shape[1]):
-            recent = shown.clone()
+        repeated = (shown.items == items.unsqueeze(1)).double()
+        for reach in (1, 3, shown.items.shape[1]):
+            recent = shown.items.clone()
             recent[:, reach:] = -1
-            profile = self._likeness.profile(recent, torch.ones(shown.shape))
+            profile = self._likeness.profile(recent, torch.ones(recent.shape))
             alike = self._likeness.to_items(profile, items.unsqueeze(1))
             columns += [repeated[:, :reach].sum(1).numpy(), alike.numpy(), (alike > 0).numpy()]
         return np.stack(columns, axis=1).astype(np.float32)
@@ -145,7 +144,8 @@ class LearnedSessions:
         n = self.num_envs
         self._rng = np.random.default_rng(seed)
         self._sessions = SessionStates(self._states, n)
-        self._shown = torch.full((n, self._model.lags), -1)
+        lags = self._model.lags
+        self._shown = Shown(torch.full((n, lags), -1), torch.zeros(n, lags))
         self._steps = np.zeros(n, dtype=np.int64)
         self._episodes = np.arange(n) % self._store.n_episodes
         self._sessions.users = torch.from_numpy(self._users[self._episodes])
@@ -166,7 +166,13 @@ class LearnedSessions:
             rewards = np.where(self._rng.random(len(chance)) < chance, high, low)
         ends = self._end.probabilities(self._shown, items, rewards, self._steps)
         self._sessions.record(items, torch.from_numpy(rewards))
-        self._shown = torch.cat([items.unsqueeze(1), self._shown[:, :-1]], dim=1)
+        latest = Shown(items.unsqueeze(1), torch.from_numpy(rewards).float().unsqueeze(1))
+        self._shown = Shown(
+            *(
+                torch.cat([new, old[:, :-1]], 1)
+                for new, old in zip(latest, self._shown, strict=True)
+            )
+        )
         self._steps += 1
         terminated = self._rng.random(len(ends)) < ends
         truncated = (self._steps >= self._longest) & ~terminated
@@ -176,7 +182,8 @@ class LearnedSessions:
             info = {"final_obs": self._observe(), "_final_obs": ended}
         rows = np.flatnonzero(ended)
         self._sessions.begin(rows)
-        self._shown[rows], self._steps[rows] = -1, 0
+        self._shown.items[rows], self._shown.rewards[rows] = -1, 0.0
+        self._steps[rows] = 0
         self._episodes[rows] = (self._episodes[rows] + self.num_envs) % self._store.n_episodes
         self._sessions.users = torch.from_numpy(self._users[self._episodes])
         info |= self._info()

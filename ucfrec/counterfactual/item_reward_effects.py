@@ -38,7 +38,8 @@ class Design:
     x: Tensor
     """(M, S) standardised states."""
     exposure: Tensor
-    """(M, 2 · lags): whether the item is the one shown n steps before, then their likeness."""
+    """(M, 4 · lags): whether the item is the one shown n steps before, then their likeness; then
+    both again, times the earlier item's reward on a scale from 0 to 1."""
     target: Tensor
     """(M,): 1 for the higher of two rewards and 0 for the lower, or standardised rewards."""
     vectors: Tensor
@@ -150,13 +151,14 @@ def _exposure(model: ItemRewardModel, rows: RewardRows) -> Tensor:
     parts = []
     for start in range(0, len(rows), _CHUNK):
         part = slice(start, start + _CHUNK)
-        items, shown = rows.items[part].unsqueeze(1), rows.shown[part]
-        likeness = model.likeness
+        items, shown = rows.items[part].unsqueeze(1), rows.shown.at(part)
+        likeness, liked = model.likeness, model.liked(shown.rewards)
         columns = [
             likeness.to_items(likeness.profile(earlier, torch.ones_like(earlier).float()), items)
-            for earlier in shown.unsqueeze(1).unbind(2)
+            for earlier in shown.items.unsqueeze(1).unbind(2)
         ]
-        parts.append(torch.cat([(shown == items).float(), torch.stack(columns, 1)], 1))
+        repeated, alike = (shown.items == items).float(), torch.stack(columns, 1)
+        parts.append(torch.cat([repeated, alike, repeated * liked, alike * liked], 1))
     return torch.cat(parts)
 
 

@@ -181,9 +181,10 @@ def _set_statistics(
             f"all {len(rows)} training rewards equal {float(values[0]):g}: there is nothing to "
             "model; check the reward expression"
         )
-    model.binary.fill_(len(values) == 2)
-    model.reward_low.fill_(values[0])
-    model.reward_high.fill_(values[-1])
+    binary = len(values) == 2
+    model.binary.fill_(binary)
+    model.reward_low.fill_(values[0] if binary else states.reward_low)
+    model.reward_high.fill_(values[1] if binary else states.reward_high)
     rewards, before = rows.rewards.double(), rows.states.double()
     model.reward_mean.copy_(rewards.mean())
     model.reward_std.copy_(rewards.std(correction=0))

@@ -6,7 +6,7 @@ from typing import Final
 import torch
 from torch import Tensor, nn
 
-from ucfrec.episodes.exposure import Likeness
+from ucfrec.episodes.exposure import Likeness, Shown
 
 FITTED: Final = "item_reward.safetensors"
 """File of a fitted model in its folder."""
@@ -71,16 +71,15 @@ class ItemRewardModel(nn.Module):
         self.register_buffer("affinity", torch.zeros(users + 1, dim))
         self.register_buffer("state", torch.zeros(state))
         self.register_buffer("interaction", torch.zeros(state, dim))
-        self.register_buffer("exposure", torch.zeros(2, LAGS))
+        self.register_buffer("exposure", torch.zeros(4, LAGS))
         self.likeness = Likeness(items, dim, sizes.get("tags", 0))
 
-    def scores(self, states: Tensor, shown: Tensor, users: Tensor | None = None) -> Tensor:
+    def scores(self, states: Tensor, shown: Shown, users: Tensor | None = None) -> Tensor:
         """Linear predictors of all items, (B, n_items).
 
         Args:
             states: (B, S) before the step.
-            shown: (B, lags) int64 items shown before the step in the session, most recent first;
-                −1 before the session began. Further columns have no effect.
+            shown: what the sessions showed before the step; more than `lags` items have no effect.
             users: (B,) int64 numbers in the training store, −1 for an unknown user; None if all
                 users are unknown.
 
@@ -88,20 +87,19 @@ class ItemRewardModel(nn.Module):
             Log-odds of the higher reward if rewards have two values; otherwise rewards in standard
             deviations from their mean.
         """
-        repeated, alike = self.exposure
-        shown = self._lagged(shown)
-        added = self.likeness.to_all(self.likeness.profile(shown, alike.expand(shown.shape)))
-        rows, lags = torch.nonzero(shown >= 0, as_tuple=True)
-        added = added.index_put((rows, shown[rows, lags]), repeated[lags], accumulate=True)
+        items, repeated, alike = self._exposure(shown)
+        added = self.likeness.to_all(self.likeness.profile(items, alike))
+        rows, lags = torch.nonzero(items >= 0, as_tuple=True)
+        added = added.index_put((rows, items[rows, lags]), repeated[rows, lags], accumulate=True)
         added = added + self._query(states, users) @ self.vectors.T
         return self.item + self.level(states, users).unsqueeze(1) + added
 
-    def score(self, states: Tensor, shown: Tensor, users: Tensor | None, items: Tensor) -> Tensor:
+    def score(self, states: Tensor, shown: Shown, users: Tensor | None, items: Tensor) -> Tensor:
         """Linear predictors (B,) of one item each, int64 (B,); see `scores`."""
-        repeated, alike = self.exposure
-        shown, each = self._lagged(shown), items.unsqueeze(1)
-        profile = self.likeness.profile(shown, alike.expand(shown.shape))
-        added = self.likeness.to_items(profile, each) + (shown == each).float() @ repeated
+        before, repeated, alike = self._exposure(shown)
+        each = items.unsqueeze(1)
+        added = self.likeness.to_items(self.likeness.profile(before, alike), each)
+        added = added + ((before == each) * repeated).sum(1)
         added = added + (self._query(states, users) * self.vectors[items]).sum(1)
         scores: Tensor = self.item[items] + self.level(states, users) + added
         return scores
@@ -155,7 +153,14 @@ class ItemRewardModel(nn.Module):
         interaction = self.standardised(states) @ self.interaction
         return self.affinity[self._known(users, states)] + interaction
 
-    def _lagged(self, shown: Tensor) -> Tensor:
-        """(B, lags) of items (B, N) shown before, most recent first."""
-        missing = max(0, self.lags - shown.shape[1])
-        return nn.functional.pad(shown[:, : self.lags], (0, missing), value=-1)
+    def liked(self, rewards: Tensor) -> Tensor:
+        """Rewards (...) on a scale from 0 to 1."""
+        return ((rewards - self.reward_low) / (self.reward_high - self.reward_low)).clamp(0, 1)
+
+    def _exposure(self, shown: Shown) -> tuple[Tensor, Tensor, Tensor]:
+        """Items (B, lags) shown before, and the weights (B, lags) of repetition and likeness."""
+        missing = max(0, self.lags - shown.items.shape[1])
+        items = nn.functional.pad(shown.items[:, : self.lags], (0, missing), value=-1)
+        liked = self.liked(nn.functional.pad(shown.rewards[:, : self.lags], (0, missing)))
+        repeated, alike, repeated_liked, alike_liked = self.exposure
+        return items, repeated + repeated_liked * liked, alike + alike_liked * liked

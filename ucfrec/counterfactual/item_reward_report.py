@@ -103,7 +103,7 @@ def scores_of(model: ItemRewardModel, rows: RewardRows) -> tuple[Tensor, Tensor]
     for start in range(0, len(rows), _CHUNK):
         part = slice(start, start + _CHUNK)
         states, users = rows.states[part], rows.users[part]
-        scores.append(model.score(states, rows.shown[part], users, rows.items[part]))
+        scores.append(model.score(states, rows.shown.at(part), users, rows.items[part]))
         levels.append(model.level(states, users))
     return torch.cat(scores), torch.cat(levels)
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
+from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.store import EpisodeStore
 
 IntArray = npt.NDArray[np.int64]
@@ -23,8 +24,8 @@ class RewardRows:
     """(M,) int64."""
     users: Tensor
     """(M,) int64 numbers in the store; −1 if the store does not name its users."""
-    shown: Tensor
-    """(M, lags) int64 items shown earlier in the session, most recent first; −1 before it began."""
+    shown: Shown
+    """The items shown earlier in the session, (M, lags)."""
     states: Tensor
     """(M, S) float32 states before the step."""
     rewards: Tensor
@@ -51,16 +52,18 @@ class RewardRows:
         return cls(
             torch.from_numpy(view.step_values(schema.ITEM, episodes, steps).astype(np.int64)),
             torch.from_numpy(_users(view)[episodes]),
-            torch.from_numpy(_shown(view, episodes, steps, lags)),
+            _shown(view, episodes, steps, lags),
             states,
             torch.from_numpy(view.step_values(schema.REWARD, episodes, steps)),
         )
 
 
-def _shown(view: EpisodeStore, episodes: IntArray, steps: IntArray, lags: int) -> IntArray:
+def _shown(view: EpisodeStore, episodes: IntArray, steps: IntArray, lags: int) -> Shown:
     earlier = steps[:, None] - np.arange(1, lags + 1)
-    items = view.step_values(schema.ITEM, episodes[:, None], np.maximum(earlier, 0))
-    return np.where(earlier >= 0, items, -1).astype(np.int64)
+    at = (episodes[:, None], np.maximum(earlier, 0))
+    items = np.where(earlier >= 0, view.step_values(schema.ITEM, *at), -1).astype(np.int64)
+    rewards = np.where(earlier >= 0, view.step_values(schema.REWARD, *at), 0).astype(np.float32)
+    return Shown(torch.from_numpy(items), torch.from_numpy(rewards))
 
 
 def _users(view: EpisodeStore) -> IntArray:

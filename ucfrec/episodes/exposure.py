@@ -1,6 +1,7 @@
 """What a session was shown lately, as additions to the logits of the items that resemble it."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 from typing import Any, cast
 
 import numpy as np
@@ -14,6 +15,25 @@ _GAIN = 10.0
 """Factor on the learned weights: thousands of small updates must be able to rule an item out."""
 _DENSE = 2**24
 """Entries of the largest matrix of items and tags that is kept dense, which is faster."""
+
+
+class Shown(NamedTuple):
+    """What B sessions showed before a step."""
+
+    items: Tensor
+    """(B, N) int64, most recent first; −1 before the session or window began."""
+    rewards: Tensor
+    """(B, N) in reward units; 0 where there is no item."""
+
+    @classmethod
+    def before_last(cls, windows: Windows) -> "Shown":
+        """What windows of K steps show before their last one, N = K − 1."""
+        items = windows.actions.masked_fill(~windows.mask, -1)
+        return cls(items[:, :-1].flip(1), windows.rewards[:, :-1].flip(1))
+
+    def at(self, rows: slice | int | Tensor) -> "Shown":
+        """The sessions with the given numbers."""
+        return Shown(self.items[rows], self.rewards[rows])
 
 
 @dataclass(frozen=True)

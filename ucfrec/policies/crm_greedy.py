@@ -13,6 +13,7 @@ from ucfrec import schema
 from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model
 from ucfrec.counterfactual.item_reward_model import ItemRewardModel
 from ucfrec.counterfactual.reward_model import mlp
+from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import PolicyConfig, SequencePolicy
@@ -97,14 +98,14 @@ class CRMGreedyPolicy(SequencePolicy):
         if not isinstance(model, ItemRewardModel):
             return self._errors(windows)[:, -1].mean()
         states, items = windows.states[:, -1], windows.actions[:, -1]
-        predicted = model.expected(model.score(states, _shown(windows), None, items))
+        predicted = model.expected(model.score(states, Shown.before_last(windows), None, items))
         return ((windows.rewards[:, -1] - predicted) / model.reward_std).square().mean()
 
     def act(self, windows: Windows) -> Tensor:
         """At the last step: scores of all items (B, n_items) as of `ItemRewardModel.scores`, for
         users that are not known, or the best action vectors (B, A)."""
         if isinstance(self.model, ItemRewardModel):
-            return self.model.scores(windows.states[:, -1], _shown(windows))
+            return self.model.scores(windows.states[:, -1], Shown.before_last(windows))
         values = self._values(self.model, self.normalized(windows).states[:, -1])
         return self.candidates[values.argmax(1)]
 
@@ -119,8 +120,3 @@ class CRMGreedyPolicy(SequencePolicy):
         of_states, remaining = F.linear(states, first.weight[:, :size]), nn.Sequential(*rest)
         chunks = torch.split(of_states, max(1, _PAIRS // len(of_actions)))
         return torch.cat([remaining(rows.unsqueeze(1) + of_actions).squeeze(-1) for rows in chunks])
-
-
-def _shown(windows: Windows) -> Tensor:
-    """(B, K − 1) items shown before the last step, most recent first; −1 for none."""
-    return windows.actions.masked_fill(~windows.mask, -1)[:, :-1].flip(1)

@@ -14,7 +14,7 @@ class Echo(gymnasium.Env[Any, Any]):
     """Five steps; the reward of item a is a, that of a vector its sum.
 
     A session's secret number is observed as `secret`, and the step as the category `step`; with
-    `whole` the category alone is the observation, and with `notes` there is an entry of no fixed size.
+    `whole` the category alone is the observation. `notes` adds an entry of no fixed size.
     """
 
     def __init__(

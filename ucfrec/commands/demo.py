@@ -38,7 +38,7 @@ class DemoConfig:
         "train.learning_rate=1e-3",
         "crm.epochs=8",
     )
-    context: int = 10
+    context: int = 11
     dim: int = 64
 
 

@@ -1,11 +1,10 @@
 """The effects that add up to the expected reward of an item, and their penalised fit."""
 
-from collections.abc import Iterator, Mapping
+from collections import deque
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -16,12 +15,16 @@ from ucfrec.counterfactual.item_reward_rows import RewardRows
 EFFECTS: Final = ("item", "user", "content", "affinity", "exposure", "state", "interaction")
 """In the order in which they are added to the model."""
 _ITERATIONS: Final = 100
+_HISTORY: Final = 10
+"""Steps that L-BFGS remembers."""
 _TOLERANCE: Final = 1e-6
-"""Relative change of the objective at which a fit ends."""
+"""Relative decrease of the objective in an iteration at which a fit ends."""
+_ARMIJO, _SHORTEST = 1e-4, 1e-4
+"""Least decrease of a step relative to the slope, and shortest step that is tried."""
+_SMALLEST: Final = 1e-6
 _CHUNK: Final = 65_536
 
 Effects = dict[str, Tensor]
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -109,24 +112,32 @@ class Design:
 
     def squares(self, name: str) -> Tensor:
         """Sum over rows of the squares of what each number of the effect `name` multiplies."""
-        vectors = self.rows.square()
-        sums = self.zeros(name)
-        if name == "mean":
-            return sums + len(self.items)
-        if name == "item":
-            return sums.index_add(0, self.items, torch.ones(len(self.items)))
-        if name == "user":
-            return sums.index_add(0, self.users, torch.ones(len(self.items)))
-        if name == "content":
-            tags = torch.bincount(self.tags[self.items].flatten(), minlength=self.n_tags + 1)
-            return torch.cat([tags[: self.n_tags].float(), vectors.sum(0)])
-        if name == "affinity":
-            return sums.index_add(0, self.users, vectors)
-        if name == "exposure":
-            return self.exposure.square().sum(0)
-        if name == "state":
-            return self.x.square().sum(0)
+        vectors, sums = self.rows.square(), self.zeros(name)
+        match name:
+            case "mean":
+                return sums + len(self.items)
+            case "item":
+                return sums.index_add(0, self.items, torch.ones(len(self.items)))
+            case "user":
+                return sums.index_add(0, self.users, torch.ones(len(self.items)))
+            case "content":
+                tags = torch.bincount(self.tags[self.items].flatten(), minlength=self.n_tags + 1)
+                return torch.cat([tags[: self.n_tags].float(), vectors.sum(0)])
+            case "affinity":
+                return sums.index_add(0, self.users, vectors)
+            case "exposure":
+                return self.exposure.square().sum(0)
+            case "state":
+                return self.x.square().sum(0)
         return self.x.square().T @ vectors
+
+    def penalty(self, name: str, spread: float) -> float:
+        """Precision of the prior of the effect `name`, twice the factor of its squares.
+
+        Under a Gaussian prior of this precision, the effect's contribution to the predictor of a
+        mean row has the standard deviation `spread`.
+        """
+        return float(self.squares(name).sum()) / len(self.items) / spread**2
 
     def loss(self, predictor: Tensor) -> Tensor:
         """Log loss in nats, or half the squared error of standardised rewards, (M,)."""
@@ -150,59 +161,118 @@ def _exposure(model: ItemRewardModel, rows: RewardRows) -> Tensor:
 
 
 def fit_effects(design: Design, start: Effects, spreads: Mapping[str, float]) -> Effects:
-    """Minimise the summed loss of `design` plus the penalties of the effects named in `spreads`.
-
-    The penalty of an effect is that of a Gaussian prior under which its contribution to the
-    predictor of a mean row has the standard deviation given as its spread.
+    """Minimise the summed loss of `design` plus penalties on the effects named in `spreads`.
 
     Args:
         design: training rows.
         start: effects to start from; missing ones start at 0.
-        spreads: of every effect of the fit.
+        spreads: of every effect of the fit; see `Design.penalty`.
     """
-    from scipy.optimize import minimize
-
     names = ("mean", *spreads)
-    curvature, penalty = 0.25 if design.binary else 1.0, {}
-    units = {}
-    for name in names:
-        squares = design.squares(name)
-        share = float(squares.sum() / len(design.items))
-        penalty[name] = share / spreads[name] ** 2 if name in spreads else 0.0
-        # In these units the objective is about as curved in all numbers.
-        units[name] = (curvature * squares + penalty[name]).clamp(min=1e-6).rsqrt()
-    shapes = {name: units[name].shape for name in names}
-    first = {name: start.get(name, design.zeros(name)) / units[name] for name in names}
+    curvature = 0.25 if design.binary else 1.0
+    penalty = {name: design.penalty(name, spreads[name]) for name in spreads}
+    units = {name: _units(design, name, curvature, penalty.get(name, 0.0)) for name in names}
+    first = {name: units[name].of(start.get(name, design.zeros(name))) for name in names}
+    sizes = [value.numel() for value in first.values()]
 
-    def objective(flat: FloatArray) -> tuple[float, FloatArray]:
-        scaled = dict(_unflattened(flat, shapes))
-        for value in scaled.values():
-            value.requires_grad_(True)
-        effects = {name: scaled[name] * units[name] for name in names}
+    def effects_of(numbers: Tensor) -> Effects:
+        parts = zip(first.items(), torch.split(numbers, sizes), strict=True)
+        return {name: units[name].effect(part.view(like.shape)) for (name, like), part in parts}
+
+    def objective(numbers: Tensor) -> Tensor:
+        effects = effects_of(numbers)
         loss = design.loss(design.predictor(effects)).sum(dtype=torch.float64)
         for name in spreads:
             loss = loss + 0.5 * penalty[name] * effects[name].square().sum(dtype=torch.float64)
-        loss.backward()  # type: ignore[no-untyped-call]
-        return loss.item(), _flattened({name: scaled[name].grad for name in names})
+        return loss
 
-    found = minimize(
-        objective, _flattened(first), jac=True, method="L-BFGS-B",
-        options={"maxiter": _ITERATIONS, "ftol": _TOLERANCE, "maxcor": 10},
-    )  # fmt: skip
-    return {name: value * units[name] for name, value in _unflattened(found.x, shapes)}
+    return effects_of(minimum(objective, torch.cat([part.flatten() for part in first.values()])))
 
 
-def _flattened(values: Mapping[str, Tensor | None]) -> FloatArray:
-    return np.concatenate(
-        [v.numpy().astype(np.float64).ravel() for v in values.values() if v is not None]
-    )
+def minimum(objective: Callable[[Tensor], Tensor], start: Tensor) -> Tensor:
+    """The numbers (P,) at which a convex function is lowest, by L-BFGS from `start`.
+
+    Its second derivative should be about 1 in all directions, because the first step, and the first
+    step that every line search tries, has the length that this implies.
+    """
+
+    def evaluated(at: Tensor) -> tuple[float, Tensor]:
+        at = at.detach().requires_grad_(True)
+        value = objective(at)
+        (gradient,) = torch.autograd.grad(value, at)
+        return value.item(), gradient
+
+    at, (value, gradient) = start, evaluated(start)
+    history: deque[tuple[Tensor, Tensor]] = deque(maxlen=_HISTORY)
+    for _ in range(_ITERATIONS):
+        direction = -_newton(gradient, history)
+        slope, length = float(gradient @ direction), 1.0
+        while True:
+            following = at + length * direction
+            value_there, gradient_there = evaluated(following)
+            if value_there <= value + _ARMIJO * length * slope:
+                break
+            length /= 2
+            if length < _SHORTEST:
+                return at
+        change = gradient_there - gradient
+        if float(change @ direction) > 0:
+            history.append((following - at, change))
+        decrease = value - value_there
+        at, value, gradient = following, value_there, gradient_there
+        if decrease <= _TOLERANCE * abs(value):
+            break
+    return at
 
 
-def _unflattened(
-    flat: FloatArray, shapes: Mapping[str, torch.Size]
-) -> Iterator[tuple[str, Tensor]]:
-    start = 0
-    for name, shape in shapes.items():
-        part = flat[start : start + shape.numel()]
-        yield name, torch.from_numpy(part.astype(np.float32)).view(shape)
-        start += shape.numel()
+def _newton(gradient: Tensor, history: deque[tuple[Tensor, Tensor]]) -> Tensor:
+    """The gradient times the inverse of the second derivative that `history` tells."""
+    result, weights = gradient.clone(), []
+    for step, change in reversed(history):
+        weights.append(float(step @ result) / float(step @ change))
+        result.sub_(change, alpha=weights[-1])
+    if history:
+        step, change = history[-1]
+        result.mul_(float(step @ change) / float(change @ change))
+    for (step, change), weight in zip(history, reversed(weights), strict=True):
+        result.add_(step, alpha=weight - float(change @ result) / float(step @ change))
+    return result
+
+
+@dataclass(frozen=True)
+class _Units:
+    """Units of an effect in which the objective is about as curved in all directions."""
+
+    effect: Callable[[Tensor], Tensor]
+    """The effect, from numbers in these units."""
+    of: Callable[[Tensor], Tensor]
+    """Its inverse."""
+
+
+def _units(design: Design, name: str, curvature: float, penalty: float) -> _Units:
+    if name in ("state", "exposure"):
+        inputs = design.x if name == "state" else design.exposure
+        factor, inverse = _factors(curvature * (inputs.T @ inputs), penalty)
+        return _Units(lambda numbers: inverse @ numbers, lambda effect: factor @ effect)
+    if name == "interaction":
+        # The curvature is about a Kronecker product of two second moments, each with a part of the
+        # penalty.
+        scale = (curvature / len(design.items)) ** 0.5
+        of_states, of_items = (scale * (rows.T @ rows) for rows in (design.x, design.rows))
+        ratio = float(of_states.diagonal().mean() / of_items.diagonal().mean())
+        left, left_inverse = _factors(of_states, (penalty * ratio) ** 0.5)
+        right, right_inverse = _factors(of_items, (penalty / ratio) ** 0.5)
+        return _Units(
+            lambda numbers: left_inverse @ numbers @ right_inverse.T,
+            lambda effect: left @ effect @ right.T,
+        )
+    unit = (curvature * design.squares(name) + penalty).clamp(min=_SMALLEST).rsqrt()
+    return _Units(lambda numbers: numbers * unit, lambda effect: effect / unit)
+
+
+def _factors(moments: Tensor, ridge: float) -> tuple[Tensor, Tensor]:
+    """U and its inverse with UᵀU = moments + ridge · I, for square matrices."""
+    whole = moments.double() + (ridge + _SMALLEST) * torch.eye(len(moments), dtype=torch.float64)
+    upper = torch.linalg.cholesky(whole).T
+    identity = torch.eye(len(moments), dtype=torch.float64)
+    return upper.float(), torch.linalg.solve_triangular(upper, identity, upper=True).float()

@@ -29,9 +29,11 @@ from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
 from ucfrec.progress import progress
 
-_SPREADS: Final = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
-_FIRST: Final = 3
-"""Index of the spread that is tried first."""
+_SPREADS: Final = tuple(0.05 * 2 ** (k / 2) for k in range(13))
+_FIRST: Final = 6
+"""Index of the spread that is tried first, 0.4."""
+_CHEAP: Final = ("item", "user", "content")
+"""Effects whose spreads are searched finely, and adjusted to each other."""
 _MAX_ROWS: Final = 500_000
 _CONSTANT: Final = 1e-6
 
@@ -88,6 +90,8 @@ def fit_item_reward_model(
     with progress(len(EFFECTS), "item rewards", "effects") as bar:
         for name in EFFECTS:
             search.add(name)
+            if name == _CHEAP[-1]:
+                search.adjust()
             bar.update()
     model.set_effects(search.effects, search.design.of_content)
     report = _report(model, search, rows, held_out, train.item_states, start)
@@ -103,7 +107,7 @@ class _Search:
         self.design, self._held_out = design, held_out
         mean = design.target.mean()
         self.effects: Effects = {"mean": torch.logit(mean) if design.binary else mean}
-        self.spreads: dict[str, float] = {}
+        self.kept: dict[str, int] = {}
         self.losses = self._losses(self.effects)
         self.base_loss = self.item_loss = float(self.losses.mean())
         self.tried: list[EffectTried] = []
@@ -112,33 +116,53 @@ class _Search:
         """Add the effect `name` with the best spread, if it lowers the held-out loss."""
         if not float(self.design.squares(name).sum()):
             return
-        found = {_FIRST: self._fitted(name, _FIRST)}
-        for step in (1, -1):
-            at = _FIRST + step
-            while 0 <= at < len(_SPREADS):
-                found[at] = self._fitted(name, at)
-                if found[at][0] >= found[at - step][0]:
-                    break
-                at += step
-            if min(found, key=lambda index: found[index][0]) > _FIRST:
-                break
-        best = min(found, key=lambda index: found[index][0])
-        _, effects, losses = found[best]
+        at, (effects, losses) = self._best(name, _FIRST, (2, 1) if name in _CHEAP else (2,))
         decrease = self.losses - losses
         gain = float(decrease.mean())
         error = float(decrease.std(correction=0)) / len(decrease) ** 0.5
-        kept = gain > error
-        self.tried.append(EffectTried(name, _SPREADS[best], gain, error, kept))
+        self.tried.append(EffectTried(name, _SPREADS[at], gain, error, gain > error))
         if name == "item":
             self.item_loss = float(losses.mean())
-        if kept:
-            self.effects, self.losses = effects, losses
-            self.spreads[name] = _SPREADS[best]
+        if gain > error:
+            self.effects, self.losses, self.kept[name] = effects, losses, at
 
-    def _fitted(self, name: str, index: int) -> tuple[float, Effects, Tensor]:
-        effects = fit_effects(self.design, self.effects, {**self.spreads, name: _SPREADS[index]})
-        losses = self._losses(effects)
-        return float(losses.mean()), effects, losses
+    def adjust(self) -> None:
+        """Choose the spreads of the effects found so far again, each given the others."""
+        for name in [*self.kept]:
+            self.kept[name], (self.effects, self.losses) = self._best(name, self.kept[name], (1,))
+
+    def report(self) -> tuple[EffectTried, ...]:
+        """The effects tried, with the final spreads of those that were kept."""
+        return tuple(
+            dataclasses.replace(tried, spread=_SPREADS[self.kept[tried.effect]])
+            if tried.kept
+            else tried
+            for tried in self.tried
+        )
+
+    def _best(
+        self, name: str, at: int, strides: tuple[int, ...]
+    ) -> tuple[int, tuple[Effects, Tensor]]:
+        """Index of the best spread of the effect `name` near `at`, the fit, and its losses."""
+        found: dict[int, tuple[Effects, Tensor]] = {}
+
+        def loss(index: int) -> float:
+            if not 0 <= index < len(_SPREADS):
+                return float("inf")
+            if index not in found:
+                spreads = {each: _SPREADS[self.kept[each]] for each in self.kept}
+                effects = fit_effects(self.design, self.effects, {**spreads, name: _SPREADS[index]})
+                found[index] = effects, self._losses(effects)
+            return float(found[index][1].mean())
+
+        for stride in strides:
+            for step in (stride, -stride):
+                start = at
+                while loss(at + step) < loss(at):
+                    at += step
+                if at != start:
+                    break
+        return at, found[at]
 
     def _losses(self, effects: Effects) -> Tensor:
         return self._held_out.loss(self._held_out.predictor(effects)).double()
@@ -195,7 +219,7 @@ def _report(
         train_rows=len(rows),
         validation_rows=len(held_out),
         binary=bool(model.binary),
-        effects=tuple(search.tried),
+        effects=search.report(),
         base_loss=search.base_loss,
         item_loss=search.item_loss,
         loss=float(search.losses.mean()),

@@ -18,10 +18,12 @@ _DENSE = 2**24
 
 @dataclass(frozen=True)
 class Exposed:
-    """The items shown before each of M steps, and the return-to-go at the step."""
+    """The items shown before each of M steps with their rewards, and the step's return-to-go."""
 
     items: Tensor
     """(M, N) int64 items shown, most recent first; −1 before the session or window began."""
+    rewards: Tensor
+    """(M, N) their rewards, in reward units."""
     returns: Tensor
     """(M,) returns-to-go in units of the policy's return scale."""
 
@@ -29,15 +31,21 @@ class Exposed:
     def before(cls, windows: Windows, lags: int) -> "Exposed":
         """For every step of B windows of K steps, (B·K, lags) earlier steps of the same window.
 
-        Row t uses the actions of steps t − 1 to t − `lags` only.
+        Row t uses the actions and rewards of steps t − 1 to t − `lags` only.
         """
         items = windows.actions.masked_fill(~windows.mask, -1)
-        earlier = nn.functional.pad(items, (lags, 0), value=-1)[:, :-1].unfold(1, lags, 1).flip(-1)
-        return cls(earlier.flatten(0, 1), windows.returns_to_go.flatten())
+        returns = windows.returns_to_go.flatten()
+        return cls(_earlier(items, lags, -1), _earlier(windows.rewards, lags, 0), returns)
 
     def select(self, rows: Tensor) -> "Exposed":
         """The steps with the given indices, or where a bool mask of the M steps is true."""
-        return Exposed(self.items[rows], self.returns[rows])
+        return Exposed(self.items[rows], self.rewards[rows], self.returns[rows])
+
+
+def _earlier(values: Tensor, lags: int, padding: int) -> Tensor:
+    """Values (B·K, lags) of the steps before each of (B, K), most recent first."""
+    padded = nn.functional.pad(values, (lags, 0), value=padding)[:, :-1]
+    return padded.unfold(1, lags, 1).flip(-1).flatten(0, 1)
 
 
 class Likeness(nn.Module):
@@ -77,7 +85,7 @@ class Likeness(nn.Module):
         self._matrix = None
 
     def _load_from_state_dict(self, *arguments: Any, **named: Any) -> None:
-        super()._load_from_state_dict(*arguments, **named)  # type: ignore[no-untyped-call]
+        super()._load_from_state_dict(*arguments, **named)
         self._matrix = None
 
     def profile(self, items: Tensor, weights: Tensor) -> Tensor:
@@ -138,29 +146,37 @@ def _read(table: Tensor, columns: Tensor) -> Tensor:
 
 
 class ExposureTerm(nn.Module):
-    """Adds to the logit of item i: Σ_n v_n(Ĝ) [i = i_n] + Σ_n w_n(Ĝ) likeness(i, i_n).
+    """Adds to the logit of item i: Σ_n (v_n + v′_n r_n) [i = i_n] + Σ_n (w_n + w′_n r_n) l(i, i_n).
 
-    i_n is the item shown n steps before. Each weight is a common one plus one of its lag, both
-    interpolated linearly in the return-to-go Ĝ between knots: how much a repetition costs depends
-    on how much is still to be earned. All weights start at 0.
+    i_n is the item shown n steps before, r_n its reward scaled to [0, 1] as in item states, and l
+    the likeness of two items. Each weight is a common one plus one of its lag, both interpolated
+    linearly in the return-to-go Ĝ between knots: how much a repetition costs depends on how much
+    is still to be earned, and on how the item was received. All weights start at 0.
     """
 
     knots: Tensor
+    reward_low: Tensor
+    reward_high: Tensor
 
     def __init__(self, lags: int, knots: int, likeness: Likeness) -> None:
         super().__init__()
         self.likeness = likeness
         self.lags = lags
         self.register_buffer("knots", torch.linspace(0, 1, knots))
-        self.common = nn.Parameter(torch.zeros(2, knots, 1))
-        self.by_lag = nn.Parameter(torch.zeros(2, knots, lags))
+        self.register_buffer("reward_low", torch.zeros(()))
+        self.register_buffer("reward_high", torch.ones(()))
+        self.common = nn.Parameter(torch.zeros(4, knots, 1))
+        self.by_lag = nn.Parameter(torch.zeros(4, knots, lags))
 
     def start_from(self, states: ItemStates, returns: Tensor) -> None:
-        """Set how alike the items are, and the knots: quantiles of returns-to-go (N,), spread out.
+        """Set how alike the items are, the scale of the rewards, and the knots.
 
-        Half of the knots' range lies in the upper tenth, because targets do.
+        The knots are quantiles of returns-to-go (N,), closer together the higher they are, because
+        targets are high.
         """
         self.likeness.start_from(states)
+        self.reward_low.fill_(states.reward_low)
+        self.reward_high.fill_(states.reward_high)
         levels = 1 - torch.logspace(0, -2, len(self.knots), dtype=torch.float64)
         levels = levels.sub(levels[0]).div(levels[-1] - levels[0])
         knots = torch.from_numpy(np.quantile(returns.double().numpy(), levels.numpy()))
@@ -169,33 +185,30 @@ class ExposureTerm(nn.Module):
         apart = 1e-3 * width * torch.arange(len(knots), dtype=torch.float64)
         self.knots.copy_((knots + apart).float())
 
-    @torch.no_grad()
-    def set_weights(self, weights: Tensor) -> None:
-        """Set the weights (2, knots, lags) of repetition and of likeness at each knot and lag."""
-        self.common.zero_()
-        self.by_lag.copy_(weights / _GAIN)
-
-    def weights(self, returns: Tensor) -> Tensor:
-        """Weights (2, M, N) of repetition and of likeness at returns-to-go (M,)."""
+    def weights(self, exposed: Exposed) -> tuple[Tensor, Tensor]:
+        """Weights of repetition and of likeness, (M, N) each, of the items shown."""
         table = _GAIN * (self.common + self.by_lag)
-        if len(self.knots) == 1:
-            return table.expand(-1, len(returns), -1)
-        at = returns.clamp(self.knots[0], self.knots[-1])
+        at = exposed.returns.clamp(self.knots[0], self.knots[-1])
         right = torch.searchsorted(self.knots, at).clamp(1, len(self.knots) - 1)
         low, high = self.knots[right - 1], self.knots[right]
         share = ((at - low) / (high - low)).view(1, -1, 1)
-        return table[:, right - 1] * (1 - share) + table[:, right] * share
+        repeated, repeated_liked, alike, alike_liked = (
+            table[:, right - 1] * (1 - share) + table[:, right] * share
+        )
+        liked = (exposed.rewards - self.reward_low) / (self.reward_high - self.reward_low)
+        liked = liked.clamp(0, 1)
+        return repeated + repeated_liked * liked, alike + alike_liked * liked
 
     def to_all(self, exposed: Exposed) -> Tensor:
         """Additions (M, n_items) to the logits of all items."""
-        repeated, alike = self.weights(exposed.returns)
+        repeated, alike = self.weights(exposed)
         added = self.likeness.to_all(self.likeness.profile(exposed.items, alike))
         rows, lags = torch.nonzero(exposed.items >= 0, as_tuple=True)
         return added.index_put((rows, exposed.items[rows, lags]), repeated[rows, lags], True)
 
     def to_items(self, exposed: Exposed, items: Tensor) -> Tensor:
         """Additions to the logits of items: (M, L) for items (L,), (M,) for items (M, 1)."""
-        repeated, alike = self.weights(exposed.returns)
+        repeated, alike = self.weights(exposed)
         added = self.likeness.to_items(self.likeness.profile(exposed.items, alike), items)
         for lag in range(self.lags):
             shown = exposed.items[:, lag]

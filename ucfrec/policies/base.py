@@ -1,7 +1,7 @@
 """Base of all sequence policies: configuration, normalisation, action loss, token embedding."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -128,6 +128,19 @@ class SequencePolicy(nn.Module, ABC):
 
     def start_from(self, train: EpisodeStore) -> None:
         """Set buffers from the training episodes, before the first update."""
+
+    def closed_form(
+        self, train: EpisodeStore, validation: EpisodeStore, folder: Path, seed: int
+    ) -> Callable[[], None] | None:
+        """What fits the policy without the training loop; None if gradients have to.
+
+        Args:
+            train: the training episodes, without edited copies.
+            validation: held-out episodes.
+            folder: for intermediate results.
+            seed: of every random draw.
+        """
+        return None
 
     @abstractmethod
     def features(self, windows: Windows) -> Tensor:

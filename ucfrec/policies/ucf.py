@@ -130,10 +130,13 @@ class UCFPolicy(SequencePolicy):
         )
         supervision = mask_loss(attention, targets, mask)
         on_parents = (attention.mean(1) * (targets > 0)).sum(-1)
+        visible = _visible(mask)
+        uniform = ((targets > 0) & visible).sum(-1) / visible.sum(-1)
         return imitation + config.lambda_mask * supervision, {
             **scalars,
             "mask_loss": supervision.detach(),
             "attention_on_parents": masked_mean(on_parents.detach(), mask),
+            "uniform_on_parents": masked_mean(uniform, mask),
         }
 
 

@@ -40,6 +40,6 @@ class RuleConfig:
     """Training impressions from which on the log supports an item."""
     least_support: Share = 0.9
     """Smallest share of a rule's decisions that the log must support."""
-    least_items: Annotated[float, Field(ge=1, le=10**9)] = 20.0
-    """Smallest effective number of items that a rule must show, the exponential of their entropy;
-    at most a quarter of the items that the log supports."""
+    least_items: Annotated[float, Field(ge=1, le=10**9)] = 10.0
+    """Smallest effective number of items that a rule must show, the exponential of their entropy: a
+    page of them; at most a quarter of the items that the log supports."""

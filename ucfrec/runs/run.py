@@ -21,6 +21,7 @@ from ucfrec.episodes.windows import FloatArray, Overlay, Windows
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder, read_json, write_json
 from ucfrec.fitting.checkpoint import save_tensors
+from ucfrec.fitting.closed_form import fit_once
 from ucfrec.fitting.loop import Fit, fit
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
@@ -121,6 +122,11 @@ def _fit_policy(
     config: Config,
 ) -> Fit:
     k, device = policy.config.context, policy.state_mean.device
+    validate = _validation(policy, validation, config.seed)
+    base = train.without_copies()
+    solve = policy.closed_form(base, validation, out / "policy", config.seed)
+    if solve is not None:
+        return fit_once(policy, solve, out / "policy", validate, config.policy_name)
 
     def draw(generator: np.random.Generator) -> Windows:
         return train.windows(*train.draw_steps(generator, config.train.batch_size), k).to(device)
@@ -132,7 +138,7 @@ def _fit_policy(
         config.train,
         out / "policy",
         seed=config.seed,
-        validate=_validation(policy, validation, config.seed),
+        validate=validate,
         describe=config.policy_name,
     )
 

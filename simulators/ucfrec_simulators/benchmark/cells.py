@@ -121,7 +121,7 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
         rule = _rule(cell, trained)
         for world in cell.worlds:
             metrics = evaluate_policy(world, trained, cell.method, episodes, seed, rule)
-            fields = {"checkpoint": checkpoint, "rule": str(rule)}
+            fields = {"checkpoint": checkpoint, "rule": f"{rule} ({rule.hash})"}
             rows.append(_row(metrics | training_metrics, row_key, world, **fields))
     return rows
 

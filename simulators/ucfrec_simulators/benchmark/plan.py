@@ -67,8 +67,8 @@ BUDGETS: Final[Mapping[str, Budget]] = {
         sweep_seeds=3,
     ),
 }
-_CONTEXT: Final = {"kuairand": 5}
-"""Context length K (steps) where it is not 10: KuaiRand's sessions have about two steps."""
+_CONTEXT: Final = 11
+"""Context length K (steps): one more than the steps that exposure features look back."""
 
 LAMBDAS: Final = (0.0, 0.05, 0.1, 0.25, 0.5, 1.0)
 BANDS: Final = ((0.05, 0.2), (0.2, 0.5), (0.5, 1.0), (1.0, 2.0))
@@ -220,8 +220,7 @@ class Plan:
         if not (store.has_items or method.vectors):
             return
         task_name = name.partition(",")[0]
-        context = _CONTEXT.get(task_name, 10)
-        memory = () if method.policy in _MEMORYLESS else (f"policy.context={context}",)
+        memory = () if method.policy in _MEMORYLESS else (f"policy.context={_CONTEXT}",)
         cuts = self._budget.cuts.get(method.policy, ())
         settings = (*self._budget.settings, *memory, *cuts, *method.settings)
         code = _code(task.worlds, policy_class(method.policy).__module__)

@@ -52,6 +52,7 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     monkeypatch.setitem(BUDGETS, "small", TINY)
     some = {name: METHODS[name] for name in ("popular", "dt")}
     monkeypatch.setattr(plan, "METHODS", some)
+    monkeypatch.setattr(plan, "MAIN", ("kuairand", "synthetic-catalog"))
     suite: Benchmark = load_plugin("benchmarks", "recommendation")
     results = tmp_path / "rows.jsonl"
     request = BenchmarkRequest("small", ["main"], tmp_path / "out", results, 1)
@@ -96,6 +97,47 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     last = read_rows(results)[-1]
     assert (last.evaluation_seed, last.log_seed) == (5, 3)
     assert last.data_fingerprint != again[-1].data_fingerprint
+
+
+@pytest.mark.slow
+def test_any_gymnasium_environment_is_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(BUDGETS, "small", replace(TINY, seeds=1))
+    monkeypatch.setattr(plan, "METHODS", {name: METHODS[name] for name in ("item-knn", "dt")})
+    name = "gymnasium:tests.support.gymnasium_worlds:ucfrec-test/Discrete-v0"
+    command = ["benchmark", "recommendation", "--env", name, "--observe", "secret"]
+    command += ["--out", str(tmp_path / "out"), "--workers", "1"]
+    assert main([*command, "--table", "sweeps"]) == 2
+    assert "--env gives the table main only" in capsys.readouterr().err
+    assert main(command) == 0
+    title = f"{name} --observe secret"
+    assert f"| {title} | dt | 1 |" in capsys.readouterr().out
+    rows = read_rows(tmp_path / "out" / "results.jsonl")
+    assert [row.method for row in rows] == ["random", *["item-knn"] * 2, *["dt"] * 2]
+    assert {(row.task, row.world, row.log_seed) for row in rows} == {(title, title, 0)}
+    random = next(row for row in rows if row.method == "random")
+    assert random.metrics["length"] == 5
+    assert {path.parent for path in tmp_path.rglob("run.json")} == {
+        path for path in (tmp_path / "out" / "small" / "runs").glob("*/*") if path.is_dir()
+    }
+
+
+def test_sardine_is_left_out_where_it_is_not_installed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plan, "MAIN", ("sardine-static", "synthetic-catalog"))
+    monkeypatch.setitem(plan._PACKAGES, "sardine-static", "not_installed")
+    assert Plan(tmp_path, TINY).missing() == ["sardine-static"]
+
+
+@pytest.mark.usefixtures("no_data")
+def test_a_world_has_the_code_version_of_what_it_runs_through() -> None:
+    def code(name: str) -> str:
+        return plan._code((World(name),))
+
+    assert code("sardine-static") == code("sardine-boredinf")
+    assert len({code(name) for name in ("sardine-static", "gymnasium:x", "synthetic-catalog")}) == 3
 
 
 @pytest.mark.usefixtures("no_data")

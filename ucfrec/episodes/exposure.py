@@ -1,8 +1,7 @@
 """What a session was shown lately, as additions to the logits of the items that resemble it."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch

@@ -16,10 +16,9 @@ from ucfrec.episodes.item_counts import TrainingCounts, liked_steps
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.ranking import Ranker, Steps
 from ucfrec.policies.item_knn import ItemKNNConfig, ItemKNNPolicy
+from ucfrec.policies.item_rate import liked_rates
 from ucfrec.runs.trained_policy import TrainedPolicy
 
-_PRIOR: Final = 10.0
-"""Impressions at the mean click rate that are added to every item's counts (smoothing)."""
 _KNN_HISTORY: Final = 20
 """Steps of the session that item-kNN reads."""
 _ALS_FACTORS: Final = 32
@@ -138,13 +137,11 @@ def baselines(counts: TrainingCounts, train: EpisodeStore | None, seed: int) -> 
         seed: of the random scores and of ALS.
     """
     shown, liked = counts.shown.double(), counts.liked.double()
-    mean = float(liked.sum() / shown.sum())
-    rate = (liked + _PRIOR * mean) / (shown + _PRIOR)
     rankers: list[Ranker] = [
         Random(len(shown), seed),
         SameForAll("most shown", shown),
         SameForAll("most clicked", liked),
-        SameForAll("item click rate", rate),
+        SameForAll("item click rate", liked_rates(counts)),
     ]
     if train is not None:
         rankers.append(ItemNeighbours(train, shown.float()))

@@ -28,6 +28,7 @@ BUILT_IN: Final = {
     "sasrec": "sasrec:SASRecPolicy",
     "bc": "bc:BCPolicy",
     "popular": "popular:PopularPolicy",
+    "item-rate": "item_rate:ItemRatePolicy",
     "item-knn": "item_knn:ItemKNNPolicy",
     "crm-greedy": "crm_greedy:CRMGreedyPolicy",
 }

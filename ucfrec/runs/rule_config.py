@@ -25,6 +25,8 @@ class RuleConfig:
     """Whether the rule is chosen on validation sessions; otherwise it is the default one."""
     default_quantile: Share = 1.0
     """Quantile of the training returns that is the default rule's target."""
+    default_tag_window: _Steps = 0
+    """Number of steps whose tags the default rule leaves out."""
     quantiles: Annotated[tuple[Share, ...], _SOME] = (0.9, 1.0)
     """Candidates for the target, as quantiles of the training returns; each with and without a
     floor at the same value."""

@@ -196,7 +196,8 @@ def _begin(
     with atomic_folder(out) as scratch:
         save_tensors(scratch / RETURNS, {"returns": torch.from_numpy(returns)}, {})
         target = float(np.quantile(returns.astype(np.float64), config.rule.default_quantile))
-        write_json(scratch / RULE, DecisionRule(target).as_dict())
+        rule = DecisionRule(target, tag_window=config.rule.default_tag_window)
+        write_json(scratch / RULE, rule.as_dict())
         for name in (ITEM_STATES, ITEMS, USERS):
             if (store.path / name).exists():
                 shutil.copyfile(store.path / name, scratch / name)
@@ -333,8 +334,7 @@ def _rule(
     model, report = fit_item_reward_model(train, validation, out / REWARD_MODEL, config.seed)
     trained = TrainedPolicy.load(out)
     targets = {quantile: trained.target_return(quantile) for quantile in config.rule.quantiles}
-    default = DecisionRule(trained.target_return(config.rule.default_quantile))
-    decider = Decider(policy, default, trained.returns, model)
+    decider = Decider(policy, trained.rule, trained.returns, model)
     choice = choose_rule(decider, targets, train, validation, config.rule, config.seed)
     write_json(out / RULE, choice.rule.as_dict())
     return dataclasses.asdict(report), choice.as_dict()

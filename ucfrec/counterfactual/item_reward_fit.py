@@ -100,6 +100,31 @@ def fit_item_reward_model(
     return model.eval(), report
 
 
+def refit_item_reward_model(
+    first: Path, store: EpisodeStore, folder: Path, seed: int, max_rows: int = _MAX_ROWS
+) -> ItemRewardModel:
+    """Fit the effects of the model in the folder `first`, as strong as there, to other rows.
+
+    Args:
+        first: folder of `fit_item_reward_model`.
+        store: view of the episodes to fit to.
+        folder: receives the fitted model.
+        seed: of the rows drawn from a view with more than `max_rows`.
+        max_rows: most rows that are used.
+    """
+    report = _report_from(load_tensors(first / FITTED)[1])
+    model = ItemRewardModel(reward_model_sizes(store))
+    rows = RewardRows.of(store, model.lags, max_rows, seed)
+    _set_statistics(model, rows, rows, store.item_states)
+    design = Design.of(model, rows)
+    mean = design.target.mean()
+    start = {"mean": torch.logit(mean) if design.binary else mean}
+    model.set_effects(fit_effects(design, start, report.kept), design.of_content)
+    folder.mkdir(parents=True, exist_ok=True)
+    save_tensors(folder / FITTED, model.state_dict(), dataclasses.asdict(report))
+    return model.eval()
+
+
 class _Search:
     """The effects found so far, and their loss on held-out rows."""
 

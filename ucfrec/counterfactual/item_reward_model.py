@@ -96,13 +96,21 @@ class ItemRewardModel(nn.Module):
 
     def score(self, states: Tensor, shown: Tensor, users: Tensor | None, items: Tensor) -> Tensor:
         """Linear predictors (B,) of one item each, int64 (B,); see `scores`."""
+        level = self.standardised(states) @ self.state
+        added = ((self.standardised(states) @ self.interaction) * self.vectors[items]).sum(1)
+        scores: Tensor = self.fixed_part(shown, users, items) + level + added
+        return scores
+
+    def fixed_part(self, shown: Tensor, users: Tensor | None, items: Tensor) -> Tensor:
+        """The part of `score` that does not depend on the state, (B,)."""
         repeated, alike = self.exposure
         shown, each = self._lagged(shown), items.unsqueeze(1)
         profile = self.likeness.profile(shown, alike.expand(shown.shape))
-        added = self.likeness.to_items(profile, each) + (shown == each).float() @ repeated
-        added = added + (self._query(states, users) * self.vectors[items]).sum(1)
-        scores: Tensor = self.item[items] + self.level(states, users) + added
-        return scores
+        exposure = self.likeness.to_items(profile, each) + (shown == each).float() @ repeated
+        known = self._known(users, items)
+        affinity = (self.affinity[known] * self.vectors[items]).sum(1)
+        part: Tensor = self.item[items] + self.user[known] + affinity + exposure
+        return part
 
     def level(self, states: Tensor, users: Tensor | None) -> Tensor:
         """The part (B,) of the scores that all items share, in states (B, S) of users (B,)."""
@@ -141,11 +149,11 @@ class ItemRewardModel(nn.Module):
         """States (..., S) in standard deviations from their training mean, clipped."""
         return ((states - self.state_mean) / self.state_std).clamp(-CLIP, CLIP)
 
-    def _known(self, users: Tensor | None, states: Tensor) -> Tensor:
-        """Rows (B,) of the users in the effects of users."""
+    def _known(self, users: Tensor | None, like: Tensor) -> Tensor:
+        """Rows (B,) of the users in the effects of users, B being the length of `like`."""
         last = len(self.user) - 1
         if users is None:
-            return torch.full((len(states),), last, device=states.device)
+            return torch.full((len(like),), last, device=like.device)
         return torch.where((users >= 0) & (users < last), users, last)
 
     def _query(self, states: Tensor, users: Tensor | None) -> Tensor:

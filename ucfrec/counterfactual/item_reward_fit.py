@@ -142,10 +142,12 @@ class _Search:
 
     def add(self, name: str) -> None:
         """Add the effect `name` with the best spread, if it lowers the held-out loss."""
-        if not float(self.design.squares(name).sum()):
+        nobody = bool((self.design.users == self.design.n_users).all())
+        if not self.design.squares(name).any() or (nobody and name in ("user", "affinity")):
             return
         if name == "user" and self._known_users() < _KNOWN:
-            return self._add_users_of_training()
+            self._add_users_of_training()
+            return
         at, (effects, losses) = self._best(name, _FIRST, (2, 1) if name in _CHEAP else (2,))
         decrease = self.losses - losses
         gain = float(decrease.mean())

@@ -17,6 +17,7 @@ from scipy.stats import rankdata
 from torch import Tensor
 
 from ucfrec import schema
+from ucfrec.episodes.group_auc import group_auc
 from ucfrec.episodes.item_counts import liked_steps
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
@@ -220,7 +221,7 @@ def measure(period: Period, ranked: Ranked, k: int) -> dict[str, tuple[FloatArra
         "hit_rate_liked": (by_user(hit * liked), by_user(liked)),
         "ndcg_liked": (by_user(gain * liked), by_user(liked)),
         "recall_liked": _recall(period, ranked, owner, len(users)),
-        "gauc": _group_auc(ranked.scores, period.liked, owner, len(users)),
+        "gauc": group_auc(ranked.scores, period.liked, owner, len(users)),
         "item_rate": (by_user(np.nansum(rates, axis=1)), by_user(known.sum(1))),
         "known": (by_user(known.sum(1)), by_user(every * ranked.top.shape[1])),
     }
@@ -239,27 +240,6 @@ def _recall(
     with np.errstate(invalid="ignore"):
         share = np.nan_to_num(np.bincount(pairs[0], hits, minlength=n_users) / n_liked)
     return share, (n_liked > 0).astype(np.float64)
-
-
-def _group_auc(
-    scores: FloatArray, liked: npt.NDArray[np.bool_], owner: IntArray, n_users: int
-) -> tuple[FloatArray, FloatArray]:
-    """Per user: AUC times impressions, and impressions (Zhu et al., KDD 2017).
-
-    Both are 0 for users whose steps are all liked or all not liked.
-    """
-    sizes = np.bincount(owner, minlength=n_users)
-    _, level = np.unique(scores, return_inverse=True)
-    # Ranks within users: ranks of (user, score) minus the number of steps of earlier users.
-    ranks = rankdata(owner * len(scores) + level) - (np.cumsum(sizes) - sizes)[owner]
-    positive = np.bincount(owner, liked, minlength=n_users)
-    negative = sizes - positive
-    above = np.bincount(owner, ranks * liked, minlength=n_users) - positive * (positive + 1) / 2
-    mixed = (positive > 0) & (negative > 0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        auc = np.where(mixed, above / (positive * negative), 0.0)
-    weight = (sizes * mixed).astype(np.float64)
-    return auc * weight, weight
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from ucfrec.commands.grid_options import (
 )
 from ucfrec.plugins import Benchmark, BenchmarkRequest, load_plugin
 from ucfrec.reporting.grid import chosen
+from ucfrec.reporting.rows_file import benchmarking
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -57,5 +58,6 @@ def run(options: argparse.Namespace) -> None:
         log_seed=options.log_seed,
         evaluation_seed=options.evaluation_seed,
     )
-    print(suite.run(request))
+    with benchmarking(results):
+        print(suite.run(request))
     print(f"\nrows: {results}")

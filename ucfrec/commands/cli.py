@@ -45,6 +45,7 @@ UCFREC = Program(
         "recommend": "recommend the next items to the users of a log",
         "score": "write a policy's probability of every logged choice",
         "ope": "estimate a policy's return from logs alone (off-policy evaluation)",
+        "verify": "compare every file of stores and runs with its checksum",
         "report": "write one HTML page about training runs",
         "benchmark": "measure every method and print tables; resumes",
     },

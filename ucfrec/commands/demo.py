@@ -59,9 +59,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec demo` and print its result table."""
+    from ucfrec.locks import claimed, remove_leftovers
     from ucfrec.reporting.tables import format_rows
 
-    print(format_rows(demo(options.out, options.seed, DemoConfig())))
+    with claimed(options.out, "filled"):
+        remove_leftovers(options.out.parent)
+        print(format_rows(demo(options.out, options.seed, DemoConfig())))
     print(f"\nreport: {options.out / 'report.html'}; its folder has results, logs and runs")
 
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ucfrec.errors import InputError
-from ucfrec.fitting.checkpoint import load_tensors, save_tensors
+from ucfrec.fitting.checkpoint import damage_explained, load_tensors, save_tensors
 
 IntArray = npt.NDArray[np.int64]
 
@@ -45,6 +45,10 @@ class ItemStates:
     """Factor by which the weight in the means falls with each step back."""
 
     def __post_init__(self) -> None:
+        if self.embeddings.dim() != 2 or self.user_features.dim() != 2:
+            raise InputError("embeddings and user features of item states must be matrices")
+        if not 1 <= self.window <= 10_000:
+            raise InputError(f"window of item states is {self.window}; give 1 to 10,000")
         if not self.reward_low < self.reward_high:
             raise InputError(
                 f"rewards from {self.reward_low:g} to {self.reward_high:g} cannot be scaled to "
@@ -120,7 +124,8 @@ class ItemStates:
             InputError: the file is missing or damaged.
         """
         tensors, numbers = load_tensors(path)
-        return cls(tensors["embeddings"], tensors["user_features"], **numbers)
+        with damage_explained(path):
+            return cls(tensors["embeddings"], tensors["user_features"], **numbers)
 
 
 def _with_zero_row(table: Tensor) -> Tensor:

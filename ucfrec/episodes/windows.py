@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ucfrec.errors import InputError
-from ucfrec.fitting.checkpoint import load_tensors, save_tensors
+from ucfrec.fitting.checkpoint import damage_explained, load_tensors, save_tensors
 
 IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float32]
@@ -177,7 +177,8 @@ class Overlay:
             InputError: the file is missing or damaged.
         """
         tensors, _ = load_tensors(path)
-        return cls(**{name: tensor.numpy() for name, tensor in tensors.items()})
+        with damage_explained(path):
+            return cls(**{name: tensor.numpy() for name, tensor in tensors.items()})
 
 
 def _shapes_differ(value: Windows | Transitions | Overlay, expected: str) -> InputError:

@@ -9,9 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ucfrec import schema
+from ucfrec.checksums import seal
+from ucfrec.episodes.record import RECORD
 from ucfrec.episodes.returns import returns_to_go
 from ucfrec.errors import InputError
-from ucfrec.files import atomic_folder, write_json
+from ucfrec.files import atomic_folder
 
 Array = npt.NDArray[Any]
 BoolArray = npt.NDArray[np.bool_]
@@ -140,7 +142,7 @@ class StoreWriter:
     def finish(
         self, reward: str, source: Mapping[str, Any], ids: Mapping[str, list[Any]] | None = None
     ) -> dict[str, Any]:
-        """Close the last shard and write `meta.json`.
+        """Close the last shard and write `meta.json`, with the checksums of the files so far.
 
         Args:
             reward: the expression that computed the rewards, for the record.
@@ -177,8 +179,7 @@ class StoreWriter:
             },
             "source": dict(source),
         }
-        write_json(self._folder / "meta.json", meta)
-        return meta
+        return seal(self._folder, RECORD, meta)
 
 
 def write_arrays(

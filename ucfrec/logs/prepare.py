@@ -19,6 +19,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ucfrec import schema
+from ucfrec.checksums import seal
+from ucfrec.episodes.record import RECORD
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder
@@ -163,11 +165,12 @@ def prepare(
                 for batch in log.connection.sql(ordered_steps(log)).to_arrow_reader(BATCH_ROWS):
                     _append(writer, batch, log)
                     bar.update(len(batch))
-            writer.finish(report["reward"], report, _write_ids(log, folder))
+            meta = writer.finish(report["reward"], report, _write_ids(log, folder))
             if log.key == schema.ITEM_ID:
                 _write_states(log, folder, features, options.embedding_size, like)
             if like is not None:
                 _copy(log, episode_users(), folder / EPISODE_USERS)
+            seal(folder, RECORD, meta)
     return report
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from ucfrec import schema
+from ucfrec.checksums import reopen, seal
 from ucfrec.counterfactual.augment import counterfactual_copies, require_rewards_vary
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
@@ -19,6 +20,7 @@ from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder, read_json, write_json
 from ucfrec.fitting.loop import Fit, fit
 from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.locks import claimed, remove_leftovers, remove_leftovers_within
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
 from ucfrec.policies.registry import policy_class
@@ -26,7 +28,7 @@ from ucfrec.provenance import command_line, versions
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.reference_losses import reference_losses
 from ucfrec.runs.samples import SAMPLES, sample_recommendations
-from ucfrec.runs.trained_policy import AUGMENTATION, COUNTS, ITEMS, RUN, USERS
+from ucfrec.runs.trained_policy import AUGMENTATION, COUNTS, INPUTS, ITEMS, RUN, USERS
 
 _VALIDATION_BATCHES = 16
 _VALIDATION_BATCH = 256
@@ -61,8 +63,22 @@ def train_run(
     Raises:
         InputError: `out` is a run on another store or with another configuration, the store has
             too few training episodes or constant rewards, or the learner does not support its
-            actions.
+            actions, or another process is training in `out`.
     """
+    with claimed(out, "trained"):
+        remove_leftovers(out.parent)
+        remove_leftovers_within(out)
+        return _train(store, out, config, about, more_copies)
+
+
+def _train(
+    store: EpisodeStore,
+    out: Path,
+    config: Config,
+    about: Mapping[str, Any] | None,
+    more_copies: Overlay | None,
+) -> dict[str, Any]:
+    """`train_run` of a run that no other process trains."""
     train, validation = training_views(store)
     if (out / RUN).exists():
         _require_same(read_json(out / RUN), store, out, config)
@@ -72,6 +88,7 @@ def train_run(
     if not (out / RUN).exists():
         _begin(store, train, validation, out, config, about or {})
     record = read_json(out / RUN)
+    reopen(out, RUN, record, INPUTS)
     record["config"] = dataclasses.asdict(config)
     start = time.perf_counter() - record["wall_time_s"]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -88,8 +105,7 @@ def train_run(
     record["policy"] = dataclasses.asdict(fitted)
     record["wall_time_s"] = time.perf_counter() - start
     _write_samples(out, policy, validation, record)
-    write_json(out / RUN, record)
-    return dict(record)
+    return seal(out, RUN, record)
 
 
 def _fit_policy(
@@ -172,7 +188,7 @@ def _begin(
             counts = TrainingCounts.of(train)
             counts.save(scratch / COUNTS)
             record["reference_losses"] = reference_losses(counts, validation)
-        write_json(scratch / RUN, record)
+        seal(scratch, RUN, record)
 
 
 def _require_same(

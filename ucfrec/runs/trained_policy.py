@@ -13,12 +13,12 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.policy_actor import PolicyActor
+from ucfrec.checksums import sealed_record
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import ITEM_STATES
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
-from ucfrec.files import read_json
 from ucfrec.fitting.checkpoint import load_tensors, load_weights
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
@@ -28,6 +28,8 @@ from ucfrec.runs.config import config_from_dict
 RUN, AUGMENTATION = "run.json", "augmentation.json"
 ITEMS, USERS = "items.parquet", "users.parquet"
 COUNTS = "training_counts.safetensors"
+INPUTS = (ITEM_STATES, ITEMS, USERS, COUNTS)
+"""Files of a run that training does not change."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +140,10 @@ def read_record(run: Path) -> dict[str, Any]:
     """
     if not (run / RUN).exists():
         raise InputError(f"{run} is not a run folder: it has no {RUN}; train one first")
-    return dict(read_json(run / RUN))
+    record, sealed = sealed_record(run, RUN, "train again")
+    if sealed is not None:
+        sealed.require_small()
+    return record
 
 
 def describe_trained(record: Mapping[str, Any]) -> str:

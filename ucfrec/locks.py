@@ -7,6 +7,7 @@ process ends, also when it is killed; whoever gets the lock next knows that the 
 
 import json
 import os
+import secrets
 import shutil
 import socket
 import sys
@@ -118,6 +119,23 @@ def remove_leftovers_within(folder: Path) -> None:
     if folder.is_dir():
         for each, _, _ in os.walk(folder):
             remove_leftovers(Path(each))
+
+
+@contextmanager
+def scratch_folder(parent: Path, name: str) -> Iterator[Path]:
+    """Yield a new folder for scratch in `parent` that nobody else can read; removed at the end.
+
+    If this process is killed, the next one that calls this or `remove_leftovers` removes it.
+    """
+    path = parent / f"{name}-{secrets.token_hex(8)}"
+    with claimed(path):
+        remove_leftovers(parent)
+        scratch = scratch_of(path)
+        scratch.mkdir(mode=0o700)
+        try:
+            yield scratch
+        finally:
+            shutil.rmtree(scratch, ignore_errors=True)
 
 
 def remove(path: Path) -> None:

@@ -18,6 +18,7 @@ from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
+from ucfrec.locks import scratch_folder
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
@@ -102,8 +103,8 @@ def logged_sessions(
     options = PrepareOptions(Expression(record["reward"], str(run / RUN)), session_by)
     if gap_ms is not None:
         options = replace(options, gap_minutes=gap_ms / 60_000)
-    with tempfile.TemporaryDirectory(prefix="ucfrec-") as scratch:
-        folder = Path(scratch) / "store"
+    with scratch_folder(Path(tempfile.gettempdir()), "logs") as scratch:
+        folder = scratch / "store"
         report = prepare(files, mapping, folder, options, like=run, keep_unknown=keep_unknown)
         store = EpisodeStore.open(folder)
         unknown = int((store.step_values(schema.ITEM, *store.all_steps()) < 0).sum())

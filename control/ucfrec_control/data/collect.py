@@ -82,8 +82,8 @@ def collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[di
 
     Raises:
         InputError: `out` is complete, was started with other settings or is being filled by another
-            process, the environment cannot be created or has no step limit, its action space is not a `Box`, Stable-Baselines3 is not
-            installed, or no policy beat the random policy.
+            process, the environment cannot be created or has no step limit, its action space is not
+            a `Box`, Stable-Baselines3 is not installed, or no policy beat the random policy.
     """
     with claimed(out, "filled"):
         remove_leftovers_within(out)

@@ -19,7 +19,7 @@ ORDER = (
     {"schema", "errors"},
     {"locks", "processes"},
     {"files", "progress", "provenance", "plugins", "settings", "code_version"},
-    {"checksums"},
+    {"checksums", "parquet_files"},
     {"fitting"},
     {"episodes"},
     {"logs", "counterfactual"},

@@ -2,6 +2,9 @@
 
 import errno
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 
 class InputError(ValueError):
@@ -22,6 +25,33 @@ class InputError(ValueError):
 
 class InputNote(UserWarning):
     """Something about an input that a user should know; the command line prints it as one line."""
+
+
+@contextmanager
+def damage_explained(path: Path, remedy: str) -> Iterator[None]:
+    """Turn errors over the content of a file, which the block uses, into one `InputError`.
+
+    Args:
+        path: of the file.
+        remedy: what to do about it.
+
+    Raises:
+        InputError: an entry is missing or has another type or shape than the block needs.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except _FAULTS as error:
+        what = f"{type(error).__name__}: {error}"
+        raise InputError(f"{path} is damaged ({what:.200}); {remedy}") from None
+
+
+_FAULTS = (
+    *(KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError),
+    *(RuntimeError, RecursionError, ZeroDivisionError),
+)
+"""What using values of another type, shape or range raises."""
 
 
 def one_line(text: str) -> str:

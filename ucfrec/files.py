@@ -17,6 +17,7 @@ from ucfrec.locks import claim, claimed, remove, remove_leftovers, scratch_of
 CHECKSUM: Final = "checksum"
 """Entry of a JSON object with the checksum of its other entries; see `content_checksum`."""
 _LARGEST_JSON: Final = 2**30
+_LARGEST_TOML: Final = 2**24
 
 
 @contextmanager
@@ -140,6 +141,22 @@ def read_text(path: Path, largest: int = _LARGEST_JSON) -> str:
         raise InputError(f"{path} is not UTF-8 text: {_reason(error)}") from None
     except OSError as error:
         raise InputError(explain_os_error(error)) from None
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file of at most 16 MiB.
+
+    Raises:
+        InputError: the file is missing, cannot be read, or is not TOML.
+    """
+    import tomllib  # only a few commands read TOML
+
+    try:
+        return tomllib.loads(read_text(path, _LARGEST_TOML))
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path} is not TOML: {_reason(error)}") from None
 
 
 def content_checksum(value: Mapping[str, Any]) -> str:

@@ -12,8 +12,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ucfrec.errors import InputError
-from ucfrec.fitting.checkpoint import damage_explained, load_tensors, save_tensors
+from ucfrec.errors import InputError, damage_explained
+from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 
 IntArray = npt.NDArray[np.int64]
 
@@ -124,7 +124,7 @@ class ItemStates:
             InputError: the file is missing or damaged.
         """
         tensors, numbers = load_tensors(path)
-        with damage_explained(path):
+        with damage_explained(path, REMEDY):
             return cls(tensors["embeddings"], tensors["user_features"], **numbers)
 
 

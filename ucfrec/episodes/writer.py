@@ -224,7 +224,7 @@ def require_finite(rewards: Array) -> None:
     """Check that rewards (N,) are finite, because one that is not would spoil a shard's returns.
 
     Raises:
-        InputError: some rewards are NaN or infinite, or overflow float32.
+        InputError: some rewards are NaN or infinite, or so large that training would overflow.
     """
     with np.errstate(over="ignore"):
         stored = np.asarray(rewards, dtype=schema.STEP_DTYPES[schema.REWARD])
@@ -233,6 +233,12 @@ def require_finite(rewards: Array) -> None:
         raise InputError(
             f"{not_finite} of {len(stored)} rewards are not finite; drop those rows or correct the "
             "reward expression"
+        )
+    large = int(np.count_nonzero(np.abs(stored) > schema.LARGEST_REWARD))
+    if large:
+        raise InputError(
+            f"{large} of {len(stored)} rewards are beyond ±{schema.LARGEST_REWARD:g}, too large to "
+            "train with in float32; divide them"
         )
 
 

@@ -1,8 +1,7 @@
 """Checkpoints: one safetensors file each, with metadata as JSON in the file's header."""
 
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,15 +11,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, damage_explained
 from ucfrec.files import CHECKSUM, atomic_file
 
+REMEDY: Final = "restore it or train again"
+"""What to do about a damaged file."""
 _OPTIMIZER = "optimizer."
-_FAULTS: Final = (
-    *(KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError),
-    *(RuntimeError, RecursionError),
-)
-"""What reading entries of a file of another content raises."""
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> None:
@@ -59,12 +55,12 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             stated = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
-        raise InputError(f"{path} is damaged ({error}); restore it or train again") from None
+        raise InputError(f"{path} is damaged ({error}); {REMEDY}") from None
     about = stated.get("about", "{}")
     # Older versions wrote no checksum.
     if CHECKSUM in stated and stated[CHECKSUM] != _checksum(tensors, about):
         raise InputError(f"{path} is damaged (its checksum differs); restore it or train again")
-    with damage_explained(path):
+    with damage_explained(path, REMEDY):
         return tensors, dict(json.loads(about))
 
 
@@ -77,22 +73,6 @@ def _checksum(tensors: Mapping[str, Tensor], about: str) -> str:
         if tensor.numel():
             digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()
-
-
-@contextmanager
-def damage_explained(path: Path) -> Iterator[None]:
-    """Turn errors over the content of `path`, which the block has read, into one `InputError`.
-
-    Raises:
-        InputError: an entry is missing or has another type or shape than the block needs.
-    """
-    try:
-        yield
-    except InputError:
-        raise
-    except _FAULTS as error:
-        what = f"{type(error).__name__}: {error}"
-        raise InputError(f"{path} is damaged ({what:.200}); restore it or train again") from None
 
 
 def save_training(
@@ -123,12 +103,12 @@ def load_training(
     """
     tensors, counters = load_tensors(path)
     state: dict[int, dict[str, Tensor]] = {}
-    with damage_explained(path):
+    with damage_explained(path, REMEDY):
         for name in [name for name in tensors if name.startswith(_OPTIMIZER)]:
             index, key = name.removeprefix(_OPTIMIZER).split(".")
             state.setdefault(int(index), {})[key] = tensors.pop(name)
     load_weights(path, module, tensors)
-    with damage_explained(path):
+    with damage_explained(path, REMEDY):
         _require_shapes(state, optimizer)
         groups = optimizer.state_dict()["param_groups"]
         optimizer.load_state_dict({"state": state, "param_groups": groups})

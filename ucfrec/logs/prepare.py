@@ -25,7 +25,7 @@ from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder
 from ucfrec.logs.binding import explained
-from ucfrec.logs.clean import CleanLog, read_log
+from ucfrec.logs.clean import DUPLICATES, CleanLog, read_log
 from ucfrec.logs.engine import engine
 from ucfrec.logs.feature_tables import load_features
 from ucfrec.logs.mapping import LogMapping, log_files
@@ -73,6 +73,9 @@ class PrepareOptions:
     which validation and test begin."""
     embedding_size: int = 32
     """Most dimensions of an item embedding."""
+    duplicates: str = "highest"
+    """Key of `ucfrec.logs.clean.DUPLICATES`: which of several rows with the same user, item or
+    action, and time is kept; with "first" and "last" the order of files and rows matters."""
     memory_limit: str = "2GB"
     """Memory of DuckDB, e.g. "2GB"; beyond it, rows spill to disk."""
     temp_folder: Path | None = None
@@ -81,6 +84,8 @@ class PrepareOptions:
     def __post_init__(self) -> None:
         if self.session_by not in (None, *SESSIONS):
             raise InputError(f"session_by is {self.session_by!r}; use {', '.join(SESSIONS)}")
+        if self.duplicates not in DUPLICATES:
+            raise InputError(f"duplicates is {self.duplicates!r}; use {', '.join(DUPLICATES)}")
         if not self.gap_minutes > 0 or self.min_steps < 1 or self.embedding_size < 1:
             raise InputError("gap_minutes, min_steps and embedding_size must be above 0")
         times = len(self.split) == 2 and self.split[0] <= self.split[1]
@@ -216,7 +221,8 @@ def _episodes(
     inputs = (*files, *_other_inputs(mapping, like))
     with engine(inputs, spill, options.memory_limit) as connection:
         with progress(4, "check the logs", "stages") as stage:
-            log = read_log(connection, files, mapping, reward, session_by, known, spill)
+            rule = options.duplicates
+            log = read_log(connection, files, mapping, reward, session_by, known, spill, rule)
             stage.update()
             with explained(connection, log.tables, spill):
                 dropped = drop_counts(log)
@@ -238,6 +244,7 @@ def _episodes(
                 number_ids(log, features, like)
                 stage.update()
                 report = {"reward": reward, **build_report(log, cut, dropped)}
+                report["duplicates"] = rule
                 stage.update()
         yield log, report, features
 

@@ -24,7 +24,7 @@ from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.logs.sessions import EPISODE_USERS
 from ucfrec.progress import progress
-from ucfrec.runs.trained_policy import RUN, TrainedPolicy
+from ucfrec.runs.trained_policy import RUN, TrainedPolicy, duplicates_of
 
 SESSION, PROBABILITY, RANK, GREEDY = "session", "probability", "rank", "greedy_item_id"
 _STEPS_AT_ONCE = 1024
@@ -101,6 +101,7 @@ def logged_sessions(
     # Older runs did not record `session_by`, but they did record the gap.
     session_by = record.get("session_by") or (None if gap_ms is None else "gap")
     options = PrepareOptions(Expression(record["reward"], str(run / RUN)), session_by)
+    options = replace(options, duplicates=duplicates_of(record))
     if gap_ms is not None:
         options = replace(options, gap_minutes=gap_ms / 60_000)
     with scratch_folder(Path(tempfile.gettempdir()), "logs") as scratch:

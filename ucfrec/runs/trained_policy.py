@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
@@ -21,9 +20,11 @@ from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, load_weights
 from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.parquet_files import read_ids
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
 from ucfrec.runs.config import config_from_dict
+from ucfrec.runs.record import require_run_record
 
 RUN, AUGMENTATION = "run.json", "augmentation.json"
 ITEMS, USERS = "items.parquet", "users.parquet"
@@ -143,7 +144,15 @@ def read_record(run: Path) -> dict[str, Any]:
     record, sealed = sealed_record(run, RUN, "train again")
     if sealed is not None:
         sealed.require_small()
+    require_run_record(run / RUN, record)
     return record
+
+
+def duplicates_of(record: Mapping[str, Any]) -> str:
+    """The rule for duplicates that the logs of a run were prepared with."""
+    rule = record.get("data", {}).get("duplicates")
+    # Older stores have no such entry, and a store of somebody else may have any.
+    return rule if rule in ("highest", "lowest", "first", "last") else "highest"
 
 
 def describe_trained(record: Mapping[str, Any]) -> str:
@@ -179,4 +188,4 @@ def _weights(path: Path) -> dict[str, Tensor]:
 def _ids(path: Path, column: str) -> npt.NDArray[Any]:
     if not path.exists():
         return np.empty(0, dtype=np.int64)
-    return np.asarray(pq.read_table(path, columns=[column]).column(column))
+    return read_ids(path, column)

@@ -57,9 +57,8 @@ def read_ids(path: Path, column: str) -> npt.NDArray[Any]:
             "it, or make the store or run again"
         ) from None
     integers = pa.types.is_integer(ids.type)
-    if ids.null_count or not (
-        integers or pa.types.is_string(ids.type) or pa.types.is_large_string(ids.type)
-    ):
+    texts = pa.types.is_string(ids.type) or pa.types.is_large_string(ids.type)
+    if ids.null_count or not (integers or texts):
         raise InputError(
             f"{path}: {column} is {ids.type} with {ids.null_count} missing values, not ids; "
             "restore it, or make the store or run again"

@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from errno import ENOTDIR
 from pathlib import Path
 from typing import Final
 
@@ -56,9 +57,14 @@ def claim(path: Path, wait: bool = False) -> Iterator[bool]:
         yield True
         return
     made = [each for each in (path.parent, *path.parent.parents) if not each.exists()]
-    path.parent.mkdir(parents=True, exist_ok=True)
     lock = _lock_of(path)
-    opened = _acquire(lock, None if wait else _PATIENCE)
+    _make_folder(path.parent)
+    try:
+        opened = _acquire(lock, None if wait else _PATIENCE)
+    except FileNotFoundError:
+        # Another process that had made the folder for nothing has removed it meanwhile.
+        _make_folder(path.parent)
+        opened = _acquire(lock, None if wait else _PATIENCE)
     if opened is None:
         yield False
         return
@@ -147,6 +153,13 @@ def remove(path: Path) -> None:
         path.unlink(missing_ok=True)
     except OSError:
         return
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise NotADirectoryError(ENOTDIR, os.strerror(ENOTDIR), str(folder)) from None
 
 
 def _remove_empty(folders: list[Path]) -> None:

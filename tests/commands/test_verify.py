@@ -1,5 +1,6 @@
 """`ucfrec verify` finds damage and says where."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -78,3 +79,20 @@ def test_a_flipped_bit_of_a_run_is_found_by_whoever_reads_it(
         assert main(arguments) == 2
         assert f"{name} has another content than was written" in capsys.readouterr().err
         path.write_bytes(before)
+
+
+def test_a_store_without_checksums_is_used_with_a_note(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(made / "store", tmp_path / "old")
+    record = read_json(tmp_path / "old" / "meta.json")
+    del record["files"]
+    write_json(tmp_path / "old" / "meta.json", record)
+    settings = [part for name, value in TINY.items() for part in ("--set", f"{name}={value}")]
+    arguments = ["train", str(tmp_path / "old"), "--out", str(tmp_path / "run"), *settings]
+    assert main(arguments) == 0
+    (note,) = capsys.readouterr().err.splitlines()
+    assert note.startswith("ucfrec train: note: ")
+    assert "old has no checksums, an older ucfrec wrote it" in note
+    assert main(["verify", str(tmp_path / "run")]) == 0
+    assert main(["verify", str(made / "run")]) == 0

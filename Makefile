@@ -8,7 +8,7 @@ BIN := .venv/bin
 # once. One thread each, or the workers' linear algebra fights over the cores.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
 
-.PHONY: demo test test-slow lint types docs wheel clean
+.PHONY: demo test test-slow torture lint types docs wheel clean
 
 demo: .venv/base  ## Set up and run the main job end to end on simulated logs.
 	$(BIN)/ucfrec demo --out demo-out
@@ -18,6 +18,12 @@ test: .venv/dev  ## Set up and run the tests, all but the slow ones.
 
 test-slow: .venv/dev  ## The slow tests: trainings and worlds that take many seconds each.
 	$(PYTEST) -m slow
+
+# A share of the cases: make torture SCALE=0.02 takes minutes, all of them hours.
+SCALE ?= 1
+torture: .venv/dev  ## Kill, interrupt, corrupt, fuzz and starve the commands; print a table.
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.torture --scale $(SCALE) \
+	  --results benchmarks/results/torture.jsonl
 
 lint: .venv/dev  ## Style.
 	$(BIN)/ruff check .

@@ -146,7 +146,7 @@ def test_reading_what_is_not_there_or_not_json(tmp_path: Path) -> None:
         read_json(tmp_path / "a.json")
     for content in (b"{", b"", b"\xff\xfe\x00"):
         (tmp_path / "a.json").write_bytes(content)
-        with pytest.raises(InputError, match=r"a\.json is not JSON") as caught:
+        with pytest.raises(InputError, match=r"a\.json is not (JSON|UTF-8)") as caught:
             read_json(tmp_path / "a.json")
         assert "\n" not in str(caught.value)
 

@@ -17,7 +17,9 @@ PACKAGES = {
 }
 ORDER = (
     {"schema", "errors"},
+    {"locks", "processes"},
     {"files", "progress", "provenance", "plugins", "settings", "code_version"},
+    {"checksums", "parquet_files"},
     {"fitting"},
     {"episodes"},
     {"logs", "counterfactual"},

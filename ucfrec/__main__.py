@@ -1,7 +1,17 @@
-"""Makes `python -m ucfrec` run the command `ucfrec`."""
+"""The command `ucfrec`, also as `python -m ucfrec`."""
 
 import sys
 
-from ucfrec.commands.cli import main
+from ucfrec.processes import end_at_once_when_interrupted
 
-sys.exit(main())
+
+def main() -> int:
+    """Run one `ucfrec` command; returns its exit status, as `ucfrec.commands.cli.main` does."""
+    end_at_once_when_interrupted()
+    from ucfrec.commands.cli import main as run
+
+    return run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -15,6 +15,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder
+from ucfrec.locks import scratch_folder
 from ucfrec.logs.clean import REASONS
 from ucfrec.logs.histories import log_table
 from ucfrec.logs.mapping import LogMapping
@@ -101,7 +102,8 @@ class Recommender:
         options = {name: value for name, value in log_options.items() if value is not None}
         with ExitStack() as stack:
             if not isinstance(data, EpisodeStore):
-                prepared = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ucfrec-")))
+                temporary = Path(tempfile.gettempdir())
+                prepared = stack.enter_context(scratch_folder(temporary, "logs"))
                 store = _store(data, prepared, mapping, options)
             elif options or mapping is not None:
                 raise InputError(f"{data} is prepared already; prepare its logs with other options")

@@ -36,6 +36,9 @@ STEP_DTYPES: Final = {
 }
 EPISODE_DTYPES: Final = {USER: "<i8", SPLIT: "|u1", TERMINATED: "|u1"}
 
+LARGEST_REWARD: Final = 1e12
+"""Largest absolute reward: beyond it, squares of returns overflow float32 in training."""
+
 SPLITS: Final = ("train", "validation", "test")
 """In chronological order; the column `split` holds the index in this tuple."""
 

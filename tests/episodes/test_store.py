@@ -31,8 +31,8 @@ from ucfrec.episodes import store as store_module
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay, Transitions, Windows
 from ucfrec.episodes.writer import StoreWriter
-from ucfrec.errors import InputError
-from ucfrec.files import atomic_folder
+from ucfrec.errors import InputError, InputNote
+from ucfrec.files import atomic_folder, read_json, write_json
 
 LENGTHS = [3, 1, 7, 2, 5, 9, 1, 4]
 SHARDS = (2**24, 6, 1)
@@ -106,7 +106,8 @@ def test_neither_shards_nor_the_size_of_appends_show(
         parts = EpisodeStore.open(pieces)
 
         assert parts.meta["n_shards"] >= min(len(lengths), sum(lengths) // (shard_steps + 8))
-        assert {**parts.meta, "n_shards": 1} == dict(whole.meta)
+        layout = {"n_shards": 1, "files": {}}
+        assert {**parts.meta, **layout} == {**whole.meta, **layout}
         assert parts.lengths.tolist() == lengths
         assert np.array_equal(parts.returns, whole.returns)
         for column in of_episodes:
@@ -637,7 +638,7 @@ def test_an_overlay_comes_back_from_its_file(folder: Path) -> None:
 def test_opening_reads_the_record_only(folder: Path) -> None:
     write_store(folder / "store", random_episodes(LENGTHS), shard_steps=6)
     for column in folder.glob("store/shard-*/*"):
-        column.unlink()
+        column.write_bytes(bytes(column.stat().st_size))
     store = EpisodeStore.open(folder / "store")
     assert store.meta["n_steps"] == sum(LENGTHS)
 
@@ -702,8 +703,79 @@ def test_a_column_of_another_length_is_named(folder: Path) -> None:
     write_store(folder / "store", random_episodes(LENGTHS), some_states(), shard_steps=6)
     path = folder / "store" / "shard-00001" / "reward.npy"
     np.save(path, np.load(path)[:-1])
-    with pytest.raises(InputError, match="'reward' has 31 of 32 steps"):
+    with pytest.raises(InputError, match=r"reward\.npy is truncated: 152 of 156 bytes"):
         use(EpisodeStore.open(folder / "store"))
+    without_checksums(folder / "store")
+    with (
+        pytest.raises(InputError, match="'reward' has 31 of 32 steps"),
+        pytest.warns(InputNote, match="has no checksums, an older ucfrec wrote it"),
+    ):
+        use(EpisodeStore.open(folder / "store"))
+
+
+def without_checksums(store: Path) -> None:
+    """As ucfrec wrote stores before it had checksums."""
+    record = read_json(store / "meta.json")
+    del record["files"]
+    write_json(store / "meta.json", record)
+
+
+@pytest.mark.parametrize("column", ["reward", "item", "return_to_go", "offsets", "user"])
+def test_a_flipped_bit_of_a_column_is_found_when_it_is_used(folder: Path, column: str) -> None:
+    store = write_store(folder / "store", random_episodes(LENGTHS), some_states(), shard_steps=6)
+    path = store.path / "shard-00001" / f"{column}.npy"
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 16
+    path.write_bytes(content)
+    opened = EpisodeStore.open(store.path)
+    with pytest.raises(InputError, match=rf"shard-00001/{column}\.npy has another content"):
+        use(opened)
+
+
+def test_a_record_that_was_changed_is_named(folder: Path) -> None:
+    write_store(folder / "store", random_episodes(LENGTHS))
+    path = folder / "store" / "meta.json"
+    path.write_text(path.read_text().replace('"reward": "reward"', '"reward": "reword"'))
+    with pytest.raises(InputError, match=r"meta\.json was changed after ucfrec wrote it"):
+        EpisodeStore.open(folder / "store")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("n_shards", 10**12),
+        ("n_shards", -1),
+        ("n_steps", "many"),
+        ("n_episodes", None),
+        ("columns", []),
+        ("columns", {"reward": [], "item": [3]}),
+        ("columns", {"reward": [], "observation": [10**12]}),
+        ("columns", {"reward": [], "../../etc/passwd": []}),
+        ("source", 3),
+        ("files", {"../meta.json": [1, ""]}),
+        ("files", {"meta.json": 3}),
+    ],
+)
+def test_a_record_of_another_form_is_named(folder: Path, name: str, value: object) -> None:
+    store = write_store(folder / "store", random_episodes(LENGTHS))
+    write_json(store.path / "meta.json", {**store.meta, name: value})
+    with pytest.raises(InputError, match="damaged") as caught:
+        EpisodeStore.open(folder / "store")
+    assert "\n" not in str(caught.value)
+
+
+def test_an_item_that_the_catalogue_lacks_is_named(folder: Path) -> None:
+    store = write_store(folder / "store", random_episodes(LENGTHS), some_states())
+    without_checksums(store.path)
+    path = store.path / "shard-00000" / "item.npy"
+    items = np.load(path)
+    items[3] = 10**6
+    np.save(path, items)
+    with (
+        pytest.raises(InputError, match="'item' has items from 0 to 1000000, there are 11"),
+        pytest.warns(InputNote),
+    ):
+        use(EpisodeStore.open(store.path))
 
 
 def test_a_column_that_was_never_logged_is_named(folder: Path) -> None:

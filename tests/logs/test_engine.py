@@ -2,6 +2,7 @@
 
 import gzip
 import re
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +12,7 @@ import pandas as pd
 import pytest
 
 from ucfrec.errors import InputError
+from ucfrec.locks import SCRATCH
 from ucfrec.logs import LogMapping, PrepareOptions, prepare, validate
 from ucfrec.logs.binding import Table, glob_pattern, open_tables, text
 from ucfrec.logs.engine import engine
@@ -100,7 +102,7 @@ def closed(inputs: list[Path], tmp_path: Path) -> Iterator[duckdb.DuckDBPyConnec
 
 
 def work_of(folder: Path) -> Path:
-    (work,) = (path for path in folder.iterdir() if path.name.startswith(".ucfrec-"))
+    (work,) = (path for path in folder.iterdir() if path.name.endswith(SCRATCH))
     return work
 
 
@@ -196,7 +198,7 @@ def test_rows_spill_into_the_scratch_folder_and_vanish(tmp_path: Path) -> None:
             "ORDER BY s LIMIT 5 OFFSET 700000"
         ).fetchall()
         assert len(rows) == 5
-        assert [path.parent for path in folder.iterdir()] == [folder]
+        assert [path.is_dir() for path in sorted(folder.iterdir())] == [False, True]
     assert not list(folder.iterdir())
 
 
@@ -262,3 +264,20 @@ def test_every_connection_is_closed_to_the_world() -> None:
     found = {path.name for path in files if opens.search(path.read_text(encoding="utf-8"))}
     assert found == {"engine.py"}
     assert text("it's") == "'it''s'"
+
+
+def test_scratch_of_a_killed_process_goes_with_the_next(inputs: list[Path], tmp_path: Path) -> None:
+    code = (
+        "import os, sys; from pathlib import Path; from ucfrec.logs.engine import engine\n"
+        "with engine([], Path(sys.argv[1])) as connection:\n"
+        "    connection.execute('CREATE TABLE t AS SELECT range AS x FROM range(100000)')\n"
+        "    os.kill(os.getpid(), 9)\n"
+    )
+    folder = tmp_path / "scratch"
+    folder.mkdir()
+    for _ in range(2):
+        subprocess.run([sys.executable, "-c", code, str(folder)], check=False)
+        assert sum(path.is_dir() for path in folder.iterdir()) == 1
+    with engine(inputs, folder):
+        assert sum(path.is_dir() for path in folder.iterdir()) == 1
+    assert list(folder.iterdir()) == []

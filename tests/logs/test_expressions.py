@@ -18,6 +18,7 @@ from tests.support.attacks import ATTACKS, attack
 from ucfrec import UCF, EpisodeStore
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
+from ucfrec.files import read_json
 from ucfrec.logs import FeatureTable, LogMapping, PrepareOptions, prepare, read_histories, validate
 from ucfrec.logs.binding import Table, bind, open_tables
 from ucfrec.logs.engine import engine
@@ -241,7 +242,7 @@ def fit(store: Path, run: Path) -> None:
 
 
 def reward_of_run(run: Path, text: str) -> None:
-    record = json.loads((run / "run.json").read_text())
+    record = read_json(run / "run.json")
     (run / "run.json").write_text(json.dumps({**record, "reward": text}))
 
 
@@ -348,7 +349,7 @@ def test_a_store_of_somebody_else_brings_no_program(
     (tmp_path / "secret.txt").write_text(SECRET)
     text = attack(name, str(tmp_path / "out"), str(tmp_path / "secret.txt"))
     shutil.copytree(trained / "store", tmp_path / "store")
-    meta = json.loads((tmp_path / "store" / "meta.json").read_text())
+    meta = read_json(tmp_path / "store" / "meta.json")
     (tmp_path / "store" / "meta.json").write_text(json.dumps({**meta, "reward": text}))
     fit(tmp_path / "store", tmp_path / "run")
     assert TrainedPolicy.load(tmp_path / "run").record["reward"] == text

@@ -580,3 +580,62 @@ def test_a_mapping_is_read_from_toml(tmp_path: Path) -> None:
     (tmp_path / "bad.toml").write_text("rewards = 'x'\n")
     with pytest.raises(InputError, match=r"bad.toml: .*rewards"):
         read_mapping(tmp_path / "bad.toml")
+
+
+@pytest.mark.parametrize(
+    ("rule", "kept"), [("highest", 5.0), ("lowest", 1.0), ("first", 3.0), ("last", 1.0)]
+)
+def test_the_rule_for_duplicates_is_chosen_and_recorded(
+    tmp_path: Path, rule: str, kept: float
+) -> None:
+    log = pd.DataFrame(
+        {
+            "user_id": [1, 1, 1, 1, 2],
+            "item_id": [1, 1, 1, 2, 2],
+            "timestamp": START + np.array([0, 0, 0, 1, 2]),
+            "reward": [3.0, 5.0, 1.0, 0.0, 0.5],
+        }
+    )
+    options = PrepareOptions(duplicates=rule, embedding_size=2)
+    report = prepare([write(log, tmp_path / "log.parquet")], LogMapping(), tmp_path / "s", options)
+    assert steps_of(tmp_path / "s")["reward"].tolist() == [kept, 0.0, 0.5]
+    assert (report["duplicates"], report["conflicting_duplicates"]) == (rule, 2)
+    assert {"highest": "highest", "lowest": "lowest"}.get(rule, "in the files") in format_report(
+        report
+    )
+    with pytest.raises(InputError, match="use highest, lowest, first, last"):
+        PrepareOptions(duplicates="any")
+
+
+def test_rewards_near_the_end_of_float32_are_refused_with_their_number(tmp_path: Path) -> None:
+    log = make_log()
+    log.loc[[3, 5], "reward"] = [2e38, -1e13]
+    path = write(log, tmp_path / "log.parquet")
+    with pytest.raises(
+        InputError, match=r"[12] of \d+ rewards are beyond ±1e\+12 \(up to 2e\+38\)"
+    ):
+        prepare([path], LogMapping(), tmp_path / "store", SMALL)
+    divided = LogMapping(reward="reward / 1e30")
+    prepare([path], divided, tmp_path / "store", SMALL)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_an_observation_that_is_not_finite_is_refused_with_row_counts(
+    tmp_path: Path, value: float
+) -> None:
+    log = make_log()
+    log["observation"] = list(np.random.default_rng(0).normal(size=(len(log), 3)))
+    log.loc[7, "observation"][1] = value
+    log.at[9, "observation"] = None
+    path = write(log, tmp_path / "log.parquet")
+    with pytest.raises(InputError, match=rf"observation is missing .* in 2 of {len(log)} rows"):
+        prepare([path], LogMapping(), tmp_path / "store", SMALL)
+    prepare([path], LogMapping({"observation": ""}), tmp_path / "store", SMALL)
+
+
+def test_messages_do_not_repeat_line_breaks_of_foreign_text(tmp_path: Path) -> None:
+    log = make_log().rename(columns={"reward": "click\n\x1b[31mforged: all is well"})
+    path = write(log, tmp_path / "log.parquet")
+    with pytest.raises(InputError) as caught:
+        prepare([path], LogMapping(), tmp_path / "store", SMALL)
+    assert str(caught.value).isprintable()

@@ -15,6 +15,7 @@ from ucfrec.reporting.result_row import RowKey
 from ucfrec.reporting.rows_file import (
     CONFIGURATIONS,
     append_rows,
+    benchmarking,
     latest,
     measuring,
     read_configurations,
@@ -172,3 +173,35 @@ def test_of_rows_that_measure_the_same_the_last_counts() -> None:
         result_row(4.0, conditions={"budget": "full"}),
     ]
     assert sorted(row.value for row in latest(rows)) == [2.0, 3.0, 4.0]
+
+
+_BENCHMARK = """
+import sys
+from pathlib import Path
+from ucfrec.reporting.rows_file import benchmarking
+with benchmarking(Path(sys.argv[1])):
+    print("measuring", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_one_command_at_a_time_fills_a_file_and_its_processes_append(tmp_path: Path) -> None:
+    path = tmp_path / "rows.jsonl"
+    other = subprocess.Popen(
+        [sys.executable, "-c", _BENCHMARK, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    assert other.stdout is not None
+    assert other.stdout.readline() == b"measuring\n"
+    with (
+        pytest.raises(InputError, match=rf"rows\.jsonl is being filled by process {other.pid} "),
+        benchmarking(path),
+    ):
+        raise AssertionError("the block must not run")
+    with benchmarking(tmp_path / "others.jsonl"):
+        append_rows(path, [result_row()])
+    other.kill()
+    other.wait()
+    with benchmarking(path):
+        append_rows(path, [result_row(training_seed=7)])
+    assert len(read_rows(path)) == 2
+    assert [each.name for each in tmp_path.iterdir()] == ["rows.jsonl"]

@@ -73,11 +73,12 @@ def test_the_distractor_goes_with_the_reward_and_nothing_else_changes(
         if file.is_file() and file.name not in own:
             assert file.read_bytes() == (planted.path / file.relative_to(store.path)).read_bytes()
     assert planted.meta["fingerprint"] != store.meta["fingerprint"]
-    assert {**planted.meta, "columns": 0, "fingerprint": 0, "source": 0} == {
+    assert {**planted.meta, "columns": 0, "fingerprint": 0, "source": 0, "files": 0} == {
         **store.meta,
         "columns": 0,
         "fingerprint": 0,
         "source": 0,
+        "files": 0,
     }
 
 

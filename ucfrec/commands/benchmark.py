@@ -12,6 +12,7 @@ from ucfrec.commands.grid_options import (
 from ucfrec.commands.options import env_options, world_given
 from ucfrec.plugins import Benchmark, BenchmarkRequest, load_plugin
 from ucfrec.reporting.grid import chosen
+from ucfrec.reporting.rows_file import benchmarking
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -65,5 +66,6 @@ def run(options: argparse.Namespace) -> None:
         evaluation_seed=options.evaluation_seed,
         world=world_given(options) if options.env else None,
     )
-    print(suite.run(request))
+    with benchmarking(results):
+        print(suite.run(request))
     print(f"\nrows: {results}")

@@ -5,17 +5,18 @@ command loads what only another one needs.
 """
 
 import argparse
-import errno
 import os
-import signal
 import sys
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Protocol, cast
+from typing import Any, Final, Protocol, cast
 
 from ucfrec import __version__
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote, explain_os_error, one_line
+from ucfrec.processes import Interrupted, interruptions_raised
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,7 @@ UCFREC = Program(
         "recommend": "recommend the next items to the users of a log",
         "score": "write a policy's probability of every logged choice",
         "ope": "estimate a policy's return from logs alone (off-policy evaluation)",
+        "verify": "compare every file of stores and runs with its checksum",
         "report": "write one HTML page about training runs",
         "benchmark": "measure every method and print tables; resumes",
     },
@@ -58,39 +60,85 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: command-line arguments without the program name; None for `sys.argv`.
 
     Returns:
-        Exit status: 0 for success, 2 for an unusable input or a full disk (one line on stderr says
-        what to do), 130 for an interruption. An interrupted command that is run again resumes.
+        Exit status: 0 for success; 2 for an unusable input or an error of the operating system (one
+        line on stderr says what to do); 130 after Ctrl-C and 143 after TERM. An interrupted command
+        that is run again resumes or starts again; it leaves nothing half-written.
     """
     return run(UCFREC, arguments)
 
 
 def run(program: Program, arguments: Sequence[str] | None) -> int:
     """Run one command of `program`; returns the exit status as `main` does."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-    options = build_parser(program, arguments).parse_args(arguments)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    name = f"{program.name} {options.command}"
+    debug = "--debug" in (sys.argv[1:] if arguments is None else arguments)
+    name = program.name
     try:
-        _module(program, options.command).run(options)
-    except InputError as error:
-        return _failed(options, f"{name}: {error}")
+        with interruptions_raised(), _notes_on_one_line(program.name):
+            arguments = sys.argv[1:] if arguments is None else arguments
+            options = build_parser(program, arguments).parse_args(arguments)
+            name = f"{program.name} {options.command}"
+            _module(program, options.command).run(options)
+            sys.stdout.flush()
+    except Interrupted as interruption:
+        if sys.stderr.isatty():
+            print(file=sys.stderr)  # after ^C, or a progress bar
+        print(f"{name}: interrupted; the same command goes on or starts again", file=sys.stderr)
+        return interruption.status
     except BrokenPipeError:
         # The reader of a pipe, such as `head`, closed it: that is no failure.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except OSError as error:
-        if error.errno != errno.ENOSPC:
+    except Exception as error:
+        message = explanation(error)
+        if message is None or debug:
             raise
-        where = f" for {error.filename}" if error.filename else ""
-        message = f"no space is left on disk{where}; nothing was written. Free space and run again"
-        return _failed(options, f"{name}: {message}")
-    except KeyboardInterrupt:
-        print(
-            "\ninterrupted; run the same command again to resume from the last checkpoint",
-            file=sys.stderr,
-        )
-        return 130
+        print(one_line(f"{name}: {message}"), file=sys.stderr)
+        return 2
     return 0
+
+
+def explanation(error: BaseException) -> str | None:
+    """What a user can do about an error, on one line; None if it is a defect of ucfrec."""
+    if isinstance(error, InputError):
+        return str(error)
+    if isinstance(error, OSError):
+        return explain_os_error(error)
+    text = str(error)
+    if isinstance(error, MemoryError) or any(phrase in text for phrase in _NO_MEMORY):
+        reason = f" ({text:.120})" if text else ""
+        return (
+            f"memory is exhausted{reason}; close other programs, raise the limit (ulimit -v), or "
+            "use smaller settings"
+        )
+    if any(phrase in text for phrase in _NO_SPACE):
+        return f"no space is left on a disk ({text:.120}); free space and run again"
+    return None
+
+
+_NO_MEMORY: Final = (
+    *("DefaultCPUAllocator", "std::bad_alloc", "out of memory", "Out of Memory"),
+    *("cannot allocate memory", "Cannot allocate memory", "can't start new thread"),
+    *("failed to map segment", "could not allocate", "malloc of size"),
+)
+"""How libraries that raise other errors than `MemoryError` say that there is no memory."""
+_NO_SPACE: Final = ("No space left on device", "Disk quota exceeded", "File too large")
+"""How libraries that raise other errors than `OSError` say that a disk is full."""
+
+
+@contextmanager
+def _notes_on_one_line(name: str) -> Iterator[None]:
+    """Print each `InputNote` as one line on stderr; other warnings as always."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", InputNote)
+        shown = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+            if issubclass(category, InputNote):
+                print(one_line(f"{name}: note: {message}"), file=sys.stderr)
+            else:
+                shown(message, category, *where, **more)
+
+        warnings.showwarning = show
+        yield
 
 
 def build_parser(program: Program, arguments: Sequence[str]) -> argparse.ArgumentParser:
@@ -120,13 +168,6 @@ class _Command(Protocol):
 
 def _module(program: Program, command: str) -> _Command:
     return cast(_Command, import_module(f"{program.package}.{command.replace('-', '_')}"))
-
-
-def _failed(options: argparse.Namespace, message: str) -> int:
-    if options.debug:
-        raise
-    print(message, file=sys.stderr)
-    return 2
 
 
 if __name__ == "__main__":

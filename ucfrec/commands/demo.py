@@ -3,12 +3,12 @@
 import argparse
 import os
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+from ucfrec.processes import pool_of_processes, without_ctrl_c
 from ucfrec.progress import progress
 
 WORLDS = ("synthetic-taobao", "synthetic-catalog")
@@ -57,9 +57,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec demo` and print its result table."""
+    from ucfrec.locks import claimed, remove_leftovers
     from ucfrec.reporting.tables import format_rows
 
-    print(format_rows(demo(options.out, options.seed, DemoConfig())))
+    with claimed(options.out, "filled"):
+        remove_leftovers(options.out.parent)
+        print(format_rows(demo(options.out, options.seed, DemoConfig())))
     print(f"\nreport: {options.out / 'report.html'}; its folder has results, logs and runs")
 
 
@@ -82,8 +85,10 @@ def demo(out: Path, seed: int, config: DemoConfig) -> list[dict[str, Any]]:
         simulated_store(World(world), out / world, config.sessions, seed)
     jobs = [(world, name) for name in reversed(LEARNERS) for world in WORLDS]
     # One thread each: at this size two trainings side by side beat one on two threads.
-    with ProcessPoolExecutor(min(len(jobs), os.cpu_count() or 1), get_context("spawn")) as pool:
-        started = [pool.submit(_learn, out / world, name, seed, config) for world, name in jobs]
+    workers = min(len(jobs), os.cpu_count() or 1)
+    with pool_of_processes(workers) as pool:
+        with without_ctrl_c():
+            started = [pool.submit(_learn, out / world, name, seed, config) for world, name in jobs]
         with progress(len(jobs), "train and evaluate", "policies") as bar:
             for finished in as_completed(started):
                 finished.result()

@@ -37,6 +37,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "test begin (default: 0.8,0.1,0.1)",
     )
     parser.add_argument(
+        "--duplicates",
+        choices=["highest", "lowest", "first", "last"],
+        help="of rows with the same user, item and time, keep that with the highest or lowest "
+        "reward, or the first or last in the files (default: highest)",
+    )
+    parser.add_argument(
+        "--memory-limit",
+        metavar="SIZE",
+        help="memory for reading the log; beyond it rows spill to a scratch folder beside the "
+        "store, to at most 90%% of the free disk (default: 2GB)",
+    )
+    parser.add_argument(
         "--validate", action="store_true", help="check the logs without writing a store"
     )
 
@@ -56,6 +68,8 @@ def run(options: argparse.Namespace) -> None:
         "reward": options.reward and Expression(options.reward, "--reward"),
         "session_by": options.session_by,
         "gap_minutes": options.gap_minutes,
+        "duplicates": options.duplicates,
+        "memory_limit": options.memory_limit,
         "split": options.split and parse_split(options.split),
     }
     prepared = PrepareOptions(**{name: value for name, value in given.items() if value is not None})

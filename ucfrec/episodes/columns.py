@@ -1,5 +1,6 @@
 """The columns of an episode store: memory-mapped files or arrays in memory."""
 
+import warnings
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
@@ -11,10 +12,11 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
+from ucfrec.checksums import Sealed
+from ucfrec.episodes.record import REMEDY, read_store_record
 from ucfrec.episodes.returns import returns_to_go
 from ucfrec.episodes.states import ItemStates
-from ucfrec.errors import InputError
-from ucfrec.files import read_json
+from ucfrec.errors import InputError, InputNote, one_line
 
 Array = npt.NDArray[Any]
 IntArray = npt.NDArray[np.int64]
@@ -36,6 +38,7 @@ class Columns:
         meta: Mapping[str, Any],
         arrays: Mapping[str, Array] | None = None,
         item_states: ItemStates | None = None,
+        sealed: Sealed | None = None,
     ) -> None:
         """
         Args:
@@ -43,8 +46,9 @@ class Columns:
             meta: contents of its `meta.json`.
             arrays: columns in memory, by name, used instead of the files of the folder.
             item_states: used instead of the file of the folder.
+            sealed: checksums of the files; None if there are none.
         """
-        self.path, self.meta = path, meta
+        self.path, self.meta, self._sealed = path, meta, sealed
         self._arrays, self._item_states_in_memory = dict(arrays or {}), item_states
         self._shards = [path / f"shard-{i:05d}" for i in range(meta["n_shards"])]
         self._steps: dict[str, _StepColumn] = {}
@@ -56,23 +60,17 @@ class Columns:
         Raises:
             InputError: the folder is not a store, is damaged, or was written by a newer ucfrec.
         """
-        if not (path / "meta.json").is_file():
-            raise InputError(
-                f"{path} is not an episode store: it has no meta.json; give a folder that "
-                "`ucfrec prepare` wrote"
+        meta, sealed = read_store_record(path)
+        if sealed is None:
+            warnings.warn(
+                f"{path} has no checksums, an older ucfrec wrote it: damage to it would go "
+                "unnoticed; prepare it again",
+                InputNote,
+                stacklevel=3,
             )
-        meta = read_json(path / "meta.json")
-        version = meta.get("version") if isinstance(meta, dict) else None
-        if not isinstance(version, int):
-            raise InputError(
-                f"{path / 'meta.json'} is damaged: it has no store version; prepare it again"
-            )
-        if version > schema.STORE_VERSION:
-            raise InputError(
-                f"{path} has store version {version}, this ucfrec reads versions up to "
-                f"{schema.STORE_VERSION}; upgrade ucfrec"
-            )
-        return cls(path, meta)
+        else:
+            sealed.require_sizes()
+        return cls(path, meta, sealed=sealed)
 
     @classmethod
     def from_arrays(
@@ -122,6 +120,7 @@ class Columns:
             {**self.meta, "columns": sizes},
             {**self._arrays, name: values},
             self._item_states_in_memory,
+            self._sealed,
         )
         copy._steps = {other: column for other, column in self._steps.items() if other != name}
         return copy
@@ -140,9 +139,17 @@ class Columns:
     def _starts_and_lengths(self) -> tuple[IntArray, IntArray]:
         starts, lengths, before = [], [], 0
         for offsets in self._parts(_OFFSETS):
+            if len(offsets) < 2 or offsets[0] != 0 or np.any(np.diff(offsets) < 1):
+                raise self._damaged(_OFFSETS, "do not ascend from 0")
             starts.append(offsets[:-1] + before)
             lengths.append(np.diff(offsets))
             before += int(offsets[-1])
+        found = (sum(map(len, starts)), before)
+        expected = (self.meta["n_episodes"], self.meta["n_steps"])
+        if found != expected:
+            raise self._damaged(
+                _OFFSETS, "have {} episodes of {} steps, not {} of {}".format(*found, *expected)
+            )
         return np.concatenate(starts), np.concatenate(lengths)
 
     @property
@@ -162,7 +169,11 @@ class Columns:
         Raises:
             InputError: the file of item states is missing or damaged.
         """
-        return self._item_states_in_memory or ItemStates.load(self.path / ITEM_STATES)
+        if self._item_states_in_memory is not None:
+            return self._item_states_in_memory
+        if self._sealed is not None:
+            self._sealed.require(ITEM_STATES)
+        return ItemStates.load(self.path / ITEM_STATES)
 
     @property
     def has_item_states(self) -> bool:
@@ -190,7 +201,12 @@ class Columns:
         parts = self._parts(name)
         if not parts:
             raise InputError(f"{self.path} has no column {name!r}; write the store with it")
-        return np.concatenate(parts)
+        values = np.concatenate(parts)
+        if len(values) != self.meta["n_episodes"]:
+            raise self._damaged(name, f"has {len(values)} of {self.meta['n_episodes']} episodes")
+        if name == schema.SPLIT and np.any(values >= len(schema.SPLITS)):
+            raise self._damaged(name, "has numbers that are no split")
+        return values
 
     def step_column(self, name: str) -> Array:
         """A copy of the whole step column `name`, (N,) or (N, size).
@@ -256,10 +272,9 @@ class Columns:
                 raise InputError(f"{self.path} has no column {name!r}; prepare the logs with it")
             column = _StepColumn(self._parts(name, mmap=True))
             if len(column) != self.meta["n_steps"]:
-                raise InputError(
-                    f"{self.path} is damaged: column {name!r} has {len(column)} of "
-                    f"{self.meta['n_steps']} steps; prepare it again"
-                )
+                raise self._damaged(name, f"has {len(column)} of {self.meta['n_steps']} steps")
+            if name == schema.ITEM and name not in self._arrays:
+                self._require_items(column)
             self._steps[name] = column
         return self._steps[name]
 
@@ -267,7 +282,38 @@ class Columns:
         """A column as one array per shard; a column in memory is a single array."""
         if name in self._arrays:
             return [self._arrays[name]]
-        return [_load(shard / f"{name}.npy", mmap) for shard in self._shards]
+        shape = tuple(self.meta["columns"].get(name, ()))
+        return [self._load(f"{shard.name}/{name}.npy", name, shape, mmap) for shard in self._shards]
+
+    def _load(self, file: str, name: str, shape: tuple[int, ...], mmap: bool) -> Array:
+        """A column of one shard, memory-mapped or in memory, whose rows have the given shape."""
+        if self._sealed is not None:
+            self._sealed.require(file)
+        path = self.path / file
+        try:
+            # Mapping compares the header with the size of the file before it takes memory.
+            values: Array = np.load(path, mmap_mode="r")
+        except Exception as error:  # numpy parses headers as Python and raises what that raises
+            message = one_line(str(error)) or type(error).__name__
+            raise InputError(f"{path} is missing or damaged ({message}); {REMEDY}") from None
+        kinds = {_OFFSETS: "<i8", schema.RETURN_TO_GO: "<f4"}
+        kinds |= schema.STEP_DTYPES | schema.EPISODE_DTYPES
+        if values.dtype != kinds[name] or values.shape[1:] != shape or values.ndim == 0:
+            raise InputError(
+                f"{path} is damaged: it holds {values.dtype} in the shape {values.shape}; {REMEDY}"
+            )
+        return values if mmap else np.array(values)
+
+    def _require_items(self, column: "_StepColumn") -> None:
+        if not self.has_item_states:
+            return
+        low, high = column.range()
+        items = len(self.item_states.embeddings)
+        if not -1 <= low <= high < items:
+            raise self._damaged(schema.ITEM, f"has items from {low} to {high}, there are {items}")
+
+    def _damaged(self, name: str, fault: str) -> InputError:
+        return InputError(f"{self.path} is damaged: column {name!r} {fault}; {REMEDY}")
 
 
 class _StepColumn:
@@ -280,6 +326,10 @@ class _StepColumn:
     def __len__(self) -> int:
         return int(self._bounds[-1])
 
+    def range(self) -> tuple[Any, Any]:
+        """The lowest and the highest value."""
+        return min(part.min() for part in self._parts), max(part.max() for part in self._parts)
+
     def take(self, index: IntArray) -> Array:
         """A copy of the values at the indices `index`, of any shape."""
         if len(self._parts) == 1:
@@ -291,12 +341,3 @@ class _StepColumn:
             in_shard = shard == i
             values[in_shard] = part[index[in_shard] - self._bounds[i]]
         return values
-
-
-def _load(path: Path, mmap: bool) -> Array:
-    try:
-        values: Array = np.load(path, mmap_mode="r" if mmap else None)
-    except (OSError, ValueError, EOFError) as error:
-        message = str(error).splitlines()[0]
-        raise InputError(f"{path} is missing or damaged ({message}); prepare it again") from None
-    return values

@@ -11,9 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ucfrec import schema
+from ucfrec.checksums import FILES, seal
+from ucfrec.episodes.record import RECORD
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files import atomic_folder, write_json
+from ucfrec.files import atomic_folder
 
 
 def reward_bit(
@@ -84,13 +86,16 @@ def with_observations(
             end = begin + int(np.load(shard / "offsets.npy")[-1])
             np.save(shard / f"{schema.OBSERVATION}.npy", values[begin:end])
             begin = end
+        changed = f"{schema.OBSERVATION}.npy"
+        kept = store.meta.get(FILES, {}).items()
         meta = {
             **store.meta,
+            FILES: {name: each for name, each in kept if not name.endswith(f"/{changed}")},
             "columns": {**store.meta["columns"], schema.OBSERVATION: [values.shape[1]]},
             "fingerprint": digest,
             "source": {**store.meta["source"], **source},
         }
-        write_json(scratch / "meta.json", meta)
+        seal(scratch, RECORD, meta)
     return EpisodeStore.open(out)
 
 

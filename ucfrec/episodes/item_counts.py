@@ -10,7 +10,8 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.fitting.checkpoint import load_tensors, save_tensors
+from ucfrec.errors import damage_explained
+from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 
 LIKED = 0.6
 """A step counts as liked if its reward, scaled to [0, 1] as in item states, is at least this: the
@@ -66,4 +67,5 @@ class TrainingCounts:
             InputError: the file is missing or damaged.
         """
         tensors, numbers = load_tensors(path)
-        return cls(tensors["shown"], tensors["liked"], int(numbers["episodes"]))
+        with damage_explained(path, REMEDY):
+            return cls(tensors["shown"], tensors["liked"], int(numbers["episodes"]))

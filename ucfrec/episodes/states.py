@@ -12,8 +12,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ucfrec.errors import InputError
-from ucfrec.fitting.checkpoint import load_tensors, save_tensors
+from ucfrec.errors import InputError, damage_explained
+from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 
 IntArray = npt.NDArray[np.int64]
 
@@ -48,6 +48,10 @@ class ItemStates:
     none. States do not contain them: they tell which items are alike."""
 
     def __post_init__(self) -> None:
+        if self.embeddings.dim() != 2 or self.user_features.dim() != 2:
+            raise InputError("embeddings and user features of item states must be matrices")
+        if not 1 <= self.window <= 10_000:
+            raise InputError(f"window of item states is {self.window}; give 1 to 10,000")
         if not self.reward_low < self.reward_high:
             raise InputError(
                 f"rewards from {self.reward_low:g} to {self.reward_high:g} cannot be scaled to "
@@ -125,8 +129,9 @@ class ItemStates:
             InputError: the file is missing or damaged.
         """
         tensors, numbers = load_tensors(path)
-        states = cls(tensors["embeddings"], tensors["user_features"], **numbers)
-        return replace(states, tags=tensors["tags"]) if "tags" in tensors else states
+        with damage_explained(path, REMEDY):
+            states = cls(tensors["embeddings"], tensors["user_features"], **numbers)
+            return replace(states, tags=tensors["tags"]) if "tags" in tensors else states
 
 
 def _with_zero_row(table: Tensor) -> Tensor:

@@ -9,8 +9,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ucfrec.errors import InputError
-from ucfrec.fitting.checkpoint import load_tensors, save_tensors
+from ucfrec.errors import InputError, damage_explained
+from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 
 IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float32]
@@ -177,7 +177,8 @@ class Overlay:
             InputError: the file is missing or damaged.
         """
         tensors, _ = load_tensors(path)
-        return cls(**{name: tensor.numpy() for name, tensor in tensors.items()})
+        with damage_explained(path, REMEDY):
+            return cls(**{name: tensor.numpy() for name, tensor in tensors.items()})
 
 
 def _shapes_differ(value: Windows | Transitions | Overlay, expected: str) -> InputError:

@@ -9,9 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ucfrec import schema
+from ucfrec.checksums import seal
+from ucfrec.episodes.record import RECORD
 from ucfrec.episodes.returns import returns_to_go
 from ucfrec.errors import InputError
-from ucfrec.files import atomic_folder, write_json
+from ucfrec.files import atomic_folder
 
 Array = npt.NDArray[Any]
 BoolArray = npt.NDArray[np.bool_]
@@ -140,7 +142,7 @@ class StoreWriter:
     def finish(
         self, reward: str, source: Mapping[str, Any], ids: Mapping[str, list[Any]] | None = None
     ) -> dict[str, Any]:
-        """Close the last shard and write `meta.json`.
+        """Close the last shard and write `meta.json`, with the checksums of the files so far.
 
         Args:
             reward: the expression that computed the rewards, for the record.
@@ -177,8 +179,7 @@ class StoreWriter:
             },
             "source": dict(source),
         }
-        write_json(self._folder / "meta.json", meta)
-        return meta
+        return seal(self._folder, RECORD, meta)
 
 
 def write_arrays(
@@ -223,7 +224,7 @@ def require_finite(rewards: Array) -> None:
     """Check that rewards (N,) are finite, because one that is not would spoil a shard's returns.
 
     Raises:
-        InputError: some rewards are NaN or infinite, or overflow float32.
+        InputError: some rewards are NaN or infinite, or so large that training would overflow.
     """
     with np.errstate(over="ignore"):
         stored = np.asarray(rewards, dtype=schema.STEP_DTYPES[schema.REWARD])
@@ -232,6 +233,12 @@ def require_finite(rewards: Array) -> None:
         raise InputError(
             f"{not_finite} of {len(stored)} rewards are not finite; drop those rows or correct the "
             "reward expression"
+        )
+    large = int(np.count_nonzero(np.abs(stored) > schema.LARGEST_REWARD))
+    if large:
+        raise InputError(
+            f"{large} of {len(stored)} rewards are beyond ±{schema.LARGEST_REWARD:g}, too large to "
+            "train with in float32; divide them"
         )
 
 

@@ -1,17 +1,21 @@
 """Checkpoints: one safetensors file each, with metadata as JSON in the file's header."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import torch
+import xxhash
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from ucfrec.errors import InputError
-from ucfrec.files import atomic_file
+from ucfrec.errors import InputError, damage_explained
+from ucfrec.files import CHECKSUM, atomic_file
 
+REMEDY: Final = "restore it or train again"
+"""What to do about a damaged file."""
 _OPTIMIZER = "optimizer."
 
 
@@ -26,7 +30,9 @@ def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any
         scratch.touch()
         mode = scratch.stat().st_mode
         try:
-            save_file(plain, scratch, metadata={"about": json.dumps(metadata)})
+            about = json.dumps(metadata)
+            sealed = {"about": about, CHECKSUM: _checksum(plain, about)}
+            save_file(plain, scratch, metadata=sealed)
             # safetensors restricts its files to their owner; give them the usual permissions.
             scratch.chmod(mode)
         except SafetensorError as error:
@@ -42,13 +48,31 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         InputError: the file is missing or damaged.
     """
     try:
+        # safetensors may call whatever it cannot read a missing file.
+        if not path.is_file():
+            raise InputError(f"{path} does not exist")
         with safe_open(path, framework="pt") as file:
-            metadata = json.loads((file.metadata() or {}).get("about", "{}"))
-            return {name: file.get_tensor(name) for name in file.keys()}, metadata  # noqa: SIM118
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist") from None
-    except SafetensorError as error:
-        raise InputError(f"{path} is damaged ({error}); restore it or train again") from None
+            stated = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise InputError(f"{path} is damaged ({error}); {REMEDY}") from None
+    about = stated.get("about", "{}")
+    # Older versions wrote no checksum.
+    if CHECKSUM in stated and stated[CHECKSUM] != _checksum(tensors, about):
+        raise InputError(f"{path} is damaged (its checksum differs); restore it or train again")
+    with damage_explained(path, REMEDY):
+        return tensors, dict(json.loads(about))
+
+
+def _checksum(tensors: Mapping[str, Tensor], about: str) -> str:
+    """XXH3 (64 bits, hexadecimal) of names, types, shapes and values of tensors, and of a text."""
+    digest = xxhash.xxh3_64(about.encode())
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        digest.update(f"\n{name} {tensor.dtype} {list(tensor.shape)}\n".encode())
+        if tensor.numel():
+            digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
 
 
 def save_training(
@@ -79,13 +103,26 @@ def load_training(
     """
     tensors, counters = load_tensors(path)
     state: dict[int, dict[str, Tensor]] = {}
-    for name in [name for name in tensors if name.startswith(_OPTIMIZER)]:
-        index, key = name.removeprefix(_OPTIMIZER).split(".")
-        state.setdefault(int(index), {})[key] = tensors.pop(name)
+    with damage_explained(path, REMEDY):
+        for name in [name for name in tensors if name.startswith(_OPTIMIZER)]:
+            index, key = name.removeprefix(_OPTIMIZER).split(".")
+            state.setdefault(int(index), {})[key] = tensors.pop(name)
     load_weights(path, module, tensors)
-    groups = optimizer.state_dict()["param_groups"]
-    optimizer.load_state_dict({"state": state, "param_groups": groups})
+    with damage_explained(path, REMEDY):
+        _require_shapes(state, optimizer)
+        groups = optimizer.state_dict()["param_groups"]
+        optimizer.load_state_dict({"state": state, "param_groups": groups})
     return counters
+
+
+def _require_shapes(
+    state: Mapping[int, Mapping[str, Tensor]], optimizer: torch.optim.Optimizer
+) -> None:
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    for index, moments in state.items():
+        for key, value in moments.items():
+            if value.dim() and value.shape != parameters[index].shape:
+                raise ValueError(f"the optimizer's {key} of parameter {index} has another shape")
 
 
 def load_weights(path: Path, module: nn.Module, tensors: dict[str, Tensor]) -> None:

@@ -13,6 +13,7 @@ from safetensors import SafetensorError
 
 from ucfrec.errors import InputError
 from ucfrec.logs.expressions import NotScalarError, columns_of, refused
+from ucfrec.parquet_files import require_plausible_rows
 
 _MAGIC = re.compile(r"[\[*?]")
 _NAME = re.compile(r"[^\W\d]\w*")
@@ -104,6 +105,10 @@ def _columns(connection: duckdb.DuckDBPyConnection, file: Path) -> tuple[tuple[s
     source = Table((file,), ()).sql.replace(", types = {}", "")
     try:
         types = connection.sql(f"DESCRIBE SELECT * FROM {source}").fetchall()
+        if file.suffix == ".parquet":
+            metadata = f"parquet_file_metadata({text(glob_pattern(file))})"
+            ((rows,),) = connection.sql(f"SELECT num_rows FROM {metadata}").fetchall()
+            require_plausible_rows(file, rows)
         first_row = connection.sql(f"SELECT 1 FROM {source} LIMIT 1").fetchall()
     except duckdb.Error as error:
         raise InputError(

@@ -33,12 +33,22 @@ DAY_MS: Final = 86_400_000
 REASONS: Final = {
     "null_key": "user, item or action, time or session is missing",
     "clock_out_of_range": "time before 2000 or more than a day ahead of now",
-    "vector_not_finite": "action or observation is missing or holds NaN or infinity",
+    "vector_not_finite": "action is missing or holds NaN or infinity",
     "unknown_item": "item is not in the store",
     "duplicate": "repeats user, item or action, and time of another row, which is kept",
     "reward_not_finite": "reward is missing, NaN or infinite",
 }
 """Reason to its description; a row is dropped for the first reason that applies."""
+
+
+DUPLICATES: Final = {
+    "highest": (f"{schema.REWARD} DESC", "has the highest"),
+    "lowest": (f"{schema.REWARD}", "has the lowest"),
+    "first": ("row", "comes first in the files"),
+    "last": ("row DESC", "comes last in the files"),
+}
+"""Which of several rows with the same user, item or action, and time is kept: SQL of the order in
+which the kept row is the first, and its description."""
 
 
 @dataclass(frozen=True)
@@ -87,12 +97,13 @@ def read_log(
     session_by: str | None,
     known_items: Path | None,
     folder: Path,
+    duplicates: str = "highest",
 ) -> CleanLog:
     """Read and check every row of `files`.
 
-    Of rows with the same key (user, item or action, time) the one with the highest reward is kept,
-    because late feedback is logged as a second row of an impression. Ties are broken by the other
-    columns, so that the order of rows and files does not matter.
+    Of rows with the same key (user, item or action, time) one is kept, by default that with the
+    highest reward, because late feedback is logged as a second row of an impression. Ties are
+    broken by the other columns, so that the order of rows and files does not matter.
 
     Args:
         connection: engine that may open `files` and `known_items`.
@@ -102,12 +113,16 @@ def read_log(
         session_by: "session_id", "gap" or "user"; None for session_id if the log has it, else gap.
         known_items: `items.parquet` of a store: rows with other items are dropped; None for all.
         folder: folder named when its disk is full.
+        duplicates: key of `DUPLICATES`, which of several rows with the same key is kept.
 
     Raises:
-        InputError: a file, column or type makes the log unusable.
+        InputError: a file, column or type makes the log unusable, an observation is missing or not
+            finite, or a reward is too large to train with.
     """
     tables = tuple(open_tables(connection, files))
-    return check_rows(connection, tables, mapping, reward, session_by, known_items, folder)
+    return check_rows(
+        connection, tables, mapping, reward, session_by, known_items, folder, duplicates
+    )
 
 
 def check_rows(
@@ -118,6 +133,7 @@ def check_rows(
     session_by: str | None,
     known_items: Path | None,
     folder: Path,
+    duplicates: str = "highest",
 ) -> CleanLog:
     """`read_log` of tables that are already open."""
     columns = _present(tables, mapping, session_by)
@@ -136,13 +152,47 @@ def check_rows(
         sizes = _vector_sizes(connection, columns)
         by = session_by or (schema.SESSION_ID if schema.SESSION_ID in columns else "gap")
         log = CleanLog(connection, tables, columns, sizes, by)
-        connection.execute(_checked(log, known_items))
+        _require_observations(log)
+        connection.execute(_checked(log, known_items, duplicates))
         connection.execute("DROP TABLE read")
         connection.execute(
             "CREATE VIEW clean AS SELECT * EXCLUDE (reason, conflict) FROM rows "
             "WHERE reason IS NULL"
         )
+        _require_rewards_in_range(log)
     return log
+
+
+def _require_observations(log: CleanLog) -> None:
+    """Check that the table `read` has a finite observation in every row, if it has any."""
+    if schema.OBSERVATION not in log.vector_size:
+        return
+    bad, rows = log.one(f"SELECT count_if({_not_finite(schema.OBSERVATION)}), count(*) FROM read")
+    if bad:
+        raise InputError(
+            f"{log.tables[0].files[0]}: {schema.OBSERVATION} is missing or holds NaN or infinity "
+            f"in {bad:,} of {rows:,} rows; fill them in, leave those rows out, or ignore the "
+            f"column with --column {schema.OBSERVATION}="
+        )
+
+
+def _require_rewards_in_range(log: CleanLog) -> None:
+    large, rows, largest = log.one(
+        f"SELECT count_if(abs({schema.REWARD}) > {schema.LARGEST_REWARD:.0f}), count(*), "
+        f"max(abs({schema.REWARD})) FROM clean"
+    )
+    if large:
+        raise InputError(
+            f"{log.tables[0].files[0]}: {large:,} of {rows:,} rewards are beyond "
+            f"±{schema.LARGEST_REWARD:g} (up to {largest:.3g}), too large to train with in "
+            "float32; divide them in the reward expression"
+        )
+
+
+def _not_finite(vector: str) -> str:
+    """SQL that tells whether a vector is missing or has a number that is not finite."""
+    finite = f"list_bool_and([coalesce(isfinite(v), false) FOR v IN {vector}])"
+    return f"{vector} IS NULL OR NOT {finite}"
 
 
 def _present(
@@ -248,21 +298,18 @@ def _vector_sizes(
     return sizes
 
 
-def _checked(log: CleanLog, known_items: Path | None) -> str:
+def _checked(log: CleanLog, known_items: Path | None, duplicates: str) -> str:
     keys = [schema.USER_ID, log.key, schema.TIMESTAMP]
     keys += [schema.SESSION_ID] if log.session_by == schema.SESSION_ID else []
     missing = " OR ".join(f"{k} IS NULL" for k in keys if k != schema.ACTION)
-    bad_vector = " OR ".join(
-        f"{name} IS NULL OR NOT list_bool_and([coalesce(isfinite(v), false) FOR v IN {name}])"
-        for name in log.vector_size
-    )
+    bad_vector = _not_finite(schema.ACTION) if schema.ACTION in log.vector_size else ""
     unknown = "false"
     if known_items is not None:
         source = f"read_parquet({text(glob_pattern(known_items))})"
         known = f"SELECT CAST(item_id AS VARCHAR) FROM {source}"
         unknown = f"CAST({log.key} AS VARCHAR) NOT IN ({known})"
     latest = int(time.time() * 1000) + DAY_MS
-    order = ", ".join(("good DESC", f"{schema.REWARD} DESC", *log.payload))
+    order = ", ".join(("good DESC", DUPLICATES[duplicates][0], *log.payload))
     return f"""
         CREATE TABLE rows AS
         WITH faults AS (

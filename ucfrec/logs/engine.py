@@ -3,12 +3,12 @@
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Final
 
 import duckdb
 
 from ucfrec.errors import InputError
+from ucfrec.locks import scratch_folder
 from ucfrec.logs.binding import glob_pattern, text
 
 _CLOSED: Final = {
@@ -32,17 +32,18 @@ def engine(
 
     Args:
         inputs: files that will be read.
-        folder: parent of the scratch folder, which is removed at the end.
+        folder: parent of the scratch folder, which is removed at the end; so is the scratch of
+            killed processes in it.
         memory_limit: size such as "2GB", beyond which rows spill to disk; None for DuckDB's
             default.
 
     Raises:
         InputError: `memory_limit` is not a size.
     """
-    with TemporaryDirectory(prefix=".ucfrec-", dir=folder) as work:
-        spill = str(Path(work) / "spill")
+    with scratch_folder(folder, "rows") as work:
+        spill = str(work / "spill")
         connection = duckdb.connect(
-            str(Path(work) / "rows.duckdb"), config={**_CLOSED, "temp_directory": spill}
+            str(work / "rows.duckdb"), config={**_CLOSED, "temp_directory": spill}
         )
         try:
             try:
@@ -53,7 +54,7 @@ def engine(
                     f"memory_limit {memory_limit!r} is no size; write e.g. 2GB"
                 ) from None
             _set_semantics(connection)
-            _close(connection, inputs, work)
+            _close(connection, inputs, str(work))
             yield connection
         finally:
             connection.close()

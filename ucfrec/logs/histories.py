@@ -41,6 +41,7 @@ def read_histories(
     last: int,
     memory_limit: str = "2GB",
     session_by: str = "user",
+    duplicates: str = "highest",
 ) -> Iterator[pa.RecordBatch]:
     """Read the history of each user of a log, cleaned as `prepare` cleans it.
 
@@ -51,6 +52,7 @@ def read_histories(
         last: most rows of each user, the most recent ones.
         memory_limit: size such as "2GB", beyond which rows spill to disk.
         session_by: with "session_id", batches have the column `session_ids`.
+        duplicates: see `PrepareOptions.duplicates`.
 
     Yields:
         Batches of users in sorted order: `user_id`; `item_ids`, `rewards` (float32), `timestamps`
@@ -62,14 +64,19 @@ def read_histories(
     """
     folder, files = Path(gettempdir()), log_files(paths)
     with engine(files, folder, memory_limit) as connection:
-        log = read_log(connection, files, mapping, reward, session_by, None, folder)
+        log = read_log(connection, files, mapping, reward, session_by, None, folder, duplicates)
         drop_counts(log)
         with explained(connection, log.tables, folder):
             yield from _by_user(log, last)
 
 
 def frame_histories(
-    frame: "pd.DataFrame", mapping: LogMapping, reward: str, last: int, session_by: str = "user"
+    frame: "pd.DataFrame",
+    mapping: LogMapping,
+    reward: str,
+    last: int,
+    session_by: str = "user",
+    duplicates: str = "highest",
 ) -> Iterator[pa.RecordBatch]:
     """`read_histories` of a log in memory, without using the disk.
 
@@ -82,6 +89,7 @@ def frame_histories(
         reward: scalar SQL expression over the frame's columns.
         last: most rows of each user, the most recent ones.
         session_by: with "session_id", batches have the column `session_ids`.
+        duplicates: see `PrepareOptions.duplicates`.
 
     Yields:
         Batches as of `read_histories`.
@@ -95,7 +103,10 @@ def frame_histories(
         connection.register(HISTORIES, columns)
         described = connection.sql(f"DESCRIBE {HISTORIES}").fetchall()
         table = _Frame((Path(HISTORIES),), tuple((row[0], row[1]) for row in described))
-        log = check_rows(connection, (table,), mapping, reward, session_by, None, Path(HISTORIES))
+        source = Path(HISTORIES)
+        log = check_rows(
+            connection, (table,), mapping, reward, session_by, None, source, duplicates
+        )
         _require_clean(log)
         with explained(connection, log.tables, Path(HISTORIES)):
             yield from _by_user(log, last)

@@ -1,14 +1,14 @@
 """Column mappings of logs, written as data, and the datasets that supply them."""
 
 import glob
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from ucfrec import schema
 from ucfrec.errors import InputError
+from ucfrec.files import read_toml
 from ucfrec.logs.expressions import Expression
 
 SUFFIXES: Final = (".parquet", ".csv", ".csv.gz")
@@ -121,12 +121,7 @@ def read_mapping(path: Path) -> LogMapping:
     Raises:
         InputError: the file is missing, is not TOML, or has an unknown field.
     """
-    try:
-        given: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist; name a TOML file with a mapping") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is not TOML: {error}") from None
+    given = read_toml(path)
     try:
         for name, value in given.get("columns", {}).items():
             given["columns"][name] = Expression(value, str(path))
@@ -145,7 +140,7 @@ def read_mapping(path: Path) -> LogMapping:
                 for table in tables
             )
         return LogMapping(**given)
-    except (AttributeError, TypeError, InputError) as error:
+    except (AttributeError, TypeError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: {error}") from None
 
 

@@ -19,11 +19,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ucfrec import schema
+from ucfrec.checksums import seal
+from ucfrec.episodes.record import RECORD
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder
 from ucfrec.logs.binding import explained
-from ucfrec.logs.clean import CleanLog, read_log
+from ucfrec.logs.clean import DUPLICATES, CleanLog, read_log
 from ucfrec.logs.engine import engine
 from ucfrec.logs.feature_tables import load_features
 from ucfrec.logs.mapping import LogMapping, log_files
@@ -71,6 +73,9 @@ class PrepareOptions:
     which validation and test begin."""
     embedding_size: int = 32
     """Most dimensions of an item embedding."""
+    duplicates: str = "highest"
+    """Key of `ucfrec.logs.clean.DUPLICATES`: which of several rows with the same user, item or
+    action, and time is kept; with "first" and "last" the order of files and rows matters."""
     memory_limit: str = "2GB"
     """Memory of DuckDB, e.g. "2GB"; beyond it, rows spill to disk."""
     temp_folder: Path | None = None
@@ -79,6 +84,8 @@ class PrepareOptions:
     def __post_init__(self) -> None:
         if self.session_by not in (None, *SESSIONS):
             raise InputError(f"session_by is {self.session_by!r}; use {', '.join(SESSIONS)}")
+        if self.duplicates not in DUPLICATES:
+            raise InputError(f"duplicates is {self.duplicates!r}; use {', '.join(DUPLICATES)}")
         if not self.gap_minutes > 0 or self.min_steps < 1 or self.embedding_size < 1:
             raise InputError("gap_minutes, min_steps and embedding_size must be above 0")
         times = len(self.split) == 2 and self.split[0] <= self.split[1]
@@ -163,11 +170,12 @@ def prepare(
                 for batch in log.connection.sql(ordered_steps(log)).to_arrow_reader(BATCH_ROWS):
                     _append(writer, batch, log)
                     bar.update(len(batch))
-            writer.finish(report["reward"], report, _write_ids(log, folder))
+            meta = writer.finish(report["reward"], report, _write_ids(log, folder))
             if log.key == schema.ITEM_ID:
                 _write_states(log, folder, features, options.embedding_size, like)
             if like is not None:
                 _copy(log, episode_users(), folder / EPISODE_USERS)
+            seal(folder, RECORD, meta)
     return report
 
 
@@ -213,7 +221,8 @@ def _episodes(
     inputs = (*files, *_other_inputs(mapping, like))
     with engine(inputs, spill, options.memory_limit) as connection:
         with progress(4, "check the logs", "stages") as stage:
-            log = read_log(connection, files, mapping, reward, session_by, known, spill)
+            rule = options.duplicates
+            log = read_log(connection, files, mapping, reward, session_by, known, spill, rule)
             stage.update()
             with explained(connection, log.tables, spill):
                 dropped = drop_counts(log)
@@ -235,6 +244,7 @@ def _episodes(
                 number_ids(log, features, like)
                 stage.update()
                 report = {"reward": reward, **build_report(log, cut, dropped)}
+                report["duplicates"] = rule
                 stage.update()
         yield log, report, features
 

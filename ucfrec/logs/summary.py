@@ -6,12 +6,12 @@ from datetime import UTC, datetime
 from typing import Any, Final
 
 from ucfrec import schema
-from ucfrec.errors import InputError
-from ucfrec.logs.clean import REASONS, CleanLog
+from ucfrec.errors import InputError, one_line
+from ucfrec.logs.clean import DUPLICATES, REASONS, CleanLog
 from ucfrec.logs.distributions import distributions
 from ucfrec.logs.sessions import Cut
 
-CONFLICT: Final = "duplicates with a different reward from the kept row, which has the highest"
+CONFLICT: Final = "duplicates with a different reward from the kept row"
 """Describes `conflicting_duplicates` of the report."""
 
 
@@ -156,7 +156,8 @@ def format_report(report: Mapping[str, Any]) -> str:
         if rows:
             lines.append((f"  dropped: {reason}", f"{rows:,}  {REASONS.get(reason, '')}"))
     if report["conflicting_duplicates"]:
-        conflicts = f"{report['conflicting_duplicates']:,}  {CONFLICT}"
+        kept = DUPLICATES[report.get("duplicates", "highest")][1]
+        conflicts = f"{report['conflicting_duplicates']:,}  {CONFLICT}, which {kept}"
         lines.append(("  conflicting duplicates", conflicts))
     lines += [
         ("  out of order", f"{report['unsorted_rows']:,} (sorted, none dropped)"),
@@ -181,7 +182,7 @@ def format_report(report: Mapping[str, Any]) -> str:
     if report.get("return_length_share") is not None:
         lines.append(("return-to-go", _returns_to_go(report)))
     figures = ", ".join(f"{name} {value:.4g}" for name, value in reward.items())
-    lines.append(("reward", f"{report['reward']}: {figures}"))
+    lines.append(("reward", f"{one_line(report['reward'])}: {figures}"))
     width = max(len(name) for name, _ in lines) + 2
     return "\n".join(f"{name:<{width}}{value}".rstrip() for name, value in lines)
 

@@ -19,12 +19,13 @@ from ucfrec.acting.logged_decisions import session_scores
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
+from ucfrec.locks import scratch_folder
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.logs.sessions import EPISODE_USERS
 from ucfrec.progress import progress
-from ucfrec.runs.trained_policy import RUN, TrainedPolicy
+from ucfrec.runs.trained_policy import RUN, TrainedPolicy, duplicates_of
 
 SESSION, PROBABILITY, RANK, GREEDY = "session", "probability", "rank", "greedy_item_id"
 _STEPS_AT_ONCE = 1024
@@ -103,10 +104,11 @@ def logged_sessions(
     # Older runs did not record `session_by`, but they did record the gap.
     session_by = record.get("session_by") or (None if gap_ms is None else "gap")
     options = PrepareOptions(Expression(record["reward"], str(run / RUN)), session_by)
+    options = replace(options, duplicates=duplicates_of(record))
     if gap_ms is not None:
         options = replace(options, gap_minutes=gap_ms / 60_000)
-    with tempfile.TemporaryDirectory(prefix="ucfrec-") as scratch:
-        folder = Path(scratch) / "store"
+    with scratch_folder(Path(tempfile.gettempdir()), "logs") as scratch:
+        folder = scratch / "store"
         report = prepare(files, mapping, folder, options, like=run, keep_unknown=keep_unknown)
         store = EpisodeStore.open(folder)
         unknown = int((store.step_values(schema.ITEM, *store.all_steps()) < 0).sum())

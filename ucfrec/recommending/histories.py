@@ -14,7 +14,7 @@ from ucfrec import schema
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.histories import frame_histories, read_histories
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.runs.trained_policy import RUN, TrainedPolicy
+from ucfrec.runs.trained_policy import RUN, TrainedPolicy, duplicates_of
 
 LONGEST_HISTORY = 1000
 """Most recent rows of a user that are read; older ones only count as seen."""
@@ -122,6 +122,7 @@ def histories_of_files(
         _reward(trained),
         LONGEST_HISTORY,
         session_by=_session_by(trained),
+        duplicates=duplicates_of(trained.record),
     )
     return map(Histories.from_batch, batches)
 
@@ -151,6 +152,7 @@ def histories_of_frame(
         schema.REWARD if has_rewards else _reward(trained),
         LONGEST_HISTORY,
         session_by=_session_by(trained),
+        duplicates=duplicates_of(trained.record),
     )
     return map(Histories.from_batch, batches)
 

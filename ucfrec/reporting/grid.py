@@ -1,16 +1,16 @@
 """Run the measurements of a benchmark in parallel processes, resumably."""
 
 import json
-import multiprocessing
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, as_completed
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from ucfrec.errors import InputError
+from ucfrec.processes import pool_of_processes, without_ctrl_c
 from ucfrec.progress import progress
 from ucfrec.provenance import config_hash, peak_memory_mib, reset_peak_memory
 from ucfrec.reporting.result_row import ResultRow, RowKey
@@ -97,11 +97,11 @@ def _measure_all(
     """Rows by task name, and an error line for every failed task."""
     found: dict[str, list[ResultRow]] = {}
     failed: list[str] = []
-    spawn = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, spawn, initializer=_one_thread)
     waiting: dict[Future[list[ResultRow] | None], str] = {}
-    try:
-        waiting = {pool.submit(_measure, task): name for name, task in tasks.items()}
+    # An interrupted benchmark ends at once; its cells resume from their checkpoints.
+    with pool_of_processes(workers, _one_thread) as pool:
+        with without_ctrl_c():
+            waiting = {pool.submit(_measure, task): name for name, task in tasks.items()}
         # Tasks that another process is measuring are waited for at the end.
         elsewhere: dict[Future[list[ResultRow] | None], str] = {}
         with progress(len(tasks), describe, "cells") as bar:
@@ -118,13 +118,6 @@ def _measure_all(
                 else:
                     found[name] = rows
                 bar.update()
-    except BaseException:
-        # An interrupted benchmark ends at once; its cells resume from their checkpoints.
-        for child in multiprocessing.active_children():
-            child.terminate()
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
     return found, failed
 
 

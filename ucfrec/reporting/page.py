@@ -12,7 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ucfrec import __version__
 from ucfrec.counterfactual.reward_model_fit import fit_warning
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, damage_explained
 from ucfrec.files import atomic_file, read_json
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.reporting import charts
@@ -23,7 +23,9 @@ from ucfrec.reporting.page_results import estimates, read_results, worlds
 from ucfrec.reporting.samples import read_features, sample_tables
 from ucfrec.reporting.tables import Table, shown
 from ucfrec.reporting.verdict import verdict
-from ucfrec.runs.trained_policy import AUGMENTATION, learner_of, read_record
+from ucfrec.runs.trained_policy import AUGMENTATION, RUN, learner_of, read_record
+
+_REMEDY = "restore it or train again"
 
 
 @dataclass(frozen=True)
@@ -119,6 +121,11 @@ def _read_runs(folders: Sequence[Path]) -> list[_Run]:
 
 def _warnings(run: _Run) -> list[str]:
     """Reasons why the results of a run may be unreliable."""
+    with damage_explained(run.folder / RUN, _REMEDY):
+        return _warnings_of(run)
+
+
+def _warnings_of(run: _Run) -> list[str]:
     warnings = [] if "policy" in run.record else [run.status]
     if run.copies is not None:
         model = run.copies["reward_model"]
@@ -139,6 +146,11 @@ def _warnings(run: _Run) -> list[str]:
 
 def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
     """Template variables of the section on runs with the same data."""
+    with damage_explained(runs[0].folder / RUN, _REMEDY):
+        return _variables(runs, features)
+
+
+def _variables(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
     names = [run.name for run in runs]
     edited = [(run.name, run.copies) for run in runs if run.copies is not None]
     item_runs = [run for run in runs if run.record["sizes"]["items"]]

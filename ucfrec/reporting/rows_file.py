@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 from ucfrec.errors import InputError
-from ucfrec.files import atomic_file, file_lock
+from ucfrec.files import atomic_file
+from ucfrec.locks import claim, claimed, remove_leftovers
 from ucfrec.provenance import config_hash
 from ucfrec.reporting.result_row import ResultRow, RowKey, row_from_json
 
 CONFIGURATIONS: Final = "configurations.jsonl"
 """File next to the rows with each of their configurations, by hash."""
-_WRITING, _MEASURING = ".writing.lock", ".measuring.lock"
-"""Lock files of the folder: for appending to its files, and for running measurements."""
 
 
 def read_rows(path: Path) -> list[ResultRow]:
@@ -74,9 +73,11 @@ def append_rows(
         raise InputError(f"rows for {path} have the hash of another configuration; pass their own")
     for row in rows:
         row_from_json(json.loads(json.dumps(row.to_json())), f"a row for {path}")
-    with file_lock(path.with_name(_WRITING)):
-        if config is not None and named not in _hashes(path.with_name(CONFIGURATIONS)):
-            _append(path.with_name(CONFIGURATIONS), [{"hash": named, "config": config}])
+    configurations = path.with_name(CONFIGURATIONS)
+    with claim(configurations, wait=True):
+        if config is not None and named not in _hashes(configurations):
+            _append(configurations, [{"hash": named, "config": config}])
+    with claim(path, wait=True):
         _append(path, [row.to_json() for row in rows])
 
 
@@ -114,6 +115,18 @@ _SAME: Final = (
 
 
 @contextmanager
+def benchmarking(path: Path) -> Iterator[None]:
+    """Let no other command measure for the file `path` of result rows.
+
+    Raises:
+        InputError: another command does; the message names it.
+    """
+    with claimed(path, "filled", part="benchmark"):
+        remove_leftovers(path.parent)
+        yield
+
+
+@contextmanager
 def measuring(path: Path, key: RowKey, wait: bool) -> Iterator[bool]:
     """Lock one measurement of the file `path`, so that no two processes run it at once.
 
@@ -125,10 +138,8 @@ def measuring(path: Path, key: RowKey, wait: bool) -> Iterator[bool]:
     Yields:
         Whether the lock is held.
     """
-    name = f"{path.name} {key}".encode()
-    # Each measurement locks one byte of the lock file.
-    byte = int.from_bytes(hashlib.sha256(name).digest()[:7])
-    with file_lock(path.with_name(_MEASURING), byte, wait) as held:
+    digest = hashlib.sha256(str(key).encode()).hexdigest()[:16]
+    with claim(path.with_name(f"{path.name}.{digest}"), wait) as held:
         yield held
 
 

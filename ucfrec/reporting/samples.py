@@ -10,7 +10,7 @@ import pyarrow.csv as csv
 import pyarrow.parquet as pq
 
 from ucfrec import schema
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, damage_explained
 from ucfrec.files import read_json
 from ucfrec.reporting.tables import Table, shown
 from ucfrec.runs.samples import SAMPLES
@@ -30,11 +30,12 @@ def sample_tables(run: Path, features: pa.Table | None) -> tuple[str, list[Table
     if not (run / SAMPLES).exists() or not (run / ITEMS).exists():
         return None
     samples = read_json(run / SAMPLES)
-    sessions = samples["sessions"]
-    numbers = {n for s in sessions for n in (*s["history"], s["logged"], *s["recommended"])}
-    items = _item_cells(pq.read_table(run / ITEMS), sorted(numbers), features)
-    tables = [_session(number, one, items) for number, one in enumerate(sessions, start=1)]
-    return str(samples["rule"]), tables
+    with damage_explained(run / SAMPLES, "restore it or train again"):
+        sessions = samples["sessions"]
+        numbers = {n for s in sessions for n in (*s["history"], s["logged"], *s["recommended"])}
+        items = _item_cells(pq.read_table(run / ITEMS), sorted(numbers), features)
+        tables = [_session(number, one, items) for number, one in enumerate(sessions, start=1)]
+        return str(samples["rule"]), tables
 
 
 def read_features(path: Path) -> pa.Table:

@@ -13,6 +13,7 @@ from ucfrec.counterfactual.augment import AugmentConfig
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
 from ucfrec.errors import InputError
+from ucfrec.files import read_toml
 from ucfrec.fitting.loop import LoopConfig
 from ucfrec.policies.base import PolicyConfig
 from ucfrec.policies.registry import policy_class
@@ -70,7 +71,7 @@ def resolve_config(
     """
     settings = [*_from_mapping(presets or {}, "presets")]
     if file is not None:
-        settings += _from_mapping(_read_toml(file), str(file))
+        settings += _from_mapping(read_toml(file), str(file))
     if isinstance(overrides, Mapping):
         settings += _from_mapping(overrides, "settings")
     else:
@@ -159,14 +160,5 @@ def _table(name: str, source: str) -> str:
 def _toml_value(text: str) -> Any:
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         return text.strip()
-
-
-def _read_toml(file: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{file} does not exist; give the path of a TOML file") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file} is not TOML: {error}") from None

@@ -5,12 +5,13 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from ucfrec.checksums import FILES, reopen, seal
 from ucfrec.counterfactual.item_reward_fit import refit_item_reward_model
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.run import train_run
-from ucfrec.runs.trained_policy import REWARD_MODEL, RULE, TrainedPolicy
+from ucfrec.runs.trained_policy import INPUTS, REWARD_MODEL, RULE, RUN, TrainedPolicy
 
 
 def refit(store: EpisodeStore, first: Path, out: Path) -> dict[str, Any]:
@@ -41,10 +42,11 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> dict[str, Any]:
         raise InputError(f"{first} is not finished; train it to its end first")
     about = {"refit_of": trained.record["config"] | {"rule": trained.rule.as_dict()}}
     record = train_run(store, out, _settings(trained), about, on_all_rows=True)
+    reopen(out, RUN, record, INPUTS)
     shutil.copyfile(first / RULE, out / RULE)
     if trained.reward_model is not None:
         refit_item_reward_model(first / REWARD_MODEL, store, out / REWARD_MODEL, record["seed"])
-    return record
+    return seal(out, RUN, {name: value for name, value in record.items() if name != FILES})
 
 
 def _settings(trained: TrainedPolicy) -> Config:

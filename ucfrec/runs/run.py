@@ -12,6 +12,7 @@ import torch
 
 from ucfrec import schema
 from ucfrec.acting.decision import Decider, DecisionRule
+from ucfrec.checksums import reopen, seal
 from ucfrec.counterfactual.augment import counterfactual_copies, require_rewards_vary
 from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model, reward_model_sizes
 from ucfrec.episodes.item_counts import TrainingCounts
@@ -24,6 +25,7 @@ from ucfrec.fitting.checkpoint import save_tensors
 from ucfrec.fitting.closed_form import fit_once
 from ucfrec.fitting.loop import Fit, fit
 from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.locks import claimed, remove_leftovers, remove_leftovers_within
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
 from ucfrec.policies.registry import policy_class
@@ -36,6 +38,7 @@ from ucfrec.runs.samples import SAMPLES, sample_recommendations
 from ucfrec.runs.trained_policy import (
     AUGMENTATION,
     COUNTS,
+    INPUTS,
     ITEMS,
     RETURNS,
     REWARD_MODEL,
@@ -82,8 +85,23 @@ def train_run(
     Raises:
         InputError: `out` is a run on another store or with another configuration, the store has
             too few training episodes or constant rewards, or the learner does not support its
-            actions.
+            actions, or another process is training in `out`.
     """
+    with claimed(out, "trained"):
+        remove_leftovers(out.parent)
+        remove_leftovers_within(out)
+        return _train(store, out, config, about, more_copies, on_all_rows)
+
+
+def _train(
+    store: EpisodeStore,
+    out: Path,
+    config: Config,
+    about: Mapping[str, Any] | None,
+    more_copies: Overlay | None,
+    on_all_rows: bool,
+) -> dict[str, Any]:
+    """`train_run` of a run that no other process trains."""
     train, validation = logged, held_out = training_views(store)
     if on_all_rows:
         train = logged = store
@@ -95,6 +113,7 @@ def train_run(
     if not (out / RUN).exists():
         _begin(store, train, validation, out, config, about or {})
     record = read_json(out / RUN)
+    reopen(out, RUN, record, INPUTS)
     record["config"] = dataclasses.asdict(config)
     start = time.perf_counter() - record["wall_time_s"]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -116,8 +135,7 @@ def train_run(
         record["reward_model"], record["rule"] = _rule(policy, logged, held_out, out, config)
     record["wall_time_s"] = time.perf_counter() - start
     _write_samples(out, held_out)
-    write_json(out / RUN, record)
-    return dict(record)
+    return seal(out, RUN, record)
 
 
 def _fit_policy(
@@ -212,7 +230,7 @@ def _begin(
             counts = TrainingCounts.of(train)
             counts.save(scratch / COUNTS)
             record["reference_losses"] = reference_losses(counts, validation)
-        write_json(scratch / RUN, record)
+        seal(scratch, RUN, record)
 
 
 def _returns(store: EpisodeStore, config: Config) -> ReturnToGo:

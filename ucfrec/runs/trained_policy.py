@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pyarrow.parquet as pq
 from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
+from ucfrec.checksums import sealed_record
 from ucfrec.counterfactual.item_reward_model import FITTED, ItemRewardModel
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.item_counts import TrainingCounts
@@ -23,9 +23,11 @@ from ucfrec.errors import InputError
 from ucfrec.files import read_json
 from ucfrec.fitting.checkpoint import load_tensors, load_weights
 from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.parquet_files import read_ids
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
 from ucfrec.runs.config import config_from_dict
+from ucfrec.runs.record import require_run_record
 
 RUN, AUGMENTATION = "run.json", "augmentation.json"
 ITEMS, USERS = "items.parquet", "users.parquet"
@@ -33,6 +35,8 @@ COUNTS = "training_counts.safetensors"
 RETURNS = "training_returns.safetensors"
 RULE = "decision_rule.json"
 REWARD_MODEL = "reward_model"
+INPUTS = (ITEM_STATES, ITEMS, USERS, COUNTS, RETURNS)
+"""Files of a run that training does not change."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +161,18 @@ def read_record(run: Path) -> dict[str, Any]:
     """
     if not (run / RUN).exists():
         raise InputError(f"{run} is not a run folder: it has no {RUN}; train one first")
-    return dict(read_json(run / RUN))
+    record, sealed = sealed_record(run, RUN, "train again")
+    if sealed is not None:
+        sealed.require_small()
+    require_run_record(run / RUN, record)
+    return record
+
+
+def duplicates_of(record: Mapping[str, Any]) -> str:
+    """The rule for duplicates that the logs of a run were prepared with."""
+    rule = record.get("data", {}).get("duplicates")
+    # Older stores have no such entry, and a store of somebody else may have any.
+    return rule if rule in ("highest", "lowest", "first", "last") else "highest"
 
 
 def describe_trained(record: Mapping[str, Any]) -> str:
@@ -208,4 +223,4 @@ def _reward_model(path: Path, sizes: Mapping[str, int]) -> ItemRewardModel | Non
 def _ids(path: Path, column: str) -> npt.NDArray[Any]:
     if not path.exists():
         return np.empty(0, dtype=np.int64)
-    return np.asarray(pq.read_table(path, columns=[column]).column(column))
+    return read_ids(path, column)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from ucfrec.commands.grid_options import results_given, rows_given
 from ucfrec.reporting.result_row import ResultRow
+from ucfrec.reporting.rows_file import benchmarking
 from ucfrec.reporting.tables import format_rows
 from ucfrec_control.benchmark.cells import SCORES
 from ucfrec_control.benchmark.plan import BUDGETS, MAIN, SWEEPS, TABLES, benchmark
@@ -39,16 +40,17 @@ def run(options: argparse.Namespace) -> None:
     if options.show_only:
         rows = rows_given(options, SCORES, [options.table])
     else:
-        rows = benchmark(
-            data_given(options),
-            options.out,
-            results_given(options),
-            budget_given(BUDGETS if options.table == MAIN else SWEEPS, options),
-            options.budget,
-            options.workers,
-            options.table,
-            options.method,
-        )
+        with benchmarking(results_given(options)):
+            rows = benchmark(
+                data_given(options),
+                options.out,
+                results_given(options),
+                budget_given(BUDGETS if options.table == MAIN else SWEEPS, options),
+                options.budget,
+                options.workers,
+                options.table,
+                options.method,
+            )
     _print_tables(rows, options.table)
     print(f"\nrows: {results_given(options)}")
 

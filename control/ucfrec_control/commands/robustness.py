@@ -3,6 +3,7 @@
 import argparse
 
 from ucfrec.commands.grid_options import results_given, rows_given
+from ucfrec.reporting.rows_file import benchmarking
 from ucfrec.reporting.tables import format_rows
 from ucfrec_control.benchmark.cells import ROBUSTNESS
 from ucfrec_control.benchmark.robustness import BUDGETS as ROBUSTNESS_BUDGETS
@@ -32,15 +33,16 @@ def run(options: argparse.Namespace) -> None:
     if options.show_only:
         rows = rows_given(options, ROBUSTNESS)
     else:
-        rows = robustness(
-            data_given(options),
-            options.out,
-            results_given(options),
-            budget_given(ROBUSTNESS_BUDGETS, options),
-            options.budget,
-            options.workers,
-            options.method,
-        )
+        with benchmarking(results_given(options)):
+            rows = robustness(
+                data_given(options),
+                options.out,
+                results_given(options),
+                budget_given(ROBUSTNESS_BUDGETS, options),
+                options.budget,
+                options.workers,
+                options.method,
+            )
     by = ("task", "distractor", "method")
     for lines, values in ((drops(rows), SHOWN_DROPS), (loss_rises(rows), SHOWN_LOSSES)):
         print(f"{format_rows(over_seeds(lines, by, values), (*by, *values))}\n")

@@ -3,6 +3,7 @@
 import argparse
 
 from ucfrec.commands.grid_options import results_given, rows_given
+from ucfrec.reporting.rows_file import benchmarking
 from ucfrec.reporting.tables import format_rows
 from ucfrec_control.benchmark.plan import BUDGETS, stores_of
 from ucfrec_control.benchmark.screening_table import SCREENING, screening_rows, screening_table
@@ -21,8 +22,9 @@ def run(options: argparse.Namespace) -> None:
     if options.show_only:
         rows = rows_given(options, SCREENING)
     else:
-        files, stores = BUDGETS["full"].files, stores_of(options.out)
-        rows = screening_table(
-            data_given(options), stores, files, results_given(options), options.workers
-        )
+        with benchmarking(results_given(options)):
+            files, stores = BUDGETS["full"].files, stores_of(options.out)
+            rows = screening_table(
+                data_given(options), stores, files, results_given(options), options.workers
+            )
     print(f"{format_rows(screening_rows(rows), SHOWN_SCREENING)}\n\nrows: {results_given(options)}")

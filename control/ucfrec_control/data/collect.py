@@ -16,6 +16,7 @@ from ucfrec.acting.rollout import Actor, BoolArray, FloatArray, IntArray, Step, 
 from ucfrec.errors import InputError
 from ucfrec.files import read_json, write_json
 from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.locks import claimed, remove_leftovers_within
 from ucfrec.progress import progress
 from ucfrec.provenance import provenance
 from ucfrec.settings import Count, require, settings_table
@@ -80,10 +81,17 @@ def collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[di
         undiscounted `mean_return`.
 
     Raises:
-        InputError: `out` is complete or was started with other settings, the environment cannot be
-            created or has no step limit, its action space is not a `Box`, Stable-Baselines3 is not
-            installed, or no policy beat the random policy.
+        InputError: `out` is complete, was started with other settings or is being filled by another
+            process, the environment cannot be created or has no step limit, its action space is not
+            a `Box`, Stable-Baselines3 is not installed, or no policy beat the random policy.
     """
+    with claimed(out, "filled"):
+        remove_leftovers_within(out)
+        return _collect(env_id, out, seed, config)
+
+
+def _collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[dict[str, Any]]:
+    """`collect` into a folder that no other process fills."""
     if (out / "MANIFEST.json").exists():
         raise InputError(f"{out} is complete already; remove it or name another output folder")
     training = _train(env_id, out / "training", seed, config)

@@ -12,8 +12,9 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, damage_explained
 from ucfrec.files import atomic_file, read_json
+from ucfrec_control.data.hdf5 import opened, read_numbers
 from ucfrec_control.data.trajectories import BoolArray, FloatArray, IntArray, Trajectories
 from ucfrec_control.worlds.scores import check_sizes, dataset_name, find_task
 
@@ -36,20 +37,20 @@ def read_d4rl(path: Path, env_id: str | None = None) -> Trajectories:
     Raises:
         InputError: the file is missing, damaged or not of this layout.
     """
-    with _opened(path) as file:
+    with opened(path) as file:
         missing = [name for name in _REQUIRED if name not in file]
         if missing:
             raise InputError(
                 f"{path} is not in D4RL's layout: it has no {', '.join(missing)}; it has "
-                f"{', '.join(file) or 'nothing'}"
+                f"{', '.join(list(file)[:20]) or 'nothing'}"
             )
-        steps = {name: _read(file, path, name) for name in _REQUIRED}
+        steps = {name: read_numbers(file, path, name) for name in _REQUIRED}
         for name in ("timeouts", "next_observations", _FINAL):
             if name in file:
-                steps[name] = _read(file, path, name)
-        attributes = {name: str(value) for name, value in file.attrs.items()}
+                steps[name] = read_numbers(file, path, name)
+        recorded = file.attrs.get("env_id")
     _require_aligned(steps, path)
-    named = env_id or attributes.get("env_id")
+    named = env_id or (recorded if isinstance(recorded, str) else None)
     task = find_task(named, dataset_name(path))
     check_sizes(None if env_id else task, _sizes(steps), str(path))
     terminals = _flags(steps["terminals"], "terminals", path)
@@ -122,34 +123,6 @@ def _next_observations(trajectories: Trajectories, ends: IntArray) -> FloatArray
     return next_observations
 
 
-def _opened(path: Path) -> Any:
-    if not path.is_file():
-        raise InputError(f"{path} does not exist")
-    try:
-        return h5py.File(path, "r")
-    except OSError as error:
-        raise InputError(
-            f"{path} is damaged or not HDF5 ({_first_line(error)}); fetch it again"
-        ) from None
-
-
-def _read(file: Any, path: Path, name: str) -> npt.NDArray[Any]:
-    """A dataset in memory; numbers as float32, D4RL's medium-replay files have float64."""
-    try:
-        values = np.asarray(file[name])
-    except (OSError, ValueError, TypeError, RuntimeError) as error:
-        raise InputError(
-            f"{path}: {name} cannot be read ({_first_line(error)}); fetch the file again"
-        ) from None
-    if values.dtype.kind not in "fiub":
-        raise InputError(f"{path}: {name} holds {values.dtype}, not numbers")
-    return values.astype(np.float32) if values.dtype.kind == "f" else values
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
-
-
 def _sizes(steps: Mapping[str, npt.NDArray[Any]]) -> tuple[int, ...]:
     return (*steps["observations"].shape[1:], *steps["actions"].shape[1:])
 
@@ -209,5 +182,6 @@ def _made_with(path: Path) -> dict[str, str]:
     if not manifest.is_file():
         return {}
     stated = read_json(manifest)
-    files = [entry.get("file") for entry in stated.get("files", [])]
-    return dict(stated.get("versions", {})) if path.name in files else {}
+    with damage_explained(manifest, "fetch it again, or remove it"):
+        files = [entry.get("file") for entry in stated.get("files", [])]
+        return dict(stated.get("versions", {})) if path.name in files else {}

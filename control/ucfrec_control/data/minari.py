@@ -16,6 +16,7 @@ from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 
 from ucfrec.errors import InputError
+from ucfrec_control.data.hdf5 import require_inside
 from ucfrec_control.data.trajectories import Trajectories
 from ucfrec_control.worlds.antmaze import antmaze_settings, is_antmaze
 from ucfrec_control.worlds.scores import dataset_name
@@ -61,7 +62,7 @@ def read_minari(source: str, env_id: str | None = None, download: bool = False) 
     dataset = _load(source, download)
     try:
         episodes = list(dataset.iterate_episodes())
-    except (OSError, KeyError, ValueError, RuntimeError) as error:
+    except Exception as error:  # Minari raises arbitrary types
         raise InputError(f"{source}: an episode cannot be read ({error}); fetch it again") from None
     complete = [e for e in episodes if len(e) and (e.terminations[-1] or e.truncations[-1])]
     observations = [_vectors(e.observations, source) for e in complete]
@@ -175,6 +176,8 @@ def _load(source: str, download: bool) -> minari.MinariDataset:
             raise InputError(
                 f"the Minari dataset {source} is not in {_root()}; fetch it with --download"
             )
+        for file in sorted((folder / "data").rglob("*.hdf5")):
+            require_inside(file)
         metadata = MinariStorage.read_raw_metadata(folder / "data")
         if not {"observation_space", "action_space"} <= metadata.keys():
             # Without the spaces, Minari would import and start any environment that the file names.

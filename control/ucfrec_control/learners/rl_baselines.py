@@ -14,12 +14,14 @@ import torch
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import BoolArray, FloatArray, IntArray
+from ucfrec.checksums import seal
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_file, atomic_folder, read_json, write_json
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
 from ucfrec.fitting.metrics_log import MetricsLog
 from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.locks import claimed, remove_leftovers_within
 from ucfrec.progress import progress
 from ucfrec.provenance import command_line, versions
 from ucfrec.runs.trained_policy import RUN
@@ -111,8 +113,16 @@ def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dic
     return.
 
     Raises:
-        InputError: d3rlpy is not installed, or `out` is of another configuration or other data.
+        InputError: d3rlpy is not installed, `out` is of another configuration or other data, or
+            another process is training in it.
     """
+    with claimed(out, "trained"):
+        remove_leftovers_within(out)
+        return _train(store, out, config, seed)
+
+
+def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dict[str, Any]:
+    """`train_rl` of a run that no other process trains."""
     d3rlpy = _d3rlpy()
     if (out / RUN).exists():
         existing: dict[str, Any] = read_json(out / RUN)
@@ -159,9 +169,10 @@ def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dic
     save_tensors(out / _ACTOR, {**actor, "state.mean": mean, "state.std": std}, {})
     record["policy"] = {"steps": config.steps, "best_step": None}
     record["wall_time_s"] = seconds + perf_counter() - started
-    write_json(out / RUN, record)
-    (out / _CHECKPOINT).unlink(missing_ok=True)
-    return record
+    if (out / _CHECKPOINT).exists():
+        write_json(out / RUN, record)
+        (out / _CHECKPOINT).unlink()
+    return seal(out, RUN, record)
 
 
 def _begin(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> None:

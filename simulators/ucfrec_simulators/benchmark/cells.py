@@ -9,7 +9,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.world import World
-from ucfrec.files import file_lock
+from ucfrec.locks import claim
 from ucfrec.reporting.evaluation_rows import evaluation_row
 from ucfrec.reporting.grid import Measurement
 from ucfrec.reporting.result_row import ResultRow, RowKey
@@ -113,7 +113,7 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
             for world in cell.worlds
         ]
     # Cells that differ only in their evaluation share a run.
-    with file_lock(cell.run.with_name(f".{cell.run.name}.lock")):
+    with claim(cell.run, wait=True):
         record = train_run(EpisodeStore.open(cell.store), cell.run, cell.config)
     training_metrics, rows = _training_metrics(record), []
     for checkpoint in CHECKPOINTS:

@@ -1,0 +1,17 @@
+"""The command `ucfrec-control`, also as `python -m ucfrec_control`."""
+
+import sys
+
+from ucfrec.processes import end_at_once_when_interrupted
+
+
+def main() -> int:
+    """Run one command; returns its exit status, as `ucfrec.commands.cli.main` does."""
+    end_at_once_when_interrupted()
+    from ucfrec_control.cli import main as run
+
+    return run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

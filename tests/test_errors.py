@@ -1,0 +1,47 @@
+"""Messages are one line, whatever text they quote."""
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ucfrec.errors import InputError, damage_explained, explain_os_error, one_line
+
+
+@given(st.text())
+def test_every_text_becomes_one_printable_line(text: str) -> None:
+    assert one_line(text).isprintable()
+    assert str(InputError(f"a: {text}")).isprintable()
+
+
+@given(st.text(st.characters(categories=["L", "N", "P", "S"])))
+def test_printable_text_stays(text: str) -> None:
+    assert one_line(text) == text
+
+
+def test_a_terminal_is_not_steered() -> None:
+    assert one_line("a\n\x1b[31mred\x07\r\nb") == "a \\x1b[31mred\\x07  b"
+
+
+@pytest.mark.parametrize("number", sorted(errno.errorcode))
+def test_every_error_of_the_system_is_one_line_with_its_file(number: int) -> None:
+    error = OSError(number, os.strerror(number), "some\nfile")
+    said = explain_os_error(error)
+    assert said.startswith("some file: ")
+    assert said.isprintable()
+
+
+def test_what_is_no_system_error_is_said_as_it_is() -> None:
+    assert explain_os_error(OSError("it broke\nbadly")) == "it broke badly"
+    assert explain_os_error(OSError(errno.EXDEV, "x", "a", None, "b")).startswith("a → b: ")
+
+
+def test_damage_names_the_file() -> None:
+    with (
+        pytest.raises(InputError, match=r"x is damaged .KeyError: 'missing'.; restore it"),
+        damage_explained(Path("x"), "restore it"),
+    ):
+        {}["missing"]

@@ -1,0 +1,111 @@
+"""Processes end with one line when they are interrupted, and with their parent."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from ucfrec.processes import Interrupted, interruptions_raised
+
+CHILDREN = """
+import os, sys, time
+from pathlib import Path
+from ucfrec.processes import pool_of_processes, without_ctrl_c
+def work(folder):
+    (Path(folder) / str(os.getpid())).write_text("")
+    time.sleep(60)
+if __name__ == "__main__":
+    with pool_of_processes(2) as pool:
+        with without_ctrl_c():
+            waiting = [pool.submit(work, sys.argv[1]) for _ in range(2)]
+        [each.result() for each in waiting]
+"""
+
+
+def ended(process: int, seconds: float = 20) -> bool:
+    """Whether a process ends in time; one that nobody has waited for yet counts as ended."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        try:
+            state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+        except OSError:
+            return True
+        if state == "Z":
+            return True
+        time.sleep(0.05)
+    return False
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_children_end_with_their_parent(tmp_path: Path, number: signal.Signals) -> None:
+    (tmp_path / "script.py").write_text(CHILDREN)
+    (tmp_path / "marks").mkdir()
+    script = [sys.executable, str(tmp_path / "script.py"), str(tmp_path / "marks")]
+    parent = subprocess.Popen(script, stderr=subprocess.DEVNULL)
+    until = time.monotonic() + 60
+    while len(children := list((tmp_path / "marks").iterdir())) < 2 and time.monotonic() < until:
+        time.sleep(0.05)
+    assert len(children) == 2
+    parent.send_signal(number)
+    parent.wait(20)
+    assert all(ended(int(child.name)) for child in children)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_whatever_an_interruption_causes_is_an_interruption(number: signal.Signals) -> None:
+    def work() -> None:
+        try:
+            signal.raise_signal(number)
+        except KeyboardInterrupt:
+            raise ImportError("a library that an interruption broke") from None
+
+    before = signal.getsignal(number)
+    with pytest.raises(Interrupted) as caught, interruptions_raised():
+        work()
+    assert caught.value.status == 128 + number
+    assert signal.getsignal(number) is before
+
+
+def test_an_interruption_that_a_callback_swallows_comes_again() -> None:
+    class Swallows:
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGINT)
+
+    def work() -> None:
+        Swallows()
+        for _ in range(100):
+            time.sleep(0.05)
+
+    with pytest.raises(Interrupted), interruptions_raised():
+        work()
+
+
+def test_other_errors_pass() -> None:
+    with pytest.raises(ValueError, match="mine"), interruptions_raised():
+        raise ValueError("mine")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_command_interrupted_while_it_starts_prints_one_line(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    """Its interpreter takes some hundredths of a second before the first line of ucfrec runs."""
+    log = tmp_path / "log.csv"
+    rows = "".join(f"{i % 5},{i % 7},{1_700_000_000_000 + i},{i % 2}\n" for i in range(500))
+    log.write_text("user_id,item_id,timestamp,reward\n" + rows)
+    command = [sys.executable, "-m", "ucfrec", "prepare", str(log), "--out", str(tmp_path / "out")]
+    for moment in (0.2, 0.5, 1.0, 1.7):
+        running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ)
+        time.sleep(moment)
+        running.send_signal(number)
+        _, printed = running.communicate(timeout=60)
+        if running.returncode == 0:
+            break
+        assert running.returncode == 128 + number, printed
+        assert printed.endswith("interrupted\n") or "prepare: interrupted" in printed
+        assert len(printed.splitlines()) == 1, printed
+    assert {path.name for path in tmp_path.iterdir()} <= {"log.csv", "out"}

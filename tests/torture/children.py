@@ -1,0 +1,134 @@
+"""Commands in forks of one interpreter: their end, their output, and what they leave."""
+
+import contextlib
+import os
+import resource
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+TIMEOUT = 300.0
+"""Seconds after which a command counts as hung."""
+
+
+@dataclass(frozen=True)
+class End:
+    """How a command ended."""
+
+    status: int
+    """Exit status; negative for the signal that killed it."""
+    printed: str
+    """What it wrote to stderr."""
+    seconds: float
+    hung: bool = False
+
+    @property
+    def lines(self) -> list[str]:
+        """Lines on stderr but those of progress and of counting."""
+        return [line for line in self.printed.splitlines() if not line.startswith("benchmark")]
+
+    @property
+    def traceback(self) -> bool:
+        """Whether a traceback was printed."""
+        return "Traceback (most recent call last)" in self.printed
+
+    def fault(self, allowed: Sequence[int]) -> str:
+        """What is wrong with this end; empty if nothing is.
+
+        Args:
+            allowed: exit statuses; 0 may print anything but a traceback, others one line.
+        """
+        if self.hung:
+            return "hung"
+        if self.traceback:
+            return "traceback: " + self.printed.strip().splitlines()[-1][:150]
+        if self.status not in allowed:
+            return f"status {self.status}: {self.printed.strip()[-150:]}"
+        if self.status and len(self.lines) != 1:
+            return f"{len(self.lines)} lines: {self.printed.strip()[:150]}"
+        return ""
+
+
+class Running:
+    """A function in a fork; its stderr goes to a file, its stdout to nowhere."""
+
+    def __init__(self, work: Callable[[], int], memory: int | None = None) -> None:
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115
+        self._start = time.monotonic()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        self.pid = os.fork()
+        if self.pid == 0:
+            status = 70
+            try:
+                os.dup2(self._log.fileno(), 2)
+                os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+                if memory is not None:
+                    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+                status = work()
+            except SystemExit as end:
+                status = end.code if isinstance(end.code, int) else 1
+            except BaseException:
+                import traceback
+
+                traceback.print_exc()
+            finally:
+                with contextlib.suppress(BaseException):
+                    sys.stderr.flush()
+                os._exit(status)
+
+    def send(self, number: int) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.pid, number)
+
+    def wait(self, timeout: float = TIMEOUT) -> End:
+        until, hung, status = time.monotonic() + timeout, False, 0
+        while True:
+            pid, status = os.waitpid(self.pid, os.WNOHANG)
+            if pid:
+                break
+            if time.monotonic() > until:
+                hung = True
+                self.send(signal.SIGKILL)
+                until += 1e9
+            time.sleep(0.002)
+        self._log.seek(0)
+        printed = self._log.read().decode(errors="replace")
+        self._log.close()
+        code = os.waitstatus_to_exitcode(status)
+        return End(code, printed, time.monotonic() - self._start, hung)
+
+
+def command(*arguments: object, program: str = "ucfrec") -> Callable[[], int]:
+    """A function that runs one command as its process would."""
+
+    def work() -> int:
+        sys.argv = [program, *map(str, arguments)]
+        if program == "ucfrec":
+            from ucfrec.__main__ import main
+        else:
+            from ucfrec_control.__main__ import main
+        return main()
+
+    return work
+
+
+def run(*arguments: object, program: str = "ucfrec") -> End:
+    """One command from its beginning to its end."""
+    return Running(command(*arguments, program=program)).wait()
+
+
+def leftovers(*folders: Path) -> list[str]:
+    """Locks and scratch in the folders."""
+    from ucfrec.locks import is_lock_or_scratch
+
+    return [
+        str(path)
+        for folder in folders
+        for path in folder.rglob(".*")
+        if is_lock_or_scratch(path.name)
+    ]

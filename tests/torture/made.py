@@ -1,0 +1,132 @@
+"""Small inputs of every kind, the commands that use them, and what their outputs say."""
+
+import hashlib
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tests.torture.children import run
+
+TINY = (
+    *("train.steps=60", "train.validate_every=10", "policy.dim=8", "policy.context=4"),
+    *("crm.epochs=1", "csg.epochs=1"),
+)
+SETTINGS = [part for setting in TINY for part in ("--set", setting)]
+
+
+@dataclass(frozen=True)
+class Job:
+    """A command that writes something."""
+
+    name: str
+    arguments: Callable[[Path], list[object]]
+    """Arguments of the command that writes to the given path."""
+    suffix: str = ""
+    waits: bool = False
+    """Whether the second of two processes waits for the first, instead of being refused."""
+
+
+class Inputs:
+    """Logs, a store and a run, made once."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.logs, self.store, self.run = folder / "logs", folder / "store", folder / "run"
+        world = ("--env", "synthetic-catalog", "--sessions", 60)
+        for arguments in (
+            ("collect", *world, "--out", self.logs),
+            ("prepare", self.log, "--out", self.store, "--reward", "is_click"),
+            ("train", self.store, "--out", self.run, *SETTINGS),
+        ):
+            end = run(*arguments)
+            if end.status:
+                raise SystemExit(f"{arguments[0]}: {end.printed}")
+
+    @property
+    def log(self) -> Path:
+        return self.logs / "sessions.parquet"
+
+    def jobs(self) -> list[Job]:
+        world = ("--env", "synthetic-catalog")
+        return [
+            Job("collect", lambda out: ["collect", *world, "--sessions", 60, "--out", out]),
+            Job(
+                "prepare",
+                lambda out: ["prepare", self.log, "--out", out, "--reward", "is_click"],
+            ),
+            Job("train", lambda out: ["train", self.store, "--out", out, *SETTINGS]),
+            Job(
+                "recommend",
+                lambda out: ["recommend", self.run, self.log, "--out", out],
+                ".parquet",
+                waits=True,
+            ),
+            Job("score", lambda out: ["score", self.run, self.log, "--out", out], ".parquet", True),
+            Job("ope", lambda out: ["ope", self.run, self.log, "--json", out], ".json", True),
+            Job(
+                "evaluate",
+                lambda out: ["evaluate", self.run, *world, "--episodes", 20, "--json", out],
+                ".json",
+                waits=True,
+            ),
+            Job("report", lambda out: ["report", self.run, "--out", out], ".html", waits=True),
+        ]
+
+
+def said(path: Path) -> str:
+    """A digest of what an output says, without times and names of folders."""
+    digest = hashlib.sha256()
+    files = sorted(path.rglob("*")) if path.is_dir() else [path]
+    for file in files:
+        if not file.is_file() or file.name in ("run.json", "collect.json") or "events" in str(file):
+            continue
+        name = file.relative_to(path).as_posix() if path.is_dir() else ""
+        digest.update(f"{name}:".encode())
+        digest.update(_content(file))
+    return digest.hexdigest()
+
+
+def _content(file: Path) -> bytes:
+    if file.suffix == ".safetensors":
+        from ucfrec.fitting.checkpoint import load_tensors
+
+        tensors, _ = load_tensors(file)
+        return b"".join(
+            name.encode() + np.ascontiguousarray(tensor.numpy()).tobytes()
+            for name, tensor in sorted(tensors.items())
+        )
+    if file.name == "meta.json":
+        return json.dumps(json.loads(file.read_text())["fingerprint"]).encode()
+    if file.name == "metrics.jsonl":
+        rows = [json.loads(line) for line in file.read_text().splitlines()]
+        last = {row["step"]: row.get("validation_loss") for row in rows}
+        return json.dumps(sorted(last.items())).encode()
+    if file.suffix == ".json":
+        return json.dumps(_numbers(json.loads(file.read_text()))).encode()
+    if file.suffix == ".html":
+        return b""  # has times of training and the name of its run
+    return file.read_bytes()
+
+
+def _numbers(value: object) -> object:
+    if isinstance(value, dict):
+        timed = ("seconds", "wall_time_s", "checksum", "per_second", "memory", "commit", "command")
+        return {k: _numbers(v) for k, v in value.items() if not any(t in k for t in timed)}
+    if isinstance(value, list):
+        return [_numbers(each) for each in value]
+    return value if isinstance(value, int | float) else None
+
+
+def temporary(folder: Path) -> Path:
+    """Make a folder inside `folder` the one for temporary files."""
+    import tempfile
+
+    place = folder / "tmp"
+    place.mkdir()
+    os.environ["TMPDIR"] = str(place)
+    tempfile.tempdir = None
+    return place

@@ -1,0 +1,75 @@
+"""`ucfrec verify`: compare every file of stores and runs with its checksum."""
+
+import argparse
+from pathlib import Path
+
+from ucfrec.errors import InputError
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `ucfrec verify`."""
+    parser.add_argument(
+        "paths",
+        nargs="+",
+        type=Path,
+        metavar="PATH",
+        help="episode stores and run folders (each file of theirs is read), or files of result "
+        "rows (.jsonl)",
+    )
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run `ucfrec verify`: print one line per path, and one per file with a fault.
+
+    Raises:
+        InputError: a file is missing, has another content than was written, or cannot be verified.
+    """
+    faults = sum(_verified(path) for path in options.paths)
+    if faults:
+        raise InputError(
+            f"{faults} files do not have the content that was written; restore them, or make the "
+            "store or run again"
+        )
+
+
+def _verified(path: Path) -> int:
+    """Print what `path` is and its faults; returns their number."""
+    from ucfrec.checksums import sealed_record
+    from ucfrec.errors import one_line
+
+    if path.is_file():
+        from ucfrec.reporting.rows_file import read_rows
+
+        print(one_line(f"{path}: {len(read_rows(path))} result rows, all readable"))
+        return 0
+    record = next((name for name in ("meta.json", "run.json") if (path / name).is_file()), None)
+    if record is None:
+        raise InputError(
+            f"{path} is neither an episode store (meta.json) nor a run (run.json); check the path"
+        )
+    if record == "meta.json":
+        from ucfrec.episodes.record import read_store_record
+
+        value, sealed = read_store_record(path)
+    else:
+        value, sealed = sealed_record(path, record, "train again")
+    if sealed is None:
+        print(one_line(f"{path}: no checksums, an older ucfrec wrote it; nothing can be verified"))
+        return 0
+    faults = list(sealed.faults())
+    for name, fault in faults:
+        print(one_line(f"{path / name} {fault}"))
+    for name in sealed.strangers():
+        if name != record:
+            print(one_line(f"{path / name} is not listed in {record}: it was added later"))
+    size = sum(size for size, _ in sealed.files.values())
+    unfinished = (
+        ", training has not ended" if record == "run.json" and "policy" not in value else ""
+    )
+    print(
+        one_line(
+            f"{path}: {len(sealed.files) - len(faults)} of {len(sealed.files)} files have the "
+            f"content that was written ({size / 1e6:,.1f} MB{unfinished})"
+        )
+    )
+    return len(faults)

@@ -1,0 +1,245 @@
+"""Claims: what only one process at a time may write, and the scratch that killed processes left.
+
+A process that writes PATH holds a lock of the operating system on the file `.NAME.ucfrec-lock`
+beside it and writes to the scratch `.NAME.ucfrec-partial`. The system releases the lock when the
+process ends, also when it is killed; whoever gets the lock next knows that the scratch is dead.
+"""
+
+import json
+import os
+import secrets
+import shutil
+import socket
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from errno import ENOTDIR
+from pathlib import Path
+from typing import Final
+
+from ucfrec.errors import InputError
+
+LOCK: Final = ".ucfrec-lock"
+SCRATCH: Final = ".ucfrec-partial"
+_PATIENCE: Final = 0.5
+"""Seconds before a claim is given up: somebody may just be looking whether its owner is dead."""
+_COMMAND_LENGTH: Final = 160
+
+_held: set[tuple[int, Path]] = set()
+"""(process, path) of the claims that are held; a fork holds none of its parent's."""
+
+
+def scratch_of(path: Path) -> Path:
+    """Where the content of `path` is written before it is renamed; owned by whoever claims it."""
+    return path.with_name(f".{path.name}{SCRATCH}")
+
+
+def is_lock_or_scratch(name: str) -> bool:
+    """Whether a file or folder of this name belongs to this module."""
+    return name.startswith(".") and name.endswith((LOCK, SCRATCH))
+
+
+@contextmanager
+def claim(path: Path, wait: bool = False) -> Iterator[bool]:
+    """Try to hold the claim on `path`; a process that holds it already holds it again.
+
+    Args:
+        path: need not exist; its folder is made if missing.
+        wait: wait until the claim is free, instead of giving up.
+
+    Yields:
+        Whether the claim is held; always true if `wait` is.
+    """
+    held = (os.getpid(), _plain(path))
+    if held in _held:
+        yield True
+        return
+    made = [each for each in (path.parent, *path.parent.parents) if not each.exists()]
+    lock = _lock_of(path)
+    _make_folder(path.parent)
+    try:
+        opened = _acquire(lock, None if wait else _PATIENCE)
+    except FileNotFoundError:
+        # Another process that had made the folder for nothing has removed it meanwhile.
+        _make_folder(path.parent)
+        opened = _acquire(lock, None if wait else _PATIENCE)
+    if opened is None:
+        yield False
+        return
+    try:
+        _held.add(held)
+        yield True
+    finally:
+        _held.discard(held)
+        _release(lock, opened)
+        _remove_empty(made)
+
+
+@contextmanager
+def claimed(path: Path, use: str = "written", part: str = "") -> Iterator[None]:
+    """Hold the claim on `path`, or say who does.
+
+    Args:
+        path: see `claim`.
+        use: what the holder of the claim does with the path, for the message.
+        part: claim this use of the path only; the path itself can be claimed by others.
+
+    Raises:
+        InputError: another process holds it; the message names that process.
+    """
+    claimed_path = path.with_name(f"{path.name}.{part}") if part else path
+    with claim(claimed_path) as held:
+        if not held:
+            raise InputError(
+                f"{path} is being {use} by {_holder(_lock_of(claimed_path))}; wait for it to end, "
+                "or name another path"
+            )
+        yield
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove the scratch and locks of processes that were killed while they wrote in `folder`."""
+    try:
+        names = [entry.name for entry in os.scandir(folder)]
+    except OSError:
+        return
+    for name in names:
+        if not (name.startswith(".") and name.endswith(LOCK)):
+            continue
+        path = folder / name[1 : -len(LOCK)]
+        if not path.name or (os.getpid(), _plain(path)) in _held:
+            continue
+        try:
+            opened = _acquire(folder / name, 0.0)
+        except OSError:  # of another user
+            continue
+        if opened is not None:
+            remove(scratch_of(path))
+            _release(folder / name, opened)
+
+
+def remove_leftovers_within(folder: Path) -> None:
+    """`remove_leftovers` of `folder` and of every folder in it."""
+    if folder.is_dir():
+        for each, _, _ in os.walk(folder):
+            remove_leftovers(Path(each))
+
+
+@contextmanager
+def scratch_folder(parent: Path, name: str) -> Iterator[Path]:
+    """Yield a new folder for scratch in `parent` that nobody else can read; removed at the end.
+
+    If this process is killed, the next one that calls this or `remove_leftovers` removes it.
+    """
+    path = parent / f"{name}-{secrets.token_hex(8)}"
+    with claimed(path):
+        remove_leftovers(parent)
+        scratch = scratch_of(path)
+        scratch.mkdir(mode=0o700)
+        try:
+            yield scratch
+        finally:
+            shutil.rmtree(scratch, ignore_errors=True)
+
+
+def remove(path: Path) -> None:
+    """Remove a file, or a folder with all it holds, if it exists and can be removed."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+        return
+    try:
+        path.unlink(missing_ok=True)
+    except OSError:
+        return
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise NotADirectoryError(ENOTDIR, os.strerror(ENOTDIR), str(folder)) from None
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    """Remove folders that were made for nothing: the inner ones come first."""
+    try:
+        for folder in folders:
+            folder.rmdir()
+    except OSError:
+        return
+
+
+def _plain(path: Path) -> Path:
+    """The same for every way to write one path."""
+    return path.parent.resolve() / path.name
+
+
+def _lock_of(path: Path) -> Path:
+    return path.with_name(f".{path.name}{LOCK}")
+
+
+def _acquire(lock: Path, seconds: float | None) -> int | None:
+    """Descriptor of the locked file; None if another process holds it for longer than `seconds`."""
+    import fcntl  # not on Windows
+
+    until = time.monotonic() + (seconds or 0.0)
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+    while True:
+        opened = os.open(lock, flags, 0o666)
+        try:
+            fcntl.flock(opened, fcntl.LOCK_EX | (0 if seconds is None else fcntl.LOCK_NB))
+            if _same_file(lock, opened):
+                os.truncate(opened, 0)
+                os.write(opened, json.dumps(_this_process()).encode())
+                return opened
+            # Its last holder removed the file between our two calls.
+        except BlockingIOError:
+            if time.monotonic() >= until:
+                os.close(opened)
+                return None
+            time.sleep(0.01)
+        except BaseException:
+            os.close(opened)
+            raise
+        os.close(opened)
+
+
+def _same_file(lock: Path, opened: int) -> bool:
+    try:
+        return os.path.samestat(os.stat(lock, follow_symlinks=False), os.fstat(opened))
+    except FileNotFoundError:
+        return False
+
+
+def _release(lock: Path, opened: int) -> None:
+    try:
+        if _same_file(lock, opened):
+            lock.unlink()
+    except OSError:  # on a file system that has become read-only
+        pass
+    finally:
+        os.close(opened)
+
+
+def _this_process() -> dict[str, str | int]:
+    command = " ".join([Path(sys.argv[0] or "python").name, *sys.argv[1:]])
+    return {
+        "pid": os.getpid(),
+        "host": socket.gethostname(),
+        "command": command[:_COMMAND_LENGTH],
+        "since": datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC"),
+    }
+
+
+def _holder(lock: Path) -> str:
+    """The process that holds a lock, in words."""
+    try:
+        stated = json.loads(lock.read_bytes()[:4096])
+        return (
+            f"process {stated['pid']} on {stated['host']} ({stated['command']}) since "
+            f"{stated['since']}"
+        )
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return "another process"

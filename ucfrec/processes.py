@@ -1,0 +1,144 @@
+"""How a process ends: by Ctrl-C or TERM at any moment, and with its parent."""
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import TYPE_CHECKING, Final, NoReturn
+
+if TYPE_CHECKING:
+    from concurrent.futures import ProcessPoolExecutor
+
+ENDING: Final = (signal.SIGINT, signal.SIGTERM)
+_AGAIN: Final = 0.1
+"""Seconds after which an interruption that a library swallowed is raised again."""
+
+
+class Interrupted(KeyboardInterrupt):
+    """Raised in the main thread by Ctrl-C or TERM."""
+
+    def __init__(self, number: int) -> None:
+        """
+        Args:
+            number: of the signal.
+        """
+        super().__init__(number)
+        self.status = 128 + number
+        """Exit status of a process that ends by this signal."""
+
+
+def end_at_once_when_interrupted() -> None:
+    """From now on Ctrl-C and TERM end this process with one line and status 130 or 143.
+
+    For the time in which nothing that needs an orderly end has begun, such as imports, and in which
+    nothing is left to do.
+    """
+    for number in ENDING:
+        signal.signal(number, _end)
+
+
+def _end(number: int, _: FrameType | None) -> NoReturn:
+    os.write(2, b"interrupted\n")
+    os._exit(128 + number)
+
+
+@contextmanager
+def interruptions_raised() -> Iterator[None]:
+    """Raise `Interrupted` in the block on Ctrl-C and TERM, even where a library swallows it.
+
+    Whatever else is raised after a signal came is a consequence of it: an import that was cut off
+    raises an `ImportError`, a cursor that was closed an error of the database. It leaves the block
+    as `Interrupted`, too. Has no effect but in the main thread.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+
+    def interrupt(number: int, _: FrameType | None) -> None:
+        came.append(number)
+        raise Interrupted(number)
+
+    def unraisable(unraised: "sys.UnraisableHookArgs") -> None:
+        # A callback of a library cannot pass exceptions on; Python reports them and goes on.
+        if came and issubclass(unraised.exc_type, KeyboardInterrupt):
+            timer = threading.Timer(_AGAIN, signal.raise_signal, (came[0],))
+            timer.daemon = True
+            timer.start()
+        elif not came:
+            reported(unraised)
+
+    before = {number: signal.signal(number, interrupt) for number in ENDING}
+    reported, sys.unraisablehook = sys.unraisablehook, unraisable
+    try:
+        yield
+    except BaseException:
+        if came:
+            raise Interrupted(came[0]) from None
+        raise
+    finally:
+        sys.unraisablehook = reported
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def without_ctrl_c() -> Iterator[None]:
+    """Processes that are started in the block are not reached by Ctrl-C; their parent ends them."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def end_with_parent() -> None:
+    """In a process of `multiprocessing`: end when the parent has ended, also when it was killed."""
+    import multiprocessing  # takes longer than the rest of this module
+
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def watch() -> None:
+        parent.join()
+        os._exit(128 + signal.SIGTERM)
+
+    threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
+
+
+@contextmanager
+def pool_of_processes(
+    workers: int, begin: Callable[[], None] | None = None
+) -> "Iterator[ProcessPoolExecutor]":
+    """Yield a pool whose processes end when the block raises, and when this process is killed.
+
+    Work must be submitted within `without_ctrl_c`, because Ctrl-C on a terminal reaches every
+    process of a command, and this one ends the others.
+
+    Args:
+        workers: number of processes.
+        begin: a module-level function that each process calls first.
+    """
+    import multiprocessing
+    from concurrent.futures import ProcessPoolExecutor
+
+    spawn = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(workers, spawn, initializer=_begin, initargs=(begin,))
+    try:
+        yield pool
+    except BaseException:
+        for child in multiprocessing.active_children():
+            child.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _begin(begin: Callable[[], None] | None) -> None:
+    end_with_parent()
+    if begin is not None:
+        begin()

@@ -17,6 +17,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--discount", type=float, default=1.0, help="of the returns that are estimated (default 1)"
     )
+    parser.add_argument(
+        "--pages",
+        action="store_true",
+        help="estimate the return of a page: rows of one user and time are its positions, each row "
+        "a session",
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, help="write the result rows here")
 
@@ -42,6 +48,7 @@ def run(options: argparse.Namespace) -> None:
             greedy=options.greedy,
             seed=options.seed,
             discount=options.discount,
+            pages=options.pages,
         )
     rows = [row | {"checkpoint": options.checkpoint} for row in estimates.rows]
     shown = ("estimator", "policy", "choice", "R_cum", "effective_sessions", "sessions")

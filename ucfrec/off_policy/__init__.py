@@ -17,6 +17,7 @@ _HOMES = {
     "LoggedSteps": "logged_steps",
     "Modelled": "logged_steps",
     "Verdict": "verdict",
+    "as_pages": "pages",
     "cluster_probabilities": "logged_steps",
     "diagnose": "diagnostics",
     "estimate": "estimators",

@@ -16,6 +16,8 @@ whole session, E_n the mean over sessions.
 | DR | E_n[Σ_t γ^t (w_it (r_it − q_it) + w_i,t−1 v_it)] | Dudík 2011; Jiang & Li, ICML 2016 |
 | SNDR | DR with w_it / E_n[w_it] for w_it | weighted DR: Thomas & Brunskill, ICML 2016, eq. 8 |
 | MIPS | PDIS with weights of clusters | Saito & Joachims, ICML 2022 |
+| IIPS | E_n[Σ_t γ^t ρ_it r_it], of pages | Li et al., KDD 2018; `ucfrec.off_policy.pages` |
+| SNIIPS | the same with ρ_it over its mean at position t | |
 | clipped IPS, SWITCH-DR, … | | `ucfrec.off_policy.shrinkage` |
 
 In the means over sessions at step t, a session that has ended counts with the weight of its last
@@ -30,6 +32,7 @@ import numpy.typing as npt
 
 from ucfrec.off_policy.intervals import Interval, cluster_intervals
 from ucfrec.off_policy.logged_steps import LoggedSteps
+from ucfrec.off_policy.pages import independent_terms
 from ucfrec.off_policy.shrinkage import shrunk
 
 FloatArray = npt.NDArray[np.float64]
@@ -116,6 +119,9 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
         corrected = weights * left + steps.before(weights) * steps.model.v
         found["DR"] = Terms(steps.per_session(steps.discounts * corrected), ones, last)
         found["SNDR"] = Terms(_normalised_by_step(steps, left, steps.model.v), ones, last)
+    if steps.pages:
+        for name, (above, kept) in independent_terms(steps).items():
+            found[name] = Terms(above, ones, kept)
     if (clustered := steps.cluster_weights) is not None:
         above = steps.per_session(steps.discounts * clustered * steps.reward)
         found["MIPS"] = Terms(above, ones, clustered[steps.last])
@@ -131,7 +137,8 @@ def _groups(steps: LoggedSteps) -> Iterator[tuple[LoggedSteps, dict[str, Terms]]
     if steps.model is not None:
         modelled = steps.per_session(steps.discounts * steps.model.reward)
         plain["DM"] = Terms(modelled, ones, ones)
-        plain["FQE"] = Terms(steps.model.v[steps.first], ones, ones)
+        if not steps.pages:
+            plain["FQE"] = Terms(steps.model.v[steps.first], ones, ones)
     yield steps, plain
     without = steps.per_session(np.isnan(steps.propensity).astype(np.float64)) > 0
     if without.all():

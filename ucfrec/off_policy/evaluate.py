@@ -15,6 +15,7 @@ from ucfrec.off_policy.diagnostics import Diagnosis, diagnose
 from ucfrec.off_policy.estimators import LOGGED, Estimate, estimate
 from ucfrec.off_policy.fqe import cross_fitted
 from ucfrec.off_policy.logged_steps import LoggedSteps
+from ucfrec.off_policy.pages import as_pages
 from ucfrec.off_policy.score import LoggedSessions, ScoredSteps, scored_steps
 from ucfrec.off_policy.training_rows import MOST_SEEN, share_seen
 from ucfrec.off_policy.verdict import Verdict, cautions, judge
@@ -46,6 +47,7 @@ def evaluate_off_policy(
     greedy: bool,
     seed: int,
     discount: float = 1.0,
+    pages: bool = False,
 ) -> OffPolicyReport:
     """Estimate the mean return of a session under the policy of `run`, from logs alone.
 
@@ -62,14 +64,19 @@ def evaluate_off_policy(
             items from its softmax.
         seed: seed of the folds and of the bootstrap.
         discount: discount factor γ of the estimated returns.
+        pages: estimate the return of a page instead: sessions of one step, of one user and time,
+            are the positions of a page (`ucfrec.off_policy.pages`).
 
     Returns:
         The estimates, the warnings and the verdict.
 
     Raises:
-        InputError: propensities are not probabilities, or there is only one user.
+        InputError: propensities are not probabilities, there is only one user, or `pages` is set
+            and a session has several steps.
     """
     steps = logged_steps(trained, logged, target_return, greedy, seed, discount)
+    if pages:
+        steps = as_pages(steps, _pages(logged))
     found, diagnosis = estimate(steps, seed), diagnose(steps)
     seen = share_seen(trained, logged.store)
     verdict = judge(steps, seed, diagnosis=diagnosis, forbidden=_seen_too_often(seen))
@@ -78,6 +85,7 @@ def evaluate_off_policy(
         "target_return": target_return,
         "discount": discount,
         "sessions": len(steps.first),
+        "pages": pages,
         "steps": len(steps.reward),
         "dropped": logged.report["dropped"],
         "unknown_item_rows": logged.unknown_items,
@@ -97,6 +105,14 @@ def evaluate_off_policy(
         for name, one in found.items()
     ]
     return OffPolicyReport(rows, said, verdict)
+
+
+def _pages(logged: LoggedSessions) -> npt.NDArray[np.int64]:
+    """(N,) number of the page of each step: of one user and millisecond."""
+    episodes, steps = logged.store.all_steps()
+    users = np.unique(logged.users, return_inverse=True)[1][episodes]
+    times = logged.store.step_values(schema.TIMESTAMP, episodes, steps).astype(np.int64)
+    return np.asarray(np.unique(np.stack([users, times]), axis=1, return_inverse=True)[1]).ravel()
 
 
 def _seen_too_often(seen: float | None) -> list[str]:

@@ -6,6 +6,7 @@ target / propensity of the logged action; w_it = Π_{k ≤ t} ρ_ik, with w_i,�
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -60,6 +61,9 @@ class LoggedSteps:
     `cluster_probabilities`."""
     cluster_target: FloatArray | None = None
     """(N,) the evaluated policy's probability of it."""
+    pages: bool = False
+    """Whether a session is one page and its steps the page's positions, chosen at once; see
+    `ucfrec.off_policy.pages`."""
 
     def __post_init__(self) -> None:
         n = len(self.session)
@@ -165,21 +169,32 @@ class LoggedSteps:
             InputError: it marks none.
         """
         rows = keep[self.session]
-        parts = {
-            name: values[rows]
-            for name in ("reward", "propensity", "target", "cluster_propensity", "cluster_target")
-            if (values := getattr(self, name)) is not None
-        }
-        model = self.model
-        if model is not None:
-            model = Modelled(*(values[rows] for values in vars(model).values()))
         return replace(
             self,
             session=(np.cumsum(keep) - 1)[self.session[rows]],
-            model=model,
             user=None if self.user is None else self.user[keep],
-            **parts,
+            **self._columns(rows),
         )
+
+    def regrouped(self, order: IntArray, session: IntArray, user: IntArray | None) -> "LoggedSteps":
+        """The same steps in another order and other sessions.
+
+        Args:
+            order: (N,) steps in their new order.
+            session: (N,) session of each, in the new order.
+            user: (S,) of the new sessions; None where each is somebody else's.
+        """
+        return replace(self, session=session, user=user, **self._columns(order))
+
+    def _columns(self, rows: IntArray | BoolArray) -> dict[str, Any]:
+        """What there is one of a step, at the given steps; without the sessions."""
+        names = ("reward", "propensity", "target", "cluster_propensity", "cluster_target")
+        parts: dict[str, Any] = {
+            name: values[rows] for name in names if (values := getattr(self, name)) is not None
+        }
+        if self.model is not None:
+            parts["model"] = Modelled(*(values[rows] for values in vars(self.model).values()))
+        return parts
 
     def _products(self, upto: FloatArray) -> FloatArray:
         """(N,) products of ratios (N,) from the session's first step to each."""

@@ -1,4 +1,4 @@
-"""Pages: weights by model of the reward, against loops, enumeration and the Open Bandit Pipeline."""
+"""Pages: each model of the reward, against enumeration and the Open Bandit Pipeline."""
 
 import itertools
 from dataclasses import replace

@@ -2,8 +2,12 @@
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ucfrec.commands.options import log_options, logs_given, target_given, target_options
+
+if TYPE_CHECKING:
+    from ucfrec.off_policy.options import EstimateOptions
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -14,6 +18,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--greedy", action="store_true", help="judge the most probable item, not the softmax"
     )
+    estimate_options(parser)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path, help="write the result rows here")
+
+
+def estimate_options(parser: argparse.ArgumentParser) -> None:
+    """Add what `estimates_asked` reads."""
     parser.add_argument(
         "--discount", type=float, default=1.0, help="of the returns that are estimated (default 1)"
     )
@@ -23,8 +34,57 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="estimate the return of a page: rows of one user and time are its positions, each row "
         "a session",
     )
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path, help="write the result rows here")
+    parser.add_argument(
+        "--anonymous",
+        action="store_true",
+        help="the logs' users are no persons (as in obd): take each session for somebody else's",
+    )
+    parser.add_argument(
+        "--reward-range",
+        type=float,
+        nargs=2,
+        metavar=("LEAST", "MOST"),
+        help="what a step can earn, to bound what unsupported choices could (default: as observed)",
+    )
+    parser.add_argument(
+        "--lift",
+        type=float,
+        metavar="RETURN",
+        help="return a session that a launch should gain; the verdict says how many sessions would "
+        "show it (default: 5%% of the mean logged return)",
+    )
+    parser.add_argument(
+        "--item-groups",
+        type=int,
+        default=0,
+        metavar="N",
+        help="groups of items, by their embeddings, for MIPS and the tests by group; 1 for neither "
+        "(default: the root of the number of items, up to 32)",
+    )
+    parser.add_argument(
+        "--estimate-propensities",
+        action="store_true",
+        help="estimate the propensities that the logs lack; the verdict says so",
+    )
+
+
+def estimates_asked(options: argparse.Namespace) -> "EstimateOptions":
+    """What `estimate_options` were given.
+
+    Raises:
+        InputError: a value is out of its range.
+    """
+    from ucfrec.off_policy.options import EstimateOptions
+
+    return EstimateOptions(
+        discount=options.discount,
+        pages=options.pages,
+        users_known=not options.anonymous,
+        reward_range=None if options.reward_range is None else tuple(options.reward_range),
+        wanted_lift=options.lift,
+        item_clusters=options.item_groups,
+        estimate_propensities=options.estimate_propensities,
+    )
 
 
 def run(options: argparse.Namespace) -> None:
@@ -47,8 +107,7 @@ def run(options: argparse.Namespace) -> None:
             target_return=target_given(options, trained),
             greedy=options.greedy,
             seed=options.seed,
-            discount=options.discount,
-            pages=options.pages,
+            options=estimates_asked(options),
         )
     rows = [row | {"checkpoint": options.checkpoint} for row in estimates.rows]
     shown = ("estimator", "policy", "choice", "R_cum", "effective_sessions", "sessions")

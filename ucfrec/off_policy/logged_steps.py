@@ -14,6 +14,7 @@ import numpy.typing as npt
 from ucfrec.errors import InputError
 
 FloatArray = npt.NDArray[np.float64]
+Float32Array = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
@@ -31,6 +32,16 @@ class Modelled:
     """(N,) discounted return from the logged action on."""
     v: FloatArray
     """(N,) Σ_a π(a | s) q(s, a): the mean of `q` over the evaluated policy's actions."""
+
+
+@dataclass(frozen=True)
+class ItemGroups:
+    """Groups of items alike, of N logged steps: each is tested alone (`diagnose`)."""
+
+    number: IntArray
+    """(N,) group of the logged item, from 0; −1 for an item of none."""
+    target: Float32Array
+    """(N, K) the evaluated policy's probability of every group."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +72,7 @@ class LoggedSteps:
     `cluster_probabilities`."""
     cluster_target: FloatArray | None = None
     """(N,) the evaluated policy's probability of it."""
+    groups: ItemGroups | None = None
     pages: bool = False
     """Whether a session is one page and its steps the page's positions, chosen at once; see
     `ucfrec.off_policy.pages`."""
@@ -82,6 +94,10 @@ class LoggedSteps:
             raise InputError("give both cluster_propensity and cluster_target, or neither")
         if self.cluster_propensity is not None and self.cluster_target is not None:
             _require_probabilities(self.cluster_propensity, self.cluster_target, n)
+        if self.groups is not None:
+            of, target = self.groups.number.shape, self.groups.target.shape
+            if of != (n,) or len(target) != 2 or target[0] != n:
+                raise InputError(f"groups have shapes {of} and {target}; {n} steps are one each")
         if self.user is not None and self.user.shape != (len(self.first),):
             raise InputError(
                 f"user has shape {self.user.shape}; {len(self.first)} sessions are "
@@ -194,6 +210,8 @@ class LoggedSteps:
         }
         if self.model is not None:
             parts["model"] = Modelled(*(values[rows] for values in vars(self.model).values()))
+        if self.groups is not None:
+            parts["groups"] = ItemGroups(self.groups.number[rows], self.groups.target[rows])
         return parts
 
     def _products(self, upto: FloatArray) -> FloatArray:

@@ -57,6 +57,13 @@ class ScoredSteps:
     """Each step, last in its window, with the steps before it that the policy sees."""
     log_probabilities: Tensor
     """(B, n_items): natural logarithm of the probability that the policy shows each item."""
+    asked: Windows
+    """The windows as the policy saw them: returns-to-go from the target return."""
+
+    @property
+    def returns_left(self) -> Tensor:
+        """(B,): target return less the session's reward before the step."""
+        return self.asked.returns_to_go[:, -1]
 
 
 @contextmanager
@@ -148,7 +155,9 @@ def scored_steps(
             # Steps after an unknown item (−1) have weight 0, so any known item can replace it here.
             known = replace(windows, actions=windows.actions.clamp(min=0))
             log_probabilities = trained.log_probabilities(known, more.unsqueeze(1))
-            yield ScoredSteps(episodes, steps, windows, log_probabilities)
+            left = (windows.returns_to_go + more.unsqueeze(1)).masked_fill(~windows.mask, 0.0)
+            asked = replace(known, returns_to_go=left.float())
+            yield ScoredSteps(episodes, steps, windows, log_probabilities, asked)
             bar.update(len(steps))
 
 

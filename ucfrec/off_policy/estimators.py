@@ -40,8 +40,6 @@ FloatArray = npt.NDArray[np.float64]
 LOGGED = "logged"
 WEIGHTED = ("IPS", "SNIPS", "PDIS", "SNPDIS", "DR", "SNDR", "MIPS")
 """Estimates that weigh sessions, unshrunk."""
-MODELS = ("DM", "FQE")
-"""Estimates that nothing but a model stands behind."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +49,9 @@ class Estimate:
     value: float
     low: float | None
     """Ends of the 95% interval, studentised and clustered by user (`cluster_intervals`). None for
-    DM and FQE, whose error is the model's and not that of the sessions it is averaged over, and
-    where nothing spreads: too few sessions earn anything under the weights."""
+    DM and FQE, whose error is the model's and not that of the sessions it is averaged over; where
+    weights are shrunk, whose bias no resampling shows; and where nothing spreads: too few sessions
+    earn anything under the weights."""
     high: float | None
     error: float | None
     """Standard error, over users."""
@@ -74,6 +73,8 @@ class Terms:
     weights: FloatArray
     """(S,) what each session counts."""
     parameter: float | None = None
+    biased: bool = False
+    """Whether a model's or shrunk weights' error, which no resampling shows, is in the estimate."""
 
 
 def estimate(steps: LoggedSteps, seed: int) -> dict[str, Estimate]:
@@ -97,7 +98,7 @@ def estimate(steps: LoggedSteps, seed: int) -> dict[str, Estimate]:
             seed,
         )
         for (name, one), interval in zip(terms.items(), intervals, strict=True):
-            found[name] = _summary(one, None if name in MODELS else interval)
+            found[name] = _summary(one, None if one.biased else interval)
     return found
 
 
@@ -126,7 +127,7 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
         above = steps.per_session(steps.discounts * clustered * steps.reward)
         found["MIPS"] = Terms(above, ones, clustered[steps.last])
     for name, (parameter, above, kept) in shrunk(steps).items():
-        found[name] = Terms(above, ones, kept, parameter)
+        found[name] = Terms(above, ones, kept, parameter, biased=bool((kept != last).any()))
     return found
 
 
@@ -136,9 +137,9 @@ def _groups(steps: LoggedSteps) -> Iterator[tuple[LoggedSteps, dict[str, Terms]]
     plain = {LOGGED: Terms(steps.returns, ones, ones)}
     if steps.model is not None:
         modelled = steps.per_session(steps.discounts * steps.model.reward)
-        plain["DM"] = Terms(modelled, ones, ones)
+        plain["DM"] = Terms(modelled, ones, ones, biased=True)
         if not steps.pages:
-            plain["FQE"] = Terms(steps.model.v[steps.first], ones, ones)
+            plain["FQE"] = Terms(steps.model.v[steps.first], ones, ones, biased=True)
     yield steps, plain
     without = steps.per_session(np.isnan(steps.propensity).astype(np.float64)) > 0
     if without.all():

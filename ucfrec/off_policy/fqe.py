@@ -29,6 +29,9 @@ states (what is linear in features has its exact mean over these actions)."""
 FOLDS = 5
 _ROWS_AT_ONCE = 2**13
 _CLOSE = 1e-6
+_ROUNDS = 10
+"""Regressions of FQE for each step of the longest session, unless they settle before: a linear Q
+is still on its way when as many steps as there are have been looked ahead."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ class ModelReport:
     td_bias: float
     """Mean TD error, 0 for a right model; in units of the reward."""
     iterations: int
-    """Regressions of FQE, the most of any fold; one a step of the longest session at most."""
+    """Regressions of FQE, the most of any fold."""
     settled: bool
     """Whether Q ended within what so many rewards can be, in every fold."""
 
@@ -160,7 +163,7 @@ class _Sums:
         weights = first = cho_solve(factor, earned)
         most = horizon * max(abs(reward.min()), abs(reward.max()))
         iterations, settled = 1, True
-        while iterations < horizon:
+        while iterations < _ROUNDS * horizon:
             iterations += 1
             before, weights = weights, cho_solve(factor, earned + discount * follows @ weights)
             size = (weights @ gram @ weights / rows) ** 0.5

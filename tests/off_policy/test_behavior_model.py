@@ -15,8 +15,8 @@ STEPS = 6000
 
 
 def behavior() -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float64]]:
-    """States (N, 3), and the probability (N, 9) of every item: groups by the state, items of a group
-    alike but for the first, which is shown twice as often."""
+    """States (N, 3), and the probability (N, 9) of every item: groups by the state, items of a
+    group alike but for the first, which is shown twice as often."""
     rng = np.random.default_rng(0)
     states = rng.normal(size=(STEPS, 3)).astype(np.float32)
     logits = 0.5 * states @ rng.normal(size=(3, 3))
@@ -44,9 +44,8 @@ def logged() -> tuple[
 def test_probabilities_are_those_of_the_logging_policy() -> None:
     _, probabilities, item, model = logged()
     true = probabilities[np.arange(STEPS), item]
-    of_group = np.array([probabilities[:, GROUP_OF == group].sum(axis=1) for group in range(3)]).T[
-        np.arange(STEPS), GROUP_OF[item]
-    ]
+    groups = np.stack([probabilities[:, group == GROUP_OF].sum(axis=1) for group in range(3)])
+    of_group = groups[GROUP_OF[item], np.arange(STEPS)]
     assert np.corrcoef(model.item, true)[0, 1] > 0.97
     assert np.abs(model.group - of_group).mean() < 0.03
     assert model.log_loss < model.share_log_loss - 0.1

@@ -14,6 +14,7 @@ from typing import Any
 
 _HOMES = {
     "Estimate": "estimators",
+    "ItemGroups": "logged_steps",
     "LoggedSteps": "logged_steps",
     "Modelled": "logged_steps",
     "Verdict": "verdict",
@@ -22,6 +23,7 @@ _HOMES = {
     "diagnose": "diagnostics",
     "estimate": "estimators",
     "judge": "verdict",
+    "select": "selection",
 }
 """Public name to the module that defines it."""
 

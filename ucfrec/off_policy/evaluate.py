@@ -13,7 +13,7 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.off_policy.behavior_model import BehaviorModel, fit_behavior
 from ucfrec.off_policy.diagnostics import Diagnosis, diagnose
-from ucfrec.off_policy.estimators import LOGGED, Estimate, estimate
+from ucfrec.off_policy.estimators import LOGGED, Estimate, estimate, session_terms
 from ucfrec.off_policy.features import InputsFile, StepInputs, context_of, scores_of
 from ucfrec.off_policy.fqe import ModelReport, fit_models
 from ucfrec.off_policy.item_groups import default_groups, group_items
@@ -22,11 +22,13 @@ from ucfrec.off_policy.options import EstimateOptions
 from ucfrec.off_policy.pages import as_pages
 from ucfrec.off_policy.score import LoggedSessions, ScoredSteps, scored_steps
 from ucfrec.off_policy.training_rows import MOST_SEEN, share_seen
-from ucfrec.off_policy.verdict import Verdict, cautions, judge
+from ucfrec.off_policy.verdict import Verdict, cautions, influences, judge
 from ucfrec.provenance import provenance
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 DEFAULTS = EstimateOptions()
+
+FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,12 @@ class OffPolicyReport:
     warnings: list[str]
     """The verdict's reasons, cautions, and remarks on the logs."""
     verdict: Verdict
+    returns: FloatArray
+    """(S,) of the logged sessions, or pages, with all their propensities; empty if none has."""
+    user: npt.NDArray[np.int64] | None
+    """(S,) whose they are; None where each is somebody else's."""
+    terms: FloatArray | None
+    """(S,) whose mean is the estimate that the verdict is of; None where nothing can be weighed."""
 
 
 @dataclass(frozen=True)
@@ -106,6 +114,7 @@ def evaluate_off_policy(
         "discount": options.discount,
         "sessions": len(steps.first),
         "pages": options.pages,
+        "anonymous": not options.users_known,
         "steps": len(steps.reward),
         "dropped": logged.report["dropped"],
         "unknown_item_rows": logged.unknown_items,
@@ -125,7 +134,20 @@ def evaluate_off_policy(
         as_row(name, one) | (behavior if name == LOGGED else who) | about
         for name, one in found.items()
     ]
-    return OffPolicyReport(rows, said, verdict)
+    known = steps.known() if diagnosis.left_out < diagnosis.sessions else None
+    return OffPolicyReport(
+        rows,
+        said,
+        verdict,
+        returns=np.empty(0) if known is None else known.returns,
+        user=None if known is None else known.user,
+        terms=None if known is None else _terms(known, verdict),
+    )
+
+
+def _terms(known: LoggedSteps, verdict: Verdict) -> FloatArray | None:
+    terms = {} if verdict.estimator is None else session_terms(known)
+    return influences(terms[verdict.estimator]) if verdict.estimator in terms else None
 
 
 def _pages(logged: LoggedSessions) -> npt.NDArray[np.int64]:

@@ -2,11 +2,13 @@
 
 Groups by a multinomial logistic regression on the state before the choice, items within a group by
 their share of its logged steps. Every user is predicted by a model of other users (cross-fitting),
-and one temperature, fitted on those predictions, calibrates them.
+and those predictions are calibrated by one temperature and by mixing in the group's share of the
+logs, as much as predicts best: all of it where the state tells nothing.
 """
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import numpy.typing as npt
@@ -22,9 +24,10 @@ States = Callable[[], Iterator[Float32Array]]
 FOLDS = 3
 _MOST_ROWS = 20_000
 """Steps that a model is fitted on, drawn at random: it has some thousand weights."""
-_SHARE = 0.01
-"""Of the group's share in the logs that is mixed into every probability, so that none is 0."""
-_TEMPERATURES = np.geomspace(0.5, 4.0, 25)
+_SHARES = (0.01, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
+"""How much of the group's share in the logs may be mixed in; never nothing, so that no probability
+is 0."""
+_TEMPERATURES = (0.7, 1.0, 1.4, 2.0, 3.0)
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,9 @@ class BehaviorModel:
     """Mean absolute difference between what is predicted and what occurs, over groups and tenths
     of the predicted probability, weighted by their steps."""
     temperature: float
+    """Scores are divided by it."""
+    share: float
+    """How much of the group's share in the logs is mixed in."""
 
     def __str__(self) -> str:
         return (
@@ -82,14 +88,14 @@ def fit_behavior(
             shares = np.bincount(group[others], minlength=count) + 1.0
             models.append(_Groups(tables(sample), group[sample], shares / shares.sum()))
             bar.update()
-    temperature = _temperature(models, tables, group, folds, np.unique(np.concatenate(samples)))
+    calibrated = _calibrated(models, tables, group, folds, np.unique(np.concatenate(samples)))
     of_group, begin, table = np.ones(len(item)), 0, np.zeros((2, count, 10))
     for rows in states():
         part = slice(begin, begin + len(rows))
         probabilities = np.empty((len(rows), count))
         for fold, model in enumerate(models):
             here = folds[part] == fold
-            probabilities[here] = model(rows[here], temperature)
+            probabilities[here] = model(rows[here], *calibrated)
         mine = group[part][:, None]
         of_group[part] = np.take_along_axis(probabilities, mine, axis=1)[:, 0]
         _count_calibration(table, probabilities[known[part]], group[part][known[part]])
@@ -101,7 +107,8 @@ def fit_behavior(
         log_loss=float(-np.log(of_group[known]).mean()),
         share_log_loss=float(-np.log(mean_shares).mean()),
         calibration_error=_calibration_error(table),
-        temperature=temperature,
+        temperature=calibrated[0],
+        share=calibrated[1],
     )
 
 
@@ -121,8 +128,8 @@ class _Groups:
             self._model = LogisticRegression(C=0.1, max_iter=100, tol=1e-3)
             self._model.fit(self._scaled(states), group)
 
-    def __call__(self, states: Float32Array, temperature: float) -> FloatArray:
-        """(B, K)."""
+    def __call__(self, states: Float32Array, temperature: float, share: float) -> FloatArray:
+        """(B, K), with so much of the shares of groups mixed in."""
         if self._model is None or not len(states):
             return np.tile(self.shares, (len(states), 1))
         scores = self._model.decision_function(self._scaled(states)) / temperature
@@ -131,7 +138,7 @@ class _Groups:
         exponents = np.exp(scores - scores.max(axis=1, keepdims=True))
         found = np.zeros((len(states), len(self.shares)))
         found[:, self._present] = exponents / exponents.sum(axis=1, keepdims=True)
-        return np.asarray((1 - _SHARE) * found + _SHARE * self.shares)
+        return np.asarray((1 - share) * found + share * self.shares)
 
     def _scaled(self, states: Float32Array) -> Float32Array:
         return np.asarray((states - self._mean) / self._spread, dtype=np.float32)
@@ -154,22 +161,26 @@ def _rows_of(states: States, wanted: IntArray) -> Callable[[IntArray], Float32Ar
     return lambda rows: table[np.searchsorted(wanted, rows)]
 
 
-def _temperature(
+def _calibrated(
     models: list[_Groups],
     tables: Callable[[IntArray], Float32Array],
     group: IntArray,
     folds: IntArray,
     sample: IntArray,
-) -> float:
-    """The temperature of least held-out loss."""
-    losses = np.zeros(len(_TEMPERATURES))
+) -> tuple[float, float]:
+    """The temperature and the mixed-in share of least held-out loss."""
+    choices = list(product(_TEMPERATURES, _SHARES))
+    losses = np.zeros(len(choices))
     for fold, model in enumerate(models):
         mine = sample[folds[sample] == fold][:_MOST_ROWS]
         states, rows = tables(mine), np.arange(len(mine))
-        for place, temperature in enumerate(_TEMPERATURES):
-            likely = model(states, float(temperature))[rows, group[mine]]
-            losses[place] -= np.log(likely).sum()
-    return float(_TEMPERATURES[int(np.argmin(losses))])
+        shares = model.shares[group[mine]]
+        for temperature in _TEMPERATURES:
+            likely = model(states, temperature, 0.0)[rows, group[mine]]
+            for share in _SHARES:
+                mixed = (1 - share) * likely + share * shares
+                losses[choices.index((temperature, share))] -= np.log(mixed).sum()
+    return choices[int(np.argmin(losses))]
 
 
 def _within(item: IntArray, group: IntArray, folds: IntArray) -> FloatArray:

@@ -49,9 +49,9 @@ class Estimate:
     value: float
     low: float | None
     """Ends of the 95% interval, studentised and clustered by user (`cluster_intervals`). None for
-    DM and FQE, whose error is the model's and not that of the sessions it is averaged over; where
-    weights are shrunk, whose bias no resampling shows; and where nothing spreads: too few sessions
-    earn anything under the weights."""
+    DM and FQE, whose error is the model's and not that of the sessions it is averaged over; for
+    MIPS and where weights are shrunk, whose bias no resampling shows; and where nothing spreads:
+    too few sessions earn anything under the weights."""
     high: float | None
     error: float | None
     """Standard error, over users."""
@@ -74,7 +74,8 @@ class Terms:
     """(S,) what each session counts."""
     parameter: float | None = None
     biased: bool = False
-    """Whether a model's or shrunk weights' error, which no resampling shows, is in the estimate."""
+    """Whether there is an error in it that no resampling shows: a model's, or that of shrunk or
+    marginalised weights."""
 
 
 def estimate(steps: LoggedSteps, seed: int) -> dict[str, Estimate]:
@@ -125,7 +126,7 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
             found[name] = Terms(above, ones, kept)
     if (clustered := steps.cluster_weights) is not None:
         above = steps.per_session(steps.discounts * clustered * steps.reward)
-        found["MIPS"] = Terms(above, ones, clustered[steps.last])
+        found["MIPS"] = Terms(above, ones, clustered[steps.last], biased=True)
     for name, (parameter, above, kept) in shrunk(steps).items():
         found[name] = Terms(above, ones, kept, parameter, biased=bool((kept != last).any()))
     return found

@@ -145,6 +145,10 @@ def cautions(diagnosis: Diagnosis, found: Mapping[str, Estimate]) -> list[str]:
         )
     if "DM" in found:
         said.append("DM and FQE are only as good as their models: they carry no interval")
+    if "MIPS" in found:
+        said.append(
+            "MIPS is right only if what an item earns depends on its group alone: no interval"
+        )
     return said
 
 

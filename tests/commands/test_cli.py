@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -237,6 +238,27 @@ def test_ope_tells_from_uniform_logs_what_playing_tells(
     # Simulated clocks are coarse: a few users are shown the same item at the same time.
     assert 0 < rows["DR"]["seen_in_training"] < 0.05
     assert rows["DR"]["reliable"]
+
+
+def test_a_model_card_lies_beside_every_run_with_what_was_measured(
+    catalog: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(catalog[0], tmp_path / "run")
+    run, logs, card = str(tmp_path / "run"), str(catalog[1]), tmp_path / "run" / "MODEL_CARD.md"
+    trained = card.read_text()
+    assert "# Model card: ucf" in trained
+    assert "| reward | `is_click` |" in trained
+    world = ["--env", "synthetic-catalog", "--episodes", "20"]
+    assert main(["evaluate", run, *world]) == 0
+    assert main(["ope", run, logs]) == 0
+    assert main(["rank", run, logs, "--k", "5"]) == 0
+    found = card.read_text()
+    assert "### ucfrec evaluate: synthetic-catalog, target return" in found
+    assert re.search(r"### ucfrec ope: DR on sessions\.parquet, softmax, target return", found)
+    assert "- Do not rely on this estimate: " in found
+    assert "### ucfrec rank: sessions.parquet, k 5, checkpoint best" in found
+    assert re.search(r"\| hit_rate_liked \| [\d.]+ \[[\d.]+, [\d.]+\] \|", found)
+    assert str(tmp_path) not in found
 
 
 def test_ope_ranks_targets_and_rules_and_says_which_it_cannot_judge(

@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ucfrec.commands.cards import card_of_estimates
 from ucfrec.commands.options import log_options, logs_given, target_given, target_options
 from ucfrec.errors import InputError
 
@@ -173,6 +174,7 @@ def _judged(options: argparse.Namespace, candidate: "dict[str, Any]") -> "OffPol
     for warning in found.warnings:
         print(f"warning: {warning}")
     print(f"verdict: {found.verdict.headline}")
+    card_of_estimates(run, options.logs, found)
     return found
 
 

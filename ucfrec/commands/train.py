@@ -51,6 +51,7 @@ def run(options: argparse.Namespace) -> None:
     import torch
 
     from ucfrec.episodes.store import EpisodeStore
+    from ucfrec.reporting.model_card import write_card
     from ucfrec.runs.config import resolve_config
     from ucfrec.runs.run import describe_run, train_run
 
@@ -58,5 +59,6 @@ def run(options: argparse.Namespace) -> None:
         torch.set_num_threads(options.threads)
     config = resolve_config(options.policy, options.config, options.set, options.seed)
     record = train_run(EpisodeStore.open(options.store), options.out, config)
+    card = write_card(options.out)
     print(describe_run(record))
-    print(f"\nrun: {options.out}; TensorBoard can open it")
+    print(f"\nrun: {options.out}; TensorBoard can open it\nmodel card: {card}")

@@ -19,6 +19,7 @@ from ucfrec.off_policy.logged_steps import LoggedSteps
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
 
 ENOUGH_TO_TEST: Final = 30
 """Users below which a mean weight is not tested."""
@@ -29,6 +30,7 @@ LEAST_SHOWN: Final = 0.01
 """Share of the evaluated policy's choices below which an item group is not tested."""
 _SIGNIFICANCE, _TOLERANCE = 0.01, 0.02
 SESSION_PRODUCTS: Final = "session products"
+ITEMS_TO_CHOOSE_FROM: Final = "items to choose from"
 
 
 @dataclass(frozen=True)
@@ -171,6 +173,31 @@ def _group_weights(steps: LoggedSteps, ratios: FloatArray) -> list[tuple[str, fl
         (mean,), (error,) = cluster_means(beyond[:, None], user)
         found.append((f"item group {number}", 1 + float(mean), float(error)))
     return found
+
+
+def implied_items(steps: LoggedSteps, listed: BoolArray, items: int) -> WeightTest | None:
+    """Test that the propensities of a catalogue can add up to 1.
+
+    The mean of 1 / propensity over the logged choices among `items` items is the number of these
+    that the behavior policy chose from, at most all of them. So the test is one-sided, at 1%.
+
+    Args:
+        listed: (N,) whether the logged item is one of the items.
+        items: how many there are.
+
+    Returns:
+        The implied share of the items as a test, errors clustered by user; None with fewer than 30
+        users, or without propensities.
+    """
+    known = ~np.isnan(steps.propensity)
+    user = steps.session if steps.user is None else steps.user[steps.session]
+    if not known.any() or len(np.unique(user[known])) < ENOUGH_TO_TEST:
+        return None
+    shares = np.where(listed[known], 1 / steps.propensity[known], 0.0) / items
+    (mean,), (error,) = cluster_means(shares[:, None], user[known])
+    limit = NormalDist().inv_cdf(1 - _SIGNIFICANCE)
+    passed = bool(mean - 1 <= max(_TOLERANCE, limit * error))
+    return WeightTest(ITEMS_TO_CHOOSE_FROM, float(mean), float(error), passed)
 
 
 def pareto_tail(weights: FloatArray) -> float | None:

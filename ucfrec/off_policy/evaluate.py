@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.off_policy.behavior_model import BehaviorModel, fit_behavior
-from ucfrec.off_policy.diagnostics import Diagnosis, diagnose
+from ucfrec.off_policy.diagnostics import Diagnosis, diagnose, implied_items
 from ucfrec.off_policy.estimators import LOGGED, Estimate, estimate, session_terms
 from ucfrec.off_policy.features import InputsFile, StepInputs, context_of, scores_of
 from ucfrec.off_policy.fqe import ModelReport, fit_models
@@ -104,7 +104,7 @@ def evaluate_off_policy(
         seed,
         diagnosis=diagnosis,
         wanted_lift=options.wanted_lift,
-        forbidden=_seen_too_often(seen),
+        forbidden=[*_seen_too_often(seen), *_too_many_items(trained, judged)],
         declared=_declared(judged),
     )
     said = [*verdict.reasons, *cautions(diagnosis, found), *_of_the_logs(seen, logged)]
@@ -184,6 +184,20 @@ def _seen_too_often(seen: float | None) -> list[str]:
     return [
         f"{seen:.0%} of the rows were seen in training: on these a policy looks "
         "better than it is; give later logs"
+    ]
+
+
+def _too_many_items(trained: TrainedPolicy, judged: JudgedSteps) -> list[str]:
+    steps = judged.steps
+    assert trained.item_ids is not None
+    assert steps.groups is not None
+    items = len(trained.item_ids)
+    found = None if judged.estimated else implied_items(steps, steps.groups.number >= 0, items)
+    if found is None or found.passed:
+        return []
+    return [
+        f"the propensities imply {found.mean * items:,.0f} ± {found.error * items:,.0f} items to "
+        f"choose from, the run knows {items:,}: propensities are too small"
     ]
 
 

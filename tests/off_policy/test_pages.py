@@ -11,6 +11,7 @@ from tests.support.logged_steps import random_steps
 from ucfrec.errors import InputError
 from ucfrec.off_policy import LoggedSteps, as_pages, estimate, judge
 from ucfrec.off_policy.estimators import session_terms
+from ucfrec.off_policy.pages import pages_of
 
 SLATE = Path(__file__).with_name("fixtures") / "slate.npz"
 BY_MODEL = {"independent": "IIPS", "cascade": "PDIS", "slate": "IPS"}
@@ -63,6 +64,18 @@ def test_steps_of_a_page_lie_anywhere_and_keep_their_order() -> None:
     assert pages.model is not None
     assert steps.model is not None
     np.testing.assert_array_equal(pages.model.q, steps.model.q[[1, 3, 5, 0, 2, 4]])
+
+
+def test_the_cascade_follows_the_positions() -> None:
+    steps, page = rows(6), np.array([0, 1, 0, 1, 0, 1])
+    pages = as_pages(steps, page, np.array([2, 0, 0, 1, 1, 2]))
+    np.testing.assert_array_equal(pages.reward, steps.reward[[2, 4, 0, 1, 3, 5]])
+
+
+def test_rows_of_one_user_within_ten_milliseconds_are_a_page() -> None:
+    user = np.array([3, 8, 3, 3, 8, 3])
+    time = np.array([1000, 1003, 1009, 1018, 1014, 1029])
+    np.testing.assert_array_equal(pages_of(user, time), [0, 2, 0, 0, 3, 1])
 
 
 def test_normalised_weights_ignore_the_scale_of_a_position() -> None:

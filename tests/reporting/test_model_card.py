@@ -21,6 +21,7 @@ RECORD: dict[str, Any] = {
     "data": {
         "files": ["/home/me/secret/log.parquet"], "users": 33,
         "time_range_ms": [1_574_553_600_000, 1_575_158_400_000], "unknown_propensities": 7,
+        "split_times_ms": [1_575_072_000_000, 1_575_115_200_000],
     },
 }  # fmt: skip
 
@@ -41,7 +42,7 @@ def test_it_says_data_reward_rule_and_limits(tmp_path: Path) -> None:
     assert write_card(folder) == folder / CARD
     card = text_of(folder)
     for what in (
-        "# Model card: dt", "2019-11-24 00:00 to 2019-12-01 00:00", "| reward | `is_click` |",
+        "# Model card: dt", "2019-11-24 00:00 to 2019-11-30 00:00", "| reward | `is_click` |",
         "| training steps | 5,400 |", "a target return: 9 by default",
         "It knows 80 items and never shows another one.", "7 steps of its logs have no propensity",
         "Nothing yet: `ucfrec evaluate`",

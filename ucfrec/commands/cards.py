@@ -29,6 +29,8 @@ def card_of_estimates(run: Path, logs: Iterable[str], report: "OffPolicyReport")
     files = ", ".join(map(without_folders, logs))
     of = f"{row['estimator']} on {files}, {rows[next(reversed(rows))]['choice']}"
     of += f", target return {row['target_return']:g}"
+    of += ", pages" if row["pages"] else ""
+    of += f", discount {row['discount']:g}" if row["discount"] != 1 else ""
     values = _values(row, "R_cum", names) | {"logged": rows[LOGGED]["R_cum"]}
     said = (str(report.verdict), *(w for w in report.warnings if w not in report.verdict.reasons))
     add_measurement(run, "ucfrec ope", of, values, said)

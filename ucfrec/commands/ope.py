@@ -47,8 +47,8 @@ def estimate_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--pages",
         action="store_true",
-        help="estimate the return of a page: rows of one user and time are its positions, each row "
-        "a session",
+        help="estimate the return of a page: rows of one user within 10 ms are its positions, each "
+        "row a session",
     )
     parser.add_argument(
         "--anonymous",

@@ -19,7 +19,7 @@ from ucfrec.off_policy.fqe import ModelReport, fit_models
 from ucfrec.off_policy.item_groups import default_groups, group_items
 from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps
 from ucfrec.off_policy.options import EstimateOptions
-from ucfrec.off_policy.pages import as_pages
+from ucfrec.off_policy.pages import as_pages, pages_of
 from ucfrec.off_policy.score import LoggedSessions, ScoredSteps, scored_steps
 from ucfrec.off_policy.training_rows import MOST_SEEN, share_seen
 from ucfrec.off_policy.verdict import Verdict, cautions, influences, judge
@@ -29,6 +29,7 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 DEFAULTS = EstimateOptions()
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class OffPolicyReport:
     verdict: Verdict
     returns: FloatArray
     """(S,) of the logged sessions, or pages, with all their propensities; empty if none has."""
-    user: npt.NDArray[np.int64] | None
+    user: IntArray | None
     """(S,) whose they are; None where each is somebody else's."""
     terms: FloatArray | None
     """(S,) whose mean is the estimate that the verdict is of; None where nothing can be weighed."""
@@ -94,7 +95,7 @@ def evaluate_off_policy(
             for and a session has several steps.
     """
     judged = logged_steps(trained, logged, target_return, greedy, seed, options)
-    steps = as_pages(judged.steps, _pages(logged)) if options.pages else judged.steps
+    steps = as_pages(judged.steps, *_pages(logged)) if options.pages else judged.steps
     began = logged.store.step_values(schema.TIMESTAMP, *logged.store.all_steps())
     segment = None if options.pages else _quarters(began[steps.first])
     found, diagnosis = estimate(steps, seed), diagnose(steps, options.reward_range, segment)
@@ -150,15 +151,20 @@ def _terms(known: LoggedSteps, verdict: Verdict) -> FloatArray | None:
     return influences(terms[verdict.estimator]) if verdict.estimator in terms else None
 
 
-def _pages(logged: LoggedSessions) -> npt.NDArray[np.int64]:
-    """(N,) number of the page of each step: of one user and millisecond."""
+def _pages(logged: LoggedSessions) -> tuple[IntArray, IntArray | None]:
+    """(N,) page of each step, and its position there where the observation is one-hot."""
     episodes, steps = logged.store.all_steps()
     users = np.unique(logged.users, return_inverse=True)[1][episodes]
     times = logged.store.step_values(schema.TIMESTAMP, episodes, steps).astype(np.int64)
-    return np.asarray(np.unique(np.stack([users, times]), axis=1, return_inverse=True)[1]).ravel()
+    page, size = pages_of(users, times), logged.store.observation_size
+    if size < 2:
+        return page, None
+    seen = logged.store.step_values(schema.OBSERVATION, episodes, steps)
+    one_hot = np.isin(seen, (0, 1)).all() and (seen.sum(axis=1) == 1).all()
+    return page, seen.argmax(axis=1) if one_hot else None
 
 
-def _quarters(times: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+def _quarters(times: npt.NDArray[Any]) -> IntArray:
     """(S,) quarter of the logs, 1 to 4 by time, in which each session begins."""
     return 1 + np.searchsorted(np.quantile(times, [0.25, 0.5, 0.75]), times, side="right")
 
@@ -347,9 +353,7 @@ def _weighed_by_model(
     )
 
 
-def _item_groups(
-    trained: TrainedPolicy, options: EstimateOptions, seed: int
-) -> npt.NDArray[np.int64]:
+def _item_groups(trained: TrainedPolicy, options: EstimateOptions, seed: int) -> IntArray:
     """(n_items,) group of every item."""
     assert trained.item_states is not None
     embeddings = trained.item_states.embeddings.numpy()

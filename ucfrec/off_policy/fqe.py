@@ -160,12 +160,13 @@ class _Sums:
         )
         rows = int(self.rows.sum() - self.rows[fold])
         factor = cho_factor(gram + np.diag(_penalty(self.gram.sum(axis=0), int(self.rows.sum()))))
-        weights = first = cho_solve(factor, earned)
+        weights = first = cho_solve(factor, earned, check_finite=False)
         most = horizon * max(abs(reward.min()), abs(reward.max()))
         iterations, settled = 1, True
         while iterations < _ROUNDS * horizon:
             iterations += 1
-            before, weights = weights, cho_solve(factor, earned + discount * follows @ weights)
+            before, target = weights, earned + discount * (follows @ weights)
+            weights = cho_solve(factor, target, check_finite=False)
             size = (weights @ gram @ weights / rows) ** 0.5
             if not size <= most:
                 # Root mean square above what so many rewards could be: it runs away.

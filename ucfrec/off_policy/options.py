@@ -16,8 +16,8 @@ class EstimateOptions:
     discount: float = 1.0
     """Discount factor γ of the estimated returns, in (0, 1]."""
     pages: bool = False
-    """Estimate the return of a page: sessions of one step, of one user and time, are the positions
-    of a page (`ucfrec.off_policy.pages`)."""
+    """Estimate the return of a page: sessions of one step, of one user within 10 ms, are the
+    positions of a page (`ucfrec.off_policy.pages`)."""
     users_known: bool = True
     """Whether the logs' users are persons, whose sessions are resampled together; if not, each
     session is taken to be somebody else's."""

@@ -25,9 +25,11 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 ENOUGH_TO_NORMALISE = 1e-12
+PAGE_MS = 10
+"""Most milliseconds between rows of one page: Open Bandit writes its positions one by one."""
 
 
-def as_pages(steps: LoggedSteps, page: IntArray) -> LoggedSteps:
+def as_pages(steps: LoggedSteps, page: IntArray, position: IntArray | None = None) -> LoggedSteps:
     """Sessions of one step each, put together to pages.
 
     The evaluated policy chooses each position without knowing what the others got; its probability
@@ -36,7 +38,9 @@ def as_pages(steps: LoggedSteps, page: IntArray) -> LoggedSteps:
 
     Args:
         steps: sessions of one step.
-        page: (N,) whose equal numbers mark one page; positions in the order of the steps.
+        page: (N,) whose equal numbers mark one page.
+        position: (N,) by which the steps of a page are ordered, the cascade's first in front; None
+            for the order of the steps.
 
     Returns:
         A session a page, in order of the numbers of `page`, each of the user of its first step.
@@ -51,11 +55,26 @@ def as_pages(steps: LoggedSteps, page: IntArray) -> LoggedSteps:
         )
     if page.shape != steps.session.shape:
         raise InputError(f"page has shape {page.shape}, {len(steps.session)} steps are one each")
-    order = np.argsort(page, kind="stable")
+    places = np.zeros(len(page)) if position is None else position
+    order = np.lexsort((places, page))
     number = np.unique(page[order], return_inverse=True)[1]
     first = np.flatnonzero(np.diff(number, prepend=-1))
     user = None if steps.user is None else steps.user[order][first]
     return replace(steps.regrouped(order, number, user), pages=True)
+
+
+def pages_of(user: IntArray, time: IntArray) -> IntArray:
+    """(N,) number of the page of each step: of one user, each row within 10 ms of the one before.
+
+    Args:
+        user: (N,) whose step it is.
+        time: (N,) ms.
+    """
+    order = np.lexsort((time, user))
+    begins = (np.diff(user[order], prepend=-1) != 0) | (np.diff(time[order], prepend=0) > PAGE_MS)
+    page = np.empty(len(order), dtype=np.int64)
+    page[order] = np.cumsum(begins) - 1
+    return page
 
 
 def independent_terms(steps: LoggedSteps) -> dict[str, tuple[FloatArray, FloatArray]]:

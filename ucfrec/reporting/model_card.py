@@ -94,11 +94,13 @@ def _about(record: Mapping[str, Any]) -> str:
 
 def _data(record: Mapping[str, Any]) -> str:
     source = record.get("data") or {}
-    window = source.get("time_range_ms")
+    window = _window(source)
     files = [PurePath(file).name for file in source.get("files", [])]
     rows = {
         "files": ", ".join(files) or None,
-        "window (UTC)": None if window is None else " to ".join(_day(time) for time in window),
+        "training window (UTC)": None
+        if window is None
+        else " to ".join(_day(time) for time in window),
         "reward": f"`{record['reward']}`",
         "sessions by": record.get("session_by"),
         "training sessions": record.get("train_episodes"),
@@ -110,6 +112,15 @@ def _data(record: Mapping[str, Any]) -> str:
         "fingerprint": record["fingerprint"][:12],
     }
     return _listed(rows)
+
+
+def _window(source: Mapping[str, Any]) -> tuple[int, int] | None:
+    """Times (ms) of the first training row, and from which on rows are no longer trained on."""
+    times = source.get("time_range_ms")
+    if times is None:
+        return None
+    begins = source.get("split_times_ms") or times[1:]
+    return int(times[0]), min(int(begins[0]), int(times[1]))
 
 
 def _day(milliseconds: int) -> str:
@@ -132,7 +143,7 @@ def _limits(record: Mapping[str, Any]) -> list[str]:
     limits = []
     if items:
         limits.append(f"It knows {items:,} items and never shows another one.")
-    window = source.get("time_range_ms")
+    window = _window(source)
     if window is not None:
         limits.append(
             f"It knows nothing of what happened after {_day(window[1])} UTC; tastes and items "

@@ -1,7 +1,6 @@
 """Estimates from logs what a trained policy would have earned, and reports how reliable that is."""
 
-import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,9 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.off_policy.behavior_model import BehaviorModel, fit_behavior
-from ucfrec.off_policy.diagnostics import Diagnosis, diagnose, implied_items
-from ucfrec.off_policy.estimators import LOGGED, Estimate, estimate, session_terms
+from ucfrec.off_policy.columns import as_row, diagnosis_columns, verdict_columns
+from ucfrec.off_policy.diagnostics import diagnose, implied_items
+from ucfrec.off_policy.estimators import LOGGED, estimate, session_terms
 from ucfrec.off_policy.features import InputsFile, StepInputs, context_of, scores_of
 from ucfrec.off_policy.fqe import ModelReport, fit_models
 from ucfrec.off_policy.item_groups import default_groups, group_items
@@ -22,7 +22,7 @@ from ucfrec.off_policy.options import EstimateOptions
 from ucfrec.off_policy.pages import as_pages, pages_of
 from ucfrec.off_policy.score import LoggedSessions, ScoredSteps, scored_steps
 from ucfrec.off_policy.training_rows import MOST_SEEN, share_seen
-from ucfrec.off_policy.verdict import Verdict, cautions, influences, judge
+from ucfrec.off_policy.verdict import FAR_OFF, Verdict, cautions, influences, judge
 from ucfrec.provenance import provenance
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -96,6 +96,7 @@ def evaluate_off_policy(
     """
     judged = logged_steps(trained, logged, target_return, greedy, seed, options)
     steps = as_pages(judged.steps, *_pages(logged)) if options.pages else judged.steps
+    steps, of_groups = _without_far_off_groups(steps)
     began = logged.store.step_values(schema.TIMESTAMP, *logged.store.all_steps())
     segment = None if options.pages else _quarters(began[steps.first])
     found, diagnosis = estimate(steps, seed), diagnose(steps, options.reward_range, segment)
@@ -109,7 +110,7 @@ def evaluate_off_policy(
         declared=_declared(judged),
     )
     said = [*verdict.reasons, *cautions(diagnosis, found), *_of_the_logs(seen, logged)]
-    said += _of_the_models(judged)
+    said += [*of_groups, *_of_the_models(judged)]
     about = {
         "target_return": target_return,
         "discount": options.discount,
@@ -121,8 +122,8 @@ def evaluate_off_policy(
         "unknown_item_rows": logged.unknown_items,
         "seen_in_training": seen,
         "warnings": said,
-        **_verdict_columns(verdict),
-        **_diagnosis_columns(diagnosis),
+        **verdict_columns(verdict),
+        **diagnosis_columns(diagnosis),
         **judged.models.columns(),
         "run": str(run),
         "fingerprint": logged.store.meta["fingerprint"],
@@ -162,6 +163,16 @@ def _pages(logged: LoggedSessions) -> tuple[IntArray, IntArray | None]:
     seen = logged.store.step_values(schema.OBSERVATION, episodes, steps)
     one_hot = np.isin(seen, (0, 1)).all() and (seen.sum(axis=1) == 1).all()
     return page, seen.argmax(axis=1) if one_hot else None
+
+
+def _without_far_off_groups(steps: LoggedSteps) -> tuple[LoggedSteps, list[str]]:
+    """The steps without weights of item groups, and why, where their mean is not 1: the estimated
+    probabilities of groups are not good enough for sessions of this length."""
+    weights = steps.cluster_weights
+    if weights is None or abs((mean := float(weights[steps.last].mean())) - 1) <= FAR_OFF:
+        return steps, []
+    said = f"MIPS is left out: its session weights have mean {mean:.3g} where 1 is expected"
+    return replace(steps, cluster_propensity=None, cluster_target=None), [said]
 
 
 def _quarters(times: npt.NDArray[Any]) -> IntArray:
@@ -220,49 +231,6 @@ def _of_the_logs(seen: float | None, logged: LoggedSessions) -> list[str]:
             "weigh 0"
         )
     return said
-
-
-def as_row(name: str, found: Estimate) -> dict[str, Any]:
-    """Turn an estimate into a result row.
-
-    Args:
-        name: name of the estimator.
-        found: its estimate.
-
-    Returns:
-        The row. `R_cum` is the mean return, as in `ucfrec.evaluation.metrics`; the ends of its
-        interval are None if there is no interval.
-    """
-    return {
-        "estimator": name,
-        "R_cum": found.value,
-        "R_cum_low": found.low,
-        "R_cum_high": found.high,
-        "R_cum_error": found.error,
-        "effective_sessions": found.effective_sessions,
-        "largest_weight": found.largest_weight,
-        "parameter": found.parameter if found.parameter != math.inf else None,
-    }
-
-
-def _verdict_columns(verdict: Verdict) -> dict[str, Any]:
-    columns = asdict(verdict) | {"verdict": str(verdict), "verdict_of": verdict.estimator}
-    return {name: value for name, value in columns.items() if name not in ("estimator", "reasons")}
-
-
-def _diagnosis_columns(diagnosis: Diagnosis) -> dict[str, Any]:
-    return {
-        "overlap": diagnosis.overlap,
-        "users": diagnosis.users,
-        "sessions_without_propensity": diagnosis.left_out,
-        "effective_users": diagnosis.effective_users,
-        "effective_by_step": list(diagnosis.effective_by_step),
-        "stops_telling_at": diagnosis.stops_telling_at,
-        "weight_tests": [asdict(test) for test in diagnosis.tests],
-        "mean_weight": diagnosis.mean_weight,
-        "pareto_tail": diagnosis.tail,
-        "bounds": None if diagnosis.bounds is None else list(diagnosis.bounds),
-    }
 
 
 def logged_steps(

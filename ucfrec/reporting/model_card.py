@@ -98,9 +98,7 @@ def _data(record: Mapping[str, Any]) -> str:
     files = [PurePath(file).name for file in source.get("files", [])]
     rows = {
         "files": ", ".join(files) or None,
-        "training window (UTC)": None
-        if window is None
-        else " to ".join(_day(time) for time in window),
+        "training window (UTC)": None if window is None else " to ".join(map(_day, window)),
         "reward": f"`{record['reward']}`",
         "sessions by": record.get("session_by"),
         "training sessions": record.get("train_episodes"),

@@ -22,6 +22,7 @@ from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
+from ucfrec.reporting.model_card import write_card
 from ucfrec.runs.config import config_from_dict, resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy, describe_trained
@@ -114,6 +115,7 @@ class Recommender:
                 scratch = tempfile.TemporaryDirectory(prefix="ucfrec-")
                 out = Path(scratch.name) / "run"
             train_run(store, Path(out), self.config)
+            write_card(Path(out))
         self._scratch, self._folder = scratch, Path(out)
         self._trained = TrainedPolicy.load(self._folder)
         return self

@@ -109,7 +109,7 @@ def test_models_are_asked_about_what_the_policy_would_show(
 ) -> None:
     rule = replace(RULE, temperature=0.0) if greedy else RULE
     frame = pd.concat(score(trained, logged, RULE))
-    steps = logged_steps(trained, logged, rule, seed=0)
+    steps = logged_steps(trained, logged, rule, seed=0).steps
     certain = (frame.greedy_item_id == frame.item_id).astype(float)
     np.testing.assert_allclose(steps.target, certain if greedy else frame.probability, rtol=1e-5)
     np.testing.assert_array_equal(steps.session, frame.session)
@@ -125,12 +125,13 @@ def test_features_at_the_policy_are_the_mean_over_its_items(
     trained: TrainedPolicy, logged: LoggedSessions
 ) -> None:
     batch = next(scored_steps(trained, logged.store, RULE))
-    _, _, at_policy = step_features(trained, batch)
+    at_policy = step_features(trained, batch)[2].features()[1]
     probabilities = batch.log_probabilities.exp().numpy()
     mean = np.zeros(at_policy.shape)
     for item in range(probabilities.shape[1]):
         shown = replace(batch.windows, actions=torch.full_like(batch.windows.actions, item))
-        target, of_item, _ = step_features(trained, replace(batch, windows=shown))
+        target, _, seen = step_features(trained, replace(batch, windows=shown))
+        of_item, _ = seen.features()
         np.testing.assert_allclose(target, probabilities[:, item], rtol=1e-6)
         mean += probabilities[:, item, None] * of_item
     np.testing.assert_allclose(at_policy, mean, rtol=1e-4, atol=1e-5)
@@ -161,13 +162,13 @@ def test_unknown_items_may_stay_with_no_probability(
     log = pd.read_parquet(folder / "rest.parquet")
     new = np.arange(len(log)) % 3 == 0
     log.assign(item_id=np.where(new, 999, log.item_id)).to_parquet(tmp_path / "log.parquet")
-    before = logged_steps(trained, logged, RULE, seed=0)
+    before = logged_steps(trained, logged, RULE, seed=0).steps
     files = [tmp_path / "log.parquet"]
     with logged_sessions(folder / "run", trained, files, LogMapping(), keep_unknown=True) as kept:
         unknown = kept.store.step_values("item", *kept.store.all_steps()) < 0
         assert kept.unknown_items == unknown.sum() == new.sum()
         assert kept.report["dropped"]["unknown_item"] == 0
-        steps = logged_steps(trained, kept, RULE, seed=0)
+        steps = logged_steps(trained, kept, RULE, seed=0).steps
     assert (steps.target[unknown] == 0).all()
     assert (steps.weights[unknown] == 0).all()
     untouched = np.logical_and.accumulate(~unknown)

@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from ucfrec.commands.cards import card_of_evaluation
 from ucfrec.commands.options import rule_given, rule_options, world_given, world_options
 from ucfrec.errors import InputError
 
@@ -48,6 +49,7 @@ def run(options: argparse.Namespace) -> None:
         rule = rule_given(options, trained)
         row = evaluate_policy(world, trained, trained.name, options.episodes, options.seed, rule)
         rows.append(row | {"run": without_folders(str(run)), "checkpoint": options.checkpoint})
+        card_of_evaluation(run, rows[-1])
     rows += [
         evaluate_behavior(world, behavior, options.episodes, options.seed)
         for behavior in options.behavior

@@ -64,6 +64,7 @@ def run(options: argparse.Namespace) -> None:
     import torch
 
     from ucfrec.episodes.store import EpisodeStore
+    from ucfrec.reporting.model_card import write_card
     from ucfrec.runs.config import resolve_config
     from ucfrec.runs.refit import refit
     from ucfrec.runs.run import describe_run, train_run
@@ -78,5 +79,6 @@ def run(options: argparse.Namespace) -> None:
     else:
         config = resolve_config(options.policy, options.config, options.set, options.seed)
         record = train_run(store, options.out, config)
+    card = write_card(options.out)
     print(describe_run(record))
-    print(f"\nrun: {options.out}; TensorBoard can open it")
+    print(f"\nrun: {options.out}; TensorBoard can open it\nmodel card: {card}")

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 import pyarrow.parquet as pq
+import torch
 from torch import Tensor
 
 from ucfrec import schema
@@ -61,6 +62,13 @@ class ScoredSteps:
     """(B, n_items): what the rule decides by, see `ucfrec.acting.decision.Decider.scores`."""
     log_probabilities: Tensor
     """(B, n_items): natural logarithm of the probability that the policy shows each item."""
+    asked: Windows
+    """The windows as the policy saw them: returns-to-go from the target return."""
+
+    @property
+    def returns_left(self) -> Tensor:
+        """(B,): what the rule asks for at the step, in units of the reward."""
+        return self.asked.returns_to_go[:, -1]
 
 
 @contextmanager
@@ -148,7 +156,11 @@ def scored_steps(
             windows = store.windows(episodes, steps, trained.policy.config.context)
             scores = session_scores(decider, store, episodes, steps)
             log_probabilities = decider.rule.log_probabilities(scores)
-            yield ScoredSteps(episodes, steps, windows, scores, log_probabilities)
+            # Steps after an unknown item (−1) have weight 0, so any known item can replace it here.
+            known = replace(windows, actions=windows.actions.clamp(min=0))
+            collected = torch.from_numpy(store.rewards_before(episodes, steps))
+            asked = decider.asked(known, collected)
+            yield ScoredSteps(episodes, steps, windows, scores, log_probabilities, asked)
             bar.update(len(steps))
 
 

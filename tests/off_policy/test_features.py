@@ -50,7 +50,7 @@ def test_context_is_the_state_the_return_left_and_the_window(
     seen = []
     for target in (3.0, 5.0):
         batch = next(scored_steps(trained, logged.store, target))
-        seen.append(step_features(trained, batch, greedy=False)[2])
+        seen.append(step_features(trained, batch)[2])
         earned = torch.zeros(len(batch.steps))
         for row, (episode, step) in enumerate(zip(batch.episodes, batch.steps, strict=True)):
             steps = np.arange(step)

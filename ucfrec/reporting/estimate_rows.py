@@ -66,7 +66,6 @@ def estimate_row(
         checkpoint=estimate["checkpoint"],
         target_return=estimate["target_return"],
         rule=estimate["rule"],
-        rule=estimate["choice"],
         details={name: _plain(value) for name, value in others.items() if name not in metrics},
         command=estimate["command"],
         commit=estimate["commit"],

@@ -6,16 +6,14 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
-import torch
-from torch import Tensor
 
-from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.rollout import rollout
 from ucfrec.commands.cli import main
 from ucfrec.evaluation.world import World
@@ -149,7 +147,8 @@ def test_score_tells_the_probability_of_every_choice(
     log.loc[log.index[:3], "item_id"] = 987654
     log.to_parquet(tmp_path / "log.parquet")
     out = tmp_path / "scores.parquet"
-    assert main(["score", run, str(tmp_path / "log.parquet"), "--out", str(out)]) == 0
+    arguments = ["score", run, str(tmp_path / "log.parquet"), "--out", str(out)]
+    assert main([*arguments, "--temperature", "1"]) == 0
     printed = capsys.readouterr().out
     assert re.search(r"dropped: unknown_item +3 ", printed)
     scores = pd.read_parquet(out)
@@ -159,6 +158,10 @@ def test_score_tells_the_probability_of_every_choice(
     assert list(scores.columns) == columns.split()
     assert scores.session.nunique() == log[3:].session_id.nunique()
     assert scores.probability.between(0, 1, inclusive="neither").all()
+    # By default it is the run's own rule that is scored, which takes the best item.
+    assert main(arguments) == 0
+    by_rule = pd.read_parquet(out)
+    assert (by_rule.probability == (scores["rank"] == 1)).all()
 
 
 def estimates_in(out: Path) -> dict[str, dict[str, Any]]:
@@ -167,7 +170,7 @@ def estimates_in(out: Path) -> dict[str, dict[str, Any]]:
     return {row["estimator"]: row for row in read_evaluations(out)}
 
 
-@pytest.mark.parametrize("choice", [[], ["--greedy"]])
+@pytest.mark.parametrize("choice", [["--temperature", "1"], ["--temperature", "0"]])
 def test_ope_writes_the_rows_it_prints(
     catalog: tuple[str, Path], choice: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -178,7 +181,7 @@ def test_ope_writes_the_rows_it_prints(
     printed = capsys.readouterr().out
     rows = estimates_in(out)
     weighted = set(rows) - {"logged", "DM", "FQE"}
-    assert weighted or choice
+    assert weighted or choice == ["--temperature", "0"]
     assert not weighted or {"IPS", "SNIPS", "PDIS", "SNPDIS", "DR", "SNDR"} <= weighted
     log = pd.read_parquet(logs)
     assert rows["logged"]["R_cum"] == pytest.approx(log.is_click.sum() / 300)
@@ -203,13 +206,6 @@ def test_ope_writes_the_rows_it_prints(
     assert estimates_in(out) == rows
 
 
-class SoftmaxActor(PolicyActor):
-    """Draws items from the policy's probabilities: what `ope` judges, played."""
-
-    def _best(self, scores: Tensor) -> Tensor:
-        return torch.multinomial(scores.softmax(-1), 1)[:, 0]
-
-
 def test_ope_tells_from_uniform_logs_what_playing_tells(
     catalog: tuple[str, Path], tmp_path: Path
 ) -> None:
@@ -217,14 +213,11 @@ def test_ope_tells_from_uniform_logs_what_playing_tells(
     collected = ["--behavior", "random", "--sessions", "3000", "--out", str(tmp_path / "logs")]
     assert main(["collect", "--env", "synthetic-catalog", *collected]) == 0
     out = tmp_path / "rows.json"
-    assert main(["ope", run, str(tmp_path / "logs/sessions.parquet"), "--json", str(out)]) == 0
+    given = ["--temperature", "1", "--json", str(out)]
+    assert main(["ope", run, str(tmp_path / "logs/sessions.parquet"), *given]) == 0
     rows = estimates_in(out)
-    torch.manual_seed(0)
     trained = TrainedPolicy.load(Path(run))
-    target = trained.target_return(1.0)
-    size = trained.record["observation_size"]
-    numbers = (trained.item_states, trained.item_ids, trained.user_ids)
-    actor = SoftmaxActor(trained.policy, 512, target, size, *numbers)
+    actor = trained.actor(512, replace(trained.rule, temperature=1.0))
     env = World("synthetic-catalog", None).simulator().make(512, None)
     returns = rollout(env, actor, 2000, seed=0).returns
     truth, error = returns.mean(), returns.std() / 2000**0.5
@@ -250,11 +243,11 @@ def test_a_model_card_lies_beside_every_run_with_what_was_measured(
     assert "| reward | `is_click` |" in trained
     world = ["--env", "synthetic-catalog", "--episodes", "20"]
     assert main(["evaluate", run, *world]) == 0
-    assert main(["ope", run, logs]) == 0
+    assert main(["ope", run, logs, "--temperature", "1"]) == 0
     assert main(["rank", run, logs, "--k", "5"]) == 0
     found = card.read_text()
-    assert "### ucfrec evaluate: synthetic-catalog, target return" in found
-    assert re.search(r"### ucfrec ope: DR on sessions\.parquet, softmax, target return", found)
+    assert "### ucfrec evaluate: synthetic-catalog, target " in found
+    assert re.search(r"### ucfrec ope: DR on sessions\.parquet, target .*temperature 1", found)
     assert "- Do not rely on this estimate: " in found
     assert "### ucfrec rank: sessions.parquet, k 5, checkpoint best" in found
     assert re.search(r"\| hit_rate_liked \| [\d.]+ \[[\d.]+, [\d.]+\] \|", found)
@@ -268,18 +261,18 @@ def test_ope_ranks_targets_and_rules_and_says_which_it_cannot_judge(
     collected = ["--behavior", "random", "--sessions", "1500", "--out", str(tmp_path / "logs")]
     assert main(["collect", "--env", "synthetic-catalog", *collected, "--seed", "7"]) == 0
     out, fresh = tmp_path / "rows.json", str(tmp_path / "logs/sessions.parquet")
-    asked = ["--targets", "q0.5,6", "--both-rules", "--json", str(out)]
+    asked = ["--targets", "q0.5,6", "--temperatures", "1,0", "--json", str(out)]
     assert main(["ope", run, fresh, *asked]) == 0
     printed = capsys.readouterr().out
     rows = read_evaluations(out)
     names = list(dict.fromkeys(row["candidate"] for row in rows))
     assert len(names) == 4
-    assert names[-1] == "target return 6, greedy"
+    assert names[-1] == "target return 6, temperature 0"
     ranked = {row["candidate"]: row for row in rows if "rank" in row}
     assert ranked
     # A policy that always shows one item agrees with hardly any whole random session.
-    assert not any("greedy" in name for name in ranked)
-    assert "not ranked: target return 6, greedy: " in printed
+    assert not any("temperature 0" in name for name in ranked)
+    assert "not ranked: target return 6, temperature 0: " in printed
     first = min(ranked.values(), key=lambda row: row["rank"])
     assert f"choice: {first['selection']}" in printed
     assert sum(row["probability_best"] for row in ranked.values()) == pytest.approx(1)
@@ -303,7 +296,8 @@ def test_ope_without_propensities_has_only_models_and_without_one_leaves_a_sessi
     log.assign(propensity=log.propensity.where(log.index != 5)).to_parquet(tmp_path / "one.parquet")
     for name in ("without", "one"):
         out = tmp_path / f"{name}.json"
-        assert main(["ope", run, str(tmp_path / f"{name}.parquet"), "--json", str(out)]) == 0
+        given = ["--temperature", "1", "--json", str(out)]
+        assert main(["ope", run, str(tmp_path / f"{name}.parquet"), *given]) == 0
         rows = list(estimates_in(out).values())
         printed = capsys.readouterr().out
         if name == "without":
@@ -325,6 +319,7 @@ def test_ope_estimates_propensities_if_asked_and_says_so(
     log = pd.read_parquet(logs).drop(columns="propensity")
     log.to_parquet(tmp_path / "without.parquet")
     arguments = ["ope", run, str(tmp_path / "without.parquet"), "--estimate-propensities"]
+    arguments += ["--temperature", "1"]
     out = tmp_path / "rows.json"
     assert main([*arguments, "--reward-range", "0", "1", "--lift", "0.5", "--json", str(out)]) == 0
     rows = estimates_in(out)

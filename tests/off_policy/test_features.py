@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.logs import LogMapping
 from ucfrec.off_policy.evaluate import step_features
 from ucfrec.off_policy.features import ROWS_AT_ONCE, InputsFile, StepInputs, scores_of
@@ -49,8 +50,9 @@ def test_context_is_the_state_the_return_left_and_the_window(
     """Two targets differ in the return left, and in what the policy makes of it."""
     seen = []
     for target in (3.0, 5.0):
-        batch = next(scored_steps(trained, logged.store, target))
-        seen.append(step_features(trained, batch, greedy=False)[2])
+        rule = DecisionRule(target, temperature=1.0)
+        batch = next(scored_steps(trained, logged.store, rule))
+        seen.append(step_features(trained, batch)[2])
         earned = torch.zeros(len(batch.steps))
         for row, (episode, step) in enumerate(zip(batch.episodes, batch.steps, strict=True)):
             steps = np.arange(step)

@@ -2,14 +2,16 @@
 
 import argparse
 import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ucfrec.commands.cards import card_of_estimates
-from ucfrec.commands.options import log_options, logs_given, target_given, target_options
+from ucfrec.commands.options import log_options, logs_given, rule_given, rule_options
 from ucfrec.errors import InputError
 
 if TYPE_CHECKING:
+    from ucfrec.acting.decision import DecisionRule
     from ucfrec.off_policy.evaluate import OffPolicyReport
     from ucfrec.off_policy.options import EstimateOptions
     from ucfrec.runs.trained_policy import TrainedPolicy
@@ -18,19 +20,16 @@ if TYPE_CHECKING:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """What `ope` takes."""
     log_options(parser)
-    target_options(parser)
-    parser.add_argument(
-        "--greedy", action="store_true", help="judge the most probable item, not the softmax"
-    )
+    rule_options(parser)
     parser.add_argument(
         "--targets",
         metavar="RETURN,…",
         help="compare these target returns, or quantiles of the training returns: 5,10 or q0.5,q1",
     )
     parser.add_argument(
-        "--both-rules",
-        action="store_true",
-        help="compare drawing items from the softmax with the most probable item",
+        "--temperatures",
+        metavar="T,…",
+        help="compare drawing items at these temperatures; 0 takes the best: 0,0.5,1",
     )
     parser.usage = "%(prog)s RUN... LOGS... [options]"
     parser.epilog = "Several runs, targets or rules are ranked, with a band that holds all at once."
@@ -118,13 +117,13 @@ def run(options: argparse.Namespace) -> None:
     if not runs or not options.logs:
         raise InputError("name a run folder of `ucfrec train` first, then the logs")
     candidates = [
-        {"run": str(run), "target return": target, "rule": rule}
+        _Candidate(run, rule)
         for run in runs
-        for target in _targets(options, TrainedPolicy.load(run, options.checkpoint))
-        for rule in _rules(options)
+        for rule in _rules(options, TrainedPolicy.load(run, options.checkpoint))
     ]
     reports = {}
-    for name, candidate in zip(names_of(candidates), candidates, strict=True):
+    named = names_of([one.parts for one in candidates])
+    for name, candidate in zip(named, candidates, strict=True):
         if len(candidates) > 1:
             print(f"\n{name}:")
         reports[name] = _judged(options, candidate)
@@ -147,7 +146,24 @@ def run(options: argparse.Namespace) -> None:
     _write(options, reports, {name: choice.columns(name) for name in reports})
 
 
-def _judged(options: argparse.Namespace, candidate: "dict[str, Any]") -> "OffPolicyReport":
+@dataclass(frozen=True)
+class _Candidate:
+    """One run under one decision rule."""
+
+    run: Path
+    rule: "DecisionRule"
+
+    @property
+    def parts(self) -> dict[str, object]:
+        """What may differ from other candidates, by name."""
+        return {
+            "run": str(self.run),
+            "target return": self.rule.target,
+            "temperature": self.rule.temperature,
+        }
+
+
+def _judged(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicyReport":
     """Print and return what the logs say of one candidate."""
     from ucfrec.logs.summary import format_report
     from ucfrec.off_policy.evaluate import evaluate_off_policy
@@ -156,7 +172,7 @@ def _judged(options: argparse.Namespace, candidate: "dict[str, Any]") -> "OffPol
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     files, mapping = logs_given(options)
-    run = Path(candidate["run"])
+    run = candidate.run
     trained = TrainedPolicy.load(run, options.checkpoint)
     with logged_sessions(run, trained, files, mapping, keep_unknown=True) as logged:
         print(format_report(logged.report))
@@ -164,8 +180,7 @@ def _judged(options: argparse.Namespace, candidate: "dict[str, Any]") -> "OffPol
             run,
             trained,
             logged,
-            target_return=candidate["target return"],
-            greedy=candidate["rule"] == "greedy",
+            rule=candidate.rule,
             seed=options.seed,
             options=estimates_asked(options),
         )
@@ -178,34 +193,46 @@ def _judged(options: argparse.Namespace, candidate: "dict[str, Any]") -> "OffPol
     return found
 
 
-def _targets(options: argparse.Namespace, trained: "TrainedPolicy") -> list[float]:
-    """The target returns to judge, in units of the reward.
+def _rules(options: argparse.Namespace, trained: "TrainedPolicy") -> "list[DecisionRule]":
+    """The decision rules to judge: the run's own with the parts that the options name.
 
     Raises:
-        InputError: one of `--targets` is neither a number nor a quantile.
+        InputError: one of `--targets` is neither a number nor a quantile, or a temperature is no
+            number.
     """
-    if options.targets is None:
-        return [target_given(options, trained)]
-    found = []
-    for part in options.targets.split(","):
-        quantile = part.strip().startswith("q")
+    own = rule_given(options, trained)
+    targets: list[float | None] = [own.target]
+    if options.targets is not None:
+        targets = [_target(part.strip(), trained) for part in options.targets.split(",")]
+    temperatures = [own.temperature]
+    if options.temperatures is not None:
         try:
-            value = float(part.strip().removeprefix("q"))
+            temperatures = [float(part) for part in options.temperatures.split(",")]
         except ValueError:
-            value = float("nan")
-        if not math.isfinite(value) or (quantile and not 0 <= value <= 1):
             raise InputError(
-                f"--targets {options.targets}: {part!r} is neither a return nor a quantile of the "
-                "training returns; write e.g. 5,10 or q0.5,q0.9"
-            )
-        found.append(trained.target_return(value) if quantile else value)
-    return list(dict.fromkeys(found))
+                f"--temperatures {options.temperatures} are no numbers; write e.g. 0,0.5,1"
+            ) from None
+    rules = [
+        replace(own, target=target, temperature=temperature)
+        for target in targets
+        for temperature in temperatures
+    ]
+    return list({rule.hash: rule for rule in rules}.values())
 
 
-def _rules(options: argparse.Namespace) -> list[str]:
-    if options.both_rules:
-        return ["softmax", "greedy"]
-    return ["greedy" if options.greedy else "softmax"]
+def _target(part: str, trained: "TrainedPolicy") -> float:
+    """A target return: a number in units of the reward, or `q` and a quantile."""
+    quantile = part.startswith("q")
+    try:
+        value = float(part.removeprefix("q"))
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value) or (quantile and not 0 <= value <= 1):
+        raise InputError(
+            f"--targets: {part!r} is neither a return nor a quantile of the training returns; "
+            "write e.g. 5,10 or q0.5,q0.9"
+        )
+    return trained.target_return(value) if quantile else value
 
 
 def _write(

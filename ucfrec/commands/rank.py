@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ucfrec.commands.cards import card_of_ranking
-from ucfrec.commands.options import log_options, logs_given, target_given, target_options
+from ucfrec.commands.options import log_options, logs_given, rule_given, rule_options
 from ucfrec.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--k", type=int, default=10, help="items recommended at each step (default: 10)"
     )
-    target_options(parser)
+    rule_options(parser)
     parser.add_argument(
         "--seed",
         type=int,
@@ -101,7 +101,7 @@ def _rows(
     from ucfrec.evaluation.ranking_table import ranking_rows
 
     policies = [
-        PolicyRanker(policy, target_given(options, policy), policy.name) for policy in trained
+        PolicyRanker(policy, rule_given(options, policy), policy.name) for policy in trained
     ]
     rows = ranking_rows(policies, trained[0], train, later, users, options.k, options.seed)
     return [row | {"checkpoint": options.checkpoint} for row in rows]

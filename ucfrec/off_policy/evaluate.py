@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.off_policy.behavior_model import BehaviorModel, fit_behavior
 from ucfrec.off_policy.columns import as_row, diagnosis_columns, verdict_columns
 from ucfrec.off_policy.diagnostics import diagnose, implied_items
@@ -66,8 +67,7 @@ def evaluate_off_policy(
     trained: TrainedPolicy,
     logged: LoggedSessions,
     *,
-    target_return: float,
-    greedy: bool,
+    rule: DecisionRule | None = None,
     seed: int,
     options: EstimateOptions = DEFAULTS,
 ) -> OffPolicyReport:
@@ -81,9 +81,7 @@ def evaluate_off_policy(
         trained: the policy of the run.
         logged: logs read with `keep_unknown`. The policy would never show an item that it does not
             know, so such a step has weight 0.
-        target_return: the return that the policy is asked for, in units of the reward.
-        greedy: judge the policy that shows its most probable item; otherwise the one that draws
-            items from its softmax.
+        rule: the decision rule to judge; None for the run's own.
         seed: seed of the folds and of the bootstrap.
         options: what else is asked.
 
@@ -94,7 +92,8 @@ def evaluate_off_policy(
         InputError: propensities are not probabilities, there is only one user, or pages are asked
             for and a session has several steps.
     """
-    judged = logged_steps(trained, logged, target_return, greedy, seed, options)
+    rule = rule or trained.rule
+    judged = logged_steps(trained, logged, rule, seed, options)
     steps = as_pages(judged.steps, *_pages(logged)) if options.pages else judged.steps
     steps, of_groups = _without_far_off_groups(steps)
     began = logged.store.step_values(schema.TIMESTAMP, *logged.store.all_steps())
@@ -112,7 +111,9 @@ def evaluate_off_policy(
     said = [*verdict.reasons, *cautions(diagnosis, found), *_of_the_logs(seen, logged)]
     said += [*of_groups, *_of_the_models(judged)]
     about = {
-        "target_return": target_return,
+        "target_return": rule.target,
+        "rule": rule.hash,
+        "decision_rule": rule.as_dict(),
         "discount": options.discount,
         "sessions": len(steps.first),
         "pages": options.pages,
@@ -130,7 +131,7 @@ def evaluate_off_policy(
         "seed": seed,
         **provenance(),
     }
-    who = {"policy": trained.name, "choice": "greedy" if greedy else "softmax"}
+    who = {"policy": trained.name, "choice": "softmax" if rule.temperature else "greedy"}
     behavior = {"policy": "behavior", "choice": "as logged"}
     rows = [
         as_row(name, one) | (behavior if name == LOGGED else who) | about
@@ -236,8 +237,7 @@ def _of_the_logs(seen: float | None, logged: LoggedSessions) -> list[str]:
 def logged_steps(
     trained: TrainedPolicy,
     logged: LoggedSessions,
-    target_return: float,
-    greedy: bool,
+    rule: DecisionRule,
     seed: int,
     options: EstimateOptions = DEFAULTS,
 ) -> JudgedSteps:
@@ -248,8 +248,7 @@ def logged_steps(
     Args:
         trained: a policy that chooses items.
         logged: logs read with `keep_unknown`.
-        target_return: the return that the policy is asked for, in units of the reward.
-        greedy: judge the policy that shows its most probable item, instead of drawing items.
+        rule: the decision rule to judge.
         seed: seed of the folds, item groups and samples.
         options: what else is asked.
 
@@ -267,9 +266,9 @@ def logged_steps(
     target, shown = np.empty(len(items)), np.empty((len(items), one_hot.shape[1]), np.float32)
     done, behavior = 0, None
     with InputsFile() as inputs:
-        for batch in scored_steps(trained, store, target_return):
+        for batch in scored_steps(trained, store, rule):
             rows = slice(done, done + len(batch.steps))
-            target[rows], probabilities, seen = step_features(trained, batch, greedy)
+            target[rows], probabilities, seen = step_features(trained, batch)
             shown[rows] = (probabilities @ one_hot).numpy()
             inputs.append(seen)
             done = rows.stop
@@ -332,7 +331,7 @@ def _item_groups(trained: TrainedPolicy, options: EstimateOptions, seed: int) ->
 
 
 def step_features(
-    trained: TrainedPolicy, batch: ScoredSteps, greedy: bool
+    trained: TrainedPolicy, batch: ScoredSteps
 ) -> tuple[npt.NDArray[Any], Tensor, StepInputs]:
     """Compute the policy's probability and the models' inputs for B logged steps.
 
@@ -341,7 +340,6 @@ def step_features(
     Args:
         trained: a policy that chooses items.
         batch: the steps, scored by the policy.
-        greedy: judge the policy that shows its most probable item, instead of drawing items.
 
     Returns:
         The evaluated policy's probability (B,) of the logged item, and (B, n_items) of all items;
@@ -352,11 +350,9 @@ def step_features(
     items = batch.windows.actions[:, -1]
     known = items >= 0
     probabilities = batch.log_probabilities.exp()
-    if greedy:
-        best = batch.log_probabilities.argmax(1, keepdim=True)
-        probabilities = torch.zeros_like(probabilities).scatter_(1, best, 1.0)
     target = probabilities.gather(1, items[:, None].clamp(min=0))[:, 0].double() * known
-    of_chosen, of_shown = scores_of(batch.log_probabilities, items, probabilities)
+    # What the policy thinks of an item counts for the models also where the rule takes the best.
+    of_chosen, of_shown = scores_of(batch.scores.log_softmax(-1), items, probabilities)
     seen = StepInputs(
         context=context_of(trained, batch),
         state_size=batch.windows.states.shape[2],

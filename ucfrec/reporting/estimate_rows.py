@@ -10,7 +10,7 @@ from ucfrec.reporting.result_row import ResultRow
 SUITE: Final = "off-policy"
 _FIELDS: Final = (
     *("estimator", "policy", "choice", "seed", "fingerprint", "checkpoint", "target_return"),
-    *("R_cum_low", "R_cum_high", "command", "commit", "versions"),
+    *("R_cum_low", "R_cum_high", "command", "commit", "versions", "rule"),
 )
 """Keys of an estimate's row that are fields of the result row."""
 _CONDITIONS: Final = ("run", "discount", "pages", "anonymous", "sessions", "steps")
@@ -56,7 +56,7 @@ def estimate_row(
         interval=None if low is None else (low, high),
         checkpoint=estimate["checkpoint"],
         target_return=estimate["target_return"],
-        rule=estimate["choice"],
+        rule=estimate["rule"],
         details={name: _plain(value) for name, value in others.items() if name not in metrics},
         command=estimate["command"],
         commit=estimate["commit"],

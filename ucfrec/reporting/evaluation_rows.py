@@ -13,6 +13,7 @@ from ucfrec.reporting.rows_file import read_lines
 _NOT_METRICS: Final = (
     *("world", "policy", "seed", "train_seed", "fingerprint", "config", "wall_time_s"),
     *("command", "commit", "versions", "target_return", "run", "checkpoint"),
+    *("rule", "decision_rule"),
 )
 """Keys of an evaluation row that are not statistics of its episodes."""
 
@@ -35,6 +36,7 @@ def evaluation_row(evaluation: Mapping[str, Any], key: RowKey, **more: Any) -> R
         "interval": (low, high),
         "world": evaluation["world"],
         "target_return": evaluation.get("target_return"),
+        "rule": evaluation.get("rule"),
         **{name: evaluation[name] for name in ("wall_time_s", "command", "commit", "versions")},
     }
     return ResultRow(**given | more)

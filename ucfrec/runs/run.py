@@ -11,25 +11,42 @@ import numpy as np
 import torch
 
 from ucfrec import schema
+from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.counterfactual.augment import counterfactual_copies, require_rewards_vary
+from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model, reward_model_sizes
 from ucfrec.episodes.item_counts import TrainingCounts
+from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
-from ucfrec.episodes.windows import Overlay, Windows
+from ucfrec.episodes.windows import FloatArray, Overlay, Windows
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder, read_json, write_json
+from ucfrec.fitting.checkpoint import save_tensors
+from ucfrec.fitting.closed_form import fit_once
 from ucfrec.fitting.loop import Fit, fit
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
 from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import command_line, versions
+from ucfrec.runs.choose_rule import choose_rule
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.reference_losses import reference_losses
 from ucfrec.runs.samples import SAMPLES, sample_recommendations
-from ucfrec.runs.trained_policy import AUGMENTATION, COUNTS, ITEMS, RUN, USERS
+from ucfrec.runs.trained_policy import (
+    AUGMENTATION,
+    COUNTS,
+    ITEMS,
+    RETURNS,
+    REWARD_MODEL,
+    RULE,
+    RUN,
+    USERS,
+    TrainedPolicy,
+)
 
 _VALIDATION_BATCHES = 16
 _VALIDATION_BATCH = 256
+_MOST_RETURNS = 1_000_001
 _QUANTILES = (0.5, 0.75, 0.9, 0.95, 0.99, 1.0)
 
 
@@ -63,7 +80,7 @@ def train_run(
             too few training episodes or constant rewards, or the learner does not support its
             actions.
     """
-    train, validation = training_views(store)
+    train, validation = logged, held_out = training_views(store)
     if (out / RUN).exists():
         _require_same(read_json(out / RUN), store, out, config)
     elif config.augment.copies > 0:
@@ -76,6 +93,9 @@ def train_run(
     start = time.perf_counter() - record["wall_time_s"]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     view = policy.training_view(train, config.policy, out / "view", config.seed)
+    returns = ReturnToGo(**record["return_to_go"])
+    if not returns.per_session:
+        view, validation = (each.with_return_to_go(returns) for each in (view, validation))
     if view is not train:
         train, policy = view, new_policy(view, config)
     policy = policy.to(device)
@@ -86,8 +106,10 @@ def train_run(
         train = train.with_overlay(more_copies)
     fitted = _fit_policy(policy, train, validation, out, config)
     record["policy"] = dataclasses.asdict(fitted)
+    if logged.has_items and config.rule.choose:
+        record["reward_model"], record["rule"] = _rule(policy, logged, held_out, out, config)
     record["wall_time_s"] = time.perf_counter() - start
-    _write_samples(out, policy, validation, record)
+    _write_samples(out, held_out)
     write_json(out / RUN, record)
     return dict(record)
 
@@ -100,6 +122,11 @@ def _fit_policy(
     config: Config,
 ) -> Fit:
     k, device = policy.config.context, policy.state_mean.device
+    validate = _validation(policy, validation, config.seed)
+    base = train.without_copies()
+    solve = policy.closed_form(base, validation, out / "policy", config.seed)
+    if solve is not None:
+        return fit_once(policy, solve, out / "policy", validate, config.policy_name)
 
     def draw(generator: np.random.Generator) -> Windows:
         return train.windows(*train.draw_steps(generator, config.train.batch_size), k).to(device)
@@ -111,7 +138,7 @@ def _fit_policy(
         config.train,
         out / "policy",
         seed=config.seed,
-        validate=_validation(policy, validation, config.seed),
+        validate=validate,
         describe=config.policy_name,
     )
 
@@ -157,6 +184,7 @@ def _begin(
         "observation_size": store.observation_size,
         "train_episodes": train.n_episodes,
         "train_steps": train.n_steps,
+        "return_to_go": dataclasses.asdict(_returns(store, config)),
         "return_quantiles": {str(q): float(np.quantile(train.returns, q)) for q in _QUANTILES},
         "mean_return": float(train.returns.mean()),
         "data": store.meta["source"],
@@ -164,7 +192,12 @@ def _begin(
         "wall_time_s": 0.0,
         **about,
     }
+    returns = _target_returns(train, _returns(store, config))
     with atomic_folder(out) as scratch:
+        save_tensors(scratch / RETURNS, {"returns": torch.from_numpy(returns)}, {})
+        target = float(np.quantile(returns.astype(np.float64), config.rule.default_quantile))
+        rule = DecisionRule(target, tag_window=config.rule.default_tag_window)
+        write_json(scratch / RULE, rule.as_dict())
         for name in (ITEM_STATES, ITEMS, USERS):
             if (store.path / name).exists():
                 shutil.copyfile(store.path / name, scratch / name)
@@ -173,6 +206,24 @@ def _begin(
             counts.save(scratch / COUNTS)
             record["reference_losses"] = reference_losses(counts, validation)
         write_json(scratch / RUN, record)
+
+
+def _returns(store: EpisodeStore, config: Config) -> ReturnToGo:
+    return config.policy.returns(store.meta["source"].get("session_by"))
+
+
+def _target_returns(train: EpisodeStore, definition: ReturnToGo) -> FloatArray:
+    """Sorted returns-to-go of sessions, or of steps if targets are set anew at every step.
+
+    Of more than a million, evenly spaced order statistics are kept, the lowest and highest too.
+    """
+    returns = train.returns
+    if not definition.per_session:
+        returns = train.with_return_to_go(definition).step_values(
+            schema.RETURN_TO_GO, *train.all_steps()
+        )
+    kept = np.linspace(0, len(returns) - 1, min(len(returns), _MOST_RETURNS)).astype(np.int64)
+    return np.asarray(np.sort(returns)[kept], dtype=np.float32)
 
 
 def _require_same(
@@ -226,8 +277,7 @@ def _counterfactuals(
 def _sizes(store: EpisodeStore) -> dict[str, int]:
     columns = store.meta["columns"]
     if store.has_items:
-        items, dim = store.item_states.embeddings.shape
-        return {"state": store.state_size, "action": dim, "items": items}
+        return reward_model_sizes(store)
     return {"state": store.state_size, "action": columns[schema.ACTION][0], "items": 0}
 
 
@@ -241,15 +291,20 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
     policy.state_mean.copy_(mean)
     policy.state_std.copy_(torch.where(std > 1e-6, std, 1.0))
     scale = config.policy.return_scale or float(np.abs(base.returns).max()) or 1.0
-    policy.return_scale.fill_(scale)
     episodes, steps = base.all_steps()
     returns_to_go = base.step_values(schema.RETURN_TO_GO, episodes, steps)
+    if not _returns(base, config).per_session and not config.policy.return_scale:
+        scale = float(np.abs(returns_to_go).max()) or 1.0
+    policy.return_scale.fill_(scale)
     policy.lowest_return_to_go.fill_(float(returns_to_go.min()))
     if isinstance(policy.head, ItemHead):
         counts = np.bincount(
             base.step_values(schema.ITEM, episodes, steps), minlength=len(policy.head.counts)
         )
         policy.head.start_from(base.item_states.embeddings, torch.from_numpy(counts).float())
+        if policy.head.exposure is not None:
+            scaled = torch.from_numpy(returns_to_go) / policy.return_scale
+            policy.head.exposure.start_from(base.item_states, scaled)
     else:
         actions = base.step_values(schema.ACTION, episodes, steps)
         policy.head.scale.copy_(torch.from_numpy(np.abs(actions).max(0)).clamp(min=1.0))
@@ -272,13 +327,25 @@ def _validation(policy: SequencePolicy, validation: EpisodeStore, seed: int) -> 
     return loss
 
 
-def _write_samples(
-    out: Path, policy: SequencePolicy, validation: EpisodeStore, record: Mapping[str, Any]
-) -> None:
-    """Save a few recommendations for the report, with the commands' default target return."""
+def _rule(
+    policy: SequencePolicy, train: EpisodeStore, validation: EpisodeStore, out: Path, config: Config
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Fit the reward model of items and choose the rule; returns the reports of both."""
+    model, report = fit_item_reward_model(train, validation, out / REWARD_MODEL, config.seed)
+    trained = TrainedPolicy.load(out)
+    targets = {quantile: trained.target_return(quantile) for quantile in config.rule.quantiles}
+    decider = Decider(policy, trained.rule, trained.returns, model)
+    choice = choose_rule(decider, targets, train, validation, config.rule, config.seed)
+    write_json(out / RULE, choice.rule.as_dict())
+    return dataclasses.asdict(report), choice.as_dict()
+
+
+def _write_samples(out: Path, validation: EpisodeStore) -> None:
+    """Save a few recommendations for the report, by the run's decision rule."""
     if validation.has_items:
-        target = max(record["return_quantiles"].values())
-        write_json(out / SAMPLES, sample_recommendations(policy, validation, target))
+        write_json(
+            out / SAMPLES, sample_recommendations(TrainedPolicy.load(out).decider(), validation)
+        )
 
 
 def describe_run(record: Mapping[str, Any]) -> str:

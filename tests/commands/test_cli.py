@@ -158,10 +158,16 @@ def test_score_tells_the_probability_of_every_choice(
     assert list(scores.columns) == columns.split()
     assert scores.session.nunique() == log[3:].session_id.nunique()
     assert scores.probability.between(0, 1, inclusive="neither").all()
-    # By default it is the run's own rule that is scored, which takes the best item.
+    # The rule that takes the best item is certain of it.
+    assert main([*arguments, "--temperature", "0"]) == 0
+    best = pd.read_parquet(out)
+    assert (best.probability == (scores["rank"] == 1)).all()
+    # Without options it is the run's own rule that is scored.
+    rule = TrainedPolicy.load(Path(run)).rule
     assert main(arguments) == 0
-    by_rule = pd.read_parquet(out)
-    assert (by_rule.probability == (scores["rank"] == 1)).all()
+    own = pd.read_parquet(out)
+    assert main([*arguments, "--temperature", str(rule.temperature)]) == 0
+    pd.testing.assert_frame_equal(own, pd.read_parquet(out))
 
 
 def estimates_in(out: Path) -> dict[str, dict[str, Any]]:

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import torch
@@ -70,6 +70,18 @@ class Design:
             n_tags=n_tags,
             n_users=last,
             binary=bool(model.binary),
+        )
+
+    def select(self, rows: Tensor) -> "Design":
+        """The design of the rows where a bool mask (M,) is true."""
+        return replace(
+            self,
+            items=self.items[rows],
+            users=self.users[rows],
+            x=self.x[rows],
+            exposure=self.exposure[rows],
+            target=self.target[rows],
+            rows=self.rows[rows],
         )
 
     def zeros(self, name: str) -> Tensor:

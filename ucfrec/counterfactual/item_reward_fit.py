@@ -34,6 +34,8 @@ _FIRST: Final = 6
 """Index of the spread that is tried first, 0.4."""
 _CHEAP: Final = ("item", "user", "content")
 """Effects whose spreads are searched finely, and adjusted to each other."""
+_KNOWN: Final = 0.1
+"""Least share of held-out rows of known users that can judge the effect of users."""
 _MAX_ROWS: Final = 500_000
 _CONSTANT: Final = 1e-6
 
@@ -62,7 +64,8 @@ def fit_item_reward_model(
 
     Effects are added one after the other, all fitted jointly. Validation rows choose the strength
     of each effect's penalty, and whether the effect is kept: if it lowers their mean loss by more
-    than the standard error of the decrease.
+    than the standard error of the decrease. (Where hardly any validation row is of a user with
+    training rows, a fifth of the training rows judges the effect of users instead.)
 
     Args:
         train: view of a store of items.
@@ -100,6 +103,31 @@ def fit_item_reward_model(
     return model.eval(), report
 
 
+def refit_item_reward_model(
+    first: Path, store: EpisodeStore, folder: Path, seed: int, max_rows: int = _MAX_ROWS
+) -> ItemRewardModel:
+    """Fit the effects of the model in the folder `first`, as strong as there, to other rows.
+
+    Args:
+        first: folder of `fit_item_reward_model`.
+        store: view of the episodes to fit to.
+        folder: receives the fitted model.
+        seed: of the rows drawn from a view with more than `max_rows`.
+        max_rows: most rows that are used.
+    """
+    report = _report_from(load_tensors(first / FITTED)[1])
+    model = ItemRewardModel(reward_model_sizes(store))
+    rows = RewardRows.of(store, model.lags, max_rows, seed)
+    _set_statistics(model, rows, rows, store.item_states)
+    design = Design.of(model, rows)
+    mean = design.target.mean()
+    start = {"mean": torch.logit(mean) if design.binary else mean}
+    model.set_effects(fit_effects(design, start, report.kept), design.of_content)
+    folder.mkdir(parents=True, exist_ok=True)
+    save_tensors(folder / FITTED, model.state_dict(), dataclasses.asdict(report))
+    return model.eval()
+
+
 class _Search:
     """The effects found so far, and their loss on held-out rows."""
 
@@ -116,6 +144,8 @@ class _Search:
         """Add the effect `name` with the best spread, if it lowers the held-out loss."""
         if not float(self.design.squares(name).sum()):
             return
+        if name == "user" and self._known_users() < _KNOWN:
+            return self._add_users_of_training()
         at, (effects, losses) = self._best(name, _FIRST, (2, 1) if name in _CHEAP else (2,))
         decrease = self.losses - losses
         gain = float(decrease.mean())
@@ -126,9 +156,32 @@ class _Search:
         if gain > error:
             self.effects, self.losses, self.kept[name] = effects, losses, at
 
+    def _known_users(self) -> float:
+        """Share of the held-out rows whose users have training rows."""
+        seen = torch.bincount(self.design.users, minlength=self.design.n_users + 1) > 0
+        seen[-1] = False
+        return float(seen[self._held_out.users].float().mean())
+
+    def _add_users_of_training(self) -> None:
+        """Add the effect of users, judged on a fifth of the training rows.
+
+        Held-out users that are not known cannot show it, but without it the effects of items would
+        contain those of the users who saw them.
+        """
+        held_back = torch.arange(len(self.design.items)) % 5 == 4
+        inner = _Search(self.design.select(~held_back), self.design.select(held_back))
+        inner.kept = dict(self.kept)
+        _, (inner.effects, inner.losses) = inner._best("item", self.kept.get("item", _FIRST), ())
+        inner.add("user")
+        self.tried += inner.tried
+        if "user" in inner.kept:
+            self.kept["user"] = inner.kept["user"]
+            _, (self.effects, self.losses) = self._best("user", self.kept["user"], ())
+
     def adjust(self) -> None:
         """Choose the spreads of the effects found so far again, each given the others."""
-        for name in [*self.kept]:
+        judged = self._known_users() >= _KNOWN
+        for name in [each for each in self.kept if judged or each != "user"]:
             self.kept[name], (self.effects, self.losses) = self._best(name, self.kept[name], (1,))
 
     def report(self) -> tuple[EffectTried, ...]:
@@ -162,6 +215,7 @@ class _Search:
                     at += step
                 if at != start:
                     break
+        loss(at)
         return at, found[at]
 
     def _losses(self, effects: Effects) -> Tensor:

@@ -96,13 +96,20 @@ class ItemRewardModel(nn.Module):
 
     def score(self, states: Tensor, shown: Shown, users: Tensor | None, items: Tensor) -> Tensor:
         """Linear predictors (B,) of one item each, int64 (B,); see `scores`."""
-        before, repeated, alike = self._exposure(shown)
-        each = items.unsqueeze(1)
-        added = self.likeness.to_items(self.likeness.profile(before, alike), each)
-        added = added + ((before == each) * repeated).sum(1)
-        added = added + (self._query(states, users) * self.vectors[items]).sum(1)
-        scores: Tensor = self.item[items] + self.level(states, users) + added
+        level = self.standardised(states) @ self.state
+        added = ((self.standardised(states) @ self.interaction) * self.vectors[items]).sum(1)
+        scores: Tensor = self.fixed_part(shown, users, items) + level + added
         return scores
+
+    def fixed_part(self, shown: Shown, users: Tensor | None, items: Tensor) -> Tensor:
+        """The part of `score` that does not depend on the state, (B,)."""
+        before, repeated, alike = self._exposure(shown)
+        each, known = items.unsqueeze(1), self._known(users, items)
+        exposure = self.likeness.to_items(self.likeness.profile(before, alike), each)
+        exposure = exposure + ((before == each) * repeated).sum(1)
+        affinity = (self.affinity[known] * self.vectors[items]).sum(1)
+        part: Tensor = self.item[items] + self.user[known] + affinity + exposure
+        return part
 
     def level(self, states: Tensor, users: Tensor | None) -> Tensor:
         """The part (B,) of the scores that all items share, in states (B, S) of users (B,)."""
@@ -141,11 +148,11 @@ class ItemRewardModel(nn.Module):
         """States (..., S) in standard deviations from their training mean, clipped."""
         return ((states - self.state_mean) / self.state_std).clamp(-CLIP, CLIP)
 
-    def _known(self, users: Tensor | None, states: Tensor) -> Tensor:
-        """Rows (B,) of the users in the effects of users."""
+    def _known(self, users: Tensor | None, like: Tensor) -> Tensor:
+        """Rows (B,) of the users in the effects of users, B being the length of `like`."""
         last = len(self.user) - 1
         if users is None:
-            return torch.full((len(states),), last, device=states.device)
+            return torch.full((len(like),), last, device=like.device)
         return torch.where((users >= 0) & (users < last), users, last)
 
     def _query(self, states: Tensor, users: Tensor | None) -> Tensor:

@@ -44,9 +44,13 @@ class RewardRows:
         if len(numbers) > limit:
             drawn = np.random.default_rng(seed).choice(view.n_steps, limit, replace=False)
             numbers = np.sort(drawn)
-        episodes, steps = view.locate(numbers)
-        states = torch.empty(len(numbers), view.state_size)
-        for start in range(0, len(numbers), _CHUNK):
+        return cls.at(view, *view.locate(numbers), lags)
+
+    @classmethod
+    def at(cls, view: EpisodeStore, episodes: IntArray, steps: IntArray, lags: int) -> "RewardRows":
+        """The given steps (M,) of a view."""
+        states = torch.empty(len(steps), view.state_size)
+        for start in range(0, len(steps), _CHUNK):
             part = slice(start, start + _CHUNK)
             states[part] = view.windows(episodes[part], steps[part], 1).states[:, 0]
         return cls(

@@ -18,7 +18,7 @@ def fit_once(
     module: nn.Module,
     solve: Callable[[], None],
     folder: Path,
-    validate: Callable[[], float],
+    validate: Callable[[], float] | None,
     describe: str,
 ) -> Fit:
     """Fit `module` by one call of `solve`, or read it from `folder` if that was done before.
@@ -31,7 +31,7 @@ def fit_once(
         module: fitted in place, and left in evaluation mode.
         solve: sets the weights of `module`.
         folder: of the files.
-        validate: the validation loss; called in evaluation mode without gradients.
+        validate: the validation loss; called in evaluation mode without gradients. None for none.
         describe: name of the fit in error messages.
 
     Raises:
@@ -48,12 +48,12 @@ def fit_once(
     solve()
     module.eval()
     with torch.no_grad():
-        loss = validate()
-    if not math.isfinite(loss):
+        loss = math.nan if validate is None else validate()
+    if validate is not None and not math.isfinite(loss):
         raise InputError(f"{describe}: the validation loss is {loss}; look for extreme values")
     seconds = time.perf_counter() - start
     log = MetricsLog(folder, 0)
-    log.add(1, {"validation_loss": loss})
+    log.add(1, {} if validate is None else {"validation_loss": loss})
     log.close()
     about = {"step": 1, "best_step": 1, "best_validation": loss, "seconds": seconds}
     save_tensors(folder / "best.safetensors", module.state_dict(), about)

@@ -160,7 +160,7 @@ def choose_rule(
     config: RuleConfig,
     seed: int,
 ) -> Choice:
-    """Choose target, floor and temperature, then tilt and temperature, then tag window and tilt.
+    """Choose target, floor and temperature, then the tilt, then tag window and tilt.
 
     Args:
         decider: the policy under its default rule, with a reward model.
@@ -208,9 +208,8 @@ def _untilted(
 
 def _tilted(config: RuleConfig, rule: DecisionRule) -> Iterator[DecisionRule]:
     for tilt in config.tilts:
-        for temperature in config.temperatures:
-            if tilt:
-                yield replace(rule, tilt=tilt, temperature=temperature)
+        if tilt:
+            yield replace(rule, tilt=tilt)
 
 
 def calibrate(model: ItemRewardModel, rows: RewardRows) -> tuple[float, float]:

@@ -36,7 +36,7 @@ class RuleConfig:
     """Candidates for β, the weight of the reward model."""
     tag_windows: Annotated[tuple[_Steps, ...], _SOME] = (0, 3, 10)
     """Candidates for the number of steps whose tags are left out, where items have tags."""
-    sessions: Count = 200
+    sessions: Count = 100
     """Sessions played of each candidate."""
     least_impressions: Count = 10
     """Training impressions from which on the log supports an item."""

@@ -57,6 +57,7 @@ def train_run(
     config: Config,
     about: Mapping[str, Any] | None = None,
     more_copies: Overlay | None = None,
+    on_all_rows: bool = False,
 ) -> dict[str, Any]:
     """Train a policy on the training episodes of `store`, or resume the run in `out`.
 
@@ -71,6 +72,8 @@ def train_run(
         about: entries that a dataset adapter adds to the record.
         more_copies: a dataset adapter's edited copies of training episodes, used in addition to
             the counterfactual ones.
+        on_all_rows: train on the validation and test episodes too, and keep the last weights; see
+            `ucfrec.runs.refit`.
 
     Returns:
         The content of `run.json`: provenance, configuration and the report of every stage.
@@ -81,6 +84,8 @@ def train_run(
             actions.
     """
     train, validation = logged, held_out = training_views(store)
+    if on_all_rows:
+        train = logged = store
     if (out / RUN).exists():
         _require_same(read_json(out / RUN), store, out, config)
     elif config.augment.copies > 0:
@@ -104,7 +109,7 @@ def train_run(
         more_copies = overlay if more_copies is None else overlay.joined(more_copies)
     if more_copies is not None:
         train = train.with_overlay(more_copies)
-    fitted = _fit_policy(policy, train, validation, out, config)
+    fitted = _fit_policy(policy, train, None if on_all_rows else validation, out, config)
     record["policy"] = dataclasses.asdict(fitted)
     if logged.has_items and config.rule.choose:
         record["reward_model"], record["rule"] = _rule(policy, logged, held_out, out, config)
@@ -117,14 +122,15 @@ def train_run(
 def _fit_policy(
     policy: SequencePolicy,
     train: EpisodeStore,
-    validation: EpisodeStore,
+    validation: EpisodeStore | None,
     out: Path,
     config: Config,
 ) -> Fit:
+    """Train the policy; without validation, the last weights are kept."""
     k, device = policy.config.context, policy.state_mean.device
-    validate = _validation(policy, validation, config.seed)
+    validate = None if validation is None else _validation(policy, validation, config.seed)
     base = train.without_copies()
-    solve = policy.closed_form(base, validation, out / "policy", config.seed)
+    solve = policy.closed_form(base, validation or base, out / "policy", config.seed)
     if solve is not None:
         return fit_once(policy, solve, out / "policy", validate, config.policy_name)
 

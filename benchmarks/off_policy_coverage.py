@@ -10,10 +10,21 @@ users, 30 rewarded users, Pareto k 0.5, …) were chosen on other worlds: one fi
 
 For every kind of world the table says in what share of the replications the verdict stands, and how
 often the interval of each estimator holds the truth among these; an asterisk marks less than 90% or
-more than 98%, where the verdict stands in more than 5% of the replications. Measured with
-MEASURED_WITH:
+more than 98%, where the verdict stands in more than 5% of the replications. Measured with 200
+replications (standard error 1.5 points), the last two rows with 60 (2.8 points; five of the last
+row's verdicts stand):
 
-TABLE
+world                    stands   logged     IPS   SNIPS    PDIS  SNPDIS      DR    SNDR    lift
+bandit                    91.5%   96.7%   94.5%   96.2%   94.5%   96.2%   95.6%   95.1%   91.3%
+ten rows a user           99.5%   97.5%   98.0%   97.5%   98.0%   97.5%   99.0%*  99.0%*  95.0%
+5% reward                100.0%   95.5%   93.5%   94.0%   93.5%   94.0%   94.0%   94.0%   93.0%
+five-step sessions        99.5%   95.0%   92.5%   95.0%   94.0%   95.5%   93.5%   94.5%   94.0%
+20 sessions a user       100.0%   96.0%   94.5%   95.0%   95.5%   95.5%   96.5%   95.5%   94.0%
+heavy tails                5.0%  100.0%  100.0%   90.0%  100.0%   90.0%   90.0%  100.0%  100.0%
+wrong model              100.0%   98.3%*  96.7%   95.0%   96.7%   95.0%   95.0%   95.0%   95.0%
+heavy tails, eight steps   8.3%  100.0%* 100.0%* 100.0%* 100.0%* 100.0%* 100.0%* 100.0%* 100.0%*
+
+The world "heavy tails, more users" has not been measured since its tables are drawn anew.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """How often the best of four policies is chosen from logs, where the truth is known.
 
-    python benchmarks/off_policy_selection.py                      # 100 replications a row, minutes
+    python benchmarks/off_policy_selection.py                      # 40 replications, minutes
     python benchmarks/off_policy_selection.py --replications 20 --sessions 1000
 
 In the synthetic catalogue, logs of one softmax policy over guessed tastes judge four others that
@@ -9,9 +9,12 @@ played; replications differ in their logs. The table says how often the first is
 all four verdicts stand, the mean rank correlation with the truth, the mean regret (value of the
 best less that of the chosen, in clicks a session), how often the simultaneous band holds the values
 of all four, and how far the value of the first is off before and after the correction for having
-been chosen. Measured with 100 replications:
+been chosen. Measured with 40 replications (values 1.111, 1.114, 1.331 and 1.437 clicks a session):
 
-TABLE
+estimator    best  stands  rankcorr   regret   band    naive corrected
+SNPDIS     100.0%   95.0%    0.950   0.0000  100.0%  +0.0060  +0.0056
+PDIS       100.0%   95.0%    0.930   0.0000  100.0%  +0.0053  +0.0050
+SNIPS      100.0%   95.0%    0.945   0.0000  100.0%  +0.0060  +0.0056
 """
 
 import argparse
@@ -154,7 +157,7 @@ def row(name: str, found: list[Replication], values: dict[str, float]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--replications", type=int, default=100)
+    parser.add_argument("--replications", type=int, default=40)
     parser.add_argument("--sessions", type=int, default=3000)
     options = parser.parse_args()
     values = truth()

@@ -27,7 +27,7 @@ from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
-from ucfrec.progress import progress
+from ucfrec.progress import Progress, progress
 
 _SPREADS: Final = tuple(0.05 * 2 ** (k / 2) for k in range(13))
 _FIRST: Final = 6
@@ -35,7 +35,9 @@ _FIRST: Final = 6
 _CHEAP: Final = ("item", "user", "content")
 """Effects whose spreads are searched finely, and adjusted to each other."""
 _KNOWN: Final = 0.1
-"""Least share of held-out rows of known users that can judge the effect of users."""
+"""Least share of held-out rows of known users that can judge the effects in `_LASTING`."""
+_LASTING: Final = ("item", "user", "content", "affinity")
+"""Effects that are told apart by users who were shown several items."""
 _MAX_ROWS: Final = 500_000
 _CONSTANT: Final = 1e-6
 
@@ -64,8 +66,9 @@ def fit_item_reward_model(
 
     Effects are added one after the other, all fitted jointly. Validation rows choose the strength
     of each effect's penalty, and whether the effect is kept: if it lowers their mean loss by more
-    than the standard error of the decrease. (Where hardly any validation row is of a user with
-    training rows, a fifth of the training rows judges the effect of users instead.)
+    than the standard error of the decrease. Where hardly any validation row is of a user with
+    training rows, a fifth of the training rows chooses for items, users and content instead: with
+    unknown users, effects of items that contain those of the users who saw them predict best.
 
     Args:
         train: view of a store of items.
@@ -91,11 +94,7 @@ def fit_item_reward_model(
     _set_statistics(model, rows, held_out, train.item_states)
     search = _Search(Design.of(model, rows), Design.of(model, held_out))
     with progress(len(EFFECTS), "item rewards", "effects") as bar:
-        for name in EFFECTS:
-            search.add(name)
-            if name == _CHEAP[-1]:
-                search.adjust()
-            bar.update()
+        search.add_all(bar)
     model.set_effects(search.effects, search.design.of_content)
     report = _report(model, search, rows, held_out, train.item_states, start)
     folder.mkdir(parents=True, exist_ok=True)
@@ -142,10 +141,9 @@ class _Search:
 
     def add(self, name: str) -> None:
         """Add the effect `name` with the best spread, if it lowers the held-out loss."""
-        if not float(self.design.squares(name).sum()):
+        nobody = bool((self.design.users == self.design.n_users).all())
+        if not self.design.squares(name).any() or (nobody and name in ("user", "affinity")):
             return
-        if name == "user" and self._known_users() < _KNOWN:
-            return self._add_users_of_training()
         at, (effects, losses) = self._best(name, _FIRST, (2, 1) if name in _CHEAP else (2,))
         decrease = self.losses - losses
         gain = float(decrease.mean())
@@ -156,32 +154,44 @@ class _Search:
         if gain > error:
             self.effects, self.losses, self.kept[name] = effects, losses, at
 
+    def add_all(self, bar: Progress) -> None:
+        """Add every effect that lowers the held-out loss."""
+        judge = self if self._known_users() >= _KNOWN else self._of_training()
+        for name in EFFECTS:
+            if judge is not self and name not in _LASTING:
+                self._take(judge)
+                judge = self
+            judge.add(name)
+            if name == _CHEAP[-1]:
+                judge.adjust()
+            bar.update()
+
     def _known_users(self) -> float:
-        """Share of the held-out rows whose users have training rows."""
+        """Share of the held-out rows whose users have training rows; 1 if no users are known."""
         seen = torch.bincount(self.design.users, minlength=self.design.n_users + 1) > 0
         seen[-1] = False
-        return float(seen[self._held_out.users].float().mean())
+        return float(seen[self._held_out.users].float().mean()) if seen.any() else 1.0
 
-    def _add_users_of_training(self) -> None:
-        """Add the effect of users, judged on a fifth of the training rows.
-
-        Held-out users that are not known cannot show it, but without it the effects of items would
-        contain those of the users who saw them.
-        """
+    def _of_training(self) -> "_Search":
+        """A search that is judged on a fifth of the training rows."""
         held_back = torch.arange(len(self.design.items)) % 5 == 4
-        inner = _Search(self.design.select(~held_back), self.design.select(held_back))
-        inner.kept = dict(self.kept)
-        _, (inner.effects, inner.losses) = inner._best("item", self.kept.get("item", _FIRST), ())
-        inner.add("user")
-        self.tried += inner.tried
-        if "user" in inner.kept:
-            self.kept["user"] = inner.kept["user"]
-            _, (self.effects, self.losses) = self._best("user", self.kept["user"], ())
+        return _Search(self.design.select(~held_back), self.design.select(held_back))
+
+    def _take(self, judge: "_Search") -> None:
+        """Fit the effects that `judge` keeps, with its spreads, to all training rows."""
+        self.tried, at = list(judge.tried), judge.kept
+        if "item" in at:
+            _, (_, losses) = self._best("item", at["item"], ())
+            self.item_loss = float(losses.mean())
+        for name in at:
+            self.kept[name] = at[name]
+        if at:
+            last = [*at][-1]
+            _, (self.effects, self.losses) = self._best(last, at[last], ())
 
     def adjust(self) -> None:
         """Choose the spreads of the effects found so far again, each given the others."""
-        judged = self._known_users() >= _KNOWN
-        for name in [each for each in self.kept if judged or each != "user"]:
+        for name in [*self.kept]:
             self.kept[name], (self.effects, self.losses) = self._best(name, self.kept[name], (1,))
 
     def report(self) -> tuple[EffectTried, ...]:

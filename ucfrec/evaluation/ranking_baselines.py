@@ -10,7 +10,7 @@ from scipy import sparse
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.acting.logged_decisions import session_scores
 from ucfrec.episodes.item_counts import TrainingCounts, liked_steps
 from ucfrec.episodes.store import EpisodeStore
@@ -35,6 +35,19 @@ class PolicyRanker:
         return session_scores(self._decider, steps.store, steps.episodes, steps.steps).log_softmax(
             -1
         )
+
+
+@dataclass(frozen=True)
+class RewardRanker:
+    """Ranks items by the reward model that the run's decision rules tilt by."""
+
+    decider: Decider
+    name: str = "reward model"
+
+    def scores(self, steps: Steps) -> Tensor:
+        """Predicted rewards (B, n_items), in the model's units."""
+        windows = steps.windows(self.decider.policy.config.context)
+        return self.decider.rewards(windows, torch.from_numpy(steps.users))
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ class RuleConfig:
     floor at the same value."""
     temperatures: Annotated[tuple[_Temperature, ...], _SOME] = (0.0, 0.5, 1.0)
     """Candidates for the temperature."""
-    tilts: Annotated[tuple[_Tilt, ...], _SOME] = (0.0, 1.0, 2.0, 4.0, 8.0)
+    tilts: Annotated[tuple[_Tilt, ...], _SOME] = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
     """Candidates for β, the weight of the reward model."""
     tag_windows: Annotated[tuple[_Steps, ...], _SOME] = (0, 3, 10)
     """Candidates for the number of steps whose tags are left out, where items have tags."""

@@ -28,7 +28,8 @@ from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
 from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import command_line, versions
-from ucfrec.runs.choose_rule import choose_rule
+from ucfrec.runs.choose_by_ranking import RankedChoice, choose_by_ranking
+from ucfrec.runs.choose_rule import Choice, choose_rule
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.reference_losses import reference_losses
 from ucfrec.runs.samples import SAMPLES, sample_recommendations
@@ -341,7 +342,11 @@ def _rule(
     trained = TrainedPolicy.load(out)
     targets = {quantile: trained.target_return(quantile) for quantile in config.rule.quantiles}
     decider = Decider(policy, trained.rule, trained.returns, model)
-    choice = choose_rule(decider, targets, train, validation, config.rule, config.seed)
+    choice: Choice | RankedChoice
+    if trained.returns.per_session:
+        choice = choose_rule(decider, targets, train, validation, config.rule, config.seed)
+    else:
+        choice = choose_by_ranking(decider, train, validation, config.rule, config.seed)
     write_json(out / RULE, choice.rule.as_dict())
     return dataclasses.asdict(report), choice.as_dict()
 

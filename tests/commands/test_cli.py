@@ -330,7 +330,7 @@ def test_ope_estimates_propensities_if_asked_and_says_so(
     assert main([*arguments, "--reward-range", "0", "1", "--lift", "0.5", "--json", str(out)]) == 0
     rows = estimates_in(out)
     printed = capsys.readouterr().out
-    assert {"IPS", "DR", "MIPS"} <= set(rows)
+    assert {"IPS", "DR"} <= set(rows)
     assert f"with the propensities of {len(log):,} steps estimated (held-out loss" in printed
     assert rows["DR"]["declared"].startswith("with the propensities of")
     assert rows["DR"]["wanted_lift"] == 0.5

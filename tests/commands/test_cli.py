@@ -223,7 +223,7 @@ def test_ope_tells_from_uniform_logs_what_playing_tells(
     assert main(["ope", run, str(tmp_path / "logs/sessions.parquet"), *given]) == 0
     rows = estimates_in(out)
     trained = TrainedPolicy.load(Path(run))
-    actor = trained.actor(512, replace(trained.rule, temperature=1.0))
+    actor = trained.actor(512, replace(trained.rule, temperature=1.0, tilt=0.0))
     env = World("synthetic-catalog", None).simulator().make(512, None)
     returns = rollout(env, actor, 2000, seed=0).returns
     truth, error = returns.mean(), returns.std() / 2000**0.5
@@ -249,11 +249,11 @@ def test_a_model_card_lies_beside_every_run_with_what_was_measured(
     assert "| reward | `is_click` |" in trained
     world = ["--env", "synthetic-catalog", "--episodes", "20"]
     assert main(["evaluate", run, *world]) == 0
-    assert main(["ope", run, logs]) == 0
+    assert main(["ope", run, logs, "--temperature", "1"]) == 0
     assert main(["rank", run, logs, "--k", "5"]) == 0
     found = card.read_text()
-    assert "### ucfrec evaluate: synthetic-catalog, target return" in found
-    assert re.search(r"### ucfrec ope: DR on sessions\.parquet, softmax, target return", found)
+    assert "### ucfrec evaluate: synthetic-catalog, target " in found
+    assert re.search(r"### ucfrec ope: DR on sessions\.parquet, target .*temperature 1", found)
     assert "- Do not rely on this estimate: " in found
     assert "### ucfrec rank: sessions.parquet, k 5, checkpoint best" in found
     assert re.search(r"\| hit_rate_liked \| [\d.]+ \[[\d.]+, [\d.]+\] \|", found)
@@ -273,12 +273,12 @@ def test_ope_ranks_targets_and_rules_and_says_which_it_cannot_judge(
     rows = read_evaluations(out)
     names = list(dict.fromkeys(row["candidate"] for row in rows))
     assert len(names) == 4
-    assert names[-1] == "target return 6, greedy"
+    assert names[-1] == "target return 6, temperature 0"
     ranked = {row["candidate"]: row for row in rows if "rank" in row}
     assert ranked
     # A policy that always shows one item agrees with hardly any whole random session.
-    assert not any("greedy" in name for name in ranked)
-    assert "not ranked: target return 6, greedy: " in printed
+    assert not any("temperature 0" in name for name in ranked)
+    assert "not ranked: target return 6, temperature 0: " in printed
     first = min(ranked.values(), key=lambda row: row["rank"])
     assert f"choice: {first['selection']}" in printed
     assert sum(row["probability_best"] for row in ranked.values()) == pytest.approx(1)
@@ -325,11 +325,12 @@ def test_ope_estimates_propensities_if_asked_and_says_so(
     log = pd.read_parquet(logs).drop(columns="propensity")
     log.to_parquet(tmp_path / "without.parquet")
     arguments = ["ope", run, str(tmp_path / "without.parquet"), "--estimate-propensities"]
+    arguments += ["--temperature", "1"]
     out = tmp_path / "rows.json"
     assert main([*arguments, "--reward-range", "0", "1", "--lift", "0.5", "--json", str(out)]) == 0
     rows = estimates_in(out)
     printed = capsys.readouterr().out
-    assert {"IPS", "DR", "MIPS"} <= set(rows)
+    assert {"IPS", "DR"} <= set(rows)
     assert f"with the propensities of {len(log):,} steps estimated (held-out loss" in printed
     assert rows["DR"]["declared"].startswith("with the propensities of")
     assert rows["DR"]["wanted_lift"] == 0.5

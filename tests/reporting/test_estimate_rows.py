@@ -15,6 +15,7 @@ ROW = {
     "warnings": ["few users"], "verdict": "Do not rely on this estimate", "reliable": False,
     "weight_tests": [{"name": "step 1", "mean": math.inf, "error": 0.1, "passed": False}],
     "bounds": [0.0, math.nan], "pareto_tail": math.nan, "run": "/home/me/runs/ucf", "seed": 3,
+    "rule": "0123456789ab", "decision_rule": {"target": 7.0, "temperature": 1.0},
     "fingerprint": "abc", "checkpoint": "best", "command": "ucfrec ope", "commit": None,
     "versions": {"python": "3.11"},
 }  # fmt: skip

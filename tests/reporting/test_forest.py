@@ -65,7 +65,8 @@ def test_rows_of_ope_are_drawn_in_the_report(folder: Path, tmp_path: Path) -> No
 
     about = {
         "choice": "softmax", "seed": 0, "fingerprint": "f", "checkpoint": "best", "command": "",
-        "commit": None, "versions": {}, "target_return": 5.0, "sessions": 10, "warnings": [],
+        "commit": None, "versions": {}, "target_return": 5.0, "rule": "r",
+        "sessions": 10, "warnings": [],
         "verdict": "The policy earns more than the logged one: +2", "verdict_of": "DR",
         "reliable": True, "run": "runs/ucf",
     }  # fmt: skip

@@ -30,6 +30,7 @@ def run(folder: Path, **changes: Any) -> Path:
     folder.mkdir()
     config = dataclasses.asdict(resolve_config("dt"))
     (folder / "run.json").write_text(json.dumps(RECORD | {"config": config} | changes))
+    (folder / "decision_rule.json").write_text(json.dumps({"target": 9.0}))
     return folder
 
 
@@ -43,7 +44,7 @@ def test_it_says_data_reward_rule_and_limits(tmp_path: Path) -> None:
     card = text_of(folder)
     for what in (
         "# Model card: dt", "2019-11-24 00:00 to 2019-11-30 00:00", "| reward | `is_click` |",
-        "| training steps | 5,400 |", "a target return: 9 by default",
+        "| training steps | 5,400 |", "Its decision rule: target 9, argmax.",
         "It knows 80 items and never shows another one.", "7 steps of its logs have no propensity",
         "Nothing yet: `ucfrec evaluate`",
     ):  # fmt: skip
@@ -62,9 +63,9 @@ def test_limits_follow_the_record(tmp_path: Path) -> None:
     assert "3.7, is not below that of showing items by popularity, 3.6: it learned nothing" in card
     assert "Its logs have no propensities" in card
     assert "Counterfactual copies: trust none of them" in card
-    sizes = {"items": 0, "state": 9, "action": 3}
-    write_card(run(tmp_path / "vectors", sizes=sizes))
-    assert "It predicts an action vector" in text_of(tmp_path / "vectors")
+    (tmp_path / "run" / "decision_rule.json").unlink()
+    write_card(tmp_path / "run")
+    assert "Its decision rule is not chosen yet." in text_of(tmp_path / "run")
 
 
 def test_the_newest_of_each_measurement_is_kept(tmp_path: Path) -> None:

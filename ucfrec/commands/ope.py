@@ -11,6 +11,7 @@ from ucfrec.commands.options import log_options, logs_given, rule_given, rule_op
 from ucfrec.errors import InputError
 
 if TYPE_CHECKING:
+    from ucfrec.acting.decision import DecisionRule
     from ucfrec.off_policy.evaluate import OffPolicyReport
     from ucfrec.off_policy.options import EstimateOptions
     from ucfrec.runs.trained_policy import TrainedPolicy
@@ -123,7 +124,8 @@ def run(options: argparse.Namespace) -> None:
         for temperature in _temperatures(options, trained)
     ]
     reports = {}
-    for name, candidate in zip(names_of(candidates), candidates, strict=True):
+    named = names_of([one.parts for one in candidates])
+    for name, candidate in zip(named, candidates, strict=True):
         if len(candidates) > 1:
             print(f"\n{name}:")
         reports[name] = _judged(options, candidate)
@@ -146,7 +148,24 @@ def run(options: argparse.Namespace) -> None:
     _write(options, reports, {name: choice.columns(name) for name in reports})
 
 
-def _judged(options: argparse.Namespace, candidate: "dict[str, Any]") -> "OffPolicyReport":
+@dataclass(frozen=True)
+class _Candidate:
+    """One run under one decision rule."""
+
+    run: Path
+    rule: "DecisionRule"
+
+    @property
+    def parts(self) -> dict[str, object]:
+        """What may differ from other candidates, by name."""
+        return {
+            "run": str(self.run),
+            "target return": self.rule.target,
+            "temperature": self.rule.temperature,
+        }
+
+
+def _judged(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicyReport":
     """Print and return what the logs say of one candidate."""
     from ucfrec.logs.summary import format_report
     from ucfrec.off_policy.evaluate import evaluate_off_policy
@@ -155,7 +174,7 @@ def _judged(options: argparse.Namespace, candidate: "dict[str, Any]") -> "OffPol
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     files, mapping = logs_given(options)
-    run = Path(candidate["run"])
+    run = candidate.run
     trained = TrainedPolicy.load(run, options.checkpoint)
     with logged_sessions(run, trained, files, mapping, keep_unknown=True) as logged:
         print(format_report(logged.report))
@@ -184,7 +203,8 @@ def _targets(options: argparse.Namespace, trained: "TrainedPolicy") -> list[floa
     """The target returns to judge, in units of the reward; None for the largest expected.
 
     Raises:
-        InputError: one of `--targets` is neither a number nor a quantile.
+        InputError: one of `--targets` is neither a number nor a quantile, or a temperature is no
+            number.
     """
     if options.targets is None:
         return [rule_given(options, trained).target]
@@ -192,16 +212,17 @@ def _targets(options: argparse.Namespace, trained: "TrainedPolicy") -> list[floa
     for part in options.targets.split(","):
         quantile = part.strip().startswith("q")
         try:
-            value = float(part.strip().removeprefix("q"))
+            temperatures = [float(part) for part in options.temperatures.split(",")]
         except ValueError:
-            value = float("nan")
-        if not math.isfinite(value) or (quantile and not 0 <= value <= 1):
             raise InputError(
-                f"--targets {options.targets}: {part!r} is neither a return nor a quantile of the "
-                "training returns; write e.g. 5,10 or q0.5,q0.9"
-            )
-        found.append(trained.target_return(value) if quantile else value)
-    return list(dict.fromkeys(found))
+                f"--temperatures {options.temperatures} are no numbers; write e.g. 0,0.5,1"
+            ) from None
+    rules = [
+        replace(own, target=target, temperature=temperature)
+        for target in targets
+        for temperature in temperatures
+    ]
+    return list({rule.hash: rule for rule in rules}.values())
 
 
 def _temperatures(options: argparse.Namespace, trained: "TrainedPolicy") -> list[float]:

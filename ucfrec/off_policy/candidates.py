@@ -98,4 +98,6 @@ def names_of(candidates: Sequence[Mapping[str, object]]) -> list[str]:
 
 
 def _part(key: str, value: object) -> str:
+    if value is None:
+        return f"largest {key} expected"
     return f"{key} {value:g}" if isinstance(value, float) else str(value)

@@ -16,7 +16,7 @@ from ucfrec.files import atomic_file, read_json, write_json
 from ucfrec.locks import claim
 from ucfrec.provenance import config_hash
 from ucfrec.reporting.tables import markdown_table, shown
-from ucfrec.runs.trained_policy import learner_of, read_record
+from ucfrec.runs.trained_policy import RULE, learner_of, read_record
 
 
 def write_card(run: Path) -> Path:
@@ -32,7 +32,7 @@ def write_card(run: Path) -> Path:
         "## Training data",
         _data(record),
         "## How it acts",
-        _rule(record),
+        _rule(run),
         "## Limits",
         "\n".join(f"- {limit}" for limit in _limits(record)),
         "## Measured",
@@ -123,14 +123,13 @@ def _day(milliseconds: int) -> str:
     return datetime.fromtimestamp(milliseconds / 1000, UTC).strftime("%Y-%m-%d %H:%M")
 
 
-def _rule(record: Mapping[str, Any]) -> str:
-    largest = record.get("return_quantiles", {}).get("1.0")
-    if not record["sizes"]["items"]:
-        return f"It predicts an action vector, at a target return of {shown(largest)} by default."
+def _rule(run: Path) -> str:
+    if not (run / RULE).exists():
+        return "Its decision rule is not chosen yet."
+    rule = DecisionRule.from_dict(read_json(run / RULE), str(run / RULE))
     return (
-        "It shows the items of largest probability, given the session so far and a target return: "
-        f"{shown(largest)} by default, the largest of the training sessions, less what the session "
-        "has earned. Other targets and rules are named with each measurement below."
+        f"Its decision rule: {rule}. `evaluate`, `ope`, `rank` and `recommend` act by it unless "
+        "they are told otherwise; each measurement below names its own."
     )
 
 

@@ -219,7 +219,7 @@ def test_ope_tells_from_uniform_logs_what_playing_tells(
     collected = ["--behavior", "random", "--sessions", "3000", "--out", str(tmp_path / "logs")]
     assert main(["collect", "--env", "synthetic-catalog", *collected]) == 0
     out = tmp_path / "rows.json"
-    given = ["--temperature", "1", "--json", str(out)]
+    given = ["--temperature", "1", "--tilt", "0", "--json", str(out)]
     assert main(["ope", run, str(tmp_path / "logs/sessions.parquet"), *given]) == 0
     rows = estimates_in(out)
     trained = TrainedPolicy.load(Path(run))
@@ -267,7 +267,7 @@ def test_ope_ranks_targets_and_rules_and_says_which_it_cannot_judge(
     collected = ["--behavior", "random", "--sessions", "1500", "--out", str(tmp_path / "logs")]
     assert main(["collect", "--env", "synthetic-catalog", *collected, "--seed", "7"]) == 0
     out, fresh = tmp_path / "rows.json", str(tmp_path / "logs/sessions.parquet")
-    asked = ["--targets", "q0.5,6", "--temperatures", "0,1", "--json", str(out)]
+    asked = ["--targets", "q0.5,6", "--temperatures", "1,0", "--tilt", "0", "--json", str(out)]
     assert main(["ope", run, fresh, *asked]) == 0
     printed = capsys.readouterr().out
     rows = read_evaluations(out)

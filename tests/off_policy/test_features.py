@@ -50,7 +50,8 @@ def test_context_is_the_state_the_return_left_and_the_window(
     """Two targets differ in the return left, and in what the policy makes of it."""
     seen = []
     for target in (3.0, 5.0):
-        batch = next(scored_steps(trained, logged.store, DecisionRule(target, temperature=1.0)))
+        rule = DecisionRule(target, temperature=1.0)
+        batch = next(scored_steps(trained, logged.store, rule))
         seen.append(step_features(trained, batch)[2])
         earned = torch.zeros(len(batch.steps))
         for row, (episode, step) in enumerate(zip(batch.episodes, batch.steps, strict=True)):

@@ -13,7 +13,7 @@ def card_of_evaluation(run: Path, row: Mapping[str, Any]) -> None:
     from ucfrec.reporting.model_card import add_measurement
 
     names = ("R_cum", "R_avg_pooled", "length", "episodes", "coverage", "diversity", "seed")
-    of = f"{row['world']}, {_rule_in(row)}, checkpoint {row['checkpoint']}"
+    of = f"{row['world']}, {_rule(row)}, checkpoint {row['checkpoint']}"
     add_measurement(run, "ucfrec evaluate", of, _values(row, "R_cum", names))
 
 
@@ -27,7 +27,7 @@ def card_of_estimates(run: Path, logs: Iterable[str], report: "OffPolicyReport")
     row = rows.get(report.verdict.estimator or LOGGED, rows[LOGGED])
     names = ("R_cum", "effective_sessions", "sessions", "lift", "probability_better", "overlap")
     files = ", ".join(map(without_folders, logs))
-    of = f"{row['estimator']} on {files}, {_rule_in(row)}"
+    of = f"{row['estimator']} on {files}, {_rule(row)}"
     of += ", pages" if row["pages"] else ""
     of += f", discount {row['discount']:g}" if row["discount"] != 1 else ""
     values = _values(row, "R_cum", names) | {"logged": rows[LOGGED]["R_cum"]}
@@ -49,11 +49,10 @@ def card_of_ranking(run: Path, row: Mapping[str, Any], measures: Iterable[str], 
     add_measurement(run, "ucfrec rank", of, values)
 
 
-def _rule_in(row: Mapping[str, Any]) -> str:
-    """The decision rule of a row, in words."""
+def _rule(row: Mapping[str, Any]) -> str:
     from ucfrec.acting.decision import DecisionRule
 
-    return str(DecisionRule.from_dict(row["decision_rule"], "the row"))
+    return str(DecisionRule.from_dict(row["decision_rule"], "a result row"))
 
 
 def _values(row: Mapping[str, Any], main: str, names: Iterable[str]) -> dict[str, object]:

@@ -2,7 +2,7 @@
 
 import argparse
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +29,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--temperatures",
         metavar="T,…",
-        help="compare these temperatures, at which items are drawn; 0 takes the best item",
+        help="compare drawing items at these temperatures; 0 takes the best: 0,0.5,1",
     )
     parser.usage = "%(prog)s RUN... LOGS... [options]"
     parser.epilog = "Several runs, targets or rules are ranked, with a band that holds all at once."
@@ -117,11 +117,9 @@ def run(options: argparse.Namespace) -> None:
     if not runs or not options.logs:
         raise InputError("name a run folder of `ucfrec train` first, then the logs")
     candidates = [
-        {"run": str(run), "target return": target, "temperature": temperature}
+        _Candidate(run, rule)
         for run in runs
-        for trained in [TrainedPolicy.load(run, options.checkpoint)]
-        for target in _targets(options, trained)
-        for temperature in _temperatures(options, trained)
+        for rule in _rules(options, TrainedPolicy.load(run, options.checkpoint))
     ]
     reports = {}
     named = names_of([one.parts for one in candidates])
@@ -182,11 +180,7 @@ def _judged(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicyRep
             run,
             trained,
             logged,
-            rule=replace(
-                rule_given(options, trained),
-                target=candidate["target return"],
-                temperature=candidate["temperature"],
-            ),
+            rule=candidate.rule,
             seed=options.seed,
             options=estimates_asked(options),
         )
@@ -199,18 +193,19 @@ def _judged(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicyRep
     return found
 
 
-def _targets(options: argparse.Namespace, trained: "TrainedPolicy") -> list[float | None]:
-    """The target returns to judge, in units of the reward; None for the largest expected.
+def _rules(options: argparse.Namespace, trained: "TrainedPolicy") -> "list[DecisionRule]":
+    """The decision rules to judge: the run's own with the parts that the options name.
 
     Raises:
         InputError: one of `--targets` is neither a number nor a quantile, or a temperature is no
             number.
     """
-    if options.targets is None:
-        return [rule_given(options, trained).target]
-    found: list[float | None] = []
-    for part in options.targets.split(","):
-        quantile = part.strip().startswith("q")
+    own = rule_given(options, trained)
+    targets: list[float | None] = [own.target]
+    if options.targets is not None:
+        targets = [_target(part.strip(), trained) for part in options.targets.split(",")]
+    temperatures = [own.temperature]
+    if options.temperatures is not None:
         try:
             temperatures = [float(part) for part in options.temperatures.split(",")]
         except ValueError:
@@ -225,23 +220,19 @@ def _targets(options: argparse.Namespace, trained: "TrainedPolicy") -> list[floa
     return list({rule.hash: rule for rule in rules}.values())
 
 
-def _temperatures(options: argparse.Namespace, trained: "TrainedPolicy") -> list[float]:
-    """The temperatures to judge.
-
-    Raises:
-        InputError: one of `--temperatures` is not a number from 0 on.
-    """
-    if options.temperatures is None:
-        return [rule_given(options, trained).temperature]
+def _target(part: str, trained: "TrainedPolicy") -> float:
+    """A target return: a number in units of the reward, or `q` and a quantile."""
+    quantile = part.startswith("q")
     try:
-        found = [float(part) for part in options.temperatures.split(",")]
+        value = float(part.removeprefix("q"))
     except ValueError:
-        found = [-1.0]
-    if not all(math.isfinite(each) and each >= 0 for each in found):
+        value = math.nan
+    if not math.isfinite(value) or (quantile and not 0 <= value <= 1):
         raise InputError(
-            f"--temperatures {options.temperatures}: write numbers from 0 on, e.g. 0,0.5,1"
+            f"--targets: {part!r} is neither a return nor a quantile of the training returns; "
+            "write e.g. 5,10 or q0.5,q0.9"
         )
-    return list(dict.fromkeys(found))
+    return trained.target_return(value) if quantile else value
 
 
 def _write(

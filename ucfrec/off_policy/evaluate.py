@@ -351,6 +351,7 @@ def step_features(
     known = items >= 0
     probabilities = batch.log_probabilities.exp()
     target = probabilities.gather(1, items[:, None].clamp(min=0))[:, 0].double() * known
+    # What the policy thinks of an item counts for the models also where the rule takes the best.
     of_chosen, of_shown = scores_of(batch.scores.log_softmax(-1), items, probabilities)
     seen = StepInputs(
         context=context_of(trained, batch),

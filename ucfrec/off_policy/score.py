@@ -20,13 +20,12 @@ from ucfrec.acting.logged_decisions import session_scores
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
-from ucfrec.locks import scratch_folder
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.logs.sessions import EPISODE_USERS
 from ucfrec.progress import progress
-from ucfrec.runs.trained_policy import RUN, TrainedPolicy, duplicates_of
+from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 
 SESSION, PROBABILITY, RANK, GREEDY = "session", "probability", "rank", "greedy_item_id"
 _STEPS_AT_ONCE = 1024
@@ -67,7 +66,7 @@ class ScoredSteps:
 
     @property
     def returns_left(self) -> Tensor:
-        """(B,): what the rule asks for at the step, in units of the reward."""
+        """(B,): target return less the session's reward before the step."""
         return self.asked.returns_to_go[:, -1]
 
 
@@ -112,11 +111,10 @@ def logged_sessions(
     # Older runs did not record `session_by`, but they did record the gap.
     session_by = record.get("session_by") or (None if gap_ms is None else "gap")
     options = PrepareOptions(Expression(record["reward"], str(run / RUN)), session_by)
-    options = replace(options, duplicates=duplicates_of(record))
     if gap_ms is not None:
         options = replace(options, gap_minutes=gap_ms / 60_000)
-    with scratch_folder(Path(tempfile.gettempdir()), "logs") as scratch:
-        folder = scratch / "store"
+    with tempfile.TemporaryDirectory(prefix="ucfrec-") as scratch:
+        folder = Path(scratch) / "store"
         report = prepare(files, mapping, folder, options, like=run, keep_unknown=keep_unknown)
         store = EpisodeStore.open(folder)
         unknown = int((store.step_values(schema.ITEM, *store.all_steps()) < 0).sum())
@@ -156,10 +154,9 @@ def scored_steps(
             windows = store.windows(episodes, steps, trained.policy.config.context)
             scores = session_scores(decider, store, episodes, steps)
             log_probabilities = decider.rule.log_probabilities(scores)
-            # Steps after an unknown item (−1) have weight 0, so any known item can replace it here.
-            known = replace(windows, actions=windows.actions.clamp(min=0))
             collected = torch.from_numpy(store.rewards_before(episodes, steps))
-            asked = decider.asked(known, collected)
+            asked = replace(windows, actions=windows.actions.clamp(min=0))
+            asked = decider.asked(asked, collected)
             yield ScoredSteps(episodes, steps, windows, scores, log_probabilities, asked)
             bar.update(len(steps))
 

@@ -9,17 +9,8 @@ from ucfrec.reporting.result_row import ResultRow
 
 SUITE: Final = "off-policy"
 _FIELDS: Final = (
-    *(
-        "estimator",
-        "policy",
-        "choice",
-        "seed",
-        "fingerprint",
-        "checkpoint",
-        "target_return",
-        "rule",
-    ),
-    *("R_cum_low", "R_cum_high", "command", "commit", "versions"),
+    *("estimator", "policy", "choice", "seed", "fingerprint", "checkpoint", "target_return"),
+    *("R_cum_low", "R_cum_high", "command", "commit", "versions", "rule"),
 )
 """Keys of an estimate's row that are fields of the result row."""
 _CONDITIONS: Final = ("run", "discount", "pages", "anonymous", "sessions", "steps")

@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path, PurePath
 from typing import Any
 
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.checksums import CARD, MEASURED
 from ucfrec.files import atomic_file, read_json, write_json
 from ucfrec.locks import claim

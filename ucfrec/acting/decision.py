@@ -252,6 +252,7 @@ class Decider:
         collected: Tensor,
         forbidden: Tensor | None = None,
         users: Tensor | None = None,
+        shown: Shown | None = None,
     ) -> Tensor:
         """log π(i | s, Ĝ) + β f̂_r(s, i), up to a constant per row, −∞ for items left out.
 
@@ -261,6 +262,8 @@ class Decider:
             collected: (B,) float64 rewards earlier in the session, also before the window.
             forbidden: (B, n_items) or (n_items,) bool, items that may not be shown.
             users: (B,) rows of the training store's users, −1 for others; None for unknown ones.
+            shown: what the sessions showed before, further back than the windows may reach; None
+                for what the windows have.
 
         Returns:
             (B, n_items).
@@ -270,7 +273,7 @@ class Decider:
         """
         scores = self.act(windows, collected)
         if self.rule.tilt:
-            scores = scores + self.rule.tilt * self.rewards(windows, users)
+            scores = scores + self.rule.tilt * self.rewards(windows, users, shown)
         if forbidden is not None:
             scores = scores.masked_fill(forbidden, -torch.inf)
         if self.rule.tag_window:
@@ -284,10 +287,12 @@ class Decider:
         return scores
 
     @torch.no_grad()
-    def rewards(self, windows: Windows, users: Tensor | None = None) -> Tensor:
+    def rewards(
+        self, windows: Windows, users: Tensor | None = None, shown: Shown | None = None
+    ) -> Tensor:
         """f̂_r (B, n_items) at the last step of the windows, in the reward model's units."""
         assert self.reward_model is not None
-        shown = Shown.before_last(windows)
+        shown = shown or Shown.before_last(windows)
         scores: Tensor = self.reward_model.scores(windows.states[:, -1], shown, users)
         return scores
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import Decider
+from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.store import EpisodeStore
 
 IntArray = npt.NDArray[np.int64]
@@ -35,7 +36,9 @@ def session_scores(
     Returns:
         (B, n_items), see `Decider.scores`.
     """
-    windows = store.windows(episodes, steps, decider.policy.config.context)
+    context = decider.policy.config.context
+    lags = 0 if decider.reward_model is None else decider.reward_model.lags
+    windows = store.windows(episodes, steps, max(context, lags + 1))
     # Any known item can replace an unknown one: steps after it have weight 0.
     windows = replace(windows, actions=windows.actions.clamp(min=0))
     collected = torch.from_numpy(store.rewards_before(episodes, steps))
@@ -45,7 +48,8 @@ def session_scores(
     users = None
     if store.has_users:
         users = torch.from_numpy(store.episode_values(schema.USER).astype(np.int64)[episodes])
-    return decider.scores(windows, collected, forbidden, users)
+    shown = Shown.before_last(windows)
+    return decider.scores(windows.last(context), collected, forbidden, users, shown)
 
 
 def seen_before(store: EpisodeStore, episodes: IntArray, steps: IntArray) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ucfrec.acting.decision import Decider
 from ucfrec.acting.rollout import FORBIDDEN, USER_IDS, BoolArray, FloatArray, IntArray
+from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.states import ItemStates, SessionStates
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
@@ -132,10 +133,12 @@ class PolicyActor:
         # The environment steps rows that are not live too, so they also need an allowed action.
         allowed = None if forbidden is None else (~forbidden).int().argmax(1)
         actions = torch.zeros_like(self._actions[:, -1]) if allowed is None else allowed
-        users = None if self._sessions is None else self._sessions.users[rows]
+        users = shown = None
+        if self._sessions is not None:
+            users, shown = self._sessions.users[rows], Shown(*self._sessions.shown).at(rows)
         of_rows = None if forbidden is None else forbidden[rows]
         windows, sums = self._windows(rows), self._reward_sums[rows]
-        scores = self._decider.scores(windows, sums, of_rows, users)
+        scores = self._decider.scores(windows, sums, of_rows, users, shown)
         actions[rows], chances[rows] = self._decider.rule.choose(scores, self._generator)
         self._actions[:, -1] = actions
         if self._shown is not None:

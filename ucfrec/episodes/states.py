@@ -159,6 +159,11 @@ class SessionStates:
         """States (N, S) just before the next step, given its observations (N, O)."""
         return self._states.build(self._items, self._rewards, self._steps, self.users, observations)
 
+    @property
+    def shown(self) -> tuple[Tensor, Tensor]:
+        """Items shown before the next step, (N, window), most recent first, and their rewards."""
+        return self._items, self._rewards
+
     def record(self, items: Tensor, rewards: Tensor) -> None:
         """Add a step to every session: the items (N,) shown and their rewards (N,)."""
         rewards = rewards.float()  # rounded like the store's, for bit-identical states

@@ -52,6 +52,10 @@ class Windows:
         actions = "items" if items else f"vectors of {self.actions.shape[2]}"
         return f"Windows({windows:,} of {steps} steps, states of {size}, actions are {actions})"
 
+    def last(self, steps: int) -> "Windows":
+        """The windows of the last so many steps."""
+        return Windows(**{f.name: getattr(self, f.name)[:, -steps:] for f in fields(self)})
+
     def to(self, device: torch.device) -> "Windows":
         """A copy of the windows on `device`."""
         moved = {f.name: getattr(self, f.name).to(device, non_blocking=True) for f in fields(self)}

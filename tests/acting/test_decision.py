@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tests.policies.test_ucf import CATALOG, ITEMS, VECTORS, B, K, build, other, random_windows
 from ucfrec.acting.decision import Decider, DecisionRule
-from ucfrec.episodes.exposure import Likeness
+from ucfrec.episodes.exposure import Likeness, Shown
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Windows
@@ -247,10 +247,10 @@ class KnownRewards:
 
     lags = 2
 
-    def scores(self, states: Tensor, shown: Tensor, users: Tensor | None) -> Tensor:
+    def scores(self, states: Tensor, shown: Shown, users: Tensor | None) -> Tensor:
         items = torch.arange(ITEMS)
         of_user = torch.zeros(len(states)) if users is None else users.float()
-        repeated = (shown.unsqueeze(2) == items).any(1)
+        repeated = (shown.items[:, : self.lags].unsqueeze(2) == items).any(1)
         return states[:, :1] * items / 10 + of_user.unsqueeze(1) * items - 3.0 * repeated
 
 

@@ -92,9 +92,10 @@ def test_exposure_moves_predictions_by_what_was_shown_alone(name: str) -> None:
         torch.testing.assert_close(policy.act(windows), plain + added)
         own = windows.actions.clone()
         own[:, -1] = other(own[:, -1])
+        earned = windows.rewards.clone()
+        earned[:, -1] += 1
         torch.testing.assert_close(
-            policy.act(replace(windows, actions=own, rewards=windows.rewards + 1)),
-            policy.act(windows),
+            policy.act(replace(windows, actions=own, rewards=earned)), policy.act(windows)
         )
         noisy = torch.where(windows.mask, windows.actions, other(windows.actions))
         torch.testing.assert_close(policy.act(replace(windows, actions=noisy)), policy.act(windows))

@@ -14,9 +14,9 @@ from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 KINDS, STEPS, SESSIONS = 4, 3, 500
-KNOWS_NOBODY = ("popular",)
+KNOWS_NOBODY = ("popular", "item-rate")
 SEES_NO_STATE = ("sasrec", "item-knn")
-ITEMS_ONLY = ("item-knn",)
+ITEMS_ONLY = ("item-knn", "item-rate")
 SETTINGS = [
     "train.steps=80",
     "train.validate_every=80",
@@ -26,6 +26,7 @@ SETTINGS = [
     "policy.context=3",
     "policy.dim=16",
     "augment.copies=0",
+    "rule.choose=false",
 ]
 EXTRA = {
     "dt4rec": ["policy.layers=1", "policy.negatives=1"],

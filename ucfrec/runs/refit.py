@@ -5,10 +5,11 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from ucfrec.checksums import FILES, reopen, seal
+from ucfrec.checksums import reopen, seal
 from ucfrec.counterfactual.item_reward_fit import refit_item_reward_model
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.files import read_json
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import INPUTS, REWARD_MODEL, RULE, RUN, TrainedPolicy
@@ -46,7 +47,7 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> dict[str, Any]:
     shutil.copyfile(first / RULE, out / RULE)
     if trained.reward_model is not None:
         refit_item_reward_model(first / REWARD_MODEL, store, out / REWARD_MODEL, record["seed"])
-    return seal(out, RUN, {name: value for name, value in record.items() if name != FILES})
+    return seal(out, RUN, read_json(out / RUN))
 
 
 def _settings(trained: TrainedPolicy) -> Config:

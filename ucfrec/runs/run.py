@@ -112,8 +112,8 @@ def _train(
     policy = new_policy(train, config)
     if not (out / RUN).exists():
         _begin(store, train, validation, out, config, about or {})
+    reopen(out, RUN, read_json(out / RUN), INPUTS)
     record = read_json(out / RUN)
-    reopen(out, RUN, record, INPUTS)
     record["config"] = dataclasses.asdict(config)
     start = time.perf_counter() - record["wall_time_s"]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")

@@ -85,6 +85,12 @@ class BenchmarkRequest:
     """Seed of the evaluation episodes; None stands for the budget's."""
     world: "World | None" = None
     """A world that is measured instead of the suite's tasks; None for these."""
+    tasks: Sequence[str] = ()
+    """Names of the only tasks to measure; empty for all."""
+    methods: Sequence[str] = ()
+    """Names of the only methods to measure; empty for all."""
+    training_seeds: int | None = None
+    """Number of training seeds of each cell; None for the budget's."""
 
 
 def plugin_names(group: str) -> list[str]:

@@ -36,6 +36,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="measure and print only this table; repeatable (default: all tables)",
     )
+    for name in ("task", "method"):
+        parser.add_argument(
+            f"--{name}",
+            action="append",
+            default=[],
+            metavar="NAME",
+            help=f"measure only this {name}; repeatable (default: all {name}s)",
+        )
+    parser.add_argument(
+        "--training-seeds", type=int, metavar="N", help="training seeds (default: set by --budget)"
+    )
     parser.add_argument(
         "--log-seed", type=int, default=0, help="seed of the simulated logs (default: 0)"
     )
@@ -65,6 +76,9 @@ def run(options: argparse.Namespace) -> None:
         log_seed=options.log_seed,
         evaluation_seed=options.evaluation_seed,
         world=world_given(options) if options.env else None,
+        tasks=options.task,
+        methods=options.method,
+        training_seeds=options.training_seeds,
     )
     with benchmarking(results):
         print(suite.run(request))

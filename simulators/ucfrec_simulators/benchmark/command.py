@@ -11,6 +11,7 @@ from ucfrec.plugins import Benchmark, BenchmarkRequest
 from ucfrec.reporting.grid import run_grid
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec_simulators.benchmark.cells import MEASUREMENT
+from ucfrec_simulators.benchmark.methods import METHODS
 from ucfrec_simulators.benchmark.plan import BUDGETS, Plan
 from ucfrec_simulators.benchmark.plots import (
     plot_distractor,
@@ -24,6 +25,7 @@ from ucfrec_simulators.benchmark.tables import (
     sweep_table,
     target_table,
 )
+from ucfrec_simulators.benchmark.tasks import TASKS
 
 TABLES: Final = ("main", "distractor", "sweeps")
 
@@ -46,7 +48,13 @@ def run(request: BenchmarkRequest) -> str:
     if request.evaluation_seed is not None:
         evaluation = replace(budget.evaluation, seed=request.evaluation_seed)
         budget = replace(budget, evaluation=evaluation)
-    plan = Plan(folder, budget, request.budget, request.log_seed, request.world)
+    if request.training_seeds is not None:
+        seeds = request.training_seeds
+        if seeds < 1:
+            raise InputError(f"--training-seeds is {seeds}; train at least one")
+        budget = replace(budget, seeds=seeds, sweep_seeds=seeds)
+    _require_known(request)
+    plan = Plan(folder, budget, request.budget, request.log_seed, request.world, request.tasks)
     tables, parts = request.tables, []
     if request.world is not None:
         tables = [table for table in tables if table == "main"]
@@ -60,7 +68,11 @@ def run(request: BenchmarkRequest) -> str:
         ]
     plotted = find_spec("matplotlib") is not None
     for table in tables:
-        cells = list(getattr(plan, table)())
+        cells = [
+            cell
+            for cell in getattr(plan, table)()
+            if not request.methods or cell.run is None or cell.method in request.methods
+        ]
         rows = run_grid(cells, MEASUREMENT, request.results, request.workers, table)
         parts.append(_shown(table, rows))
         if plotted:
@@ -68,6 +80,15 @@ def run(request: BenchmarkRequest) -> str:
                 draw(rows, folder / "plots")
     pictures = f"pictures: {folder / 'plots'}" if plotted else "no pictures: install matplotlib"
     return "\n\n".join([*parts, pictures])
+
+
+def _require_known(request: BenchmarkRequest) -> None:
+    for kind, given, known in (
+        ("task", request.tasks, TASKS),
+        ("method", request.methods, METHODS),
+    ):
+        if unknown := [name for name in given if name not in known]:
+            raise InputError(f"no {kind} is called {unknown[0]!r}; choose from {', '.join(known)}")
 
 
 def show(tables: Sequence[str], rows: Sequence[ResultRow]) -> str:

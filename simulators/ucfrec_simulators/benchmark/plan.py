@@ -107,6 +107,7 @@ class Plan:
         name: str = "",
         log_seed: int = 0,
         world: World | None = None,
+        tasks: Sequence[str] = (),
     ) -> None:
         """Args:
         folder: where logs, stores, worlds and runs are kept.
@@ -114,7 +115,9 @@ class Plan:
         name: name of the budget, for the rows.
         log_seed: seed of simulated logs.
         world: a world whose cells the main table has instead; None for `MAIN`.
+        tasks: the only tasks of the tables; empty for all.
         """
+        self._only = tasks
         self._folder, self._budget, self._name = folder, budget, name
         self._log_seed, self._world = log_seed, world
         self._tasks: dict[str, BenchmarkTask] = {}
@@ -177,13 +180,15 @@ class Plan:
 
     def missing(self) -> list[str]:
         """Tasks of the main table that are left out: their files or package are missing."""
-        return [name for name in MAIN if name not in self._available(MAIN)]
+        wanted = self._only or MAIN
+        return [name for name in wanted if name not in self._available(MAIN)]
 
     def _available(self, names: Iterable[str]) -> list[str]:
         return [
             name
             for name in names
-            if (name not in _REAL or data_folder(_REAL[name]).is_dir())
+            if (not self._only or name in self._only)
+            and (name not in _REAL or data_folder(_REAL[name]).is_dir())
             and (name not in _PACKAGES or find_spec(_PACKAGES[name]) is not None)
         ]
 

@@ -3,22 +3,28 @@
     python benchmarks/off_policy_coverage.py                     # 200 replications each, minutes
     python benchmarks/off_policy_coverage.py --replications 40 --worlds "heavy tails"
 
-Sessions are drawn from small worlds of tables, whose values under any policy are exact. For every
-world the table says in what share of the replications the verdict stands, and how often the
-interval of each estimator holds the truth among these; an asterisk marks less than 90% or more than
-98%, where the verdict stands in more than 5% of the replications. Measured, the first three worlds
-with 200 replications (standard error 1.5 points), the others with 100 (2.2 points):
+Sessions are drawn from small worlds of tables, whose values under any policy are exact. Every
+replication draws new tables, new logs and so another truth. The verdict's thresholds (200 effective
+users, 30 rewarded users, Pareto k 0.5, …) were chosen on other worlds: one fixed set of tables
+(8 actions, 6 contexts, rewards of 30% and 5%, 300 to 4,000 users), of which none is here.
+
+For every kind of world the table says in what share of the replications the verdict stands, and how
+often the interval of each estimator holds the truth among these; an asterisk marks less than 90% or
+more than 98%, where the verdict stands in more than 5% of the replications. Measured with 200
+replications (standard error 1.5 points), the last two rows with 60 (2.8 points; five of the last
+row's verdicts stand):
 
 world                    stands   logged     IPS   SNIPS    PDIS  SNPDIS      DR    SNDR    lift
-bandit                    99.5%   95.0%   94.0%   94.0%   94.0%   94.0%   93.5%   94.0%   94.5%
-ten rows a user           99.5%   94.5%   95.5%   95.0%   95.5%   94.5%   94.0%   94.5%   95.5%
-5% reward                100.0%   94.5%   95.0%   94.0%   95.0%   94.0%   92.5%   92.0%   93.5%
-five-step sessions       100.0%   95.0%   94.0%   98.0%   94.0%   97.0%   99.0%*  96.0%   96.0%
-20 sessions a user        99.0%   96.0%   92.9%   94.9%   94.9%   94.9%   98.0%   96.0%   97.0%
-heavy tails                0.0%        –       –       –       –       –       –       –       –
-heavy tails, more users   98.0%   95.9%   94.9%   93.9%   94.9%   93.9%   93.9%   93.9%   94.9%
-heavy tails, five steps    0.0%        –       –       –       –       –       –       –       –
-wrong model              100.0%   93.0%   90.0%   91.0%   90.0%   91.0%   91.0%   91.0%   92.0%
+bandit                    91.5%   96.7%   94.5%   96.2%   94.5%   96.2%   95.6%   95.1%   91.3%
+ten rows a user           99.5%   97.5%   98.0%   97.5%   98.0%   97.5%   99.0%*  99.0%*  95.0%
+5% reward                100.0%   95.5%   93.5%   94.0%   93.5%   94.0%   94.0%   94.0%   93.0%
+five-step sessions        99.5%   95.0%   92.5%   95.0%   94.0%   95.5%   93.5%   94.5%   94.0%
+20 sessions a user       100.0%   96.0%   94.5%   95.0%   95.5%   95.5%   96.5%   95.5%   94.0%
+heavy tails                5.0%  100.0%  100.0%   90.0%  100.0%   90.0%   90.0%  100.0%  100.0%
+wrong model              100.0%   98.3%*  96.7%   95.0%   96.7%   95.0%   95.0%   95.0%   95.0%
+heavy tails, eight steps   8.3%  100.0%* 100.0%* 100.0%* 100.0%* 100.0%* 100.0%* 100.0%* 100.0%*
+
+The world "heavy tails, more users" has not been measured since its tables are drawn anew.
 """
 
 import argparse
@@ -58,9 +64,9 @@ class World:
     model_knows: bool = True
     """Whether the model sees context and action, or only if the action's number is odd."""
 
-    def tables(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def tables(self, seed: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Behavior, target and mean reward (X, A), and the next context's (X, A, X)."""
-        rng = np.random.default_rng(14)
+        rng = np.random.default_rng([seed, 1])
         shape = (self.contexts, self.actions)
         logits = rng.normal(size=shape)
         behavior = softmax(logits)
@@ -68,9 +74,9 @@ class World:
         pays = self.reward * rng.uniform(0.4, 1.6, shape)
         return behavior, target, pays, rng.dirichlet(np.ones(self.contexts), shape)
 
-    def value(self) -> tuple[float, float]:
+    def value(self, seed: int) -> tuple[float, float]:
         """Mean return of a session: the target's, and the behavior's."""
-        behavior, target, pays, follows = self.tables()
+        behavior, target, pays, follows = self.tables(seed)
         found = []
         for policy in (target, behavior):
             v = np.zeros(self.contexts)
@@ -81,8 +87,8 @@ class World:
 
     def logged(self, seed: int) -> LoggedSteps:
         """Logs of the behavior policy, modelled."""
-        rng = np.random.default_rng(seed)
-        behavior, target, pays, follows = self.tables()
+        rng = np.random.default_rng([seed, 2])
+        behavior, target, pays, follows = self.tables(seed)
         sessions = self.users * self.sessions_a_user
         user = np.repeat(np.arange(self.users), self.sessions_a_user)
         context = rng.integers(self.contexts, size=self.users)[user]
@@ -122,15 +128,17 @@ class World:
 
 
 WORLDS = {
-    "bandit": World(users=2000),
-    "ten rows a user": World(users=300, sessions_a_user=10, taste=0.4),
-    "5% reward": World(users=4000, reward=0.05),
-    "five-step sessions": World(users=2000, steps=5, distance=0.25),
-    "20 sessions a user": World(users=300, sessions_a_user=20, steps=2, taste=0.4),
-    "heavy tails": World(users=1000, actions=50, distance=2.0),
-    "heavy tails, more users": World(users=2500, actions=50, distance=2.0),
-    "heavy tails, five steps": World(users=1000, steps=5, distance=1.0),
-    "wrong model": World(users=2000, model_knows=False),
+    "bandit": World(users=1500, actions=20, contexts=10, reward=0.15),
+    "ten rows a user": World(users=500, sessions_a_user=10, actions=5, reward=0.2, taste=0.6),
+    "5% reward": World(users=6000, actions=12, reward=0.05),
+    "five-step sessions": World(users=3000, steps=5, contexts=3, reward=0.5, distance=0.3),
+    "20 sessions a user": World(
+        users=400, sessions_a_user=20, steps=3, reward=0.15, taste=0.6, distance=0.3
+    ),
+    "heavy tails": World(users=1500, actions=100, distance=2.2),
+    "heavy tails, more users": World(users=4000, actions=30, contexts=3, distance=1.5),
+    "heavy tails, eight steps": World(users=1500, steps=8, distance=0.8),
+    "wrong model": World(users=3000, contexts=12, reward=0.1, model_knows=False),
 }
 
 
@@ -147,7 +155,7 @@ def drawn(probabilities: FloatArray, rng: np.random.Generator) -> IntArray:
 
 def replication(world: World, seed: int) -> tuple[bool, dict[str, bool]]:
     """Whether the verdict stands, and which intervals hold the truth."""
-    steps, (truth, as_logged) = world.logged(seed), world.value()
+    steps, (truth, as_logged) = world.logged(seed), world.value(seed)
     verdict, found = judge(steps, seed), estimate(steps, seed)
     holds: dict[str, bool] = {}
     for name in SHOWN[:-1]:

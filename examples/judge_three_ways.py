@@ -9,11 +9,13 @@ and the others can be held against it. With real logs only the second and the th
 
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
 
 from ucfrec import EpisodeStore
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.evaluation.collect import collect
 from ucfrec.evaluation.evaluate import World, evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.simulated_store import simulated_store
@@ -56,8 +58,8 @@ def by_playing(runs: dict[str, Path]) -> list[dict[str, object]]:
     rows = [evaluate_behavior(WORLD, name, EPISODES, SEED) for name in ("random", "mixture")]
     for name, run in runs.items():
         trained = TrainedPolicy.load(run)
-        target = trained.target_return(1.0)  # the largest training return
-        rows.append(evaluate_policy(WORLD, trained, name, EPISODES, SEED, target))
+        # By the run's own rule: the largest training return is asked for, the best item shown.
+        rows.append(evaluate_policy(WORLD, trained, name, EPISODES, SEED, trained.rule))
     rows.append(evaluate_behavior(WORLD, "optimal", EPISODES, SEED))
     return rows
 
@@ -71,8 +73,14 @@ def by_playing(runs: dict[str, Path]) -> list[dict[str, object]]:
 # instead: they always have an answer, right or wrong.)
 #
 # One difference to the first way: there the most probable item is shown, here an item is drawn from
-# the policy's probabilities. `greedy=True` judges the most probable item, but such a policy agrees
-# with hardly any whole session of the logs, and the effective sample shrinks to almost nothing.
+# the policy's probabilities, by another decision rule. The run's own could be judged too, but a
+# policy that shows one item for certain agrees with hardly any whole session of the logs, and the
+# effective sample shrinks to almost nothing.
+
+
+def drawn(trained: TrainedPolicy) -> DecisionRule:
+    """The run's rule, but items are drawn from the policy's probabilities."""
+    return replace(trained.rule, temperature=1.0)
 
 
 def from_logs(runs: dict[str, Path], fresh: Path) -> pd.DataFrame:
@@ -81,14 +89,7 @@ def from_logs(runs: dict[str, Path], fresh: Path) -> pd.DataFrame:
     for name, run in runs.items():
         trained = TrainedPolicy.load(run)
         with logged_sessions(run, trained, [fresh / "sessions.parquet"], LogMapping()) as logged:
-            estimates = evaluate_off_policy(
-                run,
-                trained,
-                logged,
-                target_return=trained.target_return(1.0),
-                greedy=False,
-                seed=0,
-            )
+            estimates = evaluate_off_policy(run, trained, logged, rule=drawn(trained), seed=0)
         for warning in estimates.warnings:
             print(f"{name}: {warning}")
         print(f"{name}: {estimates.verdict.headline}")
@@ -110,7 +111,7 @@ def by_what_came_next(runs: dict[str, Path], fresh: Path) -> pd.DataFrame:
     for name, run in runs.items():
         trained = TrainedPolicy.load(run)
         with logged_sessions(run, trained, [fresh / "sessions.parquet"], LogMapping()) as logged:
-            steps = pd.concat(score(trained, logged, trained.target_return(1.0)))
+            steps = pd.concat(score(trained, logged, drawn(trained)))
         hit, clicked = steps["rank"] <= K, steps["reward"] > 0
         odds = steps["probability"][clicked].mean() / steps["probability"][~clicked].mean()
         rows.append(

@@ -19,6 +19,8 @@ from ucfrec.locks import is_lock_or_scratch
 
 FILES: Final = "files"
 """Entry of a record with size and checksum of the files beside it: {path: [bytes, hexadecimal]}."""
+CARD, MEASURED = "MODEL_CARD.md", "measured.json"
+"""Files of a run that later measurements change; they are never listed."""
 _BLOCK: Final = 2**20
 
 
@@ -187,5 +189,5 @@ def _size_fault(path: Path, size: int) -> str:
 def _names(folder: Path) -> Iterator[str]:
     for where, _, files in os.walk(folder):
         for name in files:
-            if not is_lock_or_scratch(name):
+            if not is_lock_or_scratch(name) and name not in (CARD, MEASURED):
                 yield (Path(where) / name).relative_to(folder).as_posix()

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
 
     from ucfrec.acting.rollout import Actor
+    from ucfrec.evaluation.world import World
     from ucfrec.reporting.result_row import ResultRow
 
 _ONE_OF: Final = {
@@ -43,6 +44,11 @@ class Simulator:
     and, if it is known, `optimal`."""
     feedback: str
     """Name of the reward column in the logs that `ucfrec collect` writes."""
+
+    @property
+    def logging_behavior(self) -> str:
+        """The behavior policy of logs that nobody chose another for."""
+        return "mixture" if "mixture" in self.behaviors else "random"
 
 
 @dataclass(frozen=True)
@@ -77,6 +83,8 @@ class BenchmarkRequest:
     """Seed of the simulated logs."""
     evaluation_seed: int | None = None
     """Seed of the evaluation episodes; None stands for the budget's."""
+    world: "World | None" = None
+    """A world that is measured instead of the suite's tasks; None for these."""
 
 
 def plugin_names(group: str) -> list[str]:

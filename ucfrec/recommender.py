@@ -11,6 +11,7 @@ from typing import Any, Self
 import pandas as pd
 import pyarrow.parquet as pq
 
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder
@@ -21,6 +22,7 @@ from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
+from ucfrec.reporting.model_card import write_card
 from ucfrec.runs.config import config_from_dict, resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy, describe_trained
@@ -113,6 +115,7 @@ class Recommender:
                 scratch = tempfile.TemporaryDirectory(prefix="ucfrec-")
                 out = Path(scratch.name) / "run"
             train_run(store, Path(out), self.config)
+            write_card(Path(out))
         self._scratch, self._folder = scratch, Path(out)
         self._trained = TrainedPolicy.load(self._folder)
         return self
@@ -147,7 +150,8 @@ class Recommender:
         filter_seen: bool = True,
         candidates: Sequence[Any] | None = None,
         skip_unknown: bool = False,
-        target_return: float | None = None,
+        rule: DecisionRule | None = None,
+        seed: int = 0,
         mapping: LogMapping | None = None,
     ) -> pd.DataFrame:
         """The `k` best next items of every user; nothing is written to disk.
@@ -165,14 +169,14 @@ class Recommender:
             filter_seen: leave out items that the user's history contains.
             candidates: the only item_ids to recommend; None for all.
             skip_unknown: ignore rows of items that are not in the training data.
-            target_return: target return of the rest of the session, in units of the training
-                reward; None for the largest training return.
+            rule: the decision rule; None for the run's own, `Recommender.trained.rule`.
+            seed: of the draws of a rule with a temperature.
             mapping: names of the columns of `histories`.
 
         Returns:
-            `user_id`, `rank` (from 1), `item_id`, `score` (log-probability among all items, nats):
-            k rows per user, users in sorted order; fewer rows if fewer items remain, as with less
-            than k candidates.
+            `user_id`, `rank` (from 1), `item_id`, `score` (log-probability at temperature 1 among
+            the items that are left, nats): k rows per user, users in sorted order; fewer rows if
+            fewer items remain, as with less than k candidates.
 
         Raises:
             InputError: the recommender is not trained, an argument is wrong, a column is missing or
@@ -184,7 +188,8 @@ class Recommender:
             trained,
             histories_of_frame(trained, histories, mapping or LogMapping()),
             k,
-            target_return=trained.target_return(1.0) if target_return is None else target_return,
+            rule=rule,
+            seed=seed,
             filter_seen=filter_seen,
             candidates=candidates,
             skip_unknown=skip_unknown,

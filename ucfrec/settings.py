@@ -207,7 +207,8 @@ def _allowed(annotation: Any, metadata: Sequence[Any] = ()) -> str:
         return f"{', '.join(others)} or {last}" if others else last
     if get_origin(annotation) is tuple:
         inner = get_args(annotation)
-        return f"{len(inner)} values, each {_allowed(inner[0])}"
+        count = "one or more" if inner[-1] is Ellipsis else len(inner)
+        return f"{count} values, each {_allowed(inner[0])}"
     kinds_by_type = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
     return kinds_by_type.get(annotation, str(annotation)) + _range(metadata)
 

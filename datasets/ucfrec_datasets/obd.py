@@ -4,9 +4,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from ucfrec import schema
 from ucfrec.errors import InputError
-from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, log_files
+from ucfrec.logs.mapping import SUFFIXES, Dataset, FeatureTable, LogMapping, log_files
 
+CAMPAIGNS: Final = ("all", "men", "women")
+"""Each has items of its own, which it numbers from 0."""
 ITEMS: Final = "item_context"
 USER_FEATURES: Final = tuple(f"user_feature_{n}" for n in range(4))
 USER: Final = f"concat_ws('-', {', '.join(f'left({name}, 8)' for name in USER_FEATURES)})"
@@ -29,19 +32,62 @@ MAPPING: Final = LogMapping(
 
 
 def _resolve(paths: Sequence[str | Path], given: LogMapping) -> tuple[tuple[Path, ...], LogMapping]:
-    """All given logs, with item features of the same paths or the logs' folder."""
+    """Logs of one campaign, with item features of the same paths or of the first log's folder.
+
+    Items are called `<campaign>/<number>`, so that no run of one campaign reads the logs of another
+    as its own.
+
+    Raises:
+        InputError: no log is named, or its campaign is not known, or there are several.
+    """
     named = log_files(paths)
     logs = tuple(file for file in named if not file.name.startswith(ITEMS))
     if not logs:
         raise InputError(f"{named[0]} has features, not impressions; name a log, e.g. all.csv")
+    item_id = given.columns.get(schema.ITEM_ID)
+    campaign = None if item_id is not None else _only_campaign(logs)
+    item_id = item_id or f"concat('{campaign}/', item_id)"
     candidates = (*named, *log_files([logs[0].parent]))
-    items = [file for file in candidates if file.name.startswith(ITEMS)]
+    items = [
+        file
+        for file in candidates
+        if file.name.startswith(ITEMS) and _campaign(file) in (None, campaign or _campaign(file))
+    ]
     defaults = LogMapping(
-        # The folders of all campaigns have the same item table.
-        item_features=(FeatureTable((items[0],), "item_id", ITEM_FEATURES),) if items else (),
+        {schema.ITEM_ID: item_id},
+        # The folders of all policies have the same item table of a campaign.
+        item_features=(FeatureTable((items[0],), item_id, ITEM_FEATURES),) if items else (),
         user_features=(FeatureTable(logs, USER, USER_FEATURES, first_by='"timestamp"'),),
     )
     return logs, given.over(defaults).over(MAPPING)
+
+
+def _only_campaign(logs: Sequence[Path]) -> str:
+    found: dict[str, Path] = {}
+    for log in logs:
+        campaign = _campaign(log)
+        if campaign is None:
+            raise InputError(
+                f"{log}: neither the file nor its folder is named after a campaign "
+                f"({', '.join(CAMPAIGNS)}), whose items have numbers of their own; rename the file,"
+                " e.g. random_men.csv"
+            )
+        found.setdefault(campaign, log)
+    if len(found) > 1:
+        raise InputError(
+            f"{' and '.join(map(str, found.values()))} are of the campaigns "
+            f"{' and '.join(found)}, which have no item in common; prepare one campaign at a time"
+        )
+    return next(iter(found))
+
+
+def _campaign(file: Path) -> str | None:
+    """The campaign that a file (`men.csv`, `random_men.parquet`) or its folder is named after."""
+    stem = file.name
+    for suffix in SUFFIXES:
+        stem = stem.removesuffix(suffix)
+    names = (stem.rpartition("_")[2], file.resolve().parent.name.rpartition("_")[2])
+    return next((name for name in names if name in CAMPAIGNS), None)
 
 
 DATASET: Final = Dataset(

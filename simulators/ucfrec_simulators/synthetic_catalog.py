@@ -10,9 +10,10 @@ from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
 from ucfrec.acting.rollout import Actor, BoolArray, FloatArray, IntArray
+from ucfrec.acting.uniform import Memoryless, Uniform
 from ucfrec.errors import InputError
 from ucfrec.plugins import Simulator
-from ucfrec_simulators.behaviors import Memoryless, SessionMixture, Uniform
+from ucfrec_simulators.behaviors import SessionMixture
 from ucfrec_simulators.session_env import AnyArray, SessionsEnv, draw_categories
 
 CLUSTERS: Final = 8

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.rollout import Step, rollout
 from ucfrec.episodes.states import ItemStates
@@ -83,7 +84,7 @@ def test_logged_windows_give_the_actions_played(world: str, name: str, tmp_path:
         policy = build(name, {"state": observed, "action": 27, "items": 0})
         ids = None
     randomised(policy)
-    actor = PolicyActor(policy, SIDE_BY_SIDE, TARGET, observed, states, ids)
+    actor = PolicyActor(Decider(policy, DecisionRule(TARGET)), SIDE_BY_SIDE, observed, states, ids)
     steps: list[Step] = []
     played = rollout(env, actor, EPISODES, seed=4, on_step=steps.append)
     assert played.lengths.max() > K, "some session must outgrow the context"

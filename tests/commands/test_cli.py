@@ -3,21 +3,22 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
-import torch
-from torch import Tensor
 
-from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.rollout import rollout
 from ucfrec.commands.cli import main
 from ucfrec.evaluation.world import World
 from ucfrec.plugins import load_plugin
+from ucfrec.reporting.evaluation_rows import read_evaluations
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 TINY = [
@@ -146,7 +147,8 @@ def test_score_tells_the_probability_of_every_choice(
     log.loc[log.index[:3], "item_id"] = 987654
     log.to_parquet(tmp_path / "log.parquet")
     out = tmp_path / "scores.parquet"
-    assert main(["score", run, str(tmp_path / "log.parquet"), "--out", str(out)]) == 0
+    arguments = ["score", run, str(tmp_path / "log.parquet"), "--out", str(out)]
+    assert main([*arguments, "--temperature", "1"]) == 0
     printed = capsys.readouterr().out
     assert re.search(r"dropped: unknown_item +3 ", printed)
     scores = pd.read_parquet(out)
@@ -156,9 +158,25 @@ def test_score_tells_the_probability_of_every_choice(
     assert list(scores.columns) == columns.split()
     assert scores.session.nunique() == log[3:].session_id.nunique()
     assert scores.probability.between(0, 1, inclusive="neither").all()
+    # The rule that takes the best item is certain of it.
+    assert main([*arguments, "--temperature", "0"]) == 0
+    best = pd.read_parquet(out)
+    assert (best.probability == (scores["rank"] == 1)).all()
+    # Without options it is the run's own rule that is scored.
+    rule = TrainedPolicy.load(Path(run)).rule
+    assert main(arguments) == 0
+    own = pd.read_parquet(out)
+    assert main([*arguments, "--temperature", str(rule.temperature)]) == 0
+    pd.testing.assert_frame_equal(own, pd.read_parquet(out))
 
 
-@pytest.mark.parametrize("choice", [[], ["--greedy"]])
+def estimates_in(out: Path) -> dict[str, dict[str, Any]]:
+    """Rows of `ope --json` by estimator; each is a result row."""
+    assert all("suite" in row for row in json.loads(out.read_text()))
+    return {row["estimator"]: row for row in read_evaluations(out)}
+
+
+@pytest.mark.parametrize("choice", [["--temperature", "1"], ["--temperature", "0"]])
 def test_ope_writes_the_rows_it_prints(
     catalog: tuple[str, Path], choice: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -167,9 +185,9 @@ def test_ope_writes_the_rows_it_prints(
     arguments = ["ope", run, str(logs), *choice, "--seed", "3", "--json", str(out)]
     assert main(arguments) == 0
     printed = capsys.readouterr().out
-    rows = {row["estimator"]: row for row in json.loads(out.read_text())}
+    rows = estimates_in(out)
     weighted = set(rows) - {"logged", "DM", "FQE"}
-    assert weighted or choice
+    assert weighted or choice == ["--temperature", "0"]
     assert not weighted or {"IPS", "SNIPS", "PDIS", "SNPDIS", "DR", "SNDR"} <= weighted
     log = pd.read_parquet(logs)
     assert rows["logged"]["R_cum"] == pytest.approx(log.is_click.sum() / 300)
@@ -181,7 +199,7 @@ def test_ope_writes_the_rows_it_prints(
         else:
             assert row["R_cum_low"] <= row["R_cum"] <= row["R_cum_high"]
         assert (row["sessions"], row["steps"], row["seed"]) == (300, len(log), 3)
-        assert (row["run"], row["checkpoint"]) == (run, "best")
+        assert (row["run"], row["checkpoint"]) == (Path(run).name, "best")
         assert row["fingerprint"]
         assert row["command"]
     # These are the logs that the run was trained on, and it says so.
@@ -191,14 +209,7 @@ def test_ope_writes_the_rows_it_prints(
     assert rows["logged"]["reliable"] is False
     assert "verdict: Do not rely on this estimate" in printed
     assert main(arguments) == 0
-    assert {row["estimator"]: row for row in json.loads(out.read_text())} == rows
-
-
-class SoftmaxActor(PolicyActor):
-    """Draws items from the policy's probabilities: what `ope` judges, played."""
-
-    def _best(self, scores: Tensor) -> Tensor:
-        return torch.multinomial(scores.softmax(-1), 1)[:, 0]
+    assert estimates_in(out) == rows
 
 
 def test_ope_tells_from_uniform_logs_what_playing_tells(
@@ -208,14 +219,11 @@ def test_ope_tells_from_uniform_logs_what_playing_tells(
     collected = ["--behavior", "random", "--sessions", "3000", "--out", str(tmp_path / "logs")]
     assert main(["collect", "--env", "synthetic-catalog", *collected]) == 0
     out = tmp_path / "rows.json"
-    assert main(["ope", run, str(tmp_path / "logs/sessions.parquet"), "--json", str(out)]) == 0
-    rows = {row["estimator"]: row for row in json.loads(out.read_text())}
-    torch.manual_seed(0)
+    given = ["--temperature", "1", "--json", str(out)]
+    assert main(["ope", run, str(tmp_path / "logs/sessions.parquet"), *given]) == 0
+    rows = estimates_in(out)
     trained = TrainedPolicy.load(Path(run))
-    target = trained.target_return(1.0)
-    size = trained.record["observation_size"]
-    numbers = (trained.item_states, trained.item_ids, trained.user_ids)
-    actor = SoftmaxActor(trained.policy, 512, target, size, *numbers)
+    actor = trained.actor(512, replace(trained.rule, temperature=1.0))
     env = World("synthetic-catalog", None).simulator().make(512, None)
     returns = rollout(env, actor, 2000, seed=0).returns
     truth, error = returns.mean(), returns.std() / 2000**0.5
@@ -223,12 +231,64 @@ def test_ope_tells_from_uniform_logs_what_playing_tells(
     for name in ("IPS", "SNIPS", "PDIS", "DR"):
         row = rows[name]
         assert row["R_cum_low"] - 2 * error < truth < row["R_cum_high"] + 2 * error, name
-    errors = {name: row["R_cum_error"] for name, row in rows.items() if row["R_cum_error"]}
+    errors = {name: row["R_cum_error"] for name, row in rows.items() if row.get("R_cum_error")}
     assert errors["DR"] < errors["PDIS"] < errors["IPS"]
     assert rows["DR"]["overlap"] == pytest.approx(1, abs=0.05)
     # Simulated clocks are coarse: a few users are shown the same item at the same time.
     assert 0 < rows["DR"]["seen_in_training"] < 0.05
     assert rows["DR"]["reliable"]
+
+
+def test_a_model_card_lies_beside_every_run_with_what_was_measured(
+    catalog: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(catalog[0], tmp_path / "run")
+    run, logs, card = str(tmp_path / "run"), str(catalog[1]), tmp_path / "run" / "MODEL_CARD.md"
+    trained = card.read_text()
+    assert "# Model card: ucf" in trained
+    assert "| reward | `is_click` |" in trained
+    world = ["--env", "synthetic-catalog", "--episodes", "20"]
+    assert main(["evaluate", run, *world]) == 0
+    assert main(["ope", run, logs]) == 0
+    assert main(["rank", run, logs, "--k", "5"]) == 0
+    found = card.read_text()
+    assert "### ucfrec evaluate: synthetic-catalog, target return" in found
+    assert re.search(r"### ucfrec ope: DR on sessions\.parquet, softmax, target return", found)
+    assert "- Do not rely on this estimate: " in found
+    assert "### ucfrec rank: sessions.parquet, k 5, checkpoint best" in found
+    assert re.search(r"\| hit_rate_liked \| [\d.]+ \[[\d.]+, [\d.]+\] \|", found)
+    assert str(tmp_path) not in found
+
+
+def test_ope_ranks_targets_and_rules_and_says_which_it_cannot_judge(
+    catalog: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, _ = catalog
+    collected = ["--behavior", "random", "--sessions", "1500", "--out", str(tmp_path / "logs")]
+    assert main(["collect", "--env", "synthetic-catalog", *collected, "--seed", "7"]) == 0
+    out, fresh = tmp_path / "rows.json", str(tmp_path / "logs/sessions.parquet")
+    asked = ["--targets", "q0.5,6", "--temperatures", "0,1", "--json", str(out)]
+    assert main(["ope", run, fresh, *asked]) == 0
+    printed = capsys.readouterr().out
+    rows = read_evaluations(out)
+    names = list(dict.fromkeys(row["candidate"] for row in rows))
+    assert len(names) == 4
+    assert names[-1] == "target return 6, greedy"
+    ranked = {row["candidate"]: row for row in rows if "rank" in row}
+    assert ranked
+    # A policy that always shows one item agrees with hardly any whole random session.
+    assert not any("greedy" in name for name in ranked)
+    assert "not ranked: target return 6, greedy: " in printed
+    first = min(ranked.values(), key=lambda row: row["rank"])
+    assert f"choice: {first['selection']}" in printed
+    assert sum(row["probability_best"] for row in ranked.values()) == pytest.approx(1)
+    for row in ranked.values():
+        assert row["band_low"] < row["band_high"]
+    assert "neither a return nor a quantile" in refused(
+        ["ope", run, fresh, "--targets", "5,much"], capsys
+    )
+    assert "name a run folder" in refused(["ope", fresh], capsys)
+    assert "name a run folder" in refused(["ope", run], capsys)
 
 
 def test_ope_without_propensities_has_only_models_and_without_one_leaves_a_session_out(
@@ -242,12 +302,13 @@ def test_ope_without_propensities_has_only_models_and_without_one_leaves_a_sessi
     log.assign(propensity=log.propensity.where(log.index != 5)).to_parquet(tmp_path / "one.parquet")
     for name in ("without", "one"):
         out = tmp_path / f"{name}.json"
-        assert main(["ope", run, str(tmp_path / f"{name}.parquet"), "--json", str(out)]) == 0
-        rows = json.loads(out.read_text())
+        given = ["--temperature", "1", "--json", str(out)]
+        assert main(["ope", run, str(tmp_path / f"{name}.parquet"), *given]) == 0
+        rows = list(estimates_in(out).values())
         printed = capsys.readouterr().out
         if name == "without":
             assert [row["estimator"] for row in rows] == ["logged", "DM", "FQE"]
-            assert rows[0]["overlap"] is None
+            assert "overlap" not in rows[0]
             assert "no session has all its propensities" in printed
             assert "warning: 2 rows show items" in printed
             assert rows[0]["unknown_item_rows"] == 2
@@ -255,6 +316,24 @@ def test_ope_without_propensities_has_only_models_and_without_one_leaves_a_sessi
             assert {"DR", "SNPDIS"} <= {row["estimator"] for row in rows}
             assert rows[0]["sessions_without_propensity"] == 1
             assert "warning: 1 of 300 sessions have a step without propensity" in printed
+
+
+def test_ope_estimates_propensities_if_asked_and_says_so(
+    catalog: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, logs = catalog
+    log = pd.read_parquet(logs).drop(columns="propensity")
+    log.to_parquet(tmp_path / "without.parquet")
+    arguments = ["ope", run, str(tmp_path / "without.parquet"), "--estimate-propensities"]
+    out = tmp_path / "rows.json"
+    assert main([*arguments, "--reward-range", "0", "1", "--lift", "0.5", "--json", str(out)]) == 0
+    rows = estimates_in(out)
+    printed = capsys.readouterr().out
+    assert {"IPS", "DR", "MIPS"} <= set(rows)
+    assert f"with the propensities of {len(log):,} steps estimated (held-out loss" in printed
+    assert rows["DR"]["declared"].startswith("with the propensities of")
+    assert rows["DR"]["wanted_lift"] == 0.5
+    assert "name the least one first" in refused([*arguments, "--reward-range", "1", "0"], capsys)
 
 
 def test_score_and_ope_refuse_what_they_cannot_use(

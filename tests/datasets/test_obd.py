@@ -1,5 +1,6 @@
 """Open Bandit Dataset: official file names, and two real policies judged by each other's logs."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -27,8 +28,9 @@ MIDNIGHT = 1_574_553_600_000
 KINDS = ["81ce123cbb5bd8ce818f60fb3586bba5", "cef3390ed299c09874189c387777674a"]
 
 
-def official(folder: Path) -> pd.DataFrame:
+def official(folder: Path, campaign: str = "all") -> pd.DataFrame:
     """A small campaign as the release has it: `all.csv` and `item_context.csv`."""
+    folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(0)
     times = MIDNIGHT + np.sort(rng.integers(10**8, size=ROWS))
     log = pd.DataFrame({"timestamp": pd.to_datetime(times, unit="ms", utc=True).astype(str)})
@@ -43,7 +45,7 @@ def official(folder: Path) -> pd.DataFrame:
     context = pd.DataFrame({"item_id": np.arange(ITEMS), "item_feature_0": rng.normal(size=ITEMS)})
     for n in (1, 2, 3):
         context[f"item_feature_{n}"] = rng.choice(KINDS, size=ITEMS)
-    log.to_csv(folder / "all.csv")
+    log.to_csv(folder / f"{campaign}.csv")
     context.to_csv(folder / "item_context.csv")
     return log
 
@@ -51,7 +53,6 @@ def official(folder: Path) -> pd.DataFrame:
 @pytest.mark.parametrize("name", ["", "all.csv"])
 def test_official_files(tmp_path: Path, name: str) -> None:
     source = tmp_path / "all"
-    source.mkdir()
     log = official(source)
     files, mapping = DATASET.resolve([source / name], LogMapping())
     assert files == (source / "all.csv",)
@@ -76,6 +77,53 @@ def test_features_alone_are_refused(tmp_path: Path) -> None:
     official(tmp_path)
     with pytest.raises(InputError, match="has features, not impressions"):
         DATASET.resolve([tmp_path / "item_context.csv"], LogMapping())
+
+
+def test_a_run_of_one_campaign_reads_no_other(tmp_path: Path) -> None:
+    """Both number their items from 0, and mean other items."""
+    for campaign in ("men", "women"):
+        official(tmp_path / "random" / campaign, campaign)
+    men, women = (tmp_path / "random" / name for name in ("men", "women"))
+    files, mapping = DATASET.resolve([men], LogMapping())
+    prepare(files, mapping, tmp_path / "store")
+    names = pd.read_parquet(tmp_path / "store" / "items.parquet").item_id
+    assert list(names) == [f"men/{n}" for n in range(ITEMS)]
+    # The item features are found by the same names.
+    assert EpisodeStore.open(tmp_path / "store").item_states.embeddings.abs().sum() > 0
+    files, mapping = DATASET.resolve([women], LogMapping())
+    with pytest.raises(InputError, match="item is not in the store"):
+        prepare(files, mapping, tmp_path / "judged", like=tmp_path / "store")
+    assert not (tmp_path / "judged").exists()
+
+
+def test_two_campaigns_at_once_are_one_clear_error(tmp_path: Path) -> None:
+    for campaign in ("men", "women"):
+        official(tmp_path / "bts" / campaign, campaign)
+    both = [tmp_path / "bts" / "men", tmp_path / "bts" / "women"]
+    with pytest.raises(InputError, match=r"men and women, .* one campaign at a time"):
+        DATASET.resolve(both, LogMapping())
+
+
+def test_the_campaign_is_in_the_name_of_the_file_or_its_folder(tmp_path: Path) -> None:
+    official(tmp_path / "men", "log")
+    (tmp_path / "elsewhere").mkdir()
+    for name in ("random_women.csv", "mine.csv"):
+        shutil.copy(tmp_path / "men" / "log.csv", tmp_path / "elsewhere" / name)
+    for path, campaign in (("men/log.csv", "men"), ("elsewhere/random_women.csv", "women")):
+        _, mapping = DATASET.resolve([tmp_path / path], LogMapping())
+        assert mapping.columns["item_id"] == f"concat('{campaign}/', item_id)"
+    strange = tmp_path / "elsewhere" / "mine.csv"
+    with pytest.raises(InputError, match="neither the file nor its folder is named after"):
+        DATASET.resolve([strange], LogMapping())
+    _, mapping = DATASET.resolve([strange], LogMapping({"item_id": "item_id + 100"}))
+    assert mapping.columns["item_id"] == "item_id + 100"
+
+
+def test_item_features_are_those_of_the_campaign(tmp_path: Path) -> None:
+    for name in ("random_men.csv", "item_context_women.csv", "item_context_men.csv"):
+        (tmp_path / name).write_text("item_id\n0\n")
+    _, mapping = DATASET.resolve([tmp_path / "random_men.csv"], LogMapping())
+    assert mapping.item_features[0].files == (tmp_path / "item_context_men.csv",)
 
 
 def test_it_is_announced() -> None:

@@ -3,11 +3,13 @@
 import math
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ucfrec.episodes.returns import remaining_return, returns_to_go
+from ucfrec.episodes.returns import ReturnToGo, returns_to_go
+from ucfrec.errors import InputError
 
 eighths = st.integers(-64, 64).map(lambda n: n / 8)
 """Exact in binary, as are their sums."""
@@ -55,17 +57,127 @@ def test_a_long_store_keeps_its_digits() -> None:
     np.testing.assert_allclose(got, suffixes, rtol=2e-7)
 
 
+# The three definitions.
+
+gammas = st.sampled_from([0.25, 0.5, 0.75, 1.0])
+definitions = st.one_of(
+    st.just(ReturnToGo()),
+    gammas.map(lambda gamma: ReturnToGo("discounted", discount=gamma)),
+    st.integers(1, 12).map(lambda steps: ReturnToGo("horizon", horizon=steps)),
+)
+
+
+def slowly(definition: ReturnToGo, rewards: list[float], step: int) -> float:
+    """Ĝ of one step, from the documentation of `ReturnToGo`."""
+    if definition.definition == "session":
+        return sum(rewards[step:])
+    if definition.definition == "horizon":
+        return sum(rewards[step : step + definition.horizon])
+    return math.fsum(
+        definition.discount**ahead * reward for ahead, reward in enumerate(rewards[step:])
+    )
+
+
+@given(definitions, episodes_of_eighths)
+def test_every_definition_equals_brute_force(
+    definition: ReturnToGo, episodes: list[list[float]]
+) -> None:
+    got = definition.of_logs(*flat(episodes))
+    assert got.dtype == np.float32
+    expected = [slowly(definition, e, t) for e in episodes for t in range(len(e))]
+    np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-6)
+
+
+def test_what_the_definitions_have_in_common() -> None:
+    rewards, offsets = flat([[1.0, 0.5, -2.0, 4.0], [3.0]])
+    whole = returns_to_go(rewards, offsets)
+    for same in (ReturnToGo("discounted", discount=1.0), ReturnToGo("horizon", horizon=4)):
+        np.testing.assert_array_equal(same.of_logs(rewards, offsets), whole)
+    now = ReturnToGo("horizon", horizon=1).of_logs(rewards, offsets)
+    np.testing.assert_array_equal(now, rewards)
+    assert ReturnToGo("horizon", horizon=2).of_logs(rewards, offsets).tolist() == [
+        *(1.5, -1.5, 2.0, 4.0, 3.0)
+    ]
+    assert ReturnToGo("discounted", discount=0.5).of_logs(rewards, offsets).tolist() == [
+        *(1.25, 0.5, 0.0, 4.0, 3.0)
+    ]
+
+
+def test_no_episodes_have_no_returns() -> None:
+    for definition in (ReturnToGo(), ReturnToGo("discounted"), ReturnToGo("horizon")):
+        assert definition.of_logs(np.zeros(0), np.zeros(1, dtype=np.int64)).shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"definition": "tomorrow"}, "'tomorrow'; choose from session, discounted, horizon"),
+        ({"discount": 0.0}, "discount 0.0"),
+        ({"discount": 1.5}, "discount 1.5"),
+        ({"discount": float("nan")}, "discount nan"),
+        ({"horizon": 0}, "horizon 0"),
+    ],
+)
+def test_wrong_definitions_are_refused(wrong: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        ReturnToGo(**wrong)  # type: ignore[arg-type]
+
+
+# Acting.
+
+
 @given(episodes_of_eighths)
 def test_acting_with_the_logged_return_as_target_gives_the_training_returns_to_go(
     episodes: list[list[float]],
 ) -> None:
     """With an episode's return as target return and its rewards, acting repeats its values."""
-    trained = returns_to_go(*flat(episodes)).tolist()
+    trained, returns = returns_to_go(*flat(episodes)).tolist(), ReturnToGo()
     seen: list[float] = []
     for episode in episodes:
-        target = torch.tensor([sum(episode)], dtype=torch.float64)
         collected = torch.zeros(1).double()
         for reward in episode:
-            seen += remaining_return(target, collected).float().tolist()
+            seen += returns.asked(sum(episode), collected).float().tolist()
             collected += reward
     assert seen == trained
+
+
+def test_only_a_target_of_a_session_is_lowered_by_rewards() -> None:
+    collected = torch.tensor([0.0, 2.0, -1.0]).double()
+    assert ReturnToGo().per_session
+    assert ReturnToGo().asked(5.0, collected).tolist() == [5, 3, 6]
+    for definition in (ReturnToGo("discounted"), ReturnToGo("horizon", horizon=3)):
+        assert not definition.per_session
+        assert definition.asked(5.0, collected).tolist() == [5, 5, 5]
+
+
+@given(definitions, st.lists(eighths, min_size=1, max_size=12), st.integers(1, 12))
+def test_the_past_of_a_window_is_as_in_training(
+    definition: ReturnToGo, rewards: list[float], length: int
+) -> None:
+    """If the future earns what is asked for, acting sees what training would have shown.
+
+    Of a horizon, what is asked for is taken to come evenly: the rewards from the last step on are
+    equal here.
+    """
+    last = len(rewards) - 1
+    if definition.definition == "horizon":
+        rewards = rewards[:-1] + [rewards[-1]] * definition.horizon
+    shown = definition.of_logs(*flat([rewards]))[: last + 1]
+    window = torch.zeros(1, length, dtype=torch.float32)
+    kept = min(length, last + 1)
+    window[0, length - kept :] = torch.tensor(rewards[last + 1 - kept : last + 1])
+    window[0, -1] = math.nan  # the reward of the step to decide is not known
+    asked = torch.tensor([slowly(definition, rewards, last)]).double()
+    got = definition.before(asked, window)
+    assert got.dtype == torch.float32
+    np.testing.assert_allclose(got[0, length - kept :], shown[last + 1 - kept :], atol=1e-5)
+
+
+@given(definitions, st.integers(0, 99))
+def test_windows_are_counted_one_by_one(definition: ReturnToGo, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    rewards = torch.randint(-8, 9, (4, 6), generator=generator) / 8
+    asked = torch.randint(-80, 80, (4,), generator=generator).double() / 8
+    apart = [definition.before(asked[b : b + 1], rewards[b : b + 1]) for b in range(4)]
+    torch.testing.assert_close(definition.before(asked, rewards), torch.cat(apart))
+    assert (definition.before(asked, rewards)[:, -1] == asked).all()

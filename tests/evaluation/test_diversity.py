@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ucfrec.acting.rollout import Step, rollout
+from ucfrec.acting.uniform import Uniform
 from ucfrec.evaluation.diversity import (
     Recommended,
     coverage,
@@ -18,7 +19,6 @@ from ucfrec.evaluation.diversity import (
     novelty,
     tag_jaccard,
 )
-from ucfrec_simulators.behaviors import Uniform
 from ucfrec_simulators.synthetic_catalog import SyntheticCatalog
 
 N, TAGS, USERS = 12, 5, 9

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from ucfrec.acting.rollout import rollout
+from ucfrec.acting.uniform import Uniform
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.diversity import Recommended
@@ -20,7 +21,6 @@ from ucfrec.evaluation.world import World
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run, training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec_simulators.behaviors import Uniform
 from ucfrec_simulators.kuai.environment import EXITS, KuaiEnv
 
 TAGS = [(0,), (0, 1), (2,), (), (1, 2), (3,)]

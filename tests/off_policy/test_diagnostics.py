@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from tests.support.logged_steps import random_steps
-from ucfrec.off_policy.diagnostics import diagnose, identification_bounds, pareto_tail
+from ucfrec.off_policy.diagnostics import (
+    diagnose,
+    identification_bounds,
+    implied_items,
+    pareto_tail,
+)
 
 
 @pytest.mark.parametrize("shape", [0.2, 0.5, 0.9])
@@ -45,3 +50,27 @@ def test_bounds_are_the_estimate_where_nothing_lacks() -> None:
     low, high = identification_bounds(half, (0, 1))
     # Half of the first choices lack, three quarters of the second, seven eighths of the third.
     assert high - low == pytest.approx(0.5 + 0.75 + 0.875)
+
+
+@pytest.mark.parametrize(("factor", "items"), [(1.0, 20), (0.5, 40), (2.0, 10)])
+def test_propensities_imply_how_many_items_there_are(factor: float, items: float) -> None:
+    """Whatever the shares of the 20 items are; fewer may be candidates, more cannot."""
+    rng = np.random.default_rng(0)
+    shares = rng.dirichlet(np.full(20, 5.0))
+    item = rng.choice(20, p=shares, size=20_000)
+    steps = random_steps([1] * 20_000)
+    steps = replace(steps, propensity=np.minimum(shares[item] * factor, 1))
+    found = implied_items(steps, np.ones(20_000, dtype=bool), 20)
+    assert found is not None
+    assert found.mean * 20 == pytest.approx(items, rel=0.05)
+    assert found.passed is (factor >= 1)
+    half = implied_items(steps, item < 10, 10)
+    assert half is not None
+    assert half.mean == pytest.approx(items / 20, rel=0.05)
+
+
+def test_few_users_and_no_propensities_imply_nothing() -> None:
+    steps = random_steps([1] * 50)
+    listed = np.ones(50, dtype=bool)
+    assert implied_items(replace(steps, user=np.arange(50) % 20), listed, 5) is None
+    assert implied_items(replace(steps, propensity=np.full(50, np.nan)), listed, 5) is None

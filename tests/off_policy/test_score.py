@@ -8,17 +8,16 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from torch import Tensor
 
-from ucfrec.acting.policy_actor import PolicyActor
-from ucfrec.episodes.windows import Windows
+from tests.support.replay import replayed
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.errors import InputError
 from ucfrec.logs import LogMapping
 from ucfrec.off_policy.evaluate import logged_steps, step_features
 from ucfrec.off_policy.score import LoggedSessions, logged_sessions, score, scored_steps
 from ucfrec.runs.trained_policy import TrainedPolicy
 
-TARGET = 7.5
+RULE = DecisionRule(7.5, temperature=1.0)
 
 
 @pytest.fixture
@@ -29,23 +28,19 @@ def logged(folder: Path, trained: TrainedPolicy) -> Iterator[LoggedSessions]:
         yield logged
 
 
-class Replay(PolicyActor):
-    """Plays what it is told, and keeps what it would have thought of every item."""
-
-    def __init__(self, trained: TrainedPolicy, items: list[int]) -> None:
-        observed = trained.record["observation_size"]
-        super().__init__(trained.policy, 1, TARGET, observed, trained.item_states)
-        self.items, self.thought = iter(items), list[Tensor]()
-
-    def _best(self, scores: Tensor) -> Tensor:
-        self.thought.append(scores[0].softmax(-1))
-        return torch.tensor([next(self.items)])
+RULES = {
+    "drawn": RULE,
+    "best": DecisionRule(7.5),
+    "floor": DecisionRule(1.5, floor=1.0, temperature=0.5),
+    "unseen": DecisionRule(7.5, temperature=2.0, top_k=4, exclude_seen=True),
+}
 
 
+@pytest.mark.parametrize("rule", RULES)
 def test_scores_are_those_of_an_actor_that_replays_the_session(
-    folder: Path, trained: TrainedPolicy, logged: LoggedSessions
+    trained: TrainedPolicy, logged: LoggedSessions, rule: str
 ) -> None:
-    frame = pd.concat(score(trained, logged, TARGET))
+    frame = pd.concat(score(trained, logged, RULES[rule]))
     assert trained.item_ids is not None
     numbers = {item: number for number, item in enumerate(trained.item_ids)}
     assert frame.session.nunique() > 300
@@ -53,22 +48,18 @@ def test_scores_are_those_of_an_actor_that_replays_the_session(
     for session in longest:
         rows = frame[frame.session == session]
         items = [numbers[item] for item in rows.item_id]
-        actor = Replay(trained, items)
-        actor.begin(np.array([0]))
-        for item, reward in zip(items, rows.reward, strict=True):
-            actor.act(np.zeros((1, 0), dtype=np.float32), np.array([True]))
-            actor.observe(np.array([item]), np.array([reward], dtype=np.float32))
-        thought = torch.stack(actor.thought).numpy()
+        thought = replayed(trained, RULES[rule], items, list(rows.reward)).numpy()[:-1]
         chosen = thought[np.arange(len(items)), items]
         np.testing.assert_allclose(rows.probability, chosen, rtol=1e-4)
-        np.testing.assert_array_equal(rows["rank"], 1 + (thought > chosen[:, None]).sum(1))
         np.testing.assert_array_equal(rows.greedy_item_id, trained.item_ids[thought.argmax(1)])
+        if rule == "drawn":
+            np.testing.assert_array_equal(rows["rank"], 1 + (thought > chosen[:, None]).sum(1))
 
 
 def test_rows_are_those_of_the_log_in_its_sessions(
     folder: Path, trained: TrainedPolicy, logged: LoggedSessions
 ) -> None:
-    frame = pd.concat(score(trained, logged, TARGET), ignore_index=True)
+    frame = pd.concat(score(trained, logged, RULE), ignore_index=True)
     log = pd.read_parquet(folder / "rest.parquet").sort_values(["user_id", "timestamp"])
     for name in ("user_id", "item_id", "timestamp", "reward"):
         np.testing.assert_array_equal(frame[name], log[name])
@@ -83,7 +74,7 @@ def test_probabilities_over_all_items_sum_to_one(
     trained: TrainedPolicy, logged: LoggedSessions
 ) -> None:
     seen = 0
-    for batch in scored_steps(trained, logged.store, TARGET):
+    for batch in scored_steps(trained, logged.store, RULE):
         total = batch.log_probabilities.double().exp().sum(1)
         np.testing.assert_allclose(total, 1, atol=1e-5)
         seen += len(total)
@@ -107,7 +98,7 @@ def test_nothing_of_the_step_or_after_it_is_looked_at(
     for file in (folder / "rest.parquet", tmp_path / "changed.parquet"):
         with logged_sessions(folder / "run", trained, [file], LogMapping()) as logged:
             _, steps = logged.store.all_steps()
-            batches = scored_steps(trained, logged.store, TARGET)
+            batches = scored_steps(trained, logged.store, RULE)
             thought.append(torch.cat([b.log_probabilities for b in batches]).numpy()[steps <= 1])
     np.testing.assert_allclose(*thought, rtol=1e-4, atol=1e-5)
 
@@ -116,8 +107,9 @@ def test_nothing_of_the_step_or_after_it_is_looked_at(
 def test_models_are_asked_about_what_the_policy_would_show(
     trained: TrainedPolicy, logged: LoggedSessions, greedy: bool
 ) -> None:
-    frame = pd.concat(score(trained, logged, TARGET))
-    steps = logged_steps(trained, logged, TARGET, greedy, seed=0)
+    rule = replace(RULE, temperature=0.0) if greedy else RULE
+    frame = pd.concat(score(trained, logged, RULE))
+    steps = logged_steps(trained, logged, rule, seed=0).steps
     certain = (frame.greedy_item_id == frame.item_id).astype(float)
     np.testing.assert_allclose(steps.target, certain if greedy else frame.probability, rtol=1e-5)
     np.testing.assert_array_equal(steps.session, frame.session)
@@ -132,13 +124,14 @@ def test_models_are_asked_about_what_the_policy_would_show(
 def test_features_at_the_policy_are_the_mean_over_its_items(
     trained: TrainedPolicy, logged: LoggedSessions
 ) -> None:
-    batch = next(scored_steps(trained, logged.store, TARGET))
-    _, _, at_policy = step_features(trained, batch, greedy=False)
+    batch = next(scored_steps(trained, logged.store, RULE))
+    at_policy = step_features(trained, batch)[2].features()[1]
     probabilities = batch.log_probabilities.exp().numpy()
     mean = np.zeros(at_policy.shape)
     for item in range(probabilities.shape[1]):
         shown = replace(batch.windows, actions=torch.full_like(batch.windows.actions, item))
-        target, of_item, _ = step_features(trained, replace(batch, windows=shown), greedy=False)
+        target, _, seen = step_features(trained, replace(batch, windows=shown))
+        of_item, _ = seen.features()
         np.testing.assert_allclose(target, probabilities[:, item], rtol=1e-6)
         mean += probabilities[:, item, None] * of_item
     np.testing.assert_allclose(at_policy, mean, rtol=1e-4, atol=1e-5)
@@ -152,7 +145,7 @@ def test_items_the_run_does_not_know_are_counted(folder: Path, tmp_path: Path) -
     files = [tmp_path / "log.parquet"]
     with logged_sessions(folder / "run", trained, files, LogMapping()) as logged:
         assert logged.report["dropped"]["unknown_item"] == 4
-        assert sum(map(len, score(trained, logged, TARGET))) == len(log)
+        assert sum(map(len, score(trained, logged, RULE))) == len(log)
     strange.to_parquet(tmp_path / "log.parquet")
     with (
         pytest.raises(InputError, match=r"no row is left \(4 rows: item is not in the store"),
@@ -169,13 +162,13 @@ def test_unknown_items_may_stay_with_no_probability(
     log = pd.read_parquet(folder / "rest.parquet")
     new = np.arange(len(log)) % 3 == 0
     log.assign(item_id=np.where(new, 999, log.item_id)).to_parquet(tmp_path / "log.parquet")
-    before = logged_steps(trained, logged, TARGET, greedy=False, seed=0)
+    before = logged_steps(trained, logged, RULE, seed=0).steps
     files = [tmp_path / "log.parquet"]
     with logged_sessions(folder / "run", trained, files, LogMapping(), keep_unknown=True) as kept:
         unknown = kept.store.step_values("item", *kept.store.all_steps()) < 0
         assert kept.unknown_items == unknown.sum() == new.sum()
         assert kept.report["dropped"]["unknown_item"] == 0
-        steps = logged_steps(trained, kept, TARGET, greedy=False, seed=0)
+        steps = logged_steps(trained, kept, RULE, seed=0).steps
     assert (steps.target[unknown] == 0).all()
     assert (steps.weights[unknown] == 0).all()
     untouched = np.logical_and.accumulate(~unknown)
@@ -213,13 +206,3 @@ def test_ids_may_be_text_where_the_run_has_integers(
         assert len(there) == len(log)
         assert sorted(there) == sorted(logged.store.step_values("item", *logged.store.all_steps()))
         assert other.users[-1] == "somebody"
-
-
-def test_log_probabilities_ask_for_more(trained: TrainedPolicy, logged: LoggedSessions) -> None:
-    """Two ways of asking for the same: in the returns-to-go, and beyond them."""
-    windows = logged.store.windows(np.arange(5), np.zeros(5, dtype=np.int64), 4)
-    asked = Windows(**(vars(windows) | {"returns_to_go": windows.mask * 3.0}))
-    more = 3.0 - windows.returns_to_go[:, -1:]
-    torch.testing.assert_close(
-        trained.log_probabilities(asked, 0.0), trained.log_probabilities(windows, more)
-    )

@@ -1,9 +1,12 @@
 """Shrunk weights against the Open Bandit Pipeline, and what tuning them must do."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tests.support.logged_steps import random_steps, reference
+from ucfrec.off_policy import LoggedSteps, Modelled, estimate
 from ucfrec.off_policy.shrinkage import DR_KINDS, IPS_KINDS, mean_squared_error, shrunk, tune
 
 STRENGTHS = {
@@ -66,3 +69,24 @@ def test_shrinking_is_tuned_to_err_less_where_weights_are_heavy() -> None:
 def test_doubly_robust_kinds_are_for_single_steps() -> None:
     assert set(shrunk(random_steps([2, 1, 3]))) == set(IPS_KINDS)
     assert set(shrunk(random_steps([1, 1, 1]))) == set(IPS_KINDS) | set(DR_KINDS)
+
+
+def test_only_unshrunk_weights_have_an_interval() -> None:
+    """SWITCH-DR that switches everything off is DM, whose sampling error says nothing."""
+    rng = np.random.default_rng(0)
+    weights = rng.lognormal(-1.125, 1.5, 500)
+    earned = (rng.random(500) < 0.3).astype(float)
+    steps = LoggedSteps(
+        np.arange(500),
+        earned,
+        np.full(500, 1e-3),
+        np.minimum(weights * 1e-3, 1),
+        Modelled(*np.full((3, 500), 0.3)),
+    )
+    found = estimate(steps, 0)
+    for name in (*IPS_KINDS, *DR_KINDS):
+        kept = shrunk(steps)[name][2]
+        assert (found[name].low is None) is bool((kept != steps.session_weights).any()), name
+    assert found["SWITCH-DR"].low is None
+    near = estimate(replace(steps, target=steps.propensity * 0.999), 0)
+    assert near["clipped IPS"].low is not None

@@ -7,6 +7,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.logs import LogMapping
 from ucfrec.off_policy.evaluate import evaluate_off_policy
 from ucfrec.off_policy.score import logged_sessions
@@ -31,9 +32,8 @@ def test_the_share_of_rows_seen_in_training(
 def test_judging_by_the_training_log_is_refused(folder: Path, trained: TrainedPolicy) -> None:
     log = folder / "train.parquet"
     with logged_sessions(folder / "run", trained, [log], LogMapping(), keep_unknown=True) as logged:
-        judged = evaluate_off_policy(
-            folder / "run", trained, logged, target_return=5.0, greedy=False, seed=0
-        )
+        rule = DecisionRule(5.0, temperature=1.0)
+        judged = evaluate_off_policy(folder / "run", trained, logged, rule=rule, seed=0)
     assert not judged.verdict.reliable
     assert "90% of the rows were seen in training" in judged.verdict.reasons[0]
     assert judged.rows[0]["seen_in_training"] == pytest.approx(0.9, abs=0.01)

@@ -1,6 +1,7 @@
 """Heads: ranges, likelihoods, and what sampling the softmax may and may not change."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,6 +10,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn import functional as F
 
+from ucfrec.episodes.exposure import Exposed, ExposureTerm, Likeness
+from ucfrec.episodes.states import ItemStates
+from ucfrec.policies import heads
 from ucfrec.policies.heads import ItemHead, VectorHead, head_from
 
 N, DIM = 60, 8
@@ -170,6 +174,120 @@ def test_learning_from_samples_finds_the_true_shares() -> None:
     torch.testing.assert_close(learnt, shown / shown.sum(), rtol=0.15, atol=0.01)
 
 
+# Items, with what was shown before.
+
+LAGS = 4
+
+
+def exposed_head(tags: bool) -> tuple[ItemHead, Tensor]:
+    """The head of `item_head` with an exposure term that matters."""
+    plain, counts = item_head()
+    generator = torch.Generator().manual_seed(5)
+    states = ItemStates(plain.embeddings, torch.zeros(0, 0), 0.0, 1.0)
+    if tags:
+        states = replace(states, tags=torch.randint(-1, 9, (N, 2), generator=generator))
+    head = ItemHead(DIM, N, 5, ExposureTerm(LAGS, 3, Likeness.of(states)))
+    head.load_state_dict(plain.state_dict(), strict=False)
+    assert head.exposure is not None
+    head.exposure.start_from(states, torch.linspace(0, 2, 50))
+    for parameter in head.exposure.parameters():
+        parameter.data = 0.1 * torch.randn(parameter.shape, generator=generator)
+    return head, counts
+
+
+def shown_before(m: int) -> Exposed:
+    generator = torch.Generator().manual_seed(9)
+    items = torch.randint(-1, N // 2, (m, LAGS), generator=generator)
+    return Exposed(items, 2 * torch.rand(m, generator=generator))
+
+
+@pytest.mark.parametrize("tags", [True, False])
+def test_exposure_is_added_to_the_logits(tags: bool) -> None:
+    head, _ = exposed_head(tags)
+    features, actions = steps(head, 9)
+    shown = shown_before(9)
+    assert head.exposure is not None
+    logits, plain = head.predict(features, shown), head.predict(features)
+    torch.testing.assert_close(logits, plain + head.exposure.to_all(shown))
+    assert (logits - plain).abs().max() > 0.5
+    losses = head.losses(features, actions, shown)
+    expected = -logits.log_softmax(-1)[torch.arange(9), actions]
+    torch.testing.assert_close(losses, expected)
+    torch.testing.assert_close(head.loss(features, actions, shown), losses.mean())
+
+
+@pytest.mark.parametrize("tags", [True, False])
+def test_sampling_the_softmax_sees_the_same_exposure(tags: bool) -> None:
+    head, _ = exposed_head(tags)
+    features, actions = steps(head, 200)
+    shown = shown_before(200)
+    full = head.losses(features, actions, shown).detach()
+    without = head.losses(features, actions).detach()
+    torch.manual_seed(0)
+    sampled = torch.stack(
+        [
+            head.sampled_loss(features, actions, 20_000, shown, reduction="none").detach()
+            for _ in range(20)
+        ]
+    ).mean(0)
+    assert float(sampled.mean()) == pytest.approx(float(full.mean()), rel=0.01)
+    assert float((sampled - full).abs().max()) < 0.1 * float((without - full).abs().max())
+
+
+def test_exposure_learns_by_sampling_what_it_learns_without() -> None:
+    head, _ = exposed_head(True)
+    features, actions = steps(head, 200)
+    shown = shown_before(200)
+    gradients = []
+    torch.manual_seed(0)
+    for loss in (
+        head.loss(features, actions, shown),
+        torch.stack([head.sampled_loss(features, actions, 5000, shown) for _ in range(10)]).mean(),
+    ):
+        head.zero_grad()
+        loss.backward()
+        assert head.exposure is not None
+        parts = [parameter.grad for parameter in head.exposure.parameters()]
+        gradients.append(torch.cat([part.flatten().clone() for part in parts if part is not None]))
+    assert gradients[0].norm() > 0
+    assert F.cosine_similarity(gradients[0], gradients[1], dim=0) > 0.98
+
+
+def test_large_catalogues_are_sampled(monkeypatch: pytest.MonkeyPatch) -> None:
+    head, _ = exposed_head(True)
+    features, actions = steps(head, 50)
+    shown = shown_before(50)
+    full = head.loss(features, actions, shown)
+    monkeypatch.setattr(heads, "SAMPLED_SOFTMAX_ABOVE", N - 1)
+    torch.manual_seed(0)
+    sampled = head.loss(features, actions, shown)
+    assert not torch.equal(full, sampled)
+    assert float(sampled.detach()) == pytest.approx(float(full.detach()), rel=0.05)
+    assert head.losses(features, actions, shown).shape == (50,)
+
+
+def test_losses_of_vectors_have_the_loss_as_their_mean() -> None:
+    torch.manual_seed(0)
+    head = VectorHead(DIM, 2)
+    head.scale.copy_(torch.tensor([4.0, 0.5]))
+    features, actions = torch.randn(7, DIM), torch.randn(7, 2)
+    losses = head.losses(features, actions)
+    assert losses.shape == (7,)
+    torch.testing.assert_close(losses.mean(), head.loss(features, actions))
+    torch.testing.assert_close(losses[2], head.loss(features[2:3], actions[2:3]))
+
+
 def test_a_store_of_items_or_of_vectors_gets_its_head() -> None:
     assert isinstance(head_from({"items": 7, "action": 3}, DIM), ItemHead)
     assert isinstance(head_from({"items": 0, "action": 3}, DIM), VectorHead)
+
+
+def test_a_head_has_an_exposure_term_if_it_looks_back() -> None:
+    sizes = {"items": 7, "action": 3, "tags": 2}
+    head = head_from(sizes, DIM, 5)
+    assert isinstance(head, ItemHead)
+    assert head.exposure is not None
+    assert (head.exposure.lags, head.exposure.likeness.tags.shape) == (5, (7, 2))
+    plain = head_from(sizes, DIM, 0)
+    assert isinstance(plain, ItemHead)
+    assert plain.exposure is None

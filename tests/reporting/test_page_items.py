@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -116,14 +117,17 @@ def test_samples_are_what_the_policy_shows(folder: Path, tmp_path: Path) -> None
     trained, held_out = TrainedPolicy.load(run), EpisodeStore.open(folder / "store")
     held_out = held_out.split("validation")
     first = held_out.windows(np.array([0]), held_out.lengths[:1] - 1, 5)
-    more = samples["target_return"] - float(held_out.returns[0])
-    best = trained.log_probabilities(first, more)[0].topk(5).indices
+    target = max(record_of(run)["return_quantiles"].values())
+    assert samples["rule"] == f"target {target:g}, argmax" == str(trained.rule)
+    more = target - float(held_out.returns[0])
+    asked = replace(first, returns_to_go=first.returns_to_go + more * first.mask)
+    with torch.no_grad():
+        best = trained.policy.act(asked)[0].topk(5).indices
     session = samples["sessions"][0]
     assert session["recommended"] == best.tolist()
     items = held_out.step_values("item", *held_out.all_steps())[: held_out.lengths[0]]
     assert session["history"] == items[:-1][-5:].tolist()
     assert session["logged"] == items[-1]
-    assert samples["target_return"] == max(record_of(run)["return_quantiles"].values())
     table = page_of(tmp_path / "report.html", run).tables["Held-out session 1"]
     lines = [name for name in table if name.startswith("recommended 1")]
     assert table[lines[0]]["item_id"] == f"item {best[0]}"

@@ -11,6 +11,7 @@ from gymnasium.vector import VectorEnv
 
 from tests.simulators.kuai.test_kuairand import QUICK, planted_store
 from ucfrec import schema
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import IntArray, rollout
 from ucfrec.commands.cli import main
 from ucfrec.episodes.distractor import reward_bit
@@ -154,7 +155,7 @@ def test_a_policy_is_shown_the_distractor_where_it_was_trained_on_it(
     folder = kuairand_folder / "world"
     for rate in (0.0, 1.0):
         world = DistractorWorld(name, folder, rate)
-        assert evaluate_policy(world, trained, "bc", 20, 0, 1.0)["episodes"] == 20
+        assert evaluate_policy(world, trained, "bc", 20, 0, DecisionRule(1.0))["episodes"] == 20
         env = world.simulator().make(8, folder)
         ids = np.arange(len(trained.item_ids)) if trained.item_ids is not None else None
         steps_played, states_shown = _play_and_watch(env, trained, ids)
@@ -166,7 +167,7 @@ def _play_and_watch(
     env: VectorEnv[Any, Any, Any], trained: TrainedPolicy, ids: IntArray | None
 ) -> tuple[int, torch.Tensor]:
     """Steps played and the states (M, S) that the policy was given in them."""
-    actor = trained.actor(env.num_envs, 1.0, ids)
+    actor = trained.actor(env.num_envs, DecisionRule(1.0), ids)
     shown: list[torch.Tensor] = []
     played = rollout(
         env, actor, 16, 0, on_step=lambda step: shown.append(actor._states[step.rows, -1].clone())

@@ -1,4 +1,4 @@
-"""A trained policy as an actor: it sees the last K steps and the remaining target return."""
+"""A trained policy as an actor: it sees the last K steps, and decides by its rule."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,37 +8,35 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from ucfrec.acting.decision import Decider
 from ucfrec.acting.rollout import FORBIDDEN, USER_IDS, BoolArray, FloatArray, IntArray
-from ucfrec.episodes.returns import remaining_return
 from ucfrec.episodes.states import ItemStates, SessionStates
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
-from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
 
 
 class PolicyActor:
     """Plays N episodes at once with one batched forward pass per step (an `Actor` of `rollout`).
 
-    Vector actions are played as predicted. Of items, the most probable one that the environment
-    has and allows is played. Users who are in the training logs keep their logged features.
+    Vector actions are played as predicted. Items are chosen by the decision rule among those that
+    the environment has and allows. Users who are in the training logs keep their logged features.
     """
 
     def __init__(
         self,
-        policy: SequencePolicy,
+        decider: Decider,
         episodes: int,
-        target_return: float,
         observation_size: int,
         item_states: ItemStates | None = None,
         item_ids: IntArray | None = None,
         user_ids: npt.NDArray[Any] | None = None,
+        seed: int = 0,
     ) -> None:
         """
         Args:
-            policy: in evaluation mode.
+            decider: the policy and its decision rule.
             episodes: N, number of episodes played in parallel.
-            target_return: target return of every episode, in units of the training reward.
             observation_size: leading entries of the environment's observation that the logs
                 contain; 0 ignores the observation.
             item_states: builds states from items; None if the observation is the state.
@@ -46,23 +44,29 @@ class PolicyActor:
                 that it lacks; None for vector actions.
             user_ids: (n_users,) identifiers of the store's users, sorted; None or text if they are
                 not the environment's users.
+            seed: of the draws of a rule with a temperature.
         """
+        policy = decider.policy
         n, k = episodes, policy.config.context
-        self._policy, self._target = policy, float(target_return)
+        self._decider, self._policy = decider, policy
+        self._generator = torch.Generator().manual_seed(seed)
         self._observation_size, self._item_ids = observation_size, item_ids
-        featured = item_states is not None and item_states.user_features.shape[1] > 0
-        known = featured and user_ids is not None and user_ids.dtype.kind in "iu"
+        kept = item_states is not None and len(item_states.user_features) > 0
+        known = kept and user_ids is not None and user_ids.dtype.kind in "iu"
         self._user_ids = user_ids if known else None
         self._absent = None if item_ids is None else torch.from_numpy(item_ids < 0)
         self._forbidden: Tensor | None = None
         self._sessions = None if item_states is None else SessionStates(item_states, n)
+        self._shown: Tensor | None = None
+        if isinstance(policy.head, ItemHead) and decider.rule.exclude_seen:
+            self._shown = torch.zeros(n, len(policy.head.bias), dtype=torch.bool)
         self._actions = (
             torch.zeros(n, k, dtype=torch.int64)
             if isinstance(policy.head, ItemHead)
             else torch.zeros(n, k, len(policy.head.scale))
         )
         self._states = torch.zeros(n, k, len(policy.state_mean))
-        self._returns_to_go, self._rewards = torch.zeros(2, n, k)
+        self._rewards = torch.zeros(n, k)
         self._mask = torch.zeros(n, k, dtype=torch.bool)
         self._steps = torch.zeros(n, dtype=torch.int64)
         self._reward_sums = torch.zeros(n, dtype=torch.float64)
@@ -74,6 +78,8 @@ class PolicyActor:
         self._reward_sums[rows] = 0.0
         if self._sessions is not None:
             self._sessions.begin(rows)
+        if self._shown is not None:
+            self._shown[rows] = False
 
     def inform(self, info: Mapping[str, Any]) -> None:
         """Record the users of the next step (`USER_IDS`) and its forbidden items (`FORBIDDEN`).
@@ -89,38 +95,54 @@ class PolicyActor:
         self._forbidden = None if forbidden is None else self._in_store(forbidden)
 
     @torch.no_grad()
-    def act(self, observations: FloatArray, live: BoolArray) -> tuple[npt.NDArray[Any], None]:
-        """Choose the actions of the live rows; the other rows are scored as zeros.
+    def act(
+        self, observations: FloatArray, live: BoolArray
+    ) -> tuple[npt.NDArray[Any], FloatArray | None]:
+        """Choose the actions of the live rows; other rows play the first item that is allowed.
 
         Args:
             observations: (N, O) with O at least `observation_size`.
             live: (N,) true where the action is used.
 
         Returns:
-            (N, A) vectors or (N,) indices of the environment's items; and None, because the
-            propensities are unknown.
+            (N, A) vectors and None; or (N,) indices of the environment's items and the
+            probabilities (N,) with which they were chosen, 1 in rows that are not live.
+
+        Raises:
+            InputError: every item is forbidden in some live row.
         """
         observed = torch.as_tensor(observations, dtype=torch.float32)[:, : self._observation_size]
         states = observed if self._sessions is None else self._sessions.current(observed)
-        target = torch.full_like(self._reward_sums, self._target)
         self._states = _appended(self._states, states)
-        self._returns_to_go = _appended(
-            self._returns_to_go, remaining_return(target, self._reward_sums).float()
-        )
         self._mask = _appended(self._mask, torch.ones_like(self._mask[:, 0]))
         self._actions = _appended(self._actions, torch.zeros_like(self._actions[:, 0]))
         self._rewards = _appended(self._rewards, torch.zeros_like(self._rewards[:, 0]))
-
         rows = torch.from_numpy(np.flatnonzero(live))
-        device = self._policy.state_mean.device
-        predicted = self._policy.act(self._windows(rows).to(device)).cpu()
+        if isinstance(self._policy.head, ItemHead):
+            return self._items(rows)
+        predicted = self._decider.act(self._windows(rows), self._reward_sums[rows])
+        self._actions[rows, -1] = predicted
+        self._actions[torch.from_numpy(~live), -1] = 0.0
+        return self._actions[:, -1].numpy(), None
+
+    def _items(self, rows: Tensor) -> tuple[npt.NDArray[Any], FloatArray]:
+        """The environment's items (N,) and their probabilities (N,); live are the `rows`."""
+        forbidden = self._left_out()
+        chances = torch.ones(len(self._mask))
         # The environment steps rows that are not live too, so they also need an allowed action.
-        outputs = torch.zeros(len(live), predicted.shape[1])
-        outputs[rows] = predicted
-        actions = self._best(outputs) if isinstance(self._policy.head, ItemHead) else outputs
+        allowed = None if forbidden is None else (~forbidden).int().argmax(1)
+        actions = torch.zeros_like(self._actions[:, -1]) if allowed is None else allowed
+        users = None if self._sessions is None else self._sessions.users[rows]
+        of_rows = None if forbidden is None else forbidden[rows]
+        windows, sums = self._windows(rows), self._reward_sums[rows]
+        scores = self._decider.scores(windows, sums, of_rows, users)
+        actions[rows], chances[rows] = self._decider.rule.choose(scores, self._generator)
         self._actions[:, -1] = actions
+        if self._shown is not None:
+            self._shown[rows, actions[rows]] = True
         played = actions.numpy()
-        return (played if self._item_ids is None else self._item_ids[played]), None
+        indices = played if self._item_ids is None else self._item_ids[played]
+        return indices, chances.numpy().astype(np.float32)
 
     def observe(self, actions: npt.NDArray[Any], rewards: FloatArray) -> None:
         """Subtract the rewards (N,) from the returns-to-go and advance by one step.
@@ -134,15 +156,17 @@ class PolicyActor:
         self._rewards[:, -1] = latest
         self._steps += 1
 
-    def _best(self, scores: Tensor) -> Tensor:
-        """Allowed items (N,) with the highest of the scores (N, n_items)."""
-        if self._absent is not None:
-            scores[:, self._absent] = -torch.inf
+    def _left_out(self) -> Tensor | None:
+        """(N, n_items) items that the environment lacks or forbids, or that were shown; None for
+        none."""
+        n, n_items = len(self._mask), len(self._policy.head.bias)  # type: ignore[arg-type]
+        parts = [] if self._absent is None else [self._absent.expand(n, n_items)]
+        parts += [] if self._shown is None else [self._shown]
         if self._forbidden is not None:
             # The extra column n_items absorbs forbidden items that the store lacks.
-            scores = torch.cat([scores, torch.zeros(len(scores), 1)], dim=1)
-            scores = scores.scatter(1, self._forbidden, -torch.inf)[:, :-1]
-        return scores.argmax(-1)
+            forbidden = torch.zeros(n, n_items + 1, dtype=torch.bool)
+            parts.append(forbidden.scatter_(1, self._forbidden, True)[:, :-1])
+        return torch.stack(parts).any(0) if parts else None
 
     def _in_store(self, items: IntArray) -> Tensor:
         """The store's indices of the environment's items (N, L); n_items for items it lacks."""
@@ -168,7 +192,7 @@ class PolicyActor:
             states=self._states[rows].masked_fill(~mask.unsqueeze(-1), 0.0),
             actions=actions.masked_fill(~keep, 0),
             rewards=self._rewards[rows].masked_fill(~mask, 0.0),
-            returns_to_go=self._returns_to_go[rows].masked_fill(~mask, 0.0),
+            returns_to_go=torch.zeros(mask.shape),
             timesteps=steps.clamp(min=0),
             mask=mask,
         )

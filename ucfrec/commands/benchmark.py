@@ -9,6 +9,7 @@ from ucfrec.commands.grid_options import (
     results_given,
     rows_given,
 )
+from ucfrec.commands.options import env_options, world_given
 from ucfrec.plugins import Benchmark, BenchmarkRequest, load_plugin
 from ucfrec.reporting.grid import chosen
 from ucfrec.reporting.rows_file import benchmarking
@@ -39,6 +40,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--log-seed", type=int, default=0, help="seed of the simulated logs (default: 0)"
     )
     evaluation_seed_option(parser)
+    env_options(
+        parser,
+        required=False,
+        use="; its main table is measured instead of the suite's tasks, on logs of its mixture or, "
+        "where it has none, of random actions (default: the suite's tasks)",
+    )
     grid_options(parser, "runs/benchmark", os.cpu_count() or 1)
 
 
@@ -57,6 +64,7 @@ def run(options: argparse.Namespace) -> None:
         workers=options.workers,
         log_seed=options.log_seed,
         evaluation_seed=options.evaluation_seed,
+        world=world_given(options) if options.env else None,
     )
     with benchmarking(results):
         print(suite.run(request))

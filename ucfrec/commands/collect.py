@@ -2,9 +2,13 @@
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from ucfrec.commands.options import world_options
+from ucfrec.commands.options import world_given, world_options
 from ucfrec.errors import InputError
+
+if TYPE_CHECKING:
+    from gymnasium import Space
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -12,8 +16,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     world_options(parser)
     parser.add_argument(
         "--behavior",
-        default="mixture",
-        help="built-in policy that acts in the sessions (default: mixture)",
+        help="built-in policy that acts in the sessions (default: mixture, or random in worlds "
+        "that have no mixture)",
     )
     parser.add_argument(
         "--sessions", type=int, default=20_000, help="number of sessions (default: 20000)"
@@ -28,15 +32,15 @@ def run(options: argparse.Namespace) -> None:
         InputError: the simulator has no such logging policy, or --out exists.
     """
     from ucfrec.evaluation.collect import collect
-    from ucfrec.evaluation.world import World
 
-    world = World(options.env, options.env_folder)
+    world = world_given(options)
     simulator = world.simulator()
-    if options.behavior not in simulator.behaviors:
+    behavior = options.behavior or simulator.logging_behavior
+    if behavior not in simulator.behaviors:
         known = ", ".join(simulator.behaviors)
-        raise InputError(f"{world.name} has no behavior {options.behavior!r}; it has {known}")
+        raise InputError(f"{world.name} has no behavior {behavior!r}; it has {known}")
     env = simulator.make(256, world.folder)
-    actor = simulator.behaviors[options.behavior](env, options.seed)
+    actor = simulator.behaviors[behavior](env, options.seed)
     played = collect(
         simulator,
         env,
@@ -44,10 +48,18 @@ def run(options: argparse.Namespace) -> None:
         options.sessions,
         options.seed,
         options.out,
-        env_name=options.env,
-        behavior=options.behavior,
+        env_name=world.title,
+        behavior=behavior,
     )
     print(
-        f"{options.out}: {options.sessions} sessions, {int(played.lengths.sum())} steps, mean "
-        f"return {played.returns.mean():.3f}; reward column {simulator.feedback}"
+        f"{options.out}: {options.sessions} sessions of {behavior}, {int(played.lengths.sum())} "
+        f"steps, mean return {played.returns.mean():.3f}; reward column {simulator.feedback}; "
+        f"{_observed(env.single_observation_space)}"
     )
+
+
+def _observed(space: "Space[Any]") -> str:
+    """What the logs say about a step besides its action and reward."""
+    if not space.shape or not space.shape[0]:
+        return "no observation: states come from the items shown and their rewards"
+    return f"observation of {space.shape[0]} numbers"

@@ -33,14 +33,12 @@ class DemoConfig:
     """Logged sessions of each world."""
     episodes: int = 1000
     """Evaluated episodes of each policy."""
-    target_quantile: float = 1.0
-    """Quantile of the training returns that is the target return."""
     settings: Sequence[str] = (
         "train.steps=1500",
         "train.learning_rate=1e-3",
         "crm.epochs=8",
     )
-    context: int = 10
+    context: int = 11
     dim: int = 64
 
 
@@ -134,5 +132,4 @@ def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> dict[str, 
         name,
         config.episodes,
         EVALUATION_SEED + seed,
-        trained.target_return(config.target_quantile),
     )

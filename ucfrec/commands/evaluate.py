@@ -3,7 +3,8 @@
 import argparse
 from pathlib import Path
 
-from ucfrec.commands.options import target_given, target_options, world_options
+from ucfrec.commands.cards import card_of_evaluation
+from ucfrec.commands.options import rule_given, rule_options, world_given, world_options
 from ucfrec.errors import InputError
 
 
@@ -23,7 +24,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="also evaluate this built-in policy of the simulator, e.g. random; repeatable "
         "(default: none)",
     )
-    target_options(parser)
+    rule_options(parser)
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the rows as JSON")
 
 
@@ -34,21 +35,21 @@ def run(options: argparse.Namespace) -> None:
         InputError: neither a run nor a built-in policy is named, or one of them cannot be used.
     """
     from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
-    from ucfrec.evaluation.world import World
     from ucfrec.files import write_json
     from ucfrec.provenance import without_folders
     from ucfrec.reporting.tables import format_rows
     from ucfrec.runs.trained_policy import TrainedPolicy
 
-    world = World(options.env, options.env_folder)
+    world = world_given(options)
     if not options.runs and not options.behavior:
         raise InputError("name a run folder, or a built-in policy with --behavior")
     rows = []
     for run in options.runs:
         trained = TrainedPolicy.load(run, options.checkpoint)
-        target = target_given(options, trained)
-        row = evaluate_policy(world, trained, trained.name, options.episodes, options.seed, target)
+        rule = rule_given(options, trained)
+        row = evaluate_policy(world, trained, trained.name, options.episodes, options.seed, rule)
         rows.append(row | {"run": without_folders(str(run)), "checkpoint": options.checkpoint})
+        card_of_evaluation(run, rows[-1])
     rows += [
         evaluate_behavior(world, behavior, options.episodes, options.seed)
         for behavior in options.behavior

@@ -1,29 +1,153 @@
 """`ucfrec ope`: what a policy would have earned, from logs alone."""
 
 import argparse
+import math
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from ucfrec.commands.options import log_options, logs_given, target_given, target_options
+from ucfrec.commands.cards import card_of_estimates
+from ucfrec.commands.options import log_options, logs_given, rule_given, rule_options
+from ucfrec.errors import InputError
+
+if TYPE_CHECKING:
+    from ucfrec.off_policy.evaluate import OffPolicyReport
+    from ucfrec.off_policy.options import EstimateOptions
+    from ucfrec.runs.trained_policy import TrainedPolicy
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """What `ope` takes."""
-    parser.add_argument("run", type=Path, metavar="RUN")
     log_options(parser)
-    target_options(parser)
+    rule_options(parser)
     parser.add_argument(
-        "--greedy", action="store_true", help="judge the most probable item, not the softmax"
+        "--targets",
+        metavar="RETURN,…",
+        help="compare these target returns, or quantiles of the training returns: 5,10 or q0.5,q1",
     )
     parser.add_argument(
-        "--discount", type=float, default=1.0, help="of the returns that are estimated (default 1)"
+        "--temperatures",
+        metavar="T,…",
+        help="compare these temperatures, at which items are drawn; 0 takes the best item",
     )
+    parser.usage = "%(prog)s RUN... LOGS... [options]"
+    parser.epilog = "Several runs, targets or rules are ranked, with a band that holds all at once."
+    estimate_options(parser)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, help="write the result rows here")
 
 
+def estimate_options(parser: argparse.ArgumentParser) -> None:
+    """Add what `estimates_asked` reads."""
+    parser.add_argument(
+        "--discount", type=float, default=1.0, help="of the returns that are estimated (default 1)"
+    )
+    parser.add_argument(
+        "--pages",
+        action="store_true",
+        help="estimate the return of a page: rows of one user within 10 ms are its positions, each "
+        "row a session",
+    )
+    parser.add_argument(
+        "--anonymous",
+        action="store_true",
+        help="the logs' users are no persons (as in obd): take each session for somebody else's",
+    )
+    parser.add_argument(
+        "--reward-range",
+        type=float,
+        nargs=2,
+        metavar=("LEAST", "MOST"),
+        help="what a step can earn, to bound what unsupported choices could (default: as observed)",
+    )
+    parser.add_argument(
+        "--lift",
+        type=float,
+        metavar="RETURN",
+        help="return a session that a launch should gain; the verdict says how many sessions would "
+        "show it (default: 5%% of the mean logged return)",
+    )
+    parser.add_argument(
+        "--item-groups",
+        type=int,
+        default=0,
+        metavar="N",
+        help="groups of items, by their embeddings, for MIPS and the tests by group; 1 for neither "
+        "(default: the root of the number of items, up to 32)",
+    )
+    parser.add_argument(
+        "--estimate-propensities",
+        action="store_true",
+        help="estimate the propensities that the logs lack; the verdict says so",
+    )
+
+
+def estimates_asked(options: argparse.Namespace) -> "EstimateOptions":
+    """What `estimate_options` were given.
+
+    Raises:
+        InputError: a value is out of its range.
+    """
+    from ucfrec.off_policy.options import EstimateOptions
+
+    return EstimateOptions(
+        discount=options.discount,
+        pages=options.pages,
+        users_known=not options.anonymous,
+        reward_range=None if options.reward_range is None else tuple(options.reward_range),
+        wanted_lift=options.lift,
+        item_clusters=options.item_groups,
+        estimate_propensities=options.estimate_propensities,
+    )
+
+
 def run(options: argparse.Namespace) -> None:
-    """`ucfrec ope`."""
-    from ucfrec.files import write_json
+    """Run `ucfrec ope`: print the estimates and the verdict of every candidate.
+
+    Raises:
+        InputError: no run or no log is named, or one of them cannot be used.
+    """
+    from ucfrec.off_policy.candidates import choose, names_of
+    from ucfrec.reporting.tables import text_table
+    from ucfrec.runs.trained_policy import RUN, TrainedPolicy
+
+    runs = [Path(path) for path in options.logs if (Path(path) / RUN).is_file()]
+    options.logs = [path for path in options.logs if Path(path) not in runs]
+    if not runs or not options.logs:
+        raise InputError("name a run folder of `ucfrec train` first, then the logs")
+    candidates = [
+        {"run": str(run), "target return": target, "temperature": temperature}
+        for run in runs
+        for trained in [TrainedPolicy.load(run, options.checkpoint)]
+        for target in _targets(options, trained)
+        for temperature in _temperatures(options, trained)
+    ]
+    reports = {}
+    for name, candidate in zip(names_of(candidates), candidates, strict=True):
+        if len(candidates) > 1:
+            print(f"\n{name}:")
+        reports[name] = _judged(options, candidate)
+    if len(candidates) == 1:
+        _write(options, reports, {})
+        return
+    choice = choose(reports, options.seed)
+    if choice.selection is not None:
+        print("\nvalue of a session, with a 95% band that holds all of them at once:")
+        head = ("candidate", "value [band]", "P(best)", "rank")
+        body = [
+            (one.name, f"{one.value:.4g} [{one.low:.4g}, {one.high:.4g}]",
+             f"{one.probability_best:.2f}", str(one.rank))
+            for one in choice.selection.standings
+        ]  # fmt: skip
+        print(text_table(head, body))
+    for name, reasons in choice.excluded.items():
+        print(f"not ranked: {name}: {reasons}")
+    print(f"choice: {choice.headline}")
+    _write(options, reports, {name: choice.columns(name) for name in reports})
+
+
+def _judged(options: argparse.Namespace, candidate: "dict[str, Any]") -> "OffPolicyReport":
+    """Print and return what the logs say of one candidate."""
     from ucfrec.logs.summary import format_report
     from ucfrec.off_policy.evaluate import evaluate_off_policy
     from ucfrec.off_policy.score import logged_sessions
@@ -31,23 +155,98 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     files, mapping = logs_given(options)
-    trained = TrainedPolicy.load(options.run, options.checkpoint)
-    with logged_sessions(options.run, trained, files, mapping, keep_unknown=True) as logged:
+    run = Path(candidate["run"])
+    trained = TrainedPolicy.load(run, options.checkpoint)
+    with logged_sessions(run, trained, files, mapping, keep_unknown=True) as logged:
         print(format_report(logged.report))
-        estimates = evaluate_off_policy(
-            options.run,
+        found = evaluate_off_policy(
+            run,
             trained,
             logged,
-            target_return=target_given(options, trained),
-            greedy=options.greedy,
+            rule=replace(
+                rule_given(options, trained),
+                target=candidate["target return"],
+                temperature=candidate["temperature"],
+            ),
             seed=options.seed,
-            discount=options.discount,
+            options=estimates_asked(options),
         )
-    rows = [row | {"checkpoint": options.checkpoint} for row in estimates.rows]
     shown = ("estimator", "policy", "choice", "R_cum", "effective_sessions", "sessions")
-    print(f"\n{format_rows(rows, shown)}")
-    for warning in estimates.warnings:
+    print(f"\n{format_rows(found.rows, shown)}")
+    for warning in found.warnings:
         print(f"warning: {warning}")
-    print(f"verdict: {estimates.verdict.headline}")
-    if options.json is not None:
-        write_json(options.json, rows)
+    print(f"verdict: {found.verdict.headline}")
+    card_of_estimates(run, options.logs, found)
+    return found
+
+
+def _targets(options: argparse.Namespace, trained: "TrainedPolicy") -> list[float | None]:
+    """The target returns to judge, in units of the reward; None for the largest expected.
+
+    Raises:
+        InputError: one of `--targets` is neither a number nor a quantile.
+    """
+    if options.targets is None:
+        return [rule_given(options, trained).target]
+    found: list[float | None] = []
+    for part in options.targets.split(","):
+        quantile = part.strip().startswith("q")
+        try:
+            value = float(part.strip().removeprefix("q"))
+        except ValueError:
+            value = float("nan")
+        if not math.isfinite(value) or (quantile and not 0 <= value <= 1):
+            raise InputError(
+                f"--targets {options.targets}: {part!r} is neither a return nor a quantile of the "
+                "training returns; write e.g. 5,10 or q0.5,q0.9"
+            )
+        found.append(trained.target_return(value) if quantile else value)
+    return list(dict.fromkeys(found))
+
+
+def _temperatures(options: argparse.Namespace, trained: "TrainedPolicy") -> list[float]:
+    """The temperatures to judge.
+
+    Raises:
+        InputError: one of `--temperatures` is not a number from 0 on.
+    """
+    if options.temperatures is None:
+        return [rule_given(options, trained).temperature]
+    try:
+        found = [float(part) for part in options.temperatures.split(",")]
+    except ValueError:
+        found = [-1.0]
+    if not all(math.isfinite(each) and each >= 0 for each in found):
+        raise InputError(
+            f"--temperatures {options.temperatures}: write numbers from 0 on, e.g. 0,0.5,1"
+        )
+    return list(dict.fromkeys(found))
+
+
+def _write(
+    options: argparse.Namespace,
+    reports: "dict[str, OffPolicyReport]",
+    more: "dict[str, dict[str, Any]]",
+) -> None:
+    """Write the rows of all candidates, if asked to."""
+    if options.json is None:
+        return
+    from ucfrec.code_version import code_version
+    from ucfrec.files import write_json
+    from ucfrec.provenance import config_hash
+    from ucfrec.reporting.estimate_rows import estimate_row
+    from ucfrec.runs.trained_policy import read_record
+
+    version, written = code_version("ucfrec.off_policy.evaluate"), []
+    for name, report in reports.items():
+        for row in report.rows:
+            record = read_record(Path(row["run"]))
+            about = {"checkpoint": options.checkpoint, "candidate": name, **more.get(name, {})}
+            found = estimate_row(
+                row | about,
+                training_seed=record["seed"],
+                config_hash=config_hash(record["config"]),
+                code_version=version,
+            )
+            written.append(found.to_json())
+    write_json(options.json, written)

@@ -1,24 +1,57 @@
 """Options that several commands share, and the objects made from them."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from ucfrec.acting.decision import DecisionRule
+    from ucfrec.evaluation.world import World
     from ucfrec.logs.mapping import Dataset, LogMapping
     from ucfrec.runs.trained_policy import TrainedPolicy
 
 
 def world_options(parser: argparse.ArgumentParser) -> None:
-    """Add --env, --env-folder and --seed."""
-    parser.add_argument("--env", required=True, help="simulator, e.g. synthetic-taobao")
+    """Add --env with the options that belong to it, and --seed."""
+    env_options(parser, required=True)
+    parser.add_argument("--seed", type=int, default=0, help="seed of the sessions (default: 0)")
+
+
+def env_options(parser: argparse.ArgumentParser, required: bool, use: str = "") -> None:
+    """Add --env, --env-folder, --observe and --item-features.
+
+    Args:
+        required: whether --env must be given.
+        use: what the world is used for, for the help of --env.
+    """
+    parser.add_argument(
+        "--env",
+        required=required,
+        help=f"simulator, e.g. synthetic-taobao, or gymnasium:ID, any Gymnasium environment "
+        f"(gymnasium:MODULE:ID imports MODULE first){use}",
+    )
     parser.add_argument(
         "--env-folder",
         type=Path,
         metavar="FOLDER",
         help="folder with the simulator's files, e.g. its weights (default: none)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of the sessions (default: 0)")
+    parser.add_argument(
+        "--observe",
+        default="",
+        metavar="KEY[,KEY…]",
+        help="of gymnasium:ID with a dict observation: entries that are observed, one after the "
+        "other as one vector (default: none, states come from the items shown and their rewards; "
+        "worlds of vector actions need one)",
+    )
+    parser.add_argument(
+        "--item-features",
+        metavar="SOURCE",
+        help="of gymnasium:ID with items: their features, from an attribute of the environment or "
+        "a file .npy (a row for each item) or .parquet (with a column item_id from 0) (default: "
+        "none)",
+    )
 
 
 def log_options(parser: argparse.ArgumentParser) -> None:
@@ -52,28 +85,82 @@ def log_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def target_options(parser: argparse.ArgumentParser) -> None:
-    """Add --checkpoint, --target-return and --target-quantile."""
+def rule_options(parser: argparse.ArgumentParser) -> None:
+    """Add --checkpoint and the parts of a decision rule that replace those of the run's own."""
     parser.add_argument(
         "--checkpoint",
         choices=["best", "last"],
         default="best",
         help="policy weights: of the lowest validation loss, or the last ones (default: best)",
     )
-    parser.add_argument(
+    rule = parser.add_argument_group(
+        "decision rule", "each part is the run's own, chosen at the end of its training, by default"
+    )
+    target = rule.add_mutually_exclusive_group()
+    target.add_argument(
         "--target-return",
         type=float,
         metavar="RETURN",
-        help="target return of an episode, in units of the reward (default: by --target-quantile)",
+        help="target return, in units of the reward: of a session, or of every step for "
+        "returns-to-go of a horizon or discounted ones",
     )
-    parser.add_argument(
+    target.add_argument(
         "--target-quantile",
         type=float,
-        default=1.0,
         metavar="QUANTILE",
-        help="without --target-return: this quantile of the training returns, 0 to 1 "
-        "(default: 1, the largest)",
+        help="target return: this quantile of the training's, 0 to 1; 1 is the largest",
     )
+    target.add_argument(
+        "--max-return",
+        action="store_true",
+        help="target return: the largest that the policy expects in each state",
+    )
+    rule.add_argument(
+        "--target-floor",
+        type=float,
+        metavar="RETURN",
+        help="never ask for less, also once a session has reached its target",
+    )
+    rule.add_argument(
+        "--tilt", type=float, metavar="BETA", help="weight of the reward model; 0 for none"
+    )
+    rule.add_argument(
+        "--temperature", type=float, help="draw items at this temperature; 0 takes the best"
+    )
+    rule.add_argument("--top-k", type=int, metavar="N", help="draw from the N best items only")
+    rule.add_argument(
+        "--exclude-seen", action="store_true", help="leave out items that the session has shown"
+    )
+    rule.add_argument(
+        "--tag-window",
+        type=int,
+        metavar="N",
+        help="leave out items that share a tag with one of the last N, unless none remain",
+    )
+
+
+def rule_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "DecisionRule":
+    """The run's decision rule with the parts that `rule_options` name.
+
+    Raises:
+        InputError: a value is out of range.
+    """
+    target = options.target_return
+    if options.target_quantile is not None:
+        target = trained.target_return(options.target_quantile)
+    parts = {
+        "target": target,
+        "floor": options.target_floor,
+        "tilt": options.tilt,
+        "temperature": options.temperature,
+        "top_k": options.top_k,
+        "exclude_seen": options.exclude_seen or None,
+        "tag_window": options.tag_window,
+    }
+    given = {name: value for name, value in parts.items() if value is not None}
+    if options.max_return:
+        given["target"] = None
+    return replace(trained.rule, **given)
 
 
 def logs_given(options: argparse.Namespace) -> "tuple[tuple[Path, ...], LogMapping]":
@@ -92,8 +179,10 @@ def logs_given(options: argparse.Namespace) -> "tuple[tuple[Path, ...], LogMappi
     return dataset.resolve(options.logs, given)
 
 
-def target_given(options: argparse.Namespace, trained: "TrainedPolicy") -> float:
-    """Target return (reward units) that `target_options` name."""
-    if options.target_return is not None:
-        return float(options.target_return)
-    return trained.target_return(options.target_quantile)
+def world_given(options: argparse.Namespace) -> "World":
+    """The world that `env_options` name."""
+    from ucfrec.evaluation.world import World
+
+    observe = tuple(key for key in options.observe.split(",") if key)
+    features = options.item_features
+    return World(options.env, options.env_folder, observe=observe, item_features=features)

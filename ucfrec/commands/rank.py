@@ -4,7 +4,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ucfrec.commands.options import log_options, logs_given, target_given, target_options
+from ucfrec.commands.cards import card_of_ranking
+from ucfrec.commands.options import log_options, logs_given, rule_given, rule_options
 from ucfrec.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--k", type=int, default=10, help="items recommended at each step (default: 10)"
     )
-    target_options(parser)
+    rule_options(parser)
     parser.add_argument(
         "--seed",
         type=int,
@@ -46,6 +47,7 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.files import write_json
     from ucfrec.logs.summary import format_report
     from ucfrec.off_policy.score import logged_sessions
+    from ucfrec.provenance import without_folders
     from ucfrec.reporting.tables import format_rows
     from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 
@@ -69,6 +71,9 @@ def run(options: argparse.Namespace) -> None:
     print(format_rows(rows, ("policy", *_SHOWN, "coverage")))
     print("\n" + "\n".join(f"{name:<16}{MEASURES[name]}" for name in _SHOWN))
     print(f"k is {rows[0]['k']}; --json has 95% intervals and paired differences by user")
+    on = ", ".join(map(without_folders, options.logs)) or "the test split"
+    for policy, row in zip(trained, rows, strict=False):
+        card_of_ranking(policy.folder, row, _SHOWN, on)
     if options.json is not None:
         write_json(options.json, rows)
 
@@ -96,7 +101,7 @@ def _rows(
     from ucfrec.evaluation.ranking_table import ranking_rows
 
     policies = [
-        PolicyRanker(policy, target_given(options, policy), policy.name) for policy in trained
+        PolicyRanker(policy, rule_given(options, policy), policy.name) for policy in trained
     ]
     rows = ranking_rows(policies, trained[0], train, later, users, options.k, options.seed)
     return [row | {"checkpoint": options.checkpoint} for row in rows]

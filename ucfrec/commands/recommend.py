@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ucfrec.commands.options import log_options, logs_given, target_given, target_options
+from ucfrec.commands.options import log_options, logs_given, rule_given, rule_options
 from ucfrec.progress import Progress, progress
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="ignore rows with items outside the catalogue of the run (default: an error)",
     )
-    target_options(parser)
+    rule_options(parser)
     parser.add_argument("--out", type=Path, required=True, help="Parquet file to write")
 
 
@@ -49,7 +49,7 @@ def run(options: argparse.Namespace) -> None:
             trained,
             _counted(histories_of_files(trained, files, mapping), bar),
             options.k,
-            target_return=target_given(options, trained),
+            rule=rule_given(options, trained),
             filter_seen=not options.keep_seen,
             skip_unknown=options.skip_unknown,
         )

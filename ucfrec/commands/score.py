@@ -3,14 +3,14 @@
 import argparse
 from pathlib import Path
 
-from ucfrec.commands.options import log_options, logs_given, target_given, target_options
+from ucfrec.commands.options import log_options, logs_given, rule_given, rule_options
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec score`."""
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder of `ucfrec train`")
     log_options(parser)
-    target_options(parser)
+    rule_options(parser)
     parser.add_argument("--out", type=Path, required=True, help="Parquet file to write")
 
 
@@ -29,5 +29,5 @@ def run(options: argparse.Namespace) -> None:
     trained = TrainedPolicy.load(options.run, options.checkpoint)
     with logged_sessions(options.run, trained, files, mapping) as logged:
         print(format_report(logged.report))
-        rows = write_frames(options.out, score(trained, logged, target_given(options, trained)))
+        rows = write_frames(options.out, score(trained, logged, rule_given(options, trained)))
     print(f"\n{options.out}: {rows:,} rows")

@@ -3,11 +3,24 @@
 import argparse
 from pathlib import Path
 
+from ucfrec.errors import InputError
 from ucfrec.policies.registry import policy_names
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `train`, for `ucfrec` and for other programs with this command."""
+    """Add the options of `ucfrec train`."""
+    training_options(parser)
+    parser.add_argument(
+        "--refit",
+        type=Path,
+        metavar="RUN",
+        help="train as this finished run did, its settings and decision rule included, on all rows "
+        "of the store, validation and test too (default: on the training rows)",
+    )
+
+
+def training_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `train` for `ucfrec` and for other programs with this command."""
     parser.epilog = "Every setting, its range and meaning: ucfrec settings --policy NAME"
     parser.add_argument("store", type=Path, metavar="STORE", help="episode store to train on")
     parser.add_argument(
@@ -51,12 +64,21 @@ def run(options: argparse.Namespace) -> None:
     import torch
 
     from ucfrec.episodes.store import EpisodeStore
+    from ucfrec.reporting.model_card import write_card
     from ucfrec.runs.config import resolve_config
+    from ucfrec.runs.refit import refit
     from ucfrec.runs.run import describe_run, train_run
 
     if options.threads is not None:
         torch.set_num_threads(options.threads)
-    config = resolve_config(options.policy, options.config, options.set, options.seed)
-    record = train_run(EpisodeStore.open(options.store), options.out, config)
+    store = EpisodeStore.open(options.store)
+    if options.refit is not None:
+        if options.config is not None or options.set:
+            raise InputError("--refit takes all settings of the run; leave out --config and --set")
+        record = refit(store, options.refit, options.out)
+    else:
+        config = resolve_config(options.policy, options.config, options.set, options.seed)
+        record = train_run(store, options.out, config)
+    card = write_card(options.out)
     print(describe_run(record))
-    print(f"\nrun: {options.out}; TensorBoard can open it")
+    print(f"\nrun: {options.out}; TensorBoard can open it\nmodel card: {card}")

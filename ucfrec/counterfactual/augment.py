@@ -5,7 +5,7 @@ only the edited states (paper appendix H).
 """
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -19,6 +19,8 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.counterfactual.edit_statistics import MoveReport, MoveStatistics
 from ucfrec.counterfactual.generators import CSGConfig, Generator, make_generator
+from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model
+from ucfrec.counterfactual.item_reward_mean import EffectsMean, EffectTransitions
 from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig
 from ucfrec.counterfactual.reward_model_fit import CRMReport, fit_crm, fit_warning
 from ucfrec.episodes.store import EpisodeStore
@@ -26,6 +28,8 @@ from ucfrec.episodes.windows import FloatArray, IntArray, Overlay, Transitions
 from ucfrec.errors import InputError
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.settings import Count, Quantile, settings_table
+
+Read = Callable[[EpisodeStore, IntArray, IntArray], Transitions]
 
 _CHUNK = 8192
 _DELTA_LEVEL = "0.95"
@@ -116,6 +120,7 @@ def augment(
     generator: Generator,
     config: AugmentConfig,
     seed: int,
+    read: Read = EpisodeStore.transitions,
 ) -> tuple[Overlay, AugmentationReport]:
     """Make edited copies of episodes (Algorithm 5, or appendix H; see `AugmentConfig`).
 
@@ -126,6 +131,7 @@ def augment(
         generator: proposes counterfactual states.
         config: numbers of copies and edits, and the gate.
         seed: of sampling and proposals.
+        read: reads transitions with the actions that the reward model was fitted to.
 
     Raises:
         InputError: `config.copies` is 0.
@@ -136,7 +142,7 @@ def augment(
     epsilon_r = config.epsilon_r
     if epsilon_r is None:
         epsilon_r = 0.1 * float(crm.reward_std)
-    editor = _Editor(view, crm, generator, epsilon_r, seed)
+    editor = _Editor(view, crm, generator, epsilon_r, seed, read)
     episodes, steps = _candidates(view, config, rng)
     if config.edits_per_copy:
         rounds = _fill_copies(editor, episodes, steps, config, rng)
@@ -187,18 +193,25 @@ def counterfactual_copies(
             is 0.
     """
     limit = max(crm_config.max_transitions, csg_config.max_transitions)
-    training = sample_transitions(train, limit, seed)
-    held_out = sample_transitions(validation, limit // 10, seed)
-    crm, crm_report = fit_crm(training, held_out, crm_config, folder / "crm", seed)
+    mean: EffectsMean | None = None
+    read: Read = EpisodeStore.transitions
+    if crm_config.mean == "effects" and train.has_items:
+        model, _ = fit_item_reward_model(train, validation, folder / "item-reward", seed)
+        mean, read = EffectsMean(model), EffectTransitions(model)
+    training = sample_transitions(train, limit, seed, read)
+    held_out = sample_transitions(validation, limit // 10, seed, read)
+    crm, crm_report = fit_crm(training, held_out, crm_config, folder / "crm", seed, mean)
     generator = make_generator(training, crm, csg_config, folder / "csg", seed)
-    return augment(train, crm, crm_report, generator, config, seed)
+    return augment(train, crm, crm_report, generator, config, seed, read)
 
 
-def sample_transitions(view: EpisodeStore, limit: int, seed: int) -> Transitions:
+def sample_transitions(
+    view: EpisodeStore, limit: int, seed: int, read: Read = EpisodeStore.transitions
+) -> Transitions:
     """All transitions of a view; if there are more than `limit`, so many drawn with replacement."""
     if view.n_steps <= limit:
-        return view.transitions(*view.all_steps())
-    return view.transitions(*view.draw_steps(np.random.default_rng(seed), limit))
+        return read(view, *view.all_steps())
+    return read(view, *view.draw_steps(np.random.default_rng(seed), limit))
 
 
 class _Edits(NamedTuple):
@@ -220,8 +233,9 @@ class _Editor:
         generator: Generator,
         epsilon_r: float,
         seed: int,
+        read: Read,
     ) -> None:
-        self._view, self._crm, self._generator = view, crm, generator
+        self._view, self._crm, self._generator, self._read = view, crm, generator, read
         self._random = torch.Generator().manual_seed(seed)
         # The gates are evaluated in float64 on the stored float32 values, so that a later check
         # of an overlay confirms every edit.
@@ -245,7 +259,7 @@ class _Editor:
     def _chunk(
         self, episodes: IntArray, steps: IntArray
     ) -> tuple[npt.NDArray[np.bool_], FloatArray]:
-        factual = self._view.transitions(episodes, steps)
+        factual = self._read(self._view, episodes, steps)
         z = self._crm.abduct(factual.states, factual.actions, factual.rewards)
         proposed = self._generator.propose(factual.states, factual.actions, z, self._random)
         exact = replace(

@@ -1,13 +1,22 @@
 """Causal reward model: the reward as a function of state, action and a latent disturbance."""
 
 import math
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from ucfrec.settings import BatchSize, LearningRate, Weight, WeightDecay, Width, settings_table
+from ucfrec.counterfactual.item_reward_mean import EffectsMean
+from ucfrec.settings import (
+    BatchSize,
+    LearningRate,
+    Weight,
+    WeightDecay,
+    Width,
+    require,
+    settings_table,
+)
 
 _LOG_2PI = math.log(2 * math.pi)
 
@@ -38,6 +47,10 @@ class CRMConfig:
     """
     mean_first: bool = True
     """Fit E[r | s, a] by regression, freeze it, then train the CVAE on top; false: Eq. 2 alone."""
+    mean: Literal["network", "effects"] = "network"
+    """What E[r | s, a] is: `network`, a network of state and action; `effects`, where actions are
+    items, additive effects of item, user, what was shown before and the state. Action vectors
+    always have the network."""
     learning_rate: LearningRate = 3e-4
     """Learning rate."""
     weight_decay: WeightDecay = 1e-4
@@ -50,6 +63,15 @@ class CRMConfig:
     """Epochs without a better validation loss before stopping early; 0 never stops early."""
     max_transitions: Annotated[int, Field(ge=100, le=10**9)] = 200_000
     """Maximum number of transitions to train on; from more, a random sample is drawn."""
+
+    def __post_init__(self) -> None:
+        """Check the fields against each other."""
+        require(
+            self.mean_first or self.mean == "network",
+            f"crm.mean is {self.mean!r}, which needs crm.mean_first=true",
+            "crm.mean",
+            "crm.mean_first",
+        )
 
 
 class Posterior(NamedTuple):
@@ -82,11 +104,26 @@ class CausalRewardModel(nn.Module):
     reward_std: Tensor
     surprise_std: Tensor
 
-    def __init__(self, state_size: int, action_size: int, config: CRMConfig) -> None:
+    expected: nn.Sequential | EffectsMean
+
+    def __init__(
+        self,
+        state_size: int,
+        action_size: int,
+        config: CRMConfig,
+        mean: EffectsMean | None = None,
+    ) -> None:
+        """Args:
+        state_size: S.
+        action_size: A, the size of an action vector or of an item's embedding; with `mean`, of
+            the actions that it reads.
+        config: settings.
+        mean: E[r | s, a]; None for a network that is yet to be trained.
+        """
         super().__init__()
         self.config = config
         given = state_size + action_size
-        self.expected = mlp(given, config.hidden, 2, 1)
+        self.expected = mean or mlp(given, config.hidden, 2, 1)
         self.encoder = mlp(given + 1, config.hidden, 2, 2 * config.latent_dim)
         self.decoder = mlp(given + config.latent_dim, config.hidden, 2, 1)
         for name, shape in (("state", (state_size,)), ("action", (action_size,)), ("reward", ())):
@@ -97,7 +134,7 @@ class CausalRewardModel(nn.Module):
     def encode(self, states: Tensor, actions: Tensor, rewards: Tensor) -> Posterior:
         """The posterior q_ϕ(z | s, a, r), both fields (..., latent_dim)."""
         given = self.given(states, actions)
-        residual = (self._normalised_reward(rewards) - self._expected(given)) / self.surprise_std
+        residual = self.residual(states, actions, rewards) / self.surprise_std
         out = self.encoder(torch.cat([given, residual.unsqueeze(-1)], dim=-1))
         mean, log_variance = out.chunk(2, dim=-1)
         return Posterior(mean, log_variance.clamp(-12.0, 6.0))
@@ -121,17 +158,23 @@ class CausalRewardModel(nn.Module):
 
     def residual(self, states: Tensor, actions: Tensor, rewards: Tensor) -> Tensor:
         """The residual r − E[r | s, a], in standard deviations of the reward, (...)."""
-        return self._normalised_reward(rewards) - self._expected(self.given(states, actions))
+        return self._normalised_reward(rewards) - self._expected(states, actions)
 
     def _decode(self, states: Tensor, actions: Tensor, z: Tensor) -> Tensor:
         given = self.given(states, actions)
         disturbance: Tensor = self.decoder(torch.cat([given, z], dim=-1)).squeeze(-1)
-        return self._expected(given) + disturbance
+        if isinstance(self.expected, EffectsMean):
+            # With z at its prior mean, the model predicts exactly E[r | s, a].
+            without = torch.cat([given, torch.zeros_like(z)], dim=-1)
+            disturbance = disturbance - self.decoder(without).squeeze(-1)
+        return self._expected(states, actions) + disturbance
 
-    def _expected(self, given: Tensor) -> Tensor:
+    def _expected(self, states: Tensor, actions: Tensor) -> Tensor:
         if not self.config.mean_first:
-            return given.new_zeros(given.shape[:-1])
-        expected: Tensor = self.expected(given).squeeze(-1)
+            return states.new_zeros(states.shape[:-1])
+        if isinstance(self.expected, EffectsMean):
+            return self._normalised_reward(self.expected(states, actions))
+        expected: Tensor = self.expected(self.given(states, actions)).squeeze(-1)
         return expected
 
     def given(self, states: Tensor, actions: Tensor) -> Tensor:

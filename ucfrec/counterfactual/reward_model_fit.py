@@ -10,6 +10,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from ucfrec.counterfactual.item_reward_mean import EffectsMean
 from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, kl_to_prior
 from ucfrec.episodes.windows import Transitions
 from ucfrec.errors import InputError
@@ -23,6 +24,7 @@ _PREDICTS_NOTHING = 0.02
 _QUANTILES = (0.5, 0.9, 0.95, 0.99)
 _CONSTANT = 1e-6
 _VALIDATION_LIMIT = 20_000
+_CHUNK = 16_384
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,12 @@ class CRMReport:
 
 @random_state_kept()
 def fit_crm(
-    train: Transitions, validation: Transitions, config: CRMConfig, folder: Path, seed: int
+    train: Transitions,
+    validation: Transitions,
+    config: CRMConfig,
+    folder: Path,
+    seed: int,
+    mean: EffectsMean | None = None,
 ) -> tuple[CausalRewardModel, CRMReport]:
     """Train the reward model (Algorithm 2) with early stopping on held-out steps.
 
@@ -67,6 +74,7 @@ def fit_crm(
         config: architecture and training.
         folder: of the checkpoints, which training resumes from.
         seed: of sampling, initialisation and training.
+        mean: E[r | s, a], if it was fitted before; transitions then have the actions that it reads.
 
     Returns:
         The model with the lowest validation loss, in evaluation mode, and its quality.
@@ -78,10 +86,13 @@ def fit_crm(
     train = _at_most(train, config.max_transitions, rng)
     held_out = _at_most(validation, _VALIDATION_LIMIT, rng)
     torch.manual_seed(seed)
-    model = CausalRewardModel(train.states.shape[1], train.actions.shape[1], config)
+    model = CausalRewardModel(train.states.shape[1], train.actions.shape[1], config, mean)
     _set_statistics(model, train, held_out)
-    if config.mean_first:
+    if config.mean_first and mean is None:
         _fit_mean(model, train, held_out, folder / "mean", seed)
+    if config.mean_first:
+        model.expected.requires_grad_(False)
+        model.surprise_std.fill_(_residual_deviation(model, train))
     _fit_elbo(model, train, held_out, folder / "cvae", seed)
     return model, _report(model, len(train.rewards), held_out)
 
@@ -105,8 +116,17 @@ def _fit_mean(
         model.expected, draw, loss, loop, folder, seed=seed, validate=validate,
         describe="expected reward",
     )  # fmt: skip
-    model.expected.requires_grad_(False)
-    model.surprise_std.fill_(max(validate(), 1e-8) ** 0.5)
+
+
+@torch.no_grad()
+def _residual_deviation(model: CausalRewardModel, train: Transitions) -> float:
+    """Root of the mean squared residual of the training steps."""
+    total = 0.0
+    for start in range(0, len(train.rewards), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        residual = model.residual(train.states[part], train.actions[part], train.rewards[part])
+        total += float(residual.double().square().sum())
+    return float(max(total / len(train.rewards), 1e-8) ** 0.5)
 
 
 def _fit_elbo(

@@ -187,6 +187,11 @@ class Columns:
             return np.full(self.meta["n_episodes"], -1)
         return self.episode_column(schema.USER)
 
+    def has_episode_column(self, name: str) -> bool:
+        """Whether the store has the episode column `name`."""
+        files = [shard / f"{name}.npy" for shard in self._shards]
+        return name in self._arrays or (bool(files) and all(file.is_file() for file in files))
+
     def episode_column(self, name: str) -> Array:
         """The whole episode column `name`, (E,).
 

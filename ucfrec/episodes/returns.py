@@ -1,45 +1,150 @@
-"""Returns-to-go, defined once for both training and acting."""
+"""Returns-to-go, defined once for training, acting and scoring."""
 
-from typing import TYPE_CHECKING, TypeVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 
+from ucfrec.errors import InputError
+
 if TYPE_CHECKING:
     from torch import Tensor
 
-ArrayOrTensor = TypeVar("ArrayOrTensor", npt.NDArray[np.float64], "Tensor")
+Definition = Literal["session", "discounted", "horizon"]
 
 
-def remaining_return(total: ArrayOrTensor, collected: ArrayOrTensor) -> ArrayOrTensor:
-    """The return-to-go: `total` minus the rewards collected so far (undiscounted, γ = 1).
+@dataclass(frozen=True)
+class ReturnToGo:
+    """What the return-to-go Ĝ_t of step t counts.
 
-    Args:
-        total: the episode's return in training, the target return when acting; any shape.
-        collected: sum of the rewards strictly before the step, of the same shape.
+    - `session`: the whole rest of the session, Σ_{k≥t} r_k (paper section 2.1).
+    - `discounted`: Σ_{k≥t} γ^{k−t} r_k.
+    - `horizon`: the next h steps, Σ_{t≤k<t+h} r_k.
+
+    Raises:
+        InputError: the definition is unknown, γ is not in (0, 1], or h is below 1.
     """
-    return total - collected
+
+    definition: Definition = "session"
+    discount: float = 0.9
+    """γ of `discounted`."""
+    horizon: int = 1
+    """h of `horizon`, steps."""
+
+    def __post_init__(self) -> None:
+        if self.definition not in get_args(Definition):
+            known = ", ".join(get_args(Definition))
+            raise InputError(f"no return-to-go is called {self.definition!r}; choose from {known}")
+        if not 0 < self.discount <= 1 or self.horizon < 1:
+            raise InputError(
+                f"the return-to-go has discount {self.discount} and horizon {self.horizon}; give a "
+                "discount above 0, at most 1, and a horizon of 1 step or more"
+            )
+
+    @property
+    def per_session(self) -> bool:
+        """Whether a target is set for a session as a whole, so that rewards lower what is left.
+
+        Otherwise, the same target is set anew at every step.
+        """
+        return self.definition == "session"
+
+    def of_logs(
+        self, rewards: npt.NDArray[np.floating], offsets: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.float32]:
+        """Returns-to-go of logged episodes.
+
+        Example: rewards [1, 0, 2, 5] with offsets [0, 3, 4] give [3, 2, 2, 5] for `session`.
+
+        Args:
+            rewards: (N,) rewards of all episodes, concatenated.
+            offsets: (E + 1,) index of the first step of each episode, followed by N.
+
+        Returns:
+            (N,) in reward units; summed in float64, rounded to float32.
+        """
+        if self.definition == "discounted":
+            return _discounted(rewards, offsets, self.discount)
+        before = np.concatenate([[0.0], np.cumsum(rewards, dtype=np.float64)])  # (N + 1,)
+        lengths, steps = np.diff(offsets), np.arange(len(rewards))
+        ends = np.repeat(offsets[1:], lengths)
+        if self.definition == "horizon":
+            return np.asarray(
+                before[np.minimum(steps + self.horizon, ends)] - before[:-1], dtype=np.float32
+            )
+        starts = np.repeat(offsets[:-1], lengths)
+        totals, collected = before[ends] - before[starts], before[:-1] - before[starts]
+        return np.asarray(totals - collected, dtype=np.float32)
+
+    def asked(self, target: float, collected: "Tensor") -> "Tensor":
+        """What is asked for at the next step, (B,) float64, in reward units.
+
+        Args:
+            target: of the session if `per_session`, otherwise of every step.
+            collected: (B,) sum of the rewards earlier in the session.
+        """
+        # Checking a log needs this module, but not the seconds that importing torch takes.
+        import torch
+
+        whole = torch.full_like(collected, target, dtype=torch.float64)
+        return whole - collected if self.per_session else whole
+
+    def before(self, asked: "Tensor", rewards: "Tensor") -> "Tensor":
+        """Returns-to-go of all steps of a window, given what is asked for at its last step.
+
+        Earlier steps count the rewards that followed them, then what is asked for: the numbers that
+        training would show if the future earned exactly that.
+
+        Args:
+            asked: (B,) at the last step.
+            rewards: (B, K) of the windows' steps, 0 at padding; the last column is not used.
+
+        Returns:
+            (B, K) float32.
+        """
+        import torch
+
+        earlier = rewards[:, :-1].double()
+        last = asked.double().unsqueeze(1)
+        if self.definition == "session":
+            returns = last + earlier.flip(1).cumsum(1).flip(1)
+        elif self.definition == "discounted":
+            # Σ_{j≤k<t} γ^{k−j} r_k: a triangular product, because a recursion would be a loop.
+            length = earlier.shape[1]
+            ahead = torch.arange(length).unsqueeze(0) - torch.arange(length).unsqueeze(1)
+            weights = torch.where(ahead >= 0, self.discount ** ahead.clamp(min=0).double(), 0.0)
+            reach = self.discount ** torch.arange(length, 0, -1, dtype=torch.float64)
+            returns = earlier @ weights.T.to(earlier) + reach.to(last) * last
+        else:
+            sums = torch.nn.functional.pad(earlier.cumsum(1), (1, 0))  # before each step
+            length = earlier.shape[1]
+            steps = torch.arange(length)
+            ends = (steps + self.horizon).clamp(max=length)
+            beyond = (steps + self.horizon - length).clamp(min=0).double() / self.horizon
+            returns = sums[:, ends] - sums[:, :-1] + beyond.to(last) * last
+        return torch.cat([returns, last], dim=1).float()
 
 
 def returns_to_go(
     rewards: npt.NDArray[np.floating], offsets: npt.NDArray[np.int64]
 ) -> npt.NDArray[np.float32]:
-    """Undiscounted suffix sums Ĝ_t = Σ_{k≥t} r_k within each episode (paper section 2.1).
+    """Returns-to-go of the whole rest of each session; see `ReturnToGo.of_logs`."""
+    return ReturnToGo().of_logs(rewards, offsets)
 
-    Example: rewards [1, 0, 2, 5] with offsets [0, 3, 4] give [3, 2, 2, 5].
 
-    Args:
-        rewards: (N,) rewards of all episodes, concatenated.
-        offsets: (E + 1,) index of the first step of each episode, followed by N.
-
-    Returns:
-        (N,) returns-to-go in reward units; summed in float64, rounded to float32.
-    """
+def _discounted(
+    rewards: npt.NDArray[np.floating], offsets: npt.NDArray[np.int64], discount: float
+) -> npt.NDArray[np.float32]:
+    """Discounted suffix sums, for all episodes at once, one step from their ends at a time."""
     lengths = np.diff(offsets)
-    before = np.concatenate([[0.0], np.cumsum(rewards, dtype=np.float64)])  # (N + 1,)
-    totals = before[offsets[1:]] - before[offsets[:-1]]  # (E,)
-    collected = before[:-1] - np.repeat(before[offsets[:-1]], lengths)  # (N,)
-    remaining: npt.NDArray[np.float32] = remaining_return(
-        np.repeat(totals, lengths), collected
-    ).astype(np.float32)
-    return remaining
+    order = np.argsort(-lengths, kind="stable")
+    longest, result = int(lengths.max(initial=0)), np.zeros(len(rewards))
+    reached = np.searchsorted(-lengths[order], -np.arange(1, longest + 1), side="right")
+    following = np.zeros(len(lengths))
+    for back in range(1, longest + 1):
+        rows = order[: reached[back - 1]]
+        steps = offsets[1:][rows] - back
+        following[rows] = rewards[steps] + discount * following[rows]
+        result[steps] = following[rows]
+    return result.astype(np.float32)

@@ -4,7 +4,7 @@ Training windows and acting both call `ItemStates.build`. It uses only element-w
 fixed order, so its results are bit-identical for every batch size.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +43,9 @@ class ItemStates:
     """Number of most recent steps that enter the means."""
     decay: float = 0.8
     """Factor by which the weight in the means falls with each step back."""
+    tags: Tensor = field(default_factory=lambda: torch.zeros(0, 0, dtype=torch.int64))
+    """(n_items, T) int64 numbers of each item's tags, padded with −1; T is 0 if the catalogue has
+    none. States do not contain them: they tell which items are alike."""
 
     def __post_init__(self) -> None:
         if self.embeddings.dim() != 2 or self.user_features.dim() != 2:
@@ -114,6 +117,8 @@ class ItemStates:
         numbers = {"window": self.window, "decay": self.decay}
         numbers |= {"reward_low": self.reward_low, "reward_high": self.reward_high}
         tensors = {"embeddings": self.embeddings, "user_features": self.user_features}
+        if self.tags.shape[1]:
+            tensors["tags"] = self.tags
         save_tensors(path, tensors, numbers)
 
     @classmethod
@@ -125,7 +130,8 @@ class ItemStates:
         """
         tensors, numbers = load_tensors(path)
         with damage_explained(path, REMEDY):
-            return cls(tensors["embeddings"], tensors["user_features"], **numbers)
+            states = cls(tensors["embeddings"], tensors["user_features"], **numbers)
+            return replace(states, tags=tensors["tags"]) if "tags" in tensors else states
 
 
 def _with_zero_row(table: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.episodes.columns import ITEM_STATES, Columns
+from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.view import EpisodeView
 from ucfrec.episodes.windows import Overlay, Transitions, Windows
@@ -162,6 +163,16 @@ class EpisodeStore(EpisodeView):
         column[self._columns.starts[self._sources[episodes]] + steps] = values
         columns = self._columns.with_step_column(schema.RETURN_TO_GO, column)
         return EpisodeStore(columns, self._selected)
+
+    def with_return_to_go(self, definition: ReturnToGo) -> "EpisodeStore":
+        """A view of the same episodes whose returns-to-go are counted by `definition`.
+
+        Raises:
+            InputError: this view has edited copies.
+        """
+        rewards = self.step_values(schema.REWARD, *self.all_steps())
+        offsets = np.concatenate([[0], np.cumsum(self.lengths)])
+        return self.with_returns_to_go(definition.of_logs(rewards, offsets))
 
     def without_observation_dimensions(self, dimensions: Sequence[int]) -> "EpisodeStore":
         """A view of the same episodes without some dimensions of the observations.

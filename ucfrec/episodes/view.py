@@ -99,6 +99,11 @@ class EpisodeView:
         return self._columns.has_items
 
     @property
+    def has_users(self) -> bool:
+        """Whether the store names the user of every episode."""
+        return self._columns.has_episode_column(schema.USER)
+
+    @property
     def item_states(self) -> ItemStates:
         """Builds states from items; for stores of items only.
 
@@ -125,6 +130,13 @@ class EpisodeView:
         """
         return self._columns.episode_column(name)[self._sources]
 
+    @property
+    def terminated(self) -> npt.NDArray[np.bool_]:
+        """(E + C,) whether each session is known to have ended with its last step."""
+        if not self._columns.has_episode_column(schema.TERMINATED):
+            return np.ones(self.n_episodes, dtype=bool)
+        return self.episode_values(schema.TERMINATED).astype(bool)
+
     @cached_property
     def returns(self) -> FloatArray:
         """(E + C,) undiscounted return of each episode, in reward units."""
@@ -147,6 +159,33 @@ class EpisodeView:
         return self._columns.step_values(
             name, self._columns.starts[self._sources[episodes]] + steps
         )
+
+    def rewards_before(self, episodes: IntArray, steps: IntArray) -> npt.NDArray[np.float64]:
+        """(B,) sum of the rewards of the session before each step, in reward units.
+
+        Args:
+            episodes: (B,) positions in the view.
+            steps: (B,) steps of those episodes, from 0.
+        """
+        owner, before = self._earlier(steps)
+        rewards = self.step_values(schema.REWARD, episodes[owner], before)
+        return np.bincount(owner, rewards, minlength=len(steps)).astype(np.float64)
+
+    def items_before(self, episodes: IntArray, steps: IntArray) -> tuple[IntArray, IntArray]:
+        """(rows, items), each (M,): the items that sessions showed before the given steps.
+
+        Args:
+            episodes: (B,) positions in the view.
+            steps: (B,) steps of those episodes, from 0; `rows` are indices into the B.
+        """
+        owner, before = self._earlier(steps)
+        return owner, self.step_values(schema.ITEM, episodes[owner], before).astype(np.int64)
+
+    @staticmethod
+    def _earlier(steps: IntArray) -> tuple[IntArray, IntArray]:
+        """Row and number of every step before the given ones (B,), row by row."""
+        owner = np.repeat(np.arange(len(steps)), steps)
+        return owner, np.arange(len(owner)) - np.repeat(np.cumsum(steps) - steps, steps)
 
     def all_steps(self) -> tuple[IntArray, IntArray]:
         """(episodes, steps), each (n_steps,): every step of the view, episode by episode."""

@@ -61,10 +61,10 @@ def collect(
     """Play `sessions` sessions and write them as logs that `ucfrec prepare` reads.
 
     `out` contains `sessions.parquet` (one row per step: user, session, time in ms, item or action,
-    observation, the simulator's feedback, and the propensity if it is known; sessions played in
-    parallel are interleaved), `items.parquet` if the world describes its items, and `collect.json`,
-    the record of the run. Sessions start 60 s apart and their steps 1 s apart. Memory is bounded,
-    because rows are written one row group at a time.
+    the simulator's feedback, the observation unless it is empty, and the propensity if it is known;
+    sessions played in parallel are interleaved), `items.parquet` if the world describes its items,
+    and `collect.json`, the record of the run. Sessions start 60 s apart and their steps 1 s apart.
+    Memory is bounded, because rows are written one row group at a time.
 
     Args:
         simulator: names the feedback column.
@@ -147,9 +147,11 @@ class _SessionLog:
             (ACTION if self._items is None else ITEM_ID): (
                 _lists(actions) if self._items is None else pa.array(self._items[actions])
             ),
-            OBSERVATION: _lists(np.concatenate([step.observations for step in steps])),
             self._feedback: pa.array(np.concatenate([step.rewards for step in steps])),
         }
+        observations = np.concatenate([step.observations for step in steps])
+        if observations.shape[1]:
+            columns[OBSERVATION] = _lists(observations)
         known = [step.propensities for step in steps if step.propensities is not None]
         if len(known) == len(steps):
             columns[PROPENSITY] = pa.array(np.concatenate(known))

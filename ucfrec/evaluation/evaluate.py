@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from ucfrec import schema
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import Actor, IntArray, rollout
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.errors import InputError
@@ -54,7 +55,7 @@ def evaluate_policy(
     name: str,
     episodes: int,
     seed: int,
-    target_return: float,
+    rule: DecisionRule | None = None,
 ) -> dict[str, Any]:
     """Result row of a trained policy.
 
@@ -63,18 +64,21 @@ def evaluate_policy(
         trained: the policy.
         name: name of the policy in the row.
         episodes: number of episodes to play.
-        seed: environment i is seeded with `seed` + i.
-        target_return: target return of every episode, in units of the training reward.
+        seed: environment i is seeded with `seed` + i; also of the draws of the rule.
+        rule: the decision rule; None for the run's own.
 
     Raises:
         InputError: the policy's actions or observations do not fit this world.
     """
     env = world.simulator().make(min(episodes, SIDE_BY_SIDE), world.folder)
     numbers = _item_numbers(world, env, trained)
-    actor = trained.actor(env.num_envs, target_return, numbers)
+    rule = rule or trained.rule
+    actor = trained.actor(env.num_envs, rule, numbers, seed)
     row = _row(world, name, env, actor, episodes, seed, trained.counts, numbers)
     return row | {
-        "target_return": target_return,
+        "target_return": rule.target,
+        "rule": rule.hash,
+        "decision_rule": rule.as_dict(),
         "train_seed": trained.record["seed"],
         "fingerprint": trained.record["fingerprint"],
         "config": config_hash(trained.record["config"]),
@@ -100,7 +104,7 @@ def _row(
         variety = variety_columns(env, recommended, counts, numbers)
     env.close()
     return {
-        "world": world.name,
+        "world": world.title,
         "policy": name,
         **asdict(session_metrics(played, seed)),
         **variety,
@@ -119,8 +123,8 @@ def _item_numbers(world: World, env: Any, trained: TrainedPolicy) -> IntArray | 
     expected = trained.record["observation_size"]
     if expected > provided:
         raise InputError(
-            f"the policy observes {expected} numbers, {world.name} shows {provided}; train it on "
-            f"logs of {world.name}"
+            f"the policy observes {expected} numbers, {world.title} shows {provided}; train it on "
+            f"logs of {world.name}, collected with the same --observe"
         )
     if not isinstance(space, spaces.Discrete):
         if sizes["items"] or space.shape != (sizes["action"],):

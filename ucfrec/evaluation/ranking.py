@@ -17,6 +17,7 @@ from scipy.stats import rankdata
 from torch import Tensor
 
 from ucfrec import schema
+from ucfrec.episodes.group_auc import group_auc
 from ucfrec.episodes.item_counts import liked_steps
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
@@ -67,7 +68,9 @@ class Ranked:
     ranks: FloatArray
     """(N,) rank of the shown item, from 1; tied items share their mean rank."""
     scores: FloatArray
-    """(N,) score of the shown item."""
+    """(N,) score of the shown item at its user's first evaluated step: what was known before any of
+    the user's evaluated steps. Scores at the steps themselves would depend on the very rewards that
+    they are compared by."""
     top: IntArray
     """(N, k) recommended items, best first."""
 
@@ -82,12 +85,13 @@ def evaluated_steps(store: EpisodeStore, at_once: int) -> Iterator[Steps]:
 
 
 @torch.no_grad()
-def rank_steps(ranker: Ranker, store: EpisodeStore, k: int) -> Ranked:
+def rank_steps(ranker: Ranker, store: EpisodeStore, k: int, users: npt.NDArray[Any]) -> Ranked:
     """Rank every step of `store`.
 
     Args:
         ranker: scores the items.
         store: episodes of items.
+        users: (N,) identifier of each step's user.
         k: number of recommended items per step, at most n_items.
     """
     n_items = len(store.item_states.embeddings)
@@ -100,21 +104,43 @@ def rank_steps(ranker: Ranker, store: EpisodeStore, k: int) -> Ranked:
             parts.append(_ranked_alike(scores[0], torch.from_numpy(shown), k))
         else:
             parts.append(_ranked(scores, torch.from_numpy(shown), k))
-    return Ranked(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    ranks, top = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return Ranked(ranks, _first_scores(ranker, store, users, at_once), top)
 
 
-def _ranked(scores: Tensor, shown: Tensor, k: int) -> tuple[FloatArray, FloatArray, IntArray]:
+def _first_scores(
+    ranker: Ranker, store: EpisodeStore, users: npt.NDArray[Any], at_once: int
+) -> FloatArray:
+    """(N,) score of each step's item at the first step of its user."""
+    _, first, owner = np.unique(users, return_index=True, return_inverse=True)
+    episodes, steps = store.all_steps()
+    items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
+    known = store.episode_values(schema.USER).astype(np.int64)
+    order = np.argsort(owner, kind="stable")
+    bounds = np.searchsorted(owner[order], np.arange(len(first) + 1))
+    found = np.empty(len(owner))
+    for begin in range(0, len(first), at_once):
+        at = first[begin : begin + at_once]
+        batch = Steps(store, episodes[at], steps[at], known[episodes[at]])
+        scores = ranker.scores(batch)
+        rows = order[bounds[begin] : bounds[begin + len(at)]]
+        of_user = owner[rows] - begin if len(scores) > 1 else np.zeros(len(rows), dtype=np.int64)
+        found[rows] = scores.double().numpy()[of_user, items[rows]]
+    return found
+
+
+def _ranked(scores: Tensor, shown: Tensor, k: int) -> tuple[FloatArray, IntArray]:
     of_shown = scores.gather(1, shown.unsqueeze(1))
     above, equal = (scores > of_shown).sum(1), (scores == of_shown).sum(1)
     ranks = 1 + above.double() + (equal - 1).double() / 2
-    return ranks.numpy(), of_shown[:, 0].double().numpy(), scores.topk(k, dim=1).indices.numpy()
+    return ranks.numpy(), scores.topk(k, dim=1).indices.numpy()
 
 
-def _ranked_alike(scores: Tensor, shown: Tensor, k: int) -> tuple[FloatArray, FloatArray, IntArray]:
+def _ranked_alike(scores: Tensor, shown: Tensor, k: int) -> tuple[FloatArray, IntArray]:
     """`_ranked` for scores (n_items,) that all steps share, which are sorted only once."""
     ranks = rankdata(-scores.double().numpy(), method="average")
     top = np.broadcast_to(scores.topk(k).indices.numpy(), (len(shown), k))
-    return ranks[shown], scores[shown].double().numpy(), top
+    return ranks[shown], top
 
 
 @dataclass(frozen=True)
@@ -157,8 +183,8 @@ MEASURES: Mapping[str, str] = {
     "ndcg_liked": "ndcg_shown over liked steps only",
     "recall_liked": "share of the items that a user liked in the period that are among the k "
     "recommended at the user's first step, mean over users",
-    "gauc": "probability that a liked step scores higher than another step of the same user, mean "
-    "over users weighted by impressions",
+    "gauc": "probability that a liked item scores higher than another one shown to the same user, "
+    "from what was known before the user's first step, mean over users weighted by impressions",
     "item_rate": "mean share of liked impressions, in the period, of the recommended items that "
     "the period showed",
     "known": "share of recommended items that the period showed",
@@ -195,7 +221,7 @@ def measure(period: Period, ranked: Ranked, k: int) -> dict[str, tuple[FloatArra
         "hit_rate_liked": (by_user(hit * liked), by_user(liked)),
         "ndcg_liked": (by_user(gain * liked), by_user(liked)),
         "recall_liked": _recall(period, ranked, owner, len(users)),
-        "gauc": _group_auc(ranked.scores, period.liked, owner, len(users)),
+        "gauc": group_auc(ranked.scores, period.liked, owner, len(users)),
         "item_rate": (by_user(np.nansum(rates, axis=1)), by_user(known.sum(1))),
         "known": (by_user(known.sum(1)), by_user(every * ranked.top.shape[1])),
     }
@@ -214,27 +240,6 @@ def _recall(
     with np.errstate(invalid="ignore"):
         share = np.nan_to_num(np.bincount(pairs[0], hits, minlength=n_users) / n_liked)
     return share, (n_liked > 0).astype(np.float64)
-
-
-def _group_auc(
-    scores: FloatArray, liked: npt.NDArray[np.bool_], owner: IntArray, n_users: int
-) -> tuple[FloatArray, FloatArray]:
-    """Per user: AUC times impressions, and impressions (Zhu et al., KDD 2017).
-
-    Both are 0 for users whose steps are all liked or all not liked.
-    """
-    sizes = np.bincount(owner, minlength=n_users)
-    _, level = np.unique(scores, return_inverse=True)
-    # Ranks within users: ranks of (user, score) minus the number of steps of earlier users.
-    ranks = rankdata(owner * len(scores) + level) - (np.cumsum(sizes) - sizes)[owner]
-    positive = np.bincount(owner, liked, minlength=n_users)
-    negative = sizes - positive
-    above = np.bincount(owner, ranks * liked, minlength=n_users) - positive * (positive + 1) / 2
-    mixed = (positive > 0) & (negative > 0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        auc = np.where(mixed, above / (positive * negative), 0.0)
-    weight = (sizes * mixed).astype(np.float64)
-    return auc * weight, weight
 
 
 @dataclass(frozen=True)

@@ -10,30 +10,44 @@ from scipy import sparse
 from torch import Tensor
 
 from ucfrec import schema
+from ucfrec.acting.decision import Decider, DecisionRule
+from ucfrec.acting.logged_decisions import session_scores
 from ucfrec.episodes.item_counts import TrainingCounts, liked_steps
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.ranking import Ranker, Steps
 from ucfrec.policies.item_knn import ItemKNNConfig, ItemKNNPolicy
+from ucfrec.policies.item_rate import liked_rates
 from ucfrec.runs.trained_policy import TrainedPolicy
 
-_PRIOR: Final = 10.0
-"""Impressions at the mean click rate that are added to every item's counts (smoothing)."""
 _KNN_HISTORY: Final = 20
 """Steps of the session that item-kNN reads."""
 _ALS_FACTORS: Final = 32
 
 
 class PolicyRanker:
-    """Ranks items by a trained policy's probabilities at a target return (reward units)."""
+    """Ranks items as a trained policy does under its decision rule, before anything is drawn."""
 
-    def __init__(self, trained: TrainedPolicy, target_return: float, name: str) -> None:
-        self.name, self._trained, self._target = name, trained, target_return
+    def __init__(self, trained: TrainedPolicy, rule: DecisionRule | None, name: str) -> None:
+        self.name, self._decider = name, trained.decider(rule)
 
     def scores(self, steps: Steps) -> Tensor:
-        """Log-probabilities (B, n_items); earlier rewards of the session lower the return-to-go."""
-        windows = steps.windows(self._trained.policy.config.context)
-        more = torch.from_numpy(self._target - steps.store.returns[steps.episodes])
-        return self._trained.log_probabilities(windows, more.unsqueeze(1))
+        """Log-probabilities at temperature 1 (B, n_items); see `Decider.scores`."""
+        return session_scores(self._decider, steps.store, steps.episodes, steps.steps).log_softmax(
+            -1
+        )
+
+
+@dataclass(frozen=True)
+class RewardRanker:
+    """Ranks items by the reward model that the run's decision rules tilt by."""
+
+    decider: Decider
+    name: str = "reward model"
+
+    def scores(self, steps: Steps) -> Tensor:
+        """Predicted rewards (B, n_items), in the model's units."""
+        windows = steps.windows(self.decider.policy.config.context)
+        return self.decider.rewards(windows, torch.from_numpy(steps.users))
 
 
 @dataclass(frozen=True)
@@ -136,13 +150,11 @@ def baselines(counts: TrainingCounts, train: EpisodeStore | None, seed: int) -> 
         seed: of the random scores and of ALS.
     """
     shown, liked = counts.shown.double(), counts.liked.double()
-    mean = float(liked.sum() / shown.sum())
-    rate = (liked + _PRIOR * mean) / (shown + _PRIOR)
     rankers: list[Ranker] = [
         Random(len(shown), seed),
         SameForAll("most shown", shown),
         SameForAll("most clicked", liked),
-        SameForAll("item click rate", rate),
+        SameForAll("item click rate", liked_rates(counts)),
     ]
     if train is not None:
         rankers.append(ItemNeighbours(train, shown.float()))

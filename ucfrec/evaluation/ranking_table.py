@@ -10,7 +10,7 @@ import numpy.typing as npt
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.ranking import MEASURES, Period, compare, rank_steps, rankers_named
-from ucfrec.evaluation.ranking_baselines import PolicyRanker, baselines
+from ucfrec.evaluation.ranking_baselines import PolicyRanker, RewardRanker, baselines
 from ucfrec.provenance import provenance
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -56,7 +56,7 @@ def ranking_rows(
 
     Args:
         policies: at least one; the first is the reference of the differences.
-        trained: any of their runs, for the counts of the training rows.
+        trained: any of their runs, for the counts of the training rows and the reward model.
         train: the store of those rows; None leaves out item-kNN and ALS.
         later: the steps to rank.
         users: (E,) identifier of the user of each episode of `later`.
@@ -66,10 +66,11 @@ def ranking_rows(
     counts = trained.counts
     assert counts is not None
     fitted_on = None if train is None else train.split("train")
-    named = rankers_named([*policies, *baselines(counts, fitted_on, seed)])
+    model = [] if trained.reward_model is None else [RewardRanker(trained.decider())]
+    named = rankers_named([*policies, *model, *baselines(counts, fitted_on, seed)])
     k = min(k, len(counts.shown))
-    ranked = {name: rank_steps(ranker, later, k) for name, ranker in named.items()}
     period = Period.of(later, np.asarray(users))
+    ranked = {name: rank_steps(ranker, later, k, period.users) for name, ranker in named.items()}
     reference = next(iter(named))
     shared = {
         "k": k,

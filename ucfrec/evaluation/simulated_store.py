@@ -10,7 +10,7 @@ from ucfrec.schema import ITEM_ID, SESSION_ID
 
 
 def simulated_store(
-    world: World, folder: Path, sessions: int, seed: int, behavior: str = "mixture"
+    world: World, folder: Path, sessions: int, seed: int, behavior: str | None = None
 ) -> Path:
     """Collect logs in `folder/logs` and prepare `folder/store`; existing folders are reused.
 
@@ -19,7 +19,8 @@ def simulated_store(
         folder: holds both folders.
         sessions: number of sessions to play.
         seed: seed of the environments and of the behavior policy.
-        behavior: name of one of the simulator's built-in policies.
+        behavior: name of one of the simulator's built-in policies; None for its
+            `logging_behavior`.
 
     Returns:
         The path of the store.
@@ -28,8 +29,9 @@ def simulated_store(
     simulator = world.simulator()
     if not logs.exists():
         env = simulator.make(256, world.folder)
-        actor = simulator.behaviors[behavior](env, seed)
-        collect(simulator, env, actor, sessions, seed, logs, env_name=world.name, behavior=behavior)
+        chosen = behavior or simulator.logging_behavior
+        actor = simulator.behaviors[chosen](env, seed)
+        collect(simulator, env, actor, sessions, seed, logs, env_name=world.title, behavior=chosen)
     if not store.exists():
         items = logs / "items.parquet"
         features = (FeatureTable((items,), ITEM_ID),) if items.exists() else ()

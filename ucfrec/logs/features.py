@@ -12,6 +12,8 @@ from ucfrec.errors import InputError
 
 CATEGORIES: Final = 200
 """Most categories or tags of one column: the most frequent among trained ids are kept."""
+TAGS: Final = 16
+"""Most tags kept of one item, the most frequent ones."""
 CLIP: Final = 5.0
 """Standardised numbers are clipped to ± this many standard deviations."""
 
@@ -49,6 +51,51 @@ def encode_features(
             if block.shape[1]:
                 blocks.append(block)
     return sparse.hstack(blocks, format="csr", dtype=np.float32) if blocks else None
+
+
+def item_tags(
+    connection: duckdb.DuckDBPyConnection, names: Sequence[str], ids: str, id_column: str
+) -> Array:
+    """Number the tags of items; row i belongs to the id with `number` i in the table `ids`.
+
+    The tags are the values of all columns of lists. Where there are such columns, items without any
+    tag share one of their own, as they would share the category of a missing value.
+
+    Args:
+        connection: engine with the tables.
+        names: feature tables of `load_features`.
+        ids: table with `number` and the ids.
+        id_column: column of the ids in it.
+
+    Returns:
+        (n_ids, T) int64, padded with −1, T at most `TAGS`; T is 0 without columns of lists.
+    """
+    ((count,),) = connection.sql(f"SELECT count(*) FROM {ids}").fetchall()
+    cases = [
+        f"SELECT number, '{name}.{column}:' || unnest(list_distinct({column})) AS tag "
+        f"FROM {ids} JOIN {name} ON {ids}.{id_column} = {name}.id"
+        for name in names
+        for column, kind, *_ in connection.sql(f"DESCRIBE {name}").fetchall()[1:]
+        if kind == "VARCHAR[]"
+    ]
+    if not cases:
+        return np.zeros((count, 0), dtype=np.int64)
+    found = connection.sql(f"""
+        WITH cases AS ({" UNION ALL ".join(cases)}),
+        tags AS (
+            SELECT tag, row_number() OVER (ORDER BY count(*) DESC, tag) - 1 AS tag_number
+            FROM cases WHERE tag IS NOT NULL GROUP BY tag
+        )
+        SELECT number, tag_number,
+            row_number() OVER (PARTITION BY number ORDER BY tag_number) - 1 AS place
+        FROM cases JOIN tags USING (tag) QUALIFY place < {TAGS}
+    """).fetchnumpy()
+    numbers, places = found["number"].astype(np.int64), found["place"].astype(np.int64)
+    tags = np.full((count, int(places.max(initial=0)) + 1), -1, dtype=np.int64)
+    tags[numbers, places] = found["tag_number"]
+    untagged = tags[:, 0] < 0
+    tags[untagged, 0] = tags.max() + 1
+    return tags
 
 
 def _encode(

@@ -1,5 +1,6 @@
 """Item embeddings and user features, learnt from the training split only."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -36,6 +37,7 @@ def write_item_states(
     n_items: int,
     n_users: int,
     size: int,
+    tags: IntArray | None = None,
 ) -> ItemStates:
     """Learn the item embeddings and user features of the store at `folder` and write them there.
 
@@ -46,6 +48,7 @@ def write_item_states(
         n_items: number of items of the store.
         n_users: number of users of the store.
         size: most dimensions of the item embeddings.
+        tags: (n_items, T) as from `ucfrec.logs.features.item_tags`; None for none.
 
     Returns:
         The item states, as written.
@@ -73,6 +76,8 @@ def write_item_states(
         spread = user_vectors[known].std(axis=0)
         user_vectors /= np.where(spread > 0, spread, 1)
     states = ItemStates(torch.from_numpy(embeddings), torch.from_numpy(user_vectors), low, high)
+    if tags is not None:
+        states = replace(states, tags=torch.from_numpy(tags))
     states.save(folder / ITEM_STATES)
     return states
 

@@ -300,7 +300,7 @@ def _write_states(
     """Learn the item states, or copy those of the store `like`."""
     # Importing torch and scikit-learn takes seconds, which only checking a log must not cost.
     from ucfrec.episodes.store import ITEM_STATES
-    from ucfrec.logs.features import encode_features
+    from ucfrec.logs.features import encode_features, item_tags
     from ucfrec.logs.items import write_item_states
 
     if like is not None:
@@ -317,4 +317,5 @@ def _write_states(
         counts[schema.ITEM_ID],
         counts[schema.USER_ID],
         size,
+        item_tags(log.connection, features[schema.ITEM_ID], "items", schema.ITEM_ID),
     )

@@ -64,7 +64,9 @@ def cut_episodes(log: CleanLog, cut: Cut) -> None:
 
     It has the columns of `clean` except `row`, and `split` (0 train, 1 validation, 2 test),
     `starts` (first step of a session), `first` (first step of an episode), `episode` (number within
-    the user) and `terminated`.
+    the user) and `terminated`, which is false for episodes cut at a split and for sessions that may
+    have gone on after the log ended: a user's last one if sessions are users, or if it ended within
+    the gap before the end of the log.
 
     Raises:
         InputError: no episode remains, or none in the training split.
@@ -92,13 +94,14 @@ def cut_episodes(log: CleanLog, cut: Cut) -> None:
             FROM ({source}) WINDOW w AS (PARTITION BY {user} ORDER BY {order})
         ), ended AS (
             SELECT *, starts OR split <> lag(split) OVER w AS first,
-                coalesce(lead(starts) OVER w, true) AS ends
-            FROM marked WINDOW w AS (PARTITION BY {user} ORDER BY {order})
+                coalesce(lead(starts) OVER w, {_last_row_ends(cut)}) AS ends
+            FROM marked, (SELECT max({time}) AS log_end FROM clean)
+            WINDOW w AS (PARTITION BY {user} ORDER BY {order})
         ), numbered AS (
             SELECT *, CAST(sum(first::INT) OVER w AS BIGINT) AS episode
             FROM ended WINDOW w AS (PARTITION BY {user} ORDER BY {order})
         ), measured AS (
-            SELECT * EXCLUDE (ends, began, row),
+            SELECT * EXCLUDE (ends, began, row, log_end),
                 count(*) OVER e AS length, bool_or(ends) OVER e AS terminated
             FROM numbered WINDOW e AS (PARTITION BY {user}, episode)
         )
@@ -115,6 +118,13 @@ def cut_episodes(log: CleanLog, cut: Cut) -> None:
         raise InputError(
             f"no row is in the training split (before {cut.bounds[0]} ms); choose a later split"
         )
+
+
+def _last_row_ends(cut: Cut) -> str:
+    """SQL that tells if a user's last row ends its session for certain."""
+    if cut.session_by == schema.SESSION_ID:
+        return "true"
+    return "false" if cut.session_by == "user" else f"log_end - {schema.TIMESTAMP} > {cut.gap_ms}"
 
 
 def number_ids(log: CleanLog, listed: dict[str, list[str]], like: Path | None) -> None:

@@ -1,5 +1,6 @@
 """Report on what `prepare` read, dropped and kept, as a dictionary and as a text table."""
 
+import math
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any, Final
@@ -79,10 +80,15 @@ def build_report(log: CleanLog, cut: Cut, dropped: Mapping[str, int]) -> dict[st
     """
     read, conflicts = log.one("SELECT count(*), count_if(conflict) FROM rows")
     (clean,) = log.one("SELECT count(*) FROM clean")
-    steps, episodes, users, sessions, cuts, first_ms, last_ms = log.one(f"""
+    steps, episodes, users, sessions, unfinished, first_ms, last_ms = log.one(f"""
         SELECT count(*), count_if(first), count(DISTINCT {schema.USER_ID}), count_if(starts),
-            count_if(starts AND NOT terminated), min({schema.TIMESTAMP}), max({schema.TIMESTAMP})
+            count_if(first AND NOT terminated), min({schema.TIMESTAMP}), max({schema.TIMESTAMP})
         FROM steps
+    """)
+    (censored,) = log.one(f"""
+        SELECT count_if(NOT terminated) FROM (
+            SELECT arg_max(terminated, episode) AS terminated FROM steps GROUP BY {schema.USER_ID}
+        )
     """)
     mean, deviation, low, high = log.one(
         "SELECT avg(reward), stddev_pop(reward), min(reward), max(reward) FROM steps"
@@ -101,7 +107,9 @@ def build_report(log: CleanLog, cut: Cut, dropped: Mapping[str, int]) -> dict[st
         "steps": steps,
         "episodes": episodes,
         "sessions": sessions,
-        "sessions_cut": cuts,
+        "sessions_cut": unfinished - censored,
+        "sessions_censored": censored,
+        "return_length_share": _return_length_share(log),
         "users": users,
         "splits": splits,
         "session_by": cut.session_by,
@@ -118,6 +126,26 @@ def build_report(log: CleanLog, cut: Cut, dropped: Mapping[str, int]) -> dict[st
             f"SELECT count_if({schema.PROPENSITY} IS NULL) FROM steps"
         )
     return report
+
+
+def _return_length_share(log: CleanLog) -> float | None:
+    """Share of the variance of training returns-to-go that the number of steps left explains.
+
+    Of the whole rest of the session; None if either does not vary.
+    """
+    (correlation,) = log.one(f"""
+        SELECT corr(rest, ahead) FROM (
+            SELECT sum(reward) OVER w AS rest, count(*) OVER w AS ahead FROM steps
+            WHERE split = 0
+            WINDOW w AS (
+                PARTITION BY {schema.USER_ID}, episode ORDER BY {schema.TIMESTAMP}
+                ROWS BETWEEN CURRENT ROW AND UNBOUNDED FOLLOWING
+            )
+        )
+    """)
+    if correlation is None or not math.isfinite(correlation):
+        return None
+    return float(correlation**2)
 
 
 def format_report(report: Mapping[str, Any]) -> str:
@@ -143,15 +171,27 @@ def format_report(report: Mapping[str, Any]) -> str:
     lines.append(("sessions", f"{report['sessions']:,} by {report['session_by']}"))
     if report["sessions_cut"]:
         lines.append(("  cut at a split", f"{report['sessions_cut']:,}"))
+    if report.get("sessions_censored"):
+        text = f"{report['sessions_censored']:,}  may have gone on after the log ended"
+        lines.append(("  censored", text))
     lines += [
         (f"  {name}", f"{count['episodes']:,} episodes, {count['steps']:,} steps")
         for name, count in report["splits"].items()
     ]
     lines.append(("times (UTC)", " to ".join(_clock(t) for t in report["time_range_ms"])))
+    if report.get("return_length_share") is not None:
+        lines.append(("return-to-go", _returns_to_go(report)))
     figures = ", ".join(f"{name} {value:.4g}" for name, value in reward.items())
     lines.append(("reward", f"{one_line(report['reward'])}: {figures}"))
     width = max(len(name) for name, _ in lines) + 2
     return "\n".join(f"{name:<{width}}{value}".rstrip() for name, value in lines)
+
+
+def _returns_to_go(report: Mapping[str, Any]) -> str:
+    text = f"{report['return_length_share']:.0%} of its variance is the number of steps left"
+    if report["session_by"] != "user":
+        return text
+    return f"{text}, which is chance where sessions are users: policies learn the next step's"
 
 
 def _clock(milliseconds: int) -> str:

@@ -14,13 +14,16 @@ from typing import Any
 
 _HOMES = {
     "Estimate": "estimators",
+    "ItemGroups": "logged_steps",
     "LoggedSteps": "logged_steps",
     "Modelled": "logged_steps",
     "Verdict": "verdict",
+    "as_pages": "pages",
     "cluster_probabilities": "logged_steps",
     "diagnose": "diagnostics",
     "estimate": "estimators",
     "judge": "verdict",
+    "select": "selection",
 }
 """Public name to the module that defines it."""
 

@@ -19,14 +19,18 @@ from ucfrec.off_policy.logged_steps import LoggedSteps
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
 
 ENOUGH_TO_TEST: Final = 30
 """Users below which a mean weight is not tested."""
 ENOUGH_USERS: Final = 200
 """Effective users below which no estimate stands: in `benchmarks/off_policy_coverage.py` intervals
 of fewer hold the truth too seldom."""
+LEAST_SHOWN: Final = 0.01
+"""Share of the evaluated policy's choices below which an item group is not tested."""
 _SIGNIFICANCE, _TOLERANCE = 0.01, 0.02
 SESSION_PRODUCTS: Final = "session products"
+ITEMS_TO_CHOOSE_FROM: Final = "items to choose from"
 
 
 @dataclass(frozen=True)
@@ -120,7 +124,11 @@ def diagnose(
 
 def weight_tests(steps: LoggedSteps, segment: IntArray | None = None) -> tuple[WeightTest, ...]:
     """Two-sided tests that mean weights are 1: the ratios of each step, the session products, and
-    those of each segment. Errors are clustered by user; groups of under 30 users are left out.
+    those of each segment and item group. Errors are clustered by user; what fewer than 30 users
+    have is left out.
+
+    Over all steps, the ratios of an item group's own have the mean of the evaluated policy's
+    probability of the group; their quotient is tested.
 
     Args:
         segment: (S,) as `diagnose` takes it.
@@ -141,11 +149,55 @@ def weight_tests(steps: LoggedSteps, segment: IntArray | None = None) -> tuple[W
         if len(np.unique(user)) >= ENOUGH_TO_TEST:
             (mean,), (error,) = cluster_means(values[:, None], user)
             found.append((name, float(mean), float(error)))
+    found += _group_weights(steps, ratios)
     limit = NormalDist().inv_cdf(1 - _SIGNIFICANCE / (2 * max(len(found), 1)))
     return tuple(
         WeightTest(name, mean, error, abs(mean - 1) <= max(_TOLERANCE, limit * error))
         for name, mean, error in found
     )
+
+
+def _group_weights(steps: LoggedSteps, ratios: FloatArray) -> list[tuple[str, float, float]]:
+    """Name, mean weight and its error of each item group that the evaluated policy shows."""
+    if steps.groups is None:
+        return []
+    user = steps.session if steps.user is None else steps.user[steps.session]
+    found = []
+    for number in range(steps.groups.target.shape[1]):
+        here = steps.groups.number == number
+        expected = steps.groups.target[:, number].astype(np.float64)
+        share = float(expected.mean())
+        if len(np.unique(user[here])) < ENOUGH_TO_TEST or share < LEAST_SHOWN:
+            continue
+        beyond = (np.where(here, ratios, 0.0) - expected) / share
+        (mean,), (error,) = cluster_means(beyond[:, None], user)
+        found.append((f"item group {number}", 1 + float(mean), float(error)))
+    return found
+
+
+def implied_items(steps: LoggedSteps, listed: BoolArray, items: int) -> WeightTest | None:
+    """Test that the propensities of a catalogue can add up to 1.
+
+    The mean of 1 / propensity over the logged choices among `items` items is the number of these
+    that the behavior policy chose from, at most all of them. So the test is one-sided, at 1%.
+
+    Args:
+        listed: (N,) whether the logged item is one of the items.
+        items: how many there are.
+
+    Returns:
+        The implied share of the items as a test, errors clustered by user; None with fewer than 30
+        users, or without propensities.
+    """
+    known = ~np.isnan(steps.propensity)
+    user = steps.session if steps.user is None else steps.user[steps.session]
+    if not known.any() or len(np.unique(user[known])) < ENOUGH_TO_TEST:
+        return None
+    shares = np.where(listed[known], 1 / steps.propensity[known], 0.0) / items
+    (mean,), (error,) = cluster_means(shares[:, None], user[known])
+    limit = NormalDist().inv_cdf(1 - _SIGNIFICANCE)
+    passed = bool(mean - 1 <= max(_TOLERANCE, limit * error))
+    return WeightTest(ITEMS_TO_CHOOSE_FROM, float(mean), float(error), passed)
 
 
 def pareto_tail(weights: FloatArray) -> float | None:

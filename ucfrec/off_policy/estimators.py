@@ -16,6 +16,8 @@ whole session, E_n the mean over sessions.
 | DR | E_n[Σ_t γ^t (w_it (r_it − q_it) + w_i,t−1 v_it)] | Dudík 2011; Jiang & Li, ICML 2016 |
 | SNDR | DR with w_it / E_n[w_it] for w_it | weighted DR: Thomas & Brunskill, ICML 2016, eq. 8 |
 | MIPS | PDIS with weights of clusters | Saito & Joachims, ICML 2022 |
+| IIPS | E_n[Σ_t γ^t ρ_it r_it], of pages | Li et al., KDD 2018; `ucfrec.off_policy.pages` |
+| SNIIPS | the same with ρ_it over its mean at position t | |
 | clipped IPS, SWITCH-DR, … | | `ucfrec.off_policy.shrinkage` |
 
 In the means over sessions at step t, a session that has ended counts with the weight of its last
@@ -30,6 +32,7 @@ import numpy.typing as npt
 
 from ucfrec.off_policy.intervals import Interval, cluster_intervals
 from ucfrec.off_policy.logged_steps import LoggedSteps
+from ucfrec.off_policy.pages import independent_terms
 from ucfrec.off_policy.shrinkage import shrunk
 
 FloatArray = npt.NDArray[np.float64]
@@ -37,8 +40,6 @@ FloatArray = npt.NDArray[np.float64]
 LOGGED = "logged"
 WEIGHTED = ("IPS", "SNIPS", "PDIS", "SNPDIS", "DR", "SNDR", "MIPS")
 """Estimates that weigh sessions, unshrunk."""
-MODELS = ("DM", "FQE")
-"""Estimates that nothing but a model stands behind."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,9 @@ class Estimate:
     value: float
     low: float | None
     """Ends of the 95% interval, studentised and clustered by user (`cluster_intervals`). None for
-    DM and FQE, whose error is the model's and not that of the sessions it is averaged over, and
-    where nothing spreads: too few sessions earn anything under the weights."""
+    DM and FQE, whose error is the model's and not that of the sessions it is averaged over; for
+    MIPS and where weights are shrunk, whose bias no resampling shows; and where nothing spreads:
+    too few sessions earn anything under the weights."""
     high: float | None
     error: float | None
     """Standard error, over users."""
@@ -71,6 +73,9 @@ class Terms:
     weights: FloatArray
     """(S,) what each session counts."""
     parameter: float | None = None
+    biased: bool = False
+    """Whether there is an error in it that no resampling shows: a model's, or that of shrunk or
+    marginalised weights."""
 
 
 def estimate(steps: LoggedSteps, seed: int) -> dict[str, Estimate]:
@@ -94,7 +99,7 @@ def estimate(steps: LoggedSteps, seed: int) -> dict[str, Estimate]:
             seed,
         )
         for (name, one), interval in zip(terms.items(), intervals, strict=True):
-            found[name] = _summary(one, None if name in MODELS else interval)
+            found[name] = _summary(one, None if one.biased else interval)
     return found
 
 
@@ -116,11 +121,14 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
         corrected = weights * left + steps.before(weights) * steps.model.v
         found["DR"] = Terms(steps.per_session(steps.discounts * corrected), ones, last)
         found["SNDR"] = Terms(_normalised_by_step(steps, left, steps.model.v), ones, last)
+    if steps.pages:
+        for name, (above, kept) in independent_terms(steps).items():
+            found[name] = Terms(above, ones, kept)
     if (clustered := steps.cluster_weights) is not None:
         above = steps.per_session(steps.discounts * clustered * steps.reward)
-        found["MIPS"] = Terms(above, ones, clustered[steps.last])
+        found["MIPS"] = Terms(above, ones, clustered[steps.last], biased=True)
     for name, (parameter, above, kept) in shrunk(steps).items():
-        found[name] = Terms(above, ones, kept, parameter)
+        found[name] = Terms(above, ones, kept, parameter, biased=bool((kept != last).any()))
     return found
 
 
@@ -130,8 +138,9 @@ def _groups(steps: LoggedSteps) -> Iterator[tuple[LoggedSteps, dict[str, Terms]]
     plain = {LOGGED: Terms(steps.returns, ones, ones)}
     if steps.model is not None:
         modelled = steps.per_session(steps.discounts * steps.model.reward)
-        plain["DM"] = Terms(modelled, ones, ones)
-        plain["FQE"] = Terms(steps.model.v[steps.first], ones, ones)
+        plain["DM"] = Terms(modelled, ones, ones, biased=True)
+        if not steps.pages:
+            plain["FQE"] = Terms(steps.model.v[steps.first], ones, ones, biased=True)
     yield steps, plain
     without = steps.per_session(np.isnan(steps.propensity).astype(np.float64)) > 0
     if without.all():

@@ -1,7 +1,6 @@
 """Estimates from logs what a trained policy would have earned, and reports how reliable that is."""
 
-import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,19 +10,27 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.off_policy.diagnostics import Diagnosis, diagnose
-from ucfrec.off_policy.estimators import LOGGED, Estimate, estimate
-from ucfrec.off_policy.fqe import cross_fitted
-from ucfrec.off_policy.logged_steps import LoggedSteps
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.off_policy.behavior_model import BehaviorModel, fit_behavior
+from ucfrec.off_policy.columns import as_row, diagnosis_columns, verdict_columns
+from ucfrec.off_policy.diagnostics import diagnose, implied_items
+from ucfrec.off_policy.estimators import LOGGED, estimate, session_terms
+from ucfrec.off_policy.features import InputsFile, StepInputs, context_of, scores_of
+from ucfrec.off_policy.fqe import ModelReport, fit_models
+from ucfrec.off_policy.item_groups import default_groups, group_items
+from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps
+from ucfrec.off_policy.options import EstimateOptions
+from ucfrec.off_policy.pages import as_pages, pages_of
 from ucfrec.off_policy.score import LoggedSessions, ScoredSteps, scored_steps
 from ucfrec.off_policy.training_rows import MOST_SEEN, share_seen
-from ucfrec.off_policy.verdict import Verdict, cautions, judge
+from ucfrec.off_policy.verdict import FAR_OFF, Verdict, cautions, influences, judge
 from ucfrec.provenance import provenance
 from ucfrec.runs.trained_policy import TrainedPolicy
 
-_PRODUCTS = 256
+DEFAULTS = EstimateOptions()
 
-Float32Array = npt.NDArray[np.float32]
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -35,6 +42,24 @@ class OffPolicyReport:
     warnings: list[str]
     """The verdict's reasons, cautions, and remarks on the logs."""
     verdict: Verdict
+    returns: FloatArray
+    """(S,) of the logged sessions, or pages, with all their propensities; empty if none has."""
+    user: IntArray | None
+    """(S,) whose they are; None where each is somebody else's."""
+    terms: FloatArray | None
+    """(S,) whose mean is the estimate that the verdict is of; None where nothing can be weighed."""
+
+
+@dataclass(frozen=True)
+class JudgedSteps:
+    """Logged steps with the evaluated policy's probabilities, and the models fitted on them."""
+
+    steps: LoggedSteps
+    models: ModelReport
+    behavior: BehaviorModel | None
+    """None where neither MIPS nor a lacking propensity needs it."""
+    estimated: int
+    """Number of steps whose propensity is estimated."""
 
 
 def evaluate_off_policy(
@@ -42,61 +67,133 @@ def evaluate_off_policy(
     trained: TrainedPolicy,
     logged: LoggedSessions,
     *,
-    target_return: float,
-    greedy: bool,
+    rule: DecisionRule | None = None,
     seed: int,
-    discount: float = 1.0,
+    options: EstimateOptions = DEFAULTS,
 ) -> OffPolicyReport:
     """Estimate the mean return of a session under the policy of `run`, from logs alone.
 
     Models of future reward are fitted on these logs; each user's sessions are predicted by models
-    fitted on other users. Needs about 5 kB of memory per logged step.
+    fitted on other users.
 
     Args:
         run: folder of the run, named in the rows.
         trained: the policy of the run.
         logged: logs read with `keep_unknown`. The policy would never show an item that it does not
             know, so such a step has weight 0.
-        target_return: the return that the policy is asked for, in units of the reward.
-        greedy: judge the policy that shows its most probable item; otherwise the one that draws
-            items from its softmax.
+        rule: the decision rule to judge; None for the run's own.
         seed: seed of the folds and of the bootstrap.
-        discount: discount factor γ of the estimated returns.
+        options: what else is asked.
 
     Returns:
         The estimates, the warnings and the verdict.
 
     Raises:
-        InputError: propensities are not probabilities, or there is only one user.
+        InputError: propensities are not probabilities, there is only one user, or pages are asked
+            for and a session has several steps.
     """
-    steps = logged_steps(trained, logged, target_return, greedy, seed, discount)
-    found, diagnosis = estimate(steps, seed), diagnose(steps)
+    rule = rule or trained.rule
+    judged = logged_steps(trained, logged, rule, seed, options)
+    steps = as_pages(judged.steps, *_pages(logged)) if options.pages else judged.steps
+    steps, of_groups = _without_far_off_groups(steps)
+    began = logged.store.step_values(schema.TIMESTAMP, *logged.store.all_steps())
+    segment = None if options.pages else _quarters(began[steps.first])
+    found, diagnosis = estimate(steps, seed), diagnose(steps, options.reward_range, segment)
     seen = share_seen(trained, logged.store)
-    verdict = judge(steps, seed, diagnosis=diagnosis, forbidden=_seen_too_often(seen))
+    verdict = judge(
+        steps,
+        seed,
+        diagnosis=diagnosis,
+        wanted_lift=options.wanted_lift,
+        forbidden=[*_seen_too_often(seen), *_too_many_items(trained, judged)],
+        declared=_declared(judged),
+    )
     said = [*verdict.reasons, *cautions(diagnosis, found), *_of_the_logs(seen, logged)]
+    said += [*of_groups, *_of_the_models(judged)]
     about = {
-        "target_return": target_return,
-        "discount": discount,
+        "target_return": rule.target,
+        "rule": rule.hash,
+        "decision_rule": rule.as_dict(),
+        "discount": options.discount,
         "sessions": len(steps.first),
+        "pages": options.pages,
+        "anonymous": not options.users_known,
         "steps": len(steps.reward),
         "dropped": logged.report["dropped"],
         "unknown_item_rows": logged.unknown_items,
         "seen_in_training": seen,
         "warnings": said,
-        **_verdict_columns(verdict),
-        **_diagnosis_columns(diagnosis),
+        **verdict_columns(verdict),
+        **diagnosis_columns(diagnosis),
+        **judged.models.columns(),
         "run": str(run),
         "fingerprint": logged.store.meta["fingerprint"],
         "seed": seed,
         **provenance(),
     }
-    who = {"policy": trained.name, "choice": "greedy" if greedy else "softmax"}
+    who = {"policy": trained.name, "choice": "softmax" if rule.temperature else "greedy"}
     behavior = {"policy": "behavior", "choice": "as logged"}
     rows = [
         as_row(name, one) | (behavior if name == LOGGED else who) | about
         for name, one in found.items()
     ]
-    return OffPolicyReport(rows, said, verdict)
+    known = steps.known() if diagnosis.left_out < diagnosis.sessions else None
+    return OffPolicyReport(
+        rows,
+        said,
+        verdict,
+        returns=np.empty(0) if known is None else known.returns,
+        user=None if known is None else known.user,
+        terms=None if known is None else _terms(known, verdict),
+    )
+
+
+def _terms(known: LoggedSteps, verdict: Verdict) -> FloatArray | None:
+    terms = {} if verdict.estimator is None else session_terms(known)
+    return influences(terms[verdict.estimator]) if verdict.estimator in terms else None
+
+
+def _pages(logged: LoggedSessions) -> tuple[IntArray, IntArray | None]:
+    """(N,) page of each step, and its position there where the observation is one-hot."""
+    episodes, steps = logged.store.all_steps()
+    users = np.unique(logged.users, return_inverse=True)[1][episodes]
+    times = logged.store.step_values(schema.TIMESTAMP, episodes, steps).astype(np.int64)
+    page, size = pages_of(users, times), logged.store.observation_size
+    if size < 2:
+        return page, None
+    seen = logged.store.step_values(schema.OBSERVATION, episodes, steps)
+    one_hot = np.isin(seen, (0, 1)).all() and (seen.sum(axis=1) == 1).all()
+    return page, seen.argmax(axis=1) if one_hot else None
+
+
+def _without_far_off_groups(steps: LoggedSteps) -> tuple[LoggedSteps, list[str]]:
+    """The steps without weights of item groups, and why, where their mean is not 1: the estimated
+    probabilities of groups are not good enough for sessions of this length."""
+    weights = steps.cluster_weights
+    if weights is None or abs((mean := float(weights[steps.last].mean())) - 1) <= FAR_OFF:
+        return steps, []
+    said = f"MIPS is left out: its session weights have mean {mean:.3g} where 1 is expected"
+    return replace(steps, cluster_propensity=None, cluster_target=None), [said]
+
+
+def _quarters(times: npt.NDArray[Any]) -> IntArray:
+    """(S,) quarter of the logs, 1 to 4 by time, in which each session begins."""
+    return 1 + np.searchsorted(np.quantile(times, [0.25, 0.5, 0.75]), times, side="right")
+
+
+def _declared(judged: JudgedSteps) -> str:
+    if not judged.estimated:
+        return ""
+    return f"with the propensities of {judged.estimated:,} steps estimated ({judged.behavior})"
+
+
+def _of_the_models(judged: JudgedSteps) -> list[str]:
+    if judged.models.settled:
+        return []
+    return [
+        "fitted Q evaluation ran away (its values grew beyond what so many rewards can be) and was "
+        "stopped: FQE says nothing here"
+    ]
 
 
 def _seen_too_often(seen: float | None) -> list[str]:
@@ -105,6 +202,20 @@ def _seen_too_often(seen: float | None) -> list[str]:
     return [
         f"{seen:.0%} of the rows were seen in training: on these a policy looks "
         "better than it is; give later logs"
+    ]
+
+
+def _too_many_items(trained: TrainedPolicy, judged: JudgedSteps) -> list[str]:
+    steps = judged.steps
+    assert trained.item_ids is not None
+    assert steps.groups is not None
+    items = len(trained.item_ids)
+    found = None if judged.estimated else implied_items(steps, steps.groups.number >= 0, items)
+    if found is None or found.passed:
+        return []
+    return [
+        f"the propensities imply {found.mean * items:,.0f} ± {found.error * items:,.0f} items to "
+        f"choose from, the run knows {items:,}: propensities are too small"
     ]
 
 
@@ -123,66 +234,23 @@ def _of_the_logs(seen: float | None, logged: LoggedSessions) -> list[str]:
     return said
 
 
-def as_row(name: str, found: Estimate) -> dict[str, Any]:
-    """Turn an estimate into a result row.
-
-    Args:
-        name: name of the estimator.
-        found: its estimate.
-
-    Returns:
-        The row. `R_cum` is the mean return, as in `ucfrec.evaluation.metrics`; the ends of its
-        interval are None if there is no interval.
-    """
-    return {
-        "estimator": name,
-        "R_cum": found.value,
-        "R_cum_low": found.low,
-        "R_cum_high": found.high,
-        "R_cum_error": found.error,
-        "effective_sessions": found.effective_sessions,
-        "largest_weight": found.largest_weight,
-        "parameter": found.parameter if found.parameter != math.inf else None,
-    }
-
-
-def _verdict_columns(verdict: Verdict) -> dict[str, Any]:
-    columns = asdict(verdict) | {"verdict": str(verdict), "verdict_of": verdict.estimator}
-    return {name: value for name, value in columns.items() if name not in ("estimator", "reasons")}
-
-
-def _diagnosis_columns(diagnosis: Diagnosis) -> dict[str, Any]:
-    return {
-        "overlap": diagnosis.overlap,
-        "users": diagnosis.users,
-        "sessions_without_propensity": diagnosis.left_out,
-        "effective_users": diagnosis.effective_users,
-        "effective_by_step": list(diagnosis.effective_by_step),
-        "stops_telling_at": diagnosis.stops_telling_at,
-        "weight_tests": [asdict(test) for test in diagnosis.tests],
-        "mean_weight": diagnosis.mean_weight,
-        "pareto_tail": diagnosis.tail,
-        "bounds": None if diagnosis.bounds is None else list(diagnosis.bounds),
-    }
-
-
 def logged_steps(
     trained: TrainedPolicy,
     logged: LoggedSessions,
-    target_return: float,
-    greedy: bool,
+    rule: DecisionRule,
     seed: int,
-    discount: float = 1.0,
-) -> LoggedSteps:
+    options: EstimateOptions = DEFAULTS,
+) -> JudgedSteps:
     """Collect the logged steps, the policy's probabilities and models of what it would earn.
+
+    In memory are some ten numbers a step; what the models see of it lies on disk meanwhile.
 
     Args:
         trained: a policy that chooses items.
         logged: logs read with `keep_unknown`.
-        target_return: the return that the policy is asked for, in units of the reward.
-        greedy: judge the policy that shows its most probable item, instead of drawing items.
-        seed: seed of the folds.
-        discount: discount factor γ of the returns.
+        rule: the decision rule to judge.
+        seed: seed of the folds, item groups and samples.
+        options: what else is asked.
 
     Returns:
         The N logged steps, in order.
@@ -190,31 +258,81 @@ def logged_steps(
     Raises:
         InputError: propensities are not probabilities, or there is only one user.
     """
+    store, plain = logged.store, _unjudged(logged, options)
+    items = store.step_values(schema.ITEM, *store.all_steps()).astype(np.int64)
+    group_of = _item_groups(trained, options, seed)
+    group = np.where(items >= 0, group_of[items], -1)
+    one_hot = torch.from_numpy(np.eye(group_of.max() + 1, dtype=np.float32)[group_of])
+    target, shown = np.empty(len(items)), np.empty((len(items), one_hot.shape[1]), np.float32)
+    done, behavior = 0, None
+    with InputsFile() as inputs:
+        for batch in scored_steps(trained, store, rule):
+            rows = slice(done, done + len(batch.steps))
+            target[rows], probabilities, seen = step_features(trained, batch)
+            shown[rows] = (probabilities @ one_hot).numpy()
+            inputs.append(seen)
+            done = rows.stop
+        grouped = shown.shape[1] > 1 and plain.unknown_propensities < len(items)
+        if grouped or options.estimate_propensities:
+            known = np.maximum(group, 0)
+            behavior = fit_behavior(inputs.states, items, known, plain.session, seed, plain.user)
+        fitted = fit_models(
+            inputs.chunks, plain.reward, plain.session, seed, plain.user, plain.discount
+        )
+    groups = ItemGroups(group, shown)
+    steps = replace(plain, target=target, model=fitted.modelled, groups=groups)
+    estimated = 0
+    if behavior is not None:
+        estimated = plain.unknown_propensities if options.estimate_propensities else 0
+        steps = _weighed_by_model(steps, groups, behavior, options.estimate_propensities)
+    return JudgedSteps(steps, fitted.report, behavior, estimated)
+
+
+def _unjudged(logged: LoggedSessions, options: EstimateOptions) -> LoggedSteps:
+    """What the logs say, without any policy. Checks the propensities before the slow scoring."""
     store = logged.store
-    assert trained.item_states is not None
-    one_state, one_item = torch.zeros(1, store.state_size), trained.item_states.embeddings[:1]
-    width = _features(one_state, one_item).shape[1]
-    features, at_policy = np.empty((2, store.n_steps, width), dtype=np.float32)
-    target, done = np.empty(store.n_steps), 0
-    for batch in scored_steps(trained, store, target_return):
-        rows = slice(done, done + len(batch.steps))
-        target[rows], features[rows], at_policy[rows] = step_features(trained, batch, greedy)
-        done = rows.stop
-    episodes, steps = store.all_steps()
-    reward = store.step_values(schema.REWARD, episodes, steps).astype(np.float64)
-    propensity = np.full(len(reward), np.nan)
+    episodes, places = store.all_steps()
+    propensity = np.full(len(episodes), np.nan)
     if schema.PROPENSITY in store.meta["columns"]:
-        propensity = store.step_values(schema.PROPENSITY, episodes, steps).astype(np.float64)
-    user = np.unique(logged.users, return_inverse=True)[1]
-    # This checks the propensities before the slow fitting starts.
-    unmodelled = LoggedSteps(episodes, reward, propensity, target, user=user, discount=discount)
-    model = cross_fitted(features, at_policy, reward, episodes, seed, user, discount)
-    return replace(unmodelled, model=model)
+        propensity = store.step_values(schema.PROPENSITY, episodes, places).astype(np.float64)
+    return LoggedSteps(
+        session=episodes,
+        reward=store.step_values(schema.REWARD, episodes, places).astype(np.float64),
+        propensity=propensity,
+        target=np.zeros(len(episodes)),
+        user=np.unique(logged.users, return_inverse=True)[1] if options.users_known else None,
+        discount=options.discount,
+    )
+
+
+def _weighed_by_model(
+    steps: LoggedSteps, groups: ItemGroups, behavior: BehaviorModel, fill: bool
+) -> LoggedSteps:
+    """The steps with the probabilities of their items' groups, for MIPS, and with `fill` the
+    estimated propensities where the logs lack them."""
+    lacking = np.isnan(steps.propensity) & fill
+    of_group = np.take_along_axis(groups.target, np.maximum(groups.number, 0)[:, None], axis=1)
+    return replace(
+        steps,
+        propensity=np.where(lacking, behavior.item, steps.propensity),
+        cluster_propensity=behavior.group,
+        cluster_target=np.where(groups.number < 0, 0.0, of_group[:, 0]).clip(0, 1),
+    )
+
+
+def _item_groups(trained: TrainedPolicy, options: EstimateOptions, seed: int) -> IntArray:
+    """(n_items,) group of every item."""
+    assert trained.item_states is not None
+    embeddings = trained.item_states.embeddings.numpy()
+    wanted = options.item_clusters or default_groups(len(embeddings))
+    if wanted == 1:
+        return np.zeros(len(embeddings), dtype=np.int64)
+    return group_items(embeddings, wanted, seed)
 
 
 def step_features(
-    trained: TrainedPolicy, batch: ScoredSteps, greedy: bool
-) -> tuple[npt.NDArray[Any], Float32Array, Float32Array]:
+    trained: TrainedPolicy, batch: ScoredSteps
+) -> tuple[npt.NDArray[Any], Tensor, StepInputs]:
     """Compute the policy's probability and the models' inputs for B logged steps.
 
     An item that the run does not know (−1) has probability 0 and an embedding of zeros.
@@ -222,40 +340,23 @@ def step_features(
     Args:
         trained: a policy that chooses items.
         batch: the steps, scored by the policy.
-        greedy: judge the policy that shows its most probable item, instead of drawing items.
 
     Returns:
-        The evaluated policy's probability (B,) of the logged item; features (B, P) of the state and
-        the logged item; and the mean (B, P) of such features over the items that the policy shows.
+        The evaluated policy's probability (B,) of the logged item, and (B, n_items) of all items;
+        and what the models see.
     """
     assert trained.item_states is not None
     embeddings = trained.item_states.embeddings
-    states, items = batch.windows.states[:, -1], batch.windows.actions[:, -1]
+    items = batch.windows.actions[:, -1]
     known = items >= 0
-    if greedy:
-        best = batch.log_probabilities.argmax(1)
-        target, shown = (best == items).double(), embeddings[best]
-    else:
-        probabilities = batch.log_probabilities.exp()
-        target = probabilities.gather(1, items[:, None].clamp(min=0))[:, 0].double() * known
-        shown = probabilities @ embeddings
-    chosen = _features(states, embeddings[items] * known[:, None])
-    return target.clamp(0, 1).numpy(), chosen, _features(states, shown)
-
-
-def _features(states: Tensor, items: Tensor) -> Float32Array:
-    """Features (B, P) of states (B, S) and item embeddings (B, D), linear in the embeddings.
-
-    They are a constant 1, the states, the embeddings, and products of the two.
-
-    The three embeddings at the start of a state (`ucfrec.episodes.states.ItemStates`) are
-    multiplied with the item's own, dimension by dimension. The rest (user, observation) is
-    multiplied with as many of the item's first dimensions as `_PRODUCTS` allows.
-    """
-    dim = items.shape[1]
-    led_by, rest = states[:, : 3 * dim], states[:, 3 * dim :]
-    leading = items[:, : _PRODUCTS // rest.shape[1]]
-    products = rest.unsqueeze(2) * leading.unsqueeze(1)
-    ones = torch.ones(len(states), 1)
-    parts = [ones, states, items, led_by * items.repeat(1, 3), products.flatten(1)]
-    return np.asarray(torch.cat(parts, dim=1))
+    probabilities = batch.log_probabilities.exp()
+    target = probabilities.gather(1, items[:, None].clamp(min=0))[:, 0].double() * known
+    of_chosen, of_shown = scores_of(batch.scores.log_softmax(-1), items, probabilities)
+    seen = StepInputs(
+        context=context_of(trained, batch),
+        state_size=batch.windows.states.shape[2],
+        chosen=embeddings[items] * known[:, None],
+        shown=probabilities @ embeddings,
+        scores=torch.stack([of_chosen, of_shown], dim=1),
+    )
+    return target.clamp(0, 1).numpy(), probabilities, seen

@@ -1,9 +1,13 @@
-"""Models of what a policy would earn, each fitted on other sessions than it predicts.
+"""Models of what a policy would earn, each fitted on other users than it predicts.
 
 Fitted Q evaluation is Algorithm 3 of Le, Voloshin & Yue, *Batch Policy Learning under Constraints*
-(ICML 2019), with ridge regression, on sessions that end.
+(ICML 2019), with ridge regression, on sessions that end. With a linear model each of its
+regressions needs only sums over the logged steps, so the steps are read twice, whatever their
+number and however long the sessions are: once for the sums, once for the predictions.
 """
 
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -17,11 +21,45 @@ from ucfrec.progress import progress
 FloatArray = npt.NDArray[np.float64]
 Float32Array = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
+Chunks = Callable[[], Iterator[tuple[Float32Array, Float32Array]]]
+"""Reads the N steps from the start, some at once, in order: features (B, P) of state and logged
+action, the first of them 1, and (B, P) their mean over the evaluated policy's actions in the same
+states (what is linear in features has its exact mean over these actions)."""
 
 FOLDS = 5
-_ROWS_AT_ONCE = 2**16
+_ROWS_AT_ONCE = 2**13
 _CLOSE = 1e-6
+_ROUNDS = 10
+"""Regressions of FQE for each step of the longest session, unless they settle before: a linear Q
+is still on its way when as many steps as there are have been looked ahead."""
+
+
+@dataclass(frozen=True)
+class ModelReport:
+    """How good the models are on users that they were not fitted on."""
+
+    reward_r2: float
+    """Share of the variance of the logged rewards that the reward model predicts."""
+    td_loss: float
+    """Mean squared TD error r + γ v(s') − q(s, a) of the logged steps: the loss of FQE."""
+    td_bias: float
+    """Mean TD error, 0 for a right model; in units of the reward."""
+    iterations: int
+    """Regressions of FQE, the most of any fold."""
+    settled: bool
+    """Whether Q ended within what so many rewards can be, in every fold."""
+
+    def columns(self) -> dict[str, Any]:
+        """The numbers by name, `model_…`."""
+        return {f"model_{name}": value for name, value in asdict(self).items()}
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """What the models say of N steps, and how good they are."""
+
+    modelled: Modelled
+    report: ModelReport
 
 
 def cross_fitted(
@@ -33,13 +71,34 @@ def cross_fitted(
     user: IntArray | None = None,
     discount: float = 1.0,
 ) -> Modelled:
+    """`fit_models` for features (N, P) that lie in memory.
+
+    Args:
+        features: (N, P) of the logged state and action; the first is 1.
+        at_policy: (N, P) their mean over the evaluated policy's actions in the same states.
+    """
+
+    def chunks() -> Iterator[tuple[Float32Array, Float32Array]]:
+        for begin in range(0, len(features), _ROWS_AT_ONCE):
+            rows = slice(begin, begin + _ROWS_AT_ONCE)
+            yield features[rows], at_policy[rows]
+
+    return fit_models(chunks, reward, session, seed, user, discount).modelled
+
+
+def fit_models(
+    chunks: Chunks,
+    reward: FloatArray,
+    session: IntArray,
+    seed: int,
+    user: IntArray | None = None,
+    discount: float = 1.0,
+) -> Fitted:
     """Linear models of reward and Q, cross-fitted over users: no session is predicted by a model
     that saw it, nor by one that saw another session of its user.
 
     Args:
-        features: (N, P) of the logged state and action; the first is 1.
-        at_policy: (N, P) their mean over the evaluated policy's actions in the same states: what is
-            linear in them has its exact mean over these actions.
+        chunks: reads the features.
         reward: (N,).
         session: (N,) number of each step's session, from 0, never falling; steps in order.
         seed: draws the folds.
@@ -54,68 +113,146 @@ def cross_fitted(
     users = int(group.max()) + 1
     if users < 2:
         raise InputError("a model needs sessions of users other than the one it judges")
-    folds = (np.random.default_rng(seed).permutation(users) % min(FOLDS, users))[group]
+    folds = (np.random.default_rng(seed).permutation(users) % min(FOLDS, users))[group][session]
     last = np.diff(session, append=len(sessions)) > 0
-    gram = _gram(features)
-    penalty = _penalty(gram, len(reward))
-    modelled = Modelled(*np.zeros((3, len(reward))))
-    with progress(folds.max() + 1, "models", "folds") as bar:
-        for fold in range(folds.max() + 1):
-            here = folds[session] == fold
-            ridge = _Ridge(features, gram - _gram(features[here]) + np.diag(penalty), ~here)
-            modelled.reward[here] = at_policy[here] @ ridge.fit(reward)
-            weights = fitted_q(ridge, at_policy, reward, last, discount)
-            modelled.q[here] = features[here] @ weights
-            modelled.v[here] = at_policy[here] @ weights
-            bar.update()
-    return modelled
+    with progress(2 * len(reward), "models", "steps") as bar:
+        sums = _sums(chunks, reward, folds, last, bar.update)
+        horizon = int(np.diff(np.flatnonzero(last), prepend=-1).max())
+        fits = [
+            sums.fit(fold, reward[folds != fold], horizon, discount)
+            for fold in range(len(sums.rows))
+        ]
+        modelled, at_logged = _predicted(chunks, fits, folds, bar.update)
+    return Fitted(modelled, _report(modelled, at_logged, reward, last, discount, fits))
 
 
-class _Ridge:
-    """Ridge regression on the rows of `features` (N, P) that are kept, factorised once.
+@dataclass(frozen=True)
+class _Fit:
+    """Weights (P,) of the reward model and of Q."""
 
-    Args:
-        gram: (P, P) of these rows, the penalty on its diagonal.
-    """
-
-    def __init__(self, features: Float32Array, gram: FloatArray, keep: BoolArray) -> None:
-        self._features, self.keep = features, keep
-        self._factor: Any = cho_factor(gram)
-
-    def fit(self, target: FloatArray) -> Float32Array:
-        """(P,) weights for the target (N,); its values in rows not kept are ignored."""
-        kept = np.where(self.keep, target, 0.0).astype(np.float32)
-        weights = cho_solve(self._factor, (kept @ self._features).astype(np.float64))
-        return np.asarray(weights, dtype=np.float32)
+    reward: FloatArray
+    q: FloatArray
+    iterations: int
+    settled: bool
 
 
-def fitted_q(
-    ridge: _Ridge,
-    at_policy: Float32Array,
+@dataclass(frozen=True)
+class _Sums:
+    """Sums over the steps of each of F folds."""
+
+    gram: FloatArray
+    """(F, P, P) Σ φ φᵀ."""
+    follows: FloatArray
+    """(F, P, P) Σ φ φ̄'ᵀ over steps that another follows, φ̄' the mean features of that one."""
+    earned: FloatArray
+    """(F, P) Σ φ r."""
+    rows: IntArray
+    """(F,)."""
+
+    def fit(self, fold: int, reward: FloatArray, horizon: int, discount: float) -> _Fit:
+        """The models that know all folds but one.
+
+        Args:
+            reward: rewards of the steps of the other folds.
+        """
+        gram, follows, earned = (
+            sums.sum(axis=0) - sums[fold] for sums in (self.gram, self.follows, self.earned)
+        )
+        rows = int(self.rows.sum() - self.rows[fold])
+        factor = cho_factor(gram + np.diag(_penalty(self.gram.sum(axis=0), int(self.rows.sum()))))
+        weights = first = cho_solve(factor, earned, check_finite=False)
+        most = horizon * max(abs(reward.min()), abs(reward.max()))
+        iterations, settled = 1, True
+        while iterations < _ROUNDS * horizon:
+            iterations += 1
+            before, target = weights, earned + discount * (follows @ weights)
+            weights = cho_solve(factor, target, check_finite=False)
+            size = (weights @ gram @ weights / rows) ** 0.5
+            if not size <= most:
+                # Root mean square above what so many rewards could be: it runs away.
+                weights, settled = before, False
+                break
+            change = weights - before
+            if change @ gram @ change / rows <= (_CLOSE * most) ** 2:
+                break
+        return _Fit(first, weights, iterations, settled)
+
+
+def _sums(
+    chunks: Chunks,
     reward: FloatArray,
-    last: BoolArray,
-    discount: float = 1.0,
-) -> Float32Array:
-    """(P,) weights of Q: as many steps ahead as the longest session has, or until they settle.
+    folds: IntArray,
+    last: npt.NDArray[np.bool_],
+    done: Callable[[int], object],
+) -> _Sums:
+    begin, sums = 0, None
+    held: Float32Array | None = None
+    for features, at_policy in chunks():
+        rows, width = len(features), features.shape[1]
+        if sums is None:
+            count = int(folds.max()) + 1
+            gram, follows = np.zeros((2, count, width, width))
+            sums = _Sums(gram, follows, np.zeros((count, width)), np.bincount(folds))
+        end = begin + rows
+        # The last step of the chunk before is followed by the first of this one.
+        earlier = features[:-1] if held is None else np.vstack([held, features[:-1]])
+        later = at_policy[1:] if held is None else at_policy
+        start = begin if held is None else begin - 1
+        for fold in range(len(sums.rows)):
+            here = folds[begin:end] == fold
+            mine = features[here]
+            sums.gram[fold] += mine.T @ mine
+            sums.earned[fold] += mine.T @ reward[begin:end][here].astype(np.float32)
+            goes_on = (folds[start : end - 1] == fold) & ~last[start : end - 1]
+            sums.follows[fold] += earlier[goes_on].T @ later[goes_on]
+        held, begin = features[-1:], end
+        done(rows)
+    assert sums is not None
+    return sums
 
-    Targets are held within what so many rewards could be, so that no iteration runs away.
 
-    Args:
-        last: (N,) where a session ends and nothing follows.
-        discount: γ.
-    """
-    ends = np.flatnonzero(last)
-    horizon = int(np.diff(ends, prepend=-1).max())
-    seen = reward[ridge.keep]
-    low, high = horizon * min(seen.min(), 0.0), horizon * max(seen.max(), 0.0)
-    weights, next_values = ridge.fit(reward), np.zeros(len(reward))
-    for _ in range(horizon - 1):
-        before = next_values
-        next_values = np.where(last, 0.0, np.roll(at_policy @ weights, -1)).clip(low, high)
-        if np.abs(next_values - before).max() <= _CLOSE * (high - low):
-            break
-        weights = ridge.fit(reward + discount * next_values)
-    return weights
+def _predicted(
+    chunks: Chunks, fits: list[_Fit], folds: IntArray, done: Callable[[int], object]
+) -> tuple[Modelled, FloatArray]:
+    """What the models say of every step, and the modelled reward (N,) of the logged action."""
+    reward_weights = np.stack([fit.reward for fit in fits], axis=1)
+    q_weights = np.stack([fit.q for fit in fits], axis=1)
+    reward, q, v, at_logged = np.empty((4, len(folds)))
+    begin = 0
+    for features, at_policy in chunks():
+        rows = slice(begin, begin + len(features))
+        fold = folds[rows][:, None]
+        for into, inputs, weights in (
+            (reward, at_policy, reward_weights),
+            (at_logged, features, reward_weights),
+            (q, features, q_weights),
+            (v, at_policy, q_weights),
+        ):
+            into[rows] = np.take_along_axis(inputs @ weights, fold, axis=1)[:, 0]
+        begin = rows.stop
+        done(len(features))
+    return Modelled(reward, q, v), at_logged
+
+
+def _report(
+    modelled: Modelled,
+    at_logged: FloatArray,
+    reward: FloatArray,
+    last: npt.NDArray[np.bool_],
+    discount: float,
+    fits: list[_Fit],
+) -> ModelReport:
+    following = np.where(last, 0.0, np.roll(modelled.v, -1))
+    errors = reward + discount * following - modelled.q
+    spread = float(((reward - reward.mean()) ** 2).mean())
+    left = float(((reward - at_logged) ** 2).mean())
+    return ModelReport(
+        reward_r2=1 - left / spread if spread > 0 else 0.0,
+        td_loss=float((errors**2).mean()),
+        td_bias=float(errors.mean()),
+        iterations=max(fit.iterations for fit in fits),
+        settled=all(fit.settled for fit in fits),
+    )
 
 
 def _penalty(gram: FloatArray, rows: int) -> FloatArray:
@@ -126,12 +263,3 @@ def _penalty(gram: FloatArray, rows: int) -> FloatArray:
     penalty: FloatArray = len(gram) * np.where(mean_square > 0, mean_square, 1.0)
     penalty[0] = 0.0
     return penalty
-
-
-def _gram(features: Float32Array) -> FloatArray:
-    """(P, P) sums of products over rows, in double precision between chunks."""
-    total = np.zeros((features.shape[1],) * 2)
-    for begin in range(0, len(features), _ROWS_AT_ONCE):
-        chunk = features[begin : begin + _ROWS_AT_ONCE]
-        total += chunk.T @ chunk
-    return total

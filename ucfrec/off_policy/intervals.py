@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
 
 RESAMPLES = 2000
 MOST_CLUSTERS = 10_000
@@ -54,6 +55,59 @@ def cluster_intervals(
         One a column; None where nothing spreads: one cluster, all clusters equal, or so few that
         differ that more than a tenth of the resamples have no spread.
     """
+    drawn = resample(above, below, cluster, seed)
+    found: list[Interval | None] = []
+    for k in range(above.shape[1]):
+        usable = drawn.usable[:, k]
+        if not drawn.spreads[k] or usable.mean() < _USABLE:
+            found.append(None)
+            continue
+        shift, error = drawn.shift[usable, k], drawn.errors[usable, k]
+        low_t, high_t = np.quantile(shift / error, [(1 - level) / 2, (1 + level) / 2])
+        value, spread = drawn.value[k], drawn.error[k]
+        found.append(
+            Interval(
+                low=float(value - high_t * spread),
+                high=float(value - low_t * spread),
+                error=float(spread),
+                above_zero=float((value + shift > 0).mean()),
+            )
+        )
+    return found
+
+
+@dataclass(frozen=True)
+class Resampled:
+    """K ratios, and B resamples of them; the same clusters are drawn for all K."""
+
+    value: FloatArray
+    """(K,)."""
+    error: FloatArray
+    """(K,) standard errors over clusters."""
+    shift: FloatArray
+    """(B, K) of each resample: its ratio less `value`."""
+    errors: FloatArray
+    """(B, K) its own standard error."""
+    spreads: BoolArray
+    """(K,) whether clusters differ at all."""
+
+    @property
+    def usable(self) -> BoolArray:
+        """(B, K) whether the resample has a spread of its own."""
+        return np.asarray(np.isfinite(self.shift) & (self.errors > 1e-9 * self.error))
+
+
+def resample(
+    above: FloatArray, below: FloatArray, cluster: IntArray | None, seed: int
+) -> Resampled:
+    """Draw clusters with replacement, each with all its sessions.
+
+    Args:
+        above: (S, K), a row a session, a column a number Σ above / Σ below.
+        below: (S, K).
+        cluster: (S,) of each session, any integers; None where each session is its own.
+        seed: draws the resamples.
+    """
     names, clusters = _numbered(cluster, len(above))
     if clusters > MOST_CLUSTERS:
         shuffled = np.random.default_rng(seed).permutation(clusters)
@@ -67,25 +121,10 @@ def cluster_intervals(
     e, b = (sums[0] - value * sums[1]) / scale, sums[1] / size
     unit = scale / size
     correction = np.sqrt(clusters / max(clusters - 1, 1))
-    errors = correction * np.sqrt((e**2).sum(axis=0)) / b.sum(axis=0)
-    shift, error = _resampled(np.stack([e, b, e * e, e * b, b * b]), correction, seed)
-    found: list[Interval | None] = []
-    for k in range(above.shape[1]):
-        usable = np.isfinite(shift[:, k]) & (error[:, k] > 1e-9 * errors[k])
-        if clusters < 2 or errors[k] <= 1e-12 or usable.mean() < _USABLE:
-            found.append(None)
-            continue
-        t = shift[usable, k] / error[usable, k]
-        low_t, high_t = np.quantile(t, [(1 - level) / 2, (1 + level) / 2])
-        found.append(
-            Interval(
-                low=float(value[k] - high_t * errors[k] * unit[k]),
-                high=float(value[k] - low_t * errors[k] * unit[k]),
-                error=float(errors[k] * unit[k]),
-                above_zero=float((value[k] + shift[usable, k] * unit[k] > 0).mean()),
-            )
-        )
-    return found
+    error = correction * np.sqrt((e**2).sum(axis=0)) / b.sum(axis=0)
+    shift, errors = _resampled(np.stack([e, b, e * e, e * b, b * b]), correction, seed)
+    spreads = (error > 1e-12) & (clusters > 1)
+    return Resampled(value, error * unit, shift * unit, errors * unit, spreads)
 
 
 def cluster_means(

@@ -6,6 +6,7 @@ target / propensity of the logged action; w_it = Π_{k ≤ t} ρ_ik, with w_i,�
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +14,7 @@ import numpy.typing as npt
 from ucfrec.errors import InputError
 
 FloatArray = npt.NDArray[np.float64]
+Float32Array = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
@@ -30,6 +32,16 @@ class Modelled:
     """(N,) discounted return from the logged action on."""
     v: FloatArray
     """(N,) Σ_a π(a | s) q(s, a): the mean of `q` over the evaluated policy's actions."""
+
+
+@dataclass(frozen=True)
+class ItemGroups:
+    """Groups of items alike, of N logged steps: each is tested alone (`diagnose`)."""
+
+    number: IntArray
+    """(N,) group of the logged item, from 0; −1 for an item of none."""
+    target: Float32Array
+    """(N, K) the evaluated policy's probability of every group."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +72,10 @@ class LoggedSteps:
     `cluster_probabilities`."""
     cluster_target: FloatArray | None = None
     """(N,) the evaluated policy's probability of it."""
+    groups: ItemGroups | None = None
+    pages: bool = False
+    """Whether a session is one page and its steps the page's positions, chosen at once; see
+    `ucfrec.off_policy.pages`."""
 
     def __post_init__(self) -> None:
         n = len(self.session)
@@ -78,6 +94,10 @@ class LoggedSteps:
             raise InputError("give both cluster_propensity and cluster_target, or neither")
         if self.cluster_propensity is not None and self.cluster_target is not None:
             _require_probabilities(self.cluster_propensity, self.cluster_target, n)
+        if self.groups is not None:
+            of, target = self.groups.number.shape, self.groups.target.shape
+            if of != (n,) or len(target) != 2 or target[0] != n:
+                raise InputError(f"groups have shapes {of} and {target}; {n} steps are one each")
         if self.user is not None and self.user.shape != (len(self.first),):
             raise InputError(
                 f"user has shape {self.user.shape}; {len(self.first)} sessions are "
@@ -165,21 +185,34 @@ class LoggedSteps:
             InputError: it marks none.
         """
         rows = keep[self.session]
-        parts = {
-            name: values[rows]
-            for name in ("reward", "propensity", "target", "cluster_propensity", "cluster_target")
-            if (values := getattr(self, name)) is not None
-        }
-        model = self.model
-        if model is not None:
-            model = Modelled(*(values[rows] for values in vars(model).values()))
         return replace(
             self,
             session=(np.cumsum(keep) - 1)[self.session[rows]],
-            model=model,
             user=None if self.user is None else self.user[keep],
-            **parts,
+            **self._columns(rows),
         )
+
+    def regrouped(self, order: IntArray, session: IntArray, user: IntArray | None) -> "LoggedSteps":
+        """The same steps in another order and other sessions.
+
+        Args:
+            order: (N,) steps in their new order.
+            session: (N,) session of each, in the new order.
+            user: (S,) of the new sessions; None where each is somebody else's.
+        """
+        return replace(self, session=session, user=user, **self._columns(order))
+
+    def _columns(self, rows: IntArray | BoolArray) -> dict[str, Any]:
+        """What there is one of a step, at the given steps; without the sessions."""
+        names = ("reward", "propensity", "target", "cluster_propensity", "cluster_target")
+        parts: dict[str, Any] = {
+            name: values[rows] for name in names if (values := getattr(self, name)) is not None
+        }
+        if self.model is not None:
+            parts["model"] = Modelled(*(values[rows] for values in vars(self.model).values()))
+        if self.groups is not None:
+            parts["groups"] = ItemGroups(self.groups.number[rows], self.groups.target[rows])
+        return parts
 
     def _products(self, upto: FloatArray) -> FloatArray:
         """(N,) products of ratios (N,) from the session's first step to each."""

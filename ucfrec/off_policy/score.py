@@ -15,6 +15,8 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.logged_decisions import session_scores
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
@@ -56,8 +58,17 @@ class ScoredSteps:
     """(B,): position of each step in its session, from 0."""
     windows: Windows
     """Each step, last in its window, with the steps before it that the policy sees."""
+    scores: Tensor
+    """(B, n_items): what the rule decides by, see `ucfrec.acting.decision.Decider.scores`."""
     log_probabilities: Tensor
     """(B, n_items): natural logarithm of the probability that the policy shows each item."""
+    asked: Windows
+    """The windows as the policy saw them: returns-to-go from the target return."""
+
+    @property
+    def returns_left(self) -> Tensor:
+        """(B,): what the rule asks for at the step, in units of the reward."""
+        return self.asked.returns_to_go[:, -1]
 
 
 @contextmanager
@@ -124,59 +135,58 @@ def logged_sessions(
 
 
 def scored_steps(
-    trained: TrainedPolicy, store: EpisodeStore, target_return: float
+    trained: TrainedPolicy, store: EpisodeStore, rule: DecisionRule | None = None
 ) -> Iterator[ScoredSteps]:
     """Compute the policy's probabilities at every step of `store`, in order and in batches.
-
-    The return-to-go at a step is `target_return` minus the session's reward before that step.
 
     Args:
         trained: a policy that chooses items.
         store: the logged steps.
-        target_return: the return that the policy is asked for, in units of the reward.
+        rule: the decision rule; None for the run's own.
 
     Yields:
         Batches of scored steps.
     """
     assert trained.item_ids is not None
     at_once = max(1, min(_STEPS_AT_ONCE, _LOGITS_AT_ONCE // len(trained.item_ids)))
-    total = store.n_steps
+    total, decider = store.n_steps, trained.decider(rule)
     with progress(total, "score", "steps") as bar:
         for begin in range(0, total, at_once):
             episodes, steps = store.locate(np.arange(begin, min(begin + at_once, total)))
             windows = store.windows(episodes, steps, trained.policy.config.context)
-            # A window's return-to-go starts from the session's own return; shift it to the target.
-            more = torch.from_numpy(target_return - store.returns[episodes])
+            scores = session_scores(decider, store, episodes, steps)
+            log_probabilities = decider.rule.log_probabilities(scores)
             # Steps after an unknown item (−1) have weight 0, so any known item can replace it here.
             known = replace(windows, actions=windows.actions.clamp(min=0))
-            log_probabilities = trained.log_probabilities(known, more.unsqueeze(1))
-            yield ScoredSteps(episodes, steps, windows, log_probabilities)
+            collected = torch.from_numpy(store.rewards_before(episodes, steps))
+            asked = decider.asked(known, collected)
+            yield ScoredSteps(episodes, steps, windows, scores, log_probabilities, asked)
             bar.update(len(steps))
 
 
 def score(
-    trained: TrainedPolicy, logged: LoggedSessions, target_return: float
+    trained: TrainedPolicy, logged: LoggedSessions, rule: DecisionRule | None = None
 ) -> Iterator[pd.DataFrame]:
     """Compute the policy's probability of every logged choice.
 
     Args:
         trained: a policy that chooses items.
         logged: the logs, without unknown items.
-        target_return: the return that the policy is asked for, in units of the reward.
+        rule: the decision rule; None for the run's own.
 
     Yields:
         Frames, one row a logged step, in order of user, session and time: `user_id`, `session`
         (number, from 0), `timestamp` (ms), `item_id`, `reward`, `propensity` (where the logs have
-        one), `probability` of the logged item, its `rank` (from 1) among all items, and
-        `greedy_item_id`, the most probable one.
+        one), `probability` of the logged item under the rule, its `rank` (from 1) among all items,
+        and `greedy_item_id`, the best one.
     """
     store, item_ids = logged.store, trained.item_ids
     assert item_ids is not None
     names = [schema.TIMESTAMP, schema.ITEM_ID, schema.REWARD]
     names += [schema.PROPENSITY] if schema.PROPENSITY in store.meta["columns"] else []
-    for batch in scored_steps(trained, store, target_return):
+    for batch in scored_steps(trained, store, rule):
         items = batch.windows.actions[:, -1:]
-        chosen = batch.log_probabilities.gather(1, items)
+        chosen, scored = batch.log_probabilities.gather(1, items), batch.scores.gather(1, items)
         columns = {schema.USER_ID: logged.users[batch.episodes], SESSION: batch.episodes}
         for name in names:
             if name == schema.ITEM_ID:
@@ -184,6 +194,6 @@ def score(
             else:
                 columns[name] = store.step_values(name, batch.episodes, batch.steps)
         columns[PROBABILITY] = chosen[:, 0].double().exp().numpy()
-        columns[RANK] = 1 + (batch.log_probabilities > chosen).sum(1).numpy()
-        columns[GREEDY] = item_ids[batch.log_probabilities.argmax(1).numpy()]
+        columns[RANK] = 1 + (batch.scores > scored).sum(1).numpy()
+        columns[GREEDY] = item_ids[batch.scores.argmax(1).numpy()]
         yield pd.DataFrame(columns)

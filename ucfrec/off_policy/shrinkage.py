@@ -13,8 +13,8 @@ The IPS kinds shrink the weight of the whole session; the DR kinds are for sessi
 λ has the least estimated mean squared error of the candidates (Su et al. 2020, section 5): the
 sample variance over n plus the square of the estimated bias E_n[(w − ŵ)(r − q)]. Their bound on
 that bias does not depend on λ and, with logs of 500 sessions and lognormal weights, never shrinks
-anything; the plain estimate of it lowers the error there by a tenth to a third. The intervals take
-λ as given, and know nothing of the bias.
+anything; the plain estimate of it lowers the error there by a tenth to a third. Where any weight is
+shrunk there is no interval: resampling with λ as given knows nothing of the bias.
 """
 
 import math

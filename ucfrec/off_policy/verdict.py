@@ -45,6 +45,8 @@ class Verdict:
     wanted_lift: float
     sessions_needed: int | None
     """Logged sessions like these that would show `wanted_lift` in 80% of samples."""
+    declared: str = ""
+    """What the estimate rests on beside the logs, e.g. estimated propensities."""
 
     def __str__(self) -> str:
         return f"{self.headline}: {'; '.join(self.reasons)}" if self.reasons else self.headline
@@ -53,7 +55,7 @@ class Verdict:
     def headline(self) -> str:
         """The verdict without its reasons."""
         if not self.reliable or self.lift_low is None or self.lift_high is None:
-            return "Do not rely on this estimate"
+            return f"Do not rely on this estimate{self._rests_on}"
         if self.lift_low > 0:
             says = "The policy earns more than the logged one"
         elif self.lift_high < 0:
@@ -64,7 +66,12 @@ class Verdict:
             f"{says}: {self.lift:+.4g} a session [{self.lift_low:+.4g}, {self.lift_high:+.4g}] by "
             f"{self.estimator}, better with probability {self.probability_better:.3f}; a lift of "
             f"{self.wanted_lift:.4g} would show with about {self.sessions_needed or 0:,} sessions"
+            f"{self._rests_on}"
         )
+
+    @property
+    def _rests_on(self) -> str:
+        return f" ({self.declared})" if self.declared else ""
 
 
 def judge(
@@ -74,6 +81,7 @@ def judge(
     diagnosis: Diagnosis | None = None,
     wanted_lift: float | None = None,
     forbidden: Sequence[str] = (),
+    declared: str = "",
 ) -> Verdict:
     """Compare the evaluated policy with the behavior policy, if the logs allow it.
 
@@ -83,6 +91,7 @@ def judge(
         wanted_lift: return a session that a launch should gain; None for 5% of the mean logged
             return.
         forbidden: what else the caller knows to forbid a conclusion.
+        declared: what the estimate rests on beside the logs, said with the verdict.
     """
     diagnosis = diagnosis or diagnose(steps)
     reasons = [*forbidden, *_reasons(diagnosis)]
@@ -94,7 +103,8 @@ def judge(
         terms = session_terms(known)
     name = next((name for name in BEST_FIRST if name in terms), None)
     if name is None:
-        return Verdict(False, tuple(reasons), None, None, None, None, None, wanted_lift, None)
+        nothing = (None,) * 5
+        return Verdict(False, tuple(reasons), *nothing, wanted_lift, None, declared)
     lifts = influences(terms[name]) - known.returns
     (interval,) = cluster_intervals(lifts[:, None], np.ones((len(lifts), 1)), known.user, seed)
     if interval is None:
@@ -109,6 +119,7 @@ def judge(
         probability_better=None if interval is None else interval.above_zero,
         wanted_lift=wanted_lift,
         sessions_needed=_sessions_needed(interval, wanted_lift, len(lifts)),
+        declared=declared,
     )
 
 
@@ -134,6 +145,10 @@ def cautions(diagnosis: Diagnosis, found: Mapping[str, Estimate]) -> list[str]:
         )
     if "DM" in found:
         said.append("DM and FQE are only as good as their models: they carry no interval")
+    if "MIPS" in found:
+        said.append(
+            "MIPS is right only if what an item earns depends on its group alone: no interval"
+        )
     return said
 
 

@@ -1,18 +1,22 @@
 """Base of all sequence policies: configuration, normalisation, action loss, token embedding."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
+from ucfrec.episodes.exposure import Exposed
+from ucfrec.episodes.returns import Definition, ReturnToGo
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
-from ucfrec.policies.heads import Head, head_from
+from ucfrec.errors import InputError
+from ucfrec.policies.heads import Head, ItemHead, head_from
+from ucfrec.policies.values import ValueHead, advantage_weights
 from ucfrec.settings import Dropout, Width, require, settings_table
 
 _CLIP = 10.0
@@ -40,6 +44,36 @@ class PolicyConfig:
     """Returns-to-go are divided by this; 0 selects the largest absolute training return."""
     max_timestep: Timesteps = 1000
     """Rows of the timestep embedding; later steps share the last row. 1 hides the time."""
+    return_to_go: Definition | Literal["auto"] = "auto"
+    """What returns-to-go count: the whole rest of the `session`; the rest `discounted` by
+    `discount`; or the next `horizon` steps. `auto` is the horizon where the sessions of the log are
+    users, whose rest tells how many rows a user has left, and otherwise the session."""
+    discount: Annotated[float, Field(gt=0, le=1)] = 0.9
+    """γ of discounted returns-to-go."""
+    horizon: Annotated[int, Field(ge=1, le=10**6)] = 1
+    """Steps that returns-to-go of a horizon count."""
+    exposure: bool = False
+    """Whether the logits of items depend on what the session was shown lately: on repetitions, and
+    on shared tags or, without tags, on similar embeddings."""
+    exposure_window: Annotated[int, Field(ge=1, le=1000)] = 10
+    """Earlier steps that count as lately, as far as `context` reaches."""
+    advantage_weights: bool = False
+    """Whether steps count in the loss by exp((Ĝ − V(s)) / σ), instead of all alike."""
+    max_return: bool = False
+    """Whether the largest return to expect in a state is learned, which decision rules can take for
+    the target return."""
+
+    @property
+    def exposure_lags(self) -> int:
+        """Earlier steps that the exposure term reads; 0 for no such term."""
+        return min(self.exposure_window, self.context - 1) if self.exposure else 0
+
+    def returns(self, session_by: str | None) -> ReturnToGo:
+        """What returns-to-go count in a log whose sessions are made `session_by`."""
+        definition = self.return_to_go
+        if definition == "auto":
+            definition = "horizon" if session_by == "user" else "session"
+        return ReturnToGo(definition, self.discount, self.horizon)
 
 
 class SequencePolicy(nn.Module, ABC):
@@ -52,6 +86,8 @@ class SequencePolicy(nn.Module, ABC):
     Config: ClassVar[type[PolicyConfig]] = PolicyConfig
     augmented: ClassVar[bool] = False
     """Whether the default of `augment.copies` is above 0 for this learner."""
+    presets: ClassVar[Mapping[str, Any]] = {}
+    """Defaults of this learner for settings outside the table `policy`, by `table.field`."""
 
     state_mean: Tensor
     state_std: Tensor
@@ -63,7 +99,8 @@ class SequencePolicy(nn.Module, ABC):
         """Args:
         config: settings, an instance of the class's `Config`.
         sizes: `state` S; `action` A, the size of an action vector or of an item's embedding; and
-            `items`, the number of items, 0 if actions are vectors.
+            `items`, the number of items, 0 if actions are vectors; and `tags`, the most tags of an
+            item, 0 if that is left out.
         """
         super().__init__()
         self.config = config
@@ -71,7 +108,9 @@ class SequencePolicy(nn.Module, ABC):
         self.register_buffer("state_std", torch.ones(sizes["state"]))
         self.register_buffer("return_scale", torch.ones(()))
         self.register_buffer("lowest_return_to_go", torch.tensor(-torch.inf))
-        self.head = head_from(sizes, config.dim)
+        self.head = head_from(sizes, config.dim, config.exposure_lags)
+        learns_values = config.advantage_weights or config.max_return
+        self.values = ValueHead(sizes["state"], config.dim) if learns_values else None
 
     @classmethod
     def training_view(
@@ -89,6 +128,19 @@ class SequencePolicy(nn.Module, ABC):
 
     def start_from(self, train: EpisodeStore) -> None:
         """Set buffers from the training episodes, before the first update."""
+
+    def closed_form(
+        self, train: EpisodeStore, validation: EpisodeStore, folder: Path, seed: int
+    ) -> Callable[[], None] | None:
+        """What fits the policy without the training loop; None if gradients have to.
+
+        Args:
+            train: the training episodes, without edited copies.
+            validation: held-out episodes.
+            folder: for intermediate results.
+            seed: of every random draw.
+        """
+        return None
 
     @abstractmethod
     def features(self, windows: Windows) -> Tensor:
@@ -109,18 +161,69 @@ class SequencePolicy(nn.Module, ABC):
 
         In nats for items; for vectors, the squared error relative to the action's range.
         """
-        features = self.features(self.normalized(windows))
-        value = self.head.loss(features[windows.mask], windows.actions[windows.mask])
-        return value, {"action_loss": value.detach()}
+        normalized = self.normalized(windows)
+        return self.imitation(self.features(normalized), normalized)
+
+    def imitation(self, features: Tensor, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
+        """Action loss over all steps, plus the loss of the state values if there are any.
+
+        Args:
+            features: (B, K, d) of the windows.
+            windows: normalised.
+
+        Returns:
+            The loss, and scalars to log.
+        """
+        mask, exposed = windows.mask, self.exposed(windows)
+        exposed = None if exposed is None else exposed.select(windows.mask.flatten())
+        given = (features[mask], windows.actions[mask], exposed)
+        if self.values is None:
+            value = self.head.loss(*given)  # type: ignore[arg-type]
+            return value, {"action_loss": value.detach()}
+        values, returns = self.values(windows)[mask], windows.returns_to_go[mask]
+        losses = self.head.losses(*given)  # type: ignore[arg-type]
+        if self.config.advantage_weights:
+            losses = losses * advantage_weights(values, returns)
+        action_loss, value_loss = losses.mean(), self.values.loss(values, returns)
+        scalars = {"action_loss": action_loss.detach(), "value_loss": value_loss.detach()}
+        return action_loss + value_loss, scalars
 
     def action_loss(self, windows: Windows) -> Tensor:
         """Mean action loss over the windows' last steps, the validation loss."""
-        features = self.features(self.normalized(windows))
-        return self.head.loss(features[:, -1], windows.actions[:, -1])
+        normalized = self.normalized(windows)
+        features, exposed = self.features(normalized)[:, -1], self._exposed_last(normalized)
+        return self.head.loss(features, windows.actions[:, -1], exposed)  # type: ignore[arg-type]
 
     def act(self, windows: Windows) -> Tensor:
         """Predictions at the last step: actions (B, A), or logits over items (B, n_items)."""
-        return self.head.predict(self.features(self.normalized(windows))[:, -1])
+        normalized = self.normalized(windows)
+        features, exposed = self.features(normalized)[:, -1], self._exposed_last(normalized)
+        return self.head.predict(features, exposed)  # type: ignore[arg-type]
+
+    def max_return(self, windows: Windows) -> Tensor:
+        """The largest return-to-go to expect at the last step, (B,) in reward units.
+
+        Raises:
+            InputError: the policy was trained without `policy.max_return`.
+        """
+        if self.values is None:
+            raise InputError(
+                "the policy does not know its largest return; train it with "
+                "--set policy.max_return=true, or give a target return"
+            )
+        best: Tensor = self.values(self.normalized(windows))[:, -1, 1]
+        return best * self.return_scale
+
+    def exposed(self, windows: Windows) -> Exposed | None:
+        """What was shown before each of the (B·K) steps; None without `policy.exposure`."""
+        if not isinstance(self.head, ItemHead) or self.head.exposure is None:
+            return None
+        return Exposed.before(windows, self.head.exposure.lags)
+
+    def _exposed_last(self, windows: Windows) -> Exposed | None:
+        exposed, (batch, length) = self.exposed(windows), windows.mask.shape
+        last = torch.arange(1, batch + 1, device=windows.mask.device) * length - 1
+        return None if exposed is None else exposed.select(last)
 
 
 class TokenEmbedding(nn.Module):

@@ -73,11 +73,12 @@ class CDT4RecPolicy(DTPolicy):
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         """Action loss plus weighted reward loss over all steps, and scalars to log."""
         mask = windows.mask
-        hidden = self.transform(self.normalized(windows))
-        action_loss = self.head.loss(hidden[:, 1::3][mask], windows.actions[mask])
+        normalized = self.normalized(windows)
+        hidden = self.transform(normalized)
+        imitation, scalars = self.imitation(hidden[:, 1::3], normalized)
         rewards = (windows.rewards - self.reward_mean) / self.reward_std
         reward_loss = masked_mean((self.estimated_rewards(hidden, mask) - rewards).square(), mask)
-        return action_loss + self.config.reward_weight * reward_loss, {
-            "action_loss": action_loss.detach(),
+        return imitation + self.config.reward_weight * reward_loss, {
+            **scalars,
             "reward_loss": reward_loss.detach(),
         }

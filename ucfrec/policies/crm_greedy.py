@@ -1,6 +1,7 @@
 """Greedy policy: the action with the highest predicted immediate reward."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -9,7 +10,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ucfrec import schema
+from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model
+from ucfrec.counterfactual.item_reward_model import ItemRewardModel
 from ucfrec.counterfactual.reward_model import mlp
+from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import PolicyConfig, SequencePolicy
@@ -22,11 +26,12 @@ _PAIRS: Final = 2**15
 
 
 class CRMGreedyPolicy(SequencePolicy):
-    """Chooses argmax_a E[r | s, a] of the reward model's first part (`CRMConfig.mean_first`).
+    """Chooses argmax_a E[r | s, a]; disturbances have their prior mean, as future ones are unknown.
 
-    Disturbances are set to their prior mean, because future ones are unknown. The model is trained
-    here, by squared error on standardised rewards. The candidates are all items, represented by
-    their embeddings, or a sample of the logged action vectors, beyond which the model has no data.
+    For items, the expected reward is that of `ItemRewardModel`, fitted effect by effect. For action
+    vectors, it is that of a network like the first part of the causal reward model
+    (`CRMConfig.mean_first`), trained by squared error on standardised rewards; the candidates are a
+    sample of the logged action vectors, beyond which the network has no data.
     """
 
     reward_mean: Tensor
@@ -35,35 +40,50 @@ class CRMGreedyPolicy(SequencePolicy):
 
     def __init__(self, config: PolicyConfig, sizes: Mapping[str, int]) -> None:
         super().__init__(config, sizes)
+        self.model: ItemRewardModel | nn.Sequential
+        if sizes["items"]:
+            self.model = ItemRewardModel(sizes)
+            return
         self.model = mlp(sizes["state"] + sizes["action"], config.dim, 2, 1)
         for name in ("reward_mean", "reward_std"):
             self.register_buffer(name, torch.zeros(()))
-        count = sizes["items"] or _CANDIDATES
-        self.register_buffer("candidates", torch.zeros(count, sizes["action"]))
+        self.register_buffer("candidates", torch.zeros(_CANDIDATES, sizes["action"]))
 
     def start_from(self, train: EpisodeStore) -> None:
-        """Set the candidates, and the mean and standard deviation of the rewards."""
+        """For vectors, set the candidates, and the mean and standard deviation of the rewards."""
+        if not isinstance(self.head, VectorHead):
+            return
         episodes, steps = train.all_steps()
         rewards = train.step_values(schema.REWARD, episodes, steps)
         self.reward_mean.fill_(float(rewards.mean()))
         self.reward_std.fill_(max(float(rewards.std()), 1e-6))
-        if isinstance(self.head, VectorHead):
-            drawn = np.random.default_rng(0).integers(len(episodes), size=_CANDIDATES)
-            actions = train.step_values(schema.ACTION, episodes[drawn], steps[drawn])
-            self.candidates.copy_(torch.from_numpy(actions))
-        else:
-            self.candidates.copy_(self.head.embeddings)
+        drawn = np.random.default_rng(0).integers(len(episodes), size=_CANDIDATES)
+        actions = train.step_values(schema.ACTION, episodes[drawn], steps[drawn])
+        self.candidates.copy_(torch.from_numpy(actions))
+
+    def closed_form(
+        self, train: EpisodeStore, validation: EpisodeStore, folder: Path, seed: int
+    ) -> Callable[[], None] | None:
+        """For items, fits the reward model."""
+        model = self.model
+        if not isinstance(model, ItemRewardModel):
+            return None
+
+        def solve() -> None:
+            fitted, _ = fit_item_reward_model(train, validation, folder, seed)
+            model.load_state_dict(fitted.state_dict())
+
+        return solve
 
     def features(self, windows: Windows) -> Tensor:
         """Standardised states (B, K, S)."""
         return windows.states
 
     def _errors(self, windows: Windows) -> Tensor:
-        """Squared errors (B, K) of the predicted standardised rewards."""
-        states, actions = self.normalized(windows).states, windows.actions
-        if not isinstance(self.head, VectorHead):
-            actions = self.candidates[actions]
-        predicted = self.model(torch.cat([states, actions], dim=-1)).squeeze(-1)
+        """Squared errors (B, K) of the predicted standardised rewards of action vectors."""
+        inputs = torch.cat([self.normalized(windows).states, windows.actions], dim=-1)
+        assert isinstance(self.model, nn.Sequential)
+        predicted = self.model(inputs).squeeze(-1)
         standard = (windows.rewards - self.reward_mean) / self.reward_std
         return F.mse_loss(predicted, standard, reduction="none")
 
@@ -74,20 +94,24 @@ class CRMGreedyPolicy(SequencePolicy):
 
     def action_loss(self, windows: Windows) -> Tensor:
         """Mean squared error of standardised rewards over the windows' last steps."""
-        return self._errors(windows)[:, -1].mean()
+        model = self.model
+        if not isinstance(model, ItemRewardModel):
+            return self._errors(windows)[:, -1].mean()
+        states, items = windows.states[:, -1], windows.actions[:, -1]
+        predicted = model.expected(model.score(states, Shown.before_last(windows), None, items))
+        return ((windows.rewards[:, -1] - predicted) / model.reward_std).square().mean()
 
     def act(self, windows: Windows) -> Tensor:
-        """At the last step: predicted standardised rewards of all items (B, n_items), or the best
-        action vectors (B, A)."""
-        states = self.normalized(windows).states[:, -1]
-        values = self._values(states)
-        if isinstance(self.head, VectorHead):
-            return self.candidates[values.argmax(1)]
-        return values
+        """At the last step: scores of all items (B, n_items) as of `ItemRewardModel.scores`, for
+        users that are not known, or the best action vectors (B, A)."""
+        if isinstance(self.model, ItemRewardModel):
+            return self.model.scores(windows.states[:, -1], Shown.before_last(windows))
+        values = self._values(self.model, self.normalized(windows).states[:, -1])
+        return self.candidates[values.argmax(1)]
 
-    def _values(self, states: Tensor) -> Tensor:
+    def _values(self, model: nn.Sequential, states: Tensor) -> Tensor:
         """Predicted standardised rewards (B, n_candidates) in states (B, S)."""
-        first, *rest = self.model
+        first, *rest = model
         assert isinstance(first, nn.Linear)
         # The first layer is linear: its state part is computed once per state and its action part
         # once per candidate, instead of both once per pair.

@@ -65,16 +65,14 @@ class DT4RecPolicy(DTPolicy):
 
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         """Action loss plus weighted contrastive loss over all steps, and scalars to log."""
-        config, mask = self.config, windows.mask
-        normalized = self.normalized(windows)
+        config, normalized = self.config, self.normalized(windows)
         features = self.features(normalized)
-        action_loss = self.head.loss(features[mask], windows.actions[mask])
-        scalars = {"action_loss": action_loss.detach()}
+        imitation, scalars = self.imitation(features, normalized)
         if config.contrastive_weight == 0:
-            return action_loss, scalars
+            return imitation, scalars
         contrast = self.contrastive_loss(normalized, features)
         scalars["contrastive_loss"] = contrast.detach()
-        return action_loss + config.contrastive_weight * contrast, scalars
+        return imitation + config.contrastive_weight * contrast, scalars
 
     def contrastive_loss(self, windows: Windows, features: Tensor) -> Tensor:
         """InfoNCE (nats) of the logged return against those of other windows, mean over all steps.

@@ -4,19 +4,21 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
+from ucfrec.episodes.exposure import Exposed
+from ucfrec.episodes.returns import Definition
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import Context, PolicyConfig
 from ucfrec.policies.cql import CQLConfig, relabelled
 from ucfrec.policies.dt import DTConfig, DTPolicy
 from ucfrec.policies.heads import ItemHead, VectorHead
-from ucfrec.settings import Count, Weight, settings_table
+from ucfrec.settings import Count, Weight, require, settings_table
 
 
 @settings_table("policy")
@@ -35,8 +37,21 @@ class EDT4RecConfig(DTConfig):
     """Whether returns-to-go are raised by CQL's state values."""
     cql_steps: Count = 2000
     """Updates of CQL's network, if `relabel` is true."""
+    return_to_go: Definition | Literal["auto"] = "session"
+    """What returns-to-go count, as for all learners; relabelling needs those of sessions."""
     cql_weight: Weight = 1.0
     """α, weight of CQL's conservative term, which lowers the values of unlogged actions."""
+
+    def __post_init__(self) -> None:
+        """Check the fields against each other."""
+        super().__post_init__()
+        require(
+            not self.relabel or self.return_to_go == "session",
+            f"policy.return_to_go is {self.return_to_go!r}; policy.relabel raises the returns of "
+            "whole sessions, so set it to false or take the returns-to-go of the session",
+            "policy.return_to_go",
+            "policy.relabel",
+        )
 
 
 class EDT4RecPolicy(DTPolicy):
@@ -72,13 +87,15 @@ class EDT4RecPolicy(DTPolicy):
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         """Negative log-likelihood (nats) plus the entropy constraint's terms for λ and policy."""
         normalized = self.normalized(_consistent(windows))
-        features = self.features(normalized)[windows.mask]
-        action_loss = self.head.loss(features, windows.actions[windows.mask])
-        entropy = _entropy(self.head, features)
+        features = self.features(normalized)
+        imitation, scalars = self.imitation(features, normalized)
+        exposed = self.exposed(normalized)
+        exposed = None if exposed is None else exposed.select(windows.mask.flatten())
+        entropy = _entropy(self.head, features[windows.mask], exposed)
         multiplier = self.log_multiplier.exp()
         constraint = multiplier * (entropy.detach() - self.floor) - multiplier.detach() * entropy
-        return action_loss + constraint, {
-            "action_loss": action_loss.detach(),
+        return imitation + constraint, {
+            **scalars,
             "entropy": entropy.detach(),
             "multiplier": multiplier.detach(),
         }
@@ -95,20 +112,24 @@ class GaussianHead(VectorHead):
         """Log standard deviations (..., A) from features (..., d), clamped to [−5, 2]."""
         return self.log_deviation(features).clamp(-5.0, 2.0)  # type: ignore[no-any-return]
 
-    def loss(self, features: Tensor, actions: Tensor) -> Tensor:
+    def loss(self, features: Tensor, actions: Tensor, exposed: None = None) -> Tensor:
         """Mean negative log-likelihood (nats) over M steps: features (M, d), actions (M, A)."""
+        return self.losses(features, actions).mean()
+
+    def losses(self, features: Tensor, actions: Tensor, exposed: None = None) -> Tensor:
+        """Negative log-likelihood (nats) of each of M steps, (M,)."""
         log_deviation = self.deviations(features)
         error = (actions - self.predict(features)) / self.scale / log_deviation.exp()
         nats = 0.5 * error.square() + log_deviation + 0.5 * math.log(2 * math.pi)
-        return nats.sum(-1).mean()
+        return nats.sum(-1)
 
 
-def _entropy(head: nn.Module, features: Tensor) -> Tensor:
+def _entropy(head: nn.Module, features: Tensor, exposed: Exposed | None) -> Tensor:
     """Mean entropy (nats) of the head's distribution over M steps, features (M, d)."""
     if isinstance(head, GaussianHead):
         return (head.deviations(features) + 0.5 * math.log(2 * math.pi * math.e)).sum(-1).mean()
     assert isinstance(head, ItemHead)
-    log_probabilities = head.predict(features).log_softmax(-1)
+    log_probabilities = head.predict(features, exposed).log_softmax(-1)
     return -(log_probabilities.exp() * log_probabilities).sum(-1).mean()
 
 

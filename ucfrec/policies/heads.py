@@ -7,10 +7,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from ucfrec.episodes.exposure import Exposed, ExposureTerm, Likeness
+
 SAMPLED_SOFTMAX_ABOVE = 100_000
 """Number of items above which the loss samples the denominator of the softmax."""
 SAMPLED_NEGATIVES = 4096
 """Items sampled for it per batch."""
+EXPOSURE_KNOTS = 6
+"""Returns-to-go at which an exposure term has weights of its own."""
 
 
 class VectorHead(nn.Module):
@@ -28,13 +32,18 @@ class VectorHead(nn.Module):
         """Embed actions (B, K, A) as (B, K, d)."""
         return self.embed_action(actions / self.scale)  # type: ignore[no-any-return]
 
-    def predict(self, features: Tensor) -> Tensor:
+    def predict(self, features: Tensor, exposed: None = None) -> Tensor:
         """Actions (..., A) from features (..., d), within ± `scale`, the logs' largest value."""
         return torch.tanh(self.out(features)) * self.scale
 
-    def loss(self, features: Tensor, actions: Tensor) -> Tensor:
+    def loss(self, features: Tensor, actions: Tensor, exposed: None = None) -> Tensor:
         """Mean squared error over M steps in units of `scale`: features (M, d), actions (M, A)."""
         return F.mse_loss(self.predict(features) / self.scale, actions / self.scale)
+
+    def losses(self, features: Tensor, actions: Tensor, exposed: None = None) -> Tensor:
+        """The squared error of each of M steps, (M,), whose mean is `loss`."""
+        error = (self.predict(features) - actions) / self.scale
+        return error.square().mean(-1)
 
 
 class ItemHead(nn.Module):
@@ -43,13 +52,19 @@ class ItemHead(nn.Module):
     An item's vector is a learned projection of its fixed embedding, which items without training
     steps have too, plus a correction learned per item. The bias is initialised to the log of the
     item's share of the training steps, so that an untrained policy recommends popular items.
+
+    With an exposure term, what the session was shown lately moves the logits too; a dot product
+    cannot say "unlike what was just shown".
     """
 
     embeddings: Tensor
     counts: Tensor
 
-    def __init__(self, dim: int, n_items: int, embedding_size: int) -> None:
+    def __init__(
+        self, dim: int, n_items: int, embedding_size: int, exposure: ExposureTerm | None = None
+    ) -> None:
         super().__init__()
+        self.exposure = exposure
         self.register_buffer("embeddings", torch.zeros(n_items, embedding_size))
         self.register_buffer("counts", torch.ones(n_items))
         self.project = nn.Linear(embedding_size, dim)
@@ -71,19 +86,42 @@ class ItemHead(nn.Module):
         """Embed int64 items (B, K) as (B, K, d)."""
         return self.vectors(actions)
 
-    def predict(self, features: Tensor) -> Tensor:
-        """Logits over all items (..., n_items) from features (..., d)."""
+    def predict(self, features: Tensor, exposed: Exposed | None = None) -> Tensor:
+        """Logits over all items (..., n_items) from features (..., d).
+
+        Args:
+            features: (M, d) with `exposed`.
+            exposed: what was shown before the M steps; needed with an exposure term.
+        """
         vectors = self.project(self.embeddings) + self.correction
         logits: Tensor = features @ vectors.T / features.shape[-1] ** 0.5 + self.bias
+        if self.exposure is not None and exposed is not None:
+            logits = logits + self.exposure.to_all(exposed)
         return logits
 
-    def loss(self, features: Tensor, actions: Tensor) -> Tensor:
+    def loss(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:
         """Mean negative log-likelihood (nats) over M steps: features (M, d), actions (M,)."""
-        if len(self.counts) <= SAMPLED_SOFTMAX_ABOVE:
-            return F.cross_entropy(self.predict(features), actions)
-        return self.sampled_loss(features, actions, SAMPLED_NEGATIVES)
+        return self._losses(features, actions, exposed, "mean")
 
-    def sampled_loss(self, features: Tensor, actions: Tensor, negatives: int) -> Tensor:
+    def losses(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:
+        """The negative log-likelihood (nats) of each of M steps, (M,), whose mean is `loss`."""
+        return self._losses(features, actions, exposed, "none")
+
+    def _losses(
+        self, features: Tensor, actions: Tensor, exposed: Exposed | None, reduction: str
+    ) -> Tensor:
+        if len(self.counts) <= SAMPLED_SOFTMAX_ABOVE:
+            return F.cross_entropy(self.predict(features, exposed), actions, reduction=reduction)
+        return self.sampled_loss(features, actions, SAMPLED_NEGATIVES, exposed, reduction)
+
+    def sampled_loss(
+        self,
+        features: Tensor,
+        actions: Tensor,
+        negatives: int,
+        exposed: Exposed | None = None,
+        reduction: str = "mean",
+    ) -> Tensor:
         """Negative log-likelihood (nats) with `negatives` sampled items in the denominator.
 
         Negatives are drawn from the smoothed popularity Q; subtracting their log expected counts
@@ -95,19 +133,32 @@ class ItemHead(nn.Module):
         m, scale = len(actions), features.shape[-1] ** 0.5
         positive = (features * self.vectors(actions)).sum(-1) / scale + self.bias[actions]
         logits = features @ self.vectors(drawn).T / scale + self.bias[drawn]
+        if self.exposure is not None and exposed is not None:
+            positive = positive + self.exposure.to_items(exposed, actions.unsqueeze(1))
+            logits = logits + self.exposure.to_items(exposed, drawn)
         logits = logits - torch.log(negatives * share[drawn])
         accidental = drawn.unsqueeze(0) == actions.unsqueeze(1)
         negative = logits.masked_fill(accidental, -torch.inf)
         positive = positive.unsqueeze(1)
         target = torch.zeros(m, dtype=torch.int64, device=features.device)
-        return F.cross_entropy(torch.cat([positive, negative], dim=1), target)
+        return F.cross_entropy(torch.cat([positive, negative], dim=1), target, reduction=reduction)
 
 
 Head = VectorHead | ItemHead
 
 
-def head_from(sizes: Mapping[str, Any], dim: int) -> Head:
-    """The head for a store's actions: items if `sizes["items"]` is above 0, otherwise vectors."""
-    if sizes["items"]:
-        return ItemHead(dim, sizes["items"], sizes["action"])
-    return VectorHead(dim, sizes["action"])
+def head_from(sizes: Mapping[str, Any], dim: int, lags: int = 0) -> Head:
+    """The head for a store's actions: items if `sizes["items"]` is above 0, otherwise vectors.
+
+    Args:
+        sizes: see `ucfrec.policies.base.SequencePolicy`.
+        dim: width of the features.
+        lags: earlier steps that an exposure term of items reads; 0 for no such term.
+    """
+    if not sizes["items"]:
+        return VectorHead(dim, sizes["action"])
+    exposure = None
+    if lags:
+        likeness = Likeness(sizes["items"], sizes["action"], sizes.get("tags", 0))
+        exposure = ExposureTerm(lags, EXPOSURE_KNOTS, likeness)
+    return ItemHead(dim, sizes["items"], sizes["action"], exposure)

@@ -1,12 +1,13 @@
 """Item-based nearest neighbours (Sarwar et al., 2001): items liked in the same sessions."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import torch
 from pydantic import Field
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 from ucfrec import schema
@@ -18,6 +19,9 @@ from ucfrec.policies.heads import ItemHead
 from ucfrec.settings import settings_table
 
 _ROWS = 1024
+_HOTTEST = 64.0
+"""Largest factor on the cosines."""
+_HALVINGS = 30
 
 
 @settings_table("policy")
@@ -32,7 +36,8 @@ class ItemKNNPolicy(SequencePolicy):
     """Scores items by their cosines to the session's earlier items, weighted by their rewards.
 
     Cosines are between columns of the session × item matrix of rewards minus the lowest reward.
-    Only a temperature and a bias per item are learned by gradient; states and returns are not used.
+    A bias per item, the log of its share of the training steps, is added to the cosines times a
+    temperature, which is chosen on held-out steps. States and returns are not used.
     """
 
     Config = ItemKNNConfig
@@ -40,6 +45,7 @@ class ItemKNNPolicy(SequencePolicy):
     neighbors: Tensor
     cosines: Tensor
     reward_low: Tensor
+    temperature: Tensor
 
     def __init__(self, config: ItemKNNConfig, sizes: Mapping[str, int]) -> None:
         super().__init__(config, sizes)
@@ -51,7 +57,7 @@ class ItemKNNPolicy(SequencePolicy):
         self.register_buffer("neighbors", torch.zeros(shape, dtype=torch.int64))
         self.register_buffer("cosines", torch.zeros(shape))
         self.register_buffer("reward_low", torch.zeros(()))
-        self.temperature = nn.Parameter(torch.ones(()))
+        self.register_buffer("temperature", torch.ones(()))
 
     def start_from(self, train: EpisodeStore) -> None:
         """Find the neighbours of every item; an item is a neighbour of itself."""
@@ -70,6 +76,28 @@ class ItemKNNPolicy(SequencePolicy):
             rows = slice(start, start + _ROWS)
             cosines = torch.from_numpy((columns[:, rows].T @ columns).toarray()).float()
             self.cosines[rows], self.neighbors[rows] = cosines.topk(self.cosines.shape[1])
+
+    def closed_form(
+        self, train: EpisodeStore, validation: EpisodeStore, folder: Path, seed: int
+    ) -> Callable[[], None]:
+        """Chooses the temperature; everything else is set by `start_from`."""
+        return lambda: self._choose_temperature(validation)
+
+    @torch.no_grad()
+    def _choose_temperature(self, held_out: EpisodeStore) -> None:
+        """Minimise the negative log-likelihood, convex in the temperature, by bisection."""
+        numbers = np.linspace(0, held_out.n_steps - 1, min(held_out.n_steps, _ROWS), dtype=np.int64)
+        windows = held_out.windows(*held_out.locate(numbers), self.config.context)
+        windows = windows.to(self.cosines.device)
+        scores, shown = self.features(windows)[:, -1], windows.actions[:, -1:]
+        of_shown = scores.gather(1, shown).mean()
+        assert isinstance(self.head, ItemHead)
+        low, high = 0.0, _HOTTEST
+        for _ in range(_HALVINGS):
+            middle = (low + high) / 2
+            expected = (middle * scores + self.head.bias).softmax(-1).mul(scores).sum(-1).mean()
+            low, high = (low, middle) if expected > of_shown else (middle, high)
+        self.temperature.fill_((low + high) / 2)
 
     def features(self, windows: Windows) -> Tensor:
         """Cosines to the earlier items, summed with their rewards as weights, (B, K, n_items).

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 BUILT_IN: Final = {
     "ucf": "ucf:UCFPolicy",
+    "ucf-paper": "ucf:UCFPaperPolicy",
     "dt": "dt:DTPolicy",
     "dc": "dc:DCPolicy",
     "lsdt": "lsdt:LSDTPolicy",
@@ -27,6 +28,7 @@ BUILT_IN: Final = {
     "sasrec": "sasrec:SASRecPolicy",
     "bc": "bc:BCPolicy",
     "popular": "popular:PopularPolicy",
+    "item-rate": "item_rate:ItemRatePolicy",
     "item-knn": "item_knn:ItemKNNPolicy",
     "crm-greedy": "crm_greedy:CRMGreedyPolicy",
 }

@@ -1,13 +1,14 @@
 """UCF's hybrid causal architecture (paper section 3.2)."""
 
 from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from ucfrec.episodes.returns import Definition
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import (
     Heads,
@@ -43,10 +44,25 @@ class UCFConfig(PolicyConfig):
     """Weight of the parent s_{t−k} is this to the power k."""
     parent_action: Weight = 0.3
     """Weight of the parent a_{t−1}."""
+    exposure: bool = True
+    """Whether the logits of items depend on what the session was shown lately: on repetitions, and
+    on shared tags or, without tags, on similar embeddings."""
 
     def __post_init__(self) -> None:
         """Check the fields against each other."""
         require_heads(self, self.heads)
+
+
+@settings_table("policy")
+class UCFPaperConfig(UCFConfig):
+    """Settings of the policy as read in the paper: attention is supervised."""
+
+    lambda_mask: Weight = 0.1
+    """λ, weight of the mask loss, which supervises attention (Table 7)."""
+    exposure: bool = False
+    """Whether the logits of items depend on what the session was shown lately."""
+    return_to_go: Definition | Literal["auto"] = "session"
+    """What returns-to-go count: the whole rest of the session (section 2.1)."""
 
 
 class UCFPolicy(SequencePolicy):
@@ -106,18 +122,37 @@ class UCFPolicy(SequencePolicy):
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         """L_action + λ L_mask over all steps (Eq. 5, Algorithm 6), and scalars to log."""
         config, mask = self.config, windows.mask
-        features, attention = self.attend(self.normalized(windows))
-        action_loss = self.head.loss(features[mask], windows.actions[mask])
+        normalized = self.normalized(windows)
+        features, attention = self.attend(normalized)
+        imitation, scalars = self.imitation(features, normalized)
         targets = parent_targets(
             mask, config.parent_window, config.parent_decay, config.parent_action
         )
         supervision = mask_loss(attention, targets, mask)
         on_parents = (attention.mean(1) * (targets > 0)).sum(-1)
-        return action_loss + config.lambda_mask * supervision, {
-            "action_loss": action_loss.detach(),
+        visible = _visible(mask)
+        uniform = ((targets > 0) & visible).sum(-1) / visible.sum(-1)
+        return imitation + config.lambda_mask * supervision, {
+            **scalars,
             "mask_loss": supervision.detach(),
             "attention_on_parents": masked_mean(on_parents.detach(), mask),
+            "uniform_on_parents": masked_mean(uniform, mask),
         }
+
+
+class UCFPaperPolicy(UCFPolicy):
+    """UCF as read in the paper, without what later measurements added.
+
+    λ 0.1, a plain CVAE as reward model, the paper's generator, the return of the whole rest, and
+    the most probable action at the largest training return.
+    """
+
+    Config = UCFPaperConfig
+    presets: ClassVar[Mapping[str, Any]] = {
+        "crm.mean_first": False,
+        "csg.kind": "faithful",
+        "rule.choose": False,
+    }
 
 
 class ConvStream(nn.Module):

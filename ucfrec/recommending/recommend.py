@@ -1,6 +1,7 @@
 """Recommend next items to the users of a log, also to users who are not in the training logs."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,8 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
+from ucfrec.acting.decision import Decider, DecisionRule
+from ucfrec.acting.logged_decisions import seen_before, session_scores
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.recommending.histories import Histories
@@ -27,29 +30,33 @@ def recommend(
     batches: Iterable[Histories],
     k: int,
     *,
-    target_return: float,
+    rule: DecisionRule | None = None,
     filter_seen: bool = True,
     candidates: Sequence[Any] | None = None,
     skip_unknown: bool = False,
+    seed: int = 0,
 ) -> Iterator[pd.DataFrame]:
-    """The `k` best next items of every user.
+    """`k` next items of every user, by the decision rule.
 
-    A user's latest session is assumed to continue: items are scored at its next step, with
-    `target_return` as the return-to-go. For users who are not in the training logs, the state is
-    made of their rows alone.
+    A user's latest session is assumed to continue: items are scored at its next step, and the
+    rewards that the session has earned lower the target as in acting. A rule with a temperature
+    draws the items one after the other, without repetition; otherwise they are the `k` best. For
+    users who are not in the training logs, the state is made of their rows alone.
 
     Args:
         trained: a policy of items.
         batches: the users' histories.
         k: number of items per user, at least 1.
-        target_return: target return of the rest of the session, in units of the training reward.
+        rule: the decision rule; None for the run's own.
         filter_seen: leave out every item that the user has seen.
         candidates: the only item_ids to recommend, for all users; None for all items.
         skip_unknown: ignore rows of items that are not in the training data.
+        seed: of the draws of a rule with a temperature.
 
     Returns:
-        One frame per batch: `user_id`, `rank` (from 1), `item_id`, `score` (log-probability among
-        all items, nats); k rows per user, fewer if fewer items remain.
+        One frame per batch: `user_id`, `rank` (from 1), `item_id`, `score` (log-probability at
+        temperature 1 among the items that are left, nats); k rows per user, fewer if fewer items
+        remain.
 
     Raises:
         InputError: an argument is wrong, the policy's actions are vectors, or an item of the logs
@@ -62,10 +69,9 @@ def recommend(
         )
     if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or k < 1:
         raise InputError(f"k is {k!r}; give a whole number, 1 or more")
-    if not np.isfinite(target_return):
-        raise InputError(f"target_return is {target_return}; give a finite number")
     index = pd.Index(trained.item_ids)
     excluded = None if candidates is None else _all_but(index, candidates)
+    decider, generator = trained.decider(rule), torch.Generator().manual_seed(seed)
 
     def frames() -> Iterator[pd.DataFrame]:
         remaining = iter(batches)
@@ -76,42 +82,51 @@ def recommend(
             latest = batch.rows(known).latest_session(trained.record["session_gap_ms"])
             store = _next_steps(trained, latest, index)
             seen = _positions(index, batch.seen_ids) if filter_seen else None
-            yield _best(trained, store, batch, k, target_return, seen, excluded)
+            chosen = _Choice(decider, k, seen, excluded, generator)
+            yield _recommended(trained, store, batch, chosen)
 
     return frames()
 
 
-def _best(
-    trained: TrainedPolicy,
-    store: EpisodeStore,
-    batch: Histories,
-    k: int,
-    target_return: float,
-    seen: IntArray | None,
-    excluded: Tensor | None,
-) -> pd.DataFrame:
-    """The `k` best items at the last step of every episode of `store`.
+@dataclass(frozen=True)
+class _Choice:
+    """How the items of one batch are chosen."""
 
-    Args:
-        seen: (M,) index of each item of `batch.seen_ids`, which its user is not recommended; −1
-            for items without an index.
-        excluded: (n_items,) true for items that no user is recommended.
-    """
+    decider: Decider
+    k: int
+    seen: IntArray | None
+    """(M,) index of each item of `Histories.seen_ids`, which its user is not recommended; −1 for
+    items without an index."""
+    excluded: Tensor | None
+    """(n_items,) true for items that no user is recommended."""
+    generator: torch.Generator
+
+
+def _recommended(
+    trained: TrainedPolicy, store: EpisodeStore, batch: Histories, choice: _Choice
+) -> pd.DataFrame:
+    """Items for the last step of every episode of `store`."""
     item_ids, frames = trained.item_ids, []
     assert item_ids is not None
+    rule = choice.decider.rule
+    decider = replace(choice.decider, rule=replace(rule, exclude_seen=False))
     for first in range(0, len(batch.users), _USERS_AT_ONCE):
         rows = np.arange(first, min(first + _USERS_AT_ONCE, len(batch.users)))
-        windows = store.windows(rows, store.lengths[rows] - 1, trained.policy.config.context)
-        # The logged returns-to-go already contain the rewards between each step and the last.
-        scores = trained.log_probabilities(windows, target_return)
-        if seen is not None:
+        left_out = torch.zeros(len(rows), len(item_ids), dtype=torch.bool)
+        if choice.seen is not None:
             of_rows = slice(*np.searchsorted(batch.seen_owner, [rows[0], rows[-1] + 1]))
-            known = seen[of_rows] >= 0
-            owners, items = batch.seen_owner[of_rows][known], seen[of_rows][known]
-            scores[owners - first, items] = -torch.inf
-        if excluded is not None:
-            scores[:, excluded] = -torch.inf
-        frames.append(_ranked(batch.users[rows], item_ids, scores, k))
+            known = choice.seen[of_rows] >= 0
+            left_out[batch.seen_owner[of_rows][known] - first, choice.seen[of_rows][known]] = True
+        if choice.excluded is not None:
+            left_out |= choice.excluded
+        last = store.lengths[rows] - 1
+        if rule.exclude_seen:
+            left_out |= seen_before(store, rows, last)
+        # A user without any item left gets no row.
+        some = ~left_out.all(1)
+        left_out[~some] = False
+        scores = session_scores(decider, store, rows, last, left_out)
+        frames.append(_ranked(batch.users[rows], item_ids, scores, some, choice))
     return pd.concat(frames, ignore_index=True)
 
 
@@ -186,15 +201,20 @@ def _next_steps(
     return EpisodeStore.from_arrays(columns, lengths, {schema.USER: users}, trained.item_states)
 
 
-def _ranked(users: Array, item_ids: Array, scores: Tensor, k: int) -> pd.DataFrame:
-    top = scores.topk(min(k, scores.shape[1]), dim=-1)
-    rank = np.broadcast_to(np.arange(1, top.indices.shape[1] + 1), top.indices.shape)
-    allowed = torch.isfinite(top.values).numpy()
+def _ranked(
+    users: Array, item_ids: Array, scores: Tensor, some: Tensor, choice: _Choice
+) -> pd.DataFrame:
+    """Rows of the users (B,) where `some` (B,) is true, from their scores (B, n_items)."""
+    k = min(choice.k, scores.shape[1])
+    items = choice.decider.rule.ranked(scores, k, choice.generator)
+    values = scores.log_softmax(-1).gather(1, items)
+    kept = (torch.isfinite(values) & some[:, None]).numpy()
+    rank = np.cumsum(kept, axis=1)
     return pd.DataFrame(
         {
-            schema.USER_ID: np.repeat(users, allowed.sum(1)),
-            RANK: rank[allowed],
-            schema.ITEM_ID: item_ids[top.indices.numpy()[allowed]],
-            SCORE: top.values.numpy()[allowed],
+            schema.USER_ID: np.repeat(users, kept.sum(1)),
+            RANK: rank[kept],
+            schema.ITEM_ID: item_ids[items.numpy()[kept]],
+            SCORE: values.numpy()[kept],
         }
     )

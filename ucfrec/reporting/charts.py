@@ -17,7 +17,7 @@ LEFT_OF_BARS = 14
 """Left and right margin of bar charts, whose names are above the bars."""
 NAME, _BAR, _GAP = 16, 18, 10
 """Heights of one line of a bar's name, of the bar, and of the gap below it."""
-_NAME_CHARACTERS = 48
+NAME_CHARACTERS = 48
 """Most characters in a line of a bar's name."""
 _LABEL = 14
 """Height of a label."""
@@ -118,7 +118,7 @@ class Histogram:
     columns: tuple[Column, ...]
 
 
-class _Scale:
+class Scale:
     """Linear map from values to positions, with ticks at round values."""
 
     def __init__(self, values: Iterable[float], start: float, end: float) -> None:
@@ -132,10 +132,12 @@ class _Scale:
         self._start, self._end = start, end
 
     def at(self, value: float) -> float:
+        """Position of a value."""
         share = (value - self._low) / (self._high - self._low)
         return round(self._start + share * (self._end - self._start), 2)
 
     def ticks(self) -> tuple[Tick, ...]:
+        """Labelled positions of round values, the ends of the scale among them."""
         first, last = round(self._low / self._step), round(self._high / self._step)
         values = [i * self._step for i in range(first, last + 1)]
         return tuple(Tick(self.at(value), _label(value, self._step)) for value in values)
@@ -171,13 +173,13 @@ def line_chart(
     """
     levels = levels or {}
     values = [value for _, _, curve in curves for value in curve.values()]
-    x = _Scale((at for _, _, curve in curves for at in curve), LEFT, WIDTH - RIGHT)
-    y = _Scale([*values, *levels.values()], HEIGHT - BOTTOM, TOP)
+    x = Scale((at for _, _, curve in curves for at in curve), LEFT, WIDTH - RIGHT)
+    y = Scale([*values, *levels.values()], HEIGHT - BOTTOM, TOP)
     lines = tuple(_line(name, style, curve, x, y) for name, style, curve in curves)
     return LineChart(title, x_label, x.ticks(), y.ticks(), lines, _levels(levels, y))
 
 
-def _levels(levels: Mapping[str, float], y: _Scale) -> tuple[Level, ...]:
+def _levels(levels: Mapping[str, float], y: Scale) -> tuple[Level, ...]:
     drawn: list[Level] = []
     for name, value in sorted(levels.items(), key=lambda level: -level[1]):
         at = y.at(value)
@@ -186,7 +188,7 @@ def _levels(levels: Mapping[str, float], y: _Scale) -> tuple[Level, ...]:
     return tuple(drawn)
 
 
-def _line(name: str, style: int, curve: Mapping[float, float], x: _Scale, y: _Scale) -> Line:
+def _line(name: str, style: int, curve: Mapping[float, float], x: Scale, y: Scale) -> Line:
     ordered = sorted(curve.items())
     lowest = min(ordered, key=lambda point: point[1])
     summary = (
@@ -206,12 +208,12 @@ def bar_chart(title: str, bars: Sequence[tuple[str, float, float, float]]) -> Ba
         bars: (name, value, low, high) of each, with the ends of its 95% interval.
     """
     values = [0.0, *(end for bar in bars for end in bar[1:])]
-    x = _Scale(values, LEFT_OF_BARS, WIDTH - LEFT_OF_BARS)
+    x = Scale(values, LEFT_OF_BARS, WIDTH - LEFT_OF_BARS)
     drawn, top = [], float(TOP)
     for name, value, low, high in bars:
         start, end = sorted((x.at(0), x.at(value)))
         summary = f"{name}: {value:.4g}, 95% interval {low:.4g} to {high:.4g}"
-        lines = tuple(textwrap.wrap(name, _NAME_CHARACTERS)) or ("",)
+        lines = tuple(textwrap.wrap(name, NAME_CHARACTERS)) or ("",)
         y = top + NAME * len(lines) + _BAR / 2
         drawn.append(Bar(lines, summary, top, y, start, end, x.at(low), x.at(high)))
         top = y + _BAR / 2 + _GAP
@@ -234,7 +236,7 @@ def histogram(
         edges: (N + 1,) ascending bin edges; a bin includes its left edge but not its right one.
         values: (N,) counted values, instead of `edges`.
     """
-    y = _Scale([0.0, *counts], HEIGHT - BOTTOM, TOP)
+    y = Scale([0.0, *counts], HEIGHT - BOTTOM, TOP)
     width = (WIDTH - LEFT - RIGHT) / len(counts)
     names = [_short(value) for value in values or ()]
     if edges is not None:

@@ -15,6 +15,7 @@ _TITLES = {
     "validation_loss": "Validation loss (action, held-out steps)",
     "action_loss": "Training loss of the action (one batch)",
     "attention_on_parents": "Attention mass on the causal parents (1: all of it)",
+    "uniform_on_parents": "Attention mass on the causal parents, were it uniform",
     "mask_loss": "Mask loss of the attention (Eq. 5)",
     "loss": "Training loss, all terms",
     "gradient_norm": "Gradient norm before clipping",

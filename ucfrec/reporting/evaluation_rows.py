@@ -6,12 +6,14 @@ from typing import Any, Final
 
 from ucfrec.errors import InputError
 from ucfrec.files import read_json
+from ucfrec.reporting.estimate_rows import SUITE, as_estimate
 from ucfrec.reporting.result_row import ResultRow, RowKey, row_from_json
 from ucfrec.reporting.rows_file import read_lines
 
 _NOT_METRICS: Final = (
     *("world", "policy", "seed", "train_seed", "fingerprint", "config", "wall_time_s"),
     *("command", "commit", "versions", "target_return", "run", "checkpoint"),
+    *("rule", "decision_rule"),
 )
 """Keys of an evaluation row that are not statistics of its episodes."""
 
@@ -34,6 +36,7 @@ def evaluation_row(evaluation: Mapping[str, Any], key: RowKey, **more: Any) -> R
         "interval": (low, high),
         "world": evaluation["world"],
         "target_return": evaluation.get("target_return"),
+        "rule": evaluation.get("rule"),
         **{name: evaluation[name] for name in ("wall_time_s", "command", "commit", "versions")},
     }
     return ResultRow(**given | more)
@@ -66,6 +69,8 @@ def read_evaluations(path: Path) -> list[Any]:
     if path.suffix == ".jsonl" and path.exists():
         return [_evaluation(value, f"{path}, line {n}") for n, value in read_lines(path)]
     rows = read_json(path)
+    if isinstance(rows, list):
+        rows = [_evaluation(value, f"{path}, row {n}") for n, value in enumerate(rows, start=1)]
     if not isinstance(rows, list):
         raise InputError(
             f"{path} holds no list of result rows; give a file that `ucfrec evaluate` wrote"
@@ -75,5 +80,6 @@ def read_evaluations(path: Path) -> list[Any]:
 
 def _evaluation(value: object, where: str) -> object:
     if isinstance(value, dict) and "suite" in value:
-        return as_evaluation(row_from_json(value, where))
+        row = row_from_json(value, where)
+        return as_estimate(row) if row.suite == SUITE else as_evaluation(row)
     return value

@@ -19,6 +19,7 @@ from ucfrec.reporting import charts
 from ucfrec.reporting.copies import copies_table, moves_chart
 from ucfrec.reporting.curves import POINTS, REFERENCES, Curves, draw_curves, trained_on
 from ucfrec.reporting.data_quality import data_quality
+from ucfrec.reporting.forest import forest
 from ucfrec.reporting.page_results import estimates, read_results, worlds
 from ucfrec.reporting.samples import read_features, sample_tables
 from ucfrec.reporting.tables import Table, shown
@@ -84,6 +85,7 @@ def write_report(
             "verdict": verdict(evidence),
             "worlds": worlds(evidence),
             "estimates": estimates(evidence),
+            "forest": forest(evidence),
         }
     features = None if items is None else read_features(items)
     loader = PackageLoader("ucfrec.reporting", "")

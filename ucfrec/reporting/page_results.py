@@ -106,6 +106,8 @@ def _policy_estimates(group: Sequence[Row]) -> Estimates:
     name = policy["policy"]
     name += "" if choice is None else f" ({choice})"
     name += "" if run is None else f" of {run}"
+    if policy.get("selection") is not None:
+        name = f"{policy['policy']} ({policy['candidate']})"
     warnings = dict.fromkeys(str(text) for row in group for text in row.get("warnings", []))
     return Estimates(name, logged, rows, tuple(warnings))
 

@@ -21,7 +21,7 @@ _CHARACTERS = 120
 
 
 def sample_tables(run: Path, features: pa.Table | None) -> tuple[str, list[Table]] | None:
-    """The target return of the samples and one table per session; None if a run has no samples.
+    """The decision rule of the samples and one table per session; None if a run has no samples.
 
     Args:
         run: run folder.
@@ -35,7 +35,7 @@ def sample_tables(run: Path, features: pa.Table | None) -> tuple[str, list[Table
         numbers = {n for s in sessions for n in (*s["history"], s["logged"], *s["recommended"])}
         items = _item_cells(pq.read_table(run / ITEMS), sorted(numbers), features)
         tables = [_session(number, one, items) for number, one in enumerate(sessions, start=1)]
-        return shown(samples["target_return"]), tables
+        return str(samples["rule"]), tables
 
 
 def read_features(path: Path) -> pa.Table:

@@ -17,9 +17,10 @@ from ucfrec.files import read_toml
 from ucfrec.fitting.loop import LoopConfig
 from ucfrec.policies.base import PolicyConfig
 from ucfrec.policies.registry import policy_class
+from ucfrec.runs.rule_config import RuleConfig
 from ucfrec.settings import SettingError, nearest, settings_table
 
-TABLES: Final = ("policy", "train", "crm", "csg", "augment")
+TABLES: Final = ("policy", "train", "crm", "csg", "augment", "rule")
 
 
 @settings_table("")
@@ -38,6 +39,8 @@ class Config:
     """The generator of counterfactual states."""
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     """The edited copies of training episodes."""
+    rule: RuleConfig = field(default_factory=RuleConfig)
+    """The choice of the decision rule."""
     # scikit-learn accepts no larger seed.
     seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 0
     """Seed of every random draw."""
@@ -56,7 +59,7 @@ def resolve_config(
         policy_name: one of `ucfrec.policies.registry.policy_names`. The default of `augment.copies`
             is 0 for learners other than UCF: `--policy dt` is the plain baseline and `--policy dt
             --set augment.copies=1` is the paper's `w/o Arch`.
-        file: TOML with tables `policy`, `train`, `crm`, `csg` and `augment`.
+        file: TOML with tables `policy`, `train`, `crm`, `csg`, `augment` and `rule`.
         overrides: texts `table.field=value`, the value in TOML syntax; or a mapping, either nested
             (`{"train": {"steps": 200}}`) or flat (`{"train.steps": 200}`).
         seed: seed of every random draw, 0 to 2³² − 1.
@@ -103,7 +106,7 @@ def _build(policy_name: str, settings: Iterable[_Setting], seed: int) -> Config:
     if not learner.augmented:
         tables["augment"]["copies"] = 0
     sources = {}
-    for table, key, value, source in settings:
+    for table, key, value, source in (*_from_mapping(learner.presets, policy_name), *settings):
         tables[table][key] = value.item() if isinstance(value, np.generic) else value
         sources[f"{table}.{key}"] = source
     try:
@@ -114,6 +117,7 @@ def _build(policy_name: str, settings: Iterable[_Setting], seed: int) -> Config:
             CRMConfig(**tables["crm"]),
             CSGConfig(**tables["csg"]),
             AugmentConfig(**tables["augment"]),
+            RuleConfig(**tables["rule"]),
             seed,
         )
     except SettingError as error:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.errors import InputError
 from ucfrec.runs.config import config_from_dict
 
@@ -61,7 +62,21 @@ def _config(value: object) -> bool:
 
 def _sizes(value: object) -> bool:
     names = ("state", "action", "items")
-    return isinstance(value, dict) and all(_count(value.get(name)) for name in names)
+    if not isinstance(value, dict) or not all(_count(value.get(name)) for name in names):
+        return False
+    return all(_count(value.get(name, 0)) for name in ("tags", "users"))
+
+
+def _return_to_go(value: object) -> bool:
+    if not isinstance(value, dict) or value.keys() != {"definition", "discount", "horizon"}:
+        return False
+    if not _number(value["discount"]) or not _count(value["horizon"]):
+        return False
+    try:
+        ReturnToGo(**value)
+    except InputError:
+        return False
+    return True
 
 
 def _quantiles(value: object) -> bool:
@@ -83,6 +98,7 @@ _REQUIRED: Final[Mapping[str, Callable[[object], bool]]] = {
     "fingerprint": _text,
     "observation_size": _count,
     "return_quantiles": _quantiles,
+    "return_to_go": _return_to_go,
     "reward": _text,
     "train_episodes": _count,
     "train_steps": _count,

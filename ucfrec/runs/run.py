@@ -11,13 +11,18 @@ import numpy as np
 import torch
 
 from ucfrec import schema
+from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.checksums import reopen, seal
 from ucfrec.counterfactual.augment import counterfactual_copies, require_rewards_vary
+from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model, reward_model_sizes
 from ucfrec.episodes.item_counts import TrainingCounts
+from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
-from ucfrec.episodes.windows import Overlay, Windows
+from ucfrec.episodes.windows import FloatArray, Overlay, Windows
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder, read_json, write_json
+from ucfrec.fitting.checkpoint import save_tensors
+from ucfrec.fitting.closed_form import fit_once
 from ucfrec.fitting.loop import Fit, fit
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.locks import claimed, remove_leftovers, remove_leftovers_within
@@ -25,13 +30,27 @@ from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
 from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import command_line, versions
+from ucfrec.runs.choose_by_ranking import RankedChoice, choose_by_ranking
+from ucfrec.runs.choose_rule import Choice, choose_rule
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.reference_losses import reference_losses
 from ucfrec.runs.samples import SAMPLES, sample_recommendations
-from ucfrec.runs.trained_policy import AUGMENTATION, COUNTS, INPUTS, ITEMS, RUN, USERS
+from ucfrec.runs.trained_policy import (
+    AUGMENTATION,
+    COUNTS,
+    INPUTS,
+    ITEMS,
+    RETURNS,
+    REWARD_MODEL,
+    RULE,
+    RUN,
+    USERS,
+    TrainedPolicy,
+)
 
 _VALIDATION_BATCHES = 16
 _VALIDATION_BATCH = 256
+_MOST_RETURNS = 1_000_001
 _QUANTILES = (0.5, 0.75, 0.9, 0.95, 0.99, 1.0)
 
 
@@ -42,6 +61,7 @@ def train_run(
     config: Config,
     about: Mapping[str, Any] | None = None,
     more_copies: Overlay | None = None,
+    on_all_rows: bool = False,
 ) -> dict[str, Any]:
     """Train a policy on the training episodes of `store`, or resume the run in `out`.
 
@@ -56,6 +76,8 @@ def train_run(
         about: entries that a dataset adapter adds to the record.
         more_copies: a dataset adapter's edited copies of training episodes, used in addition to
             the counterfactual ones.
+        on_all_rows: train on the validation and test episodes too, and keep the last weights; see
+            `ucfrec.runs.refit`.
 
     Returns:
         The content of `run.json`: provenance, configuration and the report of every stage.
@@ -68,7 +90,7 @@ def train_run(
     with claimed(out, "trained"):
         remove_leftovers(out.parent)
         remove_leftovers_within(out)
-        return _train(store, out, config, about, more_copies)
+        return _train(store, out, config, about, more_copies, on_all_rows)
 
 
 def _train(
@@ -77,9 +99,12 @@ def _train(
     config: Config,
     about: Mapping[str, Any] | None,
     more_copies: Overlay | None,
+    on_all_rows: bool,
 ) -> dict[str, Any]:
     """`train_run` of a run that no other process trains."""
-    train, validation = training_views(store)
+    train, validation = logged, held_out = training_views(store)
+    if on_all_rows:
+        train = logged = store
     if (out / RUN).exists():
         _require_same(read_json(out / RUN), store, out, config)
     elif config.augment.copies > 0:
@@ -93,6 +118,9 @@ def _train(
     start = time.perf_counter() - record["wall_time_s"]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     view = policy.training_view(train, config.policy, out / "view", config.seed)
+    returns = ReturnToGo(**record["return_to_go"])
+    if not returns.per_session:
+        view, validation = (each.with_return_to_go(returns) for each in (view, validation))
     if view is not train:
         train, policy = view, new_policy(view, config)
     policy = policy.to(device)
@@ -101,21 +129,29 @@ def _train(
         more_copies = overlay if more_copies is None else overlay.joined(more_copies)
     if more_copies is not None:
         train = train.with_overlay(more_copies)
-    fitted = _fit_policy(policy, train, validation, out, config)
+    fitted = _fit_policy(policy, train, None if on_all_rows else validation, out, config)
     record["policy"] = dataclasses.asdict(fitted)
+    if logged.has_items and config.rule.choose:
+        record["reward_model"], record["rule"] = _rule(policy, logged, held_out, out, config)
     record["wall_time_s"] = time.perf_counter() - start
-    _write_samples(out, policy, validation, record)
+    _write_samples(out, held_out)
     return seal(out, RUN, record)
 
 
 def _fit_policy(
     policy: SequencePolicy,
     train: EpisodeStore,
-    validation: EpisodeStore,
+    validation: EpisodeStore | None,
     out: Path,
     config: Config,
 ) -> Fit:
+    """Train the policy; without validation, the last weights are kept."""
     k, device = policy.config.context, policy.state_mean.device
+    validate = None if validation is None else _validation(policy, validation, config.seed)
+    base = train.without_copies()
+    solve = policy.closed_form(base, validation or base, out / "policy", config.seed)
+    if solve is not None:
+        return fit_once(policy, solve, out / "policy", validate, config.policy_name)
 
     def draw(generator: np.random.Generator) -> Windows:
         return train.windows(*train.draw_steps(generator, config.train.batch_size), k).to(device)
@@ -127,7 +163,7 @@ def _fit_policy(
         config.train,
         out / "policy",
         seed=config.seed,
-        validate=_validation(policy, validation, config.seed),
+        validate=validate,
         describe=config.policy_name,
     )
 
@@ -173,6 +209,7 @@ def _begin(
         "observation_size": store.observation_size,
         "train_episodes": train.n_episodes,
         "train_steps": train.n_steps,
+        "return_to_go": dataclasses.asdict(_returns(store, config)),
         "return_quantiles": {str(q): float(np.quantile(train.returns, q)) for q in _QUANTILES},
         "mean_return": float(train.returns.mean()),
         "data": store.meta["source"],
@@ -180,7 +217,12 @@ def _begin(
         "wall_time_s": 0.0,
         **about,
     }
+    returns = _target_returns(train, _returns(store, config))
     with atomic_folder(out) as scratch:
+        save_tensors(scratch / RETURNS, {"returns": torch.from_numpy(returns)}, {})
+        target = float(np.quantile(returns.astype(np.float64), config.rule.default_quantile))
+        rule = DecisionRule(target, tag_window=config.rule.default_tag_window)
+        write_json(scratch / RULE, rule.as_dict())
         for name in (ITEM_STATES, ITEMS, USERS):
             if (store.path / name).exists():
                 shutil.copyfile(store.path / name, scratch / name)
@@ -189,6 +231,24 @@ def _begin(
             counts.save(scratch / COUNTS)
             record["reference_losses"] = reference_losses(counts, validation)
         seal(scratch, RUN, record)
+
+
+def _returns(store: EpisodeStore, config: Config) -> ReturnToGo:
+    return config.policy.returns(store.meta["source"].get("session_by"))
+
+
+def _target_returns(train: EpisodeStore, definition: ReturnToGo) -> FloatArray:
+    """Sorted returns-to-go of sessions, or of steps if targets are set anew at every step.
+
+    Of more than a million, evenly spaced order statistics are kept, the lowest and highest too.
+    """
+    returns = train.returns
+    if not definition.per_session:
+        returns = train.with_return_to_go(definition).step_values(
+            schema.RETURN_TO_GO, *train.all_steps()
+        )
+    kept = np.linspace(0, len(returns) - 1, min(len(returns), _MOST_RETURNS)).astype(np.int64)
+    return np.asarray(np.sort(returns)[kept], dtype=np.float32)
 
 
 def _require_same(
@@ -242,8 +302,7 @@ def _counterfactuals(
 def _sizes(store: EpisodeStore) -> dict[str, int]:
     columns = store.meta["columns"]
     if store.has_items:
-        items, dim = store.item_states.embeddings.shape
-        return {"state": store.state_size, "action": dim, "items": items}
+        return reward_model_sizes(store)
     return {"state": store.state_size, "action": columns[schema.ACTION][0], "items": 0}
 
 
@@ -257,15 +316,20 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
     policy.state_mean.copy_(mean)
     policy.state_std.copy_(torch.where(std > 1e-6, std, 1.0))
     scale = config.policy.return_scale or float(np.abs(base.returns).max()) or 1.0
-    policy.return_scale.fill_(scale)
     episodes, steps = base.all_steps()
     returns_to_go = base.step_values(schema.RETURN_TO_GO, episodes, steps)
+    if not _returns(base, config).per_session and not config.policy.return_scale:
+        scale = float(np.abs(returns_to_go).max()) or 1.0
+    policy.return_scale.fill_(scale)
     policy.lowest_return_to_go.fill_(float(returns_to_go.min()))
     if isinstance(policy.head, ItemHead):
         counts = np.bincount(
             base.step_values(schema.ITEM, episodes, steps), minlength=len(policy.head.counts)
         )
         policy.head.start_from(base.item_states.embeddings, torch.from_numpy(counts).float())
+        if policy.head.exposure is not None:
+            scaled = torch.from_numpy(returns_to_go) / policy.return_scale
+            policy.head.exposure.start_from(base.item_states, scaled)
     else:
         actions = base.step_values(schema.ACTION, episodes, steps)
         policy.head.scale.copy_(torch.from_numpy(np.abs(actions).max(0)).clamp(min=1.0))
@@ -288,13 +352,29 @@ def _validation(policy: SequencePolicy, validation: EpisodeStore, seed: int) -> 
     return loss
 
 
-def _write_samples(
-    out: Path, policy: SequencePolicy, validation: EpisodeStore, record: Mapping[str, Any]
-) -> None:
-    """Save a few recommendations for the report, with the commands' default target return."""
+def _rule(
+    policy: SequencePolicy, train: EpisodeStore, validation: EpisodeStore, out: Path, config: Config
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Fit the reward model of items and choose the rule; returns the reports of both."""
+    model, report = fit_item_reward_model(train, validation, out / REWARD_MODEL, config.seed)
+    trained = TrainedPolicy.load(out)
+    targets = {quantile: trained.target_return(quantile) for quantile in config.rule.quantiles}
+    decider = Decider(policy, trained.rule, trained.returns, model)
+    choice: Choice | RankedChoice
+    if trained.returns.per_session:
+        choice = choose_rule(decider, targets, train, validation, config.rule, config.seed)
+    else:
+        choice = choose_by_ranking(decider, train, validation, config.rule, config.seed)
+    write_json(out / RULE, choice.rule.as_dict())
+    return dataclasses.asdict(report), choice.as_dict()
+
+
+def _write_samples(out: Path, validation: EpisodeStore) -> None:
+    """Save a few recommendations for the report, by the run's decision rule."""
     if validation.has_items:
-        target = max(record["return_quantiles"].values())
-        write_json(out / SAMPLES, sample_recommendations(policy, validation, target))
+        write_json(
+            out / SAMPLES, sample_recommendations(TrainedPolicy.load(out).decider(), validation)
+        )
 
 
 def describe_run(record: Mapping[str, Any]) -> str:

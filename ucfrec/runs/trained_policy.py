@@ -1,23 +1,26 @@
 """A trained policy, read back from its run folder."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
 from torch import Tensor
 
 from ucfrec import schema
+from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.checksums import sealed_record
+from ucfrec.counterfactual.item_reward_model import FITTED, ItemRewardModel
+from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.item_counts import TrainingCounts
+from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import ITEM_STATES
-from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
+from ucfrec.files import read_json
 from ucfrec.fitting.checkpoint import load_tensors, load_weights
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.parquet_files import read_ids
@@ -29,7 +32,10 @@ from ucfrec.runs.record import require_run_record
 RUN, AUGMENTATION = "run.json", "augmentation.json"
 ITEMS, USERS = "items.parquet", "users.parquet"
 COUNTS = "training_counts.safetensors"
-INPUTS = (ITEM_STATES, ITEMS, USERS, COUNTS)
+RETURNS = "training_returns.safetensors"
+RULE = "decision_rule.json"
+REWARD_MODEL = "reward_model"
+INPUTS = (ITEM_STATES, ITEMS, USERS, COUNTS, RETURNS)
 """Files of a run that training does not change."""
 
 
@@ -48,6 +54,13 @@ class TrainedPolicy:
     """(n_items,) item identifiers in the logs; None if actions are vectors."""
     user_ids: npt.NDArray[Any]
     """(n_users,) user identifiers in the logs; empty if the store has none."""
+    training_returns: npt.NDArray[np.float32]
+    """(M,) returns-to-go that targets are set for, sorted, in reward units: those of sessions, or
+    of steps if a target is set anew at every step (`ReturnToGo.per_session`)."""
+    rule: DecisionRule
+    """The decision rule of the run."""
+    reward_model: ItemRewardModel | None = None
+    """Of the rewards of items, for decision rules with a tilt; None if the run fitted none."""
     counts: TrainingCounts | None = None
     """Item counts of the training steps; None if actions are vectors or the run lacks the file."""
 
@@ -77,6 +90,9 @@ class TrainedPolicy:
             ItemStates.load(states) if states.exists() else None,
             _ids(run / ITEMS, schema.ITEM_ID) if states.exists() else None,
             _ids(run / USERS, schema.USER_ID),
+            load_tensors(run / RETURNS)[0]["returns"].numpy(),
+            _rule(run / RULE),
+            _reward_model(run / REWARD_MODEL / FITTED, record["sizes"]),
             TrainingCounts.load(run / COUNTS) if (run / COUNTS).exists() else None,
         )
 
@@ -88,48 +104,52 @@ class TrainedPolicy:
         """Name of the learner; see `learner_of`."""
         return learner_of(self.record)
 
+    @property
+    def returns(self) -> ReturnToGo:
+        """What the returns-to-go of the training counted."""
+        return ReturnToGo(**self.record["return_to_go"])
+
     def target_return(self, quantile: float) -> float:
-        """The `quantile` (0 to 1) of the training returns, in reward units.
+        """The `quantile` (0 to 1) of `training_returns`, exact, in reward units.
 
-        Interpolated between the quantiles that the run recorded.
+        Raises:
+            InputError: the quantile is not between 0 and 1.
         """
-        known = self.record["return_quantiles"]
-        return float(np.interp(quantile, [float(q) for q in known], list(known.values())))
+        if not 0 <= quantile <= 1:
+            raise InputError(f"the target quantile is {quantile}; give a number from 0 to 1")
+        return float(np.quantile(self.training_returns.astype(np.float64), quantile))
 
-    @torch.no_grad()
-    def log_probabilities(self, windows: Windows, more: Tensor | float) -> Tensor:
-        """Log-probabilities (nats) of all items at each window's last step, (B, n_items).
-
-        Args:
-            windows: B windows of a store of items.
-            more: added to the windows' returns-to-go, one number or (B, 1), in reward units.
-        """
-        returns_to_go = (windows.returns_to_go + more).masked_fill(~windows.mask, 0.0)
-        windows = replace(windows, returns_to_go=returns_to_go).to(self.policy.state_mean.device)
-        return self.policy.act(windows).log_softmax(-1).cpu()
+    def decider(self, rule: DecisionRule | None = None) -> Decider:
+        """The policy under `rule`, by default the run's own."""
+        rule, likeness, states = rule or self.rule, None, self.item_states
+        if rule.tag_window and states is not None:
+            likeness = Likeness.of(states)
+        return Decider(self.policy, rule, self.returns, self.reward_model, likeness)
 
     def actor(
         self,
         episodes: int,
-        target_return: float,
+        rule: DecisionRule | None = None,
         item_numbers: npt.NDArray[np.int64] | None = None,
+        seed: int = 0,
     ) -> PolicyActor:
         """An actor for `episodes` parallel environments.
 
         Args:
             episodes: number of environments.
-            target_return: target return of every episode, in reward units.
+            rule: the decision rule; None for the run's own.
             item_numbers: (n_items,) the environment's index of each item, −1 for items that it
                 lacks; None if the `item_ids` are these indices.
+            seed: of the draws of a rule with a temperature.
         """
         return PolicyActor(
-            self.policy,
+            self.decider(rule),
             episodes,
-            target_return,
             self.record["observation_size"],
             self.item_states,
             self.item_ids if item_numbers is None else item_numbers,
             self.user_ids,
+            seed,
         )
 
 
@@ -183,6 +203,21 @@ def learner_of(record: Mapping[str, Any]) -> str:
 def _weights(path: Path) -> dict[str, Tensor]:
     tensors, _ = load_tensors(path)
     return {name: t for name, t in tensors.items() if not name.startswith("optimizer.")}
+
+
+def _rule(path: Path) -> DecisionRule:
+    values = read_json(path)
+    if not isinstance(values, Mapping):
+        raise InputError(f"{path} is not a decision rule; train the policy again")
+    return DecisionRule.from_dict(values, str(path))
+
+
+def _reward_model(path: Path, sizes: Mapping[str, int]) -> ItemRewardModel | None:
+    if not path.exists():
+        return None
+    model = ItemRewardModel(sizes)
+    load_weights(path, model, load_tensors(path)[0])
+    return model.eval()
 
 
 def _ids(path: Path, column: str) -> npt.NDArray[Any]:

@@ -4,7 +4,7 @@ import argparse
 
 import torch
 
-from ucfrec.commands.train import add_options as train_options
+from ucfrec.commands.train import training_options
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import describe_run
@@ -13,7 +13,7 @@ from ucfrec_control.learners.train import SCREENINGS, dataset_of, preset_of, tra
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `train`."""
-    train_options(parser)
+    training_options(parser)
     parser.add_argument(
         "--screen",
         choices=["copies", "drop"],

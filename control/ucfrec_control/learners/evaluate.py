@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import VectorEnv
 
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import rollout
 from ucfrec.errors import InputError
 from ucfrec.evaluation.metrics import bootstrap_interval
@@ -185,7 +186,7 @@ def _row(
     began = time.perf_counter()
     env = open_world(trained, env_id, min(episodes, SIDE_BY_SIDE), distractor=distractor)
     try:
-        actor = trained.actor(env.num_envs, target)
+        actor = trained.actor(env.num_envs, None if target is None else DecisionRule(target))
         played = rollout(env, actor, episodes, seed, describe=f"{trained.name} in {env_id}")
     finally:
         env.close()

@@ -12,6 +12,7 @@ import numpy.typing as npt
 import torch
 
 from ucfrec import schema
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import BoolArray, FloatArray, IntArray
 from ucfrec.checksums import seal
 from ucfrec.episodes.store import EpisodeStore
@@ -68,7 +69,7 @@ class RLPolicy:
             self._learner.create_impl((sizes["state"],), sizes["action"])
         load_weights(run / _ACTOR, self._learner.impl.modules.policy, tensors)
 
-    def actor(self, episodes: int, target_return: float | None) -> "RLPolicy":
+    def actor(self, episodes: int, rule: DecisionRule | None) -> "RLPolicy":
         """Itself: it has no memory and ignores the target return."""
         return self
 

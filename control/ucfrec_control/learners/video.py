@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.image import imsave
 
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import rollout
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_file, atomic_folder
@@ -62,7 +63,8 @@ def record_episode(
         raise InputError(f"{out} exists already; remove it or name another with --video")
     trained = load_run(run, checkpoint)
     world = world_of(trained, env_id)
-    target_return: Any = targets_of(trained, world, () if target is None else (target,))[0]
+    target_return = targets_of(trained, world, () if target is None else (target,))[0]
+    rule = None if target_return is None else DecisionRule(target_return)
     if not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")
     with (_video if out.suffix == _VIDEO else _frames)(out) as take:
@@ -72,9 +74,7 @@ def record_episode(
                 trained, world, 1, [recorder], distractor=distractor, render_mode="rgb_array"
             )
         try:
-            played = rollout(
-                env, trained.actor(1, target_return), 1, seed, describe="record episode"
-            )
+            played = rollout(env, trained.actor(1, rule), 1, seed, describe="record episode")
         finally:
             env.close()
     return float(played.returns[0])

@@ -1,10 +1,11 @@
 """One cell of the tables (a trained method or a built-in policy on a task) and its result rows."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.world import World
@@ -27,14 +28,11 @@ class EvaluationPlan:
 
     episodes: int
     """Episodes of each reported result."""
-    validation_episodes: int
-    """Episodes played to choose the target return; never reported as a result."""
-    quantiles: tuple[float, ...]
-    """Quantiles of the training returns that are candidates for the target return."""
+    target_quantile: float | None = None
+    """Quantile of the training returns that every conditioned method is given as target; None for
+    the target of each run's own rule."""
     seed: int = 1_000_000
     """Seed of the reported episodes; the same for all training seeds."""
-    validation_seed: int = 2_000_000
-    """Seed of the validation episodes."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +76,8 @@ def key(cell: Cell) -> RowKey:
     }
     fingerprint = None
     if cell.store is not None:
-        conditions["quantiles"] = quantile_names(cell.evaluation.quantiles)
+        quantile = cell.evaluation.target_quantile
+        conditions["quantiles"] = "rule" if quantile is None else f"{quantile:g}"
         fingerprint = EpisodeStore.open(cell.store).meta["fingerprint"]
     return RowKey(
         suite=SUITE,
@@ -95,16 +94,10 @@ def key(cell: Cell) -> RowKey:
     )
 
 
-def quantile_names(quantiles: tuple[float, ...]) -> str:
-    """The quantiles of a plan, as a row's conditions have them: "0.5 0.9"."""
-    return " ".join(f"{quantile:g}" for quantile in quantiles)
-
-
 def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     """Train the method, unless it is a built-in policy, and evaluate it in every world of the task.
 
-    A conditioned method is given the target return, among a few quantiles of the training returns,
-    with the highest mean return in validation episodes. Those are not the reported episodes.
+    It acts by its run's own decision rule, which was chosen on its log, not in a world.
 
     Args:
         cell: what to train and evaluate.
@@ -123,14 +116,12 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     with claim(cell.run, wait=True):
         record = train_run(EpisodeStore.open(cell.store), cell.run, cell.config)
     training_metrics, rows = _training_metrics(record), []
-    for world in cell.worlds:
-        target, validation_returns = _target(cell, world)
-        rule = _rule(cell, validation_returns)
-        for checkpoint in CHECKPOINTS:
-            trained = TrainedPolicy.load(cell.run, checkpoint)
-            metrics = evaluate_policy(world, trained, cell.method, episodes, seed, target)
-            details = {"validation": validation_returns} if validation_returns else {}
-            fields = {"checkpoint": checkpoint, "rule": rule, "details": details}
+    for checkpoint in CHECKPOINTS:
+        trained = TrainedPolicy.load(cell.run, checkpoint)
+        rule = _rule(cell, trained)
+        for world in cell.worlds:
+            metrics = evaluate_policy(world, trained, cell.method, episodes, seed, rule)
+            fields = {"checkpoint": checkpoint, "rule": f"{rule} ({rule.hash})"}
             rows.append(_row(metrics | training_metrics, row_key, world, **fields))
     return rows
 
@@ -158,33 +149,12 @@ def _training_metrics(record: Mapping[str, Any]) -> dict[str, float]:
     }
 
 
-def _rule(cell: Cell, validation_returns: Mapping[str, float] | None) -> str:
-    """How the policy's target return was chosen."""
-    if not cell.conditioned:
-        return "no target return"
-    if validation_returns is None:
-        return f"target return: quantile {quantile_names(cell.evaluation.quantiles)} of training"
-    plan = cell.evaluation
-    candidates, episodes = len(validation_returns), plan.validation_episodes
-    return f"target return: best of {candidates} in {episodes} other episodes"
-
-
-def _target(cell: Cell, world: World) -> tuple[float, dict[str, float] | None]:
-    """The target return with the highest mean validation return, and that mean for each target."""
-    assert cell.run is not None
-    trained, plan = TrainedPolicy.load(cell.run), cell.evaluation
-    if not cell.conditioned:
-        return trained.target_return(1.0), None
-    targets = dict.fromkeys(trained.target_return(q) for q in plan.quantiles)
-    if len(targets) == 1:
-        return next(iter(targets)), None
-    validation = (plan.validation_episodes, plan.validation_seed)
-    returns = {
-        target: float(evaluate_policy(world, trained, cell.method, *validation, target)["R_cum"])
-        for target in targets
-    }
-    best = max(returns, key=lambda target: returns[target])
-    return best, {f"{target:g}": value for target, value in returns.items()}
+def _rule(cell: Cell, trained: TrainedPolicy) -> DecisionRule:
+    """The run's own rule, or with the plan's target."""
+    quantile = cell.evaluation.target_quantile
+    if quantile is None or not cell.conditioned:
+        return trained.rule
+    return replace(trained.rule, target=trained.target_return(quantile))
 
 
 def config(cell: Cell) -> dict[str, Any] | None:

@@ -37,7 +37,8 @@ def run(request: BenchmarkRequest) -> str:
         The tables as Markdown.
 
     Raises:
-        InputError: the budget is unknown, or cells failed.
+        InputError: the budget is unknown, another table than main is asked of a single world, or
+            cells failed.
     """
     if request.budget not in BUDGETS:
         raise InputError(f"unknown budget {request.budget}; choose one of {', '.join(BUDGETS)}")
@@ -45,10 +46,20 @@ def run(request: BenchmarkRequest) -> str:
     if request.evaluation_seed is not None:
         evaluation = replace(budget.evaluation, seed=request.evaluation_seed)
         budget = replace(budget, evaluation=evaluation)
-    plan = Plan(folder, budget, request.budget, request.log_seed)
-    parts = [f"{name} is left out: its files are not in the data folder" for name in plan.missing()]
+    plan = Plan(folder, budget, request.budget, request.log_seed, request.world)
+    tables, parts = request.tables, []
+    if request.world is not None:
+        tables = [table for table in tables if table == "main"]
+        if not tables:
+            raise InputError("--env gives the table main only; leave out --table")
+    else:
+        parts = [
+            f"{name} is left out: its files are not in the data folder, or its package is not "
+            "installed"
+            for name in plan.missing()
+        ]
     plotted = find_spec("matplotlib") is not None
-    for table in request.tables:
+    for table in tables:
         cells = list(getattr(plan, table)())
         rows = run_grid(cells, MEASUREMENT, request.results, request.workers, table)
         parts.append(_shown(table, rows))

@@ -21,6 +21,13 @@ class Method:
 
 METHODS: Final[Mapping[str, Method]] = {
     "popular": Method("popular", conditioned=False),
+    "item-rate": Method("item-rate", ("rule.choose=false",), conditioned=False, vectors=False),
+    "item-rate-mask": Method(
+        "item-rate",
+        ("rule.choose=false", "rule.default_tag_window=10"),
+        conditioned=False,
+        vectors=False,
+    ),
     "item-knn": Method("item-knn", conditioned=False, vectors=False),
     "sasrec": Method("sasrec", conditioned=False),
     "bc": Method("bc", conditioned=False),

@@ -1,22 +1,26 @@
 """Which cells a table has, at a budget."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
 from ucfrec import schema
 from ucfrec.code_version import code_version, plugin_module
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.evaluation.world import World
+from ucfrec.evaluation import gymnasium_world
+from ucfrec.evaluation.world import GYMNASIUM, World
 from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import config_hash
+from ucfrec_simulators import sardine
 from ucfrec_simulators.benchmark import cells, tasks
 from ucfrec_simulators.benchmark.cells import Cell, EvaluationPlan
 from ucfrec_simulators.benchmark.methods import METHODS, Method
 from ucfrec_simulators.benchmark.tasks import TASKS, BenchmarkTask
 from ucfrec_simulators.distractor import OFF, ON, DistractorWorld, plant_distractor
-from ucfrec_simulators.folders import data_folder
+from ucfrec_simulators.folders import data_folder, folder_name
 
 
 @dataclass(frozen=True)
@@ -36,7 +40,6 @@ class Budget:
     """Training seeds of the sweeps and of the distractor table."""
 
 
-TARGETS: Final = (0.5, 0.9, 0.99, 1.0)
 BUDGETS: Final[Mapping[str, Budget]] = {
     # Sized for two cores: smaller width, fewer steps, smaller logs, and cheaper settings of two
     # baselines; methods and seeds are not reduced.
@@ -52,7 +55,7 @@ BUDGETS: Final[Mapping[str, Budget]] = {
             "crm.epochs=8",
         ),
         cuts={"dt4rec": ("policy.negatives=1",), "edt4rec": ("policy.cql_steps=1000",)},
-        evaluation=EvaluationPlan(episodes=500, validation_episodes=200, quantiles=TARGETS),
+        evaluation=EvaluationPlan(episodes=500),
         sweep_seeds=2,
     ),
     "full": Budget(
@@ -60,12 +63,12 @@ BUDGETS: Final[Mapping[str, Budget]] = {
         sessions=50_000,
         settings=("train.steps=20000", "train.learning_rate=3e-4"),
         cuts={},
-        evaluation=EvaluationPlan(episodes=5000, validation_episodes=1000, quantiles=TARGETS),
+        evaluation=EvaluationPlan(episodes=5000),
         sweep_seeds=3,
     ),
 }
-_CONTEXT: Final = {"kuairand": 5}
-"""Context length K (steps) where it is not 10: KuaiRand's sessions have about two steps."""
+_CONTEXT: Final = 11
+"""Context length K (steps): one more than the steps that exposure features look back."""
 
 LAMBDAS: Final = (0.0, 0.05, 0.1, 0.25, 0.5, 1.0)
 BANDS: Final = ((0.05, 0.2), (0.2, 0.5), (0.5, 1.0), (1.0, 2.0))
@@ -76,35 +79,49 @@ DISTRACTOR_METHODS: Final = tuple(
 )
 DISTRACTOR_TARGETS: Final = (1.0, 0.99)
 """Quantiles of the training returns: the default target, and one nearer to the logs."""
-MAIN: Final = ("kuairand", "kuairec", "virtual-taobao", "synthetic-catalog")
+MAIN: Final = (
+    *("kuairand", "kuairec", "virtual-taobao", "synthetic-catalog"),
+    *("sardine-static", "sardine-boredinf"),
+)
 SWEPT: Final = ("synthetic-catalog", "synthetic-taobao")
 """Tasks of the sweeps. Not VirtualTaobao: there all sequence policies reach the maximum return."""
 _REAL: Final = {"kuairand": "kuairand", "kuairec": "kuairec", "virtual-taobao": "virtualtaobao"}
 """Tasks that need files outside the package, and the subfolder of the data folder with them."""
+_PACKAGES: Final = {"sardine-static": sardine.PACKAGE, "sardine-boredinf": sardine.PACKAGE}
+"""Tasks that need an optional package, and its name."""
 _DISTRACTED_WORLDS: Final = {"synthetic-taobao": 0, "kuairand": 2}
 """Tasks with a distractor, and the index of the world that is played. KuaiRand is played as NX_10:
 all its sessions have the same length, so early exits do not hide the distractor's effect."""
 _DISTRACTOR: Final = DistractorWorld.__module__
+_GYMNASIUM_WORLD: Final = gymnasium_world.__name__
 _MEMORYLESS: Final = ("bc", "popular", "crm-greedy")
 
 
 class Plan:
     """The cells of every table, for one budget and the data at hand."""
 
-    def __init__(self, folder: Path, budget: Budget, name: str = "", log_seed: int = 0) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        budget: Budget,
+        name: str = "",
+        log_seed: int = 0,
+        world: World | None = None,
+    ) -> None:
         """Args:
         folder: where logs, stores, worlds and runs are kept.
         budget: size of the benchmark.
         name: name of the budget, for the rows.
         log_seed: seed of simulated logs.
+        world: a world whose cells the main table has instead; None for `MAIN`.
         """
         self._folder, self._budget, self._name = folder, budget, name
-        self._log_seed = log_seed
+        self._log_seed, self._world = log_seed, world
         self._tasks: dict[str, BenchmarkTask] = {}
 
     def main(self) -> Iterator[Cell]:
         """Cells of Table 2 with Table 3's ablations, and of the worlds' built-in policies."""
-        for name in self._available(MAIN):
+        for name in self._available(MAIN) if self._world is None else [self._world.title]:
             task = self._task(name)
             for behavior in task.behaviors:
                 code = _code(task.worlds)
@@ -139,7 +156,7 @@ class Plan:
         the same target returns: choosing the target in validation episodes with the distractor off
         would use knowledge of the intervention.
         """
-        plans = [replace(self._budget.evaluation, quantiles=(q,)) for q in DISTRACTOR_TARGETS]
+        plans = [replace(self._budget.evaluation, target_quantile=q) for q in DISTRACTOR_TARGETS]
         for name, world_index in _DISTRACTED_WORLDS.items():
             if name not in self._available(_DISTRACTED_WORLDS):
                 continue
@@ -159,18 +176,26 @@ class Plan:
                             yield from self._trained("distractor", *arguments)
 
     def missing(self) -> list[str]:
-        """Tasks of the main table that are left out because their data files are missing."""
+        """Tasks of the main table that are left out: their files or package are missing."""
         return [name for name in MAIN if name not in self._available(MAIN)]
 
     def _available(self, names: Iterable[str]) -> list[str]:
-        return [name for name in names if name not in _REAL or data_folder(_REAL[name]).is_dir()]
+        return [
+            name
+            for name in names
+            if (name not in _REAL or data_folder(_REAL[name]).is_dir())
+            and (name not in _PACKAGES or find_spec(_PACKAGES[name]) is not None)
+        ]
 
     def _task(self, name: str) -> BenchmarkTask:
         if name not in self._tasks:
+            world = self._world
+            made_of = (name,) if world is None else (world.name,)
             # Another version of the code may write different logs, so each version has its folder.
-            code = code_version(tasks.__name__, *map(_module, tasks.LOGGED.get(name, (name,))))
-            folder = self._folder / "tasks" / f"{name}-{self._log_seed}-{code}"
-            self._tasks[name] = TASKS[name](folder, self._budget.sessions, self._log_seed)
+            code = code_version(tasks.__name__, *map(_module, tasks.LOGGED.get(name, made_of)))
+            folder = self._folder / "tasks" / f"{folder_name(name)}-{self._log_seed}-{code}"
+            make = TASKS[name] if world is None else partial(tasks.simulated, world)
+            self._tasks[name] = make(folder, self._budget.sessions, self._log_seed)
         return self._tasks[name]
 
     def _seed_of_logs(self, name: str) -> int | None:
@@ -195,8 +220,7 @@ class Plan:
         if not (store.has_items or method.vectors):
             return
         task_name = name.partition(",")[0]
-        context = _CONTEXT.get(task_name, 10)
-        memory = () if method.policy in _MEMORYLESS else (f"policy.context={context}",)
+        memory = () if method.policy in _MEMORYLESS else (f"policy.context={_CONTEXT}",)
         cuts = self._budget.cuts.get(method.policy, ())
         settings = (*self._budget.settings, *memory, *cuts, *method.settings)
         code = _code(task.worlds, policy_class(method.policy).__module__)
@@ -214,21 +238,25 @@ class Plan:
             log_seed=self._seed_of_logs(task_name),
             training_seed=seed,
             store=task.store,
-            run=self._folder / "runs" / name / f"{method.policy}-{run_hash}-{seed}",
+            run=self._folder / "runs" / folder_name(name) / f"{method.policy}-{run_hash}-{seed}",
             settings=settings,
             conditioned=method.conditioned,
         )
 
 
-def _code(worlds: Iterable[World], *learner: str) -> str:
+def _code(worlds: Sequence[World], *learner: str) -> str:
     """The version of the code that a cell in `worlds` depends on."""
-    apart = [] if any(isinstance(world, DistractorWorld) for world in worlds) else [_DISTRACTOR]
-    return code_version(
-        cells.__name__, *learner, *(_module(world.name) for world in worlds), exclude=apart
-    )
+    modules = [_module(world.name) for world in worlds]
+    distracted = any(isinstance(world, DistractorWorld) for world in worlds)
+    on_gymnasium = any(module in (_GYMNASIUM_WORLD, sardine.__name__) for module in modules)
+    apart = [] if distracted else [_DISTRACTOR]
+    apart += [] if on_gymnasium else [_GYMNASIUM_WORLD]
+    return code_version(cells.__name__, *learner, *modules, exclude=apart)
 
 
 def _module(world: str) -> str:
+    if world.startswith(GYMNASIUM):
+        return _GYMNASIUM_WORLD
     return plugin_module("simulators", world)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -58,6 +59,31 @@ def synthetic_catalog(folder: Path, sessions: int, log_seed: int) -> BenchmarkTa
     world = World("synthetic-catalog")
     store = simulated_store(world, folder, sessions, log_seed)
     return BenchmarkTask(store, (world,), ("random", "mixture", "optimal"))
+
+
+def sardine(name: str, folder: Path, sessions: int, log_seed: int) -> BenchmarkTask:
+    """A world of SARDINE, with logs of its mixture of oracles.
+
+    A third of the sessions are collected, because they have 100 steps.
+
+    Args:
+        name: `sardine-static` or `sardine-boredinf`.
+        folder, sessions, log_seed: as for every task.
+
+    Raises:
+        InputError: `sardine-rec` is not installed.
+    """
+    return simulated(World(name), folder, max(1, sessions // 3), log_seed)
+
+
+def simulated(world: World, folder: Path, sessions: int, log_seed: int) -> BenchmarkTask:
+    """Any world that needs no files, with logs of its mixture or, without one, of random actions.
+
+    Raises:
+        InputError: the world cannot be made.
+    """
+    behaviors = tuple(world.simulator().behaviors)
+    return BenchmarkTask(simulated_store(world, folder, sessions, log_seed), (world,), behaviors)
 
 
 def kuairand(folder: Path, sessions: int, log_seed: int) -> BenchmarkTask:
@@ -130,6 +156,8 @@ TASKS: Final[Mapping[str, Callable[[Path, int, int], BenchmarkTask]]] = {
     "virtual-taobao": virtual_taobao,
     "synthetic-taobao": synthetic_taobao,
     "synthetic-catalog": synthetic_catalog,
+    "sardine-static": partial(sardine, "sardine-static"),
+    "sardine-boredinf": partial(sardine, "sardine-boredinf"),
 }
 """Makers of the tasks by name. Arguments: folder to keep it in; sessions to collect and their seed,
 where logs are simulated."""

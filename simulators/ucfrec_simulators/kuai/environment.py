@@ -14,8 +14,8 @@ from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
 from ucfrec.acting.rollout import FORBIDDEN, USER_IDS, BoolArray, FloatArray, IntArray
+from ucfrec.acting.uniform import Memoryless
 from ucfrec.errors import InputError
-from ucfrec_simulators.behaviors import Memoryless
 from ucfrec_simulators.session_env import AnyArray, SessionsEnv
 
 UNTAGGED: Final = -1

@@ -16,10 +16,10 @@ import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.acting.rollout import FloatArray
+from ucfrec.acting.uniform import Uniform
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.plugins import Simulator
-from ucfrec_simulators.behaviors import Uniform
 from ucfrec_simulators.folders import data_folder
 from ucfrec_simulators.kuai.completion import ITEMS_FILE, USERS_FILE, Completed, complete
 from ucfrec_simulators.kuai.environment import EXITS, REGIMES, ExitRule, KuaiEnv, Regime, oracle

@@ -8,9 +8,9 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
+from ucfrec.acting.uniform import Uniform
 from ucfrec.errors import InputError
 from ucfrec.plugins import Simulator
-from ucfrec_simulators.behaviors import Uniform
 from ucfrec_simulators.folders import data_folder
 from ucfrec_simulators.kuai.environment import EXITS, REGIMES, ExitRule, KuaiEnv, Regime, oracle
 

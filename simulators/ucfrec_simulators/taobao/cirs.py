@@ -8,8 +8,8 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
 from ucfrec.acting.rollout import BoolArray, FloatArray, IntArray
+from ucfrec.acting.uniform import Uniform
 from ucfrec.plugins import Simulator
-from ucfrec_simulators.behaviors import Uniform
 from ucfrec_simulators.folders import data_folder
 from ucfrec_simulators.session_env import AnyArray
 from ucfrec_simulators.taobao import ddpg

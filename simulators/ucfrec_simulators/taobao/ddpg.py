@@ -19,11 +19,12 @@ from gymnasium.vector import VectorEnv
 from torch import nn
 
 from ucfrec.acting.rollout import Actor, BoolArray, FloatArray, IntArray, Step, rollout
+from ucfrec.acting.uniform import Memoryless
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.provenance import versions
-from ucfrec_simulators.behaviors import Actions, Memoryless, SessionMixture, truncated_normal
+from ucfrec_simulators.behaviors import Actions, SessionMixture, truncated_normal
 from ucfrec_simulators.taobao.environment import ACTION_DIM, MAX_CLICKS, TaobaoEnv, taobao
 
 

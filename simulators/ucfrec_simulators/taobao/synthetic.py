@@ -8,8 +8,9 @@ import numpy.typing as npt
 from gymnasium.vector import VectorEnv
 
 from ucfrec.acting.rollout import FloatArray, IntArray
+from ucfrec.acting.uniform import Uniform
 from ucfrec.plugins import Simulator
-from ucfrec_simulators.behaviors import Blend, Rule, SessionMixture, Uniform
+from ucfrec_simulators.behaviors import Blend, Rule, SessionMixture
 from ucfrec_simulators.session_env import AnyArray, draw_categories
 from ucfrec_simulators.taobao import ddpg
 from ucfrec_simulators.taobao.environment import (

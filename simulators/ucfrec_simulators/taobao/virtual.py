@@ -11,9 +11,10 @@ from gymnasium.vector import VectorEnv
 from torch import nn
 
 from ucfrec.acting.rollout import FloatArray, IntArray
+from ucfrec.acting.uniform import Uniform
 from ucfrec.errors import InputError
 from ucfrec.plugins import Simulator
-from ucfrec_simulators.behaviors import Blend, SessionMixture, Uniform
+from ucfrec_simulators.behaviors import Blend, SessionMixture
 from ucfrec_simulators.folders import data_folder
 from ucfrec_simulators.session_env import AnyArray, draw_categories
 from ucfrec_simulators.taobao import ddpg

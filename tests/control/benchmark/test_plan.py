@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.support.control_files import hopper_like, write_hdf5
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.runs.config import Config, resolve_config
 from ucfrec_control.benchmark import robustness
 from ucfrec_control.benchmark.cells import code_of
@@ -119,7 +120,7 @@ def test_the_best_trajectories_are_cloned_and_evaluated(
     for method in rows:
         runs = tmp_path / "runs" / "tiny" / MAIN / "hopper_medium-made"
         run = runs / run_name(method, code_of(METHODS[method][0]), 0)
-        actor = load_run(run, "last").actor(len(seen), 1.0)
+        actor = load_run(run, "last").actor(len(seen), DecisionRule(1.0))
         actor.begin(np.arange(len(seen)))
         chosen[method] = actor.act(seen, np.ones(len(seen), dtype=bool))[0].mean()
     # One in five is good: all of the best 10%, four fifths of the best 25%.

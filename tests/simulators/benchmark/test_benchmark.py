@@ -18,6 +18,7 @@ from ucfrec.evaluation.world import World
 from ucfrec.plugins import Benchmark, BenchmarkRequest, load_plugin
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows, read_configurations, read_rows
+from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 from ucfrec_simulators.benchmark import plan, plots
 from ucfrec_simulators.benchmark.cells import EvaluationPlan
 from ucfrec_simulators.benchmark.methods import METHODS
@@ -33,7 +34,7 @@ TINY = replace(
     seeds=2,
     sessions=60,
     settings=("policy.dim=8", "train.steps=2", "train.validate_every=2", "crm.epochs=1"),
-    evaluation=EvaluationPlan(episodes=8, validation_episodes=4, quantiles=(0.5, 1.0)),
+    evaluation=EvaluationPlan(episodes=8),
     sweep_seeds=1,
 )
 
@@ -51,6 +52,7 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     monkeypatch.setitem(BUDGETS, "small", TINY)
     some = {name: METHODS[name] for name in ("popular", "dt")}
     monkeypatch.setattr(plan, "METHODS", some)
+    monkeypatch.setattr(plan, "MAIN", ("kuairand", "synthetic-catalog"))
     suite: Benchmark = load_plugin("benchmarks", "recommendation")
     results = tmp_path / "rows.jsonl"
     request = BenchmarkRequest("small", ["main"], tmp_path / "out", results, 1)
@@ -69,9 +71,11 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     assert found.interval == (played["R_cum_low"], played["R_cum_high"])
     # Whatever the training seed, the same episodes are reported.
     assert {row.evaluation_seed for row in rows} == {1_000_000}
-    tried = next(row for row in rows if row.method == "dt")
-    validation = tried.details["validation"]
-    assert tried.target_return == float(max(validation, key=lambda target: validation[target]))
+    # Each run acts by its own rule.
+    runs = {TrainedPolicy.load(path.parent).rule for path in (tmp_path / "out").rglob(RUN)}
+    assert {row.rule for row in rows if row.training_seed is not None} == set(map(str, runs))
+    assert {row.target_return for row in rows if row.method == "dt"} <= {r.target for r in runs}
+    assert {r.conditions.get("quantiles") for r in rows if r.training_seed is not None} == {"rule"}
     configurations = read_configurations(tmp_path)
     dims = {configurations[str(r.config_hash)]["policy"]["dim"] for r in rows if r.config_hash}
     assert dims == {8}
@@ -93,6 +97,47 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     last = read_rows(results)[-1]
     assert (last.evaluation_seed, last.log_seed) == (5, 3)
     assert last.data_fingerprint != again[-1].data_fingerprint
+
+
+@pytest.mark.slow
+def test_any_gymnasium_environment_is_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(BUDGETS, "small", replace(TINY, seeds=1))
+    monkeypatch.setattr(plan, "METHODS", {name: METHODS[name] for name in ("item-knn", "dt")})
+    name = "gymnasium:tests.support.gymnasium_worlds:ucfrec-test/Discrete-v0"
+    command = ["benchmark", "recommendation", "--env", name, "--observe", "secret"]
+    command += ["--out", str(tmp_path / "out"), "--workers", "1"]
+    assert main([*command, "--table", "sweeps"]) == 2
+    assert "--env gives the table main only" in capsys.readouterr().err
+    assert main(command) == 0
+    title = f"{name} --observe secret"
+    assert f"| {title} | dt | 1 |" in capsys.readouterr().out
+    rows = read_rows(tmp_path / "out" / "results.jsonl")
+    assert [row.method for row in rows] == ["random", *["item-knn"] * 2, *["dt"] * 2]
+    assert {(row.task, row.world, row.log_seed) for row in rows} == {(title, title, 0)}
+    random = next(row for row in rows if row.method == "random")
+    assert random.metrics["length"] == 5
+    assert {path.parent for path in tmp_path.rglob("run.json")} == {
+        path for path in (tmp_path / "out" / "small" / "runs").glob("*/*") if path.is_dir()
+    }
+
+
+def test_sardine_is_left_out_where_it_is_not_installed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plan, "MAIN", ("sardine-static", "synthetic-catalog"))
+    monkeypatch.setitem(plan._PACKAGES, "sardine-static", "not_installed")
+    assert Plan(tmp_path, TINY).missing() == ["sardine-static"]
+
+
+@pytest.mark.usefixtures("no_data")
+def test_a_world_has_the_code_version_of_what_it_runs_through() -> None:
+    def code(name: str) -> str:
+        return plan._code((World(name),))
+
+    assert code("sardine-static") == code("sardine-boredinf")
+    assert len({code(name) for name in ("sardine-static", "gymnasium:x", "synthetic-catalog")}) == 3
 
 
 @pytest.mark.usefixtures("no_data")
@@ -119,7 +164,7 @@ def test_every_cell_of_every_table_has_a_configuration(
     planted = EpisodeStore.open(distractors[0].store)  # type: ignore[arg-type]
     assert planted.observation_size == 92
     assert [world.rate for world in distractors[0].worlds] == [0.0, 1.0]  # type: ignore[attr-defined]
-    assert {cell.evaluation.quantiles for cell in given.distractor()} == {(1.0,), (0.99,)}
+    assert {cell.evaluation.target_quantile for cell in given.distractor()} == {1.0, 0.99}
 
 
 def test_unknown_tables_and_budgets_are_named(

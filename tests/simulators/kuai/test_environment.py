@@ -16,8 +16,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.support.kuai_reference import OneUser, Plain
+from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.rollout import FORBIDDEN, Step, rollout
+from ucfrec.acting.uniform import Uniform
 from ucfrec.episodes.states import ItemStates
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import collect
@@ -25,7 +27,7 @@ from ucfrec.evaluation.evaluate import _item_numbers
 from ucfrec.evaluation.world import World
 from ucfrec.plugins import Simulator
 from ucfrec.policies.dt import DTConfig, DTPolicy
-from ucfrec_simulators.behaviors import Constant, Uniform
+from ucfrec_simulators.behaviors import Constant
 from ucfrec_simulators.kuai.environment import EXITS, REGIMES, ExitRule, KuaiEnv, oracle
 from ucfrec_simulators.kuai.exit_cuts import sessions_by_exit
 from ucfrec_simulators.session_env import SingleSession
@@ -156,7 +158,7 @@ def test_a_policy_plays_what_is_there_and_allowed(regime: str) -> None:
     policy = DTPolicy(DTConfig(context=3, dim=8), sizes).eval()
     with torch.no_grad():
         policy.head.bias[-6:] = 100.0  # what it would most like to play is not there
-    actor = PolicyActor(policy, 4, 5.0, 0, states, numbers, user_ids)
+    actor = PolicyActor(Decider(policy, DecisionRule(5.0)), 4, 0, states, numbers, user_ids)
     played = rollout(env, actor, 9, seed=0)
     assert len(played.lengths) == 9
     assert (played.lengths == 10).all() == (regime == "NX_10")

@@ -12,12 +12,12 @@ import torch
 
 from tests.support.real_data import data_folder
 from ucfrec.acting.rollout import rollout
+from ucfrec.acting.uniform import Uniform
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.plugins import load_plugin
-from ucfrec_simulators.behaviors import Uniform
 from ucfrec_simulators.kuai.completion import CompletionConfig, complete
 from ucfrec_simulators.kuai.environment import REGIMES, oracle
 from ucfrec_simulators.kuai.kuairand import kuairand, main, read_tags

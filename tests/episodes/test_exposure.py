@@ -1,0 +1,246 @@
+"""Additions to logits by what was shown lately: against loops, and what they must not see."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from ucfrec.episodes import exposure
+from ucfrec.episodes.exposure import Exposed, ExposureTerm, Likeness
+from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.windows import Windows
+
+B, K, ITEMS, TAGS, LAGS, KNOTS = 4, 6, 9, 5, 3, 4
+kinds = st.sampled_from(["tags", "embeddings"])
+seeds = st.integers(0, 10**6)
+
+
+def item_states(kind: str, seed: int = 0) -> ItemStates:
+    """Items with up to three tags or none at all, or with embeddings of which one is zero."""
+    generator = torch.Generator().manual_seed(seed)
+    embeddings = torch.randn(ITEMS, 4, generator=generator)
+    embeddings[-1] = 0.0
+    states = ItemStates(embeddings, torch.zeros(0, 0), 0.0, 1.0)
+    if kind == "embeddings":
+        return states
+    tags = torch.full((ITEMS, 3), -1)
+    for item in range(1, ITEMS):
+        own = torch.randperm(TAGS, generator=generator)[: 1 + item % 3]
+        tags[item, : len(own)] = own
+    return replace(states, tags=tags)
+
+
+def term(kind: str, seed: int, knots: int = KNOTS) -> ExposureTerm:
+    """With random weights, and knots at random returns."""
+    generator = torch.Generator().manual_seed(seed)
+    states = item_states(kind, seed)
+    made = ExposureTerm(LAGS, knots, Likeness.of(states))
+    made.start_from(states, torch.randn(50, generator=generator))
+    for parameter in made.parameters():
+        parameter.data = torch.randn(parameter.shape, generator=generator) / 10
+    return made
+
+
+def exposed(steps: int, seed: int) -> Exposed:
+    generator = torch.Generator().manual_seed(seed)
+    items = torch.randint(-1, ITEMS, (steps, LAGS), generator=generator)
+    return Exposed(items, 2 * torch.randn(steps, generator=generator))
+
+
+def weights_by_hand(made: ExposureTerm, returns: float) -> tuple[list[float], list[float]]:
+    """Weights of repetition and of likeness by lag, from the documentation of `ExposureTerm`."""
+    knots = made.knots.tolist()
+    table = 10 * (made.common + made.by_lag).detach().double()
+    at = min(max(returns, knots[0]), knots[-1])
+    right = next(n for n in range(1, len(knots)) if at <= knots[n])
+    share = (at - knots[right - 1]) / (knots[right] - knots[right - 1])
+    found = (1 - share) * table[:, right - 1] + share * table[:, right]
+    return found[0].tolist(), found[1].tolist()
+
+
+def alike(states: ItemStates, one: int, other: int) -> float:
+    if states.tags.shape[1]:
+        first, second = (set(states.tags[item].tolist()) - {-1} for item in (one, other))
+        return len(first & second)
+    a, b = states.embeddings[one].double(), states.embeddings[other].double()
+    lengths = a.norm() * b.norm()
+    return float(a @ b / lengths) if lengths > 0 else 0.0
+
+
+def slowly(made: ExposureTerm, states: ItemStates, shown: Exposed) -> Tensor:
+    """The additions to all logits, one at a time."""
+    added = torch.zeros(len(shown.items), ITEMS, dtype=torch.float64)
+    for row, (items, returns) in enumerate(
+        zip(shown.items.tolist(), shown.returns.tolist(), strict=True)
+    ):
+        repeated, likeness = weights_by_hand(made, returns)
+        for lag, item in enumerate(items):
+            if item < 0:
+                continue
+            for other in range(ITEMS):
+                added[row, other] += likeness[lag] * alike(states, other, item)
+                added[row, other] += repeated[lag] * (other == item)
+    return added.float()
+
+
+@given(kinds, seeds)
+def test_additions_are_those_of_loops_over_items_and_lags(kind: str, seed: int) -> None:
+    made, shown = term(kind, seed), exposed(7, seed)
+    expected = slowly(made, item_states(kind, seed), shown)
+    everything = made.to_all(shown).detach()
+    torch.testing.assert_close(everything, expected, rtol=1e-4, atol=1e-4)
+    some = torch.tensor([4, 0, 4, ITEMS - 1])
+    torch.testing.assert_close(made.to_items(shown, some).detach(), everything[:, some])
+    own = torch.arange(7) % ITEMS
+    one_each = made.to_items(shown, own.unsqueeze(1)).detach()
+    assert one_each.shape == (7,)
+    torch.testing.assert_close(one_each, everything[torch.arange(7), own])
+
+
+@pytest.mark.parametrize("kind", ["tags", "embeddings"])
+def test_a_large_catalogue_takes_the_sparse_path_to_the_same_result(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, shown = term(kind, 3), exposed(20, 3)
+    dense = made.to_all(shown)
+    assert kind == "embeddings" or not made.likeness._tag_matrix().is_sparse
+    dense.square().sum().backward()
+    gradients = [parameter.grad for parameter in made.parameters()]
+    monkeypatch.setattr(exposure, "_DENSE", ITEMS * TAGS - 1)
+    large = term(kind, 3)
+    found = large.to_all(shown)
+    assert kind == "embeddings" or large.likeness._tag_matrix().is_sparse
+    torch.testing.assert_close(found, dense)
+    found.square().sum().backward()
+    for parameter, gradient in zip(large.parameters(), gradients, strict=True):
+        torch.testing.assert_close(parameter.grad, gradient)
+
+
+@pytest.mark.parametrize("kind", ["tags", "embeddings"])
+def test_gradients_are_those_of_differences(kind: str) -> None:
+    made, shown = term(kind, 5).double(), exposed(5, 5)
+    shown = Exposed(shown.items, shown.returns.double())
+    items = torch.tensor([2, 7])
+
+    def additions(common: Tensor, by_lag: Tensor) -> tuple[Tensor, ...]:
+        given = {"common": common, "by_lag": by_lag}
+        return tuple(
+            torch.func.functional_call(made, given, arguments)
+            for arguments in ((shown,), (shown, items), (shown, shown.items[:, :1].clamp(min=0)))
+        )
+
+    made.forward = lambda shown, items=None: (  # type: ignore[method-assign]
+        made.to_all(shown) if items is None else made.to_items(shown, items)
+    )
+    leaves = tuple(p.detach().clone().requires_grad_() for p in (made.common, made.by_lag))
+    assert torch.autograd.gradcheck(additions, leaves)
+
+
+def test_an_untrained_term_adds_nothing() -> None:
+    made = ExposureTerm(LAGS, KNOTS, Likeness.of(item_states("tags")))
+    assert (made.to_all(exposed(5, 0)) == 0).all()
+
+
+@given(kinds, seeds)
+def test_without_anything_shown_nothing_is_added(kind: str, seed: int) -> None:
+    made = term(kind, seed)
+    nothing = Exposed(torch.full((3, LAGS), -1), torch.tensor([-9.0, 0.0, 9.0]))
+    assert (made.to_all(nothing) == 0).all()
+    assert (made.to_items(nothing, torch.arange(ITEMS)) == 0).all()
+
+
+@pytest.mark.parametrize("returns", [[0.0] * 9, [0.0] * 8 + [5.0], [-3.0, 2.0, 7.5, 1e6], [4.0]])
+def test_knots_rise_and_cover_the_returns(returns: list[float]) -> None:
+    made = term("tags", 0)
+    made.start_from(item_states("tags"), torch.tensor(returns))
+    assert (made.knots.diff() > 0).all()
+    assert float(made.knots[0]) == pytest.approx(min(returns))
+    assert float(made.knots[-1]) >= max(returns)
+    weights = made.weights(torch.tensor([-1e9, *returns, 1e9]))
+    assert torch.isfinite(weights).all()
+    torch.testing.assert_close(weights[:, 0], 10 * (made.common + made.by_lag)[:, 0])
+    torch.testing.assert_close(weights[:, -1], 10 * (made.common + made.by_lag)[:, -1])
+
+
+def test_weights_are_linear_between_the_knots_and_constant_beyond() -> None:
+    made = term("tags", 1)
+    low, high = made.knots[1], made.knots[2]
+    at = torch.stack([low, low + 0.25 * (high - low), high])
+    left, between, right = made.weights(at).unbind(1)
+    torch.testing.assert_close(between, 0.75 * left + 0.25 * right, rtol=1e-4, atol=1e-5)
+    beyond = made.weights(torch.stack([made.knots[0], made.knots[0] - 5]))
+    torch.testing.assert_close(beyond[:, 0], beyond[:, 1])
+
+
+# Windows.
+
+
+def windows(seed: int, padding: tuple[int, ...] = (0, 1, 4, 5)) -> Windows:
+    generator = torch.Generator().manual_seed(seed)
+    return Windows(
+        states=torch.randn(B, K, 2, generator=generator),
+        actions=torch.randint(ITEMS, (B, K), generator=generator),
+        rewards=torch.rand(B, K, generator=generator),
+        returns_to_go=torch.rand(B, K, generator=generator),
+        timesteps=torch.zeros(B, K, dtype=torch.int64),
+        mask=torch.arange(K) >= torch.tensor(padding).unsqueeze(1),
+    )
+
+
+@given(seeds, st.integers(1, K + 3))
+def test_steps_before_a_step_are_found_one_by_one(seed: int, lags: int) -> None:
+    given_windows = windows(seed)
+    found = Exposed.before(given_windows, lags)
+    assert found.items.shape == (B * K, lags)
+    torch.testing.assert_close(found.returns.view(B, K), given_windows.returns_to_go)
+    for b in range(B):
+        for t in range(K):
+            for lag in range(1, lags + 1):
+                there = t - lag >= 0 and bool(given_windows.mask[b, t - lag])
+                expected = int(given_windows.actions[b, t - lag]) if there else -1
+                assert int(found.items.view(B, K, lags)[b, t, lag - 1]) == expected
+
+
+@given(seeds, st.integers(0, K - 1), kinds)
+def test_neither_the_step_nor_what_follows_is_seen(seed: int, t: int, kind: str) -> None:
+    before, made = windows(seed), term(kind, seed)
+    actions = before.actions.clone()
+    actions[:, t:] = (actions[:, t:] + 1) % ITEMS
+    returns = before.returns_to_go.clone()
+    returns[:, t + 1 :] += 1
+    after = replace(
+        before, actions=actions, returns_to_go=returns, rewards=before.rewards + 1,
+        states=before.states + 1,
+    )  # fmt: skip
+    first, second = (
+        made.to_all(Exposed.before(each, LAGS)).view(B, K, ITEMS) for each in (before, after)
+    )
+    assert torch.equal(first[:, : t + 1], second[:, : t + 1])
+
+
+@given(seeds, kinds)
+def test_padding_is_never_shown(seed: int, kind: str) -> None:
+    before, made = windows(seed), term(kind, seed)
+    noisy = replace(before, actions=torch.where(before.mask, before.actions, 3))
+    shown, again = Exposed.before(before, LAGS), Exposed.before(noisy, LAGS)
+    assert torch.equal(shown.items, again.items)
+    rows = before.mask.flatten()
+    torch.testing.assert_close(
+        made.to_all(shown.select(rows)), made.to_all(shown).view(B * K, ITEMS)[rows]
+    )
+    # The first step of a session has been shown nothing.
+    firsts = torch.zeros_like(before.mask)
+    firsts[torch.arange(B), before.mask.int().argmax(1)] = True
+    assert (shown.items.view(B, K, LAGS)[firsts] == -1).all()
+
+
+def test_a_term_read_back_is_the_one_saved() -> None:
+    made, shown = term("tags", 2), exposed(6, 2)
+    expected = made.to_all(shown)
+    other = ExposureTerm(LAGS, KNOTS, Likeness(ITEMS, 4, 3))
+    other.to_all(shown)  # a matrix of tags has been made before the weights are read
+    other.load_state_dict(made.state_dict())
+    torch.testing.assert_close(other.to_all(shown), expected)

@@ -1,0 +1,164 @@
+"""Any Gymnasium environment is a world: its actions, observations, users, logs and seeds."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+from gymnasium import spaces
+
+from tests.support.gymnasium_worlds import ITEMS, LENGTH
+from ucfrec.acting.rollout import USER_IDS, Step, rollout
+from ucfrec.acting.uniform import Uniform
+from ucfrec.commands.cli import main
+from ucfrec.errors import InputError
+from ucfrec.evaluation.collect import world_items
+from ucfrec.evaluation.gymnasium_world import GymnasiumWorld
+from ucfrec.evaluation.world import World
+
+MODULE = "tests.support.gymnasium_worlds"
+
+
+def world(name: str, num_envs: int = 3, observe: tuple[str, ...] = ()) -> GymnasiumWorld:
+    return GymnasiumWorld(f"{MODULE}:ucfrec-test/{name}-v0", num_envs, observe)
+
+
+@pytest.mark.parametrize(
+    ("name", "first"), [("Discrete", 0), ("Discrete-from-3", 3), ("MultiDiscrete", 0)]
+)
+def test_single_items_are_numbered_from_0(name: str, first: int) -> None:
+    env = world(name)
+    assert env.single_action_space == spaces.Discrete(ITEMS)
+    assert world_items(env).tolist() == [0, 1, 2, 3]
+    env.reset(seed=0)
+    _, rewards, _, _, _ = env.step(np.array([0, 3, 1]))
+    np.testing.assert_array_equal(rewards, first + np.array([0, 3, 1]))
+
+
+def test_vectors_are_played_within_their_bounds() -> None:
+    env = world("Box", 2, ("secret",))
+    env.reset(seed=0)
+    _, rewards, _, _, _ = env.step(np.array([[0.5, -9, 9], [0, 0, 0]], dtype=np.float32))
+    np.testing.assert_allclose(rewards, [0.5 - 1 + 2, 0])
+
+
+def test_named_entries_are_observed_in_their_order() -> None:
+    env = world("Discrete", 3, ("secret", "step"))
+    observations, _ = env.reset(seed=0)
+    assert observations.shape == (3, 2 + LENGTH + 1)
+    assert observations.dtype == np.float32
+    np.testing.assert_array_equal(observations[:, 0], observations[:, 1])
+    assert len(np.unique(observations[:, 0])) == 3, "sessions are not copies of each other"
+    np.testing.assert_array_equal(observations[:, 2:], np.eye(LENGTH + 1)[[0, 0, 0]])
+    swapped, _ = world("Discrete", 3, ("step", "secret")).reset(seed=0)
+    np.testing.assert_array_equal(swapped, np.roll(observations, LENGTH + 1, axis=1))
+
+
+def test_without_names_a_dict_is_not_observed_and_a_category_is_one_hot() -> None:
+    observations, _ = world("Discrete").reset(seed=0)
+    assert observations.shape == (3, 0)
+    env = world("Whole")
+    observations, _ = env.reset(seed=0)
+    np.testing.assert_array_equal(observations, np.eye(LENGTH + 1)[[0, 0, 0]])
+    observations, *_ = env.step(np.array([0, 1, 2]))
+    np.testing.assert_array_equal(observations, np.eye(LENGTH + 1)[[1, 1, 1]])
+
+
+def test_sessions_end_in_the_step_that_ends_them() -> None:
+    steps: list[Step] = []
+    env = world("Discrete", 3, ("step",))
+    played = rollout(env, Uniform(env, 0), 7, 0, steps.append)
+    assert played.lengths.tolist() == [LENGTH] * 7
+    last = [step for step in steps if step.truncated.any()]
+    for step in last:
+        # The last observation of the session, not the first of the next.
+        np.testing.assert_array_equal(step.next_observations.argmax(1), LENGTH)
+        np.testing.assert_array_equal(step.observations.argmax(1), LENGTH - 1)
+    rewards = np.concatenate([step.rewards for step in steps])
+    assert played.returns.sum() == rewards.sum()
+
+
+def test_neighbouring_seeds_share_no_session() -> None:
+    env = world("Discrete", 50, ("secret",))
+    secrets = [env.reset(seed=seed)[0][:, 0] for seed in (0, 1, 0)]
+    np.testing.assert_array_equal(secrets[0], secrets[2])
+    assert not set(secrets[0]) & set(secrets[1])
+
+
+def test_users_are_passed_on_and_must_be_numbers() -> None:
+    env = world("Users")
+    _, info = env.reset(seed=0)
+    assert info[USER_IDS].tolist() == [77, 77, 77]
+    _, _, _, _, info = env.step(np.array([0, 1, 2]))
+    assert info[USER_IDS].tolist() == [77, 77, 77]
+    with pytest.raises(InputError, match=r"info\['user_id'\] is 'Ann'; it must be a whole number"):
+        world("Names").reset(seed=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "observe", "said"),
+    [
+        ("Slate", (), "takes actions of MultiDiscrete.*plays one item"),
+        ("Matrix", (), "takes actions of Box.*plays one item"),
+        ("Discrete", ("secrets",), "--observe secrets: .* has the entries secret, step"),
+        ("Whole", ("step",), "--observe step: .* has no named entries"),
+        ("Notes", ("step", "notes"), "name entries of a fixed size with --observe"),
+        ("Box", (), "name entries of a fixed size with --observe"),
+        ("Absent", (), "cannot be made .*gymnasium:MODULE:ID"),
+    ],
+)
+def test_what_cannot_be_played_is_said(name: str, observe: tuple[str, ...], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        world(name, 1, observe)
+
+
+def test_a_missing_module_and_options_of_other_worlds_are_refused() -> None:
+    with pytest.raises(InputError, match="No module named 'not_there'"):
+        GymnasiumWorld("not_there:X-v0", 1)
+    with pytest.raises(InputError, match="are for gymnasium:ID; leave them out for synthetic-cat"):
+        World("synthetic-catalog", observe=("step",)).simulator()
+
+
+def test_from_the_environment_to_an_evaluation_on_the_command_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = f"gymnasium:{MODULE}:ucfrec-test/Discrete-v0"
+    env = ["--env", name, "--observe", "secret"]
+    logs, store, run = (str(tmp_path / each) for each in ("logs", "store", "run"))
+    features = ["--item-features", "vectors"]
+    assert main(["collect", *env, *features, "--sessions", "40", "--out", logs]) == 0
+    said = capsys.readouterr().out
+    assert "40 sessions of random, 200 steps" in said
+    assert "reward column reward; observation of 2 numbers" in said
+    record = json.loads((tmp_path / "logs" / "collect.json").read_text())
+    assert record["env"] == f"{name} --observe secret --item-features vectors"
+    log = pq.read_table(tmp_path / "logs" / "sessions.parquet").to_pandas()
+    assert (log["reward"] == log["item_id"]).all()
+    assert (log["propensity"] == np.float32(1 / ITEMS)).all()
+    assert main(["prepare", logs, "--out", store]) == 0
+    small = ["train.steps=2", "policy.dim=8", "train.validate_every=2"]
+    settings = [argument for setting in small for argument in ("--set", setting)]
+    assert main(["train", store, "--policy", "bc", "--out", run, *settings]) == 0
+    rows = tmp_path / "rows.json"
+    judged = ["--episodes", "8", "--behavior", "random", "--json", str(rows)]
+    assert main(["evaluate", run, *env, *judged]) == 0
+    frame = pd.read_json(rows)
+    assert frame["policy"].tolist() == ["bc", "random"]
+    assert (frame["length"] == LENGTH).all()
+    assert set(frame["world"]) == {f"{name} --observe secret"}
+    capsys.readouterr()
+    assert main(["evaluate", run, "--env", name, "--episodes", "8"]) == 2
+    assert "collected with the same --observe" in capsys.readouterr().err
+
+
+def test_a_world_that_shows_nothing_is_logged_without_observations(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = f"gymnasium:{MODULE}:ucfrec-test/MultiDiscrete-v0"
+    logs = tmp_path / "logs"
+    assert main(["collect", "--env", name, "--sessions", "3", "--out", str(logs)]) == 0
+    assert "no observation: states come from the items shown" in capsys.readouterr().out
+    assert "observation" not in pq.read_schema(logs / "sessions.parquet").names
+    assert not (logs / "items.parquet").exists()

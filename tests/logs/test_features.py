@@ -1,0 +1,133 @@
+"""Tags of items: which items share one, how many are kept, and that a store keeps them."""
+
+from collections import Counter
+from pathlib import Path
+
+import duckdb
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.logs.features import TAGS, item_tags
+from ucfrec.logs.mapping import FeatureTable, LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare
+
+Lists = list[list[str | None] | None]
+
+
+def tags_of(*columns: Lists, separate: bool = False, items: int | None = None) -> np.ndarray:
+    """Tags of items 100, 101, …, whose numbers run the other way; a table a column or one."""
+    count = len(columns[0])
+    connection = duckdb.connect()
+    numbers = items or count
+    connection.execute(
+        f"CREATE TABLE items AS SELECT {numbers} - 1 - i AS number, 100 + i AS item_id, "
+        f"1 AS train_count FROM range({numbers}) t(i)"
+    )
+    groups = [[column] for column in columns] if separate else [list(columns)]
+    for name, group in enumerate(groups):
+        declared = ", ".join(f"f{n} VARCHAR[]" for n in range(len(group)))
+        connection.execute(f"CREATE TABLE t{name} (id BIGINT, {declared})")
+        for item in range(count):
+            marks = ", ".join("?" * (len(group) + 1))
+            row = [100 + item, *(column[item] for column in group)]
+            connection.execute(f"INSERT INTO t{name} VALUES ({marks})", row)
+    names = [f"t{name}" for name in range(len(groups))]
+    return item_tags(connection, names, "items", "item_id")[::-1]
+
+
+def shared(tags: np.ndarray, one: int, other: int) -> int:
+    return len((set(tags[one].tolist()) & set(tags[other].tolist())) - {-1})
+
+
+words = st.lists(st.sampled_from(["a", "b", "c", "it's", "", None]), max_size=5)
+catalogues = st.lists(st.one_of(st.none(), words), min_size=1, max_size=7)
+
+
+@given(catalogues)
+def test_items_share_as_many_tags_as_their_lists_share_words(lists: Lists) -> None:
+    tags = tags_of(lists)
+    assert tags.dtype == np.int64
+    assert tags.shape[0] == len(lists)
+    sets = [{word for word in words or [] if word is not None} for words in lists]
+    for one, first in enumerate(sets):
+        row = tags[one].tolist()
+        kept = [tag for tag in row if tag >= 0]
+        assert len(set(kept)) == len(kept), "no tag twice"
+        assert row == kept + [-1] * (len(row) - len(kept)), "padding comes last"
+        for other, second in enumerate(sets):
+            untagged = not first and not second
+            assert shared(tags, one, other) == (1 if untagged else len(first & second))
+    # Numbers have no gaps: a matrix of items and tags has no empty column.
+    assert set(tags[tags >= 0].tolist()) == set(range(int(tags.max()) + 1))
+
+
+@pytest.mark.parametrize("separate", [False, True])
+def test_columns_of_lists_are_told_apart(separate: bool) -> None:
+    kind: Lists = [["x"], ["y"], None, None]
+    mood: Lists = [["y", "z"], ["z"], ["z"], []]
+    tags = tags_of(kind, mood, separate=separate)
+    assert [shared(tags, 0, other) for other in range(4)] == [3, 1, 1, 0]
+    # y of one column is not y of the other.
+    assert shared(tags, 1, 0) == 1
+    assert shared(tags, 3, 2) == 0
+
+
+def test_items_without_a_row_share_the_tag_of_the_untagged() -> None:
+    tags = tags_of([["a"], []], items=4)
+    assert tags.shape[0] == 4
+    assert [shared(tags, 1, other) for other in range(4)] == [0, 1, 1, 1]
+
+
+def test_at_most_sixteen_tags_are_kept_the_most_frequent() -> None:
+    many = [f"tag {n:02}" for n in range(TAGS + 9)]
+    lists: Lists = [[*many], many[9:], [*many[9:], "own"], ["own"]]
+    tags = tags_of(lists)
+    assert tags.shape == (4, TAGS)
+    assert (tags[:3] >= 0).all()
+    counts = Counter(word for words in lists for word in words or [])
+    rarest = min(counts[word] for word in many[9:])
+    assert counts["tag 00"] < rarest
+    # All sixteen of item 0 are among those that the others have too.
+    assert shared(tags, 0, 1) == TAGS
+    assert (tags[3] >= 0).sum() == 1
+
+
+def test_tags_do_not_depend_on_the_order_of_lists() -> None:
+    lists: Lists = [["b", "a", "b"], ["c", "a"], ["c"]]
+    np.testing.assert_array_equal(tags_of(lists), tags_of([["a", "b"], ["a", "c"], ["c"]]))
+
+
+def test_a_catalogue_of_empty_lists_has_one_tag() -> None:
+    np.testing.assert_array_equal(tags_of([[], None, [None]]), [[0], [0], [0]])
+
+
+@pytest.mark.parametrize("column", ["tags", "price"])
+def test_a_store_keeps_the_tags_of_its_catalogue(tmp_path: Path, column: str) -> None:
+    log = pd.DataFrame({"user_id": np.arange(60) % 7, "item_id": np.arange(60) % 6})
+    log["timestamp"] = 1_700_000_000_000 + np.arange(60) * 1000
+    log["reward"] = np.arange(60) % 2 * 1.0
+    log.to_parquet(tmp_path / "log.parquet")
+    lists = [["a"], ["a", "b"], ["b"], [], ["c"], ["c", "a"]]
+    frame = pd.DataFrame({"item_id": range(6), "tags": lists, "price": range(6)})
+    frame.to_parquet(tmp_path / "items.parquet")
+    table = FeatureTable((tmp_path / "items.parquet",), "item_id", (column,))
+    prepare(
+        [tmp_path / "log.parquet"],
+        LogMapping(item_features=(table,)),
+        tmp_path / "store",
+        PrepareOptions(embedding_size=4),
+    )
+    states = EpisodeStore.open(tmp_path / "store").item_states
+    if column == "price":
+        assert states.tags.shape[1] == 0
+    else:
+        assert states.tags.shape == (6, 2)
+        assert [shared(states.tags.numpy(), 1, other) for other in range(6)] == [1, 2, 1, 0, 0, 1]
+    states.save(tmp_path / "states.safetensors")
+    assert torch.equal(ItemStates.load(tmp_path / "states.safetensors").tags, states.tags)

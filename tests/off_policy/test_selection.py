@@ -1,0 +1,131 @@
+"""Choosing where the truth is known: bands, probabilities, luck, rank correlation and regret."""
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.stats import spearmanr
+
+from ucfrec.errors import InputError
+from ucfrec.off_policy import LoggedSteps
+from ucfrec.off_policy.estimators import session_terms
+from ucfrec.off_policy.selection import Selection, select
+from ucfrec.off_policy.verdict import influences
+
+FloatArray = npt.NDArray[np.float64]
+ITEMS = 8
+PAYS = np.linspace(0.1, 0.5, ITEMS)
+LIKING = {"worst": -0.3, "plain": 0.0, "better": 0.15, "best": 0.45}
+"""How strongly each of four policies prefers items that pay more."""
+
+
+def policy(liking: float) -> FloatArray:
+    weights = np.exp(liking * np.arange(ITEMS))
+    return np.asarray(weights / weights.sum())
+
+
+def judged(seed: int, sessions: int = 3000) -> Selection:
+    """The four policies by logs of a uniform one."""
+    rng = np.random.default_rng(seed)
+    items = rng.integers(ITEMS, size=sessions)
+    reward = (rng.random(sessions) < PAYS[items]).astype(np.float64)
+    columns = []
+    for liking in LIKING.values():
+        steps = LoggedSteps(
+            np.arange(sessions), reward, np.full(sessions, 1 / ITEMS), policy(liking)[items]
+        )
+        columns.append(influences(session_terms(steps)["SNPDIS"]))
+    return select(list(LIKING), np.stack(columns, axis=1), seed, np.arange(sessions) // 2)
+
+
+def test_the_best_of_four_policies_is_chosen() -> None:
+    """In 40 replications: how often, the rank correlation with the truth, and the regret."""
+    truth = {name: float(policy(liking) @ PAYS) for name, liking in LIKING.items()}
+    chosen, correlations, regrets, held, within = 0, [], [], 0, 0
+    for seed in range(40):
+        found = judged(seed)
+        chosen += found.chosen.name == "best"
+        named = {one.name: one for one in found.standings}
+        ranks = [named[name].rank for name in truth]
+        correlations.append(spearmanr(ranks, [-value for value in truth.values()]).statistic)
+        regrets.append(truth["best"] - truth[found.chosen.name])
+        held += all(named[name].low <= truth[name] <= named[name].high for name in truth)
+        within += regrets[-1] <= found.regret + 1e-12
+        assert sum(one.probability_best for one in found.standings) == pytest.approx(1)
+    assert chosen >= 36
+    assert np.mean(correlations) > 0.9
+    assert np.mean(regrets) < 0.01
+    # Of 40, 38 are expected.
+    assert held >= 34
+    assert within >= 36
+
+
+def equal(seed: int, candidates: int, sessions: int = 400) -> FloatArray:
+    return np.asarray(np.random.default_rng(seed).exponential(size=(sessions, candidates)))
+
+
+def test_the_luck_of_the_chosen_is_taken_off() -> None:
+    """Twenty candidates worth 1 each: the first looks like 1.09."""
+    naive, corrected, held = [], [], 0
+    for seed in range(60):
+        found = select([str(k) for k in range(20)], equal(seed, 20), seed)
+        naive.append(found.chosen.value)
+        corrected.append(found.corrected)
+        held += all(one.low <= 1 <= one.high for one in found.standings)
+        assert found.regret > 0
+    assert np.mean(naive) > 1.08
+    assert abs(np.mean(corrected) - 1) < 0.5 * (np.mean(naive) - 1)
+    assert held >= 52  # of 60, 57 are expected; one interval at a time holds all in 22
+
+
+def test_one_clear_winner_loses_nothing() -> None:
+    terms = equal(0, 4)
+    terms[:, 2] += 2
+    found = select(list("abcd"), terms, 0)
+    assert found.chosen.name == "c"
+    assert found.chosen.probability_best == 1
+    assert found.regret == 0
+    assert found.corrected == pytest.approx(found.chosen.value, abs=0.01)
+    assert found.headline.startswith("No other earns more than c: ")
+    assert [one.rank for one in found.standings] == [1, 2, 3, 4]
+
+
+def test_sessions_of_one_user_count_together() -> None:
+    terms = np.repeat(equal(0, 3, 100), 20, axis=0)
+    together = select(list("abc"), terms, 0, np.repeat(np.arange(100), 20))
+    once = select(list("abc"), equal(0, 3, 100), 0)
+    for mine, other in zip(together.standings, once.standings, strict=True):
+        assert mine.error == pytest.approx(other.error)
+        assert mine.high == pytest.approx(other.high)
+    apart = select(list("abc"), terms, 0)
+    assert apart.chosen.error == pytest.approx(once.chosen.error / 20**0.5, rel=0.01)
+
+
+def test_the_band_of_one_is_an_interval_and_of_many_is_wider() -> None:
+    terms = np.random.default_rng(0).normal(size=(2000, 30))
+    one, many = select(["0"], terms[:, :1], 0), select([str(k) for k in range(30)], terms, 0)
+    width = (one.chosen.high - one.chosen.low) / one.chosen.error / 2
+    assert width == pytest.approx(1.96, abs=0.1)
+    assert one.regret == 0
+    assert one.headline == "0 is the only candidate"
+    wide = (many.chosen.high - many.chosen.low) / many.chosen.error / 2
+    assert wide == pytest.approx(3.13, abs=0.15)  # the 95% quantile of 30 normal deviations
+
+
+def test_candidates_alike_share_first_place() -> None:
+    terms = np.repeat(equal(0, 1), 2, axis=1)
+    found = select(["a", "b"], terms, 0)
+    assert [one.probability_best for one in found.standings] == [0.5, 0.5]
+    assert found.regret == 0
+
+
+@pytest.mark.parametrize(
+    ("names", "terms", "says"),
+    [
+        ([], np.ones((5, 0)), "give a column to each of 0"),
+        (["a"], np.ones((5, 2)), r"shape \(5, 2\)"),
+        (["a"], np.full((5, 1), np.nan), "not finite at 5 places"),
+    ],
+)
+def test_wrong_arrays_are_input_errors(names: list[str], terms: FloatArray, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        select(names, terms, 0)

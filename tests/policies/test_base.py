@@ -1,0 +1,169 @@
+"""Exposure, advantage weights and the largest return, in every learner; without them, nothing."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.policies.test_ucf import CATALOG, ITEMS, SMALL, VECTORS, K, other, random_windows
+from ucfrec.acting.decision import Decider, DecisionRule
+from ucfrec.episodes.exposure import Exposed
+from ucfrec.episodes.states import ItemStates
+from ucfrec.errors import InputError
+from ucfrec.policies.base import SequencePolicy
+from ucfrec.policies.heads import ItemHead
+from ucfrec.policies.registry import policy_class
+from ucfrec.policies.values import advantage_weights
+
+TAGGED = {**CATALOG, "tags": 2}
+LEARNERS = ("ucf", "dt", "dc", "lsdt", "dt4rec", "cdt4rec", "edt4rec", "sasrec")
+ADDITIONS = {"advantage_weights": True, "max_return": True}
+learners = pytest.mark.parametrize("name", LEARNERS)
+kinds = pytest.mark.parametrize("sizes", [VECTORS, TAGGED], ids=["vectors", "items"])
+
+
+def build(name: str, sizes: dict[str, int], **settings: Any) -> SequencePolicy:
+    torch.manual_seed(0)
+    learner = policy_class(name)
+    small = {**SMALL, "dropout": 0.0, **({"kernel_groups": 4} if name == "lsdt" else {})}
+    policy = learner(learner.Config(**{**small, "exposure": False, **settings}), sizes)
+    if sizes["items"]:
+        generator = torch.Generator().manual_seed(4)
+        embeddings = torch.randn(ITEMS, 4, generator=generator)
+        policy.head.start_from(embeddings, torch.rand(ITEMS, generator=generator))
+        if policy.head.exposure is not None:  # type: ignore[union-attr]
+            tags = torch.randint(-1, 4, (ITEMS, 2), generator=generator)
+            states = ItemStates(embeddings, torch.zeros(0, 0), 0.0, 1.0, tags=tags)
+            policy.head.exposure.start_from(states, torch.rand(99))  # type: ignore[union-attr]
+    return policy
+
+
+def trained(policy: SequencePolicy, steps: int = 25) -> SequencePolicy:
+    windows = random_windows(VECTORS if policy.head.__class__.__name__ != "ItemHead" else TAGGED)
+    optimizer = torch.optim.Adam(policy.parameters(), lr=3e-3)
+    policy.train()
+    for step in range(steps):
+        torch.manual_seed(step)
+        optimizer.zero_grad()
+        policy.loss(windows)[0].backward()
+        optimizer.step()
+    return policy.eval()
+
+
+@kinds
+@learners
+def test_every_learner_trains_and_acts_with_the_additions(name: str, sizes: dict[str, int]) -> None:
+    more = {"exposure": True, "exposure_window": 3} if sizes["items"] else {}
+    policy, windows = build(name, sizes, **ADDITIONS, **more), random_windows(sizes)
+    policy.eval()
+    before = policy.loss(windows)[1]
+    trained(policy)
+    loss, scalars = policy.loss(windows)
+    assert torch.isfinite(loss)
+    assert {"action_loss", "value_loss"} <= scalars.keys()
+    assert scalars["value_loss"] < before["value_loss"]
+    assert torch.isfinite(policy.action_loss(windows))
+    collected = torch.tensor([0.0, 1.0, 2.0]).double()
+    for rule in (DecisionRule(None), DecisionRule(2.0)):
+        assert torch.isfinite(Decider(policy, rule).act(windows, collected)).all()
+    if sizes["items"]:
+        term = policy.head.exposure  # type: ignore[union-attr]
+        moved = torch.cat([parameter.flatten() for parameter in term.parameters()])
+        assert (moved != 0).any(), "the exposure term learns too"
+
+
+@learners
+def test_exposure_moves_predictions_by_what_was_shown_alone(name: str) -> None:
+    """Prediction t with the term is prediction t without it plus what `Exposed.before` says."""
+    policy = trained(build(name, TAGGED, exposure=True, exposure_window=3))
+    windows = random_windows(TAGGED)
+    head = policy.head
+    assert isinstance(head, ItemHead)
+    assert head.exposure is not None
+    for parameter in head.exposure.parameters():
+        parameter.data += 0.1
+    normalized = policy.normalized(windows)
+    with torch.no_grad():
+        plain = head.predict(policy.features(normalized)[:, -1])
+        last = torch.arange(1, len(plain) + 1) * K - 1
+        added = head.exposure.to_all(Exposed.before(normalized, 3).select(last))
+        torch.testing.assert_close(policy.act(windows), plain + added)
+        own = windows.actions.clone()
+        own[:, -1] = other(own[:, -1])
+        torch.testing.assert_close(
+            policy.act(replace(windows, actions=own, rewards=windows.rewards + 1)),
+            policy.act(windows),
+        )
+        noisy = torch.where(windows.mask, windows.actions, other(windows.actions))
+        torch.testing.assert_close(policy.act(replace(windows, actions=noisy)), policy.act(windows))
+
+
+def reference_loss(policy: SequencePolicy, windows: Any) -> Tensor:
+    """The action loss as it was before there were additions."""
+    features = policy.features(policy.normalized(windows))
+    return policy.head.loss(features[windows.mask], windows.actions[windows.mask])
+
+
+@kinds
+@learners
+def test_without_additions_the_action_loss_is_that_of_the_head(
+    name: str, sizes: dict[str, int]
+) -> None:
+    policy, windows = build(name, sizes).eval(), random_windows(sizes)
+    if name == "edt4rec":  # it shows returns-to-go that fall by the rewards
+        windows = replace(windows, rewards=torch.zeros_like(windows.rewards))
+        held = windows.returns_to_go[:, -1:].expand_as(windows.returns_to_go)
+        windows = replace(windows, returns_to_go=held * windows.mask)
+    torch.manual_seed(3)
+    _, scalars = policy.loss(windows)
+    torch.manual_seed(3)
+    assert float(scalars["action_loss"]) == float(reference_loss(policy, windows).detach())
+    assert policy.values is None
+    assert "value_loss" not in scalars
+    if name in ("dt", "dc", "lsdt"):
+        assert torch.equal(policy.loss(windows)[0], reference_loss(policy, windows))
+
+
+@kinds
+def test_the_loss_is_weighted_by_the_advantage(sizes: dict[str, int]) -> None:
+    policy, windows = build("dt", sizes, **ADDITIONS).eval(), random_windows(sizes)
+    normalized = policy.normalized(windows)
+    assert policy.values is not None
+    mask = windows.mask
+    values, returns = policy.values(normalized)[mask], normalized.returns_to_go[mask]
+    weights = advantage_weights(values, returns)
+    assert weights.max() > 1.2 * weights.min()
+    losses = policy.head.losses(policy.features(normalized)[mask], windows.actions[mask])
+    expected = (weights * losses).sum() / mask.sum()
+    value_loss = policy.values.loss(values, returns)
+    loss, scalars = policy.loss(windows)
+    torch.testing.assert_close(scalars["action_loss"], expected)
+    torch.testing.assert_close(scalars["value_loss"], value_loss)
+    torch.testing.assert_close(loss, expected + value_loss)
+    # With values but without weights, steps count alike.
+    alike = build("dt", sizes, max_return=True).eval()
+    alike.load_state_dict(policy.state_dict())
+    torch.testing.assert_close(alike.loss(windows)[1]["action_loss"], losses.mean())
+    # The weights do not teach the values to please the loss.
+    gradient = torch.autograd.grad(loss - value_loss, list(policy.values.parameters()))
+    assert all(float(each.abs().max()) < 1e-6 for each in gradient)
+
+
+def test_exposure_reaches_as_far_as_the_context() -> None:
+    for context, window, lags in ((K, 3, 3), (K, 10, K - 1), (1, 10, 0)):
+        policy = build("dt", TAGGED, exposure=True, exposure_window=window, context=context)
+        term = policy.head.exposure  # type: ignore[union-attr]
+        assert (0 if term is None else term.lags) == lags
+    with pytest.raises(InputError, match=r"policy\.exposure_window is 0"):
+        build("dt", TAGGED, exposure=True, exposure_window=0)
+
+
+def test_the_largest_return_is_in_reward_units() -> None:
+    policy, windows = build("dt", VECTORS, max_return=True).eval(), random_windows(VECTORS)
+    small = policy.max_return(windows)
+    policy.return_scale.fill_(10.0)
+    torch.testing.assert_close(policy.max_return(windows), 10 * small)
+    asked = replace(windows, returns_to_go=windows.returns_to_go + 7)
+    assert torch.equal(policy.max_return(asked), policy.max_return(windows))

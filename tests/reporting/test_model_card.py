@@ -1,0 +1,97 @@
+"""The model card says what the record says, and keeps the newest of each measurement."""
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ucfrec.errors import InputError
+from ucfrec.reporting.model_card import CARD, MEASURED, add_measurement, write_card
+from ucfrec.runs.config import resolve_config
+
+RECORD: dict[str, Any] = {
+    "seed": 4, "reward": "is_click", "session_by": "gap", "fingerprint": "f" * 64,
+    "train_episodes": 1200, "train_steps": 5400, "mean_return": 0.75,
+    "return_quantiles": {"0.5": 1.0, "1.0": 9.0}, "sizes": {"items": 80, "state": 9, "action": 8},
+    "versions": {"ucfrec": "0.1.0"}, "reference_losses": {"uniform": 4.4, "popularity": 3.6},
+    "policy": {"steps": 300, "best_validation": 3.5},
+    "data": {
+        "files": ["/home/me/secret/log.parquet"], "users": 33,
+        "time_range_ms": [1_574_553_600_000, 1_575_158_400_000], "unknown_propensities": 7,
+        "split_times_ms": [1_575_072_000_000, 1_575_115_200_000],
+    },
+}  # fmt: skip
+
+
+def run(folder: Path, **changes: Any) -> Path:
+    folder.mkdir()
+    config = dataclasses.asdict(resolve_config("dt"))
+    (folder / "run.json").write_text(json.dumps(RECORD | {"config": config} | changes))
+    return folder
+
+
+def text_of(folder: Path) -> str:
+    return (folder / CARD).read_text(encoding="utf-8")
+
+
+def test_it_says_data_reward_rule_and_limits(tmp_path: Path) -> None:
+    folder = run(tmp_path / "run")
+    assert write_card(folder) == folder / CARD
+    card = text_of(folder)
+    for what in (
+        "# Model card: dt", "2019-11-24 00:00 to 2019-11-30 00:00", "| reward | `is_click` |",
+        "| training steps | 5,400 |", "a target return: 9 by default",
+        "It knows 80 items and never shows another one.", "7 steps of its logs have no propensity",
+        "Nothing yet: `ucfrec evaluate`",
+    ):  # fmt: skip
+        assert what in card, what
+    assert "log.parquet" in card
+    assert "secret" not in card  # no folder of any machine
+    assert "learned nothing" not in card
+
+
+def test_limits_follow_the_record(tmp_path: Path) -> None:
+    worse = {"steps": 300, "best_validation": 3.7}
+    data = {"files": []}
+    copies = {"verdict": "trust none of them"}
+    write_card(run(tmp_path / "run", policy=worse, data=data, augmentation=copies))
+    card = text_of(tmp_path / "run")
+    assert "3.7, is not below that of showing items by popularity, 3.6: it learned nothing" in card
+    assert "Its logs have no propensities" in card
+    assert "Counterfactual copies: trust none of them" in card
+    sizes = {"items": 0, "state": 9, "action": 3}
+    write_card(run(tmp_path / "vectors", sizes=sizes))
+    assert "It predicts an action vector" in text_of(tmp_path / "vectors")
+
+
+def test_the_newest_of_each_measurement_is_kept(tmp_path: Path) -> None:
+    folder = run(tmp_path / "run")
+    add_measurement(folder, "ucfrec ope", "DR on a", {"R_cum": 1.0, "lift": None}, ["Do not."])
+    add_measurement(folder, "ucfrec evaluate", "world", {"R_cum": "2 [1, 3]", "episodes": 1000})
+    add_measurement(folder, "ucfrec ope", "DR on a", {"R_cum": 4.0}, ["It earns more."])
+    card = text_of(folder)
+    assert card.count("### ucfrec ope: DR on a") == 1
+    assert "| R_cum | 4 |" in card
+    assert "| R_cum | 2 [1, 3] |" in card
+    assert "- It earns more." in card
+    assert "Do not." not in card
+    assert "lift" not in card
+    assert len(json.loads((folder / MEASURED).read_text())) == 2
+    write_card(folder)  # training on keeps what was measured
+    assert text_of(folder) == card
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_run_that_may_not_be_written_is_left_alone(tmp_path: Path) -> None:
+    folder = run(tmp_path / "run")
+    folder.chmod(0o555)
+    add_measurement(folder, "ucfrec ope", "DR", {"R_cum": 1.0})
+    assert not (folder / CARD).exists()
+
+
+def test_what_is_no_run_has_no_card(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="not a run folder"):
+        write_card(tmp_path)

@@ -1,0 +1,127 @@
+"""The decision rule is chosen on the log: finds what pays, keeps its conditions, says how."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.support.tagged import tagged_store
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model
+from ucfrec.counterfactual.item_reward_rows import RewardRows
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.files import read_json
+from ucfrec.runs.choose_rule import RuleSearch, calibrate, choose_rule
+from ucfrec.runs.config import resolve_config
+from ucfrec.runs.refit import refit
+from ucfrec.runs.rule_config import RuleConfig
+from ucfrec.runs.run import train_run, training_views
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+SMALL = ["train.steps=60", "train.learning_rate=3e-3", "train.warmup_steps=5", "policy.dim=16"]
+SETTINGS = [*SMALL, "train.validate_every=20", "policy.context=6", "augment.copies=0"]
+FEW = RuleConfig(sessions=40, tilts=(0.0, 4.0), least_impressions=1, least_items=2.0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("rule")
+    store = tagged_store(folder)
+    settings = [*SETTINGS, "rule.sessions=40", "rule.least_items=2.0"]
+    train_run(store, folder / "run", resolve_config("ucf", None, settings))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(folder: Path) -> TrainedPolicy:
+    return TrainedPolicy.load(folder / "run")
+
+
+def search_of(folder: Path, trained: TrainedPolicy, config: RuleConfig = FEW) -> RuleSearch:
+    views = training_views(EpisodeStore.open(folder / "store"))
+    return RuleSearch(trained.decider(DecisionRule(2.0)), *views, config, seed=0)
+
+
+def test_a_run_acts_by_the_rule_that_it_chose_and_says_how(
+    folder: Path, trained: TrainedPolicy
+) -> None:
+    record = read_json(folder / "run" / "run.json")
+    chosen = record["rule"]
+    assert trained.rule == DecisionRule.from_dict(chosen["rule"], "the record")
+    assert "validation" in chosen["chosen_by"]
+    assert record["reward_model"]["loss"] < record["reward_model"]["base_loss"]
+    best = max(chosen["candidates"], key=lambda each: each["value"])
+    own = next(each for each in chosen["candidates"] if each["rule"] == chosen["rule"])
+    assert own["value"] >= best["value"] - best["error"] or best["items"] < chosen["least_items"]
+
+
+def test_a_tilt_pays_where_the_reward_model_knows_the_items(
+    folder: Path, trained: TrainedPolicy
+) -> None:
+    search = search_of(folder, trained)
+    plain, tilted = (search.play(DecisionRule(2.0, tilt=tilt, temperature=1.0)) for tilt in (0, 4))
+    assert tilted.value > plain.value + 2 * plain.error
+    assert tilted.items < plain.items
+
+
+def test_playing_a_rule_twice_gives_the_same(folder: Path, trained: TrainedPolicy) -> None:
+    rule = DecisionRule(2.0, tilt=1.0, temperature=0.5)
+    assert search_of(folder, trained).play(rule) == search_of(folder, trained).play(rule)
+
+
+def test_unsupported_and_narrow_rules_are_not_allowed(folder: Path, trained: TrainedPolicy) -> None:
+    search = search_of(folder, trained)
+    played = search.play(DecisionRule(2.0, temperature=1.0))
+    assert search.allowed(played)
+    assert not search.allowed(replace(played, support=0.5))
+    assert not search.allowed(replace(played, items=1.0))
+    worse = replace(played, value=played.value - 10)
+    better = replace(played, value=played.value + 10, items=1.0)
+    assert search.best([better, worse, played]) == played
+    # Within a standard error of the best, the first, which is the simplest.
+    close = replace(played, value=played.value - played.error / 2)
+    assert search.best([close, played]) == close
+    assert search.best([replace(played, items=1.0), replace(played, items=1.5)]).items == 1.5
+
+
+def test_calibration_undoes_a_stretched_and_shifted_score(folder: Path) -> None:
+    train, validation = training_views(EpisodeStore.open(folder / "store"))
+    model, _ = fit_item_reward_model(train, validation, folder / "model", 0)
+    rows = RewardRows.of(train, model.lags, 10_000, 0)
+    slope, intercept = calibrate(model, rows)
+    for name in ("item", "user", "state", "affinity", "interaction", "exposure"):
+        model.get_buffer(name).mul_(2)
+    model.item.add_(1)
+    assert calibrate(model, rows)[0] == pytest.approx(slope / 2, rel=1e-3)
+    assert calibrate(model, rows)[1] == pytest.approx(intercept - slope / 2, abs=1e-3)
+
+
+def test_every_kind_of_candidate_is_played(folder: Path, trained: TrainedPolicy) -> None:
+    views = training_views(EpisodeStore.open(folder / "store"))
+    targets = {quantile: trained.target_return(quantile) for quantile in FEW.quantiles}
+    found = choose_rule(trained.decider(DecisionRule(2.0)), targets, *views, FEW, 0)
+    rules = [candidate.rule for candidate in found.candidates]
+    assert len(set(rules)) == len(rules)
+    assert {rule.temperature for rule in rules} == set(FEW.temperatures)
+    assert {rule.tilt for rule in rules} == set(FEW.tilts)
+    assert {rule.tag_window for rule in rules} == {0, 3}  # the policy does not remember 10 steps
+    assert {rule.floor is None for rule in rules} == {True, False}
+
+
+def test_a_refit_learns_from_all_rows_and_chooses_nothing_anew(
+    folder: Path, trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    store = EpisodeStore.open(folder / "store")
+    record = refit(store, folder / "run", tmp_path / "refit")
+    again = TrainedPolicy.load(tmp_path / "refit")
+    assert record["train_steps"] == store.n_steps > trained.record["train_steps"]
+    assert record["policy"]["steps"] == max(1, trained.record["policy"]["best_step"])
+    assert again.rule == trained.rule
+    assert again.reward_model is not None
+    assert trained.reward_model is not None
+    assert not torch.equal(again.reward_model.item, trained.reward_model.item)
+    assert again.counts is not None
+    assert int(again.counts.shown.sum()) == store.n_steps
+    assert np.isfinite(again.training_returns).all()

@@ -1,0 +1,76 @@
+"""Small Gymnasium environments, registered under names that start with `ucfrec-test/`."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+LENGTH = 5
+ITEMS = 4
+
+
+class Echo(gymnasium.Env[Any, Any]):
+    """Five steps; the reward of item a is a, that of a vector its sum.
+
+    A session's secret number is observed as `secret`, and the step as the category `step`; with
+    `whole` the category alone is the observation. `notes` adds an entry of no fixed size.
+    """
+
+    def __init__(
+        self,
+        actions: spaces.Space[Any],
+        whole: bool = False,
+        users: Any = None,
+        notes: bool = False,
+    ) -> None:
+        self.action_space, self._whole, self._users = actions, whole, users
+        entries: dict[str, spaces.Space[Any]] = {
+            "step": spaces.Discrete(LENGTH + 1),
+            "secret": spaces.Box(0, 1, (2, 1), dtype=np.float64),
+        }
+        if notes:
+            entries["notes"] = spaces.Sequence(spaces.Discrete(3))
+        self.observation_space = entries["step"] if whole else spaces.Dict(entries)
+        self.vectors = np.arange(2.0 * ITEMS).reshape(ITEMS, 2)
+        self.played: list[Any] = []
+
+    def _observation(self) -> Any:
+        if self._whole:
+            return self._step
+        return {"step": self._step, "secret": np.full((2, 1), self._secret), "notes": (1, 2)}
+
+    def _info(self) -> dict[str, Any]:
+        info: dict[str, Any] = {"shape that changes": np.zeros(self._step)}
+        return info if self._users is None else info | {"user_id": self._users}
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._step, self._secret = 0, self.np_random.random()
+        return self._observation(), self._info()
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        assert self.action_space.contains(action), action
+        self.played.append(action)
+        self._step += 1
+        reward = float(np.sum(action))
+        return self._observation(), reward, False, self._step == LENGTH, self._info()
+
+
+ACTIONS: dict[str, spaces.Space[Any]] = {
+    "Discrete": spaces.Discrete(ITEMS),
+    "Discrete-from-3": spaces.Discrete(ITEMS, start=3),
+    "MultiDiscrete": spaces.MultiDiscrete([ITEMS]),
+    "Box": spaces.Box(-1, 2, (3,), dtype=np.float64),
+    "Slate": spaces.MultiDiscrete([ITEMS, ITEMS]),
+    "Matrix": spaces.Box(-1, 1, (2, 2)),
+}
+for _name, _space in ACTIONS.items():
+    gymnasium.register(f"ucfrec-test/{_name}-v0", Echo, kwargs={"actions": _space})
+_items = ACTIONS["Discrete"]
+gymnasium.register("ucfrec-test/Whole-v0", Echo, kwargs={"actions": _items, "whole": True})
+gymnasium.register("ucfrec-test/Users-v0", Echo, kwargs={"actions": _items, "users": 77})
+gymnasium.register("ucfrec-test/Names-v0", Echo, kwargs={"actions": _items, "users": "Ann"})
+gymnasium.register("ucfrec-test/Notes-v0", Echo, kwargs={"actions": _items, "notes": True})

@@ -1,0 +1,299 @@
+"""The decision rule: what turns a trained policy into what is shown, the same wherever it acts."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, Final, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ucfrec.episodes.exposure import Likeness, Shown
+from ucfrec.episodes.returns import ReturnToGo
+from ucfrec.episodes.windows import Windows
+from ucfrec.errors import InputError
+from ucfrec.policies.base import SequencePolicy
+from ucfrec.provenance import config_hash
+
+if TYPE_CHECKING:
+    from ucfrec.counterfactual.item_reward_model import ItemRewardModel
+
+
+_RANGES: Final = {
+    "target": (-1e12, 1e12),
+    "floor": (-1e12, 1e12),
+    "tilt": (0.0, 1e6),
+    "temperature": (0.0, 1e6),
+    "top_k": (1, 10**9),
+    "tag_window": (0, 10**4),
+}
+_COLDEST: Final = 1e-30
+"""Temperature below which dividing by it would leave the range of float32."""
+_OPTIONAL: Final = ("target", "floor", "top_k")
+_WHOLE: Final = ("top_k", "tag_window")
+
+
+@dataclass(frozen=True)
+class DecisionRule:
+    """How a trained policy decides: π(i) ∝ [π(i | s, Ĝ) · exp(β · f̂_r(s, i))]^(1/T) over what is
+    allowed.
+
+    Policies with vector actions use the target alone.
+
+    Raises:
+        InputError: a value is out of range.
+    """
+
+    target: float | None
+    """Target return in units of the training reward, of a session or of every step (`ReturnToGo`);
+    None for the largest return that the policy expects in each state."""
+    floor: float | None = None
+    """Returns-to-go asked for are held above this, also once a session has reached its target; None
+    for no floor."""
+    tilt: float = 0.0
+    """β, weight of the reward model, whose predictions are log-odds of a reward, or rewards in
+    standard deviations; 0 for none."""
+    temperature: float = 0.0
+    """T; items are drawn, or, at 0, the best is taken."""
+    top_k: int | None = None
+    """Only the so many best items are drawn from; None for all."""
+    exclude_seen: bool = False
+    """Whether items that the session has shown are left out."""
+    tag_window: int = 0
+    """Items that share a tag with one of so many shown before are left out, unless none remain."""
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in _RANGES.items():
+            value = getattr(self, name)
+            if value is None and name in _OPTIONAL:
+                continue
+            whole, kinds = name in _WHOLE, (int, np.integer)
+            right = isinstance(value, kinds if whole else (*kinds, float, np.floating))
+            if not right or isinstance(value, bool) or not low <= value <= high:
+                number = "whole number" if whole else "finite number"
+                raise InputError(
+                    f"the decision rule has {name} {value!r}; give a {number} from {low:g} to "
+                    f"{high:g}"
+                )
+            # Equal rules have equal types, and so the same hash.
+            object.__setattr__(self, name, int(value) if whole else float(value) + 0.0)
+        if not isinstance(self.exclude_seen, bool):
+            raise InputError(
+                f"the decision rule has exclude_seen {self.exclude_seen!r}; give true or false"
+            )
+
+    def as_dict(self) -> dict[str, Any]:
+        """The fields, as a JSON object."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any], source: str) -> Self:
+        """Rebuild a rule from its `as_dict`.
+
+        Args:
+            values: the fields.
+            source: where they come from, for messages.
+
+        Raises:
+            InputError: a field is unknown, missing, of another type or out of range.
+        """
+        known = {each.name for each in fields(cls)}
+        if "target" not in values or not values.keys() <= known:
+            raise InputError(
+                f"{source} is not a decision rule: it has the fields {', '.join(values)}; it needs "
+                f"target and knows {', '.join(sorted(known))}"
+            )
+        try:
+            return cls(**values)
+        except InputError as error:
+            raise InputError(f"{source}: {error}") from None
+
+    def __str__(self) -> str:
+        target = "the largest return expected" if self.target is None else f"{self.target:g}"
+        parts = [f"target {target}"]
+        parts += [] if self.floor is None else [f"at least {self.floor:g} at every step"]
+        parts += [f"tilt {self.tilt:g}"] if self.tilt else []
+        parts += [f"the {self.top_k} best"] if self.top_k else []
+        parts += ["unseen items"] if self.exclude_seen else []
+        parts += [f"no tag of the last {self.tag_window}"] if self.tag_window else []
+        how = f"drawn at temperature {self.temperature:g}" if self.temperature else "argmax"
+        return ", ".join([*parts, how])
+
+    @property
+    def hash(self) -> str:
+        """12 hexadecimal digits that tell rules apart, for results."""
+        return config_hash(self.as_dict())
+
+    def asked(self, returns: ReturnToGo, collected: Tensor, best: Tensor | None) -> Tensor:
+        """What is asked for at the next step, (B,) float64, in reward units.
+
+        Args:
+            returns: what returns-to-go count.
+            collected: (B,) rewards earlier in the session.
+            best: (B,) the largest returns that the policy expects; needed without a target.
+        """
+        if self.target is None:
+            assert best is not None
+            asked = best.double()
+        else:
+            asked = returns.asked(self.target, collected)
+        return asked if self.floor is None else asked.clamp(min=self.floor)
+
+    def log_probabilities(self, scores: Tensor) -> Tensor:
+        """Log-probabilities (nats) with which items are shown, (B, n_items).
+
+        Args:
+            scores: (B, n_items) of `Decider.scores`.
+        """
+        if self.temperature == 0:
+            best = scores.argmax(-1, keepdim=True)
+            return torch.full_like(scores, -torch.inf).scatter(1, best, 0.0)
+        if self.top_k is not None and self.top_k < scores.shape[1]:
+            lowest = scores.topk(self.top_k, dim=-1).values[:, -1:]
+            scores = scores.masked_fill(scores < lowest, -torch.inf)
+        # Relative to the best, so that no temperature makes every score −∞.
+        relative = scores - scores.amax(-1, keepdim=True)
+        return (relative / max(self.temperature, _COLDEST)).log_softmax(-1)
+
+    def choose(self, scores: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Items (B,) and the probabilities (B,) with which they were chosen.
+
+        Args:
+            scores: (B, n_items) of `Decider.scores`.
+            generator: of the draws.
+        """
+        if self.temperature == 0:
+            return scores.argmax(-1), torch.ones(len(scores))
+        probabilities = self.log_probabilities(scores).exp()
+        items = torch.multinomial(probabilities, 1, generator=generator)
+        return items[:, 0], probabilities.gather(1, items)[:, 0]
+
+    def ranked(self, scores: Tensor, k: int, generator: torch.Generator) -> Tensor:
+        """`k` different items (B, k), best first, or drawn one after the other.
+
+        Once all of the `top_k` items have been drawn, the others follow, best first.
+
+        Args:
+            scores: (B, n_items) of `Decider.scores`; k at most n_items.
+            k: number of items.
+            generator: of the draws.
+        """
+        if self.temperature > 0:
+            # The largest sums of log-probability and Gumbel noise are draws without replacement.
+            noise = torch.rand(scores.shape, generator=generator).clamp(min=1e-30)
+            drawn = self.log_probabilities(scores) - torch.log(-torch.log(noise))
+            found = drawn.topk(k, dim=-1)
+            if not torch.isneginf(found.values).any():
+                return found.indices
+            by_score = scores.argsort(dim=-1, descending=True)
+            places = drawn.gather(1, by_score).argsort(dim=-1, descending=True, stable=True)
+            return by_score.gather(1, places)[:, :k]
+        return scores.topk(k, dim=-1).indices
+
+
+@dataclass(frozen=True)
+class Decider:
+    """A trained policy under a decision rule."""
+
+    policy: SequencePolicy
+    """In evaluation mode."""
+    rule: DecisionRule
+    returns: ReturnToGo = field(default_factory=ReturnToGo)
+    """What the returns-to-go of the training counted."""
+    reward_model: "ItemRewardModel | None" = None
+    """f̂_r; needed for a tilt."""
+    likeness: Likeness | None = None
+    """Tags of the items; needed for a tag window."""
+
+    def __post_init__(self) -> None:
+        if self.rule.tilt and self.reward_model is None:
+            raise InputError(
+                f"the rule has tilt {self.rule.tilt:g}, but the run has no reward model of items; "
+                "train it with --set reward.fit=true, or set the tilt to 0"
+            )
+        if self.rule.tag_window and (self.likeness is None or not self.likeness.tags.shape[1]):
+            raise InputError(
+                "the rule leaves out items by their tags, but the store has none; give the items a "
+                "column of lists, or set the tag window to 0"
+            )
+        before = self.policy.config.context - 1
+        if self.rule.tag_window > before:
+            raise InputError(
+                f"the rule looks at the tags of the last {self.rule.tag_window} items, but the "
+                f"policy remembers {before} (policy.context less 1); set the tag window to at most "
+                f"{before}"
+            )
+
+    @torch.no_grad()
+    def asked(self, windows: Windows, collected: Tensor) -> Windows:
+        """The windows with the returns-to-go that the rule asks for.
+
+        Args:
+            windows: B windows that end with the step to decide.
+            collected: (B,) float64 rewards earlier in the session, also before the window.
+        """
+        best = None
+        if self.rule.target is None:
+            best = self.policy.max_return(windows.to(self.policy.state_mean.device)).cpu()
+        asked = self.rule.asked(self.returns, collected, best)
+        returns_to_go = self.returns.before(asked, windows.rewards.cpu())
+        mask = windows.mask
+        return replace(windows, returns_to_go=returns_to_go.to(mask.device).masked_fill(~mask, 0.0))
+
+    @torch.no_grad()
+    def act(self, windows: Windows, collected: Tensor) -> Tensor:
+        """The policy's outputs at the last step, on the CPU: see `SequencePolicy.act`."""
+        device = self.policy.state_mean.device
+        return self.policy.act(self.asked(windows, collected).to(device)).cpu()
+
+    def scores(
+        self,
+        windows: Windows,
+        collected: Tensor,
+        forbidden: Tensor | None = None,
+        users: Tensor | None = None,
+    ) -> Tensor:
+        """log π(i | s, Ĝ) + β f̂_r(s, i), up to a constant per row, −∞ for items left out.
+
+        Args:
+            windows: B windows of items that end with the step to decide; its own action and reward
+                are not read.
+            collected: (B,) float64 rewards earlier in the session, also before the window.
+            forbidden: (B, n_items) or (n_items,) bool, items that may not be shown.
+            users: (B,) rows of the training store's users, −1 for others; None for unknown ones.
+
+        Returns:
+            (B, n_items).
+
+        Raises:
+            InputError: no item is left in some row.
+        """
+        scores = self.act(windows, collected)
+        if self.rule.tilt:
+            scores = scores + self.rule.tilt * self.rewards(windows, users)
+        if forbidden is not None:
+            scores = scores.masked_fill(forbidden, -torch.inf)
+        if self.rule.tag_window:
+            scores = self._without_recent_tags(scores, windows)
+        none = torch.isneginf(scores).all(1)
+        if none.any():
+            raise InputError(
+                f"in {int(none.sum())} of {len(none)} decisions every item is left out; allow more "
+                "candidates, or keep seen items"
+            )
+        return scores
+
+    @torch.no_grad()
+    def rewards(self, windows: Windows, users: Tensor | None = None) -> Tensor:
+        """f̂_r (B, n_items) at the last step of the windows, in the reward model's units."""
+        assert self.reward_model is not None
+        shown = Shown.before_last(windows)
+        scores: Tensor = self.reward_model.scores(windows.states[:, -1], shown, users)
+        return scores
+
+    def _without_recent_tags(self, scores: Tensor, windows: Windows) -> Tensor:
+        assert self.likeness is not None
+        shown = Shown.before_last(windows).items[:, : self.rule.tag_window]
+        alike = self.likeness.to_all(self.likeness.profile(shown, torch.ones(shown.shape)))
+        left = scores.masked_fill(alike > 0, -torch.inf)
+        return torch.where(torch.isneginf(left).all(1, keepdim=True), scores, left)

@@ -1,0 +1,56 @@
+"""What a policy would have decided at the steps of logged sessions."""
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from ucfrec import schema
+from ucfrec.acting.decision import Decider
+from ucfrec.episodes.store import EpisodeStore
+
+IntArray = npt.NDArray[np.int64]
+
+
+def session_scores(
+    decider: Decider,
+    store: EpisodeStore,
+    episodes: IntArray,
+    steps: IntArray,
+    forbidden: Tensor | None = None,
+) -> Tensor:
+    """Scores of all items at logged steps, from what was known before each.
+
+    Rewards earlier in a session lower what is asked for, and count as in acting.
+
+    Args:
+        decider: the policy and its rule.
+        store: the logs, with the training's items; an item −1 is unknown.
+        episodes: (B,) sessions.
+        steps: (B,) steps of those sessions, from 0.
+        forbidden: (B, n_items) or (n_items,) bool, items that may not be shown; None for none.
+
+    Returns:
+        (B, n_items), see `Decider.scores`.
+    """
+    windows = store.windows(episodes, steps, decider.policy.config.context)
+    # Any known item can replace an unknown one: steps after it have weight 0.
+    windows = replace(windows, actions=windows.actions.clamp(min=0))
+    collected = torch.from_numpy(store.rewards_before(episodes, steps))
+    if decider.rule.exclude_seen:
+        seen = seen_before(store, episodes, steps)
+        forbidden = seen if forbidden is None else forbidden | seen
+    users = None
+    if store.has_users:
+        users = torch.from_numpy(store.episode_values(schema.USER).astype(np.int64)[episodes])
+    return decider.scores(windows, collected, forbidden, users)
+
+
+def seen_before(store: EpisodeStore, episodes: IntArray, steps: IntArray) -> Tensor:
+    """(B, n_items) bool: the known items that sessions showed before steps; see above."""
+    rows, items = store.items_before(episodes, steps)
+    seen = torch.zeros(len(steps), len(store.item_states.embeddings), dtype=torch.bool)
+    seen[torch.from_numpy(rows[items >= 0]), torch.from_numpy(items[items >= 0])] = True
+    return seen

@@ -1,0 +1,238 @@
+"""What a session was shown lately, as additions to the logits of the items that resemble it."""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.windows import Windows
+
+_GAIN = 10.0
+"""Factor on the learned weights: thousands of small updates must be able to rule an item out."""
+_DENSE = 2**24
+"""Entries of the largest matrix of items and tags that is kept dense, which is faster."""
+
+
+class Shown(NamedTuple):
+    """What B sessions showed before a step."""
+
+    items: Tensor
+    """(B, N) int64, most recent first; −1 before the session or window began."""
+    rewards: Tensor
+    """(B, N) in reward units; 0 where there is no item."""
+
+    @classmethod
+    def before_last(cls, windows: Windows) -> "Shown":
+        """What windows of K steps show before their last one, N = K − 1."""
+        items = windows.actions.masked_fill(~windows.mask, -1)
+        return cls(items[:, :-1].flip(1), windows.rewards[:, :-1].flip(1))
+
+    def at(self, rows: slice | int | Tensor) -> "Shown":
+        """The sessions with the given numbers."""
+        return Shown(self.items[rows], self.rewards[rows])
+
+
+@dataclass(frozen=True)
+class Exposed:
+    """The items shown before each of M steps with their rewards, and the step's return-to-go."""
+
+    items: Tensor
+    """(M, N) int64 items shown, most recent first; −1 before the session or window began."""
+    rewards: Tensor
+    """(M, N) their rewards, in reward units."""
+    returns: Tensor
+    """(M,) returns-to-go in units of the policy's return scale."""
+
+    @classmethod
+    def before(cls, windows: Windows, lags: int) -> "Exposed":
+        """For every step of B windows of K steps, (B·K, lags) earlier steps of the same window.
+
+        Row t uses the actions and rewards of steps t − 1 to t − `lags` only.
+        """
+        items = windows.actions.masked_fill(~windows.mask, -1)
+        returns = windows.returns_to_go.flatten()
+        return cls(_earlier(items, lags, -1), _earlier(windows.rewards, lags, 0), returns)
+
+    def select(self, rows: Tensor) -> "Exposed":
+        """The steps with the given indices, or where a bool mask of the M steps is true."""
+        return Exposed(self.items[rows], self.rewards[rows], self.returns[rows])
+
+
+def _earlier(values: Tensor, lags: int, padding: int) -> Tensor:
+    """Values (B·K, lags) of the steps before each of (B, K), most recent first."""
+    padded = nn.functional.pad(values, (lags, 0), value=padding)[:, :-1]
+    return padded.unfold(1, lags, 1).flip(-1).flatten(0, 1)
+
+
+class Likeness(nn.Module):
+    """How alike two items are: the number of tags that they share, or without tags their cosine.
+
+    Tags are kept as numbers per item and multiplied as a sparse matrix, so a catalogue with many
+    tags costs no dense row per item.
+    """
+
+    tags: Tensor
+    n_tags: Tensor
+    directions: Tensor
+
+    def __init__(self, n_items: int, embedding_size: int, tags_per_item: int) -> None:
+        super().__init__()
+        self.register_buffer("tags", torch.full((n_items, tags_per_item), -1))
+        self.register_buffer("n_tags", torch.zeros((), dtype=torch.int64))
+        size = 0 if tags_per_item else embedding_size
+        self.register_buffer("directions", torch.zeros(n_items, size))
+        self._matrix: Tensor | None = None
+
+    @classmethod
+    def of(cls, states: ItemStates) -> "Likeness":
+        """The likeness of the items of a store."""
+        items, size = states.embeddings.shape
+        likeness = cls(items, size, states.tags.shape[1])
+        likeness.start_from(states)
+        return likeness
+
+    def start_from(self, states: ItemStates) -> None:
+        """Set the tags, or the directions of the embeddings, of the items."""
+        if self.tags.shape[1]:
+            self.tags.copy_(states.tags)
+            self.n_tags.fill_(int(states.tags.max()) + 1)
+        else:
+            self.directions.copy_(nn.functional.normalize(states.embeddings, dim=1))
+        self._matrix = None
+
+    def _load_from_state_dict(self, *arguments: Any, **named: Any) -> None:
+        super()._load_from_state_dict(*arguments, **named)
+        self._matrix = None
+
+    def profile(self, items: Tensor, weights: Tensor) -> Tensor:
+        """The weighted sum (M, F) of the tags or directions of items (M, N), −1 for none.
+
+        Args:
+            items: (M, N) int64.
+            weights: (M, N).
+        """
+        weights = weights.masked_fill(items < 0, 0.0)
+        if not self.tags.shape[1]:
+            return torch.einsum("mn,mnf->mf", weights, self.directions[items])
+        tags, padding = self.tags[items], int(self.n_tags)
+        places = torch.where(tags < 0, padding, tags).flatten(1)
+        spread = weights.unsqueeze(-1).expand(tags.shape).flatten(1)
+        return spread.new_zeros(len(items), padding + 1).scatter_add(1, places, spread)[:, :-1]
+
+    def to_all(self, profile: Tensor) -> Tensor:
+        """Likeness (M, n_items) of all items to profiles (M, F)."""
+        if not self.tags.shape[1]:
+            return profile @ self.directions.T
+        matrix = self._tag_matrix()
+        if matrix.is_sparse:
+            return cast("Tensor", torch.sparse.mm(matrix, profile.T)).T
+        return profile @ matrix.T
+
+    def to_items(self, profile: Tensor, items: Tensor) -> Tensor:
+        """Likeness to profiles (M, F) of items: (M, L) for items (L,), (M,) for items (M, 1)."""
+        if items.ndim == 2:
+            return self._to_each(profile, items[:, 0])
+        if not self.tags.shape[1]:
+            return profile @ self.directions[items].T
+        padded = nn.functional.pad(profile, (0, 1))
+        return torch.stack([padded[:, column] for column in self.tags[items].T]).sum(0)
+
+    def _to_each(self, profile: Tensor, items: Tensor) -> Tensor:
+        if not self.tags.shape[1]:
+            return (profile * self.directions[items]).sum(1)
+        # Index −1 reads the column of zeros.
+        return _read(nn.functional.pad(profile, (0, 1)), self.tags[items]).sum(1)
+
+    def _tag_matrix(self) -> Tensor:
+        """(n_items, n_tags), 1 where the item has the tag; sparse if it has many entries."""
+        if self._matrix is None or self._matrix.device != self.tags.device:
+            rows, columns = torch.nonzero(self.tags >= 0, as_tuple=True)
+            places = torch.stack([rows, self.tags[rows, columns]])
+            shape = (len(self.tags), int(self.n_tags))
+            ones = torch.ones_like(rows, dtype=self.directions.dtype)
+            matrix = torch.sparse_coo_tensor(places, ones, shape, check_invariants=True).coalesce()
+            small = shape[0] * shape[1] <= _DENSE
+            self._matrix = matrix.to_dense() if small else matrix
+        return self._matrix
+
+
+def _read(table: Tensor, columns: Tensor) -> Tensor:
+    """table[m, columns[m, j]], (M, J); column −1 is the last."""
+    return table.gather(1, torch.where(columns < 0, table.shape[1] - 1, columns))
+
+
+class ExposureTerm(nn.Module):
+    """Adds to the logit of item i: Σ_n (v_n + v′_n r_n) [i = i_n] + Σ_n (w_n + w′_n r_n) l(i, i_n).
+
+    i_n is the item shown n steps before, r_n its reward scaled to [0, 1] as in item states, and l
+    the likeness of two items. Each weight is a common one plus one of its lag, both interpolated
+    linearly in the return-to-go Ĝ between knots: how much a repetition costs depends on how much
+    is still to be earned, and on how the item was received. All weights start at 0.
+    """
+
+    knots: Tensor
+    reward_low: Tensor
+    reward_high: Tensor
+
+    def __init__(self, lags: int, knots: int, likeness: Likeness) -> None:
+        super().__init__()
+        self.likeness = likeness
+        self.lags = lags
+        self.register_buffer("knots", torch.linspace(0, 1, knots))
+        self.register_buffer("reward_low", torch.zeros(()))
+        self.register_buffer("reward_high", torch.ones(()))
+        self.common = nn.Parameter(torch.zeros(4, knots, 1))
+        self.by_lag = nn.Parameter(torch.zeros(4, knots, lags))
+
+    def start_from(self, states: ItemStates, returns: Tensor) -> None:
+        """Set how alike the items are, the scale of the rewards, and the knots.
+
+        The knots are quantiles of returns-to-go (N,), closer together the higher they are, because
+        targets are high.
+        """
+        self.likeness.start_from(states)
+        self.reward_low.fill_(states.reward_low)
+        self.reward_high.fill_(states.reward_high)
+        levels = 1 - torch.logspace(0, -2, len(self.knots), dtype=torch.float64)
+        levels = levels.sub(levels[0]).div(levels[-1] - levels[0])
+        knots = torch.from_numpy(np.quantile(returns.double().numpy(), levels.numpy()))
+        # Equal quantiles are moved apart, so that there is an interval between any two knots.
+        width = float(knots[-1] - knots[0]) or 1.0
+        apart = 1e-3 * width * torch.arange(len(knots), dtype=torch.float64)
+        self.knots.copy_((knots + apart).float())
+
+    def weights(self, exposed: Exposed) -> tuple[Tensor, Tensor]:
+        """Weights of repetition and of likeness, (M, N) each, of the items shown."""
+        table = _GAIN * (self.common + self.by_lag)
+        at = exposed.returns.clamp(self.knots[0], self.knots[-1])
+        right = torch.searchsorted(self.knots, at).clamp(1, len(self.knots) - 1)
+        low, high = self.knots[right - 1], self.knots[right]
+        share = ((at - low) / (high - low)).view(1, -1, 1)
+        repeated, repeated_liked, alike, alike_liked = (
+            table[:, right - 1] * (1 - share) + table[:, right] * share
+        )
+        liked = (exposed.rewards - self.reward_low) / (self.reward_high - self.reward_low)
+        liked = liked.clamp(0, 1)
+        return repeated + repeated_liked * liked, alike + alike_liked * liked
+
+    def to_all(self, exposed: Exposed) -> Tensor:
+        """Additions (M, n_items) to the logits of all items."""
+        repeated, alike = self.weights(exposed)
+        added = self.likeness.to_all(self.likeness.profile(exposed.items, alike))
+        rows, lags = torch.nonzero(exposed.items >= 0, as_tuple=True)
+        return added.index_put((rows, exposed.items[rows, lags]), repeated[rows, lags], True)
+
+    def to_items(self, exposed: Exposed, items: Tensor) -> Tensor:
+        """Additions to the logits of items: (M, L) for items (L,), (M,) for items (M, 1)."""
+        repeated, alike = self.weights(exposed)
+        added = self.likeness.to_items(self.likeness.profile(exposed.items, alike), items)
+        for lag in range(self.lags):
+            shown = exposed.items[:, lag]
+            if items.ndim == 2:
+                added = added + repeated[:, lag] * (shown == items[:, 0])
+            else:
+                added = added + repeated[:, lag, None] * (shown[:, None] == items)
+        return added

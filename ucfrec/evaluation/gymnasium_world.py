@@ -1,0 +1,205 @@
+"""Any Gymnasium environment as a simulated world: `gymnasium:ID`."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Final, SupportsFloat
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from ucfrec.acting.rollout import USER_IDS, FloatArray
+from ucfrec.acting.uniform import Uniform
+from ucfrec.errors import InputError
+from ucfrec.evaluation.gymnasium_items import item_table
+from ucfrec.plugins import Simulator
+
+REWARD: Final = "reward"
+"""Column of the environment's rewards in logs."""
+
+Items = Callable[[gymnasium.Env[Any, Any], int], pa.Table]
+"""Reads the item table from an environment and its number of items."""
+
+
+def gymnasium_simulator(
+    env_id: str, observe: Sequence[str], item_features: str | None
+) -> Simulator:
+    """The simulator that plays a Gymnasium environment.
+
+    Args:
+        env_id: identifier as `gymnasium.make` takes it; `module:ID` imports `module` first.
+        observe: entries of a dict observation that are observed, see `GymnasiumWorld`.
+        item_features: file or attribute with item features, see `gymnasium_items.item_table`.
+    """
+
+    def make(num_envs: int, folder: Path | None) -> GymnasiumWorld:
+        if item_features is None:
+            return GymnasiumWorld(env_id, num_envs, observe)
+        return GymnasiumCatalog(env_id, num_envs, partial(item_table, item_features), observe)
+
+    summary = f"the Gymnasium environment {env_id}"
+    return Simulator(summary, make, behaviors={"random": Uniform}, feedback=REWARD)
+
+
+class GymnasiumWorld(SyncVectorEnv):
+    """N copies of a Gymnasium environment with `AutoresetMode.SAME_STEP`.
+
+    Actions are items 0 to n − 1 where the environment's are `Discrete(n)` or `MultiDiscrete([n])`,
+    and vectors (A,) where they are a `Box`; vectors are clipped to its bounds.
+
+    Observations are vectors (O,): of a dict observation the entries `observe`, one after the other;
+    any other observation as a whole, numbers as they are and categories one-hot. O is 0 where items
+    are recommended and nothing is chosen from a dict, or the observation has no fixed size; states
+    then come from the items shown.
+
+    Of `info`, the world passes on `user_id`, a whole number. `reset(seed=s)` seeds copy i with a
+    number drawn from (s, i), so that two seeds share no sessions.
+
+    Args:
+        env_id: identifier as `gymnasium.make` takes it; `module:ID` imports `module` first.
+        num_envs: N.
+        observe: names of the entries of a dict observation that are observed.
+
+    Raises:
+        InputError: the environment cannot be made, its actions are neither items nor vectors, or
+            its observation does not have the entries `observe`.
+    """
+
+    def __init__(self, env_id: str, num_envs: int, observe: Sequence[str] = ()) -> None:
+        if num_envs < 1:
+            raise InputError(f"num_envs is {num_envs}; at least one session must be played")
+        make = partial(_Session, env_id, tuple(observe))
+        super().__init__([make] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
+
+    def reset(
+        self,
+        *,
+        seed: int | list[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[FloatArray, dict[str, Any]]:
+        """Start all sessions; returns observations (N, O) and info."""
+        if isinstance(seed, int):
+            drawn = [np.random.SeedSequence([seed, i]) for i in range(self.num_envs)]
+            seed = [int(each.generate_state(1)[0]) for each in drawn]
+        return super().reset(seed=seed, options=options)
+
+
+class GymnasiumCatalog(GymnasiumWorld):
+    """A `GymnasiumWorld` of items that have features.
+
+    Args:
+        env_id, num_envs, observe: as for `GymnasiumWorld`.
+        items: reads the item table.
+
+    Raises:
+        InputError: as `GymnasiumWorld`, or the actions are vectors.
+    """
+
+    def __init__(
+        self, env_id: str, num_envs: int, items: Items, observe: Sequence[str] = ()
+    ) -> None:
+        super().__init__(env_id, num_envs, observe)
+        space = self.single_action_space
+        if not isinstance(space, spaces.Discrete):
+            raise InputError(f"{env_id} takes vectors, not items; leave out --item-features")
+        self._table = items(self.envs[0], int(space.n))
+
+    def item_features(self) -> pa.Table:
+        """One row per item in the order of the actions, with the column `item_id`."""
+        return self._table
+
+
+class _Session(gymnasium.Wrapper[FloatArray, Any, Any, Any]):
+    """One environment as `GymnasiumWorld` describes it."""
+
+    def __init__(self, env_id: str, observe: tuple[str, ...]) -> None:
+        try:
+            super().__init__(gymnasium.make(env_id, disable_env_checker=True))
+        except (gymnasium.error.Error, ImportError) as error:
+            raise InputError(
+                f"gymnasium:{env_id} cannot be made ({error}); give an identifier that Gymnasium "
+                "knows, or with the module that registers it, as in gymnasium:MODULE:ID"
+            ) from None
+        self.action_space, self._to_action = _actions(self.env.action_space, env_id)
+        vectors = isinstance(self.action_space, spaces.Box)
+        self._observed = _observed(self.env.observation_space, observe, vectors, env_id)
+        size = sum(spaces.flatdim(space) for _, space in self._observed)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (size,), dtype=np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[FloatArray, dict[str, Any]]:
+        """Start a session; returns the observation (O,) and info."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._vector(observation), _user(info)
+
+    def step(self, action: Any) -> tuple[FloatArray, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Play one item or vector (A,)."""
+        played = self.env.step(self._to_action(action))
+        observation, reward, terminated, truncated, info = played
+        return self._vector(observation), reward, terminated, truncated, _user(info)
+
+    def _vector(self, observation: Any) -> FloatArray:
+        if not self._observed:
+            return np.zeros(0, dtype=np.float32)
+        parts: list[Any] = [
+            spaces.flatten(space, observation if key is None else observation[key])
+            for key, space in self._observed
+        ]
+        return np.concatenate(parts).astype(np.float32)
+
+
+def _actions(
+    space: spaces.Space[Any], env_id: str
+) -> tuple[spaces.Discrete | spaces.Box, Callable[[Any], Any]]:
+    """The world's action space, and what turns its actions into the environment's."""
+    if isinstance(space, spaces.Discrete):
+        start = space.start
+        return spaces.Discrete(space.n), lambda item: start + item
+    if isinstance(space, spaces.MultiDiscrete) and space.shape == (1,):
+        first = space.start
+        return spaces.Discrete(space.nvec[0]), lambda item: (first + item).astype(space.dtype)
+    if isinstance(space, spaces.Box) and len(space.shape) == 1:
+        low, high, kind = space.low, space.high, space.dtype
+        box = spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+        return box, lambda vector: np.clip(vector, low, high).astype(kind)
+    raise InputError(
+        f"gymnasium:{env_id} takes actions of {space}; ucfrec plays one item (Discrete, or "
+        "MultiDiscrete of one entry) or one vector (Box of one dimension)"
+    )
+
+
+_Observed = tuple[tuple[str | None, spaces.Space[Any]], ...]
+"""Spaces that are observed and their keys in the dict observation; None for all of it."""
+
+
+def _observed(
+    space: spaces.Space[Any], keys: tuple[str, ...], vectors: bool, env_id: str
+) -> _Observed:
+    entries = dict(space.spaces) if isinstance(space, spaces.Dict) else {}
+    unknown = [key for key in keys if key not in entries]
+    if unknown:
+        has = f"has the entries {', '.join(entries)}" if entries else "has no named entries"
+        raise InputError(f"--observe {','.join(unknown)}: the observation of {env_id} {has}")
+    chosen: _Observed = ((None, space),) if not entries else tuple((k, entries[k]) for k in keys)
+    sized = all(part.is_np_flattenable for _, part in chosen)
+    if (keys and not sized) or (vectors and not (sized and chosen)):
+        raise InputError(
+            f"gymnasium:{env_id} has the observation {space}; name entries of a fixed size with "
+            "--observe KEY,KEY"
+        )
+    return chosen if sized else ()
+
+
+def _user(info: dict[str, Any]) -> dict[str, npt.NDArray[np.int64]]:
+    """What is passed on of `info`."""
+    if USER_IDS not in info:
+        return {}
+    user = np.asarray(info[USER_IDS])
+    if user.shape != () or user.dtype.kind not in "iu":
+        raise InputError(f"info[{USER_IDS!r}] is {info[USER_IDS]!r}; it must be a whole number")
+    return {USER_IDS: user.astype(np.int64)}

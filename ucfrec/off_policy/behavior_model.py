@@ -1,0 +1,211 @@
+"""A model of how the logs' items were chosen: estimated propensities of items and their groups.
+
+Groups by a multinomial logistic regression on the state before the choice, items within a group by
+their share of its logged steps. Every user is predicted by a model of other users (cross-fitting),
+and those predictions are calibrated by one temperature and by mixing in the group's share of the
+logs, as much as predicts best: all of it where the state tells nothing.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+import numpy.typing as npt
+
+from ucfrec.progress import progress
+
+FloatArray = npt.NDArray[np.float64]
+Float32Array = npt.NDArray[np.float32]
+IntArray = npt.NDArray[np.int64]
+States = Callable[[], Iterator[Float32Array]]
+"""Reads the states (N, S) from the first step on, some thousand at once."""
+
+FOLDS = 3
+_MOST_ROWS = 20_000
+"""Steps that a model is fitted on, drawn at random: it has some thousand weights."""
+_SHARES = (0.01, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
+"""How much of the group's share in the logs may be mixed in; never nothing, so that no probability
+is 0."""
+_TEMPERATURES = (0.7, 1.0, 1.4, 2.0, 3.0)
+
+
+@dataclass(frozen=True)
+class BehaviorModel:
+    """Estimated probabilities of what was logged, and how good they are."""
+
+    group: FloatArray
+    """(N,) of the logged item's group."""
+    item: FloatArray
+    """(N,) of the logged item."""
+    log_loss: float
+    """Held-out mean −ln p of the logged group."""
+    share_log_loss: float
+    """The same of the groups' shares in the logs, which ignore the state."""
+    calibration_error: float
+    """Mean absolute difference between what is predicted and what occurs, over groups and tenths
+    of the predicted probability, weighted by their steps."""
+    temperature: float
+    """Scores are divided by it."""
+    share: float
+    """How much of the group's share in the logs is mixed in."""
+
+    def __str__(self) -> str:
+        return (
+            f"held-out loss {self.log_loss:.3g} nats, {self.share_log_loss:.3g} with the mere "
+            f"shares of item groups; calibration error {self.calibration_error:.2g}"
+        )
+
+
+def fit_behavior(
+    states: States,
+    item: IntArray,
+    group: IntArray,
+    session: IntArray,
+    seed: int,
+    user: IntArray | None = None,
+) -> BehaviorModel:
+    """Estimate the probabilities with which the logged items and their groups were chosen.
+
+    Args:
+        states: reads what was known before each step.
+        item: (N,) logged items; −1, unknown, gets probability 1 and is fitted on nowhere.
+        group: (N,) their groups, from 0.
+        session: (N,) number of each step's session, from 0.
+        seed: draws folds and samples.
+        user: (S,) of each session; None where each is somebody else's.
+    """
+    rng = np.random.default_rng(seed)
+    owner = session if user is None else np.unique(user, return_inverse=True)[1][session]
+    folds = rng.permutation(int(owner.max()) + 1)[owner] % FOLDS
+    known, count = item >= 0, int(group.max()) + 1
+    samples = [_drawn(np.flatnonzero(known & (folds != fold)), rng) for fold in range(FOLDS)]
+    tables = _rows_of(states, np.unique(np.concatenate(samples)))
+    models = []
+    with progress(FOLDS, "propensities", "folds") as bar:
+        for fold, sample in enumerate(samples):
+            others = known & (folds != fold)
+            shares = np.bincount(group[others], minlength=count) + 1.0
+            models.append(_Groups(tables(sample), group[sample], shares / shares.sum()))
+            bar.update()
+    calibrated = _calibrated(models, tables, group, folds, np.unique(np.concatenate(samples)))
+    of_group, begin, table = np.ones(len(item)), 0, np.zeros((2, count, 10))
+    for rows in states():
+        part = slice(begin, begin + len(rows))
+        probabilities = np.empty((len(rows), count))
+        for fold, model in enumerate(models):
+            here = folds[part] == fold
+            probabilities[here] = model(rows[here], *calibrated)
+        mine = group[part][:, None]
+        of_group[part] = np.take_along_axis(probabilities, mine, axis=1)[:, 0]
+        _count_calibration(table, probabilities[known[part]], group[part][known[part]])
+        begin = part.stop
+    mean_shares = np.stack([model.shares for model in models])[folds[known], group[known]]
+    return BehaviorModel(
+        group=np.where(known, of_group, 1.0),
+        item=np.where(known, of_group * _within(item, group, folds), 1.0),
+        log_loss=float(-np.log(of_group[known]).mean()),
+        share_log_loss=float(-np.log(mean_shares).mean()),
+        calibration_error=_calibration_error(table),
+        temperature=calibrated[0],
+        share=calibrated[1],
+    )
+
+
+class _Groups:
+    """Probabilities of groups given a state."""
+
+    def __init__(self, states: Float32Array, group: IntArray, shares: FloatArray) -> None:
+        # Importing scikit-learn takes a second, which no other estimate must cost.
+        from sklearn.linear_model import LogisticRegression
+
+        self.shares = shares
+        self._mean, self._spread = states.mean(axis=0), states.std(axis=0)
+        self._spread[self._spread == 0] = 1.0
+        self._present = np.unique(group)
+        self._model = None
+        if len(self._present) > 1:
+            self._model = LogisticRegression(C=0.1, max_iter=100, tol=1e-3)
+            self._model.fit(self._scaled(states), group)
+
+    def __call__(self, states: Float32Array, temperature: float, share: float) -> FloatArray:
+        """(B, K), with so much of the shares of groups mixed in."""
+        if self._model is None or not len(states):
+            return np.tile(self.shares, (len(states), 1))
+        scores = self._model.decision_function(self._scaled(states)) / temperature
+        if scores.ndim == 1:
+            scores = np.stack([-scores / 2, scores / 2], axis=1)
+        exponents = np.exp(scores - scores.max(axis=1, keepdims=True))
+        found = np.zeros((len(states), len(self.shares)))
+        found[:, self._present] = exponents / exponents.sum(axis=1, keepdims=True)
+        return np.asarray((1 - share) * found + share * self.shares)
+
+    def _scaled(self, states: Float32Array) -> Float32Array:
+        return np.asarray((states - self._mean) / self._spread, dtype=np.float32)
+
+
+def _drawn(rows: IntArray, rng: np.random.Generator) -> IntArray:
+    if len(rows) <= _MOST_ROWS:
+        return rows
+    return np.sort(rng.choice(rows, _MOST_ROWS, replace=False))
+
+
+def _rows_of(states: States, wanted: IntArray) -> Callable[[IntArray], Float32Array]:
+    """Looks up the states of some rows, all among `wanted` (sorted)."""
+    parts, begin = [], 0
+    for rows in states():
+        low, high = np.searchsorted(wanted, [begin, begin + len(rows)])
+        parts.append(rows[wanted[low:high] - begin])
+        begin += len(rows)
+    table = np.concatenate(parts)
+    return lambda rows: table[np.searchsorted(wanted, rows)]
+
+
+def _calibrated(
+    models: list[_Groups],
+    tables: Callable[[IntArray], Float32Array],
+    group: IntArray,
+    folds: IntArray,
+    sample: IntArray,
+) -> tuple[float, float]:
+    """The temperature and the mixed-in share of least held-out loss."""
+    choices = list(product(_TEMPERATURES, _SHARES))
+    losses = np.zeros(len(choices))
+    for fold, model in enumerate(models):
+        mine = sample[folds[sample] == fold][:_MOST_ROWS]
+        states, rows = tables(mine), np.arange(len(mine))
+        shares = model.shares[group[mine]]
+        for temperature in _TEMPERATURES:
+            likely = model(states, temperature, 0.0)[rows, group[mine]]
+            for share in _SHARES:
+                mixed = (1 - share) * likely + share * shares
+                losses[choices.index((temperature, share))] -= np.log(mixed).sum()
+    return choices[int(np.argmin(losses))]
+
+
+def _within(item: IntArray, group: IntArray, folds: IntArray) -> FloatArray:
+    """(N,) share of the item among its group's steps in the other folds, one step added to each
+    item."""
+    items, found = int(item.max()) + 1, np.ones(len(item))
+    known = item >= 0
+    group_of = np.zeros(items, dtype=np.int64)
+    group_of[item[known]] = group[known]
+    for fold in range(FOLDS):
+        others, here = known & (folds != fold), known & (folds == fold)
+        counts = np.bincount(item[others], minlength=items) + 1.0
+        totals = np.bincount(group_of, counts, int(group.max()) + 1)
+        found[here] = counts[item[here]] / totals[group[here]]
+    return found
+
+
+def _count_calibration(table: FloatArray, probabilities: FloatArray, group: IntArray) -> None:
+    """Add to table (2, K, 10), by group and tenth of the probability: what is expected, and what
+    occurs."""
+    tenth = np.minimum((probabilities * 10).astype(np.int64), 9)
+    groups, rows = np.arange(probabilities.shape[1]), np.arange(len(group))
+    np.add.at(table[0], (groups[None, :], tenth), probabilities)
+    np.add.at(table[1], (group, tenth[rows, group]), 1.0)
+
+
+def _calibration_error(table: FloatArray) -> float:
+    return float(np.abs(table[0] - table[1]).sum() / max(table[1].sum(), 1.0))

@@ -1,0 +1,145 @@
+"""What models of future reward see of a logged step, kept on disk in bounded memory."""
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from ucfrec.off_policy.score import ScoredSteps
+from ucfrec.policies.base import SequencePolicy
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+Float32Array = npt.NDArray[np.float32]
+
+_PRODUCTS = 256
+_LOWEST_SCORE = -20.0
+ROWS_AT_ONCE = 8192
+
+
+@dataclass(frozen=True)
+class StepInputs:
+    """B logged steps as the models see them."""
+
+    context: Tensor
+    """(B, C): the state (S), then what the policy knows beside it: the return that is left of its
+    target, and its own features of the window of earlier steps."""
+    state_size: int
+    """S."""
+    chosen: Tensor
+    """(B, D) embedding of the logged item; zeros for an item that the run does not know."""
+    shown: Tensor
+    """(B, D) mean embedding over the items that the evaluated policy shows."""
+    scores: Tensor
+    """(B, 2) logarithm of the policy's probability of the logged item, and its mean over the items
+    that the evaluated policy shows."""
+
+    def features(self) -> tuple[Float32Array, Float32Array]:
+        """Features (B, P) of state and logged item, and their mean over the evaluated policy's."""
+        parts = ((self.chosen, 0), (self.shown, 1))
+        of_chosen, of_shown = (
+            _features(self.context, self.state_size, items, self.scores[:, [column]])
+            for items, column in parts
+        )
+        return of_chosen, of_shown
+
+    def flat(self) -> Float32Array:
+        """(B, C + 2 D + 2), for `from_flat`."""
+        parts = (self.context, self.chosen, self.shown, self.scores)
+        return np.asarray(torch.cat(parts, dim=1), dtype=np.float32)
+
+
+@torch.no_grad()
+def context_of(trained: TrainedPolicy, batch: ScoredSteps) -> Tensor:
+    """(B, C) state, return left of the target, and last-layer features of the policy's window.
+
+    A learner that is no network of features (item-knn, crm-greedy) has the first two only.
+    """
+    windows, policy = batch.windows, trained.policy
+    parts = [windows.states[:, -1], batch.returns_left[:, None]]
+    if type(policy).act is SequencePolicy.act:
+        asked = batch.asked.to(policy.state_mean.device)
+        parts.append(policy.features(policy.normalized(asked))[:, -1].cpu())
+    return torch.cat([part.float() for part in parts], dim=1)
+
+
+class InputsFile:
+    """Inputs of N steps in a temporary file: some hundred numbers a step on disk, none in memory.
+
+    A context manager; the file is removed at its end.
+    """
+
+    def __init__(self, folder: Path | None = None) -> None:
+        """Args:
+        folder: where the file lies; None for the system's temporary folder.
+        """
+        self._file = tempfile.TemporaryFile(prefix="ucfrec-", dir=folder)  # noqa: SIM115
+        self._sizes: tuple[int, int, int] | None = None
+
+    def __enter__(self) -> "InputsFile":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def append(self, inputs: StepInputs) -> None:
+        """Write the next steps."""
+        self._sizes = (inputs.context.shape[1], inputs.state_size, inputs.chosen.shape[1])
+        self._file.write(inputs.flat().tobytes())
+
+    def chunks(self) -> Iterator[tuple[Float32Array, Float32Array]]:
+        """All steps in order, some thousand at once, as `StepInputs.features`."""
+        return (inputs.features() for inputs in self._inputs())
+
+    def states(self) -> Iterator[Float32Array]:
+        """(B, S) states of all steps in order, some thousand at once."""
+        return (np.asarray(one.context[:, : one.state_size]) for one in self._inputs())
+
+    def _inputs(self) -> Iterator[StepInputs]:
+        assert self._sizes is not None
+        context, state, item = self._sizes
+        width = context + 2 * item + 2
+        self._file.seek(0)
+        while read := self._file.read(4 * width * ROWS_AT_ONCE):
+            rows = torch.from_numpy(np.frombuffer(read, dtype=np.float32).reshape(-1, width).copy())
+            parts = torch.split(rows, [context, item, item, 2], dim=1)
+            yield StepInputs(parts[0], state, parts[1], parts[2], parts[3])
+
+
+def scores_of(
+    log_probabilities: Tensor, items: Tensor, shown_probabilities: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The policy's log-probability (B,) of each item, and its mean (B,) over what is shown.
+
+    Args:
+        log_probabilities: (B, n_items).
+        items: (B,) numbers; −1, an unknown item, has the mean.
+        shown_probabilities: (B, n_items) of the evaluated policy.
+    """
+    scores = log_probabilities.clamp(min=_LOWEST_SCORE)
+    mean = (shown_probabilities * scores).sum(1)
+    chosen = scores.gather(1, items[:, None].clamp(min=0))[:, 0]
+    return torch.where(items >= 0, chosen, mean), mean
+
+
+def _features(context: Tensor, state_size: int, items: Tensor, score: Tensor) -> Float32Array:
+    """Features (B, P), linear in item embeddings (B, D) and score (B, 1): a constant 1, the
+    context, the item, and products of the two.
+
+    The three embeddings at the start of a state (`ucfrec.episodes.states.ItemStates`) and the
+    return left are multiplied with the item's own, dimension by dimension. The rest of the state
+    (user, observation) is multiplied with as many of the item's first dimensions as `_PRODUCTS`
+    allows.
+    """
+    dim = items.shape[1]
+    states, left = context[:, :state_size], context[:, [state_size]]
+    led_by, rest = states[:, : 3 * dim], states[:, 3 * dim :]
+    leading = items[:, : _PRODUCTS // max(rest.shape[1], 1)]
+    products = (rest.unsqueeze(2) * leading.unsqueeze(1)).flatten(1)
+    ones = torch.ones(len(items), 1)
+    parts = [ones, context, items, score, led_by * items.repeat(1, 3), left * items, products]
+    return np.asarray(torch.cat(parts, dim=1))

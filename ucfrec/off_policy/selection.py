@@ -1,0 +1,140 @@
+"""Choosing among several policies, target returns or rules by estimates from the same logs.
+
+The largest of several estimates is too large: what was chosen was also lucky. And one interval at a
+time does not hold for the one that was picked after seeing all. Hence three things are computed
+together, from one bootstrap that draws users and treats all candidates alike:
+
+- a simultaneous band: with 95% probability it holds the values of all candidates (max-t: Romano &
+  Wolf, Econometrica 2005), whichever is then chosen;
+- the probability of being best, the share of resamples in which a candidate is first;
+- the value of the chosen one without its luck: what the first of a resample loses, on average,
+  when it is valued by the whole sample (bias of a maximum by bootstrap: Efron & Tibshirani 1993,
+  chapter 10).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ucfrec.errors import InputError
+from ucfrec.off_policy.intervals import Resampled, resample
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+LEVEL = 0.95
+
+
+@dataclass(frozen=True)
+class Standing:
+    """One candidate among the others."""
+
+    name: str
+    value: float
+    error: float
+    """Standard error over users."""
+    low: float
+    """Ends of the simultaneous 95% band."""
+    high: float
+    probability_best: float
+    """Share of resamples in which no other candidate has a larger value."""
+    rank: int
+    """From 1, by value."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The candidates in order of their values, and what choosing the first costs."""
+
+    standings: tuple[Standing, ...]
+    corrected: float
+    """Value of the first without the luck of having been chosen."""
+    regret: float
+    """With 95% confidence the first earns at most so much less than the best of them; 0 if it is
+    best beyond doubt (Hsu, Annals of Statistics 1984, with the clustered bootstrap)."""
+
+    @property
+    def chosen(self) -> Standing:
+        """The candidate of the largest value."""
+        return self.standings[0]
+
+    @property
+    def headline(self) -> str:
+        """What was chosen, and how sure that is."""
+        first = self.chosen
+        if len(self.standings) == 1:
+            return f"{first.name} is the only candidate"
+        sure = f"best with probability {first.probability_best:.2f}"
+        if self.regret == 0:
+            return f"No other earns more than {first.name}: {self.corrected:.4g} a session, {sure}"
+        return (
+            f"{first.name} comes first: {self.corrected:.4g} a session once corrected for the "
+            f"choice ({first.value:.4g} before), {sure}, at most {self.regret:.4g} below the best"
+        )
+
+
+def select(
+    names: Sequence[str], terms: FloatArray, seed: int, user: IntArray | None = None
+) -> Selection:
+    """Rank candidates by estimates on the same sessions.
+
+    Args:
+        names: K candidates.
+        terms: (S, K) whose means over sessions are the estimates, e.g. `influences` of DR.
+        seed: draws the resamples.
+        user: (S,) whose session each is; None where each is somebody else's.
+
+    Raises:
+        InputError: there is no candidate, shapes differ, or a term is not finite.
+    """
+    if terms.ndim != 2 or terms.shape[1] != len(names) or not len(names) or not len(terms):
+        raise InputError(f"terms have shape {terms.shape}; give a column to each of {len(names)}")
+    if not np.isfinite(terms).all():
+        raise InputError(f"terms are not finite at {(~np.isfinite(terms)).sum()} places")
+    drawn = resample(terms, np.ones_like(terms), user, seed)
+    half = _critical(drawn) * drawn.error
+    again = drawn.value + drawn.shift
+    best = again == again.max(axis=1, keepdims=True)
+    share = (best / best.sum(axis=1, keepdims=True)).mean(axis=0)
+    order = np.argsort(-drawn.value, kind="stable")
+    standings = tuple(
+        Standing(
+            names[k],
+            float(drawn.value[k]),
+            float(drawn.error[k]),
+            float(drawn.value[k] - half[k]),
+            float(drawn.value[k] + half[k]),
+            float(share[k]),
+            rank,
+        )
+        for rank, k in enumerate(order, start=1)
+    )
+    # What the first of each resample is worth there, beyond its worth in the whole sample.
+    luck = drawn.shift[np.arange(len(again)), again.argmax(axis=1)].mean()
+    first = int(order[0])
+    corrected = float(drawn.value[first] - max(luck, 0.0))
+    return Selection(standings, corrected, _regret(terms, first, seed, user))
+
+
+def _regret(terms: FloatArray, first: int, seed: int, user: IntArray | None) -> float:
+    """Upper end of how much better than the first any other may be."""
+    others = np.delete(terms, first, axis=1) - terms[:, [first]]
+    if not others.shape[1]:
+        return 0.0
+    drawn = resample(others, np.ones_like(others), user, seed)
+    # Candidates that never differ are neither better nor worse.
+    differs = drawn.spreads
+    if not differs.any():
+        return 0.0
+    upper = drawn.value + _critical(drawn, two_sided=False) * drawn.error
+    return float(max(upper[differs].max(), 0.0))
+
+
+def _critical(drawn: Resampled, two_sided: bool = True) -> float:
+    """Quantile of the largest studentised deviation over candidates."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        t = np.where(drawn.usable & drawn.spreads, drawn.shift / drawn.errors, 0.0)
+    largest = np.abs(t).max(axis=1) if two_sided else (-t).max(axis=1)
+    return float(np.quantile(largest, LEVEL))

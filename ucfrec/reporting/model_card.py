@@ -1,0 +1,189 @@
+"""The model card of a run: what it was trained on, how it acts, its limits, and what was measured.
+
+`MODEL_CARD.md` lies in the run folder. It is written from `run.json` and from `measured.json`, to
+which every evaluation of the run adds its newest values; nothing in it is typed by hand.
+"""
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path, PurePath
+from typing import Any
+
+from ucfrec.checksums import CARD, MEASURED
+from ucfrec.files import atomic_file, read_json, write_json
+from ucfrec.locks import claim
+from ucfrec.provenance import config_hash
+from ucfrec.reporting.tables import markdown_table, shown
+from ucfrec.runs.trained_policy import learner_of, read_record
+
+
+def write_card(run: Path) -> Path:
+    """Write the card of a finished run, from its record and what was measured so far.
+
+    Raises:
+        InputError: `run` is not a run folder.
+    """
+    record, card = read_record(run), run / CARD
+    parts = [
+        f"# Model card: {learner_of(record)}",
+        _about(record),
+        "## Training data",
+        _data(record),
+        "## How it acts",
+        _rule(record),
+        "## Limits",
+        "\n".join(f"- {limit}" for limit in _limits(record)),
+        "## Measured",
+        _measured(_read(run)),
+    ]
+    with atomic_file(card) as scratch:
+        scratch.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+    return card
+
+
+def add_measurement(
+    run: Path,
+    how: str,
+    of: str,
+    values: Mapping[str, object],
+    said: Sequence[str] = (),
+) -> None:
+    """Add what was measured of a run to its card; it replaces an older one of the same.
+
+    Args:
+        run: the run folder; one that this process may not write to is left as it is.
+        how: the command, e.g. "ucfrec ope".
+        of: what was measured on what, e.g. "DR on sessions.parquet, target return 5".
+        values: name to number or text, in the order of the table.
+        said: the verdict and warnings.
+    """
+    if not os.access(run, os.W_OK):
+        return
+    with claim(run / MEASURED, wait=True):
+        found = [one for one in _read(run) if (one["how"], one["of"]) != (how, of)]
+        plain = {name: _plain(value) for name, value in values.items() if value is not None}
+        found.append({"how": how, "of": of, "values": plain, "said": list(said)})
+        write_json(run / MEASURED, found)
+        write_card(run)
+
+
+def _read(run: Path) -> list[dict[str, Any]]:
+    return list(read_json(run / MEASURED)) if (run / MEASURED).exists() else []
+
+
+def _plain(value: object) -> object:
+    return value if isinstance(value, (int, float, str, bool)) else json.loads(json.dumps(value))
+
+
+def _about(record: Mapping[str, Any]) -> str:
+    policy = record.get("policy", {})
+    rows = {
+        "learner": learner_of(record),
+        "configuration": config_hash(record["config"]),
+        "seed": record["seed"],
+        "training steps of the model": policy.get("steps"),
+        "best validation loss": policy.get("best_validation"),
+        "versions": ", ".join(f"{name} {number}" for name, number in record["versions"].items()),
+    }
+    return _listed(rows)
+
+
+def _data(record: Mapping[str, Any]) -> str:
+    source = record.get("data") or {}
+    window = _window(source)
+    files = [PurePath(file).name for file in source.get("files", [])]
+    rows = {
+        "files": ", ".join(files) or None,
+        "training window (UTC)": None if window is None else " to ".join(map(_day, window)),
+        "reward": f"`{record['reward']}`",
+        "sessions by": record.get("session_by"),
+        "training sessions": record.get("train_episodes"),
+        "training steps": record.get("train_steps"),
+        "users": source.get("users"),
+        "items": record["sizes"]["items"] or None,
+        "mean return of a session": record.get("mean_return"),
+        "largest return of a session": record.get("return_quantiles", {}).get("1.0"),
+        "fingerprint": record["fingerprint"][:12],
+    }
+    return _listed(rows)
+
+
+def _window(source: Mapping[str, Any]) -> tuple[int, int] | None:
+    """Times (ms) of the first training row, and from which on rows are no longer trained on."""
+    times = source.get("time_range_ms")
+    if times is None:
+        return None
+    begins = source.get("split_times_ms") or times[1:]
+    return int(times[0]), min(int(begins[0]), int(times[1]))
+
+
+def _day(milliseconds: int) -> str:
+    return datetime.fromtimestamp(milliseconds / 1000, UTC).strftime("%Y-%m-%d %H:%M")
+
+
+def _rule(record: Mapping[str, Any]) -> str:
+    largest = record.get("return_quantiles", {}).get("1.0")
+    if not record["sizes"]["items"]:
+        return f"It predicts an action vector, at a target return of {shown(largest)} by default."
+    return (
+        "It shows the items of largest probability, given the session so far and a target return: "
+        f"{shown(largest)} by default, the largest of the training sessions, less what the session "
+        "has earned. Other targets and rules are named with each measurement below."
+    )
+
+
+def _limits(record: Mapping[str, Any]) -> list[str]:
+    source, items = record.get("data") or {}, record["sizes"]["items"]
+    limits = []
+    if items:
+        limits.append(f"It knows {items:,} items and never shows another one.")
+    window = _window(source)
+    if window is not None:
+        limits.append(
+            f"It knows nothing of what happened after {_day(window[1])} UTC; tastes and items "
+            "change."
+        )
+    unknown = source.get("unknown_propensities")
+    if items and unknown is None:
+        limits.append(
+            "Its logs have no propensities: what it would earn cannot be told from them without a "
+            "model of how items were chosen."
+        )
+    elif unknown:
+        limits.append(f"{unknown:,} steps of its logs have no propensity.")
+    best = record.get("policy", {}).get("best_validation")
+    popularity = record.get("reference_losses", {}).get("popularity")
+    if best is not None and popularity is not None and best >= popularity:
+        limits.append(
+            f"Its validation loss, {best:.4g}, is not below that of showing items by popularity, "
+            f"{popularity:.4g}: it learned nothing about users."
+        )
+    copies = record.get("augmentation")
+    if copies is not None:
+        limits.append(f"Counterfactual copies: {copies['verdict']}")
+    limits.append(
+        "A validation loss says how well logged choices are predicted, not what is earned: see "
+        "what was measured."
+    )
+    return limits
+
+
+def _measured(measured: Sequence[Mapping[str, Any]]) -> str:
+    if not measured:
+        return (
+            "Nothing yet: `ucfrec evaluate`, `ucfrec ope` and `ucfrec rank` write what they find "
+            "here."
+        )
+    parts = []
+    for one in measured:
+        body = [[name, shown(value)] for name, value in one["values"].items()]
+        parts += [f"### {one['how']}: {one['of']}", markdown_table(["what", "value"], body)]
+        parts += ["\n".join(f"- {line}" for line in one["said"])] if one["said"] else []
+    return "\n\n".join(parts)
+
+
+def _listed(rows: Mapping[str, object]) -> str:
+    body = [[name, shown(value)] for name, value in rows.items() if value is not None]
+    return markdown_table(["what", "value"], body)

@@ -1,0 +1,233 @@
+"""Choose the decision rule of a run on the validation sessions of its log, never in a world.
+
+The candidates are played in a model of the users: rewards from the run's reward model, calibrated
+on validation rows, and ends of sessions from a logistic regression on the training rows. What a
+model says of a policy holds only where the log supports it, so a candidate must keep to items that
+the training log shows often enough, and to more than a handful of them.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ucfrec import schema
+from ucfrec.acting.decision import Decider, DecisionRule
+from ucfrec.acting.learned_sessions import LearnedSessions, LoggedEnds, SessionEnd
+from ucfrec.acting.policy_actor import PolicyActor
+from ucfrec.acting.rollout import Step, rollout
+from ucfrec.counterfactual.item_reward_model import ItemRewardModel
+from ucfrec.counterfactual.item_reward_report import scores_of
+from ucfrec.counterfactual.item_reward_rows import RewardRows
+from ucfrec.episodes.exposure import Likeness
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.runs.rule_config import RuleConfig
+
+_MOST_STEPS = 100_000
+"""Logged steps that the models of the users are fitted to at most."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A rule and what it did in the model of the users."""
+
+    rule: DecisionRule
+    value: float
+    """Mean return of a session, in reward units."""
+    error: float
+    """Its standard error over the sessions."""
+    length: float
+    """Mean number of steps of a session."""
+    support: float
+    """Share of decisions on items that the log supports."""
+    items: float
+    """Effective number of items shown."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """As a JSON object; the rule's fields are those of `DecisionRule.as_dict`."""
+        return {**asdict(self), "rule": self.rule.as_dict()}
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The rule that was chosen, and all candidates."""
+
+    rule: DecisionRule
+    candidates: Sequence[Candidate]
+    calibration: tuple[float, float]
+    """Slope and intercept of the reward model's scores on validation rows."""
+    least_items: float
+    """Smallest effective number of items that was asked for."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """As a JSON object, with what chose the rule in words."""
+        return {
+            "rule": self.rule.as_dict(),
+            "chosen_by": "mean return of validation users' sessions in the run's reward model, "
+            "calibrated on validation rows; no propensities are used",
+            "calibration": list(self.calibration),
+            "least_items": self.least_items,
+            "candidates": [candidate.as_dict() for candidate in self.candidates],
+        }
+
+
+class RuleSearch:
+    """Plays decision rules of one policy in a model of the users."""
+
+    def __init__(
+        self,
+        decider: Decider,
+        train: EpisodeStore,
+        validation: EpisodeStore,
+        config: RuleConfig,
+        seed: int,
+    ) -> None:
+        """
+        Args:
+            decider: the policy under its default rule, with a reward model.
+            train: training episodes, to which the model of the ends is fitted.
+            validation: sessions to begin, and to calibrate the reward model on.
+            config: candidates and conditions.
+            seed: of the sessions and the draws.
+        """
+        assert decider.reward_model is not None
+        self._decider, self._config, self._seed = decider, config, seed
+        self._store, model = validation, decider.reward_model
+        states = validation.item_states
+        self._likeness = likeness = Likeness.of(states)
+        end = SessionEnd(likeness, LoggedEnds.of(train, model.lags, _MOST_STEPS, seed))
+        rows = RewardRows.of(validation, model.lags, _MOST_STEPS, seed)
+        self.calibration = calibrate(model, rows)
+        self._world = LearnedSessions(
+            *(validation, model, self.calibration, end, config.sessions, int(train.lengths.max()))
+        )
+        shown = np.bincount(
+            train.step_values(schema.ITEM, *train.all_steps()), minlength=len(states.embeddings)
+        )
+        self._supported = shown >= config.least_impressions
+        self.least_items = min(config.least_items, self._supported.sum() / 4)
+
+    def play(self, rule: DecisionRule) -> Candidate:
+        """Play sessions by `rule`."""
+        n, items = self._config.sessions, list[npt.NDArray[np.int64]]()
+        decider = replace(self._decider, rule=rule, likeness=self._likeness)
+        users = np.arange(len(self._store.item_states.user_features))
+        actor = PolicyActor(
+            *(decider, n, self._store.observation_size, self._store.item_states, None, users),
+            seed=self._seed,
+        )
+
+        def record(step: Step) -> None:
+            items.append(step.actions)
+
+        played = rollout(self._world, actor, n, self._seed, record, "choose the rule")  # type: ignore[arg-type]
+        shown = np.concatenate(items)
+        shares = np.bincount(shown) / len(shown)
+        shares = shares[shares > 0]
+        return Candidate(
+            rule=rule,
+            value=float(played.returns.mean()),
+            error=float(played.returns.std(ddof=1) / n**0.5) if n > 1 else 0.0,
+            length=float(played.lengths.mean()),
+            support=float(self._supported[shown].mean()),
+            items=float(np.exp(-(shares * np.log(shares)).sum())),
+        )
+
+    def allowed(self, candidate: Candidate) -> bool:
+        """Whether the log supports what the candidate did."""
+        enough = candidate.items >= self.least_items
+        return enough and candidate.support >= self._config.least_support
+
+    def best(self, candidates: Sequence[Candidate]) -> Candidate:
+        """Of the allowed candidates within a standard error of the best, the first.
+
+        If none is allowed, the one with the most effective items.
+        """
+        allowed = [candidate for candidate in candidates if self.allowed(candidate)]
+        if not allowed:
+            return max(candidates, key=lambda candidate: candidate.items)
+        top = max(allowed, key=lambda candidate: candidate.value)
+        return next(c for c in allowed if c.value >= top.value - top.error)
+
+
+def choose_rule(
+    decider: Decider,
+    targets: Mapping[float, float],
+    train: EpisodeStore,
+    validation: EpisodeStore,
+    config: RuleConfig,
+    seed: int,
+) -> Choice:
+    """Choose target, floor and temperature, then the tilt, then tag window and tilt.
+
+    Args:
+        decider: the policy under its default rule, with a reward model.
+        targets: return (reward units) of each quantile in `config.quantiles`.
+        train: training episodes.
+        validation: validation episodes.
+        config: candidates and conditions.
+        seed: of the sessions and the draws.
+    """
+    search = RuleSearch(decider, train, validation, config, seed)
+    learned = decider.policy.values is not None and decider.policy.config.max_return
+    played = [search.play(rule) for rule in _untilted(config, targets, learned)]
+    first = search.best(played)
+    played.extend(search.play(rule) for rule in _tilted(config, first.rule))
+    second = search.best(_simplest_first(played))
+    longest = decider.policy.config.context - 1
+    if validation.item_states.tags.shape[1]:
+        played.extend(search.play(rule) for rule in _filtered(config, second.rule, longest))
+    best = search.best(_simplest_first(played))
+    return Choice(best.rule, played, search.calibration, float(search.least_items))
+
+
+def _simplest_first(candidates: Sequence[Candidate]) -> list[Candidate]:
+    return sorted(candidates, key=lambda each: (each.rule.tag_window > 0, each.rule.tilt))
+
+
+def _filtered(config: RuleConfig, rule: DecisionRule, longest: int) -> Iterator[DecisionRule]:
+    """Rules with a tag window, of steps that the policy remembers: `longest` of them."""
+    for window in config.tag_windows:
+        for tilt in config.tilts:
+            if 0 < window <= longest and (tilt >= rule.tilt or tilt == 0):
+                yield replace(rule, tag_window=window, tilt=tilt)
+
+
+def _untilted(
+    config: RuleConfig, targets: Mapping[float, float], learned: bool
+) -> Iterator[DecisionRule]:
+    for temperature in sorted(config.temperatures, reverse=True):
+        for target in dict.fromkeys(targets[quantile] for quantile in config.quantiles):
+            yield DecisionRule(target, temperature=temperature)
+            yield DecisionRule(target, floor=target, temperature=temperature)
+        if learned:
+            yield DecisionRule(None, temperature=temperature)
+
+
+def _tilted(config: RuleConfig, rule: DecisionRule) -> Iterator[DecisionRule]:
+    for tilt in config.tilts:
+        if tilt:
+            yield replace(rule, tilt=tilt)
+
+
+def calibrate(model: ItemRewardModel, rows: RewardRows) -> tuple[float, float]:
+    """Slope and intercept of the model's scores that fit logged rewards best.
+
+    By logistic regression for rewards of two values, by least squares otherwise.
+    """
+    from sklearn.linear_model import LinearRegression, LogisticRegression
+
+    scores, _ = scores_of(model, rows)
+    inputs, outcomes = (
+        scores.double().numpy().reshape(-1, 1),
+        model.target(rows.rewards).double().numpy(),
+    )
+    if model.binary and 0 < outcomes.mean() < 1:
+        fitted = LogisticRegression(C=np.inf, max_iter=1000).fit(inputs, outcomes > 0)
+        return float(fitted.coef_[0, 0]), float(fitted.intercept_[0])
+    if model.binary:
+        return 1.0, 0.0
+    fitted = LinearRegression().fit(inputs, outcomes)
+    return float(fitted.coef_[0]), float(fitted.intercept_)

@@ -1,0 +1,60 @@
+"""Train once more on all rows, once everything has been chosen."""
+
+import dataclasses
+import shutil
+from pathlib import Path
+from typing import Any
+
+from ucfrec.checksums import FILES, reopen, seal
+from ucfrec.counterfactual.item_reward_fit import refit_item_reward_model
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.runs.config import Config, config_from_dict
+from ucfrec.runs.run import train_run
+from ucfrec.runs.trained_policy import INPUTS, REWARD_MODEL, RULE, RUN, TrainedPolicy
+
+
+def refit(store: EpisodeStore, first: Path, out: Path) -> dict[str, Any]:
+    """Train a policy as the run `first`, but on its validation and test episodes too.
+
+    Nothing is chosen again: the settings, the number of steps (those of the best weights of
+    `first`), the strength of the reward model's effects and the decision rule are those of `first`.
+    Item embeddings stay those of the store's training split. There is nothing left to judge the
+    policy on but later logs.
+
+    Args:
+        store: the store of `first`.
+        first: a finished run.
+        out: run folder, new or interrupted.
+
+    Returns:
+        The content of `run.json`.
+
+    Raises:
+        InputError: `first` is not a finished run on this store, or `out` is another run.
+    """
+    trained = TrainedPolicy.load(first)
+    if trained.record["fingerprint"] != store.meta["fingerprint"]:
+        raise InputError(
+            f"{first} was trained on another store than {store.path}; name the store of the run"
+        )
+    if "policy" not in trained.record:
+        raise InputError(f"{first} is not finished; train it to its end first")
+    about = {"refit_of": trained.record["config"] | {"rule": trained.rule.as_dict()}}
+    record = train_run(store, out, _settings(trained), about, on_all_rows=True)
+    reopen(out, RUN, record, INPUTS)
+    shutil.copyfile(first / RULE, out / RULE)
+    if trained.reward_model is not None:
+        refit_item_reward_model(first / REWARD_MODEL, store, out / REWARD_MODEL, record["seed"])
+    return seal(out, RUN, {name: value for name, value in record.items() if name != FILES})
+
+
+def _settings(trained: TrainedPolicy) -> Config:
+    """The settings of a run, for so many steps as its best weights took, and no new choice."""
+    config = config_from_dict(trained.record["config"])
+    steps = max(1, int(trained.record["policy"]["best_step"]))
+    return dataclasses.replace(
+        config,
+        train=dataclasses.replace(config.train, steps=steps, patience=0),
+        rule=dataclasses.replace(config.rule, choose=False),
+    )

@@ -1,0 +1,47 @@
+"""Settings of how the decision rule of a run is chosen."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from ucfrec.settings import Count, Share, settings_table
+
+_Temperature = Annotated[float, Field(ge=0, le=100)]
+_Tilt = Annotated[float, Field(ge=0, le=1000)]
+_Steps = Annotated[int, Field(ge=0, le=1000)]
+_SOME = Field(strict=False, min_length=1)
+"""Not strict, because TOML and JSON have lists instead of tuples."""
+
+
+@settings_table("rule")
+class RuleConfig:
+    """How the decision rule of a run is chosen.
+
+    Only policies of items with a reward model choose; the rule of others takes the target quantile
+    `default_quantile` and the best item.
+    """
+
+    choose: bool = True
+    """Whether the rule is chosen on validation sessions; otherwise it is the default one."""
+    default_quantile: Share = 1.0
+    """Quantile of the training returns that is the default rule's target."""
+    default_tag_window: _Steps = 0
+    """Number of steps whose tags the default rule leaves out."""
+    quantiles: Annotated[tuple[Share, ...], _SOME] = (0.9, 1.0)
+    """Candidates for the target, as quantiles of the training returns; each with and without a
+    floor at the same value."""
+    temperatures: Annotated[tuple[_Temperature, ...], _SOME] = (0.0, 0.5, 1.0)
+    """Candidates for the temperature."""
+    tilts: Annotated[tuple[_Tilt, ...], _SOME] = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
+    """Candidates for β, the weight of the reward model."""
+    tag_windows: Annotated[tuple[_Steps, ...], _SOME] = (0, 3, 10)
+    """Candidates for the number of steps whose tags are left out, where items have tags."""
+    sessions: Count = 100
+    """Sessions played of each candidate."""
+    least_impressions: Count = 10
+    """Training impressions from which on the log supports an item."""
+    least_support: Share = 0.9
+    """Smallest share of a rule's decisions that the log must support."""
+    least_items: Annotated[float, Field(ge=1, le=10**9)] = 10.0
+    """Smallest effective number of items that a rule must show, the exponential of their entropy: a
+    page of them; at most a quarter of the items that the log supports."""

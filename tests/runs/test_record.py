@@ -17,6 +17,7 @@ RECORD: dict[str, Any] = {
     "fingerprint": "f1",
     "observation_size": 4,
     "return_quantiles": {"0.5": 1.0, "1.0": 2},
+    "return_to_go": {"definition": "session", "discount": 0.9, "horizon": 1},
     "reward": "reward",
     "train_episodes": 3,
     "train_steps": 9,

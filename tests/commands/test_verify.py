@@ -92,7 +92,7 @@ def test_a_store_without_checksums_is_used_with_a_note(
     arguments = ["train", str(tmp_path / "old"), "--out", str(tmp_path / "run"), *settings]
     assert main(arguments) == 0
     (note,) = capsys.readouterr().err.splitlines()
-    assert note.startswith("ucfrec train: note: ")
+    assert note.startswith("ucfrec: note: ")
     assert "old has no checksums, an older ucfrec wrote it" in note
     assert main(["verify", str(tmp_path / "run")]) == 0
     assert main(["verify", str(made / "run")]) == 0

@@ -14,8 +14,10 @@ from ucfrec.runs.record import require_run_record
 RECORD: dict[str, Any] = {
     "config": {"policy_name": "bc", "seed": 0, "train": {"steps": 3}},
     "sizes": {"state": 4, "action": 2, "items": 0},
+    "fingerprint": "f1",
     "observation_size": 4,
     "return_quantiles": {"0.5": 1.0, "1.0": 2},
+    "return_to_go": {"definition": "session", "discount": 0.9, "horizon": 1},
     "reward": "reward",
     "train_episodes": 3,
     "train_steps": 9,
@@ -54,6 +56,7 @@ def test_a_missing_entry_is_named(name: str) -> None:
         ("return_quantiles", {}),
         ("return_quantiles", {"0.5": float("nan")}),
         ("session_gap_ms", "soon"),
+        ("mean_return", 10**400),
         ("policy", []),
     ],
 )

@@ -8,6 +8,7 @@ import shutil
 import signal
 from collections import Counter
 from collections.abc import Callable
+from copy import deepcopy
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -145,11 +146,11 @@ def _other_values(generator: random.Random, content: bytes) -> bytes:
     for _ in range(generator.choice((1, 1, 1, 2, 5))):
         place, key = _place(generator, value)
         if place is None:
-            return json.dumps(generator.choice(_VALUES)).encode("utf-8", "surrogatepass")
+            return json.dumps(generator.choice(_VALUES)).encode()
         if generator.random() < 0.2:
             del place[key]
         else:
-            place[key] = generator.choice(_VALUES)
+            place[key] = deepcopy(generator.choice(_VALUES))
     return json.dumps(value).encode()
 
 

@@ -80,6 +80,13 @@ def write_report(
     for run in _read_runs(runs):
         by_data.setdefault(run.record["fingerprint"], []).append(run)
     evidence = read_results(results)
+    with damage_explained(Path(", ".join(map(str, results))), "write its rows again"):
+        judged = {
+            "verdict": verdict(evidence),
+            "worlds": worlds(evidence),
+            "estimates": estimates(evidence),
+            "forest": forest(evidence),
+        }
     features = None if items is None else read_features(items)
     loader = PackageLoader("ucfrec.reporting", "")
     environment = Environment(
@@ -87,7 +94,6 @@ def write_report(
     )
     page = environment.get_template("report.html").render(
         version=__version__,
-        verdict=verdict(evidence),
         warnings=[
             (run.name, text)
             for group in by_data.values()
@@ -95,11 +101,9 @@ def write_report(
             for text in _warnings(run)
         ],
         sections=[_section(group, features) for group in by_data.values()],
-        worlds=worlds(evidence),
-        estimates=estimates(evidence),
-        forest=forest(evidence),
         layout=charts,
         points=POINTS,
+        **judged,
     )
     with atomic_file(out) as scratch:
         # Folder names may have bytes that are not valid Unicode.

@@ -47,7 +47,9 @@ def _count(value: object) -> bool:
 
 
 def _number(value: object) -> bool:
-    return type(value) in (int, float) and math.isfinite(value)  # type: ignore[arg-type]
+    if isinstance(value, int) and not isinstance(value, bool):
+        return abs(value) < _LARGEST
+    return isinstance(value, float) and math.isfinite(value)
 
 
 def _object(value: object) -> bool:
@@ -93,6 +95,7 @@ def _or_none(holds: Callable[[object], bool]) -> Callable[[object], bool]:
 _REQUIRED: Final[Mapping[str, Callable[[object], bool]]] = {
     "config": _config,
     "sizes": _sizes,
+    "fingerprint": _text,
     "observation_size": _count,
     "return_quantiles": _quantiles,
     "return_to_go": _return_to_go,
@@ -102,7 +105,6 @@ _REQUIRED: Final[Mapping[str, Callable[[object], bool]]] = {
 }
 _OPTIONAL: Final[Mapping[str, Callable[[object], bool]]] = {
     "command": _text,
-    "fingerprint": _text,
     "store": _text,
     "seed": _count,
     "session_by": _or_none(_text),

@@ -14,6 +14,7 @@ from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Windows
 
 B, K, ITEMS, TAGS, LAGS, KNOTS = 4, 6, 9, 5, 3, 4
+LOW, HIGH = 1.0, 5.0
 kinds = st.sampled_from(["tags", "embeddings"])
 seeds = st.integers(0, 10**6)
 
@@ -23,7 +24,7 @@ def item_states(kind: str, seed: int = 0) -> ItemStates:
     generator = torch.Generator().manual_seed(seed)
     embeddings = torch.randn(ITEMS, 4, generator=generator)
     embeddings[-1] = 0.0
-    states = ItemStates(embeddings, torch.zeros(0, 0), 0.0, 1.0)
+    states = ItemStates(embeddings, torch.zeros(0, 0), LOW, HIGH)
     if kind == "embeddings":
         return states
     tags = torch.full((ITEMS, 3), -1)
@@ -45,12 +46,16 @@ def term(kind: str, seed: int, knots: int = KNOTS) -> ExposureTerm:
 
 
 def exposed(steps: int, seed: int) -> Exposed:
+    """With rewards on the scale of the items, and some below and above it."""
     generator = torch.Generator().manual_seed(seed)
     items = torch.randint(-1, ITEMS, (steps, LAGS), generator=generator)
-    return Exposed(items, 2 * torch.randn(steps, generator=generator))
+    rewards = LOW - 1 + (HIGH - LOW + 2) * torch.rand(steps, LAGS, generator=generator)
+    return Exposed(items, rewards, 2 * torch.randn(steps, generator=generator))
 
 
-def weights_by_hand(made: ExposureTerm, returns: float) -> tuple[list[float], list[float]]:
+def weights_by_hand(
+    made: ExposureTerm, returns: float, rewards: list[float]
+) -> tuple[list[float], list[float]]:
     """Weights of repetition and of likeness by lag, from the documentation of `ExposureTerm`."""
     knots = made.knots.tolist()
     table = 10 * (made.common + made.by_lag).detach().double()
@@ -58,7 +63,10 @@ def weights_by_hand(made: ExposureTerm, returns: float) -> tuple[list[float], li
     right = next(n for n in range(1, len(knots)) if at <= knots[n])
     share = (at - knots[right - 1]) / (knots[right] - knots[right - 1])
     found = (1 - share) * table[:, right - 1] + share * table[:, right]
-    return found[0].tolist(), found[1].tolist()
+    liked = [min(max((reward - LOW) / (HIGH - LOW), 0.0), 1.0) for reward in rewards]
+    repeated = [float(found[0, n] + found[1, n] * liked[n]) for n in range(LAGS)]
+    likeness = [float(found[2, n] + found[3, n] * liked[n]) for n in range(LAGS)]
+    return repeated, likeness
 
 
 def alike(states: ItemStates, one: int, other: int) -> float:
@@ -73,10 +81,10 @@ def alike(states: ItemStates, one: int, other: int) -> float:
 def slowly(made: ExposureTerm, states: ItemStates, shown: Exposed) -> Tensor:
     """The additions to all logits, one at a time."""
     added = torch.zeros(len(shown.items), ITEMS, dtype=torch.float64)
-    for row, (items, returns) in enumerate(
-        zip(shown.items.tolist(), shown.returns.tolist(), strict=True)
+    for row, (items, rewards, returns) in enumerate(
+        zip(shown.items.tolist(), shown.rewards.tolist(), shown.returns.tolist(), strict=True)
     ):
-        repeated, likeness = weights_by_hand(made, returns)
+        repeated, likeness = weights_by_hand(made, returns, rewards)
         for lag, item in enumerate(items):
             if item < 0:
                 continue
@@ -122,7 +130,7 @@ def test_a_large_catalogue_takes_the_sparse_path_to_the_same_result(
 @pytest.mark.parametrize("kind", ["tags", "embeddings"])
 def test_gradients_are_those_of_differences(kind: str) -> None:
     made, shown = term(kind, 5).double(), exposed(5, 5)
-    shown = Exposed(shown.items, shown.returns.double())
+    shown = Exposed(shown.items, shown.rewards.double(), shown.returns.double())
     items = torch.tensor([2, 7])
 
     def additions(common: Tensor, by_lag: Tensor) -> tuple[Tensor, ...]:
@@ -147,9 +155,17 @@ def test_an_untrained_term_adds_nothing() -> None:
 @given(kinds, seeds)
 def test_without_anything_shown_nothing_is_added(kind: str, seed: int) -> None:
     made = term(kind, seed)
-    nothing = Exposed(torch.full((3, LAGS), -1), torch.tensor([-9.0, 0.0, 9.0]))
+    rewards, returns = torch.full((3, LAGS), HIGH), torch.tensor([-9.0, 0.0, 9.0])
+    nothing = Exposed(torch.full((3, LAGS), -1), rewards, returns)
     assert (made.to_all(nothing) == 0).all()
     assert (made.to_items(nothing, torch.arange(ITEMS)) == 0).all()
+
+
+def weights_at(made: ExposureTerm, returns: Tensor, reward: float) -> Tensor:
+    """Weights (2, M, LAGS) at returns (M,) of items that all had the same reward."""
+    shape = (len(returns), LAGS)
+    items, rewards = torch.zeros(shape, dtype=torch.int64), torch.full(shape, reward)
+    return torch.stack(made.weights(Exposed(items, rewards, returns)))
 
 
 @pytest.mark.parametrize("returns", [[0.0] * 9, [0.0] * 8 + [5.0], [-3.0, 2.0, 7.5, 1e6], [4.0]])
@@ -159,20 +175,36 @@ def test_knots_rise_and_cover_the_returns(returns: list[float]) -> None:
     assert (made.knots.diff() > 0).all()
     assert float(made.knots[0]) == pytest.approx(min(returns))
     assert float(made.knots[-1]) >= max(returns)
-    weights = made.weights(torch.tensor([-1e9, *returns, 1e9]))
-    assert torch.isfinite(weights).all()
-    torch.testing.assert_close(weights[:, 0], 10 * (made.common + made.by_lag)[:, 0])
-    torch.testing.assert_close(weights[:, -1], 10 * (made.common + made.by_lag)[:, -1])
+    at = torch.tensor([-1e9, *returns, 1e9])
+    disliked, liked = weights_at(made, at, LOW), weights_at(made, at, HIGH)
+    assert torch.isfinite(disliked).all()
+    assert torch.isfinite(liked).all()
+    table = 10 * (made.common + made.by_lag)
+    plain, by_liking = table[[0, 2]], table[[1, 3]]
+    for end in (0, -1):
+        torch.testing.assert_close(disliked[:, end], plain[:, end])
+        torch.testing.assert_close(liked[:, end], (plain + by_liking)[:, end])
 
 
-def test_weights_are_linear_between_the_knots_and_constant_beyond() -> None:
+@pytest.mark.parametrize("reward", [LOW, 2.0, HIGH])
+def test_weights_are_linear_between_the_knots_and_constant_beyond(reward: float) -> None:
     made = term("tags", 1)
     low, high = made.knots[1], made.knots[2]
     at = torch.stack([low, low + 0.25 * (high - low), high])
-    left, between, right = made.weights(at).unbind(1)
+    left, between, right = weights_at(made, at, reward).unbind(1)
     torch.testing.assert_close(between, 0.75 * left + 0.25 * right, rtol=1e-4, atol=1e-5)
-    beyond = made.weights(torch.stack([made.knots[0], made.knots[0] - 5]))
+    beyond = weights_at(made, torch.stack([made.knots[0], made.knots[0] - 5]), reward)
     torch.testing.assert_close(beyond[:, 0], beyond[:, 1])
+
+
+def test_weights_are_linear_in_the_reward_and_constant_beyond_its_scale() -> None:
+    made, returns = term("tags", 1), torch.linspace(-3, 3, 7)
+    disliked, liked = weights_at(made, returns, LOW), weights_at(made, returns, HIGH)
+    assert (liked - disliked).abs().amax((1, 2)).min() > 0.5
+    between = weights_at(made, returns, LOW + 0.25 * (HIGH - LOW))
+    torch.testing.assert_close(between, 0.75 * disliked + 0.25 * liked, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(weights_at(made, returns, LOW - 7), disliked)
+    torch.testing.assert_close(weights_at(made, returns, HIGH + 7), liked)
 
 
 # Windows.
@@ -183,7 +215,7 @@ def windows(seed: int, padding: tuple[int, ...] = (0, 1, 4, 5)) -> Windows:
     return Windows(
         states=torch.randn(B, K, 2, generator=generator),
         actions=torch.randint(ITEMS, (B, K), generator=generator),
-        rewards=torch.rand(B, K, generator=generator),
+        rewards=LOW + (HIGH - LOW) * torch.rand(B, K, generator=generator),
         returns_to_go=torch.rand(B, K, generator=generator),
         timesteps=torch.zeros(B, K, dtype=torch.int64),
         mask=torch.arange(K) >= torch.tensor(padding).unsqueeze(1),
@@ -194,7 +226,7 @@ def windows(seed: int, padding: tuple[int, ...] = (0, 1, 4, 5)) -> Windows:
 def test_steps_before_a_step_are_found_one_by_one(seed: int, lags: int) -> None:
     given_windows = windows(seed)
     found = Exposed.before(given_windows, lags)
-    assert found.items.shape == (B * K, lags)
+    assert found.items.shape == found.rewards.shape == (B * K, lags)
     torch.testing.assert_close(found.returns.view(B, K), given_windows.returns_to_go)
     for b in range(B):
         for t in range(K):
@@ -202,6 +234,9 @@ def test_steps_before_a_step_are_found_one_by_one(seed: int, lags: int) -> None:
                 there = t - lag >= 0 and bool(given_windows.mask[b, t - lag])
                 expected = int(given_windows.actions[b, t - lag]) if there else -1
                 assert int(found.items.view(B, K, lags)[b, t, lag - 1]) == expected
+                if there:
+                    reward = found.rewards.view(B, K, lags)[b, t, lag - 1]
+                    assert reward == given_windows.rewards[b, t - lag]
 
 
 @given(seeds, st.integers(0, K - 1), kinds)
@@ -211,22 +246,41 @@ def test_neither_the_step_nor_what_follows_is_seen(seed: int, t: int, kind: str)
     actions[:, t:] = (actions[:, t:] + 1) % ITEMS
     returns = before.returns_to_go.clone()
     returns[:, t + 1 :] += 1
+    rewards = before.rewards.clone()
+    rewards[:, t:] = torch.where(rewards[:, t:] < (LOW + HIGH) / 2, HIGH, LOW)
     after = replace(
-        before, actions=actions, returns_to_go=returns, rewards=before.rewards + 1,
-        states=before.states + 1,
-    )  # fmt: skip
+        before, actions=actions, returns_to_go=returns, rewards=rewards, states=before.states + 1
+    )
     first, second = (
         made.to_all(Exposed.before(each, LAGS)).view(B, K, ITEMS) for each in (before, after)
     )
     assert torch.equal(first[:, : t + 1], second[:, : t + 1])
 
 
+@given(seeds, st.integers(0, K - 2))
+def test_the_reward_of_a_step_is_seen_by_the_steps_after_it(seed: int, t: int) -> None:
+    before, made = windows(seed, (0,) * B), term("tags", seed)
+    rewards = before.rewards.clone()
+    rewards[:, t] = torch.where(rewards[:, t] < (LOW + HIGH) / 2, HIGH, LOW)
+    after = replace(before, rewards=rewards)
+    first, second = (
+        made.to_all(Exposed.before(each, LAGS)).view(B, K, ITEMS) for each in (before, after)
+    )
+    changed = (first != second).any(2).any(0)
+    assert changed.tolist() == [t < step <= t + LAGS for step in range(K)]
+
+
 @given(seeds, kinds)
 def test_padding_is_never_shown(seed: int, kind: str) -> None:
     before, made = windows(seed), term(kind, seed)
-    noisy = replace(before, actions=torch.where(before.mask, before.actions, 3))
+    noisy = replace(
+        before,
+        actions=torch.where(before.mask, before.actions, 3),
+        rewards=torch.where(before.mask, before.rewards, HIGH + LOW - before.rewards),
+    )
     shown, again = Exposed.before(before, LAGS), Exposed.before(noisy, LAGS)
     assert torch.equal(shown.items, again.items)
+    assert torch.equal(made.to_all(shown), made.to_all(again))
     rows = before.mask.flatten()
     torch.testing.assert_close(
         made.to_all(shown.select(rows)), made.to_all(shown).view(B * K, ITEMS)[rows]

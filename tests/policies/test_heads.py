@@ -198,7 +198,8 @@ def exposed_head(tags: bool) -> tuple[ItemHead, Tensor]:
 def shown_before(m: int) -> Exposed:
     generator = torch.Generator().manual_seed(9)
     items = torch.randint(-1, N // 2, (m, LAGS), generator=generator)
-    return Exposed(items, 2 * torch.rand(m, generator=generator))
+    returns = 2 * torch.rand(m, generator=generator)
+    return Exposed(items, torch.rand(m, LAGS, generator=generator), returns)
 
 
 @pytest.mark.parametrize("tags", [True, False])

@@ -19,7 +19,7 @@ from ucfrec.policies.dt import DTConfig, DTPolicy
 from ucfrec.policies.item_knn import ItemKNNConfig, ItemKNNPolicy
 from ucfrec.policies.ucf import UCFConfig, UCFPolicy
 
-TARGET, EPISODES, SIDE_BY_SIDE, K = 20.0, 30, 8, 3
+TARGET, EPISODES, SIDE_BY_SIDE, K = 20.0, 30, 8, 2
 
 
 def randomised(policy: SequencePolicy) -> SequencePolicy:

@@ -138,7 +138,7 @@ def test_an_installed_learner_is_trained_listed_and_read_back(
         ("unchecked", "not derived from .* under @ucfrec.settings.settings_table"),
         ("gone", "my_learner:Gone, which cannot be imported"),
         ("nowhere", "no_such_learner:Mine, which cannot be imported"),
-        ("min", "choose from ucf, dt, .*, mine"),
+        ("min", "choose from ucf, ucf-paper, dt, .*, mine"),
     ],
 )
 def test_what_is_no_learner_is_refused(name: str, says: str) -> None:

@@ -16,7 +16,7 @@ from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
 from ucfrec.logs import LogMapping, PrepareOptions, prepare
 from ucfrec.recommending.histories import histories_of_files
-from ucfrec.recommending.recommend import recommend
+from ucfrec.recommending.recommend import recommend, uniforms
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SETTINGS = ["train.steps=30", "policy.dim=16", "policy.context=4", "augment.copies=0"]
@@ -53,9 +53,8 @@ def test_python_and_files_agree(fitted: tuple[Recommender, Path], log: pd.DataFr
     policy, folder = fitted
     from_frame = policy.recommend(log, k=5)
     trained = TrainedPolicy.load(folder / "run")
-    rule = DecisionRule(trained.target_return(1.0))
     batches = histories_of_files(trained, [folder / "log.parquet"], LogMapping())
-    (from_files,) = recommend(trained, batches, 5, rule=rule)
+    (from_files,) = recommend(trained, batches, 5)
     pd.testing.assert_frame_equal(from_frame, from_files, check_dtype=False)
 
 
@@ -371,3 +370,13 @@ def test_sessions_by_id_need_the_column(log: pd.DataFrame) -> None:
         policy.recommend(
             sessions.assign(session_id=sessions.session_id.mask(log.index < 9).astype("Int64"))
         )
+
+
+def test_draws_depend_on_user_item_and_seed_alone() -> None:
+    users = np.array([3, 5, 8])
+    drawn = uniforms(users, 2000, 0)
+    assert torch.equal(uniforms(users[1:2], 500, 0)[0], drawn[1, :500])
+    assert not torch.equal(uniforms(users, 2000, 1), drawn)
+    assert ((drawn >= 0) & (drawn < 1)).all()
+    np.testing.assert_allclose(drawn.mean(1), 0.5, atol=0.03)
+    assert np.abs(np.corrcoef(drawn)[np.triu_indices(3, 1)]).max() < 0.08

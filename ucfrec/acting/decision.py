@@ -168,7 +168,7 @@ class DecisionRule:
         items = torch.multinomial(probabilities, 1, generator=generator)
         return items[:, 0], probabilities.gather(1, items)[:, 0]
 
-    def ranked(self, scores: Tensor, k: int, generator: torch.Generator) -> Tensor:
+    def ranked(self, scores: Tensor, k: int, uniforms: Tensor) -> Tensor:
         """`k` different items (B, k), best first, or drawn one after the other.
 
         Once all of the `top_k` items have been drawn, the others follow, best first.
@@ -176,11 +176,11 @@ class DecisionRule:
         Args:
             scores: (B, n_items) of `Decider.scores`; k at most n_items.
             k: number of items.
-            generator: of the draws.
+            uniforms: (B, n_items) draws from [0, 1); not read at temperature 0.
         """
         if self.temperature > 0:
             # The largest sums of log-probability and Gumbel noise are draws without replacement.
-            noise = torch.rand(scores.shape, generator=generator).clamp(min=1e-30)
+            noise = uniforms.double().clamp(min=1e-300)
             drawn = self.log_probabilities(scores) - torch.log(-torch.log(noise))
             found = drawn.topk(k, dim=-1)
             if not torch.isneginf(found.values).any():

@@ -71,7 +71,7 @@ def recommend(
         raise InputError(f"k is {k!r}; give a whole number, 1 or more")
     index = pd.Index(trained.item_ids)
     excluded = None if candidates is None else _all_but(index, candidates)
-    decider, generator = trained.decider(rule), torch.Generator().manual_seed(seed)
+    decider = trained.decider(rule)
 
     def frames() -> Iterator[pd.DataFrame]:
         remaining = iter(batches)
@@ -82,7 +82,7 @@ def recommend(
             latest = batch.rows(known).latest_session(trained.record["session_gap_ms"])
             store = _next_steps(trained, latest, index)
             seen = _positions(index, batch.seen_ids) if filter_seen else None
-            chosen = _Choice(decider, k, seen, excluded, generator)
+            chosen = _Choice(decider, k, seen, excluded, seed)
             yield _recommended(trained, store, batch, chosen)
 
     return frames()
@@ -99,7 +99,7 @@ class _Choice:
     items without an index."""
     excluded: Tensor | None
     """(n_items,) true for items that no user is recommended."""
-    generator: torch.Generator
+    seed: int
 
 
 def _recommended(
@@ -201,12 +201,30 @@ def _next_steps(
     return EpisodeStore.from_arrays(columns, lengths, {schema.USER: users}, trained.item_states)
 
 
+def uniforms(users: Array, n_items: int, seed: int) -> Tensor:
+    """Draws (B, n_items) from [0, 1), float64, that depend on the user, the item and the seed only.
+
+    A user is recommended the same in any batch. The numbers are SplitMix64's (Steele et al., 2014),
+    from a counter of users' hashes and items.
+    """
+    of_users = pd.util.hash_array(np.asarray(users).astype(str).astype(object))
+    with np.errstate(over="ignore"):
+        state = of_users[:, None] + np.arange(1, n_items + 1, dtype=np.uint64) * np.uint64(
+            0x9E3779B97F4A7C15
+        )
+        state = state + np.uint64(seed) * np.uint64(0xD1B54A32D192ED03)
+        state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        state ^= state >> np.uint64(31)
+    return torch.from_numpy((state >> np.uint64(11)).astype(np.float64) / 2**53)
+
+
 def _ranked(
     users: Array, item_ids: Array, scores: Tensor, some: Tensor, choice: _Choice
 ) -> pd.DataFrame:
     """Rows of the users (B,) where `some` (B,) is true, from their scores (B, n_items)."""
     k = min(choice.k, scores.shape[1])
-    items = choice.decider.rule.ranked(scores, k, choice.generator)
+    items = choice.decider.rule.ranked(scores, k, uniforms(users, scores.shape[1], choice.seed))
     values = scores.log_softmax(-1).gather(1, items)
     kept = (torch.isfinite(values) & some[:, None]).numpy()
     rank = np.cumsum(kept, axis=1)

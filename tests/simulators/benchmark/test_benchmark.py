@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -288,3 +289,26 @@ def test_kuairand_learns_from_what_came_before_its_worlds(tmp_path: Path) -> Non
     assert learned.lengths.max() <= EXITS["easyrl4rec-kuairand"].max_turn
     row = evaluate_behavior(task.worlds[2], "random", 50, 0)
     assert row["length"] == 10
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"methods": ["dt", "nothing"]}, "no method is called 'nothing'"),
+        ({"tasks": ["nowhere"]}, "no task is called 'nowhere'"),
+        ({"training_seeds": 0}, "--training-seeds is 0"),
+    ],
+)
+def test_unknown_cells_are_refused(given: dict[str, Any], message: str, tmp_path: Path) -> None:
+    suite = load_plugin("benchmarks", "recommendation")
+    with pytest.raises(InputError, match=message):
+        suite.run(
+            BenchmarkRequest("small", ["main"], tmp_path, tmp_path / "rows.jsonl", 1, **given)
+        )
+
+
+def test_one_task_has_the_cells_of_its_methods_alone(tmp_path: Path) -> None:
+    budget = replace(BUDGETS["small"], seeds=1, sessions=60)
+    plan = Plan(tmp_path, budget, tasks=["synthetic-catalog"])
+    assert {cell.task for cell in plan.main()} == {"synthetic-catalog"}
+    assert plan.missing() == []

@@ -103,7 +103,7 @@ def test_recommend_ranks_for_known_and_new_users(folder: Path, tmp_path: Path) -
     pd.concat([log, stranger]).to_parquet(tmp_path / "log.parquet")
     arguments = ["recommend", str(folder / "synthetic-catalog-run"), str(tmp_path / "log.parquet")]
     out = tmp_path / "top.parquet"
-    assert main([*arguments, "--k", "7", "--out", str(out)]) == 0
+    assert main([*arguments, "--k", "7", "--temperature", "0", "--out", str(out)]) == 0
     top = pd.read_parquet(out)
     assert list(top.columns) == ["user_id", "rank", "item_id", "score"]
     assert set(top.user_id) == {*log.user_id, 10**6}
@@ -348,11 +348,11 @@ def test_score_and_ope_refuse_what_they_cannot_use(
     log.drop(columns="observation").to_parquet(blind)
     out = str(tmp_path / "out")
     assert "not a density" in refused(["ope", run, density, "--json", out], capsys)
-    for command in (["score", run, "--out", out], ["ope", run, "--json", out]):
-        assert "item is not in the store" in refused([*command, other], capsys)
-        assert "trained with observations of 16 numbers" in refused([*command, blind], capsys)
-        vectors = str(folder / "synthetic-taobao-run")
-        assert "are vectors" in refused([command[0], vectors, *command[2:], str(logs)], capsys)
+    vectors = str(folder / "synthetic-taobao-run")
+    for command, to in (("score", "--out"), ("ope", "--json")):
+        assert "item is not in the store" in refused([command, run, other, to, out], capsys)
+        assert "observations of 16 numbers" in refused([command, run, blind, to, out], capsys)
+        assert "are vectors" in refused([command, vectors, str(logs), to, out], capsys)
     assert not (tmp_path / "out").exists()
 
 

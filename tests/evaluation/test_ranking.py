@@ -147,7 +147,16 @@ def test_the_command_ranks_the_test_split_and_later_logs(
     assert main(["train", str(store.path), "--out", run, "--policy", "dt", *sets]) == 0
     assert main(["rank", run, "--k", "5", "--json", str(out)]) == 0
     rows = pd.read_json(out)
-    names = ["dt", "random", "most shown", "most clicked", "item click rate", "item-knn", "als"]
+    names = [
+        "dt",
+        "reward model",
+        "random",
+        "most shown",
+        "most clicked",
+        "item click rate",
+        "item-knn",
+        "als",
+    ]
     assert rows.policy.tolist() == names
     assert (rows.steps == store.split("test").n_steps).all()
     log = pd.read_parquet(store.path.parent / "log.parquet").tail(600)

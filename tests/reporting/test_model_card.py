@@ -16,6 +16,8 @@ RECORD: dict[str, Any] = {
     "seed": 4, "reward": "is_click", "session_by": "gap", "fingerprint": "f" * 64,
     "train_episodes": 1200, "train_steps": 5400, "mean_return": 0.75,
     "return_quantiles": {"0.5": 1.0, "1.0": 9.0}, "sizes": {"items": 80, "state": 9, "action": 8},
+    "observation_size": 0,
+    "return_to_go": {"definition": "session", "discount": 0.9, "horizon": 1},
     "versions": {"ucfrec": "0.1.0"}, "reference_losses": {"uniform": 4.4, "popularity": 3.6},
     "policy": {"steps": 300, "best_validation": 3.5},
     "data": {

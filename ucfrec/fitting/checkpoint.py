@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.files import CHECKSUM, atomic_file
+from ucfrec.files import atomic_file
 
 REMEDY: Final = "restore it or train again"
 """What to do about a damaged file."""
@@ -31,8 +31,9 @@ def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any
         mode = scratch.stat().st_mode
         try:
             about = json.dumps(metadata)
-            sealed = {"about": about, CHECKSUM: _checksum(plain, about)}
-            save_file(plain, scratch, metadata=sealed)
+            # One entry: safetensors writes several in any order, and files of equal content are to
+            # be equal.
+            save_file(plain, scratch, metadata={"about": f"{about}\n{_checksum(plain, about)}"})
             # safetensors restricts its files to their owner; give them the usual permissions.
             scratch.chmod(mode)
         except SafetensorError as error:
@@ -56,9 +57,9 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise InputError(f"{path} is damaged ({error}); {REMEDY}") from None
-    about = stated.get("about", "{}")
     # Older versions wrote no checksum.
-    if CHECKSUM in stated and stated[CHECKSUM] != _checksum(tensors, about):
+    about, _, checksum = stated.get("about", "{}").partition("\n")
+    if checksum and checksum != _checksum(tensors, about):
         raise InputError(f"{path} is damaged (its checksum differs); restore it or train again")
     with damage_explained(path, REMEDY):
         return tensors, dict(json.loads(about))

@@ -7,6 +7,7 @@ import torch
 
 from ucfrec import schema
 from ucfrec.acting.decision import Decider
+from ucfrec.acting.logged_decisions import session_scores
 from ucfrec.episodes.store import EpisodeStore
 
 SAMPLES = "samples.json"
@@ -30,9 +31,7 @@ def sample_recommendations(decider: Decider, validation: EpisodeStore) -> dict[s
     places = np.linspace(0, len(long_enough) - 1, min(_SESSIONS, len(long_enough)))
     episodes = long_enough[places.astype(np.int64)]
     last = validation.lengths[episodes] - 1
-    windows = validation.windows(episodes, last, decider.policy.config.context)
-    collected = torch.from_numpy(validation.rewards_before(episodes, last))
-    scores = decider.scores(windows, collected)
+    scores = session_scores(decider, validation, episodes, last)
     best = scores.topk(min(_ITEMS, len(validation.item_states.embeddings)))
     sessions = []
     for place, episode in enumerate(episodes):

@@ -20,6 +20,7 @@ from tests.support.episodes import (
     step_columns,
 )
 from tests.support.report_page import HOSTILE, SOURCE, number, page_of, record_of, rewritten, row
+from ucfrec.acting.logged_decisions import session_scores
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError

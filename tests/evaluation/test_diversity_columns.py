@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import rollout
 from ucfrec.acting.uniform import Uniform
 from ucfrec.episodes.item_counts import TrainingCounts
@@ -85,11 +86,12 @@ def test_a_run_knows_its_training_log(tmp_path: Path) -> None:
     assert trained.counts is not None
     assert trained.counts.shown.tolist() == [shown[item] for item in range(200)]
     assert trained.counts.liked.tolist() == [liked[item] for item in range(200)]
-    row = evaluate_policy(world, trained, "popular", 10, 0)
+    best = DecisionRule(1.0)
+    row = evaluate_policy(world, trained, "popular", 10, 0, best)
     # The one item that it plays is the one shown most.
     assert row["novelty"] == pytest.approx(-math.log(max(shown.values()) / train.n_episodes))
     assert row["majority_category_dominance"] in (0.0, 1.0)
     (tmp_path / "run" / "training_counts.safetensors").unlink()
-    older = evaluate_policy(world, TrainedPolicy.load(tmp_path / "run"), "popular", 10, 0)
+    older = evaluate_policy(world, TrainedPolicy.load(tmp_path / "run"), "popular", 10, 0, best)
     assert older["novelty"] is None
     assert older["R_cum"] == row["R_cum"]

@@ -11,7 +11,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from ucfrec.episodes.exposure import Exposed
-from ucfrec.episodes.returns import Definition, ReturnToGo
+from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
@@ -27,6 +27,7 @@ Context = Annotated[int, Field(ge=1, le=4096)]
 Layers = Annotated[int, Field(ge=1, le=128)]
 Heads = Annotated[int, Field(ge=1, le=1024)]
 Kernel = Annotated[int, Field(ge=1, le=4096)]
+Returns = Literal["auto", "session", "discounted", "horizon"]
 Timesteps = Annotated[int, Field(ge=1, le=10_000_000)]
 
 
@@ -44,7 +45,7 @@ class PolicyConfig:
     """Returns-to-go are divided by this; 0 selects the largest absolute training return."""
     max_timestep: Timesteps = 1000
     """Rows of the timestep embedding; later steps share the last row. 1 hides the time."""
-    return_to_go: Definition | Literal["auto"] = "auto"
+    return_to_go: Returns = "auto"
     """What returns-to-go count: the whole rest of the `session`; the rest `discounted` by
     `discount`; or the next `horizon` steps. `auto` is the horizon where the sessions of the log are
     users, whose rest tells how many rows a user has left, and otherwise the session."""

@@ -4,17 +4,16 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
 from ucfrec.episodes.exposure import Exposed
-from ucfrec.episodes.returns import Definition
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
-from ucfrec.policies.base import Context, PolicyConfig
+from ucfrec.policies.base import Context, PolicyConfig, Returns
 from ucfrec.policies.cql import CQLConfig, relabelled
 from ucfrec.policies.dt import DTConfig, DTPolicy
 from ucfrec.policies.heads import ItemHead, VectorHead
@@ -37,7 +36,7 @@ class EDT4RecConfig(DTConfig):
     """Whether returns-to-go are raised by CQL's state values."""
     cql_steps: Count = 2000
     """Updates of CQL's network, if `relabel` is true."""
-    return_to_go: Definition | Literal["auto"] = "session"
+    return_to_go: Returns = "session"
     """What returns-to-go count, as for all learners; relabelling needs those of sessions."""
     cql_weight: Weight = 1.0
     """α, weight of CQL's conservative term, which lowers the values of unlogged actions."""

@@ -1,19 +1,19 @@
 """UCF's hybrid causal architecture (paper section 3.2)."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from ucfrec.episodes.returns import Definition
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import (
     Heads,
     Layers,
     PolicyConfig,
+    Returns,
     SequencePolicy,
     TokenEmbedding,
     interleave,
@@ -61,7 +61,7 @@ class UCFPaperConfig(UCFConfig):
     """λ, weight of the mask loss, which supervises attention (Table 7)."""
     exposure: bool = False
     """Whether the logits of items depend on what the session was shown lately."""
-    return_to_go: Definition | Literal["auto"] = "session"
+    return_to_go: Returns = "session"
     """What returns-to-go count: the whole rest of the session (section 2.1)."""
 
 

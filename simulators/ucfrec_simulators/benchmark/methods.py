@@ -33,7 +33,7 @@ METHODS: Final[Mapping[str, Method]] = {
     "bc": Method("bc", conditioned=False),
     "bc-25": Method("bc", ("policy.best_share=0.25",), conditioned=False),
     "bc-10": Method("bc", ("policy.best_share=0.1",), conditioned=False),
-    "crm-greedy": Method("crm-greedy", conditioned=False),
+    "crm-greedy": Method("crm-greedy", ("rule.choose=false",), conditioned=False),
     "dt": Method("dt"),
     "dt4rec": Method("dt4rec"),
     "cdt4rec": Method("cdt4rec"),

@@ -209,7 +209,7 @@ def test_the_entropy_constraint_holds_and_its_multiplier_follows(sizes: dict[str
         before = policy.log_multiplier.item()
         trained(policy, windows, 250)
         features = policy.features(policy.normalized(_consistent(windows)))[windows.mask]
-        entropies[beta] = _entropy(policy.head, features).item()
+        entropies[beta] = _entropy(policy.head, features, None).item()
         if beta < 0:
             assert policy.log_multiplier.item() < before
         else:

@@ -74,7 +74,8 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     assert {row.evaluation_seed for row in rows} == {1_000_000}
     # Each run acts by its own rule.
     runs = {TrainedPolicy.load(path.parent).rule for path in (tmp_path / "out").rglob(RUN)}
-    assert {row.rule for row in rows if row.training_seed is not None} == set(map(str, runs))
+    told = {f"{rule} ({rule.hash})" for rule in runs}
+    assert {row.rule for row in rows if row.training_seed is not None} == told
     assert {row.target_return for row in rows if row.method == "dt"} <= {r.target for r in runs}
     assert {r.conditions.get("quantiles") for r in rows if r.training_seed is not None} == {"rule"}
     configurations = read_configurations(tmp_path)

@@ -50,6 +50,12 @@ class ItemStates:
     def __post_init__(self) -> None:
         if self.embeddings.dim() != 2 or self.user_features.dim() != 2:
             raise InputError("embeddings and user features of item states must be matrices")
+        tags = self.tags
+        if tags.dim() != 2 or (tags.shape[1] and len(tags) != len(self.embeddings)):
+            raise InputError("tags of item states must be a matrix with one row per item")
+        # Tags are numbered without gaps, so that no number exceeds their count.
+        if tags.numel() and not -1 <= int(tags.min()) <= int(tags.max()) < tags.numel():
+            raise InputError(f"tags of item states are not numbers from -1 to {tags.numel() - 1}")
         if not 1 <= self.window <= 10_000:
             raise InputError(f"window of item states is {self.window}; give 1 to 10,000")
         if not self.reward_low < self.reward_high:

@@ -14,6 +14,8 @@ CATEGORIES: Final = 200
 """Most categories or tags of one column: the most frequent among trained ids are kept."""
 TAGS: Final = 16
 """Most tags kept of one item, the most frequent ones."""
+DISTINCT_TAGS: Final = 1000
+"""Most different tags kept, the most frequent ones: what a session was shown is summed by tag."""
 CLIP: Final = 5.0
 """Standardised numbers are clipped to ± this many standard deviations."""
 
@@ -58,8 +60,9 @@ def item_tags(
 ) -> Array:
     """Number the tags of items; row i belongs to the id with `number` i in the table `ids`.
 
-    The tags are the values of all columns of lists. Where there are such columns, items without any
-    tag share one of their own, as they would share the category of a missing value.
+    The tags are the values of all columns of lists, the `DISTINCT_TAGS` most frequent ones. Where
+    there are such columns, items without any of them share one of their own, as they would share
+    the category of a missing value.
 
     Args:
         connection: engine with the tables.
@@ -85,6 +88,7 @@ def item_tags(
         tags AS (
             SELECT tag, row_number() OVER (ORDER BY count(*) DESC, tag) - 1 AS tag_number
             FROM cases WHERE tag IS NOT NULL GROUP BY tag
+            ORDER BY tag_number LIMIT {DISTINCT_TAGS}
         )
         SELECT number, tag_number,
             row_number() OVER (PARTITION BY number ORDER BY tag_number) - 1 AS place

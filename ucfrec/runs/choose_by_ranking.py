@@ -55,6 +55,8 @@ class RankedChoice:
 
     rule: DecisionRule
     candidates: Sequence[RankedRule]
+    supported: bool
+    """Whether the rule finds liked items no worse than the ten most liked; if not, none does."""
 
     def as_dict(self) -> dict[str, Any]:
         """As a JSON object, with what chose the rule in words."""
@@ -62,6 +64,9 @@ class RankedChoice:
             "rule": self.rule.as_dict(),
             "chosen_by": "mean rate, on validation rows, of the ten items shown, among rules that "
             "find liked items no worse than the ten most liked ones do; no propensities are used",
+            "warning": ""
+            if self.supported
+            else "; WARNING: no candidate does, this one has no tilt",
             "candidates": [candidate.as_dict() for candidate in self.candidates],
         }
 
@@ -101,7 +106,7 @@ def choose_by_ranking(
             bar.update()
     allowed = [each for each in candidates if each.gain >= 0]
     best = max(allowed, key=lambda each: each.item_rate) if allowed else candidates[0]
-    return RankedChoice(best.rule, candidates)
+    return RankedChoice(best.rule, candidates, bool(allowed))
 
 
 @dataclass(frozen=True)

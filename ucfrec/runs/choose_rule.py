@@ -60,6 +60,8 @@ class Choice:
     """Slope and intercept of the reward model's scores on validation rows."""
     least_items: float
     """Smallest effective number of items that was asked for."""
+    supported: bool
+    """Whether the log supports what the rule does; if not, no candidate's was."""
 
     def as_dict(self) -> dict[str, Any]:
         """As a JSON object, with what chose the rule in words."""
@@ -67,6 +69,10 @@ class Choice:
             "rule": self.rule.as_dict(),
             "chosen_by": "mean return of validation users' sessions in the run's reward model, "
             "calibrated on validation rows; no propensities are used",
+            "warning": ""
+            if self.supported
+            else "; WARNING: the log supports no candidate, this one "
+            "shows the most different items",
             "calibration": list(self.calibration),
             "least_items": self.least_items,
             "candidates": [candidate.as_dict() for candidate in self.candidates],
@@ -180,7 +186,8 @@ def choose_rule(
     if validation.item_states.tags.shape[1]:
         played.extend(search.play(rule) for rule in _filtered(config, second.rule, longest))
     best = search.best(_simplest_first(played))
-    return Choice(best.rule, played, search.calibration, float(search.least_items))
+    supported, least_items = search.allowed(best), float(search.least_items)
+    return Choice(best.rule, played, search.calibration, least_items, supported)
 
 
 def _simplest_first(candidates: Sequence[Candidate]) -> list[Candidate]:

@@ -130,8 +130,9 @@ def _train(
     if more_copies is not None:
         train = train.with_overlay(more_copies)
     fitted = _fit_policy(policy, train, None if on_all_rows else validation, out, config)
+    chosen = "rule" in record and record.get("policy") == dataclasses.asdict(fitted)
     record["policy"] = dataclasses.asdict(fitted)
-    if logged.has_items and config.rule.choose:
+    if logged.has_items and config.rule.choose and not chosen:
         record["reward_model"], record["rule"] = _rule(policy, logged, held_out, out, config)
     record["wall_time_s"] = time.perf_counter() - start
     _write_samples(out, held_out)
@@ -398,4 +399,17 @@ def describe_run(record: Mapping[str, Any]) -> str:
         f"policy        best validation loss {policy['best_validation']:.4g} at step "
         f"{policy['best_step']} of {policy['steps']}, {policy['seconds']:.0f} s"
     )
+    if "rule" in record:
+        lines.append(_describe_rule(record["rule"], record["reward_model"]))
     return "\n".join(lines)
+
+
+def _describe_rule(choice: Mapping[str, Any], model: Mapping[str, Any]) -> str:
+    rule = DecisionRule.from_dict(choice["rule"], "the run's record")
+    gain = model["item_loss"] - model["loss"]
+    return (
+        f"items         reward model: held-out loss {model['loss']:.4f}, {gain:.4f} below that of "
+        f"item effects alone\n"
+        f"decision rule {rule}\n"
+        f"              chosen by {choice['chosen_by']}{choice.get('warning', '')}"
+    )

@@ -40,6 +40,18 @@ def ended(process: int, seconds: float = 20) -> bool:
     return False
 
 
+def wait_until_handled(process: int, number: signal.Signals, seconds: float = 60) -> None:
+    """Return once a process has its own handler of a signal."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        status = Path(f"/proc/{process}/status").read_text()
+        handled = next(line for line in status.splitlines() if line.startswith("SigCgt:"))
+        if int(handled.split()[1], 16) >> (number - 1) & 1:
+            return
+        time.sleep(0.01)
+    raise TimeoutError(f"process {process} does not handle {number.name}")
+
+
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_children_end_with_their_parent(tmp_path: Path, number: signal.Signals) -> None:
     (tmp_path / "script.py").write_text(CHILDREN)
@@ -93,13 +105,14 @@ def test_other_errors_pass() -> None:
 def test_a_command_interrupted_while_it_starts_prints_one_line(
     tmp_path: Path, number: signal.Signals
 ) -> None:
-    """Its interpreter takes some hundredths of a second before the first line of ucfrec runs."""
+    """The signals come once TERM has a handler, which is the first thing that ucfrec does."""
     log = tmp_path / "log.csv"
     rows = "".join(f"{i % 5},{i % 7},{1_700_000_000_000 + i},{i % 2}\n" for i in range(500))
     log.write_text("user_id,item_id,timestamp,reward\n" + rows)
     command = [sys.executable, "-m", "ucfrec", "prepare", str(log), "--out", str(tmp_path / "out")]
-    for moment in (0.2, 0.5, 1.0, 1.7):
+    for moment in (0.0, 0.3, 0.8, 1.5):
         running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ)
+        wait_until_handled(running.pid, signal.SIGTERM)
         time.sleep(moment)
         running.send_signal(number)
         _, printed = running.communicate(timeout=60)

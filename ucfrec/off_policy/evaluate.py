@@ -111,23 +111,14 @@ def evaluate_off_policy(
     said = [*verdict.reasons, *cautions(diagnosis, found), *_of_the_logs(seen, logged)]
     said += [*of_groups, *_of_the_models(judged)]
     about = {
-        "target_return": rule.target,
-        "rule": rule.hash,
-        "decision_rule": rule.as_dict(),
-        "discount": options.discount,
-        "sessions": len(steps.first),
-        "pages": options.pages,
-        "anonymous": not options.users_known,
-        "steps": len(steps.reward),
-        "dropped": logged.report["dropped"],
-        "unknown_item_rows": logged.unknown_items,
+        **_of_the_rule(rule),
+        **_of_the_sessions(steps, logged, options),
         "seen_in_training": seen,
         "warnings": said,
         **verdict_columns(verdict),
         **diagnosis_columns(diagnosis),
         **judged.models.columns(),
         "run": str(run),
-        "fingerprint": logged.store.meta["fingerprint"],
         "seed": seed,
         **provenance(),
     }
@@ -146,6 +137,27 @@ def evaluate_off_policy(
         user=None if known is None else known.user,
         terms=None if known is None else _terms(known, verdict),
     )
+
+
+def _of_the_rule(rule: DecisionRule) -> dict[str, Any]:
+    """What rows tell of the rule that is judged."""
+    return {"target_return": rule.target, "rule": rule.hash, "decision_rule": rule.as_dict()}
+
+
+def _of_the_sessions(
+    steps: LoggedSteps, logged: LoggedSessions, options: EstimateOptions
+) -> dict[str, Any]:
+    """What rows tell of the logs, and of how they were taken."""
+    return {
+        "discount": options.discount,
+        "sessions": len(steps.first),
+        "pages": options.pages,
+        "anonymous": not options.users_known,
+        "steps": len(steps.reward),
+        "dropped": logged.report["dropped"],
+        "unknown_item_rows": logged.unknown_items,
+        "fingerprint": logged.store.meta["fingerprint"],
+    }
 
 
 def _terms(known: LoggedSteps, verdict: Verdict) -> FloatArray | None:

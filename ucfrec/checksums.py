@@ -1,7 +1,7 @@
 """Checksums of the files of a store or a run, recorded in its `meta.json` or `run.json`.
 
-XXH3 (64 bits) runs at the speed of memory: on the build machine 8 GB/s, where CRC-32 of zlib has 2
-and reading from the disk 1. It finds accidents, not forgers: who can change a file can change its
+XXH3 (64 bits) runs at the speed of memory, where CRC-32 of zlib has a quarter of it: see
+`benchmarks/checksum_cost.py`. It finds accidents, not forgers: who can change a file can change its
 checksum.
 """
 

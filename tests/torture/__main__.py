@@ -73,7 +73,9 @@ def main() -> int:
         folder = Path(name)
         temporary(folder)
         inputs = Inputs(folder)
-        print(f"{'check':<16}{'part':<26}{'cases':>8}{'faults':>7}{'seconds':>8}  counts")
+        print(
+            f"{'check':<16}{'part':<26}{'cases':>8}{'faults':>7}{'seconds':>8}  counts", flush=True
+        )
         for part in _parts(inputs, folder, options):
             key = _key(part, options.seed)
             row = next((row for row in measured if key.covers(row)), None)

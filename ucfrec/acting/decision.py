@@ -269,11 +269,18 @@ class Decider:
             (B, n_items).
 
         Raises:
-            InputError: no item is left in some row.
+            InputError: no item is left in some row, or the scores of some row are NaN.
         """
         scores = self.act(windows, collected)
         if self.rule.tilt:
             scores = scores + self.rule.tilt * self.rewards(windows, users, shown)
+        undefined = ~(scores.amax(1) < torch.inf)
+        if undefined.any():
+            raise InputError(
+                f"in {int(undefined.sum())} of {len(scores)} decisions scores are no numbers, as "
+                "weights of the policy or the reward model are NaN or infinite; train again, with "
+                "a lower train.learning_rate if the training diverged"
+            )
         if forbidden is not None:
             scores = scores.masked_fill(forbidden, -torch.inf)
         if self.rule.tag_window:

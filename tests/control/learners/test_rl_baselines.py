@@ -13,7 +13,9 @@ from ucfrec.errors import InputError
 from ucfrec.files import read_json
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.reporting.rows_file import read_rows
-from ucfrec_control.benchmark.plan import TABLES, Budget, benchmark
+from ucfrec_control.benchmark.budgets import Budget
+from ucfrec_control.benchmark.methods import TABLES
+from ucfrec_control.benchmark.plan import benchmark
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.learners import rl_baselines

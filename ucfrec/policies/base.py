@@ -17,6 +17,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.policies.heads import Head, ItemHead, head_from
+from ucfrec.policies.layers import some_padding
 from ucfrec.policies.values import ValueHead, advantage_weights
 from ucfrec.settings import Dropout, Width, require, settings_table
 
@@ -184,14 +185,19 @@ class SequencePolicy(nn.Module, ABC):
         Returns:
             The loss, and scalars to log.
         """
-        mask, exposed = windows.mask, self.exposed(windows)
-        exposed = None if exposed is None else exposed.select(windows.mask.flatten())
-        given = (features[mask], windows.actions[mask], exposed)
+        exposed, padded = self.exposed(windows), some_padding(windows.mask)
+
+        def steps(values: Tensor) -> Tensor:  # (B, K, …) -> (M, …)
+            return values.flatten(0, 1) if padded is None else values[padded]
+
+        if exposed is not None and padded is not None:
+            exposed = exposed.select(padded.flatten())
+        given = (steps(features), steps(windows.actions), exposed)
         if self.values is None:
             value = self.head.loss(*given)  # type: ignore[arg-type]
             return value, {"action_loss": value.detach()}
-        values = self.values(windows, self.head.embed(windows.actions))[mask]
-        returns = windows.returns_to_go[mask]
+        values = steps(self.values(windows, self.head.embed(windows.actions)))
+        returns = steps(windows.returns_to_go)
         losses = self.head.losses(*given)  # type: ignore[arg-type]
         if self.config.advantage_weights:
             losses = losses * advantage_weights(values, returns)

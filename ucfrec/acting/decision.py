@@ -243,8 +243,18 @@ class Decider:
     @torch.no_grad()
     def act(self, windows: Windows, collected: Tensor) -> Tensor:
         """The policy's outputs at the last step, on the CPU: see `SequencePolicy.act`."""
-        device = self.policy.state_mean.device
-        return self.policy.act(self.asked(windows, collected).to(device)).cpu()
+        return self.act_and_features(self.asked(windows, collected))[0]
+
+    @torch.no_grad()
+    def act_and_features(self, asked: Windows) -> tuple[Tensor, Tensor | None]:
+        """The policy's outputs at the last step of windows of `asked`, and the features (B, d) that
+        they are made from, on the CPU; None of a learner that is no network of features (item-knn,
+        crm-greedy)."""
+        policy, moved = self.policy, asked.to(self.policy.state_mean.device)
+        if type(policy).act is not SequencePolicy.act:
+            return policy.act(moved).cpu(), None
+        outputs, features = policy.act_and_features(moved)
+        return outputs.cpu(), features.cpu()
 
     def scores(
         self,
@@ -271,7 +281,17 @@ class Decider:
         Raises:
             InputError: no item is left in some row.
         """
-        scores = self.act(windows, collected)
+        return self.ruled(self.act(windows, collected), windows, forbidden, users, shown)
+
+    def ruled(
+        self,
+        scores: Tensor,
+        windows: Windows,
+        forbidden: Tensor | None = None,
+        users: Tensor | None = None,
+        shown: Shown | None = None,
+    ) -> Tensor:
+        """`scores` of the policy's outputs (B, n_items)."""
         if self.rule.tilt:
             scores = scores + self.rule.tilt * self.rewards(windows, users, shown)
         if forbidden is not None:

@@ -213,9 +213,13 @@ class SequencePolicy(nn.Module, ABC):
 
     def act(self, windows: Windows) -> Tensor:
         """Predictions at the last step: actions (B, A), or logits over items (B, n_items)."""
+        return self.act_and_features(windows)[0]
+
+    def act_and_features(self, windows: Windows) -> tuple[Tensor, Tensor]:
+        """Predictions at the last step, and the features (B, d) that they are made from."""
         normalized = self.normalized(windows)
         features, exposed = self.features(normalized)[:, -1], self._exposed_last(normalized)
-        return self.head.predict(features, exposed)  # type: ignore[arg-type]
+        return self.head.predict(features, exposed), features  # type: ignore[arg-type]
 
     def max_return(self, windows: Windows) -> Tensor:
         """The largest return-to-go to expect at the last step, (B,) in reward units.

@@ -11,9 +11,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.states import TAGS_PER_ITEM, ItemStates
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.states import DISTINCT_TAGS, TAGS_PER_ITEM
 from ucfrec.logs.features import item_tags
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare

@@ -12,8 +12,8 @@ import duckdb
 from safetensors import SafetensorError
 
 from ucfrec.errors import InputError
-from ucfrec.logs.expressions import NotScalarError, columns_of, refused
 from ucfrec.logs.compressed import require_plausible_size
+from ucfrec.logs.expressions import NotScalarError, columns_of, refused
 from ucfrec.parquet_files import require_plausible_rows
 
 _MAGIC = re.compile(r"[\[*?]")

@@ -22,7 +22,7 @@ class Dropout(nn.Dropout):
         if not self.training or self.p == 0:
             return input
         if input.device.type != "cpu":
-            return F.dropout(input, self.p)
+            return F.dropout(input, self.p)  # type: ignore[no-any-return]
         return input * kept(input.shape, self.p)
 
     def add(self, residual: Tensor, input: Tensor) -> Tensor:
@@ -88,7 +88,7 @@ class _ShiftedProducts(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> Any:
         steps, taps = ctx.saved_tensors
         of_steps, of_taps = gradient * taps[2], torch.empty_like(taps)
         of_taps[2] = (gradient * steps).sum((0, 1))

@@ -1,6 +1,6 @@
 """What a policy would have decided at the steps of logged sessions."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -11,8 +11,45 @@ from ucfrec import schema
 from ucfrec.acting.decision import Decider
 from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Windows
 
 IntArray = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class LoggedDecisions:
+    """What was known before B logged steps, as arguments of `Decider.scores`."""
+
+    windows: Windows
+    collected: Tensor
+    forbidden: Tensor | None
+    users: Tensor | None
+    shown: Shown
+
+    @classmethod
+    def at(
+        cls,
+        decider: Decider,
+        store: EpisodeStore,
+        episodes: IntArray,
+        steps: IntArray,
+        forbidden: Tensor | None = None,
+    ) -> "LoggedDecisions":
+        """Read them from a store; the arguments are those of `session_scores`."""
+        context = decider.policy.config.context
+        lags = 0 if decider.reward_model is None else decider.reward_model.lags
+        windows = store.windows(episodes, steps, max(context, lags + 1))
+        # Any known item can replace an unknown one: steps after it have weight 0.
+        windows = replace(windows, actions=windows.actions.clamp(min=0))
+        collected = torch.from_numpy(store.rewards_before(episodes, steps))
+        if decider.rule.exclude_seen:
+            seen = seen_before(store, episodes, steps)
+            forbidden = seen if forbidden is None else forbidden | seen
+        users = None
+        if store.has_users:
+            users = torch.from_numpy(store.episode_values(schema.USER).astype(np.int64)[episodes])
+        shown = Shown.before_last(windows)
+        return cls(windows.last(context), collected, forbidden, users, shown)
 
 
 def session_scores(
@@ -36,20 +73,8 @@ def session_scores(
     Returns:
         (B, n_items), see `Decider.scores`.
     """
-    context = decider.policy.config.context
-    lags = 0 if decider.reward_model is None else decider.reward_model.lags
-    windows = store.windows(episodes, steps, max(context, lags + 1))
-    # Any known item can replace an unknown one: steps after it have weight 0.
-    windows = replace(windows, actions=windows.actions.clamp(min=0))
-    collected = torch.from_numpy(store.rewards_before(episodes, steps))
-    if decider.rule.exclude_seen:
-        seen = seen_before(store, episodes, steps)
-        forbidden = seen if forbidden is None else forbidden | seen
-    users = None
-    if store.has_users:
-        users = torch.from_numpy(store.episode_values(schema.USER).astype(np.int64)[episodes])
-    shown = Shown.before_last(windows)
-    return decider.scores(windows.last(context), collected, forbidden, users, shown)
+    known = LoggedDecisions.at(decider, store, episodes, steps, forbidden)
+    return decider.scores(known.windows, known.collected, known.forbidden, known.users, known.shown)
 
 
 def seen_before(store: EpisodeStore, episodes: IntArray, steps: IntArray) -> Tensor:

@@ -235,8 +235,8 @@ def _of_the_logs(seen: float | None, logged: LoggedSessions) -> list[str]:
     said = []
     if seen is None:
         said.append(
-            "the store that the run was trained on is not there any more: whether these logs were "
-            "seen in training is not known"
+            "the store that the run was trained on is gone or has changed: whether these logs were "
+            "seen in training is not known; move the run together with its store"
         )
     if unknown := logged.unknown_items:
         said.append(

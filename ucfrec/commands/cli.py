@@ -118,6 +118,7 @@ _NO_MEMORY: Final = (
     *("DefaultCPUAllocator", "std::bad_alloc", "out of memory", "Out of Memory"),
     *("cannot allocate memory", "Cannot allocate memory", "can't start new thread"),
     *("failed to map segment", "could not allocate", "malloc of size"),
+    "could not create a primitive",
 )
 """How libraries that raise other errors than `MemoryError` say that there is no memory."""
 _NO_SPACE: Final = ("No space left on device", "Disk quota exceeded", "File too large")

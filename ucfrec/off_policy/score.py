@@ -1,10 +1,10 @@
 """The probability that a policy gives to each logged choice."""
 
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from ucfrec.acting.logged_decisions import session_decisions
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
+from ucfrec.locks import scratch_folder
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
@@ -110,8 +111,8 @@ def logged_sessions(
     options = PrepareOptions(Expression(record["reward"], str(run / RUN)), session_by)
     if gap_ms is not None:
         options = replace(options, gap_minutes=gap_ms / 60_000)
-    with tempfile.TemporaryDirectory(prefix="ucfrec-") as scratch:
-        folder = Path(scratch) / "store"
+    with scratch_folder(Path(gettempdir()), "logs") as scratch:
+        folder = scratch / "store"
         report = prepare(files, mapping, folder, options, like=run, keep_unknown=keep_unknown)
         store = EpisodeStore.open(folder)
         unknown = int((store.step_values(schema.ITEM, *store.all_steps()) < 0).sum())

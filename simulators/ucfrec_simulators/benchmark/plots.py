@@ -24,6 +24,11 @@ def plot_methods(rows: _Rows, folder: Path) -> list[Path]:
     return _by_world("methods", _bars, rows, folder)
 
 
+def plot_additions(rows: _Rows, folder: Path) -> list[Path]:
+    """One plot per world: return of UCF with and without each addition, as in `plot_methods`."""
+    return _by_world("additions", _bars, rows, folder)
+
+
 def plot_sweeps(rows: _Rows, folder: Path) -> list[Path]:
     """One plot per world: return of UCF with each setting, as in `plot_methods`."""
     return _by_world("sweeps", _bars, rows, folder)

@@ -148,8 +148,9 @@ def test_every_cell_of_every_table_has_a_configuration(
 ) -> None:
     monkeypatch.setattr(plan, "MAIN", ("synthetic-taobao", "synthetic-catalog"))
     monkeypatch.setattr(plan, "SWEPT", ("synthetic-taobao",))
+    monkeypatch.setattr(plan, "PURSUED", ("synthetic-catalog",))
     given = Plan(tmp_path, TINY)
-    every = [*given.main(), *given.sweeps(), *given.distractor()]
+    every = [*given.main(), *given.additions(), *given.sweeps(), *given.distractor()]
     trained = [cell for cell in every if cell.store is not None]
     folders = {(cell.run, cell.config) for cell in trained}
     assert len({run for run, _ in folders}) == len(folders), "a folder for every configuration"
@@ -174,7 +175,10 @@ def test_unknown_tables_and_budgets_are_named(
 ) -> None:
     arguments = ["benchmark", "recommendation", "--out", str(tmp_path / "out")]
     assert main([*arguments, "--table", "table-2"]) == 2
-    assert "no table is called table-2; there are main, distractor" in capsys.readouterr().err
+    assert (
+        "no table is called table-2; there are main, additions, distractor"
+        in capsys.readouterr().err
+    )
     suite: Benchmark = load_plugin("benchmarks", "recommendation")
     with pytest.raises(InputError, match="unknown budget huge"):
         suite.run(BenchmarkRequest("huge", ["main"], tmp_path, tmp_path / "rows.jsonl", 1))

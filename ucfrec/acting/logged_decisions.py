@@ -31,6 +31,45 @@ class SessionDecisions:
     """(B, d), see `Decider.act_and_features`."""
 
 
+@dataclass(frozen=True)
+class LoggedDecisions:
+    """What was known before B logged steps, as arguments of `Decider.scores`."""
+
+    logged: Windows
+    """Each step, last in its window; an unknown item is −1."""
+    windows: Windows
+    """The same with known items only."""
+    collected: Tensor
+    forbidden: Tensor | None
+    users: Tensor | None
+    shown: Shown
+
+    @classmethod
+    def at(
+        cls,
+        decider: Decider,
+        store: EpisodeStore,
+        episodes: IntArray,
+        steps: IntArray,
+        forbidden: Tensor | None = None,
+    ) -> "LoggedDecisions":
+        """Read them from a store; the arguments are those of `session_scores`."""
+        context = decider.policy.config.context
+        lags = 0 if decider.reward_model is None else decider.reward_model.lags
+        logged = store.windows(episodes, steps, max(context, lags + 1))
+        # Any known item can replace an unknown one: steps after it have weight 0.
+        known = replace(logged, actions=logged.actions.clamp(min=0))
+        collected = torch.from_numpy(store.rewards_before(episodes, steps))
+        if decider.rule.exclude_seen:
+            seen = seen_before(store, episodes, steps)
+            forbidden = seen if forbidden is None else forbidden | seen
+        users = None
+        if store.has_users:
+            users = torch.from_numpy(store.episode_values(schema.USER).astype(np.int64)[episodes])
+        shown, last = Shown.before_last(known), logged.last(context)
+        return cls(last, known.last(context), collected, forbidden, users, shown)
+
+
 def session_decisions(
     decider: Decider,
     store: EpisodeStore,
@@ -49,23 +88,11 @@ def session_decisions(
         steps: (B,) steps of those sessions, from 0.
         forbidden: (B, n_items) or (n_items,) bool, items that may not be shown; None for none.
     """
-    context = decider.policy.config.context
-    lags = 0 if decider.reward_model is None else decider.reward_model.lags
-    logged = store.windows(episodes, steps, max(context, lags + 1))
-    # Any known item can replace an unknown one: steps after it have weight 0.
-    known = replace(logged, actions=logged.actions.clamp(min=0))
-    windows, shown = known.last(context), Shown.before_last(known)
-    if decider.rule.exclude_seen:
-        seen = seen_before(store, episodes, steps)
-        forbidden = seen if forbidden is None else forbidden | seen
-    users = None
-    if store.has_users:
-        users = torch.from_numpy(store.episode_values(schema.USER).astype(np.int64)[episodes])
-    collected = torch.from_numpy(store.rewards_before(episodes, steps))
-    asked = decider.asked(windows, collected)
+    known = LoggedDecisions.at(decider, store, episodes, steps, forbidden)
+    asked = decider.asked(known.windows, known.collected)
     outputs, features = decider.act_and_features(asked)
-    scores = decider.ruled(outputs, windows, forbidden, users, shown)
-    return SessionDecisions(logged.last(context), asked, scores, features)
+    scores = decider.scores_from(outputs, known.windows, known.forbidden, known.users, known.shown)
+    return SessionDecisions(known.logged, asked, scores, features)
 
 
 def session_scores(

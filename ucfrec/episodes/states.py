@@ -184,6 +184,11 @@ class SessionStates:
         self._rewards[rows] = 0.0
         self._steps[rows] = 0
 
+    def keep(self, rows: IntArray) -> None:
+        """Forget all sessions but those at the positions `rows`, which become the only ones."""
+        for name in ("_items", "_rewards", "_steps", "users"):
+            setattr(self, name, getattr(self, name)[rows])
+
     def current(self, observations: Tensor) -> Tensor:
         """States (N, S) just before the next step, given its observations (N, O)."""
         return self._states.build(self._items, self._rewards, self._steps, self.users, observations)

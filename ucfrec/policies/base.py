@@ -157,6 +157,10 @@ class SequencePolicy(nn.Module, ABC):
     def features(self, windows: Windows) -> Tensor:
         """Inputs (B, K, d) of the action head, from normalised windows; row t ignores a_t."""
 
+    def last_features(self, windows: Windows) -> Tensor:
+        """Row K − 1 of `features`, (B, d), for acting; subclasses may leave out what it ignores."""
+        return self.features(windows)[:, -1]
+
     def normalized(self, windows: Windows) -> Windows:
         """Standardised states, and returns-to-go divided by `return_scale`.
 
@@ -218,7 +222,7 @@ class SequencePolicy(nn.Module, ABC):
     def act_and_features(self, windows: Windows) -> tuple[Tensor, Tensor]:
         """Predictions at the last step, and the features (B, d) that they are made from."""
         normalized = self.normalized(windows)
-        features, exposed = self.features(normalized)[:, -1], self._exposed_last(normalized)
+        features, exposed = self.last_features(normalized), self._exposed_last(normalized)
         return self.head.predict(features, exposed), features  # type: ignore[arg-type]
 
     def max_return(self, windows: Windows) -> Tensor:
@@ -243,9 +247,9 @@ class SequencePolicy(nn.Module, ABC):
         return Exposed.before(windows, self.head.exposure.lags)
 
     def _exposed_last(self, windows: Windows) -> Exposed | None:
-        exposed, (batch, length) = self.exposed(windows), windows.mask.shape
-        last = torch.arange(1, batch + 1, device=windows.mask.device) * length - 1
-        return None if exposed is None else exposed.select(last)
+        if not isinstance(self.head, ItemHead) or self.head.exposure is None:
+            return None
+        return Exposed.before_last(windows, self.head.exposure.lags)
 
 
 class TokenEmbedding(nn.Module):

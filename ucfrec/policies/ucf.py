@@ -98,6 +98,15 @@ class UCFPolicy(SequencePolicy):
 
     def attend(self, windows: Windows) -> tuple[Tensor, Tensor]:
         """Features (B, K, d) and attention probabilities (B, H, K, 3K), from normalised windows."""
+        return self._outputs(*self._fused(windows), _visible(windows.mask))
+
+    def last_features(self, windows: Windows) -> Tensor:
+        """Row K − 1 of `features`, (B, d): attention has a single query."""
+        states, tokens = self._fused(windows)
+        return self._outputs(states[:, -1:], tokens, _visible(windows.mask)[:, -1:])[0][:, 0]
+
+    def _fused(self, windows: Windows) -> tuple[Tensor, Tensor]:
+        """The tokens s_t (B, K, d), and all tokens (B, 3K, d), once their streams are fused."""
         tokens = self.embed(windows, self.head.embed(windows.actions))
         streams = (self.return_stream, self.state_stream, self.action_stream)
         padded = some_padding(windows.mask)
@@ -114,9 +123,12 @@ class UCFPolicy(SequencePolicy):
         revealed = revealed + F.linear(actions, of_action)
         fused_actions = self.fuse_norm(actions + revealed)
 
-        tokens = interleave(fused_returns, fused_states, fused_actions)
-        attended, attention = self.attention(fused_states, tokens, windows.mask)
-        hidden = self.dropout.add(fused_states, attended)
+        return fused_states, interleave(fused_returns, fused_states, fused_actions)
+
+    def _outputs(self, states: Tensor, tokens: Tensor, visible: Tensor) -> tuple[Tensor, Tensor]:
+        """Features (B, Q, d) and attention (B, H, Q, 3K) of Q tokens s_t, (B, Q, d)."""
+        attended, attention = self.attention(states, tokens, visible)
+        hidden = self.dropout.add(states, attended)
         hidden = self.dropout.add(hidden, self.mlp(self.mlp_norm(hidden)))
         return self.final_norm(hidden), attention
 
@@ -202,16 +214,16 @@ class SupervisedAttention(nn.Module):
         self.out = nn.Linear(config.dim, config.dim)
         self.dropout = Dropout(config.dropout)
 
-    def forward(self, states: Tensor, tokens: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Attend from `states` (B, K, d) to `tokens` (B, 3K, d).
+    def forward(self, states: Tensor, tokens: Tensor, visible: Tensor) -> tuple[Tensor, Tensor]:
+        """Attend from `states` (B, Q, d) to `tokens` (B, 3K, d).
 
         Args:
             states: the queries.
             tokens: keys and values, in the order R_0, s_0, a_0, R_1, …
-            mask: (B, K) bool, false at padding.
+            visible: (B, Q, 3K) bool, true where a state may attend to a token; somewhere in a row.
 
         Returns:
-            Output (B, K, d), without dropout of its own, and probabilities (B, H, K, 3K) before
+            Output (B, Q, d), without dropout of its own, and probabilities (B, H, Q, 3K) before
             dropout. Each row sums to one; padded tokens get zero probability, except from their own
             row.
         """
@@ -222,8 +234,8 @@ class SupervisedAttention(nn.Module):
 
         query = split(self.query(self.norm(states)))
         key, value = map(split, self.key_value(self.norm(tokens)).chunk(2, dim=-1))
-        scores = query @ key.transpose(-2, -1) / (dim // self.heads) ** 0.5  # (B, H, K, 3K)
-        scores = scores.masked_fill(~_visible(mask).unsqueeze(1), -torch.inf)
+        scores = query @ key.transpose(-2, -1) / (dim // self.heads) ** 0.5  # (B, H, Q, 3K)
+        scores = scores.masked_fill(~visible.unsqueeze(1), -torch.inf)
         attention = scores.softmax(-1)
         mixed = (self.dropout(attention) @ value).transpose(1, 2).reshape(batch, length, dim)
         return self.out(mixed), attention

@@ -1,5 +1,6 @@
 """A trained policy, read back from its run folder."""
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +20,7 @@ from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.store import ITEM_STATES
+from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files import read_json
 from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors
@@ -197,6 +198,34 @@ def read_record(run: Path) -> dict[str, Any]:
         sealed.require_small()
     require_run_record(run / RUN, record)
     return record
+
+
+def store_from(run: Path, store: Path) -> str | None:
+    """The folder of a store as seen from that of a run; None on another drive of Windows."""
+    try:
+        return os.path.relpath(store.resolve(), run.resolve())
+    except ValueError:
+        return None
+
+
+def store_of(run: Path, record: Mapping[str, Any]) -> EpisodeStore | None:
+    """The store that a run was trained on; None where it is gone or changed.
+
+    It is looked for where it lies as seen from the run, so that both can be moved or copied
+    together, and where it lay when the run was trained.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    places = [Path(record["store"])]
+    if from_run := record.get("store_from_run"):
+        places.insert(0, Path(os.path.normpath(run.resolve() / from_run)))
+    for path in places:
+        if (path / "meta.json").is_file():
+            store = EpisodeStore.open(path)
+            if store.meta["fingerprint"] == record["fingerprint"]:
+                return store
+    return None
 
 
 def duplicates_of(record: Mapping[str, Any]) -> str:

@@ -72,8 +72,8 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.episodes.store import EpisodeStore
     from ucfrec.reporting.model_card import write_card
     from ucfrec.runs.config import resolve_config
+    from ucfrec.runs.describe import describe_run
     from ucfrec.runs.refit import refit
-    from ucfrec.runs.run import describe_run
     from ucfrec.runs.screened import describe_screened, train_screened
 
     if options.threads is not None:

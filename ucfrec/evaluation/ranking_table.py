@@ -52,7 +52,8 @@ def ranking_rows(
     """One row for every policy and baseline.
 
     Each measure of `ucfrec.evaluation.ranking.MEASURES` has beside it `<measure>_interval` and
-    `<measure>_difference`: the value less the first policy's, with its interval.
+    `<measure>_difference`: the value less the first policy's, with its interval. Rows of policies
+    have their `decision_rule`, and its hash as `rule`.
 
     Args:
         policies: at least one; the first is the reference of the differences.
@@ -82,9 +83,12 @@ def ranking_rows(
         "train_fingerprint": trained.record["fingerprint"],
         **provenance(),
     }
+    rules = dict(zip(named, (policy.rule for policy in policies), strict=False))
     rows = []
     for one in compare(period, ranked, k, reference, seed):
         row: dict[str, Any] = {"policy": one.name, "coverage": one.coverage}
+        if rule := rules.get(one.name):
+            row |= {"rule": rule.hash, "decision_rule": rule.as_dict()}
         for name in MEASURES:
             row[name] = one.values[name]
             row[f"{name}_interval"] = list(one.intervals[name])

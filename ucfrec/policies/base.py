@@ -17,6 +17,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.policies.heads import Head, ItemHead, head_from
+from ucfrec.policies.layers import some_padding
 from ucfrec.policies.values import ValueHead, advantage_weights
 from ucfrec.settings import Dropout, Width, require, settings_table
 
@@ -156,6 +157,10 @@ class SequencePolicy(nn.Module, ABC):
     def features(self, windows: Windows) -> Tensor:
         """Inputs (B, K, d) of the action head, from normalised windows; row t ignores a_t."""
 
+    def last_features(self, windows: Windows) -> Tensor:
+        """Row K − 1 of `features`, (B, d), for acting; subclasses may leave out what it ignores."""
+        return self.features(windows)[:, -1]
+
     def normalized(self, windows: Windows) -> Windows:
         """Standardised states, and returns-to-go divided by `return_scale`.
 
@@ -184,14 +189,19 @@ class SequencePolicy(nn.Module, ABC):
         Returns:
             The loss, and scalars to log.
         """
-        mask, exposed = windows.mask, self.exposed(windows)
-        exposed = None if exposed is None else exposed.select(windows.mask.flatten())
-        given = (features[mask], windows.actions[mask], exposed)
+        exposed, padded = self.exposed(windows), some_padding(windows.mask)
+
+        def steps(values: Tensor) -> Tensor:  # (B, K, …) -> (M, …)
+            return values.flatten(0, 1) if padded is None else values[padded]
+
+        if exposed is not None and padded is not None:
+            exposed = exposed.select(padded.flatten())
+        given = (steps(features), steps(windows.actions), exposed)
         if self.values is None:
             value = self.head.loss(*given)  # type: ignore[arg-type]
             return value, {"action_loss": value.detach()}
-        values = self.values(windows, self.head.embed(windows.actions))[mask]
-        returns = windows.returns_to_go[mask]
+        values = steps(self.values(windows, self.head.embed(windows.actions)))
+        returns = steps(windows.returns_to_go)
         losses = self.head.losses(*given)  # type: ignore[arg-type]
         if self.config.advantage_weights:
             losses = losses * advantage_weights(values, returns)
@@ -207,9 +217,13 @@ class SequencePolicy(nn.Module, ABC):
 
     def act(self, windows: Windows) -> Tensor:
         """Predictions at the last step: actions (B, A), or logits over items (B, n_items)."""
+        return self.act_and_features(windows)[0]
+
+    def act_and_features(self, windows: Windows) -> tuple[Tensor, Tensor]:
+        """Predictions at the last step, and the features (B, d) that they are made from."""
         normalized = self.normalized(windows)
-        features, exposed = self.features(normalized)[:, -1], self._exposed_last(normalized)
-        return self.head.predict(features, exposed)  # type: ignore[arg-type]
+        features, exposed = self.last_features(normalized), self._exposed_last(normalized)
+        return self.head.predict(features, exposed), features  # type: ignore[arg-type]
 
     def max_return(self, windows: Windows) -> Tensor:
         """The largest return-to-go to expect at the last step, (B,) in reward units.
@@ -233,9 +247,9 @@ class SequencePolicy(nn.Module, ABC):
         return Exposed.before(windows, self.head.exposure.lags)
 
     def _exposed_last(self, windows: Windows) -> Exposed | None:
-        exposed, (batch, length) = self.exposed(windows), windows.mask.shape
-        last = torch.arange(1, batch + 1, device=windows.mask.device) * length - 1
-        return None if exposed is None else exposed.select(last)
+        if not isinstance(self.head, ItemHead) or self.head.exposure is None:
+            return None
+        return Exposed.before_last(windows, self.head.exposure.lags)
 
 
 class TokenEmbedding(nn.Module):

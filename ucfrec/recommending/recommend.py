@@ -67,8 +67,7 @@ def recommend(
         raise InputError(
             "this policy's actions are vectors; recommending needs a policy trained on items"
         )
-    if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or k < 1:
-        raise InputError(f"k is {k!r}; give a whole number, 1 or more")
+    _require_whole(k)
     index = pd.Index(trained.item_ids)
     excluded = None if candidates is None else _all_but(index, candidates)
     decider = trained.decider(rule)
@@ -86,6 +85,11 @@ def recommend(
             yield _recommended(trained, store, batch, chosen)
 
     return frames()
+
+
+def _require_whole(k: int) -> None:
+    if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or k < 1:
+        raise InputError(f"k is {k!r}; give a whole number, 1 or more")
 
 
 @dataclass(frozen=True)

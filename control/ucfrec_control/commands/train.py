@@ -7,7 +7,7 @@ import torch
 from ucfrec.commands.train import training_options
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.runs.config import resolve_config
-from ucfrec.runs.run import describe_run
+from ucfrec.runs.describe import describe_run
 from ucfrec_control.learners.train import SCREENINGS, dataset_of, preset_of, train_control
 
 

@@ -11,7 +11,7 @@ CONTROL = Program(
     "ucfrec_control.commands",
     {
         "prepare": "a dataset to an episode store",
-        "collect": "datasets from a SAC learner; resumes",
+        "collect": "datasets from a SAC learner, or from a saved agent",
         "convert": "D4RL HDF5 to Minari, or back",
         "distract": "a store with a distractor in its states",
         "screen": "which state dimensions have an effect",

@@ -39,6 +39,7 @@ UCFREC = Program(
         "demo": "run every step on simulated logs and write a report; resumes",
         "collect": "simulate sessions and write them as Parquet logs",
         "prepare": "turn logs into an episode store",
+        "screen": "which logged observation columns have no effect",
         "train": "train a policy on an episode store; resumes",
         "settings": "list every training setting: default, range, meaning",
         "evaluate": "measure the return of policies in a simulator",

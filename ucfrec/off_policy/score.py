@@ -121,11 +121,14 @@ def logged_sessions(
                 f"{files[0]}: in all {unknown:,} rows the item is not in the store of the run; "
                 "give logs of the same catalogue"
             )
-        if store.observation_size != record["observation_size"]:
+        if store.observation_size != trained.logged_observation_size:
             raise InputError(
-                f"the policy was trained with observations of {record['observation_size']} numbers;"
-                f" those of the logs have {store.observation_size}"
+                "the policy was trained with observations of "
+                f"{trained.logged_observation_size} numbers; those of the logs have "
+                f"{store.observation_size}"
             )
+        if store.observation_size and trained.dropped:
+            store = store.without_observation_dimensions(trained.dropped)
         users = np.asarray(pq.read_table(folder / EPISODE_USERS).column(schema.USER_ID))
         yield LoggedSessions(store, users, report, unknown)
 

@@ -191,7 +191,7 @@ def _next_steps(
     rewards = np.zeros(len(items), dtype=np.float32)
     items[places], rewards[places] = _positions(index, histories.item_ids), histories.rewards
     columns: dict[str, Array] = {schema.ITEM: items, schema.REWARD: rewards}
-    expected = trained.record["observation_size"]
+    expected = trained.logged_observation_size
     if expected:
         observations = histories.observations
         size = 0 if observations is None else observations.shape[1]
@@ -200,7 +200,8 @@ def _next_steps(
                 f"the policy was trained with observations of {expected} numbers; those of the "
                 f"histories have {size}"
             )
-        columns[schema.OBSERVATION] = np.repeat(observations, lengths, axis=0)
+        seen = np.delete(observations, trained.dropped, axis=1)
+        columns[schema.OBSERVATION] = np.repeat(seen, lengths, axis=0)
     users = _positions(pd.Index(trained.user_ids), histories.users)
     return EpisodeStore.from_arrays(columns, lengths, {schema.USER: users}, trained.item_states)
 

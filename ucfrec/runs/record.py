@@ -46,6 +46,10 @@ def _count(value: object) -> bool:
     return type(value) is int and 0 <= value < _LARGEST
 
 
+def _counts(value: object) -> bool:
+    return isinstance(value, list) and all(map(_count, value))
+
+
 def _number(value: object) -> bool:
     if isinstance(value, int) and not isinstance(value, bool):
         return abs(value) < _LARGEST
@@ -115,5 +119,7 @@ _OPTIONAL: Final[Mapping[str, Callable[[object], bool]]] = {
     "data": _object,
     "versions": _object,
     "augmentation": _or_none(_object),
+    "dropped_observations": _counts,
+    "screening": _object,
     "policy": _object,
 }

@@ -37,6 +37,8 @@ COUNTS = "training_counts.safetensors"
 RETURNS = "training_returns.safetensors"
 RULE = "decision_rule.json"
 REWARD_MODEL = "reward_model"
+DROPPED = "dropped_observations"
+"""Entry of a record: columns of the logged observation that the policy does not see."""
 INPUTS = (ITEM_STATES, ITEMS, USERS, COUNTS, RETURNS)
 """Files of a run that training does not change."""
 
@@ -137,6 +139,17 @@ class TrainedPolicy:
         return learner_of(self.record)
 
     @property
+    def dropped(self) -> tuple[int, ...]:
+        """Columns of the logged observation that the policy does not see, ascending."""
+        return tuple(self.record.get(DROPPED, ()))
+
+    @property
+    def logged_observation_size(self) -> int:
+        """Columns that observations must have; 0 if the policy sees none."""
+        kept: int = self.record["observation_size"]
+        return kept + len(self.dropped) if kept else 0
+
+    @property
     def returns(self) -> ReturnToGo:
         """What the returns-to-go of the training counted."""
         return ReturnToGo(**self.record["return_to_go"])
@@ -182,6 +195,7 @@ class TrainedPolicy:
             self.item_ids if item_numbers is None else item_numbers,
             self.user_ids,
             seed,
+            self.dropped,
         )
 
 

@@ -14,12 +14,6 @@ from ucfrec_control.learners.train import SCREENINGS, dataset_of, preset_of, tra
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `train`."""
     training_options(parser)
-    parser.add_argument(
-        "--screen",
-        choices=["copies", "drop"],
-        help="what to do with state dimensions without effect: add copies that intervene on them, "
-        "or drop them (default: not screened)",
-    )
 
 
 def run(options: argparse.Namespace) -> None:

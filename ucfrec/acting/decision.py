@@ -209,7 +209,7 @@ class Decider:
         if self.rule.tilt and self.reward_model is None:
             raise InputError(
                 f"the rule has tilt {self.rule.tilt:g}, but the run has no reward model of items; "
-                "train it with --set reward.fit=true, or set the tilt to 0"
+                "train it with --set rule.choose=true, or set the tilt to 0"
             )
         if self.rule.tag_window and (self.likeness is None or not self.likeness.tags.shape[1]):
             raise InputError(

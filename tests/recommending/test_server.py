@@ -60,9 +60,8 @@ def test_term_ends_it_after_the_requests_in_flight(trained: TrainedPolicy) -> No
                 answer += block
         assert answer.startswith(b"HTTP/1.1 200 OK")
         assert b'"items"' in answer
-        out, errors = process.communicate(timeout=60)
-        assert (process.returncode, errors) == (0, "")
-        assert "stopped" in out
+        _, errors = process.communicate(timeout=60)
+        assert (process.returncode, errors) == (0, "ucfrec serve: stopped\n")
         with pytest.raises(httpx.TransportError):
             httpx.get(f"{address}/health")
 

@@ -1,6 +1,7 @@
 """`ucfrec serve`: answer requests for recommendations over HTTP."""
 
 import argparse
+import sys
 from pathlib import Path
 
 from ucfrec.commands.options import limit_options, limits_given, rule_given, rule_options
@@ -99,4 +100,4 @@ def run(options: argparse.Namespace) -> None:
             Server(config, f"ucfrec serve: {trained!r}").run([listening])
         except Interrupted:
             # What was asked of a server that is told to stop is done.
-            print("ucfrec serve: stopped")
+            print("ucfrec serve: stopped", file=sys.stderr)

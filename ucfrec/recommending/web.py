@@ -198,9 +198,9 @@ _DESCRIBED: Final = {
 
 
 def _responses() -> dict[int | str, dict[str, Any]]:
-    faults = {
+    faults: dict[int | str, dict[str, Any]] = {
         status: {"description": text, "content": {_JSON: {"schema": _ERROR}}}
         for status, text in _FAULTS.items()
     }
-    answer = {"description": "The items.", "content": {_JSON: {"schema": _ANSWER}}}
+    answer: dict[str, Any] = {"description": "The items.", "content": {_JSON: {"schema": _ANSWER}}}
     return {200: answer, **faults}

@@ -19,6 +19,7 @@ CONTROL = Program(
         "train": "train a policy on a store; resumes",
         "evaluate": "normalised scores of trained policies",
         "benchmark": "every learner on the zoo files; resumes",
+        "rates": "learning rates by validation loss; resumes",
         "robustness": "scores lost to distractors; resumes",
         "figures": "figures of runs and result rows",
     },

@@ -13,7 +13,12 @@ from tests.support.planted import CONSTANT, f, fitted, planted
 from tests.support.real_data import data_folder
 from ucfrec.counterfactual.augment import accept
 from ucfrec.counterfactual.edit_statistics import MoveReport, MoveStatistics
-from ucfrec.counterfactual.generators import CSGConfig, Generator, make_generator
+from ucfrec.counterfactual.generators import (
+    CSGConfig,
+    Generator,
+    _products,
+    make_generator,
+)
 from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig
 from ucfrec.counterfactual.reward_model_fit import fit_crm
 from ucfrec.episodes.windows import Transitions
@@ -167,3 +172,11 @@ def test_noise_fills_the_band_in_every_direction_and_spares_what_never_varies(
     assert (moves[:, CONSTANT] == 0).all()
     varying = moves[:, crm.state_std > 0]
     assert varying.mean(0).abs().max() < 0.03
+
+
+def test_products_are_those_of_every_steps_own_matrix() -> None:
+    matrices, vectors = torch.randn(4, 3, 3), torch.randn(9, 3)
+    rows = [2, 0, 6, 1]
+    own = matrices[torch.tensor([0, 0, 2, 2, 2, 2, 2, 2, 3])]
+    expected = torch.einsum("mij,mj->mi", own, vectors)
+    torch.testing.assert_close(_products(matrices, vectors, rows), expected)

@@ -94,11 +94,17 @@ def slowly(made: ExposureTerm, states: ItemStates, shown: Exposed) -> Tensor:
     return added.float()
 
 
+def to_all(made: ExposureTerm, shown: Exposed) -> Tensor:
+    """What the term adds to the logits of all items."""
+    zeros = torch.zeros(len(shown.items), ITEMS, dtype=made.common.dtype)
+    return made.added_to(zeros, shown)
+
+
 @given(kinds, seeds)
 def test_additions_are_those_of_loops_over_items_and_lags(kind: str, seed: int) -> None:
     made, shown = term(kind, seed), exposed(7, seed)
     expected = slowly(made, item_states(kind, seed), shown)
-    everything = made.to_all(shown).detach()
+    everything = to_all(made, shown).detach()
     torch.testing.assert_close(everything, expected, rtol=1e-4, atol=1e-4)
     some = torch.tensor([4, 0, 4, ITEMS - 1])
     torch.testing.assert_close(made.to_items(shown, some).detach(), everything[:, some])
@@ -113,13 +119,13 @@ def test_a_large_catalogue_takes_the_sparse_path_to_the_same_result(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made, shown = term(kind, 3), exposed(20, 3)
-    dense = made.to_all(shown)
+    dense = to_all(made, shown)
     assert kind == "embeddings" or not made.likeness._tag_matrix().is_sparse
     dense.square().sum().backward()
     gradients = [parameter.grad for parameter in made.parameters()]
     monkeypatch.setattr(exposure, "_DENSE", ITEMS * TAGS - 1)
     large = term(kind, 3)
-    found = large.to_all(shown)
+    found = to_all(large, shown)
     assert kind == "embeddings" or large.likeness._tag_matrix().is_sparse
     torch.testing.assert_close(found, dense)
     found.square().sum().backward()
@@ -141,7 +147,7 @@ def test_gradients_are_those_of_differences(kind: str) -> None:
         )
 
     made.forward = lambda shown, items=None: (  # type: ignore[method-assign]
-        made.to_all(shown) if items is None else made.to_items(shown, items)
+        to_all(made, shown) if items is None else made.to_items(shown, items)
     )
     leaves = tuple(p.detach().clone().requires_grad_() for p in (made.common, made.by_lag))
     assert torch.autograd.gradcheck(additions, leaves)
@@ -149,7 +155,7 @@ def test_gradients_are_those_of_differences(kind: str) -> None:
 
 def test_an_untrained_term_adds_nothing() -> None:
     made = ExposureTerm(LAGS, KNOTS, Likeness.of(item_states("tags")))
-    assert (made.to_all(exposed(5, 0)) == 0).all()
+    assert (to_all(made, exposed(5, 0)) == 0).all()
 
 
 @given(kinds, seeds)
@@ -157,7 +163,7 @@ def test_without_anything_shown_nothing_is_added(kind: str, seed: int) -> None:
     made = term(kind, seed)
     rewards, returns = torch.full((3, LAGS), HIGH), torch.tensor([-9.0, 0.0, 9.0])
     nothing = Exposed(torch.full((3, LAGS), -1), rewards, returns)
-    assert (made.to_all(nothing) == 0).all()
+    assert (to_all(made, nothing) == 0).all()
     assert (made.to_items(nothing, torch.arange(ITEMS)) == 0).all()
 
 
@@ -252,7 +258,7 @@ def test_neither_the_step_nor_what_follows_is_seen(seed: int, t: int, kind: str)
         before, actions=actions, returns_to_go=returns, rewards=rewards, states=before.states + 1
     )
     first, second = (
-        made.to_all(Exposed.before(each, LAGS)).view(B, K, ITEMS) for each in (before, after)
+        to_all(made, Exposed.before(each, LAGS)).view(B, K, ITEMS) for each in (before, after)
     )
     assert torch.equal(first[:, : t + 1], second[:, : t + 1])
 
@@ -264,7 +270,7 @@ def test_the_reward_of_a_step_is_seen_by_the_steps_after_it(seed: int, t: int) -
     rewards[:, t] = torch.where(rewards[:, t] < (LOW + HIGH) / 2, HIGH, LOW)
     after = replace(before, rewards=rewards)
     first, second = (
-        made.to_all(Exposed.before(each, LAGS)).view(B, K, ITEMS) for each in (before, after)
+        to_all(made, Exposed.before(each, LAGS)).view(B, K, ITEMS) for each in (before, after)
     )
     changed = (first != second).any(2).any(0)
     assert changed.tolist() == [t < step <= t + LAGS for step in range(K)]
@@ -280,10 +286,10 @@ def test_padding_is_never_shown(seed: int, kind: str) -> None:
     )
     shown, again = Exposed.before(before, LAGS), Exposed.before(noisy, LAGS)
     assert torch.equal(shown.items, again.items)
-    assert torch.equal(made.to_all(shown), made.to_all(again))
+    assert torch.equal(to_all(made, shown), to_all(made, again))
     rows = before.mask.flatten()
     torch.testing.assert_close(
-        made.to_all(shown.select(rows)), made.to_all(shown).view(B * K, ITEMS)[rows]
+        to_all(made, shown.select(rows)), to_all(made, shown).view(B * K, ITEMS)[rows]
     )
     # The first step of a session has been shown nothing.
     firsts = torch.zeros_like(before.mask)
@@ -293,8 +299,8 @@ def test_padding_is_never_shown(seed: int, kind: str) -> None:
 
 def test_a_term_read_back_is_the_one_saved() -> None:
     made, shown = term("tags", 2), exposed(6, 2)
-    expected = made.to_all(shown)
+    expected = to_all(made, shown)
     other = ExposureTerm(LAGS, KNOTS, Likeness(ITEMS, 4, 3))
-    other.to_all(shown)  # a matrix of tags has been made before the weights are read
+    to_all(other, shown)  # a matrix of tags has been made before the weights are read
     other.load_state_dict(made.state_dict())
-    torch.testing.assert_close(other.to_all(shown), expected)
+    torch.testing.assert_close(to_all(other, shown), expected)

@@ -88,7 +88,8 @@ def test_exposure_moves_predictions_by_what_was_shown_alone(name: str) -> None:
     with torch.no_grad():
         plain = head.predict(policy.features(normalized)[:, -1])
         last = torch.arange(1, len(plain) + 1) * K - 1
-        added = head.exposure.to_all(Exposed.before(normalized, 3).select(last))
+        term = Exposed.before(normalized, 3).select(last)
+        added = head.exposure.added_to(torch.zeros(len(last), ITEMS), term)
         torch.testing.assert_close(policy.act(windows), plain + added)
         own = windows.actions.clone()
         own[:, -1] = other(own[:, -1])
@@ -133,7 +134,8 @@ def test_the_loss_is_weighted_by_the_advantage(sizes: dict[str, int]) -> None:
     normalized = policy.normalized(windows)
     assert policy.values is not None
     mask = windows.mask
-    values, returns = policy.values(normalized)[mask], normalized.returns_to_go[mask]
+    values = policy.values(normalized, policy.head.embed(windows.actions))[mask]
+    returns = normalized.returns_to_go[mask]
     weights = advantage_weights(values, returns)
     assert weights.max() > 1.2 * weights.min()
     losses = policy.head.losses(policy.features(normalized)[mask], windows.actions[mask])

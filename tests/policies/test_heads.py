@@ -209,7 +209,8 @@ def test_exposure_is_added_to_the_logits(tags: bool) -> None:
     shown = shown_before(9)
     assert head.exposure is not None
     logits, plain = head.predict(features, shown), head.predict(features)
-    torch.testing.assert_close(logits, plain + head.exposure.to_all(shown))
+    added = head.exposure.added_to(torch.zeros(9, N), shown)
+    torch.testing.assert_close(logits, plain + added)
     assert (logits - plain).abs().max() > 0.5
     losses = head.losses(features, actions, shown)
     expected = -logits.log_softmax(-1)[torch.arange(9), actions]
@@ -292,3 +293,38 @@ def test_a_head_has_an_exposure_term_if_it_looks_back() -> None:
     plain = head_from(sizes, DIM, 0)
     assert isinstance(plain, ItemHead)
     assert plain.exposure is None
+
+
+def test_vectors_are_kept_until_a_weight_changes() -> None:
+    torch.manual_seed(0)
+    head = ItemHead(8, N, 5)
+    head.start_from(torch.randn(N, 5), torch.rand(N))
+    features = torch.randn(4, 8)
+    optimizer = torch.optim.AdamW(head.eval().parameters(), lr=0.1, fused=True)
+
+    def kept() -> Tensor:
+        with torch.no_grad():
+            assert head.all_vectors() is head.all_vectors()
+            return head.predict(features)
+
+    def check() -> None:
+        vectors = head.vectors(torch.arange(N))
+        expected = features @ vectors.T / 8**0.5 + head.bias
+        torch.testing.assert_close(kept(), expected.detach())
+
+    check()
+    before = kept()
+    head.loss(features, torch.arange(4)).backward()  # type: ignore[no-untyped-call]
+    optimizer.step()
+    assert not torch.allclose(kept(), before)
+    check()
+    head.start_from(torch.randn(N, 5), torch.rand(N))
+    check()
+    head.load_state_dict({name: value + 1 for name, value in head.state_dict().items()})
+    check()
+    head.double().float()
+    check()
+    head.train()
+    head.correction.data += 1
+    head.eval()
+    check()

@@ -75,6 +75,16 @@ sequence = pytest.mark.parametrize("name", ["ucf", "dt", "dc", "lsdt"])
 
 @both_heads
 @pytest.mark.parametrize("name", ["ucf", "dt", "dc", "lsdt", "bc"])
+def test_the_last_features_are_the_last_row_of_all(name: str, sizes: dict[str, int]) -> None:
+    policy, windows = build(name, sizes), random_windows(sizes)
+    with torch.no_grad():
+        normalized = policy.normalized(windows)
+        expected = policy.features(normalized)[:, -1]
+        torch.testing.assert_close(policy.last_features(normalized), expected)
+
+
+@both_heads
+@pytest.mark.parametrize("name", ["ucf", "dt", "dc", "lsdt", "bc"])
 @pytest.mark.parametrize("t", [2, 5])
 def test_neither_the_action_nor_the_future_moves_its_prediction(
     name: str, sizes: dict[str, int], t: int

@@ -10,8 +10,12 @@ import torch
 
 from tests.support.tagged import tagged_store
 from ucfrec.acting.decision import Decider, DecisionRule
+from ucfrec.acting.learned_sessions import LearnedSessions, LoggedEnds, SessionEnd
+from ucfrec.acting.policy_actor import PolicyActor
+from ucfrec.acting.rollout import rollout
 from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model
 from ucfrec.counterfactual.item_reward_rows import RewardRows
+from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files import read_json
@@ -75,19 +79,50 @@ def test_a_tilt_pays_where_the_reward_model_knows_the_items(
     folder: Path, trained: TrainedPolicy
 ) -> None:
     search = search_of(folder, trained)
-    plain, tilted = (search.play(DecisionRule(2.0, tilt=tilt, temperature=1.0)) for tilt in (0, 4))
+    plain, tilted = search.play([DecisionRule(2.0, tilt=tilt, temperature=1.0) for tilt in (0, 4)])
     assert tilted.value > plain.value + 2 * plain.error
     assert tilted.items < plain.items
 
 
 def test_playing_a_rule_twice_gives_the_same(folder: Path, trained: TrainedPolicy) -> None:
     rule = DecisionRule(2.0, tilt=1.0, temperature=0.5)
-    assert search_of(folder, trained).play(rule) == search_of(folder, trained).play(rule)
+    assert search_of(folder, trained).play([rule]) == search_of(folder, trained).play([rule])
+
+
+def test_rules_played_side_by_side_do_what_each_does_alone(
+    folder: Path, trained: TrainedPolicy
+) -> None:
+    train, validation = training_views(EpisodeStore.open(folder / "store"))
+    search = search_of(folder, trained)
+    rules = [
+        DecisionRule(2.0, temperature=1.0),
+        DecisionRule(1.0, floor=1.0, tilt=2.0, temperature=0.5),
+        DecisionRule(3.0, tag_window=3),
+        DecisionRule(3.0, tilt=4.0, tag_window=2, temperature=2.0),
+    ]
+    together = search.play(rules)
+    model, n = trained.reward_model, FEW.sessions
+    assert model is not None
+    ends = LoggedEnds.of(train, model.lags, 100_000, 0)
+    end = SessionEnd(Likeness.of(validation.item_states), ends)
+    longest = int(train.lengths.max())
+    world = LearnedSessions(validation, model, search.calibration, end, n, longest)
+    users = np.arange(len(validation.item_states.user_features))
+    for rule, candidate in zip(rules, together, strict=True):
+        # A session a row, with sessions that begin anew and rows that are no longer live.
+        decider = replace(trained.decider(rule), likeness=Likeness.of(validation.item_states))
+        actor = PolicyActor(
+            *(decider, n, validation.observation_size, validation.item_states, None, users), seed=0
+        )
+        alone = rollout(world, actor, n, 0)  # type: ignore[arg-type]
+        assert candidate.value == pytest.approx(float(alone.returns.mean()), abs=1e-9)
+        assert candidate.length == pytest.approx(float(alone.lengths.mean()), abs=1e-9)
+        assert candidate == search.play([rule])[0]
 
 
 def test_unsupported_and_narrow_rules_are_not_allowed(folder: Path, trained: TrainedPolicy) -> None:
     search = search_of(folder, trained)
-    played = search.play(DecisionRule(2.0, temperature=1.0))
+    (played,) = search.play([DecisionRule(2.0, temperature=1.0)])
     assert search.allowed(played)
     assert not search.allowed(replace(played, support=0.5))
     assert not search.allowed(replace(played, items=1.0))

@@ -31,7 +31,7 @@ def limits(inputs: Inputs, folder: Path) -> Counter[str]:
         _expect(
             counts, job, "file too large", Running(_limited(job, out, resource.RLIMIT_FSIZE, 1))
         )
-        for megabytes in (300, 1500, 2500):
+        for megabytes in (20, 200, 1000):
             out = place / f"memory-{job.name}-{megabytes}{job.suffix}"
             memory = megabytes * 2**20
             started = Running(command(*job.arguments(out)), memory=memory)
@@ -154,7 +154,7 @@ def hostile_parquet(folder: Path) -> Counter[str]:
     for path in sorted(place.glob("*.parquet")):
         end = Running(
             command("prepare", path, "--out", place / "store", "--memory-limit", "200MB"),
-            memory=6 * 2**30,
+            memory=4 * 2**30,
         ).wait(60)
         counts["cases"] += 1
         counts["refused"] += end.status == 2

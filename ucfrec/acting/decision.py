@@ -168,7 +168,7 @@ class DecisionRule:
         items = torch.multinomial(probabilities, 1, generator=generator)
         return items[:, 0], probabilities.gather(1, items)[:, 0]
 
-    def ranked(self, scores: Tensor, k: int, uniforms: Tensor) -> Tensor:
+    def ranked(self, scores: Tensor, k: int, uniforms: Tensor | None) -> Tensor:
         """`k` different items (B, k), best first, or drawn one after the other.
 
         Once all of the `top_k` items have been drawn, the others follow, best first.
@@ -176,9 +176,10 @@ class DecisionRule:
         Args:
             scores: (B, n_items) of `Decider.scores`; k at most n_items.
             k: number of items.
-            uniforms: (B, n_items) draws from [0, 1); not read at temperature 0.
+            uniforms: (B, n_items) draws from [0, 1); needed at a temperature above 0.
         """
         if self.temperature > 0:
+            assert uniforms is not None
             # The largest sums of log-probability and Gumbel noise are draws without replacement.
             noise = uniforms.double().clamp(min=1e-300)
             drawn = self.log_probabilities(scores) - torch.log(-torch.log(noise))
@@ -243,8 +244,18 @@ class Decider:
     @torch.no_grad()
     def act(self, windows: Windows, collected: Tensor) -> Tensor:
         """The policy's outputs at the last step, on the CPU: see `SequencePolicy.act`."""
-        device = self.policy.state_mean.device
-        return self.policy.act(self.asked(windows, collected).to(device)).cpu()
+        return self.act_and_features(self.asked(windows, collected))[0]
+
+    @torch.no_grad()
+    def act_and_features(self, asked: Windows) -> tuple[Tensor, Tensor | None]:
+        """The policy's outputs at the last step of windows of `asked`, and the features (B, d) that
+        they are made from, on the CPU; None of a learner that is no network of features (item-knn,
+        crm-greedy)."""
+        policy, moved = self.policy, asked.to(self.policy.state_mean.device)
+        if type(policy).act is not SequencePolicy.act:
+            return policy.act(moved).cpu(), None
+        outputs, features = policy.act_and_features(moved)
+        return outputs.cpu(), features.cpu()
 
     def scores(
         self,
@@ -271,14 +282,27 @@ class Decider:
         Raises:
             InputError: no item is left in some row.
         """
-        scores = self.act(windows, collected)
+        logits = self.act(windows, collected)
+        return self.scores_from(logits, windows, forbidden, users, shown)
+
+    @torch.no_grad()
+    def scores_from(
+        self,
+        logits: Tensor,
+        windows: Windows,
+        forbidden: Tensor | None = None,
+        users: Tensor | None = None,
+        shown: Shown | None = None,
+    ) -> Tensor:
+        """`scores` from the policy's outputs (B, n_items)."""
+        scores = logits
         if self.rule.tilt:
-            scores = scores + self.rule.tilt * self.rewards(windows, users, shown)
+            scores = self.rewards(windows, users, shown).mul_(self.rule.tilt).add_(scores)
         if forbidden is not None:
             scores = scores.masked_fill(forbidden, -torch.inf)
         if self.rule.tag_window:
             scores = self._without_recent_tags(scores, windows)
-        none = torch.isneginf(scores).all(1)
+        none = torch.isneginf(scores.amax(1))
         if none.any():
             raise InputError(
                 f"in {int(none.sum())} of {len(none)} decisions every item is left out; allow more "
@@ -301,4 +325,6 @@ class Decider:
         shown = Shown.before_last(windows).items[:, : self.rule.tag_window]
         alike = self.likeness.to_all(self.likeness.profile(shown, torch.ones(shown.shape)))
         left = scores.masked_fill(alike > 0, -torch.inf)
-        return torch.where(torch.isneginf(left).all(1, keepdim=True), scores, left)
+        none = torch.isneginf(left.amax(1))
+        left[none] = scores[none]
+        return left

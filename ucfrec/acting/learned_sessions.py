@@ -116,6 +116,7 @@ class LearnedSessions:
         end: SessionEnd,
         sessions: int,
         longest: int,
+        copies: int = 1,
     ) -> None:
         """
         Args:
@@ -123,12 +124,16 @@ class LearnedSessions:
             reward_model: of rewards.
             calibration: slope and intercept of the reward model's scores on held-out steps.
             end: of the ends of sessions.
-            sessions: N.
+            sessions: number of sessions that differ.
             longest: steps after which a session ends in any case.
+            copies: how often each session is played; N is `copies` times `sessions`. Environment i
+                draws the same numbers as environment i modulo `sessions`.
         """
         from gymnasium.vector import AutoresetMode
 
-        self.num_envs, self.metadata = sessions, {"autoreset_mode": AutoresetMode.SAME_STEP}
+        self.num_envs = sessions * copies
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        self._different = sessions
         self._store, self._model, self._end = store, reward_model, end
         self._slope, self._intercept = calibration
         self._longest = longest
@@ -147,9 +152,21 @@ class LearnedSessions:
         lags = self._model.lags
         self._shown = Shown(torch.full((n, lags), -1), torch.zeros(n, lags))
         self._steps = np.zeros(n, dtype=np.int64)
-        self._episodes = np.arange(n) % self._store.n_episodes
+        self._numbers = np.arange(n) % self._different
+        self._episodes = self._numbers % self._store.n_episodes
         self._sessions.users = torch.from_numpy(self._users[self._episodes])
         return self._observe(), self._info()
+
+    def keep(self, rows: IntArray) -> None:
+        """End all sessions but those of `rows`, which are the only environments until `reset`."""
+        self._sessions.keep(rows)
+        self._shown = self._shown.at(torch.from_numpy(rows))
+        self._steps, self._episodes = self._steps[rows], self._episodes[rows]
+        self._numbers = self._numbers[rows]
+
+    def _draws(self) -> npt.NDArray[np.float64]:
+        """(N,) from [0, 1)."""
+        return self._rng.random(self._different)[self._numbers]
 
     def step(
         self, actions: npt.NDArray[Any]
@@ -163,7 +180,7 @@ class LearnedSessions:
         if self._outcomes is not None:
             low, high = self._outcomes
             chance = (rewards - low) / (high - low)
-            rewards = np.where(self._rng.random(len(chance)) < chance, high, low)
+            rewards = np.where(self._draws() < chance, high, low)
         ends = self._end.probabilities(self._shown, items, rewards, self._steps)
         self._sessions.record(items, torch.from_numpy(rewards))
         latest = Shown(items.unsqueeze(1), torch.from_numpy(rewards).float().unsqueeze(1))
@@ -174,7 +191,7 @@ class LearnedSessions:
             )
         )
         self._steps += 1
-        terminated = self._rng.random(len(ends)) < ends
+        terminated = self._draws() < ends
         truncated = (self._steps >= self._longest) & ~terminated
         ended = terminated | truncated
         info: dict[str, Any] = {}
@@ -184,7 +201,7 @@ class LearnedSessions:
         self._sessions.begin(rows)
         self._shown.items[rows], self._shown.rewards[rows] = -1, 0.0
         self._steps[rows] = 0
-        self._episodes[rows] = (self._episodes[rows] + self.num_envs) % self._store.n_episodes
+        self._episodes[rows] = (self._episodes[rows] + self._different) % self._store.n_episodes
         self._sessions.users = torch.from_numpy(self._users[self._episodes])
         info |= self._info()
         return self._observe(), rewards.astype(np.float32), terminated, truncated, info
@@ -192,7 +209,7 @@ class LearnedSessions:
     def _observe(self) -> FloatArray:
         size = self._store.observation_size
         if not size:
-            return np.zeros((self.num_envs, 0), dtype=np.float32)
+            return np.zeros((len(self._steps), 0), dtype=np.float32)
         steps = np.minimum(self._steps, self._store.lengths[self._episodes] - 1)
         values = self._store.step_values(schema.OBSERVATION, self._episodes, steps)
         return np.asarray(values, dtype=np.float32)

@@ -82,6 +82,15 @@ class PolicyActor:
         if self._shown is not None:
             self._shown[rows] = False
 
+    def keep(self, rows: IntArray) -> None:
+        """Forget all episodes but those of `rows`, which become the only environments."""
+        if self._sessions is not None:
+            self._sessions.keep(rows)
+        if self._shown is not None:
+            self._shown = self._shown[rows]
+        for name in ("_actions", "_states", "_rewards", "_mask", "_steps", "_reward_sums"):
+            setattr(self, name, getattr(self, name)[rows])
+
     def inform(self, info: Mapping[str, Any]) -> None:
         """Record the users of the next step (`USER_IDS`) and its forbidden items (`FORBIDDEN`).
 
@@ -138,14 +147,21 @@ class PolicyActor:
             users, shown = self._sessions.users[rows], Shown(*self._sessions.shown).at(rows)
         of_rows = None if forbidden is None else forbidden[rows]
         windows, sums = self._windows(rows), self._reward_sums[rows]
-        scores = self._decider.scores(windows, sums, of_rows, users, shown)
-        actions[rows], chances[rows] = self._decider.rule.choose(scores, self._generator)
+        decided = self._decided(rows, windows, sums, of_rows, users, shown)
+        actions[rows], chances[rows] = decided
         self._actions[:, -1] = actions
         if self._shown is not None:
             self._shown[rows, actions[rows]] = True
         played = actions.numpy()
         indices = played if self._item_ids is None else self._item_ids[played]
         return indices, chances.numpy().astype(np.float32)
+
+    def _decided(
+        self, rows: Tensor, windows: Windows, collected: Tensor, *given: Any
+    ) -> tuple[Tensor, Tensor]:
+        """Items and their probabilities, (M,) each, of the `rows` (M,); see `Decider.scores`."""
+        scores = self._decider.scores(windows, collected, *given)
+        return self._decider.rule.choose(scores, self._generator)
 
     def observe(self, actions: npt.NDArray[Any], rewards: FloatArray) -> None:
         """Subtract the rewards (N,) from the returns-to-go and advance by one step.

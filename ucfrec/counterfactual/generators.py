@@ -128,22 +128,37 @@ class TangentGenerator:
         """See `Generator.propose`."""
         low, high = self.band
         near = torch.cdist(self._crm.normalised_states(states), self._centres).argmin(dim=1)
-        covariance = self._covariances[near]
         noise = torch.randn(states.shape, generator=generator)
         length = low + (high - low) * torch.rand(len(states), 1, generator=generator)
+        # In order of clusters, so that no step needs a copy of its cluster's matrix.
+        order = near.argsort(stable=True)
+        rows = torch.bincount(near, minlength=len(self._centres)).tolist()
+        given = (each[order] for each in (states, actions, z, noise, length))
+        moves = self._moves(*given, rows)
+        return states + self._crm.state_std * torch.empty_like(moves).index_copy_(0, order, moves)
 
+    def _moves(
+        self,
+        states: Tensor,
+        actions: Tensor,
+        z: Tensor,
+        noise: Tensor,
+        length: Tensor,
+        rows: list[int],
+    ) -> Tensor:
+        """Moves Δ (M, S) of steps in order of their clusters, which have so many `rows` each."""
         reward, gradient = self._reward(states, actions, z, torch.zeros_like(states))
-        steepest = torch.einsum("mij,mj->mi", covariance, gradient)
-        move = torch.einsum("mij,mj->mi", self._roots[near], noise)
+        steepest = _products(self._covariances, gradient, rows)
+        move = _products(self._roots, noise, rows)
         move = _scaled(
             move - steepest * _ratio((gradient * move).sum(1), gradient, steepest), length
         )
         for _ in range(self._config.corrections):
             current, gradient = self._reward(states, actions, z, move)
-            steepest = torch.einsum("mij,mj->mi", covariance, gradient)
+            steepest = _products(self._covariances, gradient, rows)
             step = steepest * _ratio(current - reward, gradient, steepest)
             move = _shortened(move - _shortened(step, length), length)
-        return states + self._crm.state_std * move
+        return move
 
     def _reward(
         self, states: Tensor, actions: Tensor, z: Tensor, move: Tensor
@@ -288,6 +303,12 @@ def _faithful(
     crm.requires_grad_(False)
     fit(csg, draw, loss, loop, folder, seed=seed, describe="state generator")
     return csg
+
+
+def _products(matrices: Tensor, vectors: Tensor, rows: list[int]) -> Tensor:
+    """Products (M, S) of matrices (C, S, S) with vectors (M, S), of which each has so many rows."""
+    parts = zip(matrices, vectors.split(rows), strict=True)
+    return torch.cat([part @ matrix.T for matrix, part in parts])
 
 
 def _ratio(change: Tensor, gradient: Tensor, steepest: Tensor) -> Tensor:

@@ -56,6 +56,17 @@ class Exposed:
         returns = windows.returns_to_go.flatten()
         return cls(_earlier(items, lags, -1), _earlier(windows.rewards, lags, 0), returns)
 
+    @classmethod
+    def before_last(cls, windows: Windows, lags: int) -> "Exposed":
+        """For the last step of B windows, as `before`, (B, lags)."""
+        shown = Shown.before_last(windows.last(lags + 1))
+        missing = lags - shown.items.shape[1]
+        return cls(
+            nn.functional.pad(shown.items, (0, missing), value=-1),
+            nn.functional.pad(shown.rewards, (0, missing)),
+            windows.returns_to_go[:, -1],
+        )
+
     def select(self, rows: Tensor) -> "Exposed":
         """The steps with the given indices, or where a bool mask of the M steps is true."""
         return Exposed(self.items[rows], self.rewards[rows], self.returns[rows])
@@ -130,6 +141,15 @@ class Likeness(nn.Module):
         if matrix.is_sparse:
             return cast("Tensor", torch.sparse.mm(matrix, profile.T)).T
         return profile @ matrix.T
+
+    def added_to(self, values: Tensor, profile: Tensor) -> Tensor:
+        """`values` (M, n_items), which are overwritten, plus the likeness of all items."""
+        if not self.tags.shape[1]:
+            return values.addmm_(profile, self.directions.T)
+        matrix = self._tag_matrix()
+        if matrix.is_sparse:
+            return values.add_(self.to_all(profile))
+        return values.addmm_(profile, matrix.T)
 
     def to_items(self, profile: Tensor, items: Tensor) -> Tensor:
         """Likeness to profiles (M, F) of items: (M, L) for items (L,), (M,) for items (M, 1)."""
@@ -218,12 +238,12 @@ class ExposureTerm(nn.Module):
         liked = liked.clamp(0, 1)
         return repeated + repeated_liked * liked, alike + alike_liked * liked
 
-    def to_all(self, exposed: Exposed) -> Tensor:
-        """Additions (M, n_items) to the logits of all items."""
+    def added_to(self, logits: Tensor, exposed: Exposed) -> Tensor:
+        """Logits (M, n_items) of all items with the term; the given ones are overwritten."""
         repeated, alike = self.weights(exposed)
-        added = self.likeness.to_all(self.likeness.profile(exposed.items, alike))
+        logits = self.likeness.added_to(logits, self.likeness.profile(exposed.items, alike))
         rows, lags = torch.nonzero(exposed.items >= 0, as_tuple=True)
-        return added.index_put((rows, exposed.items[rows, lags]), repeated[rows, lags], True)
+        return logits.index_put_((rows, exposed.items[rows, lags]), repeated[rows, lags], True)
 
     def to_items(self, exposed: Exposed, items: Tensor) -> Tensor:
         """Additions to the logits of items: (M, L) for items (L,), (M,) for items (M, 1)."""

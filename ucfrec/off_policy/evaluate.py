@@ -372,7 +372,7 @@ def step_features(
     # What the policy thinks of an item counts for the models also where the rule takes the best.
     of_chosen, of_shown = scores_of(batch.scores.log_softmax(-1), items, probabilities)
     seen = StepInputs(
-        context=context_of(trained, batch),
+        context=context_of(batch),
         state_size=batch.windows.states.shape[2],
         chosen=embeddings[items] * known[:, None],
         shown=probabilities @ embeddings,

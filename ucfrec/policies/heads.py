@@ -1,7 +1,7 @@
 """Action heads, which embed and predict actions: vectors, or items of a catalogue."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -70,6 +70,7 @@ class ItemHead(nn.Module):
         self.project = nn.Linear(embedding_size, dim)
         self.correction = nn.Parameter(torch.zeros(n_items, dim))
         self.bias = nn.Parameter(torch.zeros(n_items))
+        self._kept: tuple[tuple[object, ...], Tensor] | None = None
 
     def start_from(self, embeddings: Tensor, counts: Tensor) -> None:
         """Set the embeddings (n_items, D) and, from training counts (n_items,), the bias."""
@@ -82,9 +83,33 @@ class ItemHead(nn.Module):
         """Vectors (..., d) of int64 items (...,)."""
         return self.project(self.embeddings[items]) + self.correction[items]  # type: ignore[no-any-return]
 
+    def all_vectors(self) -> Tensor:
+        """Vectors (n_items, d) of all items.
+
+        In evaluation mode without gradients they are computed once for each state of the weights.
+        Fused optimizers and `.data` change weights without a trace, so whatever trains also ends
+        what is kept: gradients, and any change of mode.
+        """
+        if self.training or torch.is_grad_enabled():
+            self._kept = None
+            return self.project(self.embeddings) + self.correction  # type: ignore[no-any-return]
+        weights = (self.embeddings, self.correction, self.project.weight, self.project.bias)
+        state = tuple((id(each), each.data_ptr(), each._version) for each in weights)
+        if self._kept is None or self._kept[0] != state:
+            self._kept = state, self.project(self.embeddings) + self.correction
+        return self._kept[1]
+
+    def train(self, mode: bool = True) -> Self:
+        """Enter training mode, or with `mode` false evaluation mode."""
+        self._kept = None
+        return super().train(mode)
+
     def embed(self, actions: Tensor) -> Tensor:
         """Embed int64 items (B, K) as (B, K, d)."""
-        return self.vectors(actions)
+        if self.training or torch.is_grad_enabled():
+            self._kept = None
+            return self.vectors(actions)
+        return F.embedding(actions, self.all_vectors())
 
     def predict(self, features: Tensor, exposed: Exposed | None = None) -> Tensor:
         """Logits over all items (..., n_items) from features (..., d).
@@ -93,10 +118,11 @@ class ItemHead(nn.Module):
             features: (M, d) with `exposed`.
             exposed: what was shown before the M steps; needed with an exposure term.
         """
-        vectors = self.project(self.embeddings) + self.correction
-        logits: Tensor = features @ vectors.T / features.shape[-1] ** 0.5 + self.bias
+        # Scaling the features instead of the logits saves two passes over the larger of them.
+        scaled = features / features.shape[-1] ** 0.5
+        logits: Tensor = F.linear(scaled, self.all_vectors(), self.bias)
         if self.exposure is not None and exposed is not None:
-            logits = logits + self.exposure.to_all(exposed)
+            return self.exposure.added_to(logits, exposed)
         return logits
 
     def loss(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:

@@ -19,6 +19,7 @@ from ucfrec.policies.base import (
     interleave,
     require_heads,
 )
+from ucfrec.policies.layers import CausalDepthwise, Dropout, some_padding
 from ucfrec.policies.losses import mask_loss, masked_mean, parent_targets
 from ucfrec.settings import Share, Weight, settings_table
 
@@ -87,9 +88,8 @@ class UCFPolicy(SequencePolicy):
         self.fuse_norm = nn.LayerNorm(dim)
         self.attention = SupervisedAttention(config)
         self.mlp_norm = nn.LayerNorm(dim)
-        self.mlp = nn.Sequential(
-            nn.Linear(dim, 4 * dim), nn.GELU(), nn.Linear(4 * dim, dim), nn.Dropout(config.dropout)
-        )
+        self.mlp = nn.Sequential(nn.Linear(dim, 4 * dim), nn.GELU(), nn.Linear(4 * dim, dim))
+        self.dropout = Dropout(config.dropout)
         self.final_norm = nn.LayerNorm(dim)
 
     def features(self, windows: Windows) -> Tensor:
@@ -98,10 +98,20 @@ class UCFPolicy(SequencePolicy):
 
     def attend(self, windows: Windows) -> tuple[Tensor, Tensor]:
         """Features (B, K, d) and attention probabilities (B, H, K, 3K), from normalised windows."""
+        return self._outputs(*self._fused(windows), _visible(windows.mask))
+
+    def last_features(self, windows: Windows) -> Tensor:
+        """Row K − 1 of `features`, (B, d): attention has a single query."""
+        states, tokens = self._fused(windows)
+        return self._outputs(states[:, -1:], tokens, _visible(windows.mask)[:, -1:])[0][:, 0]
+
+    def _fused(self, windows: Windows) -> tuple[Tensor, Tensor]:
+        """The tokens s_t (B, K, d), and all tokens (B, 3K, d), once their streams are fused."""
         tokens = self.embed(windows, self.head.embed(windows.actions))
         streams = (self.return_stream, self.state_stream, self.action_stream)
+        padded = some_padding(windows.mask)
         returns, states, actions = (
-            stream(token, windows.mask) for stream, token in zip(streams, tokens, strict=True)
+            stream(token, padded) for stream, token in zip(streams, tokens, strict=True)
         )
         # A linear layer on the concatenation of the modalities known so far ([R, 0, 0], [R, s, 0],
         # [R, s, a]) equals a running sum of the products with the three blocks of its weight.
@@ -113,29 +123,38 @@ class UCFPolicy(SequencePolicy):
         revealed = revealed + F.linear(actions, of_action)
         fused_actions = self.fuse_norm(actions + revealed)
 
-        tokens = interleave(fused_returns, fused_states, fused_actions)
-        attended, attention = self.attention(fused_states, tokens, windows.mask)
-        hidden = fused_states + attended
-        hidden = hidden + self.mlp(self.mlp_norm(hidden))
+        return fused_states, interleave(fused_returns, fused_states, fused_actions)
+
+    def _outputs(self, states: Tensor, tokens: Tensor, visible: Tensor) -> tuple[Tensor, Tensor]:
+        """Features (B, Q, d) and attention (B, H, Q, 3K) of Q tokens s_t, (B, Q, d)."""
+        attended, attention = self.attention(states, tokens, visible)
+        hidden = self.dropout.add(states, attended)
+        hidden = self.dropout.add(hidden, self.mlp(self.mlp_norm(hidden)))
         return self.final_norm(hidden), attention
 
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         """L_action + λ L_mask over all steps (Eq. 5, Algorithm 6), and scalars to log."""
-        config, mask = self.config, windows.mask
         normalized = self.normalized(windows)
         features, attention = self.attend(normalized)
         imitation, scalars = self.imitation(features, normalized)
+        if self.config.lambda_mask == 0:
+            return imitation, scalars
+        supervision, attended = self._supervision(attention, windows.mask)
+        return imitation + self.config.lambda_mask * supervision, scalars | attended
+
+    def _supervision(self, attention: Tensor, mask: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """L_mask, and scalars to log about attention (B, H, K, 3K)."""
+        config = self.config
         targets = parent_targets(
             mask, config.parent_window, config.parent_decay, config.parent_action
         )
         supervision = mask_loss(attention, targets, mask)
-        on_parents = (attention.mean(1) * (targets > 0)).sum(-1)
+        on_parents = (attention.detach().mean(1) * (targets > 0)).sum(-1)
         visible = _visible(mask)
         uniform = ((targets > 0) & visible).sum(-1) / visible.sum(-1)
-        return imitation + config.lambda_mask * supervision, {
-            **scalars,
+        return supervision, {
             "mask_loss": supervision.detach(),
-            "attention_on_parents": masked_mean(on_parents.detach(), mask),
+            "attention_on_parents": masked_mean(on_parents, mask),
             "uniform_on_parents": masked_mean(uniform, mask),
         }
 
@@ -162,11 +181,10 @@ class ConvStream(nn.Module):
         super().__init__()
         self.blocks = nn.ModuleList(_ConvBlock(config) for _ in range(config.conv_blocks))
 
-    def forward(self, tokens: Tensor, mask: Tensor) -> Tensor:
+    def forward(self, tokens: Tensor, mask: Tensor | None) -> Tensor:
         """Map (B, K, d) to (B, K, d); padded steps are set to zero before every convolution."""
-        keep = mask.unsqueeze(-1)
         for block in self.blocks:
-            tokens = block(tokens.masked_fill(~keep, 0.0))
+            tokens = block(tokens, mask)
         return tokens
 
 
@@ -174,15 +192,14 @@ class _ConvBlock(nn.Module):
     def __init__(self, config: UCFConfig) -> None:
         super().__init__()
         dim = config.dim
-        self.depthwise = nn.Conv1d(dim, dim, kernel_size=3, groups=dim)
+        self.depthwise = CausalDepthwise(dim)
         self.pointwise = nn.Linear(dim, dim)
-        self.dropout = nn.Dropout(config.dropout)
+        self.dropout = Dropout(config.dropout)
         self.norm = nn.LayerNorm(dim)
 
-    def forward(self, tokens: Tensor) -> Tensor:
-        # (B, K, d) -> (B, d, 2 + K) -> (B, K, d): the output at t depends on t − 2 to t.
-        local = self.depthwise(F.pad(tokens.transpose(1, 2), (2, 0))).transpose(1, 2)
-        return self.norm(tokens + self.dropout(F.gelu(self.pointwise(local))))  # type: ignore[no-any-return]
+    def forward(self, tokens: Tensor, mask: Tensor | None) -> Tensor:
+        local = self.depthwise(tokens, mask)
+        return self.norm(self.dropout.add(tokens, F.gelu(self.pointwise(local))))  # type: ignore[no-any-return]
 
 
 class SupervisedAttention(nn.Module):
@@ -195,19 +212,20 @@ class SupervisedAttention(nn.Module):
         self.query = nn.Linear(config.dim, config.dim)
         self.key_value = nn.Linear(config.dim, 2 * config.dim)
         self.out = nn.Linear(config.dim, config.dim)
-        self.dropout = nn.Dropout(config.dropout)
+        self.dropout = Dropout(config.dropout)
 
-    def forward(self, states: Tensor, tokens: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Attend from `states` (B, K, d) to `tokens` (B, 3K, d).
+    def forward(self, states: Tensor, tokens: Tensor, visible: Tensor) -> tuple[Tensor, Tensor]:
+        """Attend from `states` (B, Q, d) to `tokens` (B, 3K, d).
 
         Args:
             states: the queries.
             tokens: keys and values, in the order R_0, s_0, a_0, R_1, …
-            mask: (B, K) bool, false at padding.
+            visible: (B, Q, 3K) bool, true where a state may attend to a token; somewhere in a row.
 
         Returns:
-            Output (B, K, d), and probabilities (B, H, K, 3K) before dropout. Each row sums to one;
-            padded tokens get zero probability, except from their own row.
+            Output (B, Q, d), without dropout of its own, and probabilities (B, H, Q, 3K) before
+            dropout. Each row sums to one; padded tokens get zero probability, except from their own
+            row.
         """
         batch, length, dim = states.shape
 
@@ -216,11 +234,11 @@ class SupervisedAttention(nn.Module):
 
         query = split(self.query(self.norm(states)))
         key, value = map(split, self.key_value(self.norm(tokens)).chunk(2, dim=-1))
-        scores = query @ key.transpose(-2, -1) / (dim // self.heads) ** 0.5  # (B, H, K, 3K)
-        scores = scores.masked_fill(~_visible(mask).unsqueeze(1), -torch.inf)
+        scores = query @ key.transpose(-2, -1) / (dim // self.heads) ** 0.5  # (B, H, Q, 3K)
+        scores = scores.masked_fill(~visible.unsqueeze(1), -torch.inf)
         attention = scores.softmax(-1)
         mixed = (self.dropout(attention) @ value).transpose(1, 2).reshape(batch, length, dim)
-        return self.dropout(self.out(mixed)), attention
+        return self.out(mixed), attention
 
 
 def _visible(mask: Tensor) -> Tensor:

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import Decider, DecisionRule
-from ucfrec.acting.logged_decisions import session_scores
+from ucfrec.acting.logged_decisions import LoggedDecisions
 from ucfrec.episodes.item_counts import TrainingCounts, liked_steps
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.progress import progress
@@ -102,22 +103,19 @@ def choose_by_ranking(
     given = _Rows(validation, episodes, steps, items, liked, floor, rates)
     tilts = sorted({0.0, *config.tilts})
     candidates: list[RankedRule] = []
-    with progress(len(tilts) + _HALVINGS, "choose the rule", "candidates") as bar:
 
-        def rank(tilt: float) -> None:
-            rule = replace(decider.rule, tilt=tilt)
-            candidates.append(_ranked(replace(decider, rule=rule), given))
-            bar.update()
+    def rank(tilts: Sequence[float]) -> None:
+        for tilt, top in zip(tilts, _tops(decider, tilts, given), strict=True):
+            candidates.append(_ranked(replace(decider.rule, tilt=tilt), top, given))
 
-        for tilt in tilts:
-            rank(tilt)
-        for _ in range(_HALVINGS):
-            best = _best(candidates)
-            larger = [each for each in candidates if each.rule.tilt > best.rule.tilt]
-            nearest = min(larger, key=lambda each: each.rule.tilt, default=best)
-            if nearest.gain >= 0:
-                break
-            rank((best.rule.tilt + nearest.rule.tilt) / 2)
+    rank(tilts)
+    for _ in range(_HALVINGS):
+        best = _best(candidates)
+        larger = [each for each in candidates if each.rule.tilt > best.rule.tilt]
+        nearest = min(larger, key=lambda each: each.rule.tilt, default=best)
+        if nearest.gain >= 0:
+            break
+        rank([(best.rule.tilt + nearest.rule.tilt) / 2])
     best = _best(candidates)
     return RankedChoice(best.rule, candidates, best.gain >= 0)
 
@@ -143,19 +141,37 @@ class _Rows:
 
 
 @torch.no_grad()
-def _ranked(decider: Decider, rows: _Rows) -> RankedRule:
-    tops = []
-    for first in range(0, len(rows.steps), _AT_ONCE):
-        part = slice(first, first + _AT_ONCE)
-        scores = session_scores(decider, rows.store, rows.episodes[part], rows.steps[part])
-        tops.append(scores.topk(min(SHOWN, scores.shape[1])).indices.numpy())
-    top = np.concatenate(tops)
+def _tops(decider: Decider, tilts: Sequence[float], rows: _Rows) -> list[IntArray]:
+    """The items (M, `SHOWN`) that are shown with each tilt.
+
+    Policy and reward model are computed once for all tilts.
+    """
+    plain, tops = replace(decider, rule=replace(decider.rule, tilt=0.0)), list[list[Tensor]]()
+    starts = range(0, len(rows.steps), _AT_ONCE)
+    with progress(len(rows.steps), "choose the rule", "rows") as bar:
+        for first in starts:
+            part = slice(first, first + _AT_ONCE)
+            known = LoggedDecisions.at(plain, rows.store, rows.episodes[part], rows.steps[part])
+            logits = plain.act(known.windows, known.collected)
+            liked = plain.rewards(known.windows, known.users, known.shown) if any(tilts) else 0.0
+            of_tilts = []
+            for tilt in tilts:
+                scores = plain.scores_from(
+                    logits + tilt * liked, known.windows, known.forbidden, known.users, known.shown
+                )
+                of_tilts.append(scores.topk(min(SHOWN, scores.shape[1])).indices)
+            tops.append(of_tilts)
+            bar.update(len(logits))
+    return [torch.cat(parts).numpy() for parts in zip(*tops, strict=True)]
+
+
+def _ranked(rule: DecisionRule, top: IntArray, rows: _Rows) -> RankedRule:
     hit = (top == rows.items[:, None]).any(1)[rows.liked].astype(np.float64)
     ahead = hit - rows.floor[rows.liked]
     shown = rows.rates[top]
     some = len(hit) > 0
     return RankedRule(
-        rule=decider.rule,
+        rule=rule,
         item_rate=float(np.nanmean(shown)) if np.isfinite(shown).any() else 0.0,
         hits=float(hit.mean()) if some else 0.0,
         gain=float(ahead.mean()) if some else 0.0,

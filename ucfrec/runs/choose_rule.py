@@ -16,14 +16,18 @@ import numpy.typing as npt
 from ucfrec import schema
 from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.acting.learned_sessions import LearnedSessions, LoggedEnds, SessionEnd
-from ucfrec.acting.policy_actor import PolicyActor
-from ucfrec.acting.rollout import Step, rollout
+from ucfrec.acting.many_rules import ManyRules
+from ucfrec.acting.rollout import USER_IDS
 from ucfrec.counterfactual.item_reward_model import ItemRewardModel
 from ucfrec.counterfactual.item_reward_report import scores_of
 from ucfrec.counterfactual.item_reward_rows import RewardRows
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.progress import progress
 from ucfrec.runs.rule_config import RuleConfig
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 
 _MOST_STEPS = 100_000
 """Logged steps that the models of the users are fitted to at most."""
@@ -106,38 +110,45 @@ class RuleSearch:
         end = SessionEnd(likeness, LoggedEnds.of(train, model.lags, _MOST_STEPS, seed))
         rows = RewardRows.of(validation, model.lags, _MOST_STEPS, seed)
         self.calibration = calibrate(model, rows)
-        self._world = LearnedSessions(
-            *(validation, model, self.calibration, end, config.sessions, int(train.lengths.max()))
-        )
+        self._longest, self.end, self._model = int(train.lengths.max()), end, model
         shown = np.bincount(
             train.step_values(schema.ITEM, *train.all_steps()), minlength=len(states.embeddings)
         )
         self._supported = shown >= config.least_impressions
         self.least_items = min(config.least_items, self._supported.sum() / 4)
 
-    def play(self, rule: DecisionRule) -> Candidate:
-        """Play sessions by `rule`."""
-        n, items = self._config.sessions, list[npt.NDArray[np.int64]]()
-        decider = replace(self._decider, rule=rule, likeness=self._likeness)
-        users = np.arange(len(self._store.item_states.user_features))
-        actor = PolicyActor(
-            *(decider, n, self._store.observation_size, self._store.item_states, None, users),
-            seed=self._seed,
+    def play(self, rules: Sequence[DecisionRule]) -> list[Candidate]:
+        """Play sessions by each of the rules, side by side, all with the same draws."""
+        n, count = self._config.sessions, len(rules)
+        if not count:
+            return []
+        world = LearnedSessions(
+            *(self._store, self._model, self.calibration, self.end, n, self._longest, count)
         )
+        deciders = [replace(self._decider, rule=rule, likeness=self._likeness) for rule in rules]
+        users = np.arange(len(self._store.item_states.user_features))
+        states = self._store.item_states
+        actor = ManyRules(deciders, n, self._store.observation_size, states, users, seed=self._seed)
+        returns, lengths, shown = _played(world, actor, self._seed)
+        numbers = np.arange(count * n).reshape(count, n)
+        return [
+            self._candidate(rule, returns[of_rule], lengths[of_rule], shown[shown[:, 0] // n == i])
+            for i, (rule, of_rule) in enumerate(zip(rules, numbers, strict=True))
+        ]
 
-        def record(step: Step) -> None:
-            items.append(step.actions)
-
-        played = rollout(self._world, actor, n, self._seed, record, "choose the rule")  # type: ignore[arg-type]
-        shown = np.concatenate(items)
-        shares = np.bincount(shown) / len(shown)
+    def _candidate(
+        self, rule: DecisionRule, returns: FloatArray, lengths: IntArray, shown: IntArray
+    ) -> Candidate:
+        """What `rule` did in n sessions, (n,) each; `shown` (M, 2) are sessions and items."""
+        n, items = len(returns), shown[:, 1]
+        shares = np.bincount(items) / len(items)
         shares = shares[shares > 0]
         return Candidate(
             rule=rule,
-            value=float(played.returns.mean()),
-            error=float(played.returns.std(ddof=1) / n**0.5) if n > 1 else 0.0,
-            length=float(played.lengths.mean()),
-            support=float(self._supported[shown].mean()),
+            value=float(returns.mean()),
+            error=float(returns.std(ddof=1) / n**0.5) if n > 1 else 0.0,
+            length=float(lengths.mean()),
+            support=float(self._supported[items].mean()),
             items=float(np.exp(-(shares * np.log(shares)).sum())),
         )
 
@@ -156,6 +167,37 @@ class RuleSearch:
             return max(candidates, key=lambda candidate: candidate.items)
         top = max(allowed, key=lambda candidate: candidate.value)
         return next(c for c in allowed if c.value >= top.value - top.error)
+
+
+def _played(
+    world: LearnedSessions, actor: ManyRules, seed: int
+) -> tuple[FloatArray, IntArray, IntArray]:
+    """Play one session in each of the N environments.
+
+    Returns:
+        Returns (N,), lengths (N,), and the environment and item of every step, (M, 2).
+    """
+    observations, info = world.reset(seed)
+    live = np.arange(world.num_envs)
+    returns, lengths = np.zeros(len(live)), np.zeros(len(live), dtype=np.int64)
+    shown = list[IntArray]()
+    with progress(len(live), "choose the rule", "sessions") as bar:
+        while len(live):
+            actor.inform(info)
+            items, _ = actor.act(observations, np.ones(len(live), dtype=bool))
+            observations, rewards, terminated, truncated, info = world.step(items)
+            actor.observe(items, rewards)
+            returns[live] += rewards
+            lengths[live] += 1
+            shown.append(np.stack([live, items], axis=1))
+            going = np.flatnonzero(~(terminated | truncated))
+            bar.update(len(live) - len(going))
+            if len(going) < len(live):
+                live = live[going]
+                world.keep(going)
+                actor.keep(going)
+                observations, info = observations[going], {USER_IDS: info[USER_IDS][going]}
+    return returns, lengths, np.concatenate(shown)
 
 
 def choose_rule(
@@ -178,13 +220,13 @@ def choose_rule(
     """
     search = RuleSearch(decider, train, validation, config, seed)
     learned = decider.policy.values is not None and decider.policy.config.max_return
-    played = [search.play(rule) for rule in _untilted(config, targets, learned)]
+    played = search.play([*_untilted(config, targets, learned)])
     first = search.best(played)
-    played.extend(search.play(rule) for rule in _tilted(config, first.rule))
+    played.extend(search.play([*_tilted(config, first.rule)]))
     second = search.best(_simplest_first(played))
     longest = decider.policy.config.context - 1
     if validation.item_states.tags.shape[1]:
-        played.extend(search.play(rule) for rule in _filtered(config, second.rule, longest))
+        played.extend(search.play([*_filtered(config, second.rule, longest)]))
     best = search.best(_simplest_first(played))
     supported, least_items = search.allowed(best), float(search.least_items)
     return Choice(best.rule, played, search.calibration, least_items, supported)

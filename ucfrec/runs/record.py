@@ -57,7 +57,7 @@ def _object(value: object) -> bool:
 
 
 def _config(value: object) -> bool:
-    return isinstance(value, dict) and {"policy_name", "seed"} <= value.keys()
+    return isinstance(value, dict) and _text(value.get("policy_name")) and "seed" in value
 
 
 def _sizes(value: object) -> bool:

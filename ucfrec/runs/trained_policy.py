@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
 from torch import Tensor
 
 from ucfrec import schema
@@ -19,9 +20,9 @@ from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import ITEM_STATES
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, damage_explained
 from ucfrec.files import read_json
-from ucfrec.fitting.checkpoint import load_tensors, load_weights
+from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.parquet_files import read_ids
 from ucfrec.policies.base import SequencePolicy
@@ -77,24 +78,54 @@ class TrainedPolicy:
         """
         record = read_record(run)
         config = config_from_dict(record["config"])
+        path, learner = (
+            run / "policy" / f"{checkpoint}.safetensors",
+            policy_class(config.policy_name),
+        )
         with random_state_kept():
-            policy = policy_class(config.policy_name)(config.policy, record["sizes"])
-        path = run / "policy" / f"{checkpoint}.safetensors"
-        load_weights(path, policy, _weights(path))
+            build = lambda: learner(config.policy, record["sizes"])  # noqa: E731
+            policy = load_module(path, build, _weights(path))
         policy.eval()
         states = run / ITEM_STATES
-        return cls(
+        trained = cls(
             run,
             policy,
             record,
             ItemStates.load(states) if states.exists() else None,
             _ids(run / ITEMS, schema.ITEM_ID) if states.exists() else None,
             _ids(run / USERS, schema.USER_ID),
-            load_tensors(run / RETURNS)[0]["returns"].numpy(),
+            _returns(run / RETURNS),
             _rule(run / RULE),
             _reward_model(run / REWARD_MODEL / FITTED, record["sizes"]),
             TrainingCounts.load(run / COUNTS) if (run / COUNTS).exists() else None,
         )
+        trained._require_equal_sizes()
+        return trained
+
+    def _require_equal_sizes(self) -> None:
+        """Check that the files of the run are of one catalogue and of one size of states.
+
+        Raises:
+            InputError: a file has another size than the run's record states.
+        """
+        sizes, states = self.record["sizes"], self.item_states
+        state = self.record["observation_size"] + (0 if states is None else states.size)
+        found = {RUN: (sizes["state"], state)}
+        if states is not None and self.item_ids is not None:
+            table = (sizes["items"], sizes["action"])
+            found[ITEM_STATES] = (table, tuple(states.embeddings.shape))
+            found[ITEMS] = (sizes["items"], len(self.item_ids))
+        if states is not None and len(states.user_features):
+            found[USERS] = (len(states.user_features), len(self.user_ids))
+        if self.counts is not None:
+            shapes = tuple(self.counts.shown.shape), tuple(self.counts.liked.shape)
+            found[COUNTS] = (((sizes["items"],),) * 2, shapes)
+        for name, (stated, actual) in found.items():
+            if stated != actual:
+                raise InputError(
+                    f"{self.folder / name} does not fit the run: it has {actual}, the run "
+                    f"{stated}; {REMEDY}"
+                )
 
     def __repr__(self) -> str:
         return f"TrainedPolicy({describe_trained(self.record)})"
@@ -232,9 +263,17 @@ def _rule(path: Path) -> DecisionRule:
 def _reward_model(path: Path, sizes: Mapping[str, int]) -> ItemRewardModel | None:
     if not path.exists():
         return None
-    model = ItemRewardModel(sizes)
-    load_weights(path, model, load_tensors(path)[0])
-    return model.eval()
+    return load_module(path, lambda: ItemRewardModel(sizes), load_tensors(path)[0]).eval()
+
+
+def _returns(path: Path) -> npt.NDArray[np.float32]:
+    with damage_explained(path, REMEDY):
+        returns = load_tensors(path)[0]["returns"]
+        if returns.dim() != 1 or returns.dtype != torch.float32 or not len(returns):
+            raise ValueError("returns are no vector of numbers")
+        if not bool(torch.isfinite(returns).all()):
+            raise ValueError("returns are not finite")
+        return np.asarray(returns.numpy())
 
 
 def _ids(path: Path, column: str) -> npt.NDArray[Any]:

@@ -18,13 +18,11 @@ from ucfrec_simulators.benchmark.plots import (
     plot_distractor,
     plot_methods,
     plot_sweeps,
-    plot_targets,
 )
 from ucfrec_simulators.benchmark.tables import (
     distractor_table,
     method_table,
     sweep_table,
-    target_table,
 )
 from ucfrec_simulators.benchmark.tasks import TASKS
 
@@ -108,10 +106,7 @@ _Shown = tuple[
     Callable[[Sequence[ResultRow], Path], list[Path]],
 ]
 _SHOWN: Final[Mapping[str, tuple[_Shown, ...]]] = {
-    "main": (
-        ("Methods", method_table, plot_methods),
-        ("Target returns", target_table, plot_targets),
-    ),
+    "main": (("Methods", method_table, plot_methods),),
     "additions": (("Additions to the paper, one by one", method_table, plot_additions),),
     "sweeps": (("Settings of UCF", sweep_table, plot_sweeps),),
     "distractor": (("A distractor that causes nothing", distractor_table, plot_distractor),),

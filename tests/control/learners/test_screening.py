@@ -18,7 +18,8 @@ from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.reporting.rows_file import read_rows
 from ucfrec.runs.config import resolve_config
 from ucfrec_control.benchmark import screening_table
-from ucfrec_control.benchmark.plan import Budget, stores_of
+from ucfrec_control.benchmark.budgets import Budget
+from ucfrec_control.benchmark.plan import stores_of
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.distractor import add_distractor

@@ -97,7 +97,7 @@ class RuleGraph(nn.Module):
         windows = self._windows(items, rewards, steps, users, observations)
         windows = self._decider.asked(windows, collected)
         normalized = self.policy.normalized(windows)
-        features = self.policy.features(normalized)[:, -1]
+        features = self.policy.last_features(normalized)
         shown = Shown(items.flip(1), rewards.flip(1))
         scores = self.head.logits(features, shown, normalized.returns_to_go[:, -1])
         if self.reward is not None:
@@ -195,7 +195,7 @@ class _Head(nn.Module):
     def __init__(self, head: ItemHead) -> None:
         super().__init__()
         with torch.no_grad():
-            vectors = head.project(head.embeddings) + head.correction
+            vectors = head.all_vectors()
         self.register_buffer("vectors", vectors.detach())
         self.register_buffer("bias", head.bias.detach())
         self.exposure = None if head.exposure is None else _Exposure(head.exposure)

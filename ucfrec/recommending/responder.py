@@ -207,14 +207,16 @@ class Responder:
 
     def _best(self, asked: Sequence[_Asked], scores: Tensor, some: Tensor) -> list[Answer]:
         n_items = scores.shape[1]
-        drawn = torch.empty(len(asked), 0)
+        drawn = None
         if self.rule.temperature > 0:
             drawn = uniforms(_array([one.user_id for one in asked]), n_items, self._seed)
         normalised = scores.log_softmax(-1)
         answers = [Answer([], [])] * len(asked)
         for k in {one.k for one in asked}:
             rows = torch.tensor([n for n, one in enumerate(asked) if one.k == k])
-            chosen = self.rule.ranked(scores[rows], min(k, n_items), drawn[rows])
+            chosen = self.rule.ranked(
+                scores[rows], min(k, n_items), None if drawn is None else drawn[rows]
+            )
             values = normalised[rows].gather(1, chosen)
             kept = torch.isfinite(values) & some[rows, None]
             for row, items, value, keep in zip(rows.tolist(), chosen, values, kept, strict=True):

@@ -50,8 +50,12 @@ def kept(shape: torch.Size, p: float) -> Tensor:
 
 
 def some_padding(mask: Tensor) -> Tensor | None:
-    """The mask (B, K) of steps that are no padding; None on a CPU if there is no padding at all."""
-    return None if mask.device.type == "cpu" and bool(mask.all()) else mask
+    """The mask (B, K) of steps that are no padding; None on a CPU if there is no padding at all.
+
+    A graph that is exported holds for every padding.
+    """
+    known = mask.device.type == "cpu" and not torch.compiler.is_compiling()
+    return None if known and bool(mask.all()) else mask
 
 
 class CausalDepthwise(nn.Conv1d):

@@ -242,6 +242,23 @@ def store_of(run: Path, record: Mapping[str, Any]) -> EpisodeStore | None:
     return None
 
 
+def verified(run: Path) -> None:
+    """Read every file of a run and compare it with its checksum.
+
+    Raises:
+        InputError: `run` is not a run folder, has no checksums, or a file has another content.
+    """
+    read_record(run)
+    sealed = sealed_record(run, RUN, "train again")[1]
+    if sealed is None or "policy" not in read_json(run / RUN):
+        raise InputError(
+            f"{run} cannot be verified: its training has not ended, or an older ucfrec wrote it; "
+            "train it with this one"
+        )
+    for name, fault in sealed.faults():
+        raise InputError(f"{run / name} {fault}; restore the file, or train again")
+
+
 def duplicates_of(record: Mapping[str, Any]) -> str:
     """The rule for duplicates that the logs of a run were prepared with."""
     rule = record.get("data", {}).get("duplicates")

@@ -21,6 +21,7 @@ CONTROL = Program(
         "benchmark": "every learner on the zoo files; resumes",
         "rates": "learning rates by validation loss; resumes",
         "robustness": "scores lost to distractors; resumes",
+        "reproduce": "one table or figure of the paper; resumes",
         "figures": "figures of runs and result rows",
     },
 )

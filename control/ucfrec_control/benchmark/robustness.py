@@ -66,13 +66,14 @@ def robustness(
         InputError: a file is missing, a method is unknown, `results` has other content, or cells
             failed.
     """
-    cells = list(_cells(data, folder, budget, name, chosen(METHODS, methods, "method")))
+    cells = list(robustness_cells(data, folder, budget, name, chosen(METHODS, methods, "method")))
     return run_grid(cells, ROBUSTNESS_MEASUREMENT, results, workers, "robustness")
 
 
-def _cells(
+def robustness_cells(
     data: Path, folder: Path, budget: Budget, name: str, methods: Sequence[str]
 ) -> Iterator[Cell]:
+    """The cells of some methods; arguments as of `robustness`."""
     for file in budget.files:
         for distractor in DISTRACTORS:
             store = zoo_store(data, stores_of(folder), file, distractor)

@@ -59,14 +59,19 @@ def run(options: argparse.Namespace) -> None:
                 options.table,
                 options.method,
             )
-    _print_tables(rows, options.table)
-    _print_rates(rows)
+    print_scores(rows, options.table)
     print(f"\nrows: {results_given(options)}")
 
 
 def budgets_of(table: str) -> Mapping[str, Budget]:
     """The budgets of a table, by name."""
     return BUDGETS if table in (MAIN, PURSUING) else SWEEPS
+
+
+def print_scores(rows: Sequence[ResultRow], table: str) -> None:
+    """Print the tables of rows of a benchmark, and how learning rates were chosen."""
+    _print_tables(rows, table)
+    _print_rates(rows)
 
 
 def _print_rates(rows: Sequence[ResultRow]) -> None:

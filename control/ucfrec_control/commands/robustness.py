@@ -1,8 +1,10 @@
 """`ucfrec-control robustness`: scores lost to distractors; resumes."""
 
 import argparse
+from collections.abc import Sequence
 
 from ucfrec.commands.grid_options import results_given, rows_given
+from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import benchmarking
 from ucfrec.reporting.tables import format_rows
 from ucfrec_control.benchmark.cells import ROBUSTNESS
@@ -43,8 +45,13 @@ def run(options: argparse.Namespace) -> None:
                 options.workers,
                 options.method,
             )
+    print_robustness(rows)
+    print(f"\nrows: {results_given(options)}")
+
+
+def print_robustness(rows: Sequence[ResultRow]) -> None:
+    """Print what distractors cost, and what screening found."""
     by = ("task", "distractor", "method")
     for lines, values in ((drops(rows), SHOWN_DROPS), (loss_rises(rows), SHOWN_LOSSES)):
         print(f"{format_rows(over_seeds(lines, by, values), (*by, *values))}\n")
     print(format_rows(screening_rows(rows), SHOWN_SCREENING))
-    print(f"\nrows: {results_given(options)}")

@@ -6,6 +6,7 @@ import shutil
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -182,6 +183,11 @@ def _load(source: str, download: bool) -> minari.MinariDataset:
     folder = Path(source) if (Path(source) / "data").is_dir() else _root() / source
     try:
         if download and not folder.is_dir():
+            if find_spec("huggingface_hub") is None:
+                raise InputError(
+                    f"{source} is not in {_root()}, and Minari's downloads need huggingface_hub, "
+                    "which is not installed; install ucfrec[control,minari]"
+                )
             minari.download_dataset(source)
         if not folder.is_dir():
             raise InputError(

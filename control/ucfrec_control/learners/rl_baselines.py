@@ -179,6 +179,28 @@ def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dict[
     return seal(out, RUN, record)
 
 
+@random_state_kept()
+def timed_updates(store: EpisodeStore, config: RLConfig, updates: int) -> float:
+    """Seconds of one update of a training on `store`, by the time of a few.
+
+    Raises:
+        InputError: d3rlpy is not installed.
+    """
+    d3rlpy, train = _d3rlpy(), store.split("train")
+    mean, std = _statistics(train, config)
+    dataset = _dataset(d3rlpy, train, mean.numpy(), std.numpy())
+    learner, times = _learner(config), [0.0]
+    learner.fit(
+        dataset,
+        n_steps=updates + 2,
+        n_steps_per_epoch=updates + 2,
+        logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
+        show_progress=False,
+        callback=lambda *_: times.append(perf_counter()),
+    )
+    return (times[-1] - times[2]) / updates
+
+
 def _begin(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> None:
     record = {
         "command": command_line(),

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import warnings
+from importlib.util import find_spec
 from pathlib import Path
 
 import h5py
@@ -249,6 +250,9 @@ def test_minari_refusals(tmp_path: Path, minari_folder: Path) -> None:
     trajectories = read_d4rl(write_hdf5(tmp_path / "hopper.hdf5", hopper_like()))
     with pytest.raises(InputError, match="fetch it with --download"):
         read_minari("mujoco/hopper/medium-v0")
+    if find_spec("huggingface_hub") is None:
+        with pytest.raises(InputError, match=r"install ucfrec\[control,minari\]"):
+            read_minari("mujoco/hopper/medium-v0", download=True)
     with pytest.raises(InputError, match="no Minari identifier"):
         write_minari(trajectories, "no identifier")
     folder = write_minari(trajectories, "hopper/mine-v0")

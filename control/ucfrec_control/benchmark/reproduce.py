@@ -1,0 +1,68 @@
+"""What the paper's control tables and figures are made of."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from ucfrec_control.benchmark.budgets import Budget
+from ucfrec_control.benchmark.cells import ROBUSTNESS, Cell
+from ucfrec_control.benchmark.methods import MAIN, TABLES
+from ucfrec_control.benchmark.plan import cells_of
+from ucfrec_control.benchmark.robustness import robustness_cells
+
+
+@dataclass(frozen=True)
+class Part:
+    """A table or figure of the paper."""
+
+    table: str
+    """A key of `TABLES`, or `ROBUSTNESS`."""
+    methods: tuple[str, ...] = ()
+    """Rows; empty for all of the table."""
+    files: tuple[str, ...] = ()
+    """Files; empty for those of the budget."""
+    draws: bool = False
+    """Whether it is a figure."""
+
+
+_ABLATED = ("ucf", "ucf-wo-count", "ucf-wo-arch", "dt", "dc", "lsdt")
+_JUDGED = ("dt", "dc", "ucf", "ucf-dropped")
+PARTS: Final[Mapping[str, Part]] = {
+    "table-1": Part(MAIN, ("iql", "cql", "dt", "dc", "lsdt", "ucf-paper", "ucf")),
+    "table-3": Part(MAIN, _ABLATED),
+    "table-9": Part("gate"),
+    "table-10": Part("band"),
+    "figure-2": Part("lambda", draws=True),
+    "figure-3": Part(ROBUSTNESS, _JUDGED, draws=True),
+    "figure-4": Part(ROBUSTNESS, _JUDGED, draws=True),
+    "figure-5": Part(MAIN, ("ucf",), ("hopper_medium-zoo",), draws=True),
+    "figure-6": Part(MAIN, ("ucf",), ("halfcheetah_medium-zoo",), draws=True),
+}
+"""By name; tables 4 to 8 are settings, and table 2 is `ucfrec benchmark recommendation`."""
+
+
+def budget_of(part: Part, budget: Budget) -> Budget:
+    """`budget` with the files of the part."""
+    return replace(budget, files=part.files, where_present=()) if part.files else budget
+
+
+def cells_of_part(
+    part: Part, data: Path, folder: Path, budget: Budget, name: str
+) -> Iterator[Cell]:
+    """The cells of a part; writes the stores that they need.
+
+    Args:
+        part: of `PARTS`.
+        data: folder of the HDF5 files.
+        folder: where stores and runs are kept.
+        budget: of `budget_of`.
+        name: its name.
+
+    Raises:
+        InputError: a file is missing.
+    """
+    if part.table == ROBUSTNESS:
+        return robustness_cells(data, folder, budget, name, part.methods)
+    methods = part.methods or tuple(TABLES[part.table])
+    return cells_of(data, folder, budget, name, part.table, methods)

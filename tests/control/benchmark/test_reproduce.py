@@ -1,0 +1,57 @@
+"""Every table and figure of the paper has its cells, and one command makes it."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.support.control_files import hopper_like, write_hdf5
+from ucfrec.reporting.rows_file import read_rows
+from ucfrec_control.benchmark.budgets import BUDGETS, Budget
+from ucfrec_control.benchmark.cells import ROBUSTNESS
+from ucfrec_control.benchmark.estimate import estimated_hours
+from ucfrec_control.benchmark.methods import MAIN, TABLES
+from ucfrec_control.benchmark.plan import cells_of
+from ucfrec_control.benchmark.reproduce import PARTS, budget_of
+from ucfrec_control.benchmark.robustness import METHODS
+from ucfrec_control.cli import main
+
+TINY = ("train.steps=4", "train.validate_every=2", "policy.dim=16", "policy.context=3")
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_a_part_has_rows_and_files_of_its_tables(name: str) -> None:
+    part = PARTS[name]
+    assert set(part.methods) <= set(METHODS if part.table == ROBUSTNESS else TABLES[part.table])
+    for budget in BUDGETS.values():
+        own = budget_of(part, budget)
+        assert own.files == (part.files or budget.files)
+    assert part.draws == name.startswith("figure")
+
+
+def test_the_estimate_grows_with_steps_and_shrinks_with_workers(tmp_path: Path) -> None:
+    write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
+    hours = {}
+    for steps in (1_000, 1_000_000):
+        settings = (*TINY, f"train.steps={steps}")
+        budget = Budget(("hopper_medium-made",), 2, 1, settings, rl_steps=steps)
+        for method in ("dt", "iql"):
+            cells = list(cells_of(tmp_path, tmp_path / "out", budget, "tiny", MAIN, (method,)))
+            hours[method, steps] = estimated_hours(cells, 1)
+            assert estimated_hours(cells, 4) < hours[method, steps]
+    for method in ("dt", "iql"):
+        assert 0 < 10 * hours[method, 1_000] < hours[method, 1_000_000]
+
+
+def test_one_command_makes_a_figure_and_says_beforehand_how_long(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_hdf5(tmp_path / "hopper_medium-zoo.hdf5", hopper_like((30, 8, 25) * 8))
+    settings = (*TINY, "crm.epochs=1", "csg.epochs=1")
+    budgets = {"small": Budget(("unused",), 1, 1, settings)}
+    monkeypatch.setattr("ucfrec_control.commands.benchmark.BUDGETS", budgets)
+    arguments = ["reproduce", "figure-5", "--data", str(tmp_path), "--out", str(tmp_path / "out")]
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("figure-5: 1 trainings of budget small, about ")
+    assert {row.method for row in read_rows(tmp_path / "out" / "results.jsonl")} == {"ucf"}
+    assert list((tmp_path / "out" / "figure-5").glob("moves-*.png"))

@@ -69,7 +69,7 @@ def recommend(
         )
     if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or k < 1:
         raise InputError(f"k is {k!r}; give a whole number, 1 or more")
-    index = pd.Index(trained.item_ids)
+    index = trained.item_index
     excluded = None if candidates is None else _all_but(index, candidates)
     decider = trained.decider(rule)
 
@@ -197,7 +197,7 @@ def _next_steps(
                 f"histories have {size}"
             )
         columns[schema.OBSERVATION] = np.repeat(observations, lengths, axis=0)
-    users = _positions(pd.Index(trained.user_ids), histories.users)
+    users = _positions(trained.user_index, histories.users)
     return EpisodeStore.from_arrays(columns, lengths, {schema.USER: users}, trained.item_states)
 
 
@@ -224,7 +224,9 @@ def _ranked(
 ) -> pd.DataFrame:
     """Rows of the users (B,) where `some` (B,) is true, from their scores (B, n_items)."""
     k = min(choice.k, scores.shape[1])
-    items = choice.decider.rule.ranked(scores, k, uniforms(users, scores.shape[1], choice.seed))
+    rule, n_items = choice.decider.rule, scores.shape[1]
+    drawn = uniforms(users, n_items, choice.seed) if rule.temperature > 0 else None
+    items = rule.ranked(scores, k, drawn)
     values = scores.log_softmax(-1).gather(1, items)
     kept = (torch.isfinite(values) & some[:, None]).numpy()
     rank = np.cumsum(kept, axis=1)

@@ -23,7 +23,8 @@ class Dropout(nn.Dropout):
             return input
         if input.device.type != "cpu":
             return F.dropout(input, self.p)
-        return input * kept(input.shape, self.p)
+        result: Tensor = input * kept(input.shape, self.p)
+        return result
 
     def add(self, residual: Tensor, input: Tensor) -> Tensor:
         """`residual` + this dropout of `input`, both of the same shape, in one pass."""
@@ -88,7 +89,7 @@ class _ShiftedProducts(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> Any:
         steps, taps = ctx.saved_tensors
         of_steps, of_taps = gradient * taps[2], torch.empty_like(taps)
         of_taps[2] = (gradient * steps).sum((0, 1))

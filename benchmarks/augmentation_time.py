@@ -26,7 +26,7 @@ from ucfrec.reporting.tables import markdown_table
 
 RESULTS = Path("runs/augmentation_time/results.jsonl")
 STEPS, ACTION, CLUSTERS = 8192, 32, 32
-SIZES = (17, 130, 300)
+SIZES = (17, 130)
 
 
 class Case:

@@ -3,7 +3,8 @@
 import shutil
 import tempfile
 import warnings
-from collections.abc import Mapping, Sequence
+import weakref
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
@@ -54,7 +55,7 @@ class Recommender:
             InputError: the policy or a setting is unknown or out of range.
         """
         self.config = resolve_config(policy, None, settings, seed)
-        self._scratch: tempfile.TemporaryDirectory[str] | None = None
+        self._remove_scratch: Callable[[], object] = ExitStack().close
         self._folder: Path | None = None
         self._trained: TrainedPolicy | None = None
 
@@ -101,23 +102,26 @@ class Recommender:
             "split": split,
         }
         options = {name: value for name, value in log_options.items() if value is not None}
+        temporary = Path(tempfile.gettempdir())
         with ExitStack() as stack:
             if not isinstance(data, EpisodeStore):
-                temporary = Path(tempfile.gettempdir())
                 prepared = stack.enter_context(scratch_folder(temporary, "logs"))
                 store = _store(data, prepared, mapping, options)
             elif options or mapping is not None:
                 raise InputError(f"{data} is prepared already; prepare its logs with other options")
             else:
                 store = data
-            scratch = None
+            scratch = stack.enter_context(ExitStack())
             if out is None:
-                scratch = tempfile.TemporaryDirectory(prefix="ucfrec-")
-                out = Path(scratch.name) / "run"
+                # Whoever fits next removes the run, should this process be killed.
+                out = scratch.enter_context(scratch_folder(temporary, "run")) / "run"
             train_run(store, Path(out), self.config)
             write_card(Path(out))
-        self._scratch, self._folder = scratch, Path(out)
-        self._trained = TrainedPolicy.load(self._folder)
+            trained = TrainedPolicy.load(Path(out))
+            kept = scratch.pop_all()
+        self._remove_scratch()
+        self._remove_scratch = weakref.finalize(self, kept.close)
+        self._trained, self._folder = trained, Path(out)
         return self
 
     @property

@@ -24,6 +24,8 @@ RETURN_TO_GO: Final = "return_to_go"
 USER: Final = "user"
 SPLIT: Final = "split"
 TERMINATED: Final = "terminated"
+OFFSETS: Final = "offsets"
+"""First step of each episode within its shard, and the shard's number of steps."""
 
 STEP_DTYPES: Final = {
     ITEM: "<i4",

@@ -11,7 +11,7 @@ CONTROL = Program(
     "ucfrec_control.commands",
     {
         "prepare": "a dataset to an episode store",
-        "collect": "datasets from a SAC learner; resumes",
+        "collect": "datasets from a SAC learner, or from a saved agent",
         "convert": "D4RL HDF5 to Minari, or back",
         "distract": "a store with a distractor in its states",
         "screen": "which state dimensions have an effect",
@@ -19,6 +19,7 @@ CONTROL = Program(
         "train": "train a policy on a store; resumes",
         "evaluate": "normalised scores of trained policies",
         "benchmark": "every learner on the zoo files; resumes",
+        "rates": "learning rates by validation loss; resumes",
         "robustness": "scores lost to distractors; resumes",
         "figures": "figures of runs and result rows",
     },

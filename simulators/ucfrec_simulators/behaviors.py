@@ -45,9 +45,18 @@ def truncated_normal(
     below, above = ndtr((-1 - center) / scale), ndtr((1 - center) / scale)
     quantile = below + generator.random(center.shape) * (above - below)
     actions = np.clip(center + scale * ndtri(quantile), -1, 1).astype(np.float32)
+    return actions, truncated_normal_density(mean, scale, actions).astype(np.float32)
+
+
+def truncated_normal_density(
+    mean: FloatArray, scale: float, actions: FloatArray
+) -> npt.NDArray[np.float64]:
+    """Densities (N,) of actions (N, A) under the distribution of `truncated_normal`."""
+    center = mean.astype(np.float64)
+    inside = ndtr((1 - center) / scale) - ndtr((-1 - center) / scale)
     deviation = (actions - center) / scale
-    logarithm = -(deviation**2) / 2 - np.log(np.sqrt(2 * np.pi) * scale * (above - below))
-    return actions, np.exp(logarithm.sum(axis=1)).astype(np.float32)
+    logarithm = -(deviation**2) / 2 - np.log(np.sqrt(2 * np.pi) * scale * inside)
+    return np.asarray(np.exp(logarithm.sum(axis=1)))
 
 
 class Rule(Memoryless):

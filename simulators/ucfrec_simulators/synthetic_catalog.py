@@ -197,11 +197,15 @@ class SoftmaxGuess(Memoryless):
         errors = np.random.default_rng([0, 5, round(1000 * error)])
         self._guess = world.logits + error * errors.standard_normal(world.logits.shape)
 
-    def probabilities(self) -> npt.NDArray[np.float64]:
-        """(N, n_items) probability of each item in each session's next step."""
-        world = self._world
-        shown = (world.recent_tags[:, :, None] == world.tags).any(axis=1)
-        scores = (self._guess[world.users] - self._variety * shown) / self._temperature
+    def probabilities(self, live: BoolArray | None = None) -> npt.NDArray[np.float64]:
+        """(N, n_items) probability of each item in each session's next step.
+
+        Args:
+            live: (N,) marks the sessions to tell of; None for all.
+        """
+        world, rows = self._world, slice(None) if live is None else live
+        shown = (world.recent_tags[rows, :, None] == world.tags).any(axis=1)
+        scores = (self._guess[world.users[rows]] - self._variety * shown) / self._temperature
         weights = np.exp(scores - scores.max(axis=1, keepdims=True))
         greedy = weights / weights.sum(axis=1, keepdims=True)
         return np.asarray((1 - self._epsilon) * greedy + self._epsilon / scores.shape[1])

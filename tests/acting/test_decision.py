@@ -231,7 +231,8 @@ def test_the_largest_return_must_have_been_learned() -> None:
     asked = Decider(policy, DecisionRule(None)).asked(windows, collected)
     assert policy.values is not None
     with torch.no_grad():
-        best = 8 * policy.values(policy.normalized(windows))[:, -1, 1]
+        actions = policy.head.embed(windows.actions)
+        best = 8 * policy.values(policy.normalized(windows), actions)[:, -1, 1]
     torch.testing.assert_close(asked.returns_to_go[:, -1], best)
 
 

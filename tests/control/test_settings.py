@@ -10,12 +10,12 @@ import pytest
 
 pytest.importorskip("mujoco", reason="needs ucfrec[control]")
 
+from ucfrec.counterfactual.screening import ScreeningConfig
 from ucfrec.errors import InputError
 from ucfrec.settings import describe
 from ucfrec_control.data.collect import CollectConfig
 from ucfrec_control.data.sac import SacConfig
 from ucfrec_control.learners.rl_baselines import RLConfig
-from ucfrec_control.learners.screening import ScreeningConfig
 
 SOURCE = Path(__file__).parents[2] / "control"
 RL = RLConfig("iql", 100, "hopper", "medium")

@@ -11,9 +11,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.states import DISTINCT_TAGS, TAGS_PER_ITEM, ItemStates
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.logs.features import TAGS, item_tags
+from ucfrec.logs.features import item_tags
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 
@@ -85,17 +85,24 @@ def test_items_without_a_row_share_the_tag_of_the_untagged() -> None:
 
 
 def test_at_most_sixteen_tags_are_kept_the_most_frequent() -> None:
-    many = [f"tag {n:02}" for n in range(TAGS + 9)]
+    many = [f"tag {n:02}" for n in range(TAGS_PER_ITEM + 9)]
     lists: Lists = [[*many], many[9:], [*many[9:], "own"], ["own"]]
     tags = tags_of(lists)
-    assert tags.shape == (4, TAGS)
+    assert tags.shape == (4, TAGS_PER_ITEM)
     assert (tags[:3] >= 0).all()
     counts = Counter(word for words in lists for word in words or [])
     rarest = min(counts[word] for word in many[9:])
     assert counts["tag 00"] < rarest
     # All sixteen of item 0 are among those that the others have too.
-    assert shared(tags, 0, 1) == TAGS
+    assert shared(tags, 0, 1) == TAGS_PER_ITEM
     assert (tags[3] >= 0).sum() == 1
+
+
+def test_a_catalogue_keeps_at_most_a_thousand_tags() -> None:
+    lists: Lists = [[f"tag {n}" for n in range(i, i + 8)] for i in range(0, 16_000, 8)]
+    tags = tags_of([*lists, None])
+    assert int(tags.max()) == DISTINCT_TAGS  # the last number is that of items without any
+    assert len(np.unique(tags[tags >= 0])) == DISTINCT_TAGS + 1
 
 
 def test_tags_do_not_depend_on_the_order_of_lists() -> None:

@@ -353,7 +353,7 @@ def test_long_sessions_overflow_nothing() -> None:
     ("change", "says"),
     [
         ({"propensity": np.zeros(10)}, "propensities must be above 0"),
-        ({"propensity": np.full(10, 1.5)}, "not a density"),
+        ({"propensity": np.full(10, 1.5)}, "say that they are densities"),
         ({"target": np.full(10, 1.1)}, "between 0 and 1"),
         ({"target": np.full(10, np.nan)}, "target is not finite at 10 steps"),
         ({"reward": np.full(10, np.inf)}, "reward is not finite"),
@@ -368,6 +368,16 @@ def test_long_sessions_overflow_nothing() -> None:
 def test_wrong_arrays_are_input_errors(change: dict[str, FloatArray], says: str) -> None:
     with pytest.raises(InputError, match=says):
         replace(random_steps([2] * 5), **change)
+
+
+def test_densities_weigh_as_probabilities_do() -> None:
+    """Only their ratio counts, so a change of the actions' unit changes nothing."""
+    steps = random_steps([2, 3, 1] * 20)
+    larger = replace(
+        steps, propensity=steps.propensity * 1e6, target=steps.target * 1e6, densities=True
+    )
+    for name, one in estimate(steps, 0).items():
+        assert estimate(larger, 0)[name].value == pytest.approx(one.value), name
 
 
 def test_one_session_cannot_be_modelled() -> None:

@@ -134,7 +134,8 @@ def test_the_loss_is_weighted_by_the_advantage(sizes: dict[str, int]) -> None:
     normalized = policy.normalized(windows)
     assert policy.values is not None
     mask = windows.mask
-    values, returns = policy.values(normalized)[mask], normalized.returns_to_go[mask]
+    values = policy.values(normalized, policy.head.embed(windows.actions))[mask]
+    returns = normalized.returns_to_go[mask]
     weights = advantage_weights(values, returns)
     assert weights.max() > 1.2 * weights.min()
     losses = policy.head.losses(policy.features(normalized)[mask], windows.actions[mask])

@@ -26,7 +26,6 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.policies.base import SequencePolicy
-from ucfrec.policies.bc import BCConfig, BCPolicy
 from ucfrec.policies.cdt4rec import CDT4RecPolicy
 from ucfrec.policies.cql import ConservativeQ, CQLConfig, optimistic_returns, relabelled
 from ucfrec.policies.dt4rec import DT4RecPolicy
@@ -289,14 +288,20 @@ def test_cql_values_the_better_action_and_presses_unseen_ones_down(tmp_path: Pat
     assert seen - unseen > values[0.0][:2].mean() - values[0.0][2] + 0.5
 
 
-def test_percent_bc_imitates_the_best_sessions(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["bc", "dt", "dc", "lsdt", "ucf", "edt4rec"])
+def test_a_share_learns_from_the_best_sessions(name: str, tmp_path: Path) -> None:
     store = write_store(tmp_path / "store", random_episodes([4] * 20), some_states())
-    view = BCPolicy.training_view(store, BCConfig(best_share=0.25), tmp_path, 0)
-    assert view.n_episodes == 5
-    assert view.returns.min() >= np.sort(store.returns)[-5]
-    assert BCPolicy.training_view(store, BCConfig(), tmp_path, 0).n_episodes == 20
+    learner = policy_class(name)
+    own = {"cql_steps": 2} if name == "edt4rec" else {}
+
+    def view(share: float) -> EpisodeStore:
+        config = learner.Config(best_share=share, **own)
+        return learner.training_view(store, config, tmp_path / str(share), 0)
+
+    assert view(0.25).episode_ids.tolist() == sorted(np.argsort(-store.returns)[:5])
+    assert view(1.0).n_episodes == 20
     with pytest.raises(InputError, match=r"policy\.best_share is 0"):
-        BCPolicy.training_view(store, BCConfig(best_share=0.0), tmp_path, 0)
+        view(0.0)
 
 
 def test_popular_recommends_what_is_popular(tmp_path: Path) -> None:

@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from tests.policies.test_ucf import CATALOG, VECTORS, K, random_windows
+from tests.policies.test_ucf import VECTORS, K, random_windows
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.values import BEST, ValueHead, advantage_weights
 
-S, DIM = CATALOG["state"], 16
+S, DIM = VECTORS["state"], 16
 
 
 def expectile(returns: Tensor, share: float) -> float:
@@ -49,39 +49,57 @@ def test_a_fitted_head_knows_both(sample: str) -> None:
     returns = torch.linspace(0, 1, 400) if sample == "uniform" else torch.arange(400) % 2 * 1.0
     head, none = ValueHead(S, DIM), torch.zeros(len(returns), 1)
     steps = torch.zeros(len(returns), 1, dtype=torch.int64)
-    states = torch.zeros(len(returns), 1, S)
+    states, actions = torch.zeros(len(returns), 1, S), torch.zeros(len(returns), 1, DIM)
     windows = Windows(states, steps, none, returns.unsqueeze(1), steps, torch.ones_like(none) > 0)
     optimizer = torch.optim.Adam(head.parameters(), lr=0.01)
     for _ in range(600):
         optimizer.zero_grad()
-        ValueHead.loss(head(windows)[:, 0], returns).backward()
+        ValueHead.loss(head(windows, actions)[:, 0], returns).backward()
         optimizer.step()
-    mean, best = head(windows)[0, 0].tolist()
+    mean, best = head(windows, actions)[0, 0].tolist()
     exact = BEST**0.5 / (BEST**0.5 + (1 - BEST) ** 0.5) if sample == "uniform" else BEST
     assert mean == pytest.approx(0.5, abs=0.02)
     assert best == pytest.approx(exact, abs=0.02)
     assert exact == pytest.approx(expectile(returns, BEST), abs=0.01)
 
 
-@pytest.mark.parametrize("sizes", [VECTORS, CATALOG], ids=["vectors", "items"])
 @pytest.mark.parametrize("t", [0, 3])
-def test_a_value_reads_its_state_and_step_alone(sizes: dict[str, int], t: int) -> None:
+def test_a_value_reads_its_history_and_nothing_else(t: int) -> None:
+    """States and step numbers up to t, and actions before t."""
     torch.manual_seed(0)
-    head, windows = ValueHead(S, DIM), random_windows(sizes)
-    before = head(windows)
+    head, windows = ValueHead(S, DIM), random_windows(VECTORS, padding=(0, 0, 0))
+    actions = torch.randn(len(windows.mask), K, DIM, requires_grad=True)
+    before = head(windows, actions)
     assert before.shape == (*windows.mask.shape, 2)
-    states = windows.states.clone()
-    other_steps = torch.arange(K) != t
-    states[:, other_steps] += 1
-    changed = replace(
-        windows, states=states, actions=windows.actions + 1, rewards=windows.rewards + 1,
+    assert not torch.autograd.grad(before.sum(), actions, allow_unused=True)[0]
+    states, played = windows.states.clone(), actions.detach().clone()
+    states[:, t + 1 :] += 1
+    played[:, t:] += 1
+    future = replace(
+        windows, states=states, rewards=windows.rewards + 1,
         returns_to_go=windows.returns_to_go + 1,
     )  # fmt: skip
-    after = head(changed)
-    assert torch.equal(before[:, t], after[:, t])
-    assert not torch.allclose(before[:, other_steps], after[:, other_steps])
-    later = head(replace(windows, timesteps=windows.timesteps + 5))
+    after = head(future, played)
+    torch.testing.assert_close(before[:, : t + 1], after[:, : t + 1])
+    assert not torch.allclose(before[:, t + 1 :], after[:, t + 1 :])
+    states = windows.states.clone()
+    states[:, 0] += 1
+    assert not torch.allclose(before[:, t], head(replace(windows, states=states), actions)[:, t])
+    later = head(replace(windows, timesteps=windows.timesteps + 5), actions)
     assert not torch.allclose(before[:, t], later[:, t])
+
+
+def test_padding_does_not_move_a_value() -> None:
+    torch.manual_seed(0)
+    head, windows = ValueHead(S, DIM), random_windows(VECTORS)
+    actions = torch.randn(len(windows.mask), K, DIM)
+    values = head(windows, actions)
+    steps = windows.mask.unsqueeze(-1)
+    noisy = replace(windows, states=torch.where(steps, windows.states, 9.0))
+    other = head(noisy, torch.where(steps, actions, 9.0))
+    torch.testing.assert_close(values[windows.mask], other[windows.mask])
+    short = Windows(**{f: getattr(windows, f)[2:, 5:] for f in windows.__dataclass_fields__})
+    torch.testing.assert_close(head(short, actions[2:, 5:]), values[2:, 5:])
 
 
 returns_and_values = st.lists(st.tuples(st.floats(-9, 9), st.floats(-9, 9)), min_size=1)

@@ -1,5 +1,6 @@
 """The decision rule is chosen on the log: finds what pays, keeps its conditions, says how."""
 
+import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,17 +9,20 @@ import pytest
 import torch
 
 from tests.support.tagged import tagged_store
-from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.acting.learned_sessions import LearnedSessions, LoggedEnds, SessionEnd
 from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.rollout import rollout
 from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model
 from ucfrec.counterfactual.item_reward_rows import RewardRows
 from ucfrec.episodes.exposure import Likeness
+from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files import read_json
+from ucfrec.policies.heads import ItemHead
+from ucfrec.runs.choose_by_ranking import choose_by_ranking
 from ucfrec.runs.choose_rule import RuleSearch, calibrate, choose_rule
-from ucfrec.runs.config import resolve_config
+from ucfrec.runs.config import config_from_dict, resolve_config
 from ucfrec.runs.refit import refit
 from ucfrec.runs.rule_config import RuleConfig
 from ucfrec.runs.run import train_run, training_views
@@ -41,6 +45,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def trained(folder: Path) -> TrainedPolicy:
     return TrainedPolicy.load(folder / "run")
+
+
+def with_bias(trained: TrainedPolicy, bias: torch.Tensor) -> Decider:
+    """A policy that shows items, (24,), by another bias; its run is not changed."""
+    decider = trained.decider(DecisionRule(2.0))
+    policy = copy.deepcopy(decider.policy)
+    with torch.no_grad():
+        assert isinstance(policy.head, ItemHead)
+        policy.head.bias.copy_(bias)
+    return replace(decider, policy=policy)
 
 
 def search_of(folder: Path, trained: TrainedPolicy, config: RuleConfig = FEW) -> RuleSearch:
@@ -143,6 +157,52 @@ def test_every_kind_of_candidate_is_played(folder: Path, trained: TrainedPolicy)
     assert {rule.tilt for rule in rules} == set(FEW.tilts)
     assert {rule.tag_window for rule in rules} == {0, 3}  # the policy does not remember 10 steps
     assert {rule.floor is None for rule in rules} == {True, False}
+
+
+def test_tilts_below_the_first_that_overlaps_too_little_are_ranked_too(
+    folder: Path, trained: TrainedPolicy
+) -> None:
+    views = training_views(EpisodeStore.open(folder / "store"))
+    liked = TrainingCounts.of(views[0]).liked.topk(10).indices
+    decider = with_bias(trained, torch.zeros(24).index_fill(0, liked, 50.0))
+    few = RuleConfig(tilts=(0.0, 1000.0))
+    found = choose_by_ranking(decider, *views, few, 0)
+    tilts = [each.rule.tilt for each in found.candidates]
+    assert tilts[:2] == [0.0, 1000.0]
+    assert found.candidates[1].gain < 0
+    assert found.supported
+    overlapping = [each for each in found.candidates if each.gain >= 0]
+    best = max(overlapping, key=lambda each: each.item_rate)
+    assert found.rule == best.rule
+    too_large = min(each.rule.tilt for each in found.candidates if each.gain < 0)
+    assert too_large - max(each.rule.tilt for each in overlapping) == 1000 / 2 ** (len(tilts) - 2)
+
+
+def test_a_rule_without_overlap_has_no_tilt_and_says_so(
+    folder: Path, trained: TrainedPolicy
+) -> None:
+    views = training_views(EpisodeStore.open(folder / "store"))
+    liked = TrainingCounts.of(views[0]).liked.topk(10).indices
+    decider = with_bias(trained, torch.zeros(24).index_fill(0, liked, -1e4))
+    found = choose_by_ranking(decider, *views, RuleConfig(tilts=(0.0, 1.0)), 0)
+    assert not found.supported
+    assert found.rule.tilt == 0
+    assert "WARNING" in found.as_dict()["warning"]
+
+
+def test_a_finished_run_that_is_trained_again_keeps_its_rule(
+    folder: Path, trained: TrainedPolicy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*_: object) -> None:
+        raise AssertionError("the rule is chosen again")
+
+    monkeypatch.setattr("ucfrec.runs.run.choose_rule", never)
+    store = EpisodeStore.open(folder / "store")
+    before = read_json(folder / "run" / "run.json")
+    train_run(store, folder / "run", config_from_dict(before["config"]))
+    after = read_json(folder / "run" / "run.json")
+    assert after["rule"] == before["rule"]
+    assert TrainedPolicy.load(folder / "run").rule == trained.rule
 
 
 def test_a_refit_learns_from_all_rows_and_chooses_nothing_anew(

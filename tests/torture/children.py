@@ -1,9 +1,11 @@
 """Commands in forks of one interpreter: their end, their output, and what they leave."""
 
 import contextlib
+import importlib
 import os
 import resource
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -40,7 +42,7 @@ class End:
         """What is wrong with this end; empty if nothing is.
 
         Args:
-            allowed: exit statuses; 0 may print anything but a traceback, others one line.
+            allowed: exit statuses; 2, 130 and 143 print one line, others no traceback.
         """
         if self.hung:
             return "hung"
@@ -48,13 +50,16 @@ class End:
             return "traceback: " + self.printed.strip().splitlines()[-1][:150]
         if self.status not in allowed:
             return f"status {self.status}: {self.printed.strip()[-150:]}"
-        if self.status and len(self.lines) != 1:
+        if self.status in (2, 130, 143) and len(self.lines) != 1:
             return f"{len(self.lines)} lines: {self.printed.strip()[:150]}"
         return ""
 
 
 class Running:
-    """A function in a fork; its stderr goes to a file, its stdout to nowhere."""
+    """A function in a fork; its stderr goes to a file, its stdout to nowhere.
+
+    With `memory`, the fork gets no more than that many bytes beyond what this process has.
+    """
 
     def __init__(self, work: Callable[[], int], memory: int | None = None) -> None:
         self._log = tempfile.TemporaryFile()  # noqa: SIM115
@@ -68,7 +73,8 @@ class Running:
                 os.dup2(self._log.fileno(), 2)
                 os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
                 if memory is not None:
-                    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+                    limit = _address_space() + memory
+                    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
                 status = work()
             except SystemExit as end:
                 status = end.code if isinstance(end.code, int) else 1
@@ -103,6 +109,10 @@ class Running:
         return End(code, printed, time.monotonic() - self._start, hung)
 
 
+def _address_space() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+
+
 def command(*arguments: object, program: str = "ucfrec") -> Callable[[], int]:
     """A function that runs one command as its process would."""
 
@@ -120,6 +130,43 @@ def command(*arguments: object, program: str = "ucfrec") -> Callable[[], int]:
 def run(*arguments: object, program: str = "ucfrec") -> End:
     """One command from its beginning to its end."""
     return Running(command(*arguments, program=program)).wait()
+
+
+def run_first(*arguments: object) -> End:
+    """`run`, after which this interpreter imports what the command imported.
+
+    Forks then spend their time on what the command does, not on its imports.
+    """
+    with tempfile.NamedTemporaryFile("r") as names:
+
+        def work() -> int:
+            try:
+                return command(*arguments)()
+            finally:
+                Path(names.name).write_text("\n".join(sys.modules))
+
+        end = Running(work).wait()
+        for name in names.read().splitlines():
+            with contextlib.suppress(Exception):
+                importlib.import_module(name)
+    return end
+
+
+def run_fresh(*arguments: object, number: int, moment: float) -> End:
+    """One command in a new interpreter, which gets the signal `number` after `moment` seconds."""
+    command_line = [sys.executable, "-m", "ucfrec", *map(str, arguments)]
+    start = time.monotonic()
+    started = subprocess.Popen(
+        command_line, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    time.sleep(moment)
+    started.send_signal(number)
+    try:
+        _, printed = started.communicate(timeout=TIMEOUT)
+    except subprocess.TimeoutExpired:
+        started.kill()
+        return End(1, "", time.monotonic() - start, hung=True)
+    return End(started.returncode, printed, time.monotonic() - start)
 
 
 def leftovers(*folders: Path) -> list[str]:

@@ -17,14 +17,15 @@ from tests.torture.made import Inputs
 _BATCH = 50
 
 
-def flips(inputs: Inputs, folder: Path, cases: int, seed: int) -> Counter[str]:
-    """Flip single bits of a store and a run, alternately, and read everything of them."""
+def flips(inputs: Inputs, source: Path, folder: Path, cases: int, seed: int) -> Counter[str]:
+    """Flip single bits of a store or a run, and read everything of it."""
     counts = Counter[str]()
     for begin in range(0, cases, _BATCH):
         answer = folder / "flips.json"
         answer.unlink(missing_ok=True)
         numbers = range(begin, min(begin + _BATCH, cases))
-        end = Running(partial(_batch, inputs, folder, numbers, seed, answer)).wait()
+        read = read_store if source == inputs.store else read_run
+        end = Running(partial(_batch, source, read, folder, numbers, seed, answer)).wait()
         if end.status or not answer.exists():
             counts[f"a process ended with {end.status}: {end.printed[-200:]}"] += 1
             continue
@@ -32,29 +33,32 @@ def flips(inputs: Inputs, folder: Path, cases: int, seed: int) -> Counter[str]:
     return counts
 
 
-def _batch(inputs: Inputs, folder: Path, numbers: range, seed: int, answer: Path) -> int:
+def _batch(
+    source: Path,
+    read: Callable[[Path], list[Any]],
+    folder: Path,
+    numbers: range,
+    seed: int,
+    answer: Path,
+) -> int:
     from ucfrec.errors import InputError
 
     counts = Counter[str]()
-    readers: dict[Path, Callable[[Path], list[Any]]] = {
-        inputs.store: read_store,
-        inputs.run: read_run,
-    }
-    expected = {source: read(source) for source, read in readers.items()}
+    expected = read(source)
+    copy = folder / f"flipped-{source.name}"
+    shutil.rmtree(copy, ignore_errors=True)
+    shutil.copytree(source, copy)
+    files = sorted(path for path in copy.rglob("*") if path.is_file() and path.stat().st_size)
     for number in numbers:
-        generator = random.Random(seed * 1_000_003 + number)
-        source = (inputs.store, inputs.run)[number % 2]
-        copy = folder / f"flipped-{source.name}"
-        shutil.rmtree(copy, ignore_errors=True)
-        shutil.copytree(source, copy)
-        files = sorted(path for path in copy.rglob("*") if path.is_file())
-        path = generator.choice([each for each in files if each.stat().st_size])
-        content = bytearray(path.read_bytes())
+        generator = random.Random(f"{seed} {source.name} {number}")
+        path = generator.choice(files)
+        whole = path.read_bytes()
+        content = bytearray(whole)
         content[generator.randrange(len(content))] ^= 1 << generator.randrange(8)
-        path.write_bytes(content)
+        _replace(path, content)
         name = path.relative_to(copy).as_posix()
         try:
-            read = readers[source](copy)
+            found = read(copy)
         except InputError as error:
             counts["found"] += 1
             if "\n" in str(error):
@@ -62,10 +66,20 @@ def _batch(inputs: Inputs, folder: Path, numbers: range, seed: int, answer: Path
         except Exception as error:
             counts[f"{name}: {type(error).__name__}: {str(error)[:80]}"] += 1
         else:
-            same = all(map(_same, read, expected[source], strict=True))
+            same = _all_same(found, expected)
             counts["harmless" if same else f"{name}: silently another content"] += 1
+        _replace(path, whole)
+    if not _all_same(read(copy), expected):
+        raise AssertionError("the copy was not restored")
+    shutil.rmtree(copy)
     answer.write_text(json.dumps(counts))
     return 0
+
+
+def _replace(path: Path, content: bytes) -> None:
+    """Write a new file, as arrays may still map the old one."""
+    path.unlink()
+    path.write_bytes(content)
 
 
 def read_store(path: Path) -> list[Any]:
@@ -101,6 +115,10 @@ def read_run(path: Path) -> list[Any]:
     used = ("config", "sizes", "return_quantiles", "reward", "fingerprint", "train_steps")
     found.append(repr({name: trained.record.get(name) for name in used}))
     return [*found, repr(read_metrics(path / "policy"))]
+
+
+def _all_same(some: list[Any], others: list[Any]) -> bool:
+    return len(some) == len(others) and all(map(_same, some, others))
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -3,140 +3,125 @@
 import random
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 
-from tests.torture.children import TIMEOUT, End, Running, command, leftovers, run
+from tests.torture.children import Running, command, leftovers, run, run_first, run_fresh
 from tests.torture.made import Inputs, Job, said
 
-
-def references(inputs: Inputs, folder: Path) -> dict[str, tuple[str, float]]:
-    """What every job says when it is left alone, and the seconds that it takes."""
-    known = {}
-    for job in inputs.jobs():
-        out = folder / f"{job.name}{job.suffix}"
-        end = run(*job.arguments(out))
-        if end.status:
-            raise SystemExit(f"{job.name}: {end.printed}")
-        known[job.name] = (said(out), end.seconds)
-    return known
+_FRESH_KILLS, _FRESH_INTERRUPTIONS = 20, 4
+"""Every such case is a new interpreter, signalled from its very start; the others are forks."""
+_START = 3.0
+"""Seconds that a new interpreter needs, at most, before a command begins."""
 
 
-def kills(
-    inputs: Inputs, known: dict[str, tuple[str, float]], folder: Path, cases: int, seed: int
-) -> Counter[str]:
-    """Kill a command at a random moment, run it again, and compare what comes out."""
-    generator, faults = random.Random(seed), Counter[str]()
-    jobs = inputs.jobs()
-    for number in range(cases):
-        job = jobs[number % len(jobs)]
-        expected, seconds = known[job.name]
-        place = folder / f"kill-{number}"
+@dataclass(frozen=True)
+class Ends:
+    """Cases of one command."""
+
+    inputs: Inputs
+    job: Job
+    expected: str
+    """What the output says if the command is left alone."""
+    seconds: float
+    """Seconds that the command takes in a fork."""
+    folder: Path
+
+    @classmethod
+    def of(cls, inputs: Inputs, job: Job, folder: Path) -> "Ends":
+        """Run the command twice, the second time with everything imported."""
+        for number, start in enumerate((run_first, run)):
+            out = folder / f"{job.name}-{number}{job.suffix}"
+            end = start(*job.arguments(out))
+            if end.status:
+                raise SystemExit(f"{job.name}: {end.printed}")
+        return cls(inputs, job, said(out), end.seconds, folder)
+
+    def kills(self, cases: int, seed: int) -> Counter[str]:
+        """Kill the command at a random moment, run it again, and compare what comes out."""
+        generator, counts = random.Random(f"{seed} {self.job.name}"), Counter[str]()
+        for number in range(cases):
+            place, out = self._place(f"kill-{number}")
+            moment = generator.uniform(0, 1.05 * self.seconds)
+            if number % _FRESH_KILLS == _FRESH_KILLS - 1:
+                moment += generator.uniform(0, _START)
+                end = run_fresh(*self.job.arguments(out), number=signal.SIGKILL, moment=moment)
+            else:
+                running = Running(command(*self.job.arguments(out)))
+                time.sleep(moment)
+                running.send(signal.SIGKILL)
+                end = running.wait()
+            counts["killed"] += end.status == -signal.SIGKILL
+            if not (self.job.name in ("collect", "prepare") and out.exists()):
+                self._count(counts, run(*self.job.arguments(out)).fault([0]))
+            self._compare(counts, out)
+            self._clean(counts, place)
+        return counts
+
+    def interruptions(self, cases: int, seed: int) -> Counter[str]:
+        """Ctrl-C and TERM at random moments."""
+        generator, counts = random.Random(f"{seed} {self.job.name}"), Counter[str]()
+        for number in range(cases):
+            sent = (signal.SIGINT, signal.SIGTERM)[generator.randrange(2)]
+            place, out = self._place(f"interrupt-{number}")
+            moment = generator.uniform(0, 1.05 * self.seconds)
+            if number % _FRESH_INTERRUPTIONS == _FRESH_INTERRUPTIONS - 1:
+                # Before that, Python's own handlers answer.
+                moment += 0.1 + generator.uniform(0, _START)
+                end = run_fresh(*self.job.arguments(out), number=sent, moment=moment)
+            else:
+                running = Running(command(*self.job.arguments(out)))
+                time.sleep(0.05 + moment)
+                running.send(sent)
+                end = running.wait()
+            self._count(counts, end.fault([0, 128 + sent]))
+            counts["interrupted"] += end.status == 128 + sent
+            self._clean(counts, place)
+        return counts
+
+    def pairs(self, cases: int, seed: int) -> Counter[str]:
+        """Two processes with one output: one winner, and one clear line or a wait for the other."""
+        generator, counts = random.Random(f"{seed} {self.job.name}"), Counter[str]()
+        for number in range(cases):
+            place, out = self._place(f"pair-{number}")
+            both = []
+            for _ in range(2):
+                both.append(Running(command(*self.job.arguments(out))))
+                time.sleep(generator.uniform(0, 0.5 * self.seconds))
+            ends = [running.wait() for running in both]
+            for end in ends:
+                self._count(counts, end.fault([0, 2]))
+            statuses = sorted(end.status for end in ends)
+            # A training that ended before the second began is resumed by it, with nothing to do.
+            both_may_win = self.job.waits or self.job.name == "train"
+            if statuses != [0, 2] and not (both_may_win and statuses == [0, 0]):
+                self._count(counts, f"ends {statuses}")
+            refused = next((end.printed for end in ends if end.status == 2), "")
+            if refused and "is being" not in refused and "exists already" not in refused:
+                self._count(counts, f"says {refused[:80]}")
+            counts["refused"] += bool(refused)
+            self._compare(counts, out)
+            self._clean(counts, place)
+        return counts
+
+    def _place(self, name: str) -> tuple[Path, Path]:
+        place = self.folder / name
         place.mkdir()
-        out = place / f"out{job.suffix}"
-        running = Running(command(*job.arguments(out)))
-        time.sleep(generator.uniform(0, 1.05 * seconds))
-        running.send(signal.SIGKILL)
-        first = running.wait()
-        faults["killed"] += first.status == -signal.SIGKILL
-        if job.name in ("collect", "prepare") and out.exists():
-            faults[f"{job.name}: differs"] += said(out) != expected
-            shutil.rmtree(place)
-            continue
-        again = run(*job.arguments(out))
-        _count(faults, job, again.fault([0]))
-        if again.status == 0 and said(out) != expected:
-            faults[f"{job.name}: another result"] += 1
-        left = leftovers(place, inputs.folder)
-        faults[f"{job.name}: leaves {len(left)}"] += bool(left)
+        return place, place / f"out{self.job.suffix}"
+
+    def _compare(self, counts: Counter[str], out: Path) -> None:
+        if not out.exists():
+            self._count(counts, "no result")
+        elif said(out) != self.expected:
+            self._count(counts, "another result")
+
+    def _clean(self, counts: Counter[str], place: Path) -> None:
+        left = leftovers(place, self.inputs.folder)
+        self._count(counts, f"leaves {len(left)}: {left[0]}" if left else "")
         shutil.rmtree(place)
-    return faults
 
-
-def interruptions(
-    inputs: Inputs, known: dict[str, tuple[str, float]], folder: Path, cases: int, seed: int
-) -> Counter[str]:
-    """Ctrl-C and TERM at random moments, every fourth time in a process from its very start."""
-    generator, faults = random.Random(seed), Counter[str]()
-    jobs = inputs.jobs()
-    for number in range(cases):
-        job = jobs[generator.randrange(len(jobs))]
-        seconds = known[job.name][1]
-        sent = (signal.SIGINT, signal.SIGTERM)[number % 2]
-        place = folder / f"interrupt-{number}"
-        place.mkdir()
-        out = place / f"out{job.suffix}"
-        if number % 4 == 3:
-            end = _from_the_start(job, out, sent, generator.uniform(0.1, 3.0 + seconds))
-        else:
-            running = Running(command(*job.arguments(out)))
-            # A fork has Python's own handlers until the first line of the command.
-            time.sleep(0.05 + generator.uniform(0, 1.05 * seconds))
-            running.send(sent)
-            end = running.wait()
-        _count(faults, job, end.fault([0, 128 + sent]))
-        faults["interrupted"] += end.status == 128 + sent
-        left = leftovers(place, inputs.folder)
-        faults[f"{job.name}: leaves {len(left)}"] += bool(left)
-        shutil.rmtree(place)
-    return faults
-
-
-def _from_the_start(job: Job, out: Path, sent: signal.Signals, moment: float) -> End:
-    arguments = [sys.executable, "-m", "ucfrec", *map(str, job.arguments(out))]
-    start = time.monotonic()
-    started = subprocess.Popen(
-        arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-    )
-    time.sleep(moment)
-    started.send_signal(sent)
-    try:
-        _, printed = started.communicate(timeout=TIMEOUT)
-    except subprocess.TimeoutExpired:
-        started.kill()
-        return End(1, "", time.monotonic() - start, hung=True)
-    return End(started.returncode, printed, time.monotonic() - start)
-
-
-def pairs(
-    inputs: Inputs, known: dict[str, tuple[str, float]], folder: Path, cases: int, seed: int
-) -> Counter[str]:
-    """Two processes with one output: one winner, and one clear line or a wait for the other."""
-    generator, faults = random.Random(seed), Counter[str]()
-    jobs = inputs.jobs()
-    for number in range(cases):
-        job = jobs[number % len(jobs)]
-        expected, seconds = known[job.name]
-        place = folder / f"pair-{number}"
-        place.mkdir()
-        out = place / f"out{job.suffix}"
-        both = []
-        for _ in range(2):
-            both.append(Running(command(*job.arguments(out))))
-            time.sleep(generator.uniform(0, 0.5 * seconds))
-        ends = [running.wait() for running in both]
-        for end in ends:
-            _count(faults, job, end.fault([0, 2]))
-        statuses = sorted(end.status for end in ends)
-        # A training that ended before the second began is resumed by it, with nothing to do.
-        both_may_win = job.waits or job.name == "train"
-        if statuses != [0, 2] and not (both_may_win and statuses == [0, 0]):
-            faults[f"{job.name}: ends {statuses}"] += 1
-        refused = next((end.printed for end in ends if end.status == 2), "")
-        if refused and "is being" not in refused and "exists already" not in refused:
-            faults[f"{job.name}: says {refused[:80]}"] += 1
-        faults["refused"] += bool(refused)
-        if said(out) != expected:
-            faults[f"{job.name}: another result"] += 1
-        left = leftovers(place, inputs.folder)
-        faults[f"{job.name}: leaves {len(left)}"] += bool(left)
-        shutil.rmtree(place)
-    return faults
-
-
-def _count(faults: Counter[str], job: Job, fault: str) -> None:
-    if fault:
-        faults[f"{job.name}: {fault}"] += 1
+    def _count(self, counts: Counter[str], fault: str) -> None:
+        if fault:
+            counts[fault] += 1

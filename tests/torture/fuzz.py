@@ -6,6 +6,8 @@ import random
 import resource
 import shutil
 import signal
+import struct
+import warnings
 from collections import Counter
 from collections.abc import Callable
 from copy import deepcopy
@@ -16,7 +18,7 @@ from typing import Any
 from tests.torture.children import Running
 from tests.torture.made import Inputs
 
-_BATCH = 250
+_BATCH = 500
 _SECONDS = 20
 """Seconds after which reading one file counts as hung."""
 _MEMORY = 24 * 2**30
@@ -41,28 +43,40 @@ _VALUES: list[Any] = [
     *(None, True, -1, 0, 10**12, 10**400, 1.5, float("nan"), float("inf"), "", "a\nb", "../x", "1"),
     *([], [[]], [1, "a"], {}, {"a": {}}, "\ud800", "\x1b[2J", [0] * 1000),
 ]
+_SHAPES = [(0,), (0, 0), (1,), (7,), (3, 5), (1, 2, 3), (10_000,), (300, 300)]
+_DTYPES = ("float64", "float16", "int64", "uint8", "bool", "int32")
+_SLOW = (
+    *("run.json", "run.json in a report", "samples in a report", "augmentation in a report"),
+    *("evaluations in a report", "log.csv", "log.parquet", "decision rule", "policy"),
+    *("reward model", "item states of a run", "training counts", "training returns"),
+    "items of a run",
+)
+"""Readers that take longest: they draw charts, start a database, or build a policy."""
 Reader = Callable[[Path], object]
 
 
-def fuzz(inputs: Inputs, folder: Path, cases: int, seed: int) -> Counter[str]:
-    """Give every reader its share of `cases` files."""
+def shares(cases: int, inputs: Inputs) -> dict[str, int]:
+    """Number of cases of each reader; the slow ones have a tenth of the others' share."""
+    weights = {name: 1 if name in _SLOW else 10 for name in _targets(inputs)} if cases else {}
+    total = sum(weights.values())
+    return {name: -(-cases * weight // total) for name, weight in weights.items()}
+
+
+def fuzz(inputs: Inputs, name: str, folder: Path, cases: int, seed: int) -> Counter[str]:
+    """Give one reader `cases` files."""
     counts = Counter[str]()
-    targets = _targets(inputs)
-    each = -(-cases // len(targets))
     place = folder / "fuzz"
-    for name in targets:
-        for begin in range(0, each, _BATCH):
-            numbers = range(begin, min(begin + _BATCH, each))
-            answer = folder / "fuzz.json"
-            answer.unlink(missing_ok=True)
-            work = partial(_batch, inputs, place, name, numbers, seed, answer)
-            end = Running(work).wait(_SECONDS * 60)
-            counts["cases"] += len(numbers)
-            if answer.exists():
-                counts.update(json.loads(answer.read_text()))
-            if end.status:
-                last = end.printed.strip().splitlines()[-1:] or [""]
-                counts[f"{name}: a process ended with {end.status}: {last[0][:150]}"] += 1
+    for begin in range(0, cases, _BATCH):
+        numbers = range(begin, min(begin + _BATCH, cases))
+        answer = folder / "fuzz.json"
+        answer.unlink(missing_ok=True)
+        work = partial(_batch, inputs, place, name, numbers, seed, answer)
+        end = Running(work).wait(_SECONDS * 60)
+        if answer.exists():
+            counts.update(json.loads(answer.read_text()))
+        if end.status:
+            last = end.printed.strip().splitlines()[-1:] or [""]
+            counts[f"a process ended with {end.status}: {last[0][:150]}"] += 1
     return counts
 
 
@@ -80,16 +94,17 @@ def _batch(inputs: Inputs, place: Path, name: str, numbers: range, seed: int, an
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
     signal.signal(signal.SIGALRM, _alarm)
     source, changed, read = _targets(inputs)[name]
+    warnings.simplefilter("ignore")
     counts = Counter[str]()
+    shutil.rmtree(place, ignore_errors=True)
+    if source.is_dir():
+        shutil.copytree(source, place, copy_function=os.link)
+    else:
+        place.mkdir()
+    path = place / changed
+    content = (source / changed if source.is_dir() else source).read_bytes()
     for number in numbers:
         generator = random.Random(f"{seed} {name} {number}")
-        shutil.rmtree(place, ignore_errors=True)
-        if source.is_dir():
-            shutil.copytree(source, place, copy_function=os.link)
-        else:
-            place.mkdir(parents=True)
-        path = place / changed
-        content = (source / changed if source.is_dir() else source).read_bytes()
         path.unlink(missing_ok=True)
         path.write_bytes(_mutated(generator, content, path.suffix, number))
         signal.alarm(_SECONDS)
@@ -98,14 +113,14 @@ def _batch(inputs: Inputs, place: Path, name: str, numbers: range, seed: int, an
         except InputError as error:
             counts["found"] += 1
             if not str(error).isprintable():
-                counts[f"{name}: not one printable line"] += 1
+                counts["not one printable line"] += 1
         except _HungError:
-            counts[f"{name}: hung"] += 1
+            counts["hung"] += 1
         except MemoryError:
-            counts[f"{name}: MemoryError"] += 1
+            counts["MemoryError"] += 1
         except Exception as error:
             where = _where(error)
-            counts[f"{name}: {type(error).__name__} {where}: {str(error)[:80]}"] += 1
+            counts[f"{type(error).__name__} {where}: {str(error)[:80]}"] += 1
         else:
             counts["harmless"] += 1
         finally:
@@ -126,6 +141,8 @@ def _where(error: BaseException) -> str:
 
 
 def _mutated(generator: random.Random, content: bytes, suffix: str, number: int) -> bytes:
+    if suffix == ".safetensors" and number % 4:
+        return _other_tensors(generator, content)
     if suffix == ".json" and number % 4:
         return _other_values(generator, content)
     if suffix == ".jsonl" and number % 4:
@@ -165,6 +182,48 @@ def _place(generator: random.Random, value: Any) -> tuple[Any, Any]:
     return place, key
 
 
+def _other_tensors(generator: random.Random, content: bytes) -> bytes:
+    """Safetensors with other tensors and numbers, and the checksum of these."""
+    import torch
+    from safetensors.torch import load, save
+
+    from ucfrec.fitting.checkpoint import _checksum
+
+    (length,) = struct.unpack("<Q", content[:8])
+    header = json.loads(content[8 : 8 + length])
+    about, _, _ = header["__metadata__"]["about"].partition("\n")
+    tensors = load(content)
+    for _ in range(generator.choice((1, 1, 2, 4))):
+        name = generator.choice([*tensors] or ["new"])
+        tensor = tensors.pop(name, torch.zeros(3))
+        match generator.randrange(8):
+            case 0:
+                continue
+            case 1:
+                tensors[name + "s"] = tensor
+            case 2:
+                tensor = tensor.to(getattr(torch, generator.choice(_DTYPES)))
+            case 3:
+                tensor = tensor.reshape(-1)
+            case 4:
+                tensor = tensor[: len(tensor) // 2] if tensor.dim() else tensor.unsqueeze(0)
+            case 5:
+                tensor = torch.cat([tensor, tensor]) if tensor.dim() else tensor
+            case 6:
+                value = generator.choice((-1, 0, 100, float("nan"), float("inf")))
+                if tensor.is_floating_point() or isinstance(value, int):
+                    tensor = torch.full_like(
+                        tensor, value != 0 if tensor.dtype == torch.bool else value
+                    )
+            case 7:
+                tensor = torch.zeros(generator.choice(_SHAPES), dtype=tensor.dtype)
+        tensors[name] = tensor.contiguous()
+    if generator.random() < 0.4:
+        about = _other_values(generator, about.encode()).decode()
+    plain = {name: tensor.clone() for name, tensor in tensors.items()}
+    return save(plain, {"about": f"{about}\n{_checksum(plain, about)}"})
+
+
 def _other_bytes(generator: random.Random, content: bytes) -> bytes:
     changed = bytearray(content)
     for _ in range(generator.choice((1, 1, 2, 4, 16))):
@@ -192,6 +251,7 @@ def _other_bytes(generator: random.Random, content: bytes) -> bytes:
 def _targets(inputs: Inputs) -> dict[str, tuple[Path, str, Reader]]:
     """Name of a reader to (file or folder, the file in it that is changed, the reader)."""
     from tests.torture.damage import read_run, read_store
+    from ucfrec.episodes.windows import Overlay
     from ucfrec.fitting.checkpoint import load_tensors
     from ucfrec.fitting.metrics_log import read_metrics
     from ucfrec.logs.mapping import read_mapping
@@ -214,6 +274,18 @@ def _targets(inputs: Inputs) -> dict[str, tuple[Path, str, Reader]]:
         from ucfrec.logs.prepare import validate
 
         return validate([path], read_mapping(texts / "empty.toml"))
+
+    def acts(levels: int) -> Reader:
+        def read(path: Path) -> object:
+            import numpy as np
+
+            from ucfrec.runs.trained_policy import TrainedPolicy
+
+            trained = TrainedPolicy.load(folder(path, levels))
+            observations = np.zeros((2, trained.record["observation_size"]), dtype=np.float32)
+            return trained.actor(2).act(observations, np.array([True, False]))
+
+        return read
 
     def page(path: Path) -> object:
         from ucfrec.reporting.page import write_report
@@ -238,11 +310,22 @@ def _targets(inputs: Inputs) -> dict[str, tuple[Path, str, Reader]]:
             *(_unsealed(inputs), "shard-00000/offsets.npy"),
             lambda path: read_store(folder(path, 2)),
         ),
-        "item states": (store, "item_states.safetensors", load_tensors),
+        "item states": (
+            *(_unsealed(inputs), "item_states.safetensors"),
+            lambda path: read_store(path.parent),
+        ),
         "run.json": (run, "run.json", lambda path: read_run(path.parent)),
         "run.json in a report": (run, "run.json", page),
         "samples in a report": (_unsealed_run(inputs), "samples.json", page),
         "augmentation in a report": (_unsealed_run(inputs), "augmentation.json", page),
+        "decision rule": (_unsealed_run(inputs), "decision_rule.json", acts(1)),
+        "policy": (_unsealed_run(inputs), "policy/best.safetensors", acts(2)),
+        "reward model": (_unsealed_run(inputs), "reward_model/item_reward.safetensors", acts(2)),
+        "item states of a run": (_unsealed_run(inputs), "item_states.safetensors", acts(1)),
+        "training counts": (_unsealed_run(inputs), "training_counts.safetensors", acts(1)),
+        "training returns": (_unsealed_run(inputs), "training_returns.safetensors", acts(1)),
+        "items of a run": (_unsealed_run(inputs), "items.parquet", acts(1)),
+        "copies": (run, "overlay.safetensors", Overlay.load),
         "checkpoint": (run, "policy/best.safetensors", load_tensors),
         "metrics.jsonl": (run, "policy/metrics.jsonl", lambda path: read_metrics(path.parent)),
         "ids.parquet": (run, "items.parquet", lambda path: read_ids(path, "item_id")),

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.torture.children import run
+from tests.torture.children import run_first
 
 TINY = (
-    *("train.steps=60", "train.validate_every=10", "policy.dim=8", "policy.context=4"),
-    *("crm.epochs=1", "csg.epochs=1"),
+    *("train.steps=30", "train.validate_every=10", "policy.dim=8", "policy.context=4"),
+    *("crm.epochs=1", "crm.hidden=16", "csg.epochs=1", "rule.sessions=10", "rule.quantiles=[1.0]"),
+    *("rule.temperatures=[0.0,1.0]", "rule.tilts=[0.0,1.0]", "rule.tag_windows=[0]"),
 )
 SETTINGS = [part for setting in TINY for part in ("--set", setting)]
 
@@ -42,7 +43,7 @@ class Inputs:
             ("prepare", self.log, "--out", self.store, "--reward", "is_click"),
             ("train", self.store, "--out", self.run, *SETTINGS),
         ):
-            end = run(*arguments)
+            end = run_first(*arguments)
             if end.status:
                 raise SystemExit(f"{arguments[0]}: {end.printed}")
 

@@ -210,7 +210,7 @@ class Decider:
         if self.rule.tilt and self.reward_model is None:
             raise InputError(
                 f"the rule has tilt {self.rule.tilt:g}, but the run has no reward model of items; "
-                "train it with --set reward.fit=true, or set the tilt to 0"
+                "train it with --set rule.choose=true, or set the tilt to 0"
             )
         if self.rule.tag_window and (self.likeness is None or not self.likeness.tags.shape[1]):
             raise InputError(
@@ -244,8 +244,18 @@ class Decider:
     @torch.no_grad()
     def act(self, windows: Windows, collected: Tensor) -> Tensor:
         """The policy's outputs at the last step, on the CPU: see `SequencePolicy.act`."""
-        device = self.policy.state_mean.device
-        return self.policy.act(self.asked(windows, collected).to(device)).cpu()
+        return self.act_and_features(self.asked(windows, collected))[0]
+
+    @torch.no_grad()
+    def act_and_features(self, asked: Windows) -> tuple[Tensor, Tensor | None]:
+        """The policy's outputs at the last step of windows of `asked`, and the features (B, d) that
+        they are made from, on the CPU; None of a learner that is no network of features (item-knn,
+        crm-greedy)."""
+        policy, moved = self.policy, asked.to(self.policy.state_mean.device)
+        if type(policy).act is not SequencePolicy.act:
+            return policy.act(moved).cpu(), None
+        outputs, features = policy.act_and_features(moved)
+        return outputs.cpu(), features.cpu()
 
     def scores(
         self,
@@ -270,7 +280,7 @@ class Decider:
             (B, n_items).
 
         Raises:
-            InputError: no item is left in some row.
+            InputError: no item is left in some row, or the scores of some row are NaN.
         """
         logits = self.act(windows, collected)
         return self.scores_from(logits, windows, forbidden, users, shown)
@@ -288,6 +298,13 @@ class Decider:
         scores = logits
         if self.rule.tilt:
             scores = self.rewards(windows, users, shown).mul_(self.rule.tilt).add_(scores)
+        undefined = ~(scores.amax(1) < torch.inf)
+        if undefined.any():
+            raise InputError(
+                f"in {int(undefined.sum())} of {len(scores)} decisions scores are no numbers, as "
+                "weights of the policy or the reward model are NaN or infinite; train again, with "
+                "a lower train.learning_rate if the training diverged"
+            )
         if forbidden is not None:
             scores = scores.masked_fill(forbidden, -torch.inf)
         if self.rule.tag_window:

@@ -17,10 +17,28 @@ IntArray = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
+class SessionDecisions:
+    """What a policy would have decided at B logged steps."""
+
+    windows: Windows
+    """Each step, last in its window, with the steps before it that the policy sees; an unknown item
+    is −1."""
+    asked: Windows
+    """The windows as the policy saw them: returns-to-go from the target return."""
+    scores: Tensor
+    """(B, n_items), see `Decider.scores`."""
+    features: Tensor | None
+    """(B, d), see `Decider.act_and_features`."""
+
+
+@dataclass(frozen=True)
 class LoggedDecisions:
     """What was known before B logged steps, as arguments of `Decider.scores`."""
 
+    logged: Windows
+    """Each step, last in its window; an unknown item is −1."""
     windows: Windows
+    """The same with known items only."""
     collected: Tensor
     forbidden: Tensor | None
     users: Tensor | None
@@ -38,9 +56,9 @@ class LoggedDecisions:
         """Read them from a store; the arguments are those of `session_scores`."""
         context = decider.policy.config.context
         lags = 0 if decider.reward_model is None else decider.reward_model.lags
-        windows = store.windows(episodes, steps, max(context, lags + 1))
+        logged = store.windows(episodes, steps, max(context, lags + 1))
         # Any known item can replace an unknown one: steps after it have weight 0.
-        windows = replace(windows, actions=windows.actions.clamp(min=0))
+        known = replace(logged, actions=logged.actions.clamp(min=0))
         collected = torch.from_numpy(store.rewards_before(episodes, steps))
         if decider.rule.exclude_seen:
             seen = seen_before(store, episodes, steps)
@@ -48,18 +66,18 @@ class LoggedDecisions:
         users = None
         if store.has_users:
             users = torch.from_numpy(store.episode_values(schema.USER).astype(np.int64)[episodes])
-        shown = Shown.before_last(windows)
-        return cls(windows.last(context), collected, forbidden, users, shown)
+        shown, last = Shown.before_last(known), logged.last(context)
+        return cls(last, known.last(context), collected, forbidden, users, shown)
 
 
-def session_scores(
+def session_decisions(
     decider: Decider,
     store: EpisodeStore,
     episodes: IntArray,
     steps: IntArray,
     forbidden: Tensor | None = None,
-) -> Tensor:
-    """Scores of all items at logged steps, from what was known before each.
+) -> SessionDecisions:
+    """What a policy would have decided at logged steps, from what was known before each.
 
     Rewards earlier in a session lower what is asked for, and count as in acting.
 
@@ -69,12 +87,23 @@ def session_scores(
         episodes: (B,) sessions.
         steps: (B,) steps of those sessions, from 0.
         forbidden: (B, n_items) or (n_items,) bool, items that may not be shown; None for none.
-
-    Returns:
-        (B, n_items), see `Decider.scores`.
     """
     known = LoggedDecisions.at(decider, store, episodes, steps, forbidden)
-    return decider.scores(known.windows, known.collected, known.forbidden, known.users, known.shown)
+    asked = decider.asked(known.windows, known.collected)
+    outputs, features = decider.act_and_features(asked)
+    scores = decider.scores_from(outputs, known.windows, known.forbidden, known.users, known.shown)
+    return SessionDecisions(known.logged, asked, scores, features)
+
+
+def session_scores(
+    decider: Decider,
+    store: EpisodeStore,
+    episodes: IntArray,
+    steps: IntArray,
+    forbidden: Tensor | None = None,
+) -> Tensor:
+    """The scores (B, n_items) of `session_decisions`."""
+    return session_decisions(decider, store, episodes, steps, forbidden).scores
 
 
 def seen_before(store: EpisodeStore, episodes: IntArray, steps: IntArray) -> Tensor:

@@ -1,6 +1,6 @@
 """A trained policy as an actor: it sees the last K steps, and decides by its rule."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -33,25 +33,29 @@ class PolicyActor:
         item_ids: IntArray | None = None,
         user_ids: npt.NDArray[Any] | None = None,
         seed: int = 0,
+        dropped: Sequence[int] = (),
     ) -> None:
         """
         Args:
             decider: the policy and its decision rule.
             episodes: N, number of episodes played in parallel.
             observation_size: leading entries of the environment's observation that the logs
-                contain; 0 ignores the observation.
+                contain, less those in `dropped`; 0 ignores the observation.
             item_states: builds states from items; None if the observation is the state.
             item_ids: (n_items,) the environment's index of each item of the store, −1 for items
                 that it lacks; None for vector actions.
             user_ids: (n_users,) identifiers of the store's users, sorted; None or text if they are
                 not the environment's users.
             seed: of the draws of a rule with a temperature.
+            dropped: entries before those that the policy does not see.
         """
         policy = decider.policy
         n, k = episodes, policy.config.context
         self._decider, self._policy = decider, policy
         self._generator = torch.Generator().manual_seed(seed)
-        self._observation_size, self._item_ids = observation_size, item_ids
+        places = np.arange(observation_size + len(dropped))
+        self._observed = torch.from_numpy(np.setdiff1d(places, dropped)[:observation_size])
+        self._item_ids = item_ids
         kept = item_states is not None and len(item_states.user_features) > 0
         known = kept and user_ids is not None and user_ids.dtype.kind in "iu"
         self._user_ids = user_ids if known else None
@@ -111,7 +115,7 @@ class PolicyActor:
         """Choose the actions of the live rows; other rows play the first item that is allowed.
 
         Args:
-            observations: (N, O) with O at least `observation_size`.
+            observations: (N, O) with all entries that the policy sees.
             live: (N,) true where the action is used.
 
         Returns:
@@ -121,7 +125,7 @@ class PolicyActor:
         Raises:
             InputError: every item is forbidden in some live row.
         """
-        observed = torch.as_tensor(observations, dtype=torch.float32)[:, : self._observation_size]
+        observed = torch.as_tensor(observations, dtype=torch.float32)[:, self._observed]
         states = observed if self._sessions is None else self._sessions.current(observed)
         self._states = _appended(self._states, states)
         self._mask = _appended(self._mask, torch.ones_like(self._mask[:, 0]))

@@ -39,11 +39,14 @@ UCFREC = Program(
         "demo": "run every step on simulated logs and write a report; resumes",
         "collect": "simulate sessions and write them as Parquet logs",
         "prepare": "turn logs into an episode store",
+        "screen": "which logged observation columns have no effect",
         "train": "train a policy on an episode store; resumes",
         "settings": "list every training setting: default, range, meaning",
         "evaluate": "measure the return of policies in a simulator",
         "rank": "measure how well policies rank items shown and clicked later",
         "recommend": "recommend the next items to the users of a log",
+        "serve": "answer requests for recommendations over HTTP",
+        "export": "write the policy with its rule as an ONNX graph",
         "score": "write a policy's probability of every logged choice",
         "ope": "estimate a policy's return from logs alone (off-policy evaluation)",
         "verify": "compare every file of stores and runs with its checksum",
@@ -118,6 +121,7 @@ _NO_MEMORY: Final = (
     *("DefaultCPUAllocator", "std::bad_alloc", "out of memory", "Out of Memory"),
     *("cannot allocate memory", "Cannot allocate memory", "can't start new thread"),
     *("failed to map segment", "could not allocate", "malloc of size"),
+    "could not create a primitive",
 )
 """How libraries that raise other errors than `MemoryError` say that there is no memory."""
 _NO_SPACE: Final = ("No space left on device", "Disk quota exceeded", "File too large")
@@ -149,13 +153,35 @@ def build_parser(program: Program, arguments: Sequence[str]) -> argparse.Argumen
     parser = argparse.ArgumentParser(prog=program.name, description=program.summary)
     parser.add_argument("--version", action="version", version=f"ucfrec {__version__}")
     parser.add_argument("--debug", action="store_true", help="show tracebacks of input errors")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(
+        dest="command", required=True, metavar="COMMAND", parser_class=_AnyOrder
+    )
     called = next((word for word in arguments if word in program.commands), None)
     for name, summary in program.commands.items():
         command = commands.add_parser(name, help=summary, description=summary)
         if name == called:
             _module(program, name).add_options(command)
     return parser
+
+
+class _AnyOrder(argparse.ArgumentParser):
+    """Takes options before, between and after runs and logs: `ope RUN --json FILE LOGS`.
+
+    A plain parser gives all that a list of files may take to its first words, and does not know
+    those after an option.
+    """
+
+    _intermixed = False
+
+    def parse_known_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def]
+        # It calls this method: once for the options, once for the rest.
+        if self._intermixed:
+            return super().parse_known_args(args, namespace)
+        self._intermixed = True
+        try:
+            return self.parse_known_intermixed_args(args, namespace)
+        finally:
+            self._intermixed = False
 
 
 class _Command(Protocol):

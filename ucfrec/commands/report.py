@@ -3,11 +3,13 @@
 import argparse
 from pathlib import Path
 
+from ucfrec.errors import InputError
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec report`."""
     parser.add_argument(
-        "runs", nargs="+", type=Path, metavar="RUN", help="run folders of `ucfrec train`"
+        "runs", nargs="*", type=Path, metavar="RUN", help="run folders of `ucfrec train`"
     )
     parser.add_argument(
         "--results",
@@ -33,15 +35,22 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="HTML file to write (default: report.html)",
     )
+    parser.usage = "%(prog)s RUN... [options]"
 
 
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec report`.
 
     Raises:
-        InputError: a run, result or item file cannot be used.
+        InputError: no run is named, or a run, result or item file cannot be used.
     """
     from ucfrec.reporting.page import write_report
+    from ucfrec.runs.trained_policy import RUN
 
-    write_report(options.out, options.runs, options.results, options.items)
+    # A run that follows `--results FILE` is still a run.
+    runs = [*options.runs, *(path for path in options.results if (path / RUN).is_file())]
+    if not runs:
+        raise InputError("name a run folder of `ucfrec train`")
+    results = [path for path in options.results if path not in runs]
+    write_report(options.out, runs, results, options.items)
     print(f"report: {options.out}; open it in a browser")

@@ -53,6 +53,12 @@ def training_options(parser: argparse.ArgumentParser) -> None:
         "--seed", type=int, default=0, help="seed of weights and batches (default: 0)"
     )
     parser.add_argument("--threads", type=int, help="CPU threads (default: all cores)")
+    parser.add_argument(
+        "--screen",
+        choices=["drop", "copies"],
+        help="what to do with observation columns without effect: train without them, or add "
+        "copies of the sessions that intervene on them (default: not screened)",
+    )
 
 
 def run(options: argparse.Namespace) -> None:
@@ -66,19 +72,24 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.episodes.store import EpisodeStore
     from ucfrec.reporting.model_card import write_card
     from ucfrec.runs.config import resolve_config
+    from ucfrec.runs.describe import describe_run
     from ucfrec.runs.refit import refit
-    from ucfrec.runs.run import describe_run, train_run
+    from ucfrec.runs.screened import describe_screened, train_screened
 
     if options.threads is not None:
         torch.set_num_threads(options.threads)
     store = EpisodeStore.open(options.store)
     if options.refit is not None:
-        if options.config is not None or options.set:
-            raise InputError("--refit takes all settings of the run; leave out --config and --set")
+        if options.config is not None or options.set or options.screen:
+            raise InputError(
+                "--refit takes all settings of the run; leave out --config, --set and --screen"
+            )
         record = refit(store, options.refit, options.out)
     else:
         config = resolve_config(options.policy, options.config, options.set, options.seed)
-        record = train_run(store, options.out, config)
+        record = train_screened(store, options.out, config, options.screen)
     card = write_card(options.out)
     print(describe_run(record))
+    if options.screen:
+        print(describe_screened(record))
     print(f"\nrun: {options.out}; TensorBoard can open it\nmodel card: {card}")

@@ -13,16 +13,16 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.checksums import Sealed
+from ucfrec.episodes.column_files import StepColumn, load_column
 from ucfrec.episodes.record import REMEDY, read_store_record
 from ucfrec.episodes.returns import returns_to_go
 from ucfrec.episodes.states import ItemStates
-from ucfrec.errors import InputError, InputNote, one_line
+from ucfrec.errors import InputError, InputNote
 
 Array = npt.NDArray[Any]
 IntArray = npt.NDArray[np.int64]
 
 ITEM_STATES = "item_states.safetensors"
-_OFFSETS = "offsets"
 _IN_MEMORY = Path("<memory>")
 
 
@@ -51,7 +51,7 @@ class Columns:
         self.path, self.meta, self._sealed = path, meta, sealed
         self._arrays, self._item_states_in_memory = dict(arrays or {}), item_states
         self._shards = [path / f"shard-{i:05d}" for i in range(meta["n_shards"])]
-        self._steps: dict[str, _StepColumn] = {}
+        self._steps: dict[str, StepColumn] = {}
 
     @classmethod
     def open(cls, path: Path) -> "Columns":
@@ -106,7 +106,7 @@ class Columns:
             "reward": schema.REWARD,
             "source": {},
         }
-        arrays[_OFFSETS] = offsets
+        arrays[schema.OFFSETS] = offsets
         arrays[schema.RETURN_TO_GO] = returns_to_go(arrays[schema.REWARD], offsets)
         return cls(_IN_MEMORY, meta, arrays, item_states)
 
@@ -138,9 +138,9 @@ class Columns:
     @cached_property
     def _starts_and_lengths(self) -> tuple[IntArray, IntArray]:
         starts, lengths, before = [], [], 0
-        for offsets in self._parts(_OFFSETS):
+        for offsets in self._parts(schema.OFFSETS):
             if len(offsets) < 2 or offsets[0] != 0 or np.any(np.diff(offsets) < 1):
-                raise self._damaged(_OFFSETS, "do not ascend from 0")
+                raise self._damaged(schema.OFFSETS, "do not ascend from 0")
             starts.append(offsets[:-1] + before)
             lengths.append(np.diff(offsets))
             before += int(offsets[-1])
@@ -148,7 +148,8 @@ class Columns:
         expected = (self.meta["n_episodes"], self.meta["n_steps"])
         if found != expected:
             raise self._damaged(
-                _OFFSETS, "have {} episodes of {} steps, not {} of {}".format(*found, *expected)
+                schema.OFFSETS,
+                "have {} episodes of {} steps, not {} of {}".format(*found, *expected),
             )
         return np.concatenate(starts), np.concatenate(lengths)
 
@@ -266,11 +267,11 @@ class Columns:
             observations,
         )
 
-    def _column(self, name: str) -> "_StepColumn":
+    def _column(self, name: str) -> StepColumn:
         if name not in self._steps:
             if name not in (*self.meta["columns"], schema.RETURN_TO_GO):
                 raise InputError(f"{self.path} has no column {name!r}; prepare the logs with it")
-            column = _StepColumn(self._parts(name, mmap=True))
+            column = StepColumn(self._parts(name, mmap=True))
             if len(column) != self.meta["n_steps"]:
                 raise self._damaged(name, f"has {len(column)} of {self.meta['n_steps']} steps")
             if name == schema.ITEM and name not in self._arrays:
@@ -283,28 +284,12 @@ class Columns:
         if name in self._arrays:
             return [self._arrays[name]]
         shape = tuple(self.meta["columns"].get(name, ()))
-        return [self._load(f"{shard.name}/{name}.npy", name, shape, mmap) for shard in self._shards]
+        return [
+            load_column(self.path, f"{shard.name}/{name}.npy", shape, mmap, self._sealed)
+            for shard in self._shards
+        ]
 
-    def _load(self, file: str, name: str, shape: tuple[int, ...], mmap: bool) -> Array:
-        """A column of one shard, memory-mapped or in memory, whose rows have the given shape."""
-        if self._sealed is not None:
-            self._sealed.require(file)
-        path = self.path / file
-        try:
-            # Mapping compares the header with the size of the file before it takes memory.
-            values: Array = np.load(path, mmap_mode="r")
-        except Exception as error:  # numpy parses headers as Python and raises what that raises
-            message = one_line(str(error)) or type(error).__name__
-            raise InputError(f"{path} is missing or damaged ({message}); {REMEDY}") from None
-        kinds = {_OFFSETS: "<i8", schema.RETURN_TO_GO: "<f4"}
-        kinds |= schema.STEP_DTYPES | schema.EPISODE_DTYPES
-        if values.dtype != kinds[name] or values.shape[1:] != shape or values.ndim == 0:
-            raise InputError(
-                f"{path} is damaged: it holds {values.dtype} in the shape {values.shape}; {REMEDY}"
-            )
-        return values if mmap else np.array(values)
-
-    def _require_items(self, column: "_StepColumn") -> None:
+    def _require_items(self, column: StepColumn) -> None:
         if not self.has_item_states:
             return
         low, high = column.range()
@@ -314,30 +299,3 @@ class Columns:
 
     def _damaged(self, name: str, fault: str) -> InputError:
         return InputError(f"{self.path} is damaged: column {name!r} {fault}; {REMEDY}")
-
-
-class _StepColumn:
-    """A step column, indexed across its shards."""
-
-    def __init__(self, parts: list[Array]) -> None:
-        self._parts = parts
-        self._bounds = np.cumsum([0] + [len(part) for part in self._parts])
-
-    def __len__(self) -> int:
-        return int(self._bounds[-1])
-
-    def range(self) -> tuple[Any, Any]:
-        """The lowest and the highest value."""
-        return min(part.min() for part in self._parts), max(part.max() for part in self._parts)
-
-    def take(self, index: IntArray) -> Array:
-        """A copy of the values at the indices `index`, of any shape."""
-        if len(self._parts) == 1:
-            return np.asarray(self._parts[0][index])
-        shard = np.searchsorted(self._bounds[1:-1], index, side="right")
-        first = self._parts[0]
-        values = np.empty((*index.shape, *first.shape[1:]), dtype=first.dtype)
-        for i, part in enumerate(self._parts):
-            in_shard = shard == i
-            values[in_shard] = part[index[in_shard] - self._bounds[i]]
-        return values

@@ -68,4 +68,7 @@ class TrainingCounts:
         """
         tensors, numbers = load_tensors(path)
         with damage_explained(path, REMEDY):
+            for name in ("shown", "liked"):
+                if tensors[name].dtype != torch.int64 or bool((tensors[name] < 0).any()):
+                    raise ValueError(f"{name} are no counts")
             return cls(tensors["shown"], tensors["liked"], int(numbers["episodes"]))

@@ -4,8 +4,10 @@ Training windows and acting both call `ItemStates.build`. It uses only element-w
 fixed order, so its results are bit-identical for every batch size.
 """
 
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +18,11 @@ from ucfrec.errors import InputError, damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 
 IntArray = npt.NDArray[np.int64]
+
+DISTINCT_TAGS: Final = 1000
+"""Most tags of a catalogue that are told apart; rarer ones are left out."""
+TAGS_PER_ITEM: Final = 16
+"""Most tags that one item keeps."""
 
 
 @dataclass(frozen=True)
@@ -50,18 +57,30 @@ class ItemStates:
     def __post_init__(self) -> None:
         if self.embeddings.dim() != 2 or self.user_features.dim() != 2:
             raise InputError("embeddings and user features of item states must be matrices")
+        if not (self.embeddings.is_floating_point() and self.user_features.is_floating_point()):
+            raise InputError("embeddings and user features of item states must be real numbers")
         tags = self.tags
         if tags.dim() != 2 or (tags.shape[1] and len(tags) != len(self.embeddings)):
             raise InputError("tags of item states must be a matrix with one row per item")
-        # Tags are numbered without gaps, so that no number exceeds their count.
-        if tags.numel() and not -1 <= int(tags.min()) <= int(tags.max()) < tags.numel():
-            raise InputError(f"tags of item states are not numbers from -1 to {tags.numel() - 1}")
-        if not 1 <= self.window <= 10_000:
-            raise InputError(f"window of item states is {self.window}; give 1 to 10,000")
-        if not self.reward_low < self.reward_high:
+        if tags.dtype != torch.int64 or tags.shape[1] > TAGS_PER_ITEM:
             raise InputError(
-                f"rewards from {self.reward_low:g} to {self.reward_high:g} cannot be scaled to "
-                "[0, 1]; reward_low must be below reward_high"
+                f"tags of item states are {tags.shape[1]} of {tags.dtype} an item; give whole "
+                f"numbers, at most {TAGS_PER_ITEM}"
+            )
+        # Tags are numbered without gaps, so that no number exceeds their count. One more number is
+        # for items without tags.
+        most = min(tags.numel() - 1, DISTINCT_TAGS)
+        if tags.numel() and not -1 <= int(tags.min()) <= int(tags.max()) <= most:
+            raise InputError(f"tags of item states are not numbers from -1 to {most}")
+        if type(self.window) is not int or not 1 <= self.window <= 10_000:
+            raise InputError(f"window of item states is {self.window!r:.60}; give 1 to 10,000")
+        if not _is_real(self.decay) or not 0 <= self.decay <= 1:
+            raise InputError(f"decay of item states is {self.decay!r:.60}; give 0 to 1")
+        ends = self.reward_low, self.reward_high
+        if not all(map(_is_real, ends)) or not self.reward_low < self.reward_high:
+            raise InputError(
+                f"rewards from {ends[0]!r:.60} to {ends[1]!r:.60} cannot be scaled to [0, 1]; "
+                "reward_low must be below reward_high"
             )
         # Index −1 ("no item", "unknown user") selects this last row of zeros.
         object.__setattr__(self, "_items", _with_zero_row(self.embeddings))
@@ -138,6 +157,10 @@ class ItemStates:
         with damage_explained(path, REMEDY):
             states = cls(tensors["embeddings"], tensors["user_features"], **numbers)
             return replace(states, tags=tensors["tags"]) if "tags" in tensors else states
+
+
+def _is_real(value: object) -> bool:
+    return isinstance(value, int | float) and math.isfinite(value)
 
 
 def _with_zero_row(table: Tensor) -> Tensor:

@@ -115,7 +115,7 @@ class EpisodeStore(EpisodeView):
         Raises:
             InputError: this view has edited copies.
         """
-        self._require_no_copies("select from")
+        _require_no_copies(self, "select from")
         return EpisodeStore(self._columns, self.episode_ids[episodes])
 
     def split(self, name: str) -> "EpisodeStore":
@@ -129,7 +129,7 @@ class EpisodeStore(EpisodeView):
         """
         if name not in schema.SPLITS:
             raise InputError(f"no split is called {name!r}; there are {', '.join(schema.SPLITS)}")
-        self._require_no_copies("split")
+        _require_no_copies(self, "split")
         in_split = self.episode_values(schema.SPLIT) == schema.SPLITS.index(name)
         return self.select(np.flatnonzero(in_split))
 
@@ -157,7 +157,7 @@ class EpisodeStore(EpisodeView):
         Raises:
             InputError: this view has edited copies.
         """
-        self._require_no_copies("replace the returns-to-go of")
+        _require_no_copies(self, "replace the returns-to-go of")
         column = self._columns.step_column(schema.RETURN_TO_GO)
         episodes, steps = self.all_steps()
         column[self._columns.starts[self._sources[episodes]] + steps] = values
@@ -183,18 +183,11 @@ class EpisodeStore(EpisodeView):
         Raises:
             InputError: this view has edited copies; their states include all dimensions.
         """
-        self._require_no_copies("remove observation dimensions from")
+        _require_no_copies(self, "remove observation dimensions from")
         kept = np.setdiff1d(np.arange(self.observation_size), dimensions)
         column = self._columns.step_column(schema.OBSERVATION)[:, kept]
         columns = self._columns.with_step_column(schema.OBSERVATION, column)
         return EpisodeStore(columns, self._selected)
-
-    def _require_no_copies(self, operation: str) -> None:
-        if self.overlay is not None:
-            raise InputError(
-                f"{self} has edited copies; {operation} its without_copies(), then add copies with "
-                "with_overlay"
-            )
 
     # Windows and transitions.
 
@@ -285,6 +278,14 @@ class EpisodeStore(EpisodeView):
             rows, columns, edits = self.overlay.edits_at(copies, steps)
             states[rows, columns] = torch.from_numpy(self.overlay.edit_state[edits])
         return states
+
+
+def _require_no_copies(store: EpisodeStore, operation: str) -> None:
+    if store.overlay is not None:
+        raise InputError(
+            f"{store} has edited copies; {operation} its without_copies(), then add copies with "
+            "with_overlay"
+        )
 
 
 def _require_own_copies(store: EpisodeStore, overlay: Overlay) -> None:

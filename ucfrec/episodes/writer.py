@@ -130,7 +130,7 @@ class StoreWriter:
         for file in self._files.values():
             file.close()
         offsets = np.concatenate([*self._offsets, [self._steps_in_shard]]).astype(np.int64)
-        np.save(self._shard / "offsets.npy", offsets)
+        np.save(self._shard / f"{schema.OFFSETS}.npy", offsets)
         for name, values in self._episode_values.items():
             np.save(self._shard / f"{name}.npy", np.concatenate(values))
         rewards = np.load(self._shard / f"{schema.REWARD}.npy", mmap_mode="r")

@@ -120,7 +120,7 @@ def _item_numbers(world: World, env: Any, trained: TrainedPolicy) -> IntArray | 
     """The world's index of each item of the policy, −1 for items it lacks; None for vectors."""
     space, sizes = env.single_action_space, trained.record["sizes"]
     provided = int(np.prod(env.single_observation_space.shape))
-    expected = trained.record["observation_size"]
+    expected = trained.logged_observation_size
     if expected > provided:
         raise InputError(
             f"the policy observes {expected} numbers, {world.title} shows {provided}; train it on "

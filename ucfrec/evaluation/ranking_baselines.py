@@ -29,6 +29,7 @@ class PolicyRanker:
 
     def __init__(self, trained: TrainedPolicy, rule: DecisionRule | None, name: str) -> None:
         self.name, self._decider = name, trained.decider(rule)
+        self.rule = self._decider.rule
 
     def scores(self, steps: Steps) -> Tensor:
         """Log-probabilities at temperature 1 (B, n_items); see `Decider.scores`."""

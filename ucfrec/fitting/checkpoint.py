@@ -1,9 +1,9 @@
 """Checkpoints: one safetensors file each, with metadata as JSON in the file's header."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import torch
 import xxhash
@@ -17,6 +17,7 @@ from ucfrec.files import atomic_file
 REMEDY: Final = "restore it or train again"
 """What to do about a damaged file."""
 _OPTIMIZER = "optimizer."
+_Module = TypeVar("_Module", bound=nn.Module)
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> None:
@@ -124,6 +125,49 @@ def _require_shapes(
         for key, value in moments.items():
             if value.dim() and value.shape != parameters[index].shape:
                 raise ValueError(f"the optimizer's {key} of parameter {index} has another shape")
+
+
+def load_module(path: Path, build: Callable[[], _Module], tensors: dict[str, Tensor]) -> _Module:
+    """Build a module and load `tensors` into it.
+
+    The sizes of a module come from a record that may state any. They are compared with those of the
+    tensors, which a file holds, before memory is asked for.
+
+    Args:
+        path: where `tensors` were read from, for messages.
+        build: makes the module.
+        tensors: its weights.
+
+    Raises:
+        InputError: they are the weights of another architecture.
+    """
+    with damage_explained(path, REMEDY):
+        shapes = _shapes(build)
+    for name in sorted(shapes.keys() & tensors.keys()):
+        if shapes[name] != tensors[name].shape:
+            raise InputError(
+                f"{path} holds weights of another architecture ({name} is "
+                f"{list(tensors[name].shape)}, the run's record asks for {list(shapes[name])}); "
+                "restore both, or train again"
+            )
+    if shapes and shapes.keys() != tensors.keys():
+        name = min(shapes.keys() ^ tensors.keys())
+        raise InputError(
+            f"{path} holds weights of another architecture ({name} is only in "
+            f"{'the file' if name in tensors else 'the architecture'}); restore it or train again"
+        )
+    module = build()
+    load_weights(path, module, tensors)
+    return module
+
+
+def _shapes(build: Callable[[], nn.Module]) -> dict[str, torch.Size]:
+    """Shapes of a module's weights, without memory for them; none if its constructor needs some."""
+    try:
+        with torch.device("meta"):
+            return {name: tensor.shape for name, tensor in build().state_dict().items()}
+    except NotImplementedError:
+        return {}
 
 
 def load_weights(path: Path, module: nn.Module, tensors: dict[str, Tensor]) -> None:

@@ -12,6 +12,7 @@ import duckdb
 from safetensors import SafetensorError
 
 from ucfrec.errors import InputError
+from ucfrec.logs.compressed import require_plausible_size
 from ucfrec.logs.expressions import NotScalarError, columns_of, refused
 from ucfrec.parquet_files import require_plausible_rows
 
@@ -102,6 +103,8 @@ def open_tables(connection: duckdb.DuckDBPyConnection, files: Sequence[Path]) ->
 def _columns(connection: duckdb.DuckDBPyConnection, file: Path) -> tuple[tuple[str, str], ...]:
     if file.stat().st_size == 0:
         raise InputError(f"{file} is empty (0 bytes); remove it from the input or fetch it again")
+    if file.suffix == ".gz":
+        require_plausible_size(file)
     source = Table((file,), ()).sql.replace(", types = {}", "")
     try:
         types = connection.sql(f"DESCRIBE SELECT * FROM {source}").fetchall()

@@ -8,14 +8,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from ucfrec.episodes.states import DISTINCT_TAGS, TAGS_PER_ITEM
 from ucfrec.errors import InputError
 
 CATEGORIES: Final = 200
 """Most categories or tags of one column: the most frequent among trained ids are kept."""
-TAGS: Final = 16
-"""Most tags kept of one item, the most frequent ones."""
-DISTINCT_TAGS: Final = 1000
-"""Most different tags kept, the most frequent ones: what a session was shown is summed by tag."""
 CLIP: Final = 5.0
 """Standardised numbers are clipped to ± this many standard deviations."""
 
@@ -71,7 +68,7 @@ def item_tags(
         id_column: column of the ids in it.
 
     Returns:
-        (n_ids, T) int64, padded with −1, T at most `TAGS`; T is 0 without columns of lists.
+        (n_ids, T) int64, padded with −1, T at most `TAGS_PER_ITEM`, and 0 without columns of lists.
     """
     ((count,),) = connection.sql(f"SELECT count(*) FROM {ids}").fetchall()
     cases = [
@@ -92,7 +89,7 @@ def item_tags(
         )
         SELECT number, tag_number,
             row_number() OVER (PARTITION BY number ORDER BY tag_number) - 1 AS place
-        FROM cases JOIN tags USING (tag) QUALIFY place < {TAGS}
+        FROM cases JOIN tags USING (tag) QUALIFY place < {TAGS_PER_ITEM}
     """).fetchnumpy()
     numbers, places = found["number"].astype(np.int64), found["place"].astype(np.int64)
     tags = np.full((count, int(places.max(initial=0)) + 1), -1, dtype=np.int64)

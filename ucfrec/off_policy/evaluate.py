@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.episodes.store import EpisodeStore
 from ucfrec.off_policy.behavior_model import BehaviorModel, fit_behavior
 from ucfrec.off_policy.columns import as_row, diagnosis_columns, verdict_columns
 from ucfrec.off_policy.diagnostics import diagnose, implied_items
@@ -42,6 +43,8 @@ class OffPolicyReport:
     warnings: list[str]
     """The verdict's reasons, cautions, and remarks on the logs."""
     verdict: Verdict
+    models: ModelReport
+    """How good the models of DM, FQE and DR are."""
     returns: FloatArray
     """(S,) of the logged sessions, or pages, with all their propensities; empty if none has."""
     user: IntArray | None
@@ -96,8 +99,7 @@ def evaluate_off_policy(
     judged = logged_steps(trained, logged, rule, seed, options)
     steps = as_pages(judged.steps, *_pages(logged)) if options.pages else judged.steps
     steps, of_groups = _without_far_off_groups(steps)
-    began = logged.store.step_values(schema.TIMESTAMP, *logged.store.all_steps())
-    segment = None if options.pages else _quarters(began[steps.first])
+    segment = None if options.pages else _quarters(logged.store, steps)
     found, diagnosis = estimate(steps, seed), diagnose(steps, options.reward_range, segment)
     seen = share_seen(trained, logged.store)
     verdict = judge(
@@ -108,8 +110,8 @@ def evaluate_off_policy(
         forbidden=[*_seen_too_often(seen), *_too_many_items(trained, judged)],
         declared=_declared(judged),
     )
-    said = [*verdict.reasons, *cautions(diagnosis, found), *_of_the_logs(seen, logged)]
-    said += [*of_groups, *_of_the_models(judged)]
+    said = [*verdict.reasons, *cautions(diagnosis, found), *_of_the_logs(seen, logged), *of_groups]
+    said += _of_the_models(judged)
     about = {
         **_of_the_rule(rule),
         **_of_the_sessions(steps, logged, options),
@@ -122,21 +124,26 @@ def evaluate_off_policy(
         "seed": seed,
         **provenance(),
     }
-    who = {"policy": trained.name, "choice": "softmax" if rule.temperature else "greedy"}
-    behavior = {"policy": "behavior", "choice": "as logged"}
     rows = [
-        as_row(name, one) | (behavior if name == LOGGED else who) | about
-        for name, one in found.items()
+        as_row(name, one) | _of_whom(name, trained, rule) | about for name, one in found.items()
     ]
     known = steps.known() if diagnosis.left_out < diagnosis.sessions else None
     return OffPolicyReport(
         rows,
         said,
         verdict,
+        judged.models,
         returns=np.empty(0) if known is None else known.returns,
         user=None if known is None else known.user,
         terms=None if known is None else _terms(known, verdict),
     )
+
+
+def _of_whom(estimator: str, trained: TrainedPolicy, rule: DecisionRule) -> dict[str, Any]:
+    """What a row tells of the policy whose return it estimates."""
+    if estimator == LOGGED:
+        return {"policy": "behavior", "choice": "as logged"}
+    return {"policy": trained.name, "choice": "softmax" if rule.temperature else "greedy"}
 
 
 def _of_the_rule(rule: DecisionRule) -> dict[str, Any]:
@@ -188,9 +195,11 @@ def _without_far_off_groups(steps: LoggedSteps) -> tuple[LoggedSteps, list[str]]
     return replace(steps, cluster_propensity=None, cluster_target=None), [said]
 
 
-def _quarters(times: npt.NDArray[Any]) -> IntArray:
+def _quarters(store: EpisodeStore, steps: LoggedSteps) -> IntArray:
     """(S,) quarter of the logs, 1 to 4 by time, in which each session begins."""
-    return 1 + np.searchsorted(np.quantile(times, [0.25, 0.5, 0.75]), times, side="right")
+    times = store.step_values(schema.TIMESTAMP, *store.all_steps())[steps.first]
+    quarters = np.searchsorted(np.quantile(times, [0.25, 0.5, 0.75]), times, side="right")
+    return np.asarray(1 + quarters)
 
 
 def _declared(judged: JudgedSteps) -> str:
@@ -235,8 +244,8 @@ def _of_the_logs(seen: float | None, logged: LoggedSessions) -> list[str]:
     said = []
     if seen is None:
         said.append(
-            "the store that the run was trained on is not there any more: whether these logs were "
-            "seen in training is not known"
+            "the store that the run was trained on is gone or has changed: whether these logs were "
+            "seen in training is not known; move the run together with its store"
         )
     if unknown := logged.unknown_items:
         said.append(
@@ -366,7 +375,7 @@ def step_features(
     # What the policy thinks of an item counts for the models also where the rule takes the best.
     of_chosen, of_shown = scores_of(batch.scores.log_softmax(-1), items, probabilities)
     seen = StepInputs(
-        context=context_of(trained, batch),
+        context=context_of(batch),
         state_size=batch.windows.states.shape[2],
         chosen=embeddings[items] * known[:, None],
         shown=probabilities @ embeddings,

@@ -11,8 +11,6 @@ import torch
 from torch import Tensor
 
 from ucfrec.off_policy.score import ScoredSteps
-from ucfrec.policies.base import SequencePolicy
-from ucfrec.runs.trained_policy import TrainedPolicy
 
 Float32Array = npt.NDArray[np.float32]
 
@@ -53,17 +51,13 @@ class StepInputs:
         return np.asarray(torch.cat(parts, dim=1), dtype=np.float32)
 
 
-@torch.no_grad()
-def context_of(trained: TrainedPolicy, batch: ScoredSteps) -> Tensor:
+def context_of(batch: ScoredSteps) -> Tensor:
     """(B, C) state, return left of the target, and last-layer features of the policy's window.
 
     A learner that is no network of features (item-knn, crm-greedy) has the first two only.
     """
-    windows, policy = batch.windows, trained.policy
-    parts = [windows.states[:, -1], batch.returns_left[:, None]]
-    if type(policy).act is SequencePolicy.act:
-        asked = batch.asked.to(policy.state_mean.device)
-        parts.append(policy.features(policy.normalized(asked))[:, -1].cpu())
+    parts = [batch.windows.states[:, -1], batch.returns_left[:, None]]
+    parts += [] if batch.features is None else [batch.features]
     return torch.cat([part.float() for part in parts], dim=1)
 
 

@@ -1,6 +1,7 @@
 """Cluster bootstrap: intervals of ratios of sums over sessions, users resampled whole."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -170,21 +171,34 @@ def _resampled(moments: FloatArray, correction: float, seed: int) -> tuple[Float
     """
     _, clusters, columns = moments.shape
     flat = np.moveaxis(moments, 1, 0).reshape(clusters, -1)
-    generator = np.random.default_rng(seed)
-    at_once = max(1, min(RESAMPLES, _COUNTS_AT_ONCE // clusters))
+    counts, at_once = _counts(clusters, seed), max(1, _COUNTS_AT_ONCE // clusters)
     shifts, errors = [], []
     for begin in range(0, RESAMPLES, at_once):
-        draws = min(at_once, RESAMPLES - begin)
         # How often each cluster is drawn stands for the resampled rows.
-        picked = generator.integers(clusters, size=(draws, clusters))
-        picked += np.arange(draws)[:, None] * clusters
-        counts = np.bincount(picked.ravel(), minlength=draws * clusters).reshape(draws, clusters)
-        e, b, ee, eb, bb = (
-            (counts.astype(np.float64) @ flat).reshape(draws, 5, columns).swapaxes(0, 1)
-        )
+        drawn = counts[begin : begin + at_once].astype(np.float64)
+        e, b, ee, eb, bb = (drawn @ flat).reshape(-1, 5, columns).swapaxes(0, 1)
         with np.errstate(invalid="ignore", divide="ignore"):
             shift = np.where(b > 0, e / b, np.nan)
             spread = np.maximum(ee - 2 * shift * eb + shift**2 * bb, 0.0)
             errors.append(correction * np.sqrt(spread) / b)
         shifts.append(shift)
     return np.concatenate(shifts), np.concatenate(errors)
+
+
+@lru_cache(maxsize=1)
+def _counts(clusters: int, seed: int) -> npt.NDArray[np.uint16]:
+    """(B, C) how often each resample has each cluster, at most 40 MB.
+
+    Kept for the next call: an estimate, its verdict and a selection draw the same clusters.
+    """
+    generator = np.random.default_rng(seed)
+    counts = np.empty((RESAMPLES, clusters), dtype=np.uint16)
+    at_once = max(1, min(RESAMPLES, _COUNTS_AT_ONCE // clusters))
+    for begin in range(0, RESAMPLES, at_once):
+        draws = min(at_once, RESAMPLES - begin)
+        picked = generator.integers(clusters, size=(draws, clusters))
+        picked += np.arange(draws)[:, None] * clusters
+        found = np.bincount(picked.ravel(), minlength=draws * clusters)
+        counts[begin : begin + draws] = found.reshape(draws, clusters)
+    counts.setflags(write=False)
+    return counts

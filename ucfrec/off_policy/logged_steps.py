@@ -73,6 +73,9 @@ class LoggedSteps:
     cluster_target: FloatArray | None = None
     """(N,) the evaluated policy's probability of it."""
     groups: ItemGroups | None = None
+    densities: bool = False
+    """Whether `propensity` and `target` are probability densities of vector actions, which may
+    exceed 1."""
     pages: bool = False
     """Whether a session is one page and its steps the page's positions, chosen at once; see
     `ucfrec.off_policy.pages`."""
@@ -89,7 +92,8 @@ class LoggedSteps:
             _require_shape(name, values, n)
             if not np.isfinite(values).all():
                 raise InputError(f"{name} is not finite at {(~np.isfinite(values)).sum()} steps")
-        _require_probabilities(self.propensity, self.target, n)
+        most = np.inf if self.densities else 1.0
+        _require_probabilities(self.propensity, self.target, n, most)
         if (self.cluster_propensity is None) is not (self.cluster_target is None):
             raise InputError("give both cluster_propensity and cluster_target, or neither")
         if self.cluster_propensity is not None and self.cluster_target is not None:
@@ -252,15 +256,20 @@ def _require_shape(name: str, values: FloatArray, n: int) -> None:
         raise InputError(f"{name} has shape {values.shape}, {n} steps are ({n},)")
 
 
-def _require_probabilities(propensity: FloatArray, target: FloatArray, n: int) -> None:
+def _require_probabilities(
+    propensity: FloatArray, target: FloatArray, n: int, most: float = 1.0
+) -> None:
+    """Args:
+    most: what they may not exceed; infinity for densities.
+    """
     _require_shape("propensity", propensity, n)
     _require_shape("target", target, n)
     if not np.isfinite(target).all():
         raise InputError(f"target is not finite at {(~np.isfinite(target)).sum()} steps")
-    if not ((target >= 0) & (target <= 1)).all():
+    if not ((target >= 0) & (target <= most)).all():
         raise InputError("probabilities of the evaluated policy lie between 0 and 1")
-    if not (np.isnan(propensity) | (propensity > 0) & (propensity <= 1)).all():
+    if not (np.isnan(propensity) | (propensity > 0) & (propensity <= most)).all():
         raise InputError(
-            "propensities must be above 0 and at most 1 (a probability, not a density); "
-            "correct that column"
+            "propensities must be above 0 and at most 1; correct that column, or say that they "
+            "are densities (LoggedSteps(densities=True))"
         )

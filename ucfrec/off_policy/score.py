@@ -1,25 +1,25 @@
 """The probability that a policy gives to each logged choice."""
 
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
 import pyarrow.parquet as pq
-import torch
 from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.logged_decisions import session_scores
+from ucfrec.acting.logged_decisions import session_decisions
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
+from ucfrec.locks import scratch_folder
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
@@ -61,13 +61,11 @@ class ScoredSteps:
     """(B, n_items): what the rule decides by, see `ucfrec.acting.decision.Decider.scores`."""
     log_probabilities: Tensor
     """(B, n_items): natural logarithm of the probability that the policy shows each item."""
-    asked: Windows
-    """The windows as the policy saw them: returns-to-go from the target return."""
-
-    @property
-    def returns_left(self) -> Tensor:
-        """(B,): target return less the session's reward before the step."""
-        return self.asked.returns_to_go[:, -1]
+    returns_left: Tensor
+    """(B,): target return less the session's reward before the step."""
+    features: Tensor | None
+    """(B, d): last-layer features of the policy's window; None of a learner that is no network of
+    features (item-knn, crm-greedy)."""
 
 
 @contextmanager
@@ -113,8 +111,8 @@ def logged_sessions(
     options = PrepareOptions(Expression(record["reward"], str(run / RUN)), session_by)
     if gap_ms is not None:
         options = replace(options, gap_minutes=gap_ms / 60_000)
-    with tempfile.TemporaryDirectory(prefix="ucfrec-") as scratch:
-        folder = Path(scratch) / "store"
+    with scratch_folder(Path(gettempdir()), "logs") as scratch:
+        folder = scratch / "store"
         report = prepare(files, mapping, folder, options, like=run, keep_unknown=keep_unknown)
         store = EpisodeStore.open(folder)
         unknown = int((store.step_values(schema.ITEM, *store.all_steps()) < 0).sum())
@@ -123,11 +121,14 @@ def logged_sessions(
                 f"{files[0]}: in all {unknown:,} rows the item is not in the store of the run; "
                 "give logs of the same catalogue"
             )
-        if store.observation_size != record["observation_size"]:
+        if store.observation_size != trained.logged_observation_size:
             raise InputError(
-                f"the policy was trained with observations of {record['observation_size']} numbers;"
-                f" those of the logs have {store.observation_size}"
+                "the policy was trained with observations of "
+                f"{trained.logged_observation_size} numbers; those of the logs have "
+                f"{store.observation_size}"
             )
+        if store.observation_size and trained.dropped:
+            store = store.without_observation_dimensions(trained.dropped)
         users = np.asarray(pq.read_table(folder / EPISODE_USERS).column(schema.USER_ID))
         yield LoggedSessions(store, users, report, unknown)
 
@@ -151,13 +152,16 @@ def scored_steps(
     with progress(total, "score", "steps") as bar:
         for begin in range(0, total, at_once):
             episodes, steps = store.locate(np.arange(begin, min(begin + at_once, total)))
-            windows = store.windows(episodes, steps, trained.policy.config.context)
-            scores = session_scores(decider, store, episodes, steps)
-            log_probabilities = decider.rule.log_probabilities(scores)
-            collected = torch.from_numpy(store.rewards_before(episodes, steps))
-            asked = replace(windows, actions=windows.actions.clamp(min=0))
-            asked = decider.asked(asked, collected)
-            yield ScoredSteps(episodes, steps, windows, scores, log_probabilities, asked)
+            found = session_decisions(decider, store, episodes, steps)
+            yield ScoredSteps(
+                episodes,
+                steps,
+                found.windows,
+                found.scores,
+                decider.rule.log_probabilities(found.scores),
+                found.asked.returns_to_go[:, -1],
+                found.features,
+            )
             bar.update(len(steps))
 
 

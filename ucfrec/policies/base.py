@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor, nn
@@ -62,8 +63,11 @@ class PolicyConfig:
     advantage_weights: bool = False
     """Whether steps count in the loss by exp((Ĝ − V(s)) / σ), instead of all alike."""
     max_return: bool = False
-    """Whether the largest return to expect in a state is learned, which decision rules can take for
-    the target return."""
+    """Whether the largest return to expect after a history is learned, which decision rules can
+    take for the target return."""
+    best_share: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """Share of the training episodes to learn from, those with the highest returns; for `bc`, 0.1
+    is the 10% BC of Chen et al. (2021)."""
 
     @property
     def exposure_lags(self) -> int:
@@ -118,7 +122,8 @@ class SequencePolicy(nn.Module, ABC):
     def training_view(
         cls, train: EpisodeStore, config: PolicyConfig, folder: Path, seed: int
     ) -> EpisodeStore:
-        """The episodes to train on, derived from the training episodes; by default all, unchanged.
+        """The episodes to train on, derived from the training episodes; by default the share
+        `best_share` of them with the highest returns.
 
         Args:
             train: the training episodes.
@@ -126,7 +131,11 @@ class SequencePolicy(nn.Module, ABC):
             folder: keeps intermediate results, so that a resumed run reuses them.
             seed: seed of every random draw.
         """
-        return train
+        if config.best_share == 1:
+            return train
+        count = int(np.ceil(config.best_share * train.n_episodes))
+        best = np.argsort(-train.returns, kind="stable")[:count]
+        return train.select(np.sort(best))
 
     def start_from(self, train: EpisodeStore) -> None:
         """Set buffers from the training episodes, before the first update."""
@@ -191,7 +200,8 @@ class SequencePolicy(nn.Module, ABC):
         if self.values is None:
             value = self.head.loss(*given)  # type: ignore[arg-type]
             return value, {"action_loss": value.detach()}
-        values, returns = steps(self.values(windows)), steps(windows.returns_to_go)
+        values = steps(self.values(windows, self.head.embed(windows.actions)))
+        returns = steps(windows.returns_to_go)
         losses = self.head.losses(*given)  # type: ignore[arg-type]
         if self.config.advantage_weights:
             losses = losses * advantage_weights(values, returns)
@@ -207,9 +217,13 @@ class SequencePolicy(nn.Module, ABC):
 
     def act(self, windows: Windows) -> Tensor:
         """Predictions at the last step: actions (B, A), or logits over items (B, n_items)."""
+        return self.act_and_features(windows)[0]
+
+    def act_and_features(self, windows: Windows) -> tuple[Tensor, Tensor]:
+        """Predictions at the last step, and the features (B, d) that they are made from."""
         normalized = self.normalized(windows)
         features, exposed = self.last_features(normalized), self._exposed_last(normalized)
-        return self.head.predict(features, exposed)  # type: ignore[arg-type]
+        return self.head.predict(features, exposed), features  # type: ignore[arg-type]
 
     def max_return(self, windows: Windows) -> Tensor:
         """The largest return-to-go to expect at the last step, (B,) in reward units.
@@ -222,7 +236,8 @@ class SequencePolicy(nn.Module, ABC):
                 "the policy does not know its largest return; train it with "
                 "--set policy.max_return=true, or give a target return"
             )
-        best: Tensor = self.values(self.normalized(windows))[:, -1, 1]
+        normalized = self.normalized(windows)
+        best: Tensor = self.values(normalized, self.head.embed(normalized.actions))[:, -1, 1]
         return best * self.return_scale
 
     def exposed(self, windows: Windows) -> Exposed | None:

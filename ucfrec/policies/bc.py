@@ -1,14 +1,9 @@
 """Behaviour cloning: predicts the logged action from the current state alone."""
 
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Annotated
 
-import numpy as np
-from pydantic import Field
 from torch import Tensor, nn
 
-from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import Context, PolicyConfig, SequencePolicy
 from ucfrec.settings import settings_table
@@ -20,9 +15,6 @@ class BCConfig(PolicyConfig):
 
     context: Context = 1
     """K, steps of a training window; each prediction uses its own state only."""
-    best_share: Annotated[float, Field(gt=0, le=1)] = 1.0
-    """Share of the training episodes to imitate, those with the highest returns; 0.1 is the 10% BC
-    of Chen et al. (2021)."""
 
 
 class BCPolicy(SequencePolicy):
@@ -42,16 +34,6 @@ class BCPolicy(SequencePolicy):
             nn.ReLU(),
             nn.LayerNorm(dim),
         )
-
-    @classmethod
-    def training_view(
-        cls, train: EpisodeStore, config: PolicyConfig, folder: Path, seed: int
-    ) -> EpisodeStore:
-        """The share `best_share` of the episodes, those with the highest returns."""
-        assert isinstance(config, BCConfig)
-        count = int(np.ceil(config.best_share * train.n_episodes))
-        best = np.argsort(-train.returns, kind="stable")[:count]
-        return train.select(np.sort(best))
 
     def features(self, windows: Windows) -> Tensor:
         """Features (B, K, d), each from its own state."""

@@ -76,8 +76,9 @@ class EDT4RecPolicy(DTPolicy):
     def training_view(
         cls, train: EpisodeStore, config: PolicyConfig, folder: Path, seed: int
     ) -> EpisodeStore:
-        """The episodes with returns-to-go raised by CQL; unchanged if `relabel` is false."""
+        """The episodes with returns-to-go raised by CQL; as logged if `relabel` is false."""
         assert isinstance(config, EDT4RecConfig)
+        train = super().training_view(train, config, folder, seed)
         if not config.relabel:
             return train
         cql = CQLConfig(steps=config.cql_steps, weight=config.cql_weight)

@@ -61,7 +61,8 @@ class LSDTPolicy(SequencePolicy):
     A gate weights both halves. Source:
     https://github.com/WangJinCheng1998/LONG-SHORT-DECISION-TRANSFORMER, without its unused return
     and state heads and without the five of its eleven taps that its causal mask sets to zero.
-    Padding is masked in attention and set to zero before convolutions.
+    Padding is masked in attention and convolutions. As there, every linear layer and the timestep
+    embedding start with Xavier's uniform distribution.
     """
 
     Config = LSDTConfig
@@ -71,10 +72,8 @@ class LSDTPolicy(SequencePolicy):
         super().__init__(config, sizes)
         self.embed = TokenEmbedding(config, sizes["state"])
         self.blocks = nn.ModuleList(_Block(config) for _ in range(config.layers))
-        for module in self.blocks.modules():
-            if isinstance(module, nn.Linear):
-                nn.init.xavier_uniform_(module.weight)
-                nn.init.zeros_(module.bias)
+        for part in (self.embed, self.blocks, self.head):
+            part.apply(_initialise)
 
     def features(self, windows: Windows) -> Tensor:
         """Features (B, K, d): outputs at the tokens s_t."""
@@ -83,6 +82,19 @@ class LSDTPolicy(SequencePolicy):
         for block in self.blocks:
             hidden = block(hidden, valid)
         return hidden[:, 1::3]
+
+
+def _initialise(module: nn.Module) -> None:
+    """Xavier's uniform weights, and biases 0."""
+    if isinstance(module, _Attention):
+        # Queries, keys and values are three layers of the official code.
+        for weight in module.query_key_value.weight.data.chunk(3):
+            nn.init.xavier_uniform_(weight)
+        nn.init.zeros_(module.query_key_value.bias)
+    elif isinstance(module, nn.Linear | nn.Embedding):
+        nn.init.xavier_uniform_(module.weight)
+        if isinstance(module, nn.Linear):
+            nn.init.zeros_(module.bias)
 
 
 class _Block(nn.Module):
@@ -147,6 +159,10 @@ class _DynamicConvolution(nn.Module):
         batch, tokens, dim = hidden.shape
         values = F.glu(self.gated(hidden)).masked_fill(~valid.unsqueeze(-1), 0.0)
         taps = self.dropout(self.taps(values)).view(batch, tokens, self.groups, 1, self.kernel)
+        # A kernel's weights sum to 1 over tokens of the window only; the own token is the last.
+        visible = F.pad(valid, (self.kernel - 1, 0)).unfold(1, self.kernel, 1).clone()
+        visible[..., -1] = True
+        taps = taps.masked_fill(~visible[:, :, None, None], -torch.inf)
         # (B, 5 + L, c) -> (B, L, c, 6) -> (B, L, groups, c/groups, 6)
         local = F.pad(values, (0, 0, self.kernel - 1, 0)).unfold(1, self.kernel, 1)
         local = local.reshape(batch, tokens, self.groups, dim // self.groups, self.kernel)

@@ -47,12 +47,12 @@ def policy_class(name: str) -> "type[SequencePolicy]":
         InputError: no learner has this name, it cannot be imported, or it is not a `SequencePolicy`
             whose `Config` is a table of settings.
     """
-    if name not in policy_names():
-        raise InputError(f"no policy is called {name!r}; choose from {', '.join(policy_names())}")
     if name in BUILT_IN:
         module, _, title = BUILT_IN[name].partition(":")
         built_in: type[SequencePolicy] = getattr(import_module(f"ucfrec.policies.{module}"), title)
         return built_in
+    if name not in policy_names():
+        raise InputError(f"no policy is called {name!r}; choose from {', '.join(policy_names())}")
     return _checked(name, load_plugin("policies", name))
 
 

@@ -13,24 +13,35 @@ _CLIP = (-5.0, 3.0)
 
 
 class ValueHead(nn.Module):
-    """V(s_t), the mean of the return-to-go Ĝ_t, and V_τ(s_t), its expectile at τ = `BEST`.
+    """V(h_t), the mean of the return-to-go Ĝ_t, and V_τ(h_t), its expectile at τ = `BEST`.
 
-    It reads the state and the step's number only, never Ĝ_t or what follows. The expectile
-    minimises E[|τ − 1(Ĝ < V)| (Ĝ − V)²] (Zhuang et al., ICML 2024). Values are in units of the
-    policy's return scale.
+    The history h_t is what the policy sees but the returns-to-go: states and step numbers up to t
+    and actions before t, within the context. The expectile minimises E[|τ − 1(Ĝ < V)| (Ĝ − V)²]
+    (Zhuang et al., ICML 2024). Values are in units of the policy's return scale.
     """
 
     def __init__(self, state_size: int, dim: int) -> None:
         super().__init__()
-        self.net = nn.Sequential(
-            nn.Linear(state_size + 1, dim), nn.ReLU(), nn.Linear(dim, dim), nn.ReLU(),
-            nn.Linear(dim, 2),
-        )  # fmt: skip
+        self.embed = nn.Linear(state_size + 1 + dim, dim)
+        self.history = nn.GRU(dim, dim, batch_first=True)
+        self.out = nn.Sequential(nn.Linear(dim, dim), nn.ReLU(), nn.Linear(dim, 2))
 
-    def forward(self, windows: Windows) -> Tensor:
-        """Mean and expectile (B, K, 2), from normalised windows."""
+    def forward(self, windows: Windows, actions: Tensor) -> Tensor:
+        """Mean and expectile (B, K, 2).
+
+        Args:
+            windows: normalised.
+            actions: (B, K, d) the embedded actions of the windows; no gradient goes into them.
+        """
+        mask = windows.mask
         time = torch.log1p(windows.timesteps.float()).unsqueeze(-1) / 5
-        return self.net(torch.cat([windows.states, time], dim=-1))  # type: ignore[no-any-return]
+        played = actions.detach().masked_fill(~mask.unsqueeze(-1), 0.0)
+        before = F.pad(played, (0, 0, 1, 0))[:, :-1]
+        tokens = F.relu(self.embed(torch.cat([windows.states, time, before], dim=-1)))
+        # Padding is moved from the left to the right, where it follows every step.
+        padding, steps = (~mask).sum(1, keepdim=True), torch.arange(mask.shape[1]).to(mask.device)
+        found, _ = self.history(_taken(tokens, (steps + padding).clamp(max=mask.shape[1] - 1)))
+        return self.out(_taken(found, (steps - padding).clamp(min=0)))  # type: ignore[no-any-return]
 
     @staticmethod
     def loss(values: Tensor, returns: Tensor) -> Tensor:
@@ -43,6 +54,11 @@ class ValueHead(nn.Module):
         error = returns - values[:, 1]
         slope = torch.where(error < 0, 1 - BEST, BEST)
         return F.mse_loss(values[:, 0], returns) + (slope * error.square()).mean()
+
+
+def _taken(values: Tensor, steps: Tensor) -> Tensor:
+    """The rows (B, K) `steps` of `values` (B, K, d)."""
+    return values.gather(1, steps.unsqueeze(-1).expand_as(values))
 
 
 def advantage_weights(values: Tensor, returns: Tensor) -> Tensor:

@@ -67,8 +67,7 @@ def recommend(
         raise InputError(
             "this policy's actions are vectors; recommending needs a policy trained on items"
         )
-    if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or k < 1:
-        raise InputError(f"k is {k!r}; give a whole number, 1 or more")
+    _require_whole(k)
     index = trained.item_index
     excluded = None if candidates is None else _all_but(index, candidates)
     decider = trained.decider(rule)
@@ -76,16 +75,22 @@ def recommend(
     def frames() -> Iterator[pd.DataFrame]:
         remaining = iter(batches)
         for batch in remaining:
-            known = _positions(index, batch.item_ids) >= 0
+            known = positions(index, batch.item_ids) >= 0
             if not (known.all() or skip_unknown):
                 raise _unknown(index, [batch, *remaining])
             latest = batch.rows(known).latest_session(trained.record["session_gap_ms"])
-            store = _next_steps(trained, latest, index)
-            seen = _positions(index, batch.seen_ids) if filter_seen else None
+            users = positions(trained.user_index, latest.users)
+            store = next_steps(trained, latest, positions(index, latest.item_ids), users)
+            seen = positions(index, batch.seen_ids) if filter_seen else None
             chosen = _Choice(decider, k, seen, excluded, seed)
             yield _recommended(trained, store, batch, chosen)
 
     return frames()
+
+
+def _require_whole(k: int) -> None:
+    if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or k < 1:
+        raise InputError(f"k is {k!r}; give a whole number, 1 or more")
 
 
 @dataclass(frozen=True)
@@ -130,7 +135,7 @@ def _recommended(
     return pd.concat(frames, ignore_index=True)
 
 
-def _positions(index: "pd.Index[Any]", ids: Array) -> IntArray:
+def positions(index: "pd.Index[Any]", ids: Array) -> IntArray:
     """Position of each of `ids` (N,) in `index`, −1 for ids that it lacks."""
     wanted = pd.Index(ids)
     if pd.api.types.is_integer_dtype(index.dtype) != pd.api.types.is_integer_dtype(wanted.dtype):
@@ -146,7 +151,7 @@ def _all_but(index: "pd.Index[Any]", candidates: Sequence[Any]) -> Tensor:
     ids = np.asarray(list(candidates))
     if ids.ndim != 1 or len(ids) == 0:
         raise InputError("candidates is empty or nested; give a list of item_ids, or None for all")
-    numbers = _positions(index, ids)
+    numbers = positions(index, ids)
     if (numbers < 0).any():
         unknown = ids[numbers < 0].tolist()
         raise InputError(
@@ -161,7 +166,7 @@ def _all_but(index: "pd.Index[Any]", candidates: Sequence[Any]) -> Tensor:
 def _unknown(index: "pd.Index[Any]", batches: Iterable[Histories]) -> InputError:
     rows, items = 0, set[Any]()
     for batch in batches:
-        unknown = batch.item_ids[_positions(index, batch.item_ids) < 0]
+        unknown = batch.item_ids[positions(index, batch.item_ids) < 0]
         rows += len(unknown)
         items |= set(unknown.tolist())
     return InputError(
@@ -175,19 +180,29 @@ def _some(values: Sequence[Any]) -> str:
     return ", ".join(map(str, values[:3])) + (", …" if len(values) > 3 else "")
 
 
-def _next_steps(
-    trained: TrainedPolicy, histories: Histories, index: "pd.Index[Any]"
+def next_steps(
+    trained: TrainedPolicy, histories: Histories, known: IntArray, users: IntArray
 ) -> EpisodeStore:
-    """One episode per user: the session's steps and the next step, for which items are scored."""
+    """One episode per user: the session's steps and the next step, for which items are scored.
+
+    Args:
+        trained: the policy.
+        histories: U users with the N rows of their latest sessions.
+        known: (N,) index of each row's item in the store.
+        users: (U,) index of each user in the training store, −1 for others.
+
+    Raises:
+        InputError: the policy needs observations that the histories lack.
+    """
     n_users = len(histories.users)
     # Shifting each row by its user index leaves a free row at the end of every episode.
     places = np.arange(len(histories.owner)) + histories.owner
     lengths = np.bincount(histories.owner, minlength=n_users) + 1
     items = np.zeros(int(lengths.sum()), dtype=np.int64)
     rewards = np.zeros(len(items), dtype=np.float32)
-    items[places], rewards[places] = _positions(index, histories.item_ids), histories.rewards
+    items[places], rewards[places] = known, histories.rewards
     columns: dict[str, Array] = {schema.ITEM: items, schema.REWARD: rewards}
-    expected = trained.record["observation_size"]
+    expected = trained.logged_observation_size
     if expected:
         observations = histories.observations
         size = 0 if observations is None else observations.shape[1]
@@ -196,8 +211,8 @@ def _next_steps(
                 f"the policy was trained with observations of {expected} numbers; those of the "
                 f"histories have {size}"
             )
-        columns[schema.OBSERVATION] = np.repeat(observations, lengths, axis=0)
-    users = _positions(trained.user_index, histories.users)
+        seen = np.delete(observations, trained.dropped, axis=1)
+        columns[schema.OBSERVATION] = np.repeat(seen, lengths, axis=0)
     return EpisodeStore.from_arrays(columns, lengths, {schema.USER: users}, trained.item_states)
 
 

@@ -4,11 +4,12 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from ucfrec import __version__
 from ucfrec.counterfactual.reward_model_fit import fit_warning
@@ -88,11 +89,7 @@ def write_report(
             "forest": forest(evidence),
         }
     features = None if items is None else read_features(items)
-    loader = PackageLoader("ucfrec.reporting", "")
-    environment = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True
-    )
-    page = environment.get_template("report.html").render(
+    page = _template().render(
         version=__version__,
         warnings=[
             (run.name, text)
@@ -108,6 +105,15 @@ def write_report(
     with atomic_file(out) as scratch:
         # Folder names may have bytes that are not valid Unicode.
         scratch.write_text(page, encoding="utf-8", errors="backslashreplace")
+
+
+@cache
+def _template() -> Template:
+    loader = PackageLoader("ucfrec.reporting", "")
+    environment = Environment(
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+    return environment.get_template("report.html")
 
 
 def _read_runs(folders: Sequence[Path]) -> list[_Run]:

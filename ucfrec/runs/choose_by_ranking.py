@@ -26,6 +26,8 @@ SHOWN = 10
 """Items that a rule shows at a step."""
 _MOST_STEPS = 4000
 """Validation rows that are ranked at most."""
+_HALVINGS = 3
+"""How often the interval between the best tilt and the next larger one is halved."""
 _AT_ONCE = 256
 
 IntArray = npt.NDArray[np.int64]
@@ -81,11 +83,12 @@ def choose_by_ranking(
         decider: the policy under its default rule, with a reward model.
         train: training episodes.
         validation: validation episodes.
-        config: `tilts` are the candidates.
+        config: `tilts` are the first candidates.
         seed: of the validation rows that are drawn from more than 4,000.
 
     Returns:
-        The tilt with the highest rate among those with enough overlap; without any, no tilt.
+        The tilt with the highest rate among those with enough overlap; without any, no tilt. If
+        the next larger of the candidates overlaps too little, tilts between the two are tried.
     """
     rows = np.arange(validation.n_steps)
     if len(rows) > _MOST_STEPS:
@@ -99,14 +102,28 @@ def choose_by_ranking(
     floor = np.isin(items, most_liked)
     given = _Rows(validation, episodes, steps, items, liked, floor, rates)
     tilts = sorted({0.0, *config.tilts})
-    tops = _tops(decider, tilts, given)
-    candidates = [
-        _ranked(replace(decider.rule, tilt=tilt), top, given)
-        for tilt, top in zip(tilts, tops, strict=True)
-    ]
+    candidates: list[RankedRule] = []
+
+    def rank(tilts: Sequence[float]) -> None:
+        for tilt, top in zip(tilts, _tops(decider, tilts, given), strict=True):
+            candidates.append(_ranked(replace(decider.rule, tilt=tilt), top, given))
+
+    rank(tilts)
+    for _ in range(_HALVINGS):
+        best = _best(candidates)
+        larger = [each for each in candidates if each.rule.tilt > best.rule.tilt]
+        nearest = min(larger, key=lambda each: each.rule.tilt, default=best)
+        if nearest.gain >= 0:
+            break
+        rank([(best.rule.tilt + nearest.rule.tilt) / 2])
+    best = _best(candidates)
+    return RankedChoice(best.rule, candidates, best.gain >= 0)
+
+
+def _best(candidates: Sequence[RankedRule]) -> RankedRule:
+    """The candidate of the highest rate among those that overlap enough, or else the first."""
     allowed = [each for each in candidates if each.gain >= 0]
-    best = max(allowed, key=lambda each: each.item_rate) if allowed else candidates[0]
-    return RankedChoice(best.rule, candidates, bool(allowed))
+    return max(allowed, key=lambda each: each.item_rate) if allowed else candidates[0]
 
 
 @dataclass(frozen=True)

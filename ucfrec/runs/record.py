@@ -46,6 +46,10 @@ def _count(value: object) -> bool:
     return type(value) is int and 0 <= value < _LARGEST
 
 
+def _counts(value: object) -> bool:
+    return isinstance(value, list) and all(map(_count, value))
+
+
 def _number(value: object) -> bool:
     if isinstance(value, int) and not isinstance(value, bool):
         return abs(value) < _LARGEST
@@ -57,7 +61,7 @@ def _object(value: object) -> bool:
 
 
 def _config(value: object) -> bool:
-    return isinstance(value, dict) and {"policy_name", "seed"} <= value.keys()
+    return isinstance(value, dict) and _text(value.get("policy_name")) and "seed" in value
 
 
 def _sizes(value: object) -> bool:
@@ -106,6 +110,7 @@ _REQUIRED: Final[Mapping[str, Callable[[object], bool]]] = {
 _OPTIONAL: Final[Mapping[str, Callable[[object], bool]]] = {
     "command": _text,
     "store": _text,
+    "store_from_run": _or_none(_text),
     "seed": _count,
     "session_by": _or_none(_text),
     "session_gap_ms": _or_none(_number),
@@ -114,5 +119,7 @@ _OPTIONAL: Final[Mapping[str, Callable[[object], bool]]] = {
     "data": _object,
     "versions": _object,
     "augmentation": _or_none(_object),
+    "dropped_observations": _counts,
+    "screening": _object,
     "policy": _object,
 }

@@ -12,7 +12,7 @@ from ucfrec.errors import InputError
 from ucfrec.files import read_json
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.run import train_run
-from ucfrec.runs.trained_policy import INPUTS, REWARD_MODEL, RULE, RUN, TrainedPolicy
+from ucfrec.runs.trained_policy import DROPPED, INPUTS, REWARD_MODEL, RULE, RUN, TrainedPolicy
 
 
 def refit(store: EpisodeStore, first: Path, out: Path) -> dict[str, Any]:
@@ -41,7 +41,12 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> dict[str, Any]:
         )
     if "policy" not in trained.record:
         raise InputError(f"{first} is not finished; train it to its end first")
-    about = {"refit_of": trained.record["config"] | {"rule": trained.rule.as_dict()}}
+    about: dict[str, Any] = {
+        "refit_of": trained.record["config"] | {"rule": trained.rule.as_dict()}
+    }
+    if trained.dropped:
+        store = store.without_observation_dimensions(trained.dropped)
+        about[DROPPED] = list(trained.dropped)
     record = train_run(store, out, _settings(trained), about, on_all_rows=True)
     reopen(out, RUN, record, INPUTS)
     shutil.copyfile(first / RULE, out / RULE)

@@ -1,5 +1,6 @@
 """A trained policy, read back from its run folder."""
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
+import torch
 from torch import Tensor
 
 from ucfrec import schema
@@ -20,10 +22,10 @@ from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.store import ITEM_STATES
-from ucfrec.errors import InputError
+from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
+from ucfrec.errors import InputError, damage_explained
 from ucfrec.files import read_json
-from ucfrec.fitting.checkpoint import load_tensors, load_weights
+from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.parquet_files import read_ids
 from ucfrec.policies.base import SequencePolicy
@@ -37,6 +39,8 @@ COUNTS = "training_counts.safetensors"
 RETURNS = "training_returns.safetensors"
 RULE = "decision_rule.json"
 REWARD_MODEL = "reward_model"
+DROPPED = "dropped_observations"
+"""Entry of a record: columns of the logged observation that the policy does not see."""
 INPUTS = (ITEM_STATES, ITEMS, USERS, COUNTS, RETURNS)
 """Files of a run that training does not change."""
 
@@ -79,24 +83,54 @@ class TrainedPolicy:
         """
         record = read_record(run)
         config = config_from_dict(record["config"])
+        path, learner = (
+            run / "policy" / f"{checkpoint}.safetensors",
+            policy_class(config.policy_name),
+        )
         with random_state_kept():
-            policy = policy_class(config.policy_name)(config.policy, record["sizes"])
-        path = run / "policy" / f"{checkpoint}.safetensors"
-        load_weights(path, policy, _weights(path))
+            build = lambda: learner(config.policy, record["sizes"])  # noqa: E731
+            policy = load_module(path, build, _weights(path))
         policy.eval()
         states = run / ITEM_STATES
-        return cls(
+        trained = cls(
             run,
             policy,
             record,
             ItemStates.load(states) if states.exists() else None,
             _ids(run / ITEMS, schema.ITEM_ID) if states.exists() else None,
             _ids(run / USERS, schema.USER_ID),
-            load_tensors(run / RETURNS)[0]["returns"].numpy(),
+            _returns(run / RETURNS),
             _rule(run / RULE),
             _reward_model(run / REWARD_MODEL / FITTED, record["sizes"]),
             TrainingCounts.load(run / COUNTS) if (run / COUNTS).exists() else None,
         )
+        trained._require_equal_sizes()
+        return trained
+
+    def _require_equal_sizes(self) -> None:
+        """Check that the files of the run are of one catalogue and of one size of states.
+
+        Raises:
+            InputError: a file has another size than the run's record states.
+        """
+        sizes, states = self.record["sizes"], self.item_states
+        state = self.record["observation_size"] + (0 if states is None else states.size)
+        found = {RUN: (sizes["state"], state)}
+        if states is not None and self.item_ids is not None:
+            table = (sizes["items"], sizes["action"])
+            found[ITEM_STATES] = (table, tuple(states.embeddings.shape))
+            found[ITEMS] = (sizes["items"], len(self.item_ids))
+        if states is not None and len(states.user_features):
+            found[USERS] = (len(states.user_features), len(self.user_ids))
+        if self.counts is not None:
+            shapes = tuple(self.counts.shown.shape), tuple(self.counts.liked.shape)
+            found[COUNTS] = (((sizes["items"],),) * 2, shapes)
+        for name, (stated, actual) in found.items():
+            if stated != actual:
+                raise InputError(
+                    f"{self.folder / name} does not fit the run: it has {actual}, the run "
+                    f"{stated}; {REMEDY}"
+                )
 
     def __repr__(self) -> str:
         return f"TrainedPolicy({describe_trained(self.record)})"
@@ -122,6 +156,17 @@ class TrainedPolicy:
     def likeness(self) -> Likeness | None:
         """How alike the items are; None if actions are vectors."""
         return None if self.item_states is None else Likeness.of(self.item_states)
+
+    @property
+    def dropped(self) -> tuple[int, ...]:
+        """Columns of the logged observation that the policy does not see, ascending."""
+        return tuple(self.record.get(DROPPED, ()))
+
+    @property
+    def logged_observation_size(self) -> int:
+        """Columns that observations must have; 0 if the policy sees none."""
+        kept: int = self.record["observation_size"]
+        return kept + len(self.dropped) if kept else 0
 
     @property
     def returns(self) -> ReturnToGo:
@@ -168,6 +213,7 @@ class TrainedPolicy:
             self.item_ids if item_numbers is None else item_numbers,
             self.user_ids,
             seed,
+            self.dropped,
         )
 
 
@@ -184,6 +230,51 @@ def read_record(run: Path) -> dict[str, Any]:
         sealed.require_small()
     require_run_record(run / RUN, record)
     return record
+
+
+def store_from(run: Path, store: Path) -> str | None:
+    """The folder of a store as seen from that of a run; None on another drive of Windows."""
+    try:
+        return os.path.relpath(store.resolve(), run.resolve())
+    except ValueError:
+        return None
+
+
+def store_of(run: Path, record: Mapping[str, Any]) -> EpisodeStore | None:
+    """The store that a run was trained on; None where it is gone or changed.
+
+    It is looked for where it lies as seen from the run, so that both can be moved or copied
+    together, and where it lay when the run was trained.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    places = [Path(record["store"])]
+    if from_run := record.get("store_from_run"):
+        places.insert(0, Path(os.path.normpath(run.resolve() / from_run)))
+    for path in places:
+        if (path / "meta.json").is_file():
+            store = EpisodeStore.open(path)
+            if store.meta["fingerprint"] == record["fingerprint"]:
+                return store
+    return None
+
+
+def verified(run: Path) -> None:
+    """Read every file of a run and compare it with its checksum.
+
+    Raises:
+        InputError: `run` is not a run folder, has no checksums, or a file has another content.
+    """
+    read_record(run)
+    sealed = sealed_record(run, RUN, "train again")[1]
+    if sealed is None or "policy" not in read_json(run / RUN):
+        raise InputError(
+            f"{run} cannot be verified: its training has not ended, or an older ucfrec wrote it; "
+            "train it with this one"
+        )
+    for name, fault in sealed.faults():
+        raise InputError(f"{run / name} {fault}; restore the file, or train again")
 
 
 def duplicates_of(record: Mapping[str, Any]) -> str:
@@ -233,9 +324,17 @@ def _rule(path: Path) -> DecisionRule:
 def _reward_model(path: Path, sizes: Mapping[str, int]) -> ItemRewardModel | None:
     if not path.exists():
         return None
-    model = ItemRewardModel(sizes)
-    load_weights(path, model, load_tensors(path)[0])
-    return model.eval()
+    return load_module(path, lambda: ItemRewardModel(sizes), load_tensors(path)[0]).eval()
+
+
+def _returns(path: Path) -> npt.NDArray[np.float32]:
+    with damage_explained(path, REMEDY):
+        returns = load_tensors(path)[0]["returns"]
+        if returns.dim() != 1 or returns.dtype != torch.float32 or not len(returns):
+            raise ValueError("returns are no vector of numbers")
+        if not bool(torch.isfinite(returns).all()):
+            raise ValueError("returns are not finite")
+        return np.asarray(returns.numpy())
 
 
 def _ids(path: Path, column: str) -> npt.NDArray[Any]:

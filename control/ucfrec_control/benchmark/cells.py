@@ -1,7 +1,7 @@
 """One cell of the control tables: a training and its result rows."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -30,7 +30,8 @@ from ucfrec_control.learners.train import dataset_of, preset_of, train_control
 
 SCORES, ROBUSTNESS = "control", "robustness"
 """Suites of the rows."""
-_RULE: Final = "target return: the first of the preset"
+TARGET: Final = "target"
+"""Condition of rows of budgets with several target returns."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,8 @@ class Cell:
     """A key of `DISTRACTORS`; None outside the robustness suite."""
     screening: str | None = None
     """As in `train_control`."""
+    all_targets: bool = False
+    """As in `Budget`."""
 
     @property
     def config(self) -> Config:
@@ -75,8 +78,11 @@ class Cell:
 
     @property
     def targets(self) -> Sequence[float]:
-        """The target return, the preset's first; empty if there is none."""
-        return preset_of(dataset_of(EpisodeStore.open(self.store)), self.learner).targets[:1]
+        """The target returns of the preset, or the first; empty if the policy knows its own."""
+        if self.learner not in ALGORITHMS and self.config.policy.max_return:
+            return ()
+        found = preset_of(dataset_of(EpisodeStore.open(self.store)), self.learner).targets
+        return found if self.all_targets else found[:1]
 
 
 def code_of(learner: str, *more: str) -> str:
@@ -120,7 +126,7 @@ def config(cell: Cell) -> dict[str, Any]:
 
 
 def measure_scores(cell: Cell, row_key: RowKey) -> list[ResultRow]:
-    """Train, and evaluate every kept checkpoint; returns one row for each."""
+    """Train, and evaluate every kept checkpoint; returns one row for each, and for each target."""
     store = EpisodeStore.open(cell.store)
     if cell.learner in ALGORITHMS:
         train_rl(store, cell.run, cell.rl_config, cell.seed)
@@ -129,10 +135,12 @@ def measure_scores(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     evaluations = evaluate_run(
         cell.run, episodes=cell.episodes, seed=cell.evaluation_seed, targets=cell.targets
     )
-    return [
-        score_row(evaluation, row_key, rule=_RULE, **provenance(PACKAGES))
-        for evaluation in evaluations
-    ]
+    made = provenance(PACKAGES)
+    rows = [score_row(evaluation, row_key, **made) for evaluation in evaluations]
+    if not cell.all_targets:
+        return rows
+    # Rows of one seed that differ in their target are measurements of their own.
+    return [replace(r, conditions={**r.conditions, TARGET: r.target_return}) for r in rows]
 
 
 def measure_robustness(cell: Cell, row_key: RowKey) -> list[ResultRow]:
@@ -155,7 +163,7 @@ def measure_robustness(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     losses = held_out_losses(TrainedPolicy.load(cell.run, "last"), store)
     metrics = {"score_at_one": evaluations[-1]["score"], **losses}
     details = {"screening": verdicts(record["screening"], store)} if cell.screening else {}
-    fields = {"metrics": metrics, "details": details, "rule": _RULE}
+    fields = {"metrics": metrics, "details": details}
     return [score_row(evaluations[0], row_key, **fields, **provenance(PACKAGES))]
 
 

@@ -12,10 +12,12 @@ from typing import Any
 
 from ucfrec.reporting.grid import chosen, run_grid
 from ucfrec.reporting.result_row import ResultRow
+from ucfrec_control.benchmark.budgets import BUDGETS as SCORE_BUDGETS
+from ucfrec_control.benchmark.budgets import MEDIUM, Budget
 from ucfrec_control.benchmark.cells import ROBUSTNESS, ROBUSTNESS_MEASUREMENT, Cell, code_of
-from ucfrec_control.benchmark.plan import BUDGETS as SCORE_BUDGETS
-from ucfrec_control.benchmark.plan import METHODS as LEARNERS
-from ucfrec_control.benchmark.plan import Budget, run_name, stores_of
+from ucfrec_control.benchmark.methods import METHODS as LEARNERS
+from ucfrec_control.benchmark.plan import run_name, stores_of
+from ucfrec_control.benchmark.rates import settings_of
 from ucfrec_control.data.distractor import CLEAN, DISTRACTORS, zoo_store
 
 SCREENED = {"ucf-screened": "copies", "ucf-dropped": "drop"}
@@ -24,14 +26,15 @@ METHODS = ("dt", "dc", "lsdt", "ucf", "ucf-wo-count", "ucf-wo-arch", *SCREENED)
 """Methods of `ucfrec_control.benchmark.plan`, and `SCREENED`."""
 
 BUDGETS = {
-    # As the benchmark's, with fewer seeds and steps and half the context; no method and no
-    # distractor is left out.
+    # The medium files, as in the paper. As the benchmark's, with fewer seeds and steps and half the
+    # context; no method and no distractor is left out.
     "small": replace(
         SCORE_BUDGETS["small"],
+        files=MEDIUM,
         seeds=1,
         settings=(*SCORE_BUDGETS["small"].settings, "train.steps=3000", "policy.context=10"),
     ),
-    "full": SCORE_BUDGETS["full"],
+    "full": replace(SCORE_BUDGETS["full"], files=MEDIUM, where_present=(), all_targets=False),
 }
 SHOWN = ("clean", "score", "drop", "score_at_one")
 SHOWN_LOSSES = ("loss", "loss_at_zero", "rise")
@@ -85,7 +88,7 @@ def _cells(
                         file=file,
                         method=method,
                         learner=learner,
-                        settings=(*budget.settings_of(learner), *method_settings),
+                        settings=settings_of(budget, name, learner, method_settings),
                         store=store,
                         run=runs / run_name(method, code, seed),
                         seed=seed,

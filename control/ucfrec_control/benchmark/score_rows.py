@@ -38,6 +38,7 @@ def score_row(evaluation: Mapping[str, Any], key: RowKey, **fields: Any) -> Resu
         "world": evaluation["env_id"],
         "checkpoint": evaluation["checkpoint"],
         "target_return": evaluation["target_return"],
+        "rule": evaluation.get("rule"),
         "details": {name: value for name, value in details.items() if value},
         "wall_time_s": evaluation["wall_time_s"],
     }

@@ -7,14 +7,15 @@ from pathlib import Path
 from typing import Any, Final
 
 from ucfrec.code_version import code_version
+from ucfrec.counterfactual.screening import ScreeningConfig, screen
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.provenance import provenance
 from ucfrec.reporting.grid import Measurement, run_grid
 from ucfrec.reporting.result_row import ResultRow, RowKey
 from ucfrec.reporting.tables import NONE
+from ucfrec.runs.run import training_views
 from ucfrec_control.data.distractor import DISTRACTORS, zoo_store
 from ucfrec_control.data.trajectories import PACKAGES
-from ucfrec_control.learners.screening import ScreeningConfig, screen
 
 SHOWN = (
     *("task", "distractor", "training_seed", "flagged", "effect", "reward_effect"),
@@ -82,7 +83,7 @@ def _config(cell: Cell) -> dict[str, Any]:
 def _measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     store = EpisodeStore.open(cell.store)
     began = time.perf_counter()
-    report = asdict(screen(store, cell.config, SEED))
+    report = asdict(screen(training_views(store)[0], cell.config, SEED))
     dimensions = verdicts(report, store)
     wrong = sum(each["flagged"] and not each["distractor"] for each in dimensions)
     row = ResultRow(

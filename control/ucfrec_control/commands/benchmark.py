@@ -1,16 +1,24 @@
 """`ucfrec-control benchmark`: every learner on the zoo files; resumes."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ucfrec.commands.grid_options import results_given, rows_given
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import benchmarking
 from ucfrec.reporting.tables import format_rows
+from ucfrec_control.benchmark.budgets import BUDGETS, SWEEPS, Budget
 from ucfrec_control.benchmark.cells import SCORES
-from ucfrec_control.benchmark.plan import BUDGETS, MAIN, SWEEPS, TABLES, benchmark
-from ucfrec_control.benchmark.tables import against_first, over_seeds, score_table
+from ucfrec_control.benchmark.methods import MAIN, PURSUING, TABLES
+from ucfrec_control.benchmark.plan import benchmark
+from ucfrec_control.benchmark.rates import chosen_rates
+from ucfrec_control.benchmark.tables import (
+    against,
+    of_best_target,
+    over_seeds,
+    score_table,
+)
 from ucfrec_control.commands.options import (
     budget_given,
     budget_options,
@@ -29,7 +37,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--table",
         default=MAIN,
         choices=list(TABLES),
-        help="every learner (main), or a sweep over UCF's settings",
+        help="every learner (main), ways to pursue reward, or a sweep over UCF's settings",
     )
     budget_options(parser)
     control_grid_options(parser)
@@ -45,32 +53,52 @@ def run(options: argparse.Namespace) -> None:
                 data_given(options),
                 options.out,
                 results_given(options),
-                budget_given(BUDGETS if options.table == MAIN else SWEEPS, options),
+                budget_given(budgets_of(options.table), options),
                 options.budget,
                 options.workers,
                 options.table,
                 options.method,
             )
     _print_tables(rows, options.table)
+    _print_rates(rows)
     print(f"\nrows: {results_given(options)}")
+
+
+def budgets_of(table: str) -> Mapping[str, Budget]:
+    """The budgets of a table, by name."""
+    return BUDGETS if table in (MAIN, PURSUING) else SWEEPS
+
+
+def _print_rates(rows: Sequence[ResultRow]) -> None:
+    for budget in dict.fromkeys(str(row.conditions["budget"]) for row in rows):
+        rates = ", ".join(f"{method} {rate:g}" for method, rate in chosen_rates(budget).items())
+        how = f"chosen on validation loss: {rates}" if rates else "those of the presets"
+        print(f"\nlearning rates of budget {budget}, {how}")
 
 
 def _print_tables(rows: Sequence[ResultRow], table: str) -> None:
     print(format_rows([_line(row) for row in rows], _SHOWN))
+    if len(rows) > len(rows := of_best_target(rows)):
+        print("\nbelow: of several target returns the best in the mean over seeds, as papers do")
     for checkpoint in CHECKPOINTS:
         if lines := score_table(rows, checkpoint):
-            print(f"\nscores of the {checkpoint} checkpoint, mean ± standard deviation over seeds")
+            print(
+                f"\nscores of the {checkpoint} checkpoint, mean ± standard error over seeds; bold: "
+                "within 5% of the best"
+            )
             print(format_rows(lines, list(lines[0])))
     last = [row for row in rows if row.checkpoint == "last"]
     by, values = ("task", "method"), ("score", "validation_loss")
     shown = (*values, "acceptance")
     print("\nlast checkpoint, mean ± standard deviation over seeds")
     print(format_rows(over_seeds([row.as_line() for row in last], by, shown), (*by, *shown)))
-    if table != MAIN:
-        print(f"\nless {last[0].method} of the same seed, mean ± standard error")
-        print(format_rows(against_first(last, values), (*by, *values)))
+    reference = UCF if table == MAIN else last[0].method
+    print(f"\nless {reference} of the same seed, mean ± standard error")
+    print(format_rows(against(last, reference, values), (*by, *values)))
 
 
+UCF = "ucf"
+"""The method of the main table that the others are compared with."""
 _SHOWN = (
     *("task", "method", "training_seed", "checkpoint", "target_return", "score", "return"),
     *("episodes", "validation_loss"),

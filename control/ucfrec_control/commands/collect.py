@@ -1,11 +1,13 @@
-"""`ucfrec-control collect`: datasets from a SAC learner; resumes."""
+"""`ucfrec-control collect`: datasets from a SAC learner, which resumes, or from a saved agent."""
 
 import argparse
 from pathlib import Path
 
+from ucfrec.errors import InputError
 from ucfrec.reporting.tables import format_rows
 from ucfrec_control.data.collect import SHOWN as COLLECTED
 from ucfrec_control.data.collect import CollectConfig, collect
+from ucfrec_control.data.collect_agent import collect_agent
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -23,10 +25,37 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--size", type=int, default=1_000_000, help="steps of medium and of expert (1000000)"
     )
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--agent",
+        type=Path,
+        metavar="ZIP",
+        help="let this agent act that Stable-Baselines3 saved, instead of training one; what is "
+        "pickled in the file is not read",
+    )
+    parser.add_argument(
+        "--noise",
+        type=float,
+        default=0.0,
+        help="standard deviation of the noise on the agent's actions, in halves of their range (0)",
+    )
 
 
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec-control collect`."""
+    if options.agent is not None:
+        row = collect_agent(
+            options.agent,
+            options.env,
+            options.out,
+            noise=options.noise,
+            size=options.size,
+            seed=options.seed,
+        )
+        print(format_rows([row], COLLECTED))
+        print(f"\nfiles: {options.out}")
+        return
+    if options.noise:
+        raise InputError("--noise is for the actions of an --agent")
     config = CollectConfig(
         steps=options.steps, every=options.every, fraction=options.fraction, size=options.size
     )

@@ -9,7 +9,7 @@ from ucfrec.errors import InputError
 from ucfrec.files import write_json
 from ucfrec.provenance import provenance
 from ucfrec.reporting.tables import format_rows
-from ucfrec_control.commands.options import shown_score
+from ucfrec_control.commands.options import shown_score, target_given
 from ucfrec_control.data.trajectories import PACKAGES
 from ucfrec_control.learners.evaluate import CHECKPOINTS, SHOWN, evaluate_run
 from ucfrec_control.learners.video import record_episode
@@ -23,10 +23,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
         "--target",
-        type=float,
+        type=target_given,
         action="append",
         default=[],
-        help="target return; repeatable (the preset's)",
+        help="target return, or max for the largest that the policy expects in each state; "
+        "repeatable (the preset's)",
     )
     parser.add_argument("--checkpoint", choices=["both", "best", "last"], default="both")
     parser.add_argument(

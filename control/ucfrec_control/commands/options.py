@@ -8,11 +8,20 @@ from typing import Any
 
 from ucfrec.commands.grid_options import evaluation_seed_option, grid_options
 from ucfrec.errors import InputError
-from ucfrec_control.benchmark.plan import Budget
+from ucfrec_control.benchmark.budgets import Budget
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.minari import is_minari, read_minari
 from ucfrec_control.data.trajectories import Trajectories
+from ucfrec_control.learners.evaluate import NO_TARGET
 from ucfrec_control.worlds.scores import find_task
+
+MAX_RETURN = "max"
+"""`--target` for the largest return that the policy expects in each state."""
+
+
+def target_given(text: str) -> float | None:
+    """The value of `--target`: a number, or None for `MAX_RETURN`."""
+    return None if text == MAX_RETURN else float(text)
 
 
 def source_options(parser: argparse.ArgumentParser) -> None:
@@ -100,7 +109,9 @@ def budget_given(known: Mapping[str, Budget], options: argparse.Namespace) -> Bu
     return dataclasses.replace(
         budget,
         files=tuple(options.file) or budget.files,
+        where_present=() if options.file else budget.where_present,
         seeds=seeds,
+        antmaze_seeds=budget.antmaze_seeds if options.seeds is None else seeds,
         evaluation_seed=budget.evaluation_seed if evaluation_seed is None else evaluation_seed,
     )
 
@@ -108,6 +119,8 @@ def budget_given(known: Mapping[str, Budget], options: argparse.Namespace) -> Bu
 def shown_score(row: Mapping[str, Any]) -> dict[str, Any]:
     """A row of `evaluate_run` with its score, interval and target as text."""
     interval = f"{row['score']:.1f} [{row['score_low']:.1f}, {row['score_high']:.1f}]"
-    target = "none" if row["target_return"] is None else f"{row['target_return']:g}"
+    target = "none" if row["rule"] == NO_TARGET else MAX_RETURN
+    if row["target_return"] is not None:
+        target = f"{row['target_return']:g}"
     mean_return = f"{row['return']:.1f}"
     return {**row, "score": interval, "target_return": target, "return": mean_return}

@@ -4,11 +4,12 @@ import argparse
 import dataclasses
 from pathlib import Path
 
+from ucfrec.counterfactual.screening import describe_screening
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files import write_json
 from ucfrec.provenance import provenance
+from ucfrec.runs.screened import screen_store
 from ucfrec_control.data.trajectories import PACKAGES
-from ucfrec_control.learners.screening import ScreeningConfig, describe_screening, screen
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -20,7 +21,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec-control screen`."""
-    report = screen(EpisodeStore.open(options.store), ScreeningConfig(), options.seed)
+    report = screen_store(EpisodeStore.open(options.store), options.seed)
     print(describe_screening(report))
     if options.json is not None:
         write_json(options.json, dataclasses.asdict(report) | provenance(PACKAGES))

@@ -7,19 +7,13 @@ import torch
 from ucfrec.commands.train import training_options
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.runs.config import resolve_config
-from ucfrec.runs.run import describe_run
+from ucfrec.runs.describe import describe_run
 from ucfrec_control.learners.train import SCREENINGS, dataset_of, preset_of, train_control
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `train`."""
     training_options(parser)
-    parser.add_argument(
-        "--screen",
-        choices=["copies", "drop"],
-        help="what to do with state dimensions without effect: add copies that intervene on them, "
-        "or drop them (default: not screened)",
-    )
 
 
 def run(options: argparse.Namespace) -> None:

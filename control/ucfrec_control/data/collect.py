@@ -260,19 +260,36 @@ def _replay(training: _Training, medium: int, env_id: str) -> Trajectories:
 
 
 def _roll_out(training: _Training, index: int, env_id: str, seed: int, size: int) -> Trajectories:
-    """Roll out whole episodes of a saved policy, with at least `size` steps in total.
+    """Roll out a saved policy."""
+    training.learner.load_policy(training.policy(index))
+    return roll_out(training.learner, env_id, size, (seed, 4, index), f"roll out policy {index}")
+
+
+def roll_out(
+    actor: Actor, env_id: str, size: int, key: tuple[int, ...], describe: str
+) -> Trajectories:
+    """Play whole episodes, with at least `size` steps in total.
 
     Every round has a fixed number of episodes, so that short episodes are not overrepresented.
+
+    Args:
+        actor: who plays.
+        env_id: Gymnasium environment.
+        size: least number of steps.
+        key: seeds of the episodes.
+        describe: shown with the progress.
+
+    Raises:
+        InputError: the environment cannot be made.
     """
-    training.learner.load_policy(training.policy(index))
     # A small `size` needs few parallel episodes: the usual step limit of these tasks is 1000.
     env = make_env(env_id, min(SIDE_BY_SIDE, max(1, size // 1000)))
     rounds: list[Trajectories] = []
-    with progress(size, f"roll out policy {index}", "steps") as bar:
+    with progress(size, describe, "steps") as bar:
         while sum(len(part.rewards) for part in rounds) < size:
-            key = seed_all(seed, 4, index, len(rounds))
+            seed = seed_all(*key, len(rounds))
             steps: list[Step] = []
-            rollout(env, training.learner, env.num_envs, key, steps.append, describe="episodes")
+            rollout(env, actor, env.num_envs, seed, steps.append, describe="episodes")
             rounds.append(_by_episode(steps, env_id))
             bar.update(len(rounds[-1].rewards))
     env.close()

@@ -4,7 +4,8 @@ import os
 import re
 import shutil
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,17 @@ import numpy as np
 import numpy.typing as npt
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
+from minari.namespace import NAMESPACE_METADATA_FILENAME
 
 from ucfrec.errors import InputError
+from ucfrec.files import atomic_file, atomic_folder
 from ucfrec_control.data.hdf5 import require_inside
 from ucfrec_control.data.trajectories import Trajectories
 from ucfrec_control.worlds.antmaze import antmaze_settings, is_antmaze
 from ucfrec_control.worlds.scores import dataset_name
 
+_ROOT = "MINARI_DATASETS_PATH"
+"""Environment variable with the folder in which Minari keeps its datasets."""
 _IDENTIFIER = re.compile(r"([\w./-]+/)?[\w-]+-v\d+")
 
 
@@ -96,7 +101,7 @@ def read_minari(source: str, env_id: str | None = None, download: bool = False) 
 
 
 def write_minari(trajectories: Trajectories, identifier: str, env_id: str | None = None) -> Path:
-    """Write a local Minari dataset.
+    """Write a local Minari dataset, atomically.
 
     Minari stores the observation after an episode's last action. If `trajectories` does not contain
     it, the last known observation is repeated, and the dataset's description says so.
@@ -123,10 +128,11 @@ def write_minari(trajectories: Trajectories, identifier: str, env_id: str | None
     ]
     has_final = trajectories.final_observations is not None
     spec = _spec(env)
-    try:
-        with warnings.catch_warnings():
-            # Minari warns about missing authors and evaluation environments, which are unknown.
-            warnings.filterwarnings("ignore", category=UserWarning, module="minari")
+    with atomic_folder(folder) as scratch, warnings.catch_warnings():
+        # Minari warns about missing authors and evaluation environments, which are unknown.
+        warnings.filterwarnings("ignore", category=UserWarning, module="minari")
+        datasets = scratch / "datasets"
+        with _root_is(datasets):
             minari.create_dataset_from_buffers(
                 identifier,
                 _buffers(trajectories),
@@ -137,9 +143,14 @@ def write_minari(trajectories: Trajectories, identifier: str, env_id: str | None
                 + ("" if has_final else " Final observations are unknown and repeat the last one."),
                 requirements=requirements,
             )
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
+        for about in sorted(datasets.rglob(NAMESPACE_METADATA_FILENAME)):
+            place = _root() / about.relative_to(datasets)
+            if not place.exists():
+                with atomic_file(place) as half:
+                    shutil.copyfile(about, half)
+        for part in sorted((datasets / identifier).iterdir()):
+            part.rename(scratch / part.name)
+        shutil.rmtree(datasets)
     return folder
 
 
@@ -192,7 +203,21 @@ def _load(source: str, download: bool) -> minari.MinariDataset:
 
 def _root() -> Path:
     """Return the folder in which Minari stores its datasets."""
-    return Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets")
+    return Path(os.environ.get(_ROOT) or Path.home() / ".minari" / "datasets")
+
+
+@contextmanager
+def _root_is(folder: Path) -> Iterator[None]:
+    """Have Minari write its datasets to another folder."""
+    before = os.environ.get(_ROOT)
+    folder.mkdir()
+    os.environ[_ROOT] = str(folder)
+    try:
+        yield
+    finally:
+        del os.environ[_ROOT]
+        if before is not None:
+            os.environ[_ROOT] = before
 
 
 def _spec(env_id: str | None) -> gymnasium.envs.registration.EnvSpec | None:

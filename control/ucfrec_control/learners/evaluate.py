@@ -24,6 +24,7 @@ from ucfrec_control.worlds.scores import find_kind, require_task
 
 Trained = TrainedPolicy | RLPolicy
 CHECKPOINTS = ("last", "best")
+NO_TARGET = "no target return"
 SHOWN = (
     *("dataset", "method", "seed", "checkpoint", "target_return", "score", "return", "episodes"),
     "validation_loss",
@@ -36,21 +37,22 @@ def evaluate_run(
     episodes: int,
     seed: int,
     env_id: str | None = None,
-    targets: Sequence[float] = (),
+    targets: Sequence[float | None] = (),
     checkpoints: Sequence[str] = CHECKPOINTS,
     distractor: float = 0.0,
 ) -> list[dict[str, Any]]:
     """One result row for each checkpoint and target return.
 
     All rows have the same initial states. Distractors are fixed. IQL and CQL keep only their last
-    checkpoint and take no target return.
+    checkpoint; they and behaviour cloning take no target return.
 
     Args:
         run: a run folder on a control store.
         episodes: episodes of a row.
         seed: seed of the environments and the bootstrap.
         env_id: environment to play; None for that of the data.
-        targets: target returns; empty for those of the preset.
+        targets: target returns, None for the largest that the policy expects in each state; empty
+            for those of the preset, or that one if the policy was trained to know it.
         checkpoints: "last", "best" or both.
         distractor: value that every distractor is fixed to (Appendix G.4: 0).
 
@@ -70,8 +72,8 @@ def evaluate_run(
             continue
         world = world_of(trained, env_id)
         rows += [
-            _row(trained, world, target, episodes, seed, distractor) | {"checkpoint": checkpoint}
-            for target in targets_of(trained, world, targets)
+            _row(trained, world, rule, episodes, seed, distractor) | {"checkpoint": checkpoint}
+            for rule in rules_of(trained, world, targets)
         ]
     return [row | {"run": without_folders(str(run))} for row in rows]
 
@@ -163,30 +165,34 @@ def method_of(record: Mapping[str, Any]) -> str:
     return name + "".join(suffix for key, suffix in suffixes.items() if record["dataset"].get(key))
 
 
-def targets_of(
-    trained: Trained, env_id: str, given: Sequence[float] = ()
-) -> Sequence[float | None]:
-    """The target returns given, else those of the preset; (None,) for IQL and CQL."""
-    if isinstance(trained, RLPolicy):
-        return (None,)
-    if given:
-        return given
+def rules_of(
+    trained: Trained, env_id: str, given: Sequence[float | None] = ()
+) -> Sequence[DecisionRule | None]:
+    """The target returns given, else those of the preset, as rules; (None,) for learners without a
+    target return."""
     dataset, learner = trained.record["dataset"], trained.record["config"]["policy_name"]
+    if isinstance(trained, RLPolicy) or learner == "bc":
+        return (None,)
     task = require_task(env_id, dataset["dataset"])
-    if learner == "bc":
-        return (trained.target_return(1.0),)
-    return find_preset(task.name, find_kind(dataset["dataset"]), learner).targets
+    preset = find_preset(task.name, find_kind(dataset["dataset"]), learner).targets
+    own = (None,) if trained.policy.config.max_return else preset
+    return [DecisionRule(target) for target in given or own]
 
 
 def _row(
-    trained: Trained, env_id: str, target: Any, episodes: int, seed: int, distractor: float
+    trained: Trained,
+    env_id: str,
+    rule: DecisionRule | None,
+    episodes: int,
+    seed: int,
+    distractor: float,
 ) -> dict[str, Any]:
     record, dataset = trained.record, trained.record["dataset"]
     task = require_task(env_id, dataset["dataset"])
     began = time.perf_counter()
     env = open_world(trained, env_id, min(episodes, SIDE_BY_SIDE), distractor=distractor)
     try:
-        actor = trained.actor(env.num_envs, None if target is None else DecisionRule(target))
+        actor = trained.actor(env.num_envs, rule)
         played = rollout(env, actor, episodes, seed, describe=f"{trained.name} in {env_id}")
     finally:
         env.close()
@@ -196,7 +202,8 @@ def _row(
         "dataset": dataset["dataset"],
         "method": method_of(record),
         "seed": record["seed"],
-        "target_return": target,
+        "target_return": rule and rule.target,
+        "rule": NO_TARGET if rule is None else str(rule),
         "score": float(task.score(played.returns.mean())),
         "score_low": float(low),
         "score_high": float(high),

@@ -30,9 +30,14 @@ def find_preset(task: str, kind: str, policy: str) -> Preset:
     targets: list[float] = []
     text = files("ucfrec_control.learners").joinpath("presets.toml").read_text(encoding="utf-8")
     for rule in tomllib.loads(text)["rule"]:
-        if any(rule.get(key, value) != value for key, value in run.items()):
+        if not all(_names(rule.get(key, value), value) for key, value in run.items()):
             continue
         for table, values in rule.get("set", {}).items():
             tables[table] = tables.get(table, {}) | values
         targets = rule.get("targets", targets)
     return Preset(tables, tuple(targets))
+
+
+def _names(given: str | list[str], value: str) -> bool:
+    """Whether a rule's `given` is `value`, or names it among others."""
+    return value in ([given] if isinstance(given, str) else given)

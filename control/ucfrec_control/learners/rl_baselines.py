@@ -1,6 +1,7 @@
 """IQL and CQL of d3rlpy (extra `rl`) on control stores, with CORL's settings (reference §3)."""
 
 import logging
+import math
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
@@ -33,6 +35,8 @@ ALGORITHMS = ("iql", "cql")
 CHECKPOINT_EVERY = 5000
 """Steps between checkpoints and log lines."""
 _ACTOR, _CHECKPOINT = "actor.safetensors", "checkpoint.pt"
+_LOWEST_GAP = -200.0
+"""Least conservative term of a step in AntMaze."""
 _HOPPER_NARROW = ("medium", "medium-replay", "mixed")
 
 
@@ -140,7 +144,7 @@ def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dict[
         raise InputError(
             f"{store.path} has no training trajectories; prepare it with a later split"
         )
-    mean, std = train.state_statistics
+    mean, std = _statistics(train, config)
     dataset = _dataset(d3rlpy, train, mean.numpy(), std.numpy())
     learner = _learner(config, "cuda:0" if torch.cuda.is_available() else "cpu:0")
     if not (out / RUN).exists():
@@ -232,10 +236,24 @@ def _dataset(
     )
 
 
+def _statistics(train: EpisodeStore, config: RLConfig) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation (S,) that states are normalised with; 0 and 1 where CORL does not
+    normalise them."""
+    mean, std = train.state_statistics
+    if config.algorithm == "cql" and config.task == "antmaze":
+        return torch.zeros_like(mean), torch.ones_like(std)
+    return mean, std + 1e-6
+
+
 def _learner(config: RLConfig, device: str = "cpu:0") -> Any:
     d3rlpy = _d3rlpy()
-    make = {"iql": _iql, "cql": _cql}[config.algorithm]
-    return make(d3rlpy, config).create(device=device)
+    if config.algorithm == "iql":
+        return _iql(d3rlpy, config).create(device=device)
+    if config.task == "antmaze":
+        from ucfrec_control.learners.clipped_cql import ClippedCQL
+
+        return ClippedCQL(_cql(d3rlpy, config), device, _LOWEST_GAP)
+    return _cql(d3rlpy, config).create(device=device)
 
 
 def _iql(d3rlpy: Any, config: RLConfig) -> Any:
@@ -264,15 +282,21 @@ def _iql(d3rlpy: Any, config: RLConfig) -> Any:
 
 
 def _cql(d3rlpy: Any, config: RLConfig) -> Any:
-    layers = d3rlpy.models.VectorEncoderFactory([256, 256, 256])
+    layers = [d3rlpy.models.VectorEncoderFactory([256] * count) for count in (3, 5)]
+    antmaze = config.task == "antmaze"
     settings: dict[str, Any] = {
         "actor_learning_rate": 3e-5,
         "conservative_weight": 10.0,
         "alpha_learning_rate": 0.0,
     }
-    if config.task == "antmaze":
+    if config.task == "hopper" and config.kind == "medium":
+        scaler = d3rlpy.preprocessing.ReturnBasedRewardScaler(multiplier=1000.0)
+        settings |= {"reward_scaler": scaler}
+    if antmaze:
         settings = {
             "actor_learning_rate": 1e-4,
+            # CORL starts the logarithm of its multiplier at 1.
+            "initial_alpha": math.e,
             "conservative_weight": 5.0,
             "alpha_threshold": 0.8,
             "max_q_backup": True,
@@ -282,8 +306,8 @@ def _cql(d3rlpy: Any, config: RLConfig) -> Any:
         batch_size=config.batch_size,
         critic_learning_rate=3e-4,
         n_action_samples=10,
-        actor_encoder_factory=layers,
-        critic_encoder_factory=layers,
+        actor_encoder_factory=layers[0],
+        critic_encoder_factory=layers[antmaze],
         **settings,
     )
 
@@ -291,7 +315,7 @@ def _cql(d3rlpy: Any, config: RLConfig) -> Any:
 def _normalised(
     states: npt.NDArray[Any], mean: npt.NDArray[Any], std: npt.NDArray[Any]
 ) -> FloatArray:
-    normalised: FloatArray = ((states - mean) / (std + 1e-6)).astype(np.float32)
+    normalised: FloatArray = ((states - mean) / std).astype(np.float32)
     return normalised
 
 

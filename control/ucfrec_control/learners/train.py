@@ -5,6 +5,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from ucfrec.counterfactual.interventions import interventions
+from ucfrec.counterfactual.screening import ScreeningConfig, screen
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files import read_json
@@ -14,7 +16,6 @@ from ucfrec.runs.run import train_run, training_views
 from ucfrec.runs.trained_policy import RUN
 from ucfrec_control.data.trajectories import PACKAGES
 from ucfrec_control.learners.presets import Preset, find_preset
-from ucfrec_control.learners.screening import ScreeningConfig, interventions, screen
 from ucfrec_control.worlds.scores import find_kind, find_task
 
 DROPPED_DIMENSIONS = "unseen"
@@ -80,7 +81,7 @@ def train_control(
     if screening:
         key = SCREENINGS[screening]
         if started is None:
-            report = screen(store, ScreeningConfig(), config.seed)
+            report = screen(training_views(store)[0], ScreeningConfig(), config.seed)
             record["screening"] = asdict(report)
             dataset[key] = list(report.flagged)
             if len(report.flagged) == len(report.dimensions):

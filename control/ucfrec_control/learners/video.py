@@ -14,11 +14,10 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.image import imsave
 
-from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import rollout
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_file, atomic_folder
-from ucfrec_control.learners.evaluate import load_run, open_world, targets_of, world_of
+from ucfrec_control.learners.evaluate import load_run, open_world, rules_of, world_of
 
 Frame = npt.NDArray[np.uint8]
 """(height, width, 3)."""
@@ -63,8 +62,7 @@ def record_episode(
         raise InputError(f"{out} exists already; remove it or name another with --video")
     trained = load_run(run, checkpoint)
     world = world_of(trained, env_id)
-    target_return = targets_of(trained, world, () if target is None else (target,))[0]
-    rule = None if target_return is None else DecisionRule(target_return)
+    rule = rules_of(trained, world, () if target is None else (target,))[0]
     if not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")
     with (_video if out.suffix == _VIDEO else _frames)(out) as take:

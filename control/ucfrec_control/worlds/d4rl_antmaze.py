@@ -10,7 +10,7 @@ goal_reaching_env.py, assets/ant.xml). Changes in MuJoCo itself since version 2.
 
 import xml.etree.ElementTree as ET
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import gettempdir
 from typing import Any
 
 import gymnasium.envs.mujoco
@@ -18,6 +18,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium_robotics.envs.maze import maps
 from gymnasium_robotics.envs.maze.ant_maze_v5 import AntMazeEnv
+
+from ucfrec.locks import scratch_folder
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -44,14 +46,14 @@ class D4RLAntMaze(AntMazeEnv):
             maze: `umaze`, `medium` or `large`.
         """
         walls, self._goal_cell = _MAZES[maze]
-        with TemporaryDirectory() as folder:
+        with scratch_folder(Path(gettempdir()), "maze") as folder:
             super().__init__(
                 render_mode=render_mode,
                 # y grows with the row in D4RL but falls with it in gymnasium-robotics.
                 maze_map=walls[::-1],
                 reward_type="sparse",
                 continuing_task=False,
-                xml_file=_d4rl_ant(Path(folder)),
+                xml_file=_d4rl_ant(folder),
                 include_cfrc_ext_in_observation=False,
             )
         # gymnasium-robotics always passes 0 to the ant and has no argument to change it.

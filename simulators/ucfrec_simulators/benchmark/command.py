@@ -11,23 +11,22 @@ from ucfrec.plugins import Benchmark, BenchmarkRequest
 from ucfrec.reporting.grid import run_grid
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec_simulators.benchmark.cells import MEASUREMENT
-from ucfrec_simulators.benchmark.methods import METHODS
+from ucfrec_simulators.benchmark.methods import ADDITIONS, METHODS
 from ucfrec_simulators.benchmark.plan import BUDGETS, Plan
 from ucfrec_simulators.benchmark.plots import (
+    plot_additions,
     plot_distractor,
     plot_methods,
     plot_sweeps,
-    plot_targets,
 )
 from ucfrec_simulators.benchmark.tables import (
     distractor_table,
     method_table,
     sweep_table,
-    target_table,
 )
 from ucfrec_simulators.benchmark.tasks import TASKS
 
-TABLES: Final = ("main", "distractor", "sweeps")
+TABLES: Final = ("main", "additions", "distractor", "sweeps")
 
 
 def run(request: BenchmarkRequest) -> str:
@@ -85,7 +84,7 @@ def run(request: BenchmarkRequest) -> str:
 def _require_known(request: BenchmarkRequest) -> None:
     for kind, given, known in (
         ("task", request.tasks, TASKS),
-        ("method", request.methods, METHODS),
+        ("method", request.methods, {**METHODS, **ADDITIONS}),
     ):
         if unknown := [name for name in given if name not in known]:
             raise InputError(f"no {kind} is called {unknown[0]!r}; choose from {', '.join(known)}")
@@ -107,16 +106,15 @@ _Shown = tuple[
     Callable[[Sequence[ResultRow], Path], list[Path]],
 ]
 _SHOWN: Final[Mapping[str, tuple[_Shown, ...]]] = {
-    "main": (
-        ("Methods", method_table, plot_methods),
-        ("Target returns", target_table, plot_targets),
-    ),
+    "main": (("Methods", method_table, plot_methods),),
+    "additions": (("Additions to the paper, one by one", method_table, plot_additions),),
     "sweeps": (("Settings of UCF", sweep_table, plot_sweeps),),
     "distractor": (("A distractor that causes nothing", distractor_table, plot_distractor),),
 }
 
 BENCHMARK: Final = Benchmark(
-    summary="Table 2 of the paper with built-in policies, ablations, sweeps of UCF, a distractor",
+    summary="Table 2 of the paper with built-in policies, ablations, additions, sweeps of UCF, a "
+    "distractor",
     tables=TABLES,
     run=run,
     show=show,

@@ -40,6 +40,17 @@ METHODS: Final[Mapping[str, Method]] = {
     "edt4rec": Method("edt4rec"),
     "ucf-wo-count": Method("ucf", ("augment.copies=0",)),
     "ucf-wo-arch": Method("dt", ("augment.copies=1",)),
+    "ucf-paper": Method("ucf-paper"),
     "ucf": Method("ucf"),
 }
 """Methods by their name in the tables; `ucf-wo-count` and `ucf-wo-arch` are Table 3's ablations."""
+ADDITIONS: Final[Mapping[str, Method]] = {
+    "dt-exposure": Method("dt", ("policy.exposure=true",)),
+    "ucf-wo-exposure": Method("ucf", ("policy.exposure=false",), vectors=False),
+    "ucf-wo-tilt": Method("ucf", ("rule.tilts=[0]",), vectors=False),
+    "ucf-wo-rule": Method("ucf", ("rule.choose=false",), vectors=False),
+    "ucf-weights": Method("ucf", ("policy.advantage_weights=true",)),
+    "ucf-max-return": Method("ucf", ("policy.max_return=true",)),
+}
+"""UCF without one of what this project added to the paper, or with another, and DT with exposure
+features, by their name in the table of additions."""

@@ -17,7 +17,7 @@ from ucfrec.provenance import config_hash
 from ucfrec_simulators import sardine
 from ucfrec_simulators.benchmark import cells, tasks
 from ucfrec_simulators.benchmark.cells import Cell, EvaluationPlan
-from ucfrec_simulators.benchmark.methods import METHODS, Method
+from ucfrec_simulators.benchmark.methods import ADDITIONS, METHODS, Method
 from ucfrec_simulators.benchmark.tasks import TASKS, BenchmarkTask
 from ucfrec_simulators.distractor import OFF, ON, DistractorWorld, plant_distractor
 from ucfrec_simulators.folders import data_folder, folder_name
@@ -83,6 +83,8 @@ MAIN: Final = (
     *("kuairand", "kuairec", "virtual-taobao", "synthetic-catalog"),
     *("sardine-static", "sardine-boredinf"),
 )
+PURSUED: Final = ("kuairand", "synthetic-catalog", "sardine-boredinf")
+"""Tasks of the table of additions, whose actions are items."""
 SWEPT: Final = ("synthetic-catalog", "synthetic-taobao")
 """Tasks of the sweeps. Not VirtualTaobao: there all sequence policies reach the maximum return."""
 _REAL: Final = {"kuairand": "kuairand", "kuairec": "kuairec", "virtual-taobao": "virtualtaobao"}
@@ -135,6 +137,16 @@ class Plan:
             for seed in range(self._budget.seeds):
                 for method in METHODS:
                     yield from self._trained("main", name, task, method, METHODS[method], seed)
+
+    def additions(self) -> Iterator[Cell]:
+        """Cells of UCF with and without each addition to the paper; items only."""
+        own = {name: METHODS[name] for name in ("dt", "ucf-paper", "ucf")}
+        methods = {**own, **ADDITIONS}
+        for name in self._available(PURSUED):
+            task = self._task(name)
+            for seed in range(self._budget.sweep_seeds):
+                for label, method in methods.items():
+                    yield from self._trained("additions", name, task, label, method, seed)
 
     def sweeps(self) -> Iterator[Cell]:
         """Cells of UCF with other λ, bands and gates; the main table has the defaults."""

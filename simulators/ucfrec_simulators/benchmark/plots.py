@@ -9,7 +9,7 @@ import numpy as np
 from ucfrec.reporting.plot_style import LIGHT, OURS, PLAIN, save, styled
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.statistics import grouped, summary
-from ucfrec_simulators.benchmark.tables import DISTRACTOR_RATES, of_checkpoint, returns_by_target
+from ucfrec_simulators.benchmark.tables import DISTRACTOR_RATES, of_checkpoint
 from ucfrec_simulators.folders import folder_name
 
 if TYPE_CHECKING:
@@ -24,15 +24,14 @@ def plot_methods(rows: _Rows, folder: Path) -> list[Path]:
     return _by_world("methods", _bars, rows, folder)
 
 
+def plot_additions(rows: _Rows, folder: Path) -> list[Path]:
+    """One plot per world: return of UCF with and without each addition, as in `plot_methods`."""
+    return _by_world("additions", _bars, rows, folder)
+
+
 def plot_sweeps(rows: _Rows, folder: Path) -> list[Path]:
     """One plot per world: return of UCF with each setting, as in `plot_methods`."""
     return _by_world("sweeps", _bars, rows, folder)
-
-
-def plot_targets(rows: _Rows, folder: Path) -> list[Path]:
-    """One plot per world: mean return of validation sessions over target return."""
-    validated = [row for row in rows if row.details.get("validation")]
-    return _by_world("targets", _lines, validated, folder)
 
 
 def plot_distractor(rows: _Rows, folder: Path) -> list[Path]:
@@ -52,17 +51,6 @@ def _bars(axes: "Axes", rows: _Rows) -> None:
     means, spreads = [each.mean for each in returns], [each.sd for each in returns]
     axes.barh([name for name, _ in by_method], means, xerr=spreads, color=colors, height=0.7)
     axes.set_xlabel("return of a session (mean ± sd over training seeds)")
-
-
-def _lines(axes: "Axes", rows: _Rows) -> None:
-    for name, group in grouped(rows, lambda row: row.method).items():
-        returns = returns_by_target(group)
-        means = [summary(values).mean for values in returns.values()]
-        width = 2.5 if name == "ucf" else 1
-        axes.plot(list(returns), means, marker="o", linewidth=width, label=name)
-    axes.set_xlabel("target return")
-    axes.set_ylabel("return of a session, validation")
-    axes.legend()
 
 
 def _triples(axes: "Axes", rows: _Rows) -> None:

@@ -33,15 +33,6 @@ def sweep_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
     return markdown_table(head, lines)
 
 
-def target_table(rows: Sequence[ResultRow]) -> str:
-    """One line per world, method and target return: validation return, mean over seeds."""
-    lines = []
-    for (world, method), group in grouped(of_checkpoint(rows, "best"), _line).items():
-        for target, returns in returns_by_target(group).items():
-            lines.append((world, method, f"{target:g}", len(returns), mean_and_sd(returns)))
-    return markdown_table(("world", "method", "target return", "seeds", "R_cum, validation"), lines)
-
-
 def distractor_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
     """One line per world, target and method: returns without, with it off, and with it on.
 
@@ -81,20 +72,10 @@ def numbers(rows: Sequence[ResultRow], name: str) -> list[float]:
     return [row.metrics[name] for row in rows if name in row.metrics]
 
 
-def returns_by_target(rows: Sequence[ResultRow]) -> dict[float, list[float]]:
-    """Validation returns of each row by target return, in rising order of the target."""
-    returns: dict[float, list[float]] = {}
-    for row in rows:
-        for target, value in row.details.get("validation", {}).items():
-            returns.setdefault(float(target), []).append(value)
-    return dict(sorted(returns.items()))
-
-
 def _line(row: ResultRow) -> tuple[str | None, str]:
     return row.world, row.method
 
 
 def _targets(rows: Sequence[ResultRow]) -> str:
-    validated = [row for row in rows if row.details.get("validation")]
-    chosen = {f"{row.target_return:g}" for row in validated if row.target_return is not None}
+    chosen = {f"{row.target_return:g}" for row in rows if row.target_return is not None}
     return ", ".join(sorted(chosen, key=float)) or NONE

@@ -9,17 +9,12 @@ from tests.support.control_files import hopper_like, write_hdf5
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.runs.config import Config, resolve_config
 from ucfrec_control.benchmark import robustness
+from ucfrec_control.benchmark.budgets import BUDGETS, SWEEPS, Budget
 from ucfrec_control.benchmark.cells import code_of
-from ucfrec_control.benchmark.plan import (
-    BUDGETS,
-    MAIN,
-    METHODS,
-    SWEEPS,
-    TABLES,
-    Budget,
-    benchmark,
-    run_name,
-)
+from ucfrec_control.benchmark.methods import MAIN, METHODS, PURSUING, TABLES
+from ucfrec_control.benchmark.plan import benchmark, run_name
+from ucfrec_control.benchmark.rates import settings_of
+from ucfrec_control.commands.benchmark import budgets_of
 from ucfrec_control.learners.evaluate import load_run
 from ucfrec_control.learners.presets import find_preset
 from ucfrec_control.learners.rl_baselines import ALGORITHMS
@@ -33,7 +28,7 @@ def resolved(table: str, budget: Budget, file: str) -> dict[str, Config]:
         method: resolve_config(
             learner,
             None,
-            [*budget.settings_of(learner), *own],
+            settings_of(budget, "small", learner, own),
             0,
             find_preset(task, kind, learner).tables,
         )
@@ -45,7 +40,7 @@ def resolved(table: str, budget: Budget, file: str) -> dict[str, Config]:
 @pytest.mark.parametrize("size", ["small", "full"])
 @pytest.mark.parametrize("table", TABLES)
 def test_every_row_of_every_table_is_a_configuration_of_its_own(table: str, size: str) -> None:
-    budget = (BUDGETS if table == MAIN else SWEEPS)[size]
+    budget = budgets_of(table)[size]
     for file in budget.files:
         configs = resolved(table, budget, file)
         assert len(set(map(repr, configs.values()))) == len(configs)
@@ -79,7 +74,7 @@ def test_a_method_of_two_sweeps_is_one_configuration() -> None:
     for budget in SWEEPS.values():
         for file in budget.files:
             named: dict[str, Config] = {}
-            for table in TABLES.keys() - {MAIN}:
+            for table in TABLES.keys() - {MAIN, PURSUING}:
                 for method, config in resolved(table, budget, file).items():
                     assert named.setdefault(method, config) == config
 

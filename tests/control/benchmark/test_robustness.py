@@ -9,12 +9,14 @@ import pytest
 from tests.support.control_files import hopper_like, write_hdf5
 from tests.support.result_rows import result_row
 from ucfrec import schema
+from ucfrec.counterfactual.screening import ScreeningConfig
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import read_rows
 from ucfrec.reporting.tables import NONE
 from ucfrec.runs.config import resolve_config
 from ucfrec_control.benchmark import robustness
-from ucfrec_control.benchmark.plan import Budget, run_name, stores_of
+from ucfrec_control.benchmark.budgets import Budget
+from ucfrec_control.benchmark.plan import run_name, stores_of
 from ucfrec_control.benchmark.robustness import drops, loss_rises
 from ucfrec_control.benchmark.screening_table import screening_rows
 from ucfrec_control.cli import main
@@ -22,7 +24,6 @@ from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.distractor import add_distractor
 from ucfrec_control.figures.figures import make_figures
 from ucfrec_control.learners.evaluate import evaluate_run
-from ucfrec_control.learners.screening import ScreeningConfig
 from ucfrec_control.learners.train import dataset_of, preset_of, train_control
 
 TINY = ("train.steps=4", "train.validate_every=2", "policy.dim=16", "policy.context=5")

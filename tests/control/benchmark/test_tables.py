@@ -6,7 +6,7 @@ import pytest
 
 from tests.support.result_rows import result_row
 from ucfrec.reporting.result_row import ResultRow
-from ucfrec_control.benchmark.tables import against_first, over_seeds, score_table
+from ucfrec_control.benchmark.tables import against, of_best_target, over_seeds, score_table
 
 
 def scored(task: str, method: str, seed: int, score: float, **more: Any) -> ResultRow:
@@ -33,12 +33,34 @@ def test_a_table_of_scores_has_the_spread_over_seeds_and_a_mean_where_nothing_is
         if method != "iql" or checkpoint == "last"
     ]
     dt, iql = score_table(rows, "last")
-    # Of 10 and 20 the sample's deviation is 10 / √2.
-    assert dt == {"method": "dt", "a": "15 ± 7.1", "b": "45 ± 7.1", "mean": "30"}
-    assert iql == {"method": "iql", "a": "30", "b": "–", "mean": "–"}
+    # Of 10 and 20 the standard error is 5.
+    assert dt == {"method": "dt", "a": "15.0 ± 5", "b": "**45.0 ± 5**", "mean": "**30.0**"}
+    assert iql == {"method": "iql", "a": "**30.0**", "b": "–", "mean": "–"}
     best_dt, best_iql = score_table(rows, "best")
-    assert best_dt["mean"] == "31"
+    assert best_dt["mean"] == "**31.0**"
     assert best_iql == iql
+
+
+@pytest.mark.parametrize(("best", "near", "far"), [(100.0, 95.1, 94.9), (-10.0, -10.4, -10.6)])
+def test_bold_is_what_comes_within_a_twentieth_of_the_best(
+    best: float, near: float, far: float
+) -> None:
+    scores = {"a": best, "b": near, "c": far}
+    found = score_table([scored("t", method, 0, s) for method, s in scores.items()], "last")
+    assert [line["t"].startswith("**") for line in found] == [True, True, False]
+
+
+def test_of_several_targets_the_best_in_the_mean_counts() -> None:
+    scores = {1.0: (50.0, 10.0), 2.0: (20.0, 45.0), 3.0: (0.0, 49.0)}
+    rows = [
+        scored("t", "dt", seed, score, target_return=target)
+        for target, seeds in scores.items()
+        for seed, score in enumerate(seeds)
+    ] + [scored("t", "iql", 0, 5.0)]
+    kept = of_best_target(rows)
+    assert [(row.method, row.target_return, row.value) for row in kept] == [
+        ("dt", 2.0, 20.0), ("dt", 2.0, 45.0), ("iql", None, 5.0),
+    ]  # fmt: skip
 
 
 def test_what_was_not_measured_is_a_dash() -> None:
@@ -62,4 +84,5 @@ def test_methods_are_compared_seed_by_seed() -> None:
         for seed, score in enumerate(seeds)
     ]
     # Of 3 and 1: their deviation √2 over √2.
-    assert against_first(rows, ("score",)) == [{"task": "a", "method": "copies", "score": "+2 ± 1"}]
+    found = against(rows, "none", ("score", "unknown"))
+    assert found == [{"task": "a", "method": "copies", "score": "+2 ± 1", "unknown": "–"}]

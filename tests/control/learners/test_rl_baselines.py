@@ -3,6 +3,7 @@
 import re
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -12,16 +13,21 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files import read_json
 from ucfrec.fitting.metrics_log import read_metrics
+from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.reporting.rows_file import read_rows
-from ucfrec_control.benchmark.plan import TABLES, Budget, benchmark
+from ucfrec_control.benchmark.budgets import Budget
+from ucfrec_control.benchmark.methods import TABLES
+from ucfrec_control.benchmark.plan import benchmark
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.learners import rl_baselines
 from ucfrec_control.learners.evaluate import evaluate_run
-from ucfrec_control.learners.rl_baselines import rl_config, train_rl
+from ucfrec_control.learners.rl_baselines import RLConfig, rl_config, train_rl
 from ucfrec_control.learners.train import dataset_of
 
 pytest.importorskip("d3rlpy", reason="the extra rl is not installed")
+from d3rlpy.algos.qlearning.torch.cql_impl import CQLImpl
+
 pytest.importorskip("mujoco", reason="the extra control is not installed")
 
 
@@ -87,6 +93,63 @@ def test_equal_seeds_train_equal_actors_that_are_judged_as_others_are(
     assert main(asked) == 0
     assert main([*asked, "--checkpoint", "best"]) == 2
     assert "keep their last checkpoint only" in capsys.readouterr().err
+
+
+def learner_of(task: str, kind: str, algorithm: str = "cql") -> Any:
+    with random_state_kept():
+        learner = rl_baselines._learner(RLConfig(algorithm, 10, task, kind))
+        learner.create_impl((29,), 8)
+    return learner
+
+
+def test_cql_has_the_settings_of_corl() -> None:
+    scalers = {
+        (task, kind): type(learner_of(task, kind).config.reward_scaler).__name__
+        for task in ("hopper", "walker2d")
+        for kind in ("medium", "mixed", "medium-expert")
+    }
+    assert {key for key, name in scalers.items() if name != "NoneType"} == {("hopper", "medium")}
+    assert scalers["hopper", "medium"] == "ReturnBasedRewardScaler"
+    for task, hidden in (("walker2d", 3), ("antmaze", 5)):
+        modules = learner_of(task, "medium").impl.modules
+        for critic in modules.q_funcs:
+            assert sum(isinstance(m, torch.nn.Linear) for m in critic.modules()) == hidden + 1
+        actor = [m for m in modules.policy.modules() if isinstance(m, torch.nn.Linear)]
+        assert len(actor) == 3 + 2  # mean and deviation
+    learner = learner_of("antmaze", "diverse")
+    assert (learner.config.reward_scaler.shift, learner.config.reward_scaler.multiplier) == (-5, 10)
+
+
+def test_steps_of_antmaze_count_no_less_than_the_clip() -> None:
+    """Where the logged action is valued far above all others, the gap is held at −200."""
+    impl = learner_of("antmaze", "diverse").impl
+    states, actions, none = torch.zeros(4, 29), torch.zeros(4, 8), torch.zeros(4, 1)
+
+    def gap() -> torch.Tensor:
+        with torch.no_grad():
+            loss = impl._compute_conservative_loss(states, actions, states, none)
+        return loss / 5 + 0.8  # weight and threshold
+
+    plain = gap()
+    torch.manual_seed(0)
+    expected = CQLImpl._compute_conservative_loss(impl, states, actions, states, none) / 5 + 0.8
+    torch.manual_seed(0)
+    torch.testing.assert_close(gap(), expected.detach())
+    assert (plain > -200).all()
+    forward = impl._q_func_forwarder.compute_expected_q
+    impl._q_func_forwarder.compute_expected_q = lambda x, action, reduction: (
+        forward(x, action, reduction) + 1e4 * (len(action) == len(states))
+    )
+    torch.testing.assert_close(gap(), torch.full((2,), -200.0))
+
+
+def test_cql_sees_the_states_of_antmaze_as_they_are(store: EpisodeStore) -> None:
+    train = store.split("train")
+    for task, plain in (("antmaze", True), ("hopper", False)):
+        mean, std = rl_baselines._statistics(train, RLConfig("cql", 10, task, "medium"))
+        assert (not mean.any() and bool((std == 1).all())) == plain
+    mean, _ = rl_baselines._statistics(train, RLConfig("iql", 10, "antmaze", "medium"))
+    assert mean.any()
 
 
 def test_a_finished_run_is_read_and_another_configuration_refused(

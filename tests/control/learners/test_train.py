@@ -15,14 +15,17 @@ from ucfrec.acting.rollout import rollout
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files import read_json
+from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.policies.registry import BUILT_IN
 from ucfrec.runs.config import resolve_config
-from ucfrec_control.benchmark.plan import BUDGETS, METHODS, TABLES, Budget
+from ucfrec_control.benchmark.budgets import BUDGETS, Budget
+from ucfrec_control.benchmark.methods import METHODS, TABLES
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.distractor import add_distractor
 from ucfrec_control.learners.evaluate import evaluate_run
 from ucfrec_control.learners.presets import find_preset
+from ucfrec_control.learners.train import train_control
 from ucfrec_control.worlds.environments import make_env, mismatches
 from ucfrec_control.worlds.scores import TASKS
 
@@ -142,6 +145,53 @@ def test_a_policy_with_a_distractor_is_judged_at_zero(folder: Path, tmp_path: Pa
     rollout(env, Still(), 4, seed=0)  # type: ignore[arg-type]
     assert {observation.shape for observation in seen} == {(2, 12)}
     assert all((observation[:, 11] == 0).all() for observation in seen)
+
+
+def test_policies_that_know_their_largest_return_are_asked_for_it(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Every sequence learner takes the settings that pursue reward, with vector actions."""
+    pursue = ["policy.advantage_weights=true", "policy.max_return=true", "policy.best_share=0.5"]
+    own = {"lsdt": ["policy.kernel_groups=4"], "ucf": ["crm.epochs=1", "csg.epochs=1"]}
+    store = EpisodeStore.open(folder / "store")
+    for learner in ("dt", "dc", "lsdt", "ucf"):
+        settings = [*TINY, *pursue, "policy.max_timestep=1", *own.get(learner, [])]
+        run = tmp_path / learner
+        record = train_control(store, run, resolve_config(learner, None, settings))
+        losses = read_metrics(run / "policy")
+        assert losses["value_loss"]
+        assert record["policy"]["steps"] == 4
+        (row,) = evaluate_run(run, episodes=1, seed=0, checkpoints=("last",))
+        assert row["target_return"] is None
+        assert "largest return expected" in row["rule"]
+        (given,) = evaluate_run(run, episodes=1, seed=0, targets=(5.0,), checkpoints=("last",))
+        assert given["target_return"] == 5.0
+    assert main(["evaluate", str(run), "--episodes", "1", "--checkpoint", "last"]) == 0
+    assert " max " in capsys.readouterr().out
+    arguments = ["evaluate", str(folder / "store-run"), "--episodes", "1", "--target", "max"]
+    assert main(arguments) == 2
+    assert "policy.max_return=true" in capsys.readouterr().err
+
+
+def test_behaviour_cloning_has_no_target(folder: Path, tmp_path: Path) -> None:
+    store = EpisodeStore.open(folder / "store")
+    train_control(store, tmp_path / "bc", resolve_config("bc", None, TINY))
+    (row,) = evaluate_run(tmp_path / "bc", episodes=1, seed=0, checkpoints=("last",))
+    assert (row["target_return"], row["rule"]) == (None, "no target return")
+
+
+def test_presets_have_the_widths_of_the_paper() -> None:
+    widths = {
+        (task, kind): find_preset(task, kind, policy).tables["policy"].get("dim", 128)
+        for policy in ("ucf", "ucf-paper")
+        for task in ("halfcheetah", "hopper", "walker2d")
+        for kind in ("medium", "medium-replay", "mixed", "medium-expert")
+    }
+    wide = {("hopper", kind) for kind in ("medium", "medium-replay", "mixed")}
+    assert widths == {key: 256 if key in wide else 128 for key in widths}
+    paper = find_preset("antmaze", "diverse", "ucf-paper").tables
+    assert (paper["policy"]["context"], paper["crm"]["latent_dim"]) == (50, 32)
+    assert "max_timestep" not in paper["policy"]
 
 
 def test_presets_are_configurations_with_targets() -> None:

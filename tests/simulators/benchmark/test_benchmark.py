@@ -24,8 +24,8 @@ from ucfrec_simulators.benchmark import plan, plots
 from ucfrec_simulators.benchmark.cells import EvaluationPlan
 from ucfrec_simulators.benchmark.methods import METHODS
 from ucfrec_simulators.benchmark.plan import BUDGETS, Plan
-from ucfrec_simulators.benchmark.plots import plot_distractor, plot_methods, plot_targets
-from ucfrec_simulators.benchmark.tables import distractor_table, method_table, target_table
+from ucfrec_simulators.benchmark.plots import plot_distractor, plot_methods
+from ucfrec_simulators.benchmark.tables import distractor_table, method_table
 from ucfrec_simulators.benchmark.tasks import kuairand
 from ucfrec_simulators.kuai.environment import EXITS
 from ucfrec_simulators.kuai.logs import cut_by_exit, window
@@ -148,8 +148,9 @@ def test_every_cell_of_every_table_has_a_configuration(
 ) -> None:
     monkeypatch.setattr(plan, "MAIN", ("synthetic-taobao", "synthetic-catalog"))
     monkeypatch.setattr(plan, "SWEPT", ("synthetic-taobao",))
+    monkeypatch.setattr(plan, "PURSUED", ("synthetic-catalog",))
     given = Plan(tmp_path, TINY)
-    every = [*given.main(), *given.sweeps(), *given.distractor()]
+    every = [*given.main(), *given.additions(), *given.sweeps(), *given.distractor()]
     trained = [cell for cell in every if cell.store is not None]
     folders = {(cell.run, cell.config) for cell in trained}
     assert len({run for run, _ in folders}) == len(folders), "a folder for every configuration"
@@ -174,7 +175,10 @@ def test_unknown_tables_and_budgets_are_named(
 ) -> None:
     arguments = ["benchmark", "recommendation", "--out", str(tmp_path / "out")]
     assert main([*arguments, "--table", "table-2"]) == 2
-    assert "no table is called table-2; there are main, distractor" in capsys.readouterr().err
+    assert (
+        "no table is called table-2; there are main, additions, distractor"
+        in capsys.readouterr().err
+    )
     suite: Benchmark = load_plugin("benchmarks", "recommendation")
     with pytest.raises(InputError, match="unknown budget huge"):
         suite.run(BenchmarkRequest("huge", ["main"], tmp_path, tmp_path / "rows.jsonl", 1))
@@ -207,7 +211,6 @@ def distractor_rows(values: Mapping[float | None, Sequence[float]]) -> list[Resu
             metrics=metrics,
             training_seed=seed,
             target_return=3.0,
-            details={"validation": {"3": value + seed}},
             conditions={"distractor": rate, "quantiles": quantile},
         )
         for quantile in ("0.99", "1")
@@ -223,7 +226,6 @@ def test_tables_give_means_spreads_and_paired_drops() -> None:
     assert method_table([*clean, last]).splitlines()[2] == (
         "| w | m | 2 | 15 ± 7.1 | 0.5 ± 0 | 0.5 ± 0 | 2 ± 0 | – | 3 |"
     )
-    assert target_table(clean).splitlines()[2] == "| w | m | 3 | 2 | 15.5 ± 7.8 |"
     line, less = distractor_table(every).splitlines()[2:]
     assert less == line.replace("| 1 |", "| 0.99 |")
     assert line == "| w | 1 | m | 2 | 15 ± 7.1 | 10 ± 7.1 | 12 ± 5.7 | 37.5 ± 18 |"
@@ -236,7 +238,6 @@ def test_pictures_show_the_means_and_the_spread_of_the_tables(tmp_path: Path) ->
     clean = [row for row in rows if row.conditions["distractor"] is None]
     for plot, given, name in (
         (plot_methods, clean, "methods-w"),
-        (plot_targets, clean, "targets-w"),
         (plot_distractor, rows, "distractor-w"),
     ):
         made = plot(given, tmp_path)

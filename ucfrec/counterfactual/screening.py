@@ -1,36 +1,43 @@
-"""Causal screening: which state dimensions cause nothing, and copies that intervene on them.
+"""Which state dimensions cause nothing (assumption A3, minimality).
 
-A dimension that, once the other dimensions and the action are known, helps predict neither the
-reward nor the rest of the next state has no effect (assumption A3, minimality).
+A dimension of observed states has an effect if it helps to predict the reward or the rest of the
+next state, given the other dimensions and the action. Both predictions are evaluated on held-out
+episodes. The next state is predicted with the reward as a further input: a dimension that measures
+the reward, as distractors do, then adds nothing even if the predictors are imperfect. For the
+reward this is not possible. There the improvement must be a minimum share of the reward's whole
+variance; a measurement of the reward explains no more than the predictor's error. The largest
+errors of the next state are capped, so that a few falls do not decide the test.
 
-Both predictions are evaluated on held-out trajectories. The next state is predicted with the reward
-as a further input: a dimension that measures the reward, as distractors do, then adds nothing even
-if the predictors are imperfect. For the reward this is not possible. There the improvement must be
-a minimum share of the reward's whole variance; a measurement of the reward explains no more than
-the predictor's error. The largest errors of the next state are capped, so that a few falls do not
-decide the test.
+Where the reward can hardly be predicted, as clicks, no help is no evidence, and a measurement of
+the reward helps most. There a dimension counts as without effect only if it is such a measurement
+(`ucfrec.counterfactual.measured_reward`) and does not help to predict the next state. In logs of
+items the logged observation is screened, and by that test alone.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Annotated, Any
 
 import numpy as np
 import torch
 from pydantic import Field
-from scipy import stats
 from torch import Tensor, nn
 
+from ucfrec.counterfactual.measured_reward import (
+    CLIP,
+    MeasurementConfig,
+    clustered_p_value,
+    held_out_of,
+    measured_reward,
+    standardised,
+)
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import IntArray, Overlay
+from ucfrec.episodes.windows import IntArray
 from ucfrec.errors import InputError
 from ucfrec.fitting.random_state import random_state_kept
-from ucfrec.runs.run import training_views
 from ucfrec.settings import BatchSize, Count, LearningRate, Share, Width, settings_table
 
-_HELD_OUT_EVERY = 5
-_CLIP = 10.0
 _CHUNK = 1024
 _HELPED = 3
 
@@ -60,7 +67,11 @@ class ScreeningConfig:
     min_reward_effect: Share = 0.01
     """Least share of the reward's variance that counts as help."""
     level: Share = 0.01
-    """Level of the tests, over held-out trajectories."""
+    """Level of the tests, over held-out episodes."""
+    min_reward_r2: Share = 0.5
+    """Least R² of the reward at which it counts as evidence that a dimension does not help."""
+    measurement: MeasurementConfig = field(default_factory=MeasurementConfig)
+    """The test whether a dimension measures the reward."""
 
 
 @dataclass(frozen=True)
@@ -68,18 +79,20 @@ class DimensionReport:
     """What one state dimension adds to the others and the action."""
 
     dimension: int
-    effect: float
+    effect: float | None
     """Share it explains of what the others leave unexplained of the next dimensions it helps most
-    (partial R², their mean), the reward given."""
+    (partial R², their mean), the reward given; None in logs of items, where it is not tested."""
     helps: tuple[int, ...]
-    """Those dimensions, most helped first, chosen on fitted trajectories."""
-    p_value: float
-    """Of no help there, one-sided, over held-out trajectories."""
-    reward_effect: float
+    """Those dimensions, most helped first, chosen on fitted episodes."""
+    p_value: float | None
+    """Of no help there, one-sided, over held-out episodes."""
+    reward_effect: float | None
     """Share it explains of the reward's variance."""
-    reward_p_value: float
+    reward_p_value: float | None
+    measures_reward: bool
+    """Whether it tells of the reward after the fact."""
     causes: bool
-    """Whether either help counts."""
+    """Whether it counts as having an effect, be it for want of evidence."""
 
 
 @dataclass(frozen=True)
@@ -87,8 +100,8 @@ class ScreeningReport:
     """The verdict on every dimension."""
 
     dimensions: tuple[DimensionReport, ...]
-    reward_r2: float
-    """Held-out R² of the reward with all dimensions known."""
+    reward_r2: float | None
+    """Held-out R² of the reward with all dimensions known; None in logs of items."""
     transitions: int
 
     @property
@@ -98,28 +111,36 @@ class ScreeningReport:
 
 
 @random_state_kept()
-def screen(store: EpisodeStore, config: ScreeningConfig, seed: int) -> ScreeningReport:
-    """Test the effect of every observed state dimension on the training episodes of `store`.
+def screen(train: EpisodeStore, config: ScreeningConfig, seed: int) -> ScreeningReport:
+    """Test the effect of every logged observation dimension.
+
+    Args:
+        train: a view of the training episodes.
+        config: of the tests.
+        seed: of the predictors.
 
     Raises:
-        InputError: states are made of items, or there are too few trajectories to hold some out.
+        InputError: no observations are logged, or there are too few episodes to hold some out.
     """
-    train, _ = training_views(store)
-    if store.has_items:
-        raise InputError(f"{store.path} is of item logs; screening is for observed states")
-    data = _Transitions.of(train, config.max_transitions, seed)
-    if len(np.unique(data.episodes[data.held_out])) < 3:
+    if not train.observation_size:
         raise InputError(
-            f"{store.path} has {train.n_episodes} training trajectories with two steps or more; "
-            f"screening needs at least {3 * _HELD_OUT_EVERY}"
+            f"{train.path} has no logged observations to screen; its states are made of items"
         )
+    measures = measured_reward(train, config.measurement, config.max_transitions, seed)
+    if train.has_items:
+        verdicts = [
+            DimensionReport(j, None, (), None, None, None, measured, not measured)
+            for j, measured in enumerate(measures.flags)
+        ]
+        return ScreeningReport(tuple(verdicts), None, measures.transitions)
+    data = _Transitions.of(train, config.max_transitions, seed)
     torch.manual_seed(seed)
     pair = _fitted(data, config)
     seen = np.flatnonzero(~data.held_out)
     sample = np.random.default_rng(seed).choice(seen, min(len(seen), 4 * _CHUNK), replace=False)
     fitted_errors, _ = _errors(pair, data, np.sort(sample))
     next_errors, reward_errors = _errors(pair, data, np.flatnonzero(data.held_out))
-    return _report(data, fitted_errors, next_errors, reward_errors, config)
+    return _report(data, fitted_errors, next_errors, reward_errors, measures.flags, config)
 
 
 @dataclass(frozen=True)
@@ -148,18 +169,13 @@ class _Transitions:
         states = (found.states - mean) / torch.where(std > 1e-6, std, 1.0)
         next_states = (found.next_states - mean) / torch.where(std > 1e-6, std, 1.0)
         return cls(
-            states=states.clamp(-_CLIP, _CLIP),
-            actions=_standardised(found.actions),
-            rewards=_standardised(found.rewards.unsqueeze(1)),
-            changes=_standardised(next_states - states),
+            states=states.clamp(-CLIP, CLIP),
+            actions=standardised(found.actions),
+            rewards=standardised(found.rewards.unsqueeze(1)),
+            changes=standardised(next_states - states),
             episodes=episodes[inner],
-            held_out=episodes[inner] % _HELD_OUT_EVERY == _HELD_OUT_EVERY // 2,
+            held_out=held_out_of(episodes[inner]),
         )
-
-
-def _standardised(values: Tensor) -> Tensor:
-    std, mean = torch.std_mean(values, dim=0)
-    return ((values - mean) / torch.where(std > 1e-6, std, 1.0)).clamp(-_CLIP, _CLIP)
 
 
 class _Predictors(nn.Module):
@@ -272,6 +288,7 @@ def _report(
     fitted_errors: Tensor,
     next_errors: Tensor,
     reward_errors: Tensor,
+    measures: Sequence[bool],
     config: ScreeningConfig,
 ) -> ScreeningReport:
     size = data.states.shape[1]
@@ -280,18 +297,20 @@ def _report(
     fitted = fitted_errors.mean(1)
     gain = 1 - fitted[-1] / fitted[:-1].clamp(min=1e-12)  # (S, S)
     most_helped = gain.fill_diagonal_(-torch.inf).topk(min(_HELPED, size - 1)).indices
+    r2 = 1 - float(reward_errors[-1].mean()) / max(variance, 1e-12)
     found = []
     for j in range(size):
         pair = next_errors[[j, -1]][:, :, most_helped[j]]  # (2, B, helped)
         without, with_it = pair.minimum(pair.flatten(0, 1).quantile(1 - config.capped, dim=0))
         saved = (without - with_it) / without.mean(0).clamp(min=1e-12)
-        effect, p_value = float(saved.mean()), _p_value(saved.mean(1), data.episodes[rows])
+        effect, p_value = float(saved.mean()), clustered_p_value(saved.mean(1), data.episodes[rows])
         more = reward_errors[j] - reward_errors[-1]
         reward_effect = float(more.mean()) / max(variance, 1e-12)
-        reward_p_value = _p_value(more, data.episodes[rows])
-        causes = (effect >= config.min_effect and p_value < config.level) or (
+        reward_p_value = clustered_p_value(more, data.episodes[rows])
+        helps_next = effect >= config.min_effect and p_value < config.level
+        helps_reward = (
             reward_effect >= config.min_reward_effect and reward_p_value < config.level
-        )
+        ) or r2 < config.min_reward_r2
         found.append(
             DimensionReport(
                 dimension=j,
@@ -300,62 +319,27 @@ def _report(
                 p_value=p_value,
                 reward_effect=reward_effect,
                 reward_p_value=reward_p_value,
-                causes=causes,
+                measures_reward=measures[j],
+                causes=helps_next or (helps_reward and not measures[j]),
             )
         )
-    r2 = 1 - float(reward_errors[-1].mean()) / max(variance, 1e-12)
     return ScreeningReport(tuple(found), r2, len(data.states))
-
-
-def _p_value(differences: Tensor, episodes: IntArray) -> float:
-    """Of a mean of at most 0, one-sided, where whole trajectories (not steps) are independent."""
-    _, cluster = np.unique(episodes, return_inverse=True)
-    counts = np.bincount(cluster)
-    values = differences.double().numpy()
-    residual = np.bincount(cluster, values) - counts * values.mean()
-    # Cluster-robust standard error of the mean.
-    error = np.sqrt((residual**2).sum() * len(counts) / (len(counts) - 1)) / len(values)
-    return float(stats.t.sf(values.mean() / max(error, 1e-300), len(counts) - 1))
-
-
-def interventions(
-    view: EpisodeStore, dimensions: Sequence[int], seed: int, copies: int = 2
-) -> Overlay:
-    """Copies of every episode of `view` under do(d ~ marginal), d being `dimensions`.
-
-    Values are drawn, jointly, from the steps of the view. Copies 0, 2, … draw once an episode, as
-    an intervention that stays put; copies 1, 3, … at every step.
-
-    Args:
-        view: a view without an overlay.
-    """
-    rng = np.random.default_rng(seed)
-    episodes, steps = view.all_steps()
-    states = view.windows(episodes, steps, 1).states[:, 0].numpy()
-    edited = []
-    for copy in range(copies):
-        by_episode = rng.integers(len(steps), size=view.n_episodes)[episodes]
-        drawn = by_episode if copy % 2 == 0 else rng.integers(len(steps), size=len(steps))
-        changed = states.copy()
-        changed[:, list(dimensions)] = states[drawn][:, list(dimensions)]
-        edited.append(changed)
-    numbers = np.arange(copies)[:, None] * view.n_episodes + episodes
-    return Overlay(
-        copy_source=np.tile(view.episode_ids, copies),
-        edit_copy=numbers.reshape(-1),
-        edit_step=np.tile(steps, copies),
-        edit_state=np.concatenate(edited),
-    )
 
 
 def describe_screening(report: ScreeningReport) -> str:
     """The verdicts as a table."""
-    lines = [f"{report.transitions:,} transitions, reward R² {report.reward_r2:.4f}", ""]
-    lines.append("dimension  next state        p     reward        p  causes")
+    r2 = "" if report.reward_r2 is None else f", reward R² {report.reward_r2:.4f}"
+    lines = [f"{report.transitions:,} transitions{r2}", ""]
+    lines.append("dimension  next state        p     reward        p  measures reward  causes")
     lines += [
-        f"{d.dimension:>9}  {d.effect:>10.4f}  {d.p_value:>7.1g}  "
-        f"{d.reward_effect:>9.5f}  {d.reward_p_value:>7.1g}  {'yes' if d.causes else 'NOTHING'}"
+        f"{d.dimension:>9}  {_number(d.effect, '.4f'):>10}  {_number(d.p_value, '.1g'):>7}  "
+        f"{_number(d.reward_effect, '.5f'):>9}  {_number(d.reward_p_value, '.1g'):>7}  "
+        f"{'yes' if d.measures_reward else 'no':>15}  {'yes' if d.causes else 'NOTHING'}"
         for d in report.dimensions
     ]
     flagged = ", ".join(map(str, report.flagged)) or "none"
     return "\n".join([*lines, "", f"dimensions without effect: {flagged}"])
+
+
+def _number(value: float | None, form: str) -> str:
+    return "–" if value is None else f"{value:{form}}"

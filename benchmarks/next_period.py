@@ -1,0 +1,128 @@
+"""What later days of KuaiRand-Pure tell of policies trained on the days before.
+
+    python benchmarks/next_period.py --out runs/next                       # judged on 29-30 April
+    python benchmarks/next_period.py --out runs/next --validation 27 --until 29      # on 28 April
+
+Runs the commands of docs/quickstart.md on the files in $UCFREC_DATA/kuairand: it trains on the days
+before `--validation`, whose rows choose the decision rule, and ranks the days after it. `--refit`
+also ranks a policy that learned from the validation day, too. Appends rows to results.jsonl in
+--out, or to --results, and prints the table of `ucfrec rank`.
+"""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.code_version import code_version
+from ucfrec.commands.cli import main as ucfrec
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.evaluation.ranking import MEASURES
+from ucfrec.files import read_json
+from ucfrec.logs.mapping import log_files
+from ucfrec.policies.registry import policy_class
+from ucfrec.provenance import config_hash, provenance
+from ucfrec.reporting.result_row import ResultRow
+from ucfrec.reporting.rows_file import append_rows
+from ucfrec.runs.trained_policy import read_record
+from ucfrec_simulators.folders import data_folder
+
+SETTINGS = ("train.steps=2000", "policy.dim=64")
+_CHINA = "2022-04-{:02d}T00:00+08:00"
+
+
+def run(*arguments: str | Path) -> None:
+    """Run one `ucfrec` command.
+
+    Raises:
+        SystemExit: it failed.
+    """
+    print("ucfrec", *arguments, flush=True)
+    if status := ucfrec([str(argument) for argument in arguments]):
+        raise SystemExit(status)
+
+
+def logs(out: Path, until: int | None) -> list[Path]:
+    """The files of KuaiRand, their logs cut before the day `until` of April."""
+    files = log_files([data_folder("kuairand")])
+    if until is None:
+        return files
+    end = pd.Timestamp(_CHINA.format(until)).timestamp() * 1000
+    given = [file for file in files if not file.name.startswith("log_")]
+    for file in set(files) - set(given):
+        rows = pd.read_parquet(file)
+        given.append(out / file.name)
+        out.mkdir(parents=True, exist_ok=True)
+        rows[rows["time_ms"] < end].to_parquet(given[-1])
+    return given
+
+
+def result_row(row: dict[str, Any], store: Path, folder: Path, days: str) -> ResultRow:
+    """The result row of one row of `ucfrec rank --json`."""
+    record = read_record(folder)
+    own = "decision_rule" in row
+    learner = record["config"]["policy_name"] if own else row["policy"]
+    modules = [policy_class(learner).__module__] if own else []
+    return ResultRow(
+        suite="next-period",
+        table="next-period",
+        task="kuairand",
+        method=row["policy"],
+        policy=learner,
+        training_seed=record["seed"] if own else None,
+        evaluation_seed=row["seed"],
+        conditions={"days": days, "k": row["k"]},
+        config_hash=config_hash(record["config"]) if own else None,
+        code_version=code_version(Path(__file__), "ucfrec.runs.run", *modules),
+        data_fingerprint=EpisodeStore.open(store).meta["fingerprint"],
+        metric="hit_rate_liked",
+        metrics={name: row[name] for name in (*MEASURES, "coverage") if row[name] is not None},
+        interval=tuple(row["hit_rate_liked_interval"]),
+        rule=str(DecisionRule.from_dict(row["decision_rule"], "the row")) if own else None,
+        details={
+            name: row[f"{name}_{kind}"]
+            for name in MEASURES
+            for kind in ("interval", "difference")
+            if f"{name}_{kind}" in row
+        },
+        **provenance(),
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="folder of store and runs; resumed")
+    parser.add_argument("--results", type=Path, help="file of result rows")
+    parser.add_argument("--validation", type=int, default=28, help="day of April (default: 28)")
+    parser.add_argument("--until", type=int, help="the first day of April that is left out")
+    parser.add_argument("--policy", action="append", help="learners (default: ucf)")
+    parser.add_argument("--refit", action="store_true", help="also learn from the validation day")
+    parser.add_argument("--set", action="append", default=[], help="settings over the command's")
+    options = parser.parse_args()
+    first, until = options.validation, options.until
+    out = options.out / f"{first}-{until or 31}"
+    store, days = out / "store", f"{first + 1}-{(until or 31) - 1} April"
+    if not store.exists():
+        days_of = f"{_CHINA.format(first)},{_CHINA.format(first + 1)}"
+        split = ("--reward", "is_click", "--split", days_of)
+        run("prepare", *logs(out, until), "--dataset", "kuairand", "--out", store, *split)
+    settings = [part for each in (*SETTINGS, *options.set) for part in ("--set", each)]
+    runs = []
+    for learner in options.policy or ["ucf"]:
+        runs.append(out / "-".join([learner, *options.set]).replace("/", "-"))
+        run("train", store, "--out", runs[-1], "--policy", learner, *settings)
+    if options.refit:
+        runs.append(runs[0].with_name(runs[0].name + "-refit"))
+        run("train", store, "--out", runs[-1], "--refit", runs[0])
+    rows = []
+    for folder in runs:
+        run("rank", folder, "--json", folder.with_suffix(".json"))
+        ranked = read_json(folder.with_suffix(".json"))
+        rows += [result_row(row, store, folder, days) for row in ranked]
+    append_rows(options.results or options.out / "results.jsonl", rows)
+
+
+if __name__ == "__main__":
+    main()

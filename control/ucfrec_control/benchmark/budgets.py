@@ -1,0 +1,102 @@
+"""Sizes of the control benchmarks."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ucfrec_control.worlds.scores import find_task
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The size of a benchmark; every budget measures all methods."""
+
+    files: tuple[str, ...]
+    seeds: int
+    """Training seeds, but of AntMaze."""
+    episodes: int
+    settings: tuple[str, ...]
+    """Settings over the presets; without any, trainings have the authors' size."""
+    memoryless: tuple[str, ...] = ()
+    """Further settings of `bc`."""
+    rl_steps: int = 1_000_000
+    """Updates of IQL and CQL."""
+    rl_batch_size: int = 256
+    """Transitions per update of IQL and CQL."""
+    evaluation_seed: int = 1000
+    """Seed of the reported episodes; the same for all training seeds and methods."""
+    where_present: tuple[str, ...] = ()
+    """Further files, which are measured where they are."""
+    antmaze_seeds: int = 0
+    """Training seeds of AntMaze; 0 for `seeds`."""
+    all_targets: bool = False
+    """Whether a policy is asked for every target return of its preset, or for the first."""
+
+    def files_in(self, data: Path) -> tuple[str, ...]:
+        """`files`, and those of `where_present` that lie in the folder `data`."""
+        present = [file for file in self.where_present if (data / f"{file}.hdf5").exists()]
+        return (*self.files, *present)
+
+    def seeds_of(self, file: str) -> int:
+        """The number of training seeds of a file."""
+        task = find_task(file)
+        of_antmaze = task is not None and task.name == "antmaze"
+        return self.antmaze_seeds or self.seeds if of_antmaze else self.seeds
+
+    def settings_of(self, learner: str) -> tuple[str, ...]:
+        """The budget's settings for a sequence policy or `bc`."""
+        return (*self.settings, *(self.memoryless if learner == "bc" else ()))
+
+
+_TASKS, _KINDS = ("halfcheetah", "hopper", "walker2d"), ("medium", "mixed", "medium-expert")
+ANTMAZE = ("antmaze-umaze-v2", "antmaze-umaze-diverse-v2")
+"""D4RL's files of the paper's AntMaze columns, under the names of their datasets."""
+BUDGETS = {
+    # Batches, steps and width are reduced most, then files and seeds; no method is left out. The
+    # authors' learning rates are for 25 times as many steps: see `rates.toml` instead.
+    "small": Budget(
+        ("hopper_medium-zoo", "hopper_mixed-zoo", "walker2d_medium-expert-zoo"),
+        2,
+        20,
+        (
+            "train.steps=4000",
+            "train.batch_size=16",
+            "train.warmup_steps=100",
+            "train.validate_every=1000",
+            "train.learning_rate=3e-3",
+            "train.cosine=true",
+            "policy.dim=64",
+            "crm.epochs=3",
+            "csg.epochs=5",
+        ),
+        # As many predictions per update as 16 windows of 20 steps; cheap enough for the full width.
+        memoryless=("train.batch_size=320", "policy.dim=128"),
+        # They learn from single steps, not from windows of 20, and need more updates: at 5,000 they
+        # were below behaviour cloning. A quarter of the authors' batch size, as for the others.
+        rl_steps=50_000,
+        rl_batch_size=64,
+    ),
+    # Seeds, episodes, steps, widths and targets of the paper and of each method's authors.
+    "full": Budget(
+        tuple(f"{t}_{k}-zoo" for t in _TASKS for k in _KINDS),
+        5,
+        100,
+        (),
+        where_present=ANTMAZE,
+        antmaze_seeds=4,
+        all_targets=True,
+    ),
+}
+
+MEDIUM = tuple(f"{task}_medium-zoo" for task in _TASKS)
+"""Files of Appendix G.4."""
+_SWEPT = ("hopper_medium-zoo", "halfcheetah_medium-zoo")
+"""Files of Tables 9 and 10."""
+_SMALL, _FULL = BUDGETS["small"], BUDGETS["full"]
+SWEEPS = {
+    # Half the steps, but twice the seeds: settings of a sweep differ less in score than seeds do.
+    "small": replace(
+        _SMALL, files=_SWEPT, seeds=4, settings=(*_SMALL.settings, "train.steps=2000")
+    ),
+    "full": replace(_FULL, files=_SWEPT, where_present=(), all_targets=False),
+}
+"""Budgets of the sweeps over UCF's settings."""

@@ -1,0 +1,89 @@
+"""Rows of the control tables: learners and their settings, by the name of the row."""
+
+Methods = dict[str, tuple[str, tuple[str, ...]]]
+_NO_TIME = "policy.max_timestep=1"
+METHODS: Methods = {
+    "bc": ("bc", ()),
+    "bc-10": ("bc", ("policy.best_share=0.1",)),
+    "bc-25": ("bc", ("policy.best_share=0.25",)),
+    "iql": ("iql", ()),
+    "cql": ("cql", ()),
+    "dt": ("dt", ()),
+    "dt-wo-time": ("dt", (_NO_TIME,)),
+    "dc": ("dc", ()),
+    "dc-wo-time": ("dc", (_NO_TIME,)),
+    "lsdt": ("lsdt", ()),
+    "lsdt-wo-time": ("lsdt", (_NO_TIME,)),
+    "ucf": ("ucf", ()),
+    "ucf-w-time": ("ucf", ("policy.max_timestep=1000",)),
+    "ucf-paper": ("ucf-paper", ()),
+    "ucf-wo-count": ("ucf", ("augment.copies=0",)),
+    "ucf-wo-arch": ("dt", ("augment.copies=1",)),
+}
+"""Learner and settings by the name of the table's row; the last two are Table 3's ablations.
+
+UCF's preset has no embedding of time steps, the presets of DT, DC and LSDT have one; `ucf-w-time`
+and `…-wo-time` are the reverse. `ucf-paper` is UCF as the paper has it.
+"""
+
+_FAITHFUL, _NOISE = "csg.kind=faithful", "csg.kind=noise"
+_NO_GATE = "augment.epsilon_r=1e9"
+"""Disables the gate on the change of the reward; the limit on a move's length stays."""
+_ALGORITHM_5 = ("augment.copies=3", "augment.edits_per_copy=1", "augment.reward_quantile=0.0")
+METHODS_WO_TIME = {"dt": "dt-wo-time", "dc": "dc-wo-time", "lsdt": "lsdt-wo-time", "ucf": "ucf"}
+"""The method without embeddings of time steps, by learner."""
+_PURSUITS = {
+    "": (),
+    "-weights": ("policy.advantage_weights=true",),
+    "-max-return": ("policy.max_return=true",),
+    "-both": ("policy.advantage_weights=true", "policy.max_return=true"),
+    "-best-25": ("policy.best_share=0.25",),
+}
+"""Ways to pursue reward instead of imitating. A policy with `max_return` is asked for the largest
+return that it expects in each state."""
+MAIN, PURSUING = "main", "pursuing"
+TABLES: dict[str, Methods] = {
+    MAIN: METHODS,
+    # All without embeddings of time steps, as UCF is.
+    PURSUING: {
+        f"{METHODS_WO_TIME[learner]}{name}": (learner, (_NO_TIME, *settings))
+        for learner in METHODS_WO_TIME
+        for name, settings in _PURSUITS.items()
+    },
+    # Figure 2.
+    "lambda": {
+        f"ucf-lambda-{weight:g}": ("ucf", (f"policy.lambda_mask={weight}",))
+        for weight in (0.0, 0.05, 0.1, 0.25, 0.5, 1.0)
+    },
+    # Table 9, with each generator.
+    "gate": {
+        "ucf": ("ucf", ()),
+        "ucf-wo-gate": ("ucf", (_NO_GATE,)),
+        "faithful": ("ucf", (_FAITHFUL,)),
+        "faithful-wo-gate": ("ucf", (_FAITHFUL, _NO_GATE)),
+    },
+    # Table 10: λ_band exists for the paper's network only; for tangent moves the band is widened.
+    "band": {
+        "ucf": ("ucf", ()),
+        "ucf-wide": ("ucf", ("csg.band=[0.2, 2.0]",)),
+        "ucf-wo-lower": ("ucf", ("csg.band=[0.0, 0.5]",)),
+        "faithful": ("ucf", (_FAITHFUL,)),
+        "faithful-wo-band": ("ucf", (_FAITHFUL, "csg.lambda_band=0.0")),
+        "faithful-wo-lower": ("ucf", (_FAITHFUL, "csg.band=[0.0, 0.5]")),
+    },
+    # Does augmentation help? Each generator and variant of the copies, with and without gate.
+    "augmentation": {
+        "ucf-wo-count": ("ucf", ("augment.copies=0",)),
+        **{
+            f"{name}{variant}{gate}": ("ucf", (*kind, *copies, *gate_settings))
+            for name, kind, gates in (
+                ("ucf", (), (("", ()), ("-wo-gate", (_NO_GATE,)))),
+                ("faithful", (_FAITHFUL,), (("", ()), ("-wo-gate", (_NO_GATE,)))),
+                ("noise", (_NOISE,), (("-wo-gate", (_NO_GATE,)),)),
+            )
+            for variant, copies in (("", ()), ("-algorithm-5", _ALGORITHM_5))
+            for gate, gate_settings in gates
+        },
+    },
+}
+"""Rows of each table, as in `METHODS`."""

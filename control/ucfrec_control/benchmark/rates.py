@@ -1,0 +1,175 @@
+"""Learning rates of the benchmark's methods, chosen on validation loss by one small search."""
+
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.provenance import provenance
+from ucfrec.reporting.grid import Measurement, chosen, run_grid
+from ucfrec.reporting.result_row import ResultRow, RowKey
+from ucfrec.reporting.statistics import grouped
+from ucfrec_control.benchmark.budgets import Budget
+from ucfrec_control.benchmark.cells import Cell, code_of, config, key
+from ucfrec_control.benchmark.methods import METHODS, Methods
+from ucfrec_control.data.distractor import zoo_store
+from ucfrec_control.data.trajectories import PACKAGES
+from ucfrec_control.learners.rl_baselines import ALGORITHMS
+from ucfrec_control.learners.train import train_control
+
+SUITE: Final = "rates"
+"""Suite of the rows."""
+RATE: Final = "learning_rate"
+"""Condition of the rows."""
+RATES: Final = {"small": (1e-3, 3e-3, 1e-2), "full": (1e-4, 3e-4, 1e-3)}
+"""Rates that are tried, by the name of the budget."""
+_TIME, _COPIES = "policy.max_timestep", "augment.copies"
+
+
+def _searched(methods: Methods) -> dict[str, tuple[str, tuple[str, ...]]]:
+    """The sequence policies of the main table that differ in learner or embeddings of time."""
+    found: dict[tuple[str, tuple[str, ...]], str] = {}
+    for name, (learner, settings) in methods.items():
+        if learner not in ALGORITHMS:
+            found.setdefault((learner, _of_time(settings)), name)
+    return {name: (learner, settings) for (learner, settings), name in found.items()}
+
+
+def _of_time(settings: Sequence[str]) -> tuple[str, ...]:
+    return tuple(each for each in settings if each.startswith(_TIME))
+
+
+SEARCHED: Final = _searched(METHODS)
+"""Learner and settings of the methods that have a rate of their own, by name."""
+
+
+@cache
+def chosen_rates(budget: str) -> Mapping[str, float]:
+    """The chosen rate of each method of `SEARCHED`; empty for a budget without a search.
+
+    Args:
+        budget: a name of a budget.
+    """
+    text = files("ucfrec_control.benchmark").joinpath("rates.toml").read_text(encoding="utf-8")
+    rates: Mapping[str, float] = tomllib.loads(text).get(budget, {})
+    return rates
+
+
+def settings_of(
+    budget: Budget, name: str, learner: str, settings: Sequence[str]
+) -> tuple[str, ...]:
+    """Settings of a training over its presets: the budget's, the chosen rate, the method's own.
+
+    Args:
+        budget: size of the benchmark.
+        name: its name.
+        learner: as `Cell.learner`.
+        settings: of the method.
+    """
+    time = _of_time(settings)
+    if learner == "ucf" and time == _of_time(METHODS["dt-wo-time"][1]):
+        time = ()  # the preset
+    rates = chosen_rates(name)
+    rate = next((rates.get(m) for m, own in SEARCHED.items() if own == (learner, time)), None)
+    searched = () if rate is None else (f"train.{RATE}={rate:g}",)
+    return (*budget.settings_of(learner), *searched, *settings)
+
+
+def search_rates(
+    data: Path,
+    folder: Path,
+    results: Path,
+    budget: Budget,
+    name: str,
+    workers: int,
+    methods: Sequence[str] = (),
+    steps: int | None = None,
+) -> list[ResultRow]:
+    """Train every method at every rate, without copies; returns a row with the validation loss of
+    each training.
+
+    Args:
+        data: folder of the HDF5 files.
+        folder: where stores and runs are kept.
+        results: file of JSON lines; what has its row is not repeated.
+        budget: size of the trainings.
+        name: name of the budget.
+        workers: number of processes, of one thread each.
+        methods: some of `SEARCHED`; empty for all.
+        steps: updates of a training; None for the budget's.
+
+    Raises:
+        InputError: a file is missing, a method is unknown, `results` has other content, or cells
+            failed.
+    """
+    selected = chosen(SEARCHED, methods, "method")
+    cells = list(_cells(data, folder, budget, name, selected, steps))
+    return run_grid(cells, _MEASUREMENT, results, workers, SUITE)
+
+
+def _cells(
+    data: Path, folder: Path, budget: Budget, name: str, methods: Sequence[str], steps: int | None
+) -> Iterator[Cell]:
+    shorter = () if steps is None else (f"train.steps={steps}", f"train.validate_every={steps}")
+    for file in budget.files_in(data):
+        store = zoo_store(data, folder / "stores", file)
+        for method in methods:
+            learner, own = SEARCHED[method]
+            code = code_of(learner, __name__)
+            for rate in RATES[name]:
+                settings = (f"{_COPIES}=0", *shorter, f"train.{RATE}={rate:g}", *own)
+                for seed in range(budget.seeds):
+                    yield Cell(
+                        suite=SUITE,
+                        table=f"{rate:g}",
+                        budget=name,
+                        file=file,
+                        method=method,
+                        learner=learner,
+                        settings=(*budget.settings_of(learner), *settings),
+                        store=store,
+                        run=folder / SUITE / name / file / f"{method}-{rate:g}-{code}-{seed}",
+                        seed=seed,
+                        episodes=0,
+                        evaluation_seed=budget.evaluation_seed,
+                        code_version=code,
+                    )
+
+
+def _measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
+    record = train_control(EpisodeStore.open(cell.store), cell.run, cell.config)
+    loss, rate = record["policy"]["best_validation"], cell.config.train.learning_rate
+    row = ResultRow(
+        **vars(row_key) | {"conditions": {**row_key.conditions, RATE: rate}},
+        metric="validation_loss",
+        metrics={"validation_loss": loss, "steps": float(record["policy"]["steps"])},
+        wall_time_s=record["wall_time_s"],
+        **provenance(PACKAGES),
+    )
+    return [row]
+
+
+_MEASUREMENT: Final = Measurement(key, config, _measure)
+
+
+def best_rates(rows: Sequence[ResultRow]) -> dict[str, float]:
+    """The rate of each method with the lowest loss, in the mean over files and seeds, each relative
+    to the lowest loss of the method there.
+
+    Args:
+        rows: of one budget, as returned by `search_rates`.
+    """
+    found = {}
+    for method, own in grouped(rows, lambda row: row.method).items():
+        relative: dict[Any, list[float]] = {}
+        for group in grouped(own, lambda row: (row.task, row.training_seed)).values():
+            lowest = min(row.value for row in group)
+            for row in group:
+                relative.setdefault(row.conditions[RATE], []).append(row.value / lowest)
+        found[method] = min(relative, key=lambda rate: float(np.mean(relative[rate])))
+    return found

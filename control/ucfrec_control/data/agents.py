@@ -1,0 +1,202 @@
+"""Agents that Stable-Baselines3 (or its contrib package) saved, read as data.
+
+A saved agent is a zip file: tensors in `policy.pth`, and settings in `data`, a JSON file in which
+whatever JSON cannot say is pickled. Unpickling runs what its author wrote. Here the tensors are
+read by PyTorch's loader of plain weights, the JSON without its pickled parts, and the network is
+rebuilt from the names and shapes of the tensors. What that does not tell is refused.
+"""
+
+import io
+import json
+import re
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from gymnasium.spaces import Box
+from torch import Tensor, nn
+
+from ucfrec.acting.rollout import BoolArray, FloatArray, IntArray
+from ucfrec.errors import InputError
+
+_MOST_BYTES: Final = {"policy.pth": 2**30, "data": 2**26}
+"""Sizes beyond which a file is refused before it is unpacked."""
+_ACTIVATIONS: Final = {each.__name__: each for each in (nn.ReLU, nn.Tanh, nn.ELU, nn.LeakyReLU)}
+_LAYER: Final = re.compile(r"(.+)\.(\d+)\.(weight|bias)")
+_CLIPPED_MEAN: Final = 2.0
+"""Bound of the mean of agents with state-dependent exploration, where the file names no other."""
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """Where a family of algorithms keeps the network that acts."""
+
+    hidden: str
+    """Prefix of its hidden layers."""
+    last: tuple[str, ...]
+    """Possible names of its last layer."""
+    activation: type[nn.Module]
+    """Between the layers, where the file names none."""
+    squashed: bool
+    """Whether a tanh maps outputs to the action space; else they are clipped to it."""
+
+
+_KINDS: Final = (
+    # SAC, TQC; with state-dependent exploration the last layer is within a sequence.
+    _Kind("actor.latent_pi", ("actor.mu", "actor.mu.0"), nn.ReLU, True),
+    # PPO, A2C, TRPO
+    _Kind("mlp_extractor.policy_net", ("action_net",), nn.Tanh, False),
+    # TD3, DDPG: the last layer is the last of the sequence
+    _Kind("actor.mu", (), nn.ReLU, True),
+)
+
+
+class Agent:
+    """The deterministic action of a saved agent plus Gaussian noise (an `Actor` of `rollout`)."""
+
+    def __init__(self, network: nn.Module, squashed: bool, space: Box, noise: float, seed: int):
+        """Args:
+        network: maps observations (N, O) to (N, A).
+        squashed: whether its outputs, within [−1, 1], are stretched to the action space.
+        space: the environment's actions.
+        noise: standard deviation of the noise, in halves of the action space's range.
+        seed: of the noise.
+        """
+        self._network, self._squashed = network.eval(), squashed
+        self._low, self._high = (side.astype(np.float64) for side in (space.low, space.high))
+        self._noise, self._seed = noise, seed
+        self._generator = np.random.default_rng(seed)
+
+    def begin(self, rows: IntArray) -> None:
+        """Do nothing: the agent has no memory."""
+
+    def act(
+        self, observations: FloatArray, live: BoolArray
+    ) -> tuple[npt.NDArray[np.float32], None]:
+        """Actions (N, A) within the action space, and None."""
+        with torch.no_grad():
+            out = self._network(torch.as_tensor(observations, dtype=torch.float32))
+        mean, half = out.double().numpy(), (self._high - self._low) / 2
+        if self._squashed:
+            mean = self._low + half * (mean + 1)
+        noise = self._noise * half * self._generator.normal(size=mean.shape)
+        return np.clip(mean + noise, self._low, self._high).astype(np.float32), None
+
+    def observe(self, actions: npt.NDArray[Any], rewards: FloatArray) -> None:
+        """Do nothing: the agent has no memory."""
+
+
+def read_agent(file: Path, observations: int, space: Box, noise: float, seed: int) -> Agent:
+    """Read a saved agent.
+
+    Args:
+        file: zip file that Stable-Baselines3 wrote.
+        observations: size of the environment's observations.
+        space: the environment's actions, a bounded box of vectors.
+        noise: as of `Agent`.
+        seed: as of `Agent`.
+
+    Raises:
+        InputError: the file is missing or damaged, or its network is not one of layers that its
+            tensors tell in full (perceptrons of SAC, TQC, TD3, DDPG, PPO, A2C or TRPO), or of other
+            sizes.
+    """
+    tensors, settings = _contents(file)
+    kind, names = _kind_of(file, tensors)
+    known = {name for name in tensors if name.startswith((*names, "log_std", "actor.log_std"))}
+    if other := sorted(n for n in tensors.keys() - known if n.startswith(("actor.", "features"))):
+        raise _refused(file, f"its network has {other[0]}, which is no layer of a perceptron")
+    layers = [tensors[f"{name}.weight"] for name in names]
+    sizes = (layers[0].shape[1], layers[-1].shape[0])
+    if sizes != (observations, space.shape[0]):
+        raise InputError(
+            f"{file}: the agent maps observations of size {sizes[0]} to actions of size {sizes[1]};"
+            f" the environment's are {observations} and {space.shape[0]}"
+        )
+    kwargs = settings.get("policy_kwargs")
+    kwargs = kwargs if isinstance(kwargs, dict) else {}
+    activation = _activation(file, kwargs, kind)
+    parts: list[nn.Module] = []
+    for name, weight in zip(names, layers, strict=True):
+        layer = nn.Linear(weight.shape[1], weight.shape[0])
+        layer.load_state_dict({part: tensors[f"{name}.{part}"] for part in ("weight", "bias")})
+        parts += [layer, activation()]
+    parts.pop()
+    if names[-1] == "actor.mu.0" and kind.last:
+        bound = kwargs.get("clip_mean", _CLIPPED_MEAN)
+        parts.append(nn.Hardtanh(-float(bound), float(bound)))
+    squashed = kind.squashed or kwargs.get("squash_output") is True
+    return Agent(nn.Sequential(*parts, *([nn.Tanh()] if squashed else [])), squashed, space, noise,
+                 seed)  # fmt: skip
+
+
+def _contents(file: Path) -> tuple[dict[str, Tensor], Mapping[str, Any]]:
+    """Tensors and settings of a saved agent, none of them unpickled."""
+    if not file.is_file():
+        raise InputError(f"{file} does not exist; name an agent that Stable-Baselines3 saved")
+    try:
+        with zipfile.ZipFile(file) as archive:
+            parts = {name: _unpacked(archive, name) for name in _MOST_BYTES}
+        tensors = torch.load(io.BytesIO(parts["policy.pth"]), "cpu", weights_only=True)
+        settings = json.loads(parts["data"])
+        if not (
+            isinstance(settings, dict)
+            and isinstance(tensors, dict)
+            and all(isinstance(k, str) and isinstance(v, Tensor) for k, v in tensors.items())
+        ):
+            raise ValueError("its parts are not those of an agent")
+    except Exception as error:  # zipfile, json and PyTorch's unpickler raise many types
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise _refused(file, f"it cannot be read as data ({reason})") from None
+    return tensors, settings
+
+
+def _unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
+    size = archive.getinfo(name).file_size
+    if size > _MOST_BYTES[name]:
+        raise ValueError(f"{name} has {size:,} bytes, more than {_MOST_BYTES[name]:,}")
+    return archive.read(name)
+
+
+def _kind_of(file: Path, tensors: Mapping[str, Tensor]) -> tuple[_Kind, list[str]]:
+    """The family of a network, and the names of its layers from first to last."""
+    layers = [match for name in tensors if (match := _LAYER.fullmatch(name))]
+    for kind in _KINDS:
+        numbers = sorted({int(m[2]) for m in layers if m[1] == kind.hidden and m[3] == "weight"})
+        last = [name for name in kind.last if f"{name}.weight" in tensors]
+        names = [*(f"{kind.hidden}.{number}" for number in numbers), *last[:1]]
+        if not numbers or (kind.last and not last):
+            continue
+        if all(_is_layer(tensors, name) for name in names):
+            return kind, names
+    raise _refused(file, "its tensors are not those of a perceptron with vector actions")
+
+
+def _is_layer(tensors: Mapping[str, Tensor], name: str) -> bool:
+    weight, bias = (tensors.get(f"{name}.{part}") for part in ("weight", "bias"))
+    if weight is None or bias is None:
+        return False
+    return weight.ndim == 2 and bias.shape == weight.shape[:1] and weight.is_floating_point()
+
+
+def _activation(file: Path, kwargs: Mapping[str, Any], kind: _Kind) -> type[nn.Module]:
+    """What `policy_kwargs` calls the activation, of which JSON keeps the class's name."""
+    named = kwargs.get("activation_fn")
+    if named is None and "activation_fn" not in kwargs:
+        return kind.activation
+    title = str(named).removesuffix("'>").rpartition(".")[2]
+    if title not in _ACTIVATIONS:
+        raise _refused(file, f"its activation is {named!r}")
+    return _ACTIVATIONS[title]
+
+
+def _refused(file: Path, reason: str) -> InputError:
+    return InputError(
+        f"{file}: {reason}; agents of SAC, TQC, TD3, DDPG, PPO, A2C and TRPO with perceptrons can "
+        "be used, whose files keep the network as plain tensors"
+    )

@@ -1,0 +1,89 @@
+"""Learning rates are chosen on validation loss alone, and the chosen ones are trained with."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.support.control_files import hopper_like, write_hdf5
+from tests.support.result_rows import result_row
+from ucfrec.reporting.result_row import ResultRow
+from ucfrec.reporting.rows_file import read_rows
+from ucfrec_control.benchmark import rates
+from ucfrec_control.benchmark.budgets import BUDGETS, Budget
+from ucfrec_control.benchmark.methods import METHODS, TABLES
+from ucfrec_control.benchmark.rates import RATES, SEARCHED, best_rates, chosen_rates, settings_of
+from ucfrec_control.cli import main
+from ucfrec_control.learners.rl_baselines import ALGORITHMS
+
+
+def of_rate(method: str, task: str, rate: float, loss: float) -> ResultRow:
+    return result_row(
+        loss,
+        metric="validation_loss",
+        task=task,
+        method=method,
+        training_seed=0,
+        conditions={"budget": "small", "learning_rate": rate},
+    )
+
+
+def test_a_file_with_larger_losses_weighs_no_more() -> None:
+    # At 0.1 a fifth is lost on the one file; at 0.2 only a tenth, on the other with large losses.
+    rows = [
+        of_rate("dt", "small", 0.1, 0.012), of_rate("dt", "small", 0.2, 0.010),
+        of_rate("dt", "large", 0.1, 10.0), of_rate("dt", "large", 0.2, 11.0),
+        of_rate("dc", "small", 0.1, 1.0), of_rate("dc", "small", 0.2, 3.0),
+    ]  # fmt: skip
+    assert best_rates(rows) == {"dt": 0.2, "dc": 0.1}
+
+
+def test_every_learner_and_use_of_time_has_a_rate() -> None:
+    assert {name: METHODS[name] for name in SEARCHED} == SEARCHED
+    learners = {learner for learner, _ in METHODS.values()} - set(ALGORITHMS)
+    assert {learner for learner, _ in SEARCHED.values()} == learners
+    for learner in ("dt", "dc", "lsdt"):
+        assert f"{learner}-wo-time" in SEARCHED
+    assert chosen_rates("small").keys() <= SEARCHED.keys()
+    assert set(chosen_rates("small").values()) <= set(RATES["small"])
+    assert chosen_rates("unknown") == {}
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_every_row_is_trained_at_the_rate_of_its_learner(
+    table: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    numbers = {name: float(number) for number, name in enumerate(SEARCHED, start=1)}
+    monkeypatch.setattr(rates, "chosen_rates", lambda budget: numbers)
+    for name, (learner, settings) in TABLES[table].items():
+        if learner in ALGORITHMS:
+            continue
+        found = settings_of(BUDGETS["full"], "full", learner, settings)
+        # A table without time calls DT without time by that name too; UCF has none by default.
+        stem = (
+            next(m for m in sorted(SEARCHED, key=len, reverse=True) if name.startswith(m))
+            if (name not in ("ucf-wo-arch",) and not name.startswith(("faithful", "noise")))
+            else ("dt" if name == "ucf-wo-arch" else "ucf")
+        )
+        assert f"train.learning_rate={numbers[stem]:g}" in found, name
+        assert found[-len(settings) :] == settings if settings else True
+
+
+def test_the_search_writes_rows_and_a_choice_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
+    settings = ("train.batch_size=4", "train.warmup_steps=0", "policy.dim=16", "policy.context=3")
+    tiny = {"small": Budget(("hopper_medium-made",), 1, 1, settings)}
+    monkeypatch.setattr("ucfrec_control.commands.rates.BUDGETS", tiny)
+    monkeypatch.setitem(RATES, "small", (1e-9, 1e-2))
+    out, toml = tmp_path / "out", tmp_path / "rates.toml"
+    arguments = ["rates", "--data", str(tmp_path), "--out", str(out), "--toml", str(toml)]
+    arguments += ["--method", "dt-wo-time", "--steps", "30"]
+    assert main(arguments) == 0
+    rows = read_rows(out / "results.jsonl")
+    assert [row.conditions["learning_rate"] for row in rows] == [1e-9, 1e-2]
+    assert rows[1].value < rows[0].value
+    assert toml.read_text() == "[small]\ndt-wo-time = 0.01\n"
+    assert main(arguments) == 0
+    assert read_rows(out / "results.jsonl") == rows
+    assert "0 of them left" in capsys.readouterr().err

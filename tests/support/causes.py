@@ -1,0 +1,76 @@
+"""Stores in which it is known what causes what."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ucfrec import schema
+from ucfrec.counterfactual.measured_reward import MeasurementConfig
+from ucfrec.counterfactual.screening import ScreeningConfig
+from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
+
+QUICK = ScreeningConfig(
+    hidden=64,
+    shared_steps=400,
+    own_steps=200,
+    measurement=MeasurementConfig(hidden=48, steps=500, batch_size=256),
+)
+SOURCE = {"where": "planted", "dataset": "planted", "env_id": None, "versions": {}}
+
+
+def planted_vectors(
+    out: Path, trajectories: int = 60, length: int = 40, jolt: float = 0.0
+) -> EpisodeStore:
+    """Five dimensions: 0 drives 1, 1 drives 0 and the reward, 2 the reward alone, 3 measures the
+    reward, 4 is noise. 3 and 4 have no effect. In 0.3% of the steps 1 is jolted by `jolt`."""
+    rng = np.random.default_rng(0)
+    shape = (trajectories, length)
+    states, actions = np.zeros((*shape, 5)), rng.uniform(-1, 1, (*shape, 1))
+    states[:, :, [2, 4]] = rng.normal(size=(*shape, 2))
+    states[:, 0, :2] = rng.normal(size=(trajectories, 2))
+    for t in range(length - 1):
+        x, y = states[:, t, 0], states[:, t, 1]
+        states[:, t + 1, 0] = 0.8 * x + 0.5 * np.tanh(y) + 0.2 * actions[:, t, 0]
+        states[:, t + 1, 1] = 0.7 * y - 0.6 * x + 0.3 * rng.normal(size=trajectories)
+        if jolt:
+            states[:, t + 1, 1] += jolt * (rng.random(trajectories) < 0.003)
+    rewards = states[:, :, 1] + np.abs(states[:, :, 2]) + 0.3 * actions[:, :, 0]
+    states[:, :, 3] = rewards > np.median(rewards)
+    columns = {
+        schema.OBSERVATION: states.reshape(-1, 5).astype(np.float32),
+        schema.ACTION: actions.reshape(-1, 1).astype(np.float32),
+        schema.REWARD: rewards.reshape(-1).astype(np.float32),
+    }
+    # As control stores are split: every twentieth is for validation.
+    split = {schema.SPLIT: (np.arange(trajectories) % 20 == 10).astype(np.int8)}
+    return EpisodeStore.write(out, columns, np.full(trajectories, length), split, source=SOURCE)
+
+
+COLUMNS = ("bit", "seen by the policy", "not seen", "user", "early bit")
+"""Observation columns of `planted_items`."""
+
+
+def planted_items(
+    out: Path, sessions: int = 400, length: int = 12, flip: float = 0.0
+) -> EpisodeStore:
+    """Clicks on eight items. Column 0 is the click itself, wrong in the share `flip`, column 4 the
+    next step's. Columns 1 and 2 raise and lower what some items are clicked, drawn anew at every
+    step; the logging policy prefers the right items by column 1 only. Column 3 is the user's."""
+    rng = np.random.default_rng(0)
+    n, items = sessions * length, 8
+    seen, unseen = rng.integers(2, size=n), rng.integers(2, size=n)
+    user = rng.integers(2, size=sessions).repeat(length)
+    liked = np.where(seen == 1, 1, 5) % items
+    played = np.where(rng.random(n) < 0.4, liked, rng.integers(items, size=n))
+    odds = -1.5 + 1.2 * (played % 2) + 1.5 * (played == liked) + 1.0 * unseen * (played > 3)
+    odds += 0.8 * (user == played % 2)
+    clicks = (rng.random(n) < 1 / (1 + np.exp(-odds))).astype(np.float32)
+    bit = np.logical_xor(clicks == 1, rng.random(n) < flip)
+    early = np.where(np.arange(n) % length < length - 1, np.roll(clicks, -1), clicks)
+    observed = np.column_stack([bit, seen, unseen, user, early]).astype(np.float32)
+    columns = {schema.ITEM: played, schema.REWARD: clicks, schema.OBSERVATION: observed}
+    store = EpisodeStore.write(out, columns, np.full(sessions, length), source=SOURCE)
+    ItemStates(torch.eye(items), torch.zeros(0, 0), 0.0, 1.0).save(out / ITEM_STATES)
+    return EpisodeStore.open(store.path)

@@ -1,0 +1,80 @@
+"""Columns of a store as files: one a shard, mapped into memory."""
+
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from ucfrec import schema
+from ucfrec.checksums import Sealed
+from ucfrec.episodes.record import REMEDY
+from ucfrec.errors import InputError, one_line
+
+Array = npt.NDArray[Any]
+IntArray = npt.NDArray[np.int64]
+
+_DTYPES: Final = {
+    schema.OFFSETS: "<i8",
+    schema.RETURN_TO_GO: "<f4",
+    **schema.STEP_DTYPES,
+    **schema.EPISODE_DTYPES,
+}
+
+
+def load_column(
+    store: Path, file: str, shape: tuple[int, ...], mmap: bool, sealed: Sealed | None
+) -> Array:
+    """A column of one shard.
+
+    Args:
+        store: folder of the store.
+        file: of the column, named `SHARD/COLUMN.npy`.
+        shape: of each row.
+        mmap: whether the file stays mapped instead of being read.
+        sealed: checksums of the store; None if there are none.
+
+    Raises:
+        InputError: the file is missing or damaged, or holds something else.
+    """
+    if sealed is not None:
+        sealed.require(file)
+    path = store / file
+    try:
+        # Mapping compares the header with the size of the file before it takes memory.
+        values: Array = np.load(path, mmap_mode="r")
+    except Exception as error:  # numpy parses headers as Python and raises what that raises
+        message = one_line(str(error)) or type(error).__name__
+        raise InputError(f"{path} is missing or damaged ({message}); {REMEDY}") from None
+    if values.dtype != _DTYPES[path.stem] or values.shape[1:] != shape or values.ndim == 0:
+        raise InputError(
+            f"{path} is damaged: it holds {values.dtype} in the shape {values.shape}; {REMEDY}"
+        )
+    return values if mmap else np.array(values)
+
+
+class StepColumn:
+    """A step column, indexed across its shards."""
+
+    def __init__(self, parts: list[Array]) -> None:
+        self._parts = parts
+        self._bounds = np.cumsum([0] + [len(part) for part in self._parts])
+
+    def __len__(self) -> int:
+        return int(self._bounds[-1])
+
+    def range(self) -> tuple[Any, Any]:
+        """The lowest and the highest value."""
+        return min(part.min() for part in self._parts), max(part.max() for part in self._parts)
+
+    def take(self, index: IntArray) -> Array:
+        """A copy of the values at the indices `index`, of any shape."""
+        if len(self._parts) == 1:
+            return np.asarray(self._parts[0][index])
+        shard = np.searchsorted(self._bounds[1:-1], index, side="right")
+        first = self._parts[0]
+        values = np.empty((*index.shape, *first.shape[1:]), dtype=first.dtype)
+        for i, part in enumerate(self._parts):
+            in_shard = shard == i
+            values[in_shard] = part[index[in_shard] - self._bounds[i]]
+        return values

@@ -1,0 +1,43 @@
+"""What a finished run did, in a few lines."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from ucfrec.acting.decision import DecisionRule
+
+
+def describe_run(record: Mapping[str, Any]) -> str:
+    """Summary of a finished run's record, a few lines of text."""
+    lines = []
+    if "augmentation" in record:
+        report = record["augmentation"]
+        crm, moves = report["reward_model"], report["moves"]
+        lines += [
+            f"reward model  R² {crm['r2']:.3f} with z, {crm['r2_without_z']:.3f} without; "
+            f"{crm['active_dimensions']} of {crm['latent_dim']} latent dimensions active",
+            f"edits         {report['copies']} copies, acceptance {report['acceptance']:.1%}, "
+            f"mean-move ratio {moves['mean_move_ratio']:.2f}, effective rank "
+            f"{moves['effective_rank']:.1f} of {moves['dimensions']}",
+            f"bound         δ + ε_r = {report['delta']:.3g} + {report['epsilon_r']:.3g}: "
+            f"{report['verdict']}",
+        ]
+        lines += [f"warning       {warning}" for warning in report["warnings"]]
+    policy = record["policy"]
+    lines.append(
+        f"policy        best validation loss {policy['best_validation']:.4g} at step "
+        f"{policy['best_step']} of {policy['steps']}, {policy['seconds']:.0f} s"
+    )
+    if "rule" in record:
+        lines.append(_describe_rule(record["rule"], record["reward_model"]))
+    return "\n".join(lines)
+
+
+def _describe_rule(choice: Mapping[str, Any], model: Mapping[str, Any]) -> str:
+    rule = DecisionRule.from_dict(choice["rule"], "the run's record")
+    gain = model["item_loss"] - model["loss"]
+    return (
+        f"items         reward model: held-out loss {model['loss']:.4f}, {gain:.4f} below that of "
+        f"item effects alone\n"
+        f"decision rule {rule}\n"
+        f"              chosen by {choice['chosen_by']}{choice.get('warning', '')}"
+    )

@@ -1,0 +1,90 @@
+"""Training on a store whose observation columns without effect are dropped, or intervened on."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final
+
+from ucfrec.counterfactual.interventions import interventions
+from ucfrec.counterfactual.screening import ScreeningConfig, ScreeningReport, screen
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.files import read_json
+from ucfrec.runs.config import Config
+from ucfrec.runs.run import train_run, training_views
+from ucfrec.runs.trained_policy import DROPPED, RUN
+
+SCREENINGS: Final = ("drop", "copies")
+"""Train without the columns, or add copies of the sessions that intervene on them."""
+SCREENING: Final = "screening"
+"""Entry of a run's record: `how`, and the report of `ucfrec.counterfactual.screening`."""
+
+
+def screen_store(store: EpisodeStore, seed: int) -> ScreeningReport:
+    """Screen the training sessions of a store, by the default settings.
+
+    Raises:
+        InputError: as `ucfrec.counterfactual.screening.screen`.
+    """
+    return screen(training_views(store)[0], ScreeningConfig(), seed)
+
+
+def train_screened(
+    store: EpisodeStore, out: Path, config: Config, how: str | None
+) -> dict[str, Any]:
+    """`ucfrec.runs.run.train_run` after screening.
+
+    Args:
+        store: prepared episodes.
+        out: run folder; an interrupted run resumes, with the columns it started with.
+        config: of the training.
+        how: one of `SCREENINGS`; None to train on the store as it is.
+
+    Returns:
+        The run's record.
+
+    Raises:
+        InputError: as `train_run` and `screen_store`; the run was started with another `how`; or no
+            column of observed states would be left.
+    """
+    started = read_json(out / RUN) if (out / RUN).exists() else None
+    before = None if started is None else started.get(SCREENING, {}).get("how")
+    if started is not None and before != how:
+        raise InputError(
+            f"{out} was started with{f' --screen {before}' if before else 'out --screen'}; name "
+            "another run folder, or give the same options to resume"
+        )
+    if how is None:
+        return train_run(store, out, config)
+    screening = started[SCREENING] if started is not None else _screened(store, config.seed, how)
+    flagged = [d["dimension"] for d in screening["dimensions"] if not d["causes"]]
+    if len(flagged) == store.state_size:
+        raise InputError(
+            f"{store.path}: screening found no effect of any of the {len(flagged)} state "
+            "dimensions; the log has too few steps, or too noisy ones, to tell: train without "
+            "--screen"
+        )
+    if how == "drop":
+        return train_run(
+            without_columns(store, flagged), out, config, {SCREENING: screening, DROPPED: flagged}
+        )
+    train, first = training_views(store)[0], store.state_size - store.observation_size
+    places = [first + column for column in flagged]
+    copies = interventions(train, places, config.seed) if places else None
+    return train_run(store, out, config, {SCREENING: screening}, copies)
+
+
+def _screened(store: EpisodeStore, seed: int, how: str) -> Mapping[str, Any]:
+    return {"how": how, **asdict(screen_store(store, seed))}
+
+
+def without_columns(store: EpisodeStore, columns: Sequence[int]) -> EpisodeStore:
+    """`store` without some columns of its observations; itself if there are none."""
+    return store.without_observation_dimensions(columns) if columns else store
+
+
+def describe_screened(record: Mapping[str, Any]) -> str:
+    """One line on the screening of a run's record."""
+    dimensions = record[SCREENING]["dimensions"]
+    flagged = ", ".join(str(d["dimension"]) for d in dimensions if not d["causes"]) or "none"
+    return f"screening     observation columns without effect: {flagged}"

@@ -28,7 +28,8 @@ class Dropout(nn.Dropout):
     def add(self, residual: Tensor, input: Tensor) -> Tensor:
         """`residual` + this dropout of `input`, both of the same shape, in one pass."""
         if not self.training or self.p == 0 or input.device.type != "cpu":
-            return residual + self(input)
+            dropped: Tensor = self(input)
+            return residual + dropped
         return torch.addcmul(residual, input, kept(input.shape, self.p))
 
 

@@ -68,7 +68,7 @@ def recommend(
             "this policy's actions are vectors; recommending needs a policy trained on items"
         )
     _require_whole(k)
-    index = pd.Index(trained.item_ids)
+    index = trained.item_index
     excluded = None if candidates is None else _all_but(index, candidates)
     decider = trained.decider(rule)
 
@@ -79,7 +79,7 @@ def recommend(
             if not (known.all() or skip_unknown):
                 raise _unknown(index, [batch, *remaining])
             latest = batch.rows(known).latest_session(trained.record["session_gap_ms"])
-            users = positions(pd.Index(trained.user_ids), latest.users)
+            users = positions(trained.user_index, latest.users)
             store = next_steps(trained, latest, positions(index, latest.item_ids), users)
             seen = positions(index, batch.seen_ids) if filter_seen else None
             chosen = _Choice(decider, k, seen, excluded, seed)
@@ -239,7 +239,9 @@ def _ranked(
 ) -> pd.DataFrame:
     """Rows of the users (B,) where `some` (B,) is true, from their scores (B, n_items)."""
     k = min(choice.k, scores.shape[1])
-    items = choice.decider.rule.ranked(scores, k, uniforms(users, scores.shape[1], choice.seed))
+    rule, n_items = choice.decider.rule, scores.shape[1]
+    drawn = uniforms(users, n_items, choice.seed) if rule.temperature > 0 else None
+    items = rule.ranked(scores, k, drawn)
     values = scores.log_softmax(-1).gather(1, items)
     kept = (torch.isfinite(values) & some[:, None]).numpy()
     rank = np.cumsum(kept, axis=1)

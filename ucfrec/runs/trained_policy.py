@@ -3,11 +3,13 @@
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 import torch
 from torch import Tensor
 
@@ -138,6 +140,23 @@ class TrainedPolicy:
         """Name of the learner; see `learner_of`."""
         return learner_of(self.record)
 
+    @cached_property
+    def item_index(self) -> "pd.Index[Any]":
+        """Looks up `item_ids`."""
+        index: pd.Index[Any] = pd.Index(self.item_ids)  # type: ignore[arg-type]
+        return index
+
+    @cached_property
+    def user_index(self) -> "pd.Index[Any]":
+        """Looks up `user_ids`."""
+        index: pd.Index[Any] = pd.Index(self.user_ids)
+        return index
+
+    @cached_property
+    def likeness(self) -> Likeness | None:
+        """How alike the items are; None if actions are vectors."""
+        return None if self.item_states is None else Likeness.of(self.item_states)
+
     @property
     def dropped(self) -> tuple[int, ...]:
         """Columns of the logged observation that the policy does not see, ascending."""
@@ -166,9 +185,8 @@ class TrainedPolicy:
 
     def decider(self, rule: DecisionRule | None = None) -> Decider:
         """The policy under `rule`, by default the run's own."""
-        rule, likeness, states = rule or self.rule, None, self.item_states
-        if rule.tag_window and states is not None:
-            likeness = Likeness.of(states)
+        rule = rule or self.rule
+        likeness = self.likeness if rule.tag_window else None
         return Decider(self.policy, rule, self.returns, self.reward_model, likeness)
 
     def actor(

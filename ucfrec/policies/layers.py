@@ -22,7 +22,7 @@ class Dropout(nn.Dropout):
         if not self.training or self.p == 0:
             return input
         if input.device.type != "cpu":
-            return F.dropout(input, self.p)  # type: ignore[no-any-return]
+            return F.dropout(input, self.p)
         return input * kept(input.shape, self.p)
 
     def add(self, residual: Tensor, input: Tensor) -> Tensor:

@@ -66,7 +66,9 @@ def ranked(folder: Path, trained: TrainedPolicy, log: pd.DataFrame) -> pd.DataFr
     return pd.concat(frames, ignore_index=True)
 
 
-@pytest.mark.parametrize("rule", [DecisionRule(3.0), FULL], ids=["plain", "full"])
+@pytest.mark.parametrize(
+    "rule", [pytest.param(DecisionRule(3.0), marks=pytest.mark.slow, id="plain"), FULL]
+)
 def test_the_graph_recommends_what_the_policy_does(
     trained: TrainedPolicy, tmp_path: Path, rule: DecisionRule
 ) -> None:

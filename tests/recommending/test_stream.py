@@ -148,9 +148,10 @@ def test_a_stream_takes_no_logs(
 ) -> None:
     assert main(["recommend", str(trained.folder), "log.parquet", "--stream"]) == 2
     assert "leave LOGS and --out out" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        main(["recommend", str(trained.folder)])
-    assert "required: LOGS, --out" in capsys.readouterr().err
+    for given, lacks in (([], "--out"), (["--out", "x"], "LOGS")):
+        with pytest.raises(SystemExit):
+            main(["recommend", str(trained.folder), *given])
+        assert f"required: {lacks}" in capsys.readouterr().err
 
 
 def test_a_reader_that_goes_away_ends_the_command_quietly(trained: TrainedPolicy) -> None:

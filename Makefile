@@ -19,7 +19,7 @@ test: .venv/dev  ## Set up and run the tests, all but the slow ones.
 test-slow: .venv/dev  ## The slow tests: trainings and worlds that take many seconds each.
 	$(PYTEST) -m slow
 
-# A share of the cases: make torture SCALE=0.02 takes minutes, all of them hours.
+# SCALE is a share of the cases. What the file of rows has for this code is not measured again.
 SCALE ?= 1
 torture: .venv/dev  ## Kill, interrupt, corrupt, fuzz and starve the commands; print a table.
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.torture --scale $(SCALE) \

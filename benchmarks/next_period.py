@@ -116,12 +116,14 @@ def main() -> None:
     if options.refit:
         runs.append(runs[0].with_name(runs[0].name + "-refit"))
         run("train", store, "--out", runs[-1], "--refit", runs[0])
-    rows = []
+    results = options.results or options.out / "results.jsonl"
     for folder in runs:
         run("rank", folder, "--json", folder.with_suffix(".json"))
         ranked = read_json(folder.with_suffix(".json"))
-        rows += [result_row(row, store, folder, days) for row in ranked]
-    append_rows(options.results or options.out / "results.jsonl", rows)
+        rows = [result_row(row, store, folder, days) for row in ranked]
+        append_rows(results, [row for row in rows if row.config_hash is None])
+        config = read_record(folder)["config"]
+        append_rows(results, [row for row in rows if row.config_hash], config)
 
 
 if __name__ == "__main__":

@@ -6,24 +6,32 @@
 Sessions are drawn from small worlds of tables, whose values under any policy are exact. Every
 replication draws new tables, new logs and so another truth. The verdict's thresholds (200 effective
 users, 30 rewarded users, Pareto k 0.5, …) were chosen on other worlds: one fixed set of tables
-(8 actions, 6 contexts, rewards of 30% and 5%, 300 to 4,000 users), of which none is here.
+(8 actions, 6 contexts, rewards of 30% and 5%, 300 to 4,000 users), of which none is here; nor was
+anything chosen on the seeds from 1000 on, which are the default.
 
 For every kind of world the table says in what share of the replications the verdict stands, and how
-often the interval of each estimator holds the truth among these; an asterisk marks less than 90% or
-more than 98%, where the verdict stands in more than 5% of the replications. Measured with 200
-replications (standard error 1.5 points), the last two rows with 60 (2.8 points; five of the last
-row's verdicts stand):
+often the interval of each estimator holds the truth among these; the last column is the lift's
+coverage in all replications, whatever the verdict. An asterisk marks what is below 90% or above 98%
+beyond chance (Wilson's 95% interval), where the verdict stands in more than 5% of the replications.
+Measured with 200 replications (standard error 1.5 points):
 
-world                    stands   logged     IPS   SNIPS    PDIS  SNPDIS      DR    SNDR    lift
-bandit                    91.5%   96.7%   94.5%   96.2%   94.5%   96.2%   95.6%   95.1%   91.3%
-ten rows a user           99.5%   97.5%   98.0%   97.5%   98.0%   97.5%   99.0%*  99.0%*  95.0%
-5% reward                100.0%   95.5%   93.5%   94.0%   93.5%   94.0%   94.0%   94.0%   93.0%
-five-step sessions        99.5%   95.0%   92.5%   95.0%   94.0%   95.5%   93.5%   94.5%   94.0%
-20 sessions a user       100.0%   96.0%   94.5%   95.0%   95.5%   95.5%   96.5%   95.5%   94.0%
-heavy tails                5.0%  100.0%  100.0%   90.0%  100.0%   90.0%   90.0%  100.0%  100.0%
-heavy tails, more users   98.0%   96.4%   94.4%   93.9%   94.4%   93.9%   94.4%   94.4%   92.9%
-wrong model              100.0%   98.3%*  96.7%   95.0%   96.7%   95.0%   95.0%   95.0%   95.0%
-heavy tails, eight steps   8.3%  100.0%* 100.0%* 100.0%* 100.0%* 100.0%* 100.0%* 100.0%* 100.0%*
+world                    stands logged     IPS   SNIPS    PDIS  SNPDIS      DR    SNDR    lift   all
+ten rows a user           99.5%  95.0%   94.5%   95.0%   94.5%   95.0%   94.0%   94.0%   92.0%   92%
+five-step sessions        99.5%  94.5%   93.5%   94.5%   95.0%   94.5%   95.5%   94.0%   91.5%   91%
+20 sessions a user       100.0%  94.5%   94.0%   93.5%   94.5%   93.0%   94.5%   94.0%   93.0%   93%
+bandit                    94.0%  95.2%   96.3%   95.7%   96.3%   95.7%   95.2%   95.2%   95.2%   96%
+wrong model               99.0%  95.5%   97.0%   96.5%   97.0%   96.5%   96.5%   96.5%   96.0%   96%
+heavy tails, eight steps   9.5%  84.2%   89.5%   78.9%   89.5%   89.5%   94.7%   94.7%   94.7%   88%
+
+In the last of these 19 verdicts stand (standard error 5 points); of 39 more that stood in 400 other
+replications (seeds from 5000 on), DR held the truth in 35, SNIPS in 37, logged in 37.
+
+These are of seeds 0 to 199, and wait to be measured again:
+
+world                    stands logged     IPS   SNIPS    PDIS  SNPDIS      DR    SNDR    lift
+5% reward                100.0%  95.5%   93.5%   94.0%   93.5%   94.0%   94.0%   94.0%   93.0%
+heavy tails                5.0% 100.0%  100.0%   90.0%  100.0%   90.0%   90.0%  100.0%  100.0%
+heavy tails, more users   98.0%  96.4%   94.4%   93.9%   94.4%   93.9%   94.4%   94.4%   92.9%
 """
 
 import argparse
@@ -159,7 +167,7 @@ def softmax(logits: FloatArray) -> FloatArray:
 def drawn(probabilities: FloatArray, rng: np.random.Generator) -> IntArray:
     """(n,) a column drawn from each row (n, K)."""
     beyond = rng.random((len(probabilities), 1)) > probabilities.cumsum(axis=1)
-    return np.minimum(beyond.sum(axis=1), probabilities.shape[1] - 1)
+    return np.asarray(np.minimum(beyond.sum(axis=1), probabilities.shape[1] - 1))
 
 
 @dataclass(frozen=True)
@@ -214,10 +222,11 @@ class Coverage:
         cells = []
         for name in SHOWN:
             one = self.covered(name, self.standing)
-            outside = self.stands > MOST_WRONG and not LOW <= one <= HIGH
+            low, high = share_interval(one, len(self.standing)) if self.standing else (0.0, 1.0)
+            outside = self.stands > MOST_WRONG and (high < LOW or low > HIGH)
             cells.append("      –" if np.isnan(one) else f"{one:6.1%}{'*' if outside else ' '}")
-        line = f"{self.world:<24} {self.stands:>6.1%}  {' '.join(cells)}"
-        return f"{line}  {self.covered('lift', self.found):>6.1%}".rstrip()
+        line = f"{self.world:<24} {self.stands:>6.1%} {' '.join(cells)}"
+        return f"{line}{self.covered('lift', self.found):>5.0%}"
 
     def rows(self, first_seed: int, began: float) -> list[ResultRow]:
         """A result row an estimator, of the replications whose verdict stands."""
@@ -232,8 +241,8 @@ class Coverage:
             "wall_time_s": time.perf_counter() - began,
             **provenance(),
         }
-        share = {"metric": "stands", "metrics": {"stands": self.stands}}
-        found = [ResultRow(method="verdict", **share, **common)]
+        stands = {"stands": self.stands}
+        found = [ResultRow(method="verdict", metric="stands", metrics=stands, **common)]
         for name in SHOWN if self.standing else ():
             covered = self.covered(name, self.standing)
             everywhere = self.covered(name, self.found)
@@ -276,7 +285,7 @@ def main() -> None:
     )
     options = parser.parse_args()
     names = " ".join(f"{name:>7}" for name in SHOWN)
-    print(f"{'world':<24} {'stands':>6}  {names}     all")
+    print(f"{'world':<24} {'stands':>6} {names}   all")
     for name in options.worlds:
         began = time.perf_counter()
         found = coverage(name, options.replications, options.first_seed)

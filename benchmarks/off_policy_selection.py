@@ -16,6 +16,9 @@ so where the verdicts of all four stand, how often all four and any of them stan
 correlation with the truth, the mean regret (value of the best less that of the chosen, in clicks a
 session), how often the simultaneous band holds the values of all four, and how far the value of the
 first is off before and after the correction for having been chosen.
+
+In the catalogue, 40 replications of an earlier version chose the best in all, with all verdicts
+standing in 95%, mean rank correlation 0.95 (SNPDIS) and the band holding in all.
 """
 
 import argparse

@@ -1,5 +1,9 @@
 """Fit, recommend, save and load from Python."""
 
+import os
+import signal
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -77,6 +81,40 @@ def test_a_frame_leaves_only_the_run_behind(
     kept = Recommender("dt", settings=SMALL).fit(log)
     assert [path.name for path in kept.run.parent.iterdir()] == ["run"]
     assert kept.run.is_relative_to(scratch)
+
+
+KILLED = """
+import os, signal, sys
+from ucfrec import Recommender
+settings = {"policy.dim": 8, "policy.context": 2, "train.steps": 2, "augment.copies": 0}
+policy = Recommender("bc", settings=settings | {"rule.choose": False}).fit(sys.argv[1])
+print(policy.run, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_the_run_of_a_killed_process_is_removed_by_the_next_fit(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended = subprocess.run(
+        [sys.executable, "-c", KILLED, folder / "store"],
+        env={**os.environ, "TMPDIR": str(tmp_path), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == -signal.SIGKILL
+    left = Path(ended.stdout.strip())
+    assert (left / "run.json").exists()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    policy = Recommender("bc", settings={**SMALL, "rule.choose": False})
+    policy.fit(EpisodeStore.open(folder / "store"))
+    assert not left.exists()
+    assert policy.run.is_relative_to(tmp_path)
+    again = policy.fit(EpisodeStore.open(folder / "store")).run
+    assert {path.name for path in tmp_path.iterdir() if path.is_dir()} == {again.parent.name}
+    del policy
+    assert not [*tmp_path.iterdir()]
 
 
 def test_an_interrupted_fit_on_a_frame_goes_on(log: pd.DataFrame, tmp_path: Path) -> None:

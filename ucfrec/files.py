@@ -66,7 +66,8 @@ def atomic_file(path: Path) -> Iterator[Path]:
     """Yield a scratch path next to `path` that replaces `path` when the block succeeds.
 
     If the block raises, the scratch file is removed and `path` keeps its old content. Of two
-    processes that write one file, the second waits for the first.
+    processes that write one file, the second waits for the first. Scratch that killed processes
+    left next to `path` is removed.
 
     Raises:
         InputError: `path` is a folder.
@@ -74,6 +75,7 @@ def atomic_file(path: Path) -> Iterator[Path]:
     if path.is_dir():
         raise InputError(f"{path} is a folder, a file is needed; name a file")
     with claim(path, wait=True):
+        remove_leftovers(path.parent)
         scratch = scratch_of(path)
         remove(scratch)
         try:

@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 
 from ucfrec.acting.rollout import rollout
-from ucfrec.commands.cli import main
+from ucfrec.commands.cli import UCFREC, build_parser, main
 from ucfrec.evaluation.world import World
 from ucfrec.plugins import load_plugin
 from ucfrec.reporting.evaluation_rows import read_evaluations
@@ -94,6 +94,37 @@ def test_evaluate_writes_the_rows_it_prints(
     assert main(arguments) == 0
     again = json.loads(out.read_text())
     assert [r["R_cum"] for r in again] == [r["R_cum"] for r in json.loads(first)]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "ope run --json F logs",
+        "ope --json F run logs",
+        "rank run --k 3 logs",
+        "recommend --k 3 run --out F logs",
+        "score run --out F logs",
+        "evaluate run --env E logs",
+        "report run --out F logs",
+        "prepare --out F run --reward r logs",
+    ],
+)
+def test_options_stand_anywhere(line: str) -> None:
+    words = line.split()
+    options = vars(build_parser(UCFREC, words).parse_args(words))
+    named = [options.get("run"), *options.get("runs", []), *options.get("logs", [])]
+    assert [str(one) for one in named if one is not None] == ["run", "logs"]
+    assert "F" in map(str, options.values()) or options.get("k") == 3 or options["env"] == "E"
+    with pytest.raises(SystemExit):
+        build_parser(UCFREC, words).parse_args([*words, "--no-such-option"])
+
+
+def test_a_run_after_results_is_a_run(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "rows.json").write_text("[]")
+    run, out = folder / "synthetic-catalog-run", tmp_path / "report.html"
+    arguments = ["report", "--out", str(out), "--results", str(tmp_path / "rows.json"), str(run)]
+    assert main(arguments) == 0
+    assert "Trained on" in out.read_text()
 
 
 def test_recommend_ranks_for_known_and_new_users(folder: Path, tmp_path: Path) -> None:
@@ -380,6 +411,7 @@ def test_a_run_of_another_store_or_configuration_is_refused(
             "it has .*optimal",
         ),
         (["prepare", "nowhere.parquet", "--out", "store"], "nowhere.parquet does not exist"),
+        (["report"], "name a run folder"),
     ],
 )
 def test_what_cannot_be_used_is_refused_in_one_line(

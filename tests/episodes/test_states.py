@@ -1,7 +1,9 @@
 """States are identical in training and in acting, and do not depend on later steps."""
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,9 +21,10 @@ from tests.support.episodes import (
     state_before,
     write_store,
 )
-from ucfrec.episodes.states import ItemStates, SessionStates
+from ucfrec.episodes.states import DISTINCT_TAGS, TAGS_PER_ITEM, ItemStates, SessionStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.fitting.checkpoint import load_tensors, save_tensors
 
 lengths_of_episodes = st.lists(st.integers(1, 12), min_size=1, max_size=7)
 
@@ -230,6 +233,45 @@ def test_states_come_back_from_their_file(tmp_path: Path, users: int) -> None:
 def test_rewards_that_tell_nothing_apart_are_refused(low: float, high: float) -> None:
     with pytest.raises(InputError, match="reward_low must be below reward_high"):
         some_states(low=low, high=high)
+
+
+@pytest.mark.parametrize(
+    ("tags", "message"),
+    [
+        (torch.zeros(N_ITEMS, TAGS_PER_ITEM + 1, dtype=torch.int64), "at most 16"),
+        (torch.zeros(N_ITEMS, 2), "whole numbers"),
+        (torch.full((N_ITEMS, 1), N_ITEMS), "are not numbers from -1 to"),
+        (torch.full((N_ITEMS, 1), -2), "are not numbers from -1 to"),
+        (torch.zeros(N_ITEMS - 1, 1, dtype=torch.int64), "one row per item"),
+        (torch.zeros(N_ITEMS, dtype=torch.int64), "one row per item"),
+    ],
+)
+def test_tags_of_strangers_are_bounded(tmp_path: Path, tags: Tensor, message: str) -> None:
+    path = tmp_path / "states.safetensors"
+    some_states().save(path)
+    tensors, about = load_tensors(path)
+    save_tensors(path, {**tensors, "tags": tags}, about)
+    with pytest.raises(InputError, match=message):
+        ItemStates.load(path)
+
+
+def test_a_catalogue_has_at_most_a_thousand_tags_and_one_for_the_untagged() -> None:
+    plain = ItemStates(torch.zeros(2000, 2), torch.zeros(0, 0), 0.0, 1.0)
+    replace(plain, tags=torch.full((2000, 1), DISTINCT_TAGS))
+    with pytest.raises(InputError, match="are not numbers from -1 to 1000"):
+        replace(plain, tags=torch.full((2000, 1), DISTINCT_TAGS + 1))
+
+
+@pytest.mark.parametrize(
+    "numbers", [{"window": 2.0}, {"window": 10**9}, {"decay": "x"}, {"decay": float("nan")}]
+)
+def test_numbers_of_strangers_are_checked(tmp_path: Path, numbers: dict[str, Any]) -> None:
+    path = tmp_path / "states.safetensors"
+    some_states().save(path)
+    tensors, about = load_tensors(path)
+    save_tensors(path, tensors, {**about, **numbers})
+    with pytest.raises(InputError, match=f"{next(iter(numbers))} of item states is"):
+        ItemStates.load(path)
 
 
 def test_a_damaged_file_of_states_is_named(tmp_path: Path) -> None:

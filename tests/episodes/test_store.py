@@ -747,6 +747,8 @@ def test_a_record_that_was_changed_is_named(folder: Path) -> None:
         ("n_shards", -1),
         ("n_steps", "many"),
         ("n_episodes", None),
+        ("n_episodes", 10**12),
+        ("n_steps", 10**12),
         ("columns", []),
         ("columns", {"reward": [], "item": [3]}),
         ("columns", {"reward": [], "observation": [10**12]}),

@@ -11,7 +11,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ucfrec.episodes.states import TAGS_PER_ITEM, ItemStates
+from ucfrec.episodes.states import DISTINCT_TAGS, TAGS_PER_ITEM, ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs.features import item_tags
 from ucfrec.logs.mapping import FeatureTable, LogMapping
@@ -96,6 +96,13 @@ def test_at_most_sixteen_tags_are_kept_the_most_frequent() -> None:
     # All sixteen of item 0 are among those that the others have too.
     assert shared(tags, 0, 1) == TAGS_PER_ITEM
     assert (tags[3] >= 0).sum() == 1
+
+
+def test_a_catalogue_keeps_at_most_a_thousand_tags() -> None:
+    lists: Lists = [[f"tag {n}" for n in range(i, i + 8)] for i in range(0, 16_000, 8)]
+    tags = tags_of([*lists, None])
+    assert int(tags.max()) == DISTINCT_TAGS  # the last number is that of items without any
+    assert len(np.unique(tags[tags >= 0])) == DISTINCT_TAGS + 1
 
 
 def test_tags_do_not_depend_on_the_order_of_lists() -> None:

@@ -11,13 +11,15 @@ from ucfrec.off_policy import LoggedSteps, judge
 from ucfrec.off_policy.candidates import choose, names_of
 from ucfrec.off_policy.estimators import session_terms
 from ucfrec.off_policy.evaluate import OffPolicyReport
+from ucfrec.off_policy.fqe import ModelReport
 from ucfrec.off_policy.verdict import influences
 
 
 def report(steps: LoggedSteps) -> OffPolicyReport:
     verdict = judge(steps, seed=0)
     terms = influences(session_terms(steps)["SNPDIS"])
-    return OffPolicyReport([], [], verdict, steps.returns, None, terms)
+    models = ModelReport(reward_r2=0, td_loss=0, td_bias=0, iterations=1, settled=True)
+    return OffPolicyReport([], [], verdict, models, steps.returns, None, terms)
 
 
 def judged(shares: np.ndarray, steps: LoggedSteps, items: np.ndarray) -> OffPolicyReport:

@@ -370,6 +370,16 @@ def test_wrong_arrays_are_input_errors(change: dict[str, FloatArray], says: str)
         replace(random_steps([2] * 5), **change)
 
 
+def test_densities_weigh_as_probabilities_do() -> None:
+    """Only their ratio counts, so a change of the actions' unit changes nothing."""
+    steps = random_steps([2, 3, 1] * 20)
+    larger = replace(
+        steps, propensity=steps.propensity * 1e6, target=steps.target * 1e6, densities=True
+    )
+    for name, one in estimate(steps, 0).items():
+        assert estimate(larger, 0)[name].value == pytest.approx(one.value), name
+
+
 def test_one_session_cannot_be_modelled() -> None:
     one = np.ones((3, 1), dtype=np.float32)
     with pytest.raises(InputError, match="sessions of users other than the one"):

@@ -66,6 +66,18 @@ def test_context_is_the_state_the_return_left_and_the_window(
     assert not torch.allclose(seen[0].context[:, size + 1 :], seen[1].context[:, size + 1 :])
 
 
+def test_features_are_those_that_the_scores_are_made_from(
+    trained: TrainedPolicy, logged: LoggedSessions
+) -> None:
+    batch = next(scored_steps(trained, logged.store, DecisionRule(3.0)))
+    assert batch.features is not None
+    predicted = trained.policy.head.predict(batch.features)  # type: ignore[call-arg]
+    without_exposure = trained.policy.head.exposure is None
+    if without_exposure:
+        torch.testing.assert_close(batch.scores, predicted.detach())
+    assert batch.features.shape == (len(batch.steps), trained.policy.config.dim)
+
+
 def test_scores_are_of_the_item_and_their_mean_over_what_is_shown() -> None:
     logs = torch.tensor([[0.5, 0.25, 0.25], [1e-30, 0.5, 0.5]]).log()
     shown = torch.tensor([[0.0, 1.0, 0.0], [0.5, 0.25, 0.25]])

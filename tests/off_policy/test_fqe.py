@@ -61,6 +61,7 @@ def test_a_model_that_knows_nothing_reports_so() -> None:
     assert report.reward_r2 < 0.02
     assert report.td_loss == pytest.approx(reward.var(), rel=0.1)
     assert report.columns()["model_reward_r2"] == report.reward_r2
+    assert f"{report.td_loss:.3g} squared" in str(report)
 
 
 def test_q_that_runs_away_is_stopped_and_said() -> None:

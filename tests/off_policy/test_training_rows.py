@@ -12,7 +12,7 @@ from ucfrec.logs import LogMapping
 from ucfrec.off_policy.evaluate import evaluate_off_policy
 from ucfrec.off_policy.score import logged_sessions
 from ucfrec.off_policy.training_rows import share_seen
-from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.runs.trained_policy import TrainedPolicy, store_of
 
 
 @pytest.mark.parametrize(("seen", "expected"), [(0, 0.0), (300, 0.5)])
@@ -44,8 +44,23 @@ def test_without_the_training_store_nothing_is_known(
 ) -> None:
     shutil.copytree(folder / "store", tmp_path / "store")
     for store in (tmp_path / "gone", tmp_path / "store"):
-        moved = replace(trained, record={**trained.record, "store": str(store)})
+        places = {"store": str(store), "store_from_run": "../gone"}
+        moved = replace(trained, record={**trained.record, **places})
         with logged_sessions(
             folder / "run", trained, [folder / "rest.parquet"], LogMapping()
         ) as logged:
             assert (share_seen(moved, logged.store) is None) is (store.name == "gone")
+
+
+def test_a_run_that_was_moved_with_its_store_finds_it(
+    folder: Path, trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    for name in ("run", "store"):
+        shutil.copytree(folder / name, tmp_path / name)
+    record = {**trained.record, "store": str(tmp_path / "gone")}
+    found = store_of(tmp_path / "run", record)
+    assert found is not None
+    assert found.path == (tmp_path / "store").resolve()
+    (tmp_path / "store").rename(tmp_path / "elsewhere")
+    assert store_of(tmp_path / "run", record) is None
+    assert store_of(tmp_path / "run", trained.record) is not None

@@ -48,6 +48,7 @@ def test_a_missing_entry_is_named(name: str) -> None:
         ("config", {"policy_name": "bc"}),
         ("config", {"policy_name": "no such", "seed": 0}),
         ("config", {"policy_name": 3, "seed": 0}),
+        ("config", {"policy_name": ["bc"], "seed": 0}),
         ("config", {"policy_name": "bc", "seed": "x"}),
         ("config", {"policy_name": "bc", "seed": 0, "train": {"steps": "many"}}),
         ("sizes", {"state": -1, "action": 2, "items": 0}),

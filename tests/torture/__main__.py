@@ -40,7 +40,10 @@ FULL = {
     "hostile Parquet": 1,
 }
 """Number of cases of each check at scale 1."""
-COUNTED = ("killed", "interrupted", "refused", "found", "harmless", "skipped")
+COUNTED = (
+    *("killed", "interrupted", "refused", "found", "harmless", "skipped"),
+    "ended by a library",
+)
 """Entries of a check that are no faults."""
 _PACKAGES = ("ucfrec", "control", "simulators", "datasets", "tests/torture")
 
@@ -73,7 +76,9 @@ def main() -> int:
         folder = Path(name)
         temporary(folder)
         inputs = Inputs(folder)
-        print(f"{'check':<16}{'part':<26}{'cases':>8}{'faults':>7}{'seconds':>8}  counts")
+        print(
+            f"{'check':<16}{'part':<26}{'cases':>8}{'faults':>7}{'seconds':>8}  counts", flush=True
+        )
         for part in _parts(inputs, folder, options):
             key = _key(part, options.seed)
             row = next((row for row in measured if key.covers(row)), None)

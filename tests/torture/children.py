@@ -42,7 +42,7 @@ class End:
         """What is wrong with this end; empty if nothing is.
 
         Args:
-            allowed: exit statuses; 0 may print anything but a traceback, others one line.
+            allowed: exit statuses; 2, 130 and 143 print one line, others no traceback.
         """
         if self.hung:
             return "hung"
@@ -50,7 +50,7 @@ class End:
             return "traceback: " + self.printed.strip().splitlines()[-1][:150]
         if self.status not in allowed:
             return f"status {self.status}: {self.printed.strip()[-150:]}"
-        if self.status and len(self.lines) != 1:
+        if self.status in (2, 130, 143) and len(self.lines) != 1:
             return f"{len(self.lines)} lines: {self.printed.strip()[:150]}"
         return ""
 

@@ -47,15 +47,17 @@ _SHAPES = [(0,), (0, 0), (1,), (7,), (3, 5), (1, 2, 3), (10_000,), (300, 300)]
 _DTYPES = ("float64", "float16", "int64", "uint8", "bool", "int32")
 _SLOW = (
     *("run.json", "run.json in a report", "samples in a report", "augmentation in a report"),
-    *("evaluations in a report", "log.csv", "log.parquet"),
+    *("evaluations in a report", "log.csv", "log.parquet", "decision rule", "policy"),
+    *("reward model", "item states of a run", "training counts", "training returns"),
+    "items of a run",
 )
 """Readers that take longest: they draw charts, start a database, or build a policy."""
 Reader = Callable[[Path], object]
 
 
 def shares(cases: int, inputs: Inputs) -> dict[str, int]:
-    """Number of cases of each reader; the slow ones have a quarter of the others' share."""
-    weights = {name: 1 if name in _SLOW else 4 for name in _targets(inputs)} if cases else {}
+    """Number of cases of each reader; the slow ones have a tenth of the others' share."""
+    weights = {name: 1 if name in _SLOW else 10 for name in _targets(inputs)} if cases else {}
     total = sum(weights.values())
     return {name: -(-cases * weight // total) for name, weight in weights.items()}
 

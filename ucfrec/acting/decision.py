@@ -210,7 +210,7 @@ class Decider:
         if self.rule.tilt and self.reward_model is None:
             raise InputError(
                 f"the rule has tilt {self.rule.tilt:g}, but the run has no reward model of items; "
-                "train it with --set reward.fit=true, or set the tilt to 0"
+                "train it with --set rule.choose=true, or set the tilt to 0"
             )
         if self.rule.tag_window and (self.likeness is None or not self.likeness.tags.shape[1]):
             raise InputError(
@@ -280,7 +280,7 @@ class Decider:
             (B, n_items).
 
         Raises:
-            InputError: no item is left in some row.
+            InputError: no item is left in some row, or the scores of some row are NaN.
         """
         logits = self.act(windows, collected)
         return self.scores_from(logits, windows, forbidden, users, shown)
@@ -298,6 +298,13 @@ class Decider:
         scores = logits
         if self.rule.tilt:
             scores = self.rewards(windows, users, shown).mul_(self.rule.tilt).add_(scores)
+        undefined = ~(scores.amax(1) < torch.inf)
+        if undefined.any():
+            raise InputError(
+                f"in {int(undefined.sum())} of {len(scores)} decisions scores are no numbers, as "
+                "weights of the policy or the reward model are NaN or infinite; train again, with "
+                "a lower train.learning_rate if the training diverged"
+            )
         if forbidden is not None:
             scores = scores.masked_fill(forbidden, -torch.inf)
         if self.rule.tag_window:

@@ -67,7 +67,7 @@ class ManyRules(PolicyActor):
                 for rule, part in zip(rules, parts, strict=True)
             ]
             logits = self._policy.act(_joined(asked).to(self._policy.state_mean.device)).cpu()
-            of_rules = logits.split([len(each.mask) for each in asked])
+            of_rules = torch.split(logits, [len(each.mask) for each in asked])
             for rule, part, window, values in zip(rules, parts, asked, of_rules, strict=True):
                 decider, (forbidden, users, shown) = self._deciders[rule], given
                 scores = decider.scores_from(

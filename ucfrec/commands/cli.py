@@ -45,6 +45,8 @@ UCFREC = Program(
         "evaluate": "measure the return of policies in a simulator",
         "rank": "measure how well policies rank items shown and clicked later",
         "recommend": "recommend the next items to the users of a log",
+        "serve": "answer requests for recommendations over HTTP",
+        "export": "write the policy with its rule as an ONNX graph",
         "score": "write a policy's probability of every logged choice",
         "ope": "estimate a policy's return from logs alone (off-policy evaluation)",
         "verify": "compare every file of stores and runs with its checksum",

@@ -186,6 +186,7 @@ def _judged(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicyRep
         )
     shown = ("estimator", "policy", "choice", "R_cum", "effective_sessions", "sessions")
     print(f"\n{format_rows(found.rows, shown)}")
+    print(f"models: {found.models}")
     for warning in found.warnings:
         print(f"warning: {warning}")
     print(f"verdict: {found.verdict.headline}")

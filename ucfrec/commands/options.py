@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
     from ucfrec.evaluation.world import World
     from ucfrec.logs.mapping import Dataset, LogMapping
+    from ucfrec.recommending.requests import Limits
     from ucfrec.runs.trained_policy import TrainedPolicy
 
 
@@ -54,9 +55,9 @@ def env_options(parser: argparse.ArgumentParser, required: bool, use: str = "") 
     )
 
 
-def log_options(parser: argparse.ArgumentParser) -> None:
-    """Add LOGS, --dataset, --column and --mapping."""
-    parser.add_argument(
+def log_options(parser: argparse.ArgumentParser) -> argparse.Action:
+    """Add LOGS, which is returned, --dataset, --column and --mapping."""
+    logs = parser.add_argument(
         "logs",
         nargs="+",
         metavar="LOGS",
@@ -83,6 +84,7 @@ def log_options(parser: argparse.ArgumentParser) -> None:
         help="file with column mapping, reward and feature tables; --column overrides it "
         "(default: none)",
     )
+    return logs
 
 
 def rule_options(parser: argparse.ArgumentParser) -> None:
@@ -136,6 +138,39 @@ def rule_options(parser: argparse.ArgumentParser) -> None:
         type=int,
         metavar="N",
         help="leave out items that share a tag with one of the last N, unless none remain",
+    )
+
+
+def limit_options(parser: argparse.ArgumentParser) -> None:
+    """Add the limits of a request for recommendations."""
+    limits = parser.add_argument_group("limits of a request", "beyond one, it gets an error")
+    limits.add_argument(
+        "--max-bytes", type=int, default=2**21, metavar="N", help="bytes of JSON (default: 2 MiB)"
+    )
+    limits.add_argument(
+        "--max-k", type=int, default=1000, metavar="N", help="items asked for (default: 1,000)"
+    )
+    limits.add_argument(
+        "--max-history", type=int, default=5000, metavar="N", help="rows (default: 5,000)"
+    )
+    limits.add_argument(
+        "--max-candidates", type=int, default=10_000, metavar="N", help="items (default: 10,000)"
+    )
+
+
+def limits_given(options: argparse.Namespace) -> "Limits":
+    """The limits that `limit_options` name.
+
+    Raises:
+        InputError: one is out of range.
+    """
+    from ucfrec.recommending.requests import Limits
+
+    return Limits(
+        bytes=options.max_bytes,
+        k=options.max_k,
+        history=options.max_history,
+        candidates=options.max_candidates,
     )
 
 

@@ -81,8 +81,8 @@ def run(options: argparse.Namespace) -> None:
 def _test_split(trained: "TrainedPolicy", store: "EpisodeStore | None") -> "EpisodeStore":
     if store is None:
         raise InputError(
-            f"{trained.folder}: its store {trained.record['store']} is gone or has changed; name "
-            "the logs to rank"
+            f"{trained.folder}: its store {trained.record['store']} is gone or has changed; move "
+            "the run together with its store, or name the logs to rank"
         )
     test = store.split("test")
     if not test.n_episodes:

@@ -1,11 +1,20 @@
-"""`ucfrec recommend`: recommend the next items to the users of a log."""
+"""`ucfrec recommend`: recommend the next items to the users of a log or of a stream."""
 
 import argparse
+import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from ucfrec.commands.options import log_options, logs_given, rule_given, rule_options
+from ucfrec.commands.options import (
+    limit_options,
+    limits_given,
+    log_options,
+    logs_given,
+    rule_given,
+    rule_options,
+)
+from ucfrec.errors import InputError
 from ucfrec.progress import Progress, progress
 
 if TYPE_CHECKING:
@@ -15,7 +24,7 @@ if TYPE_CHECKING:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec recommend`."""
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder of `ucfrec train`")
-    log_options(parser)
+    logs = log_options(parser)
     parser.add_argument("--k", type=int, default=10, help="items for each user (default: 10)")
     parser.add_argument(
         "--keep-seen",
@@ -28,15 +37,45 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="ignore rows with items outside the catalogue of the run (default: an error)",
     )
     rule_options(parser)
-    parser.add_argument("--out", type=Path, required=True, help="Parquet file to write")
+    out = parser.add_argument("--out", type=Path, required=True, help="Parquet file to write")
+    parser.add_argument(
+        "--stream",
+        action=_Stream,
+        instead_of=(logs, out),
+        help="instead of LOGS and --out: read requests from stdin, JSON on each line, and write "
+        "answers to stdout (docs/serving.md)",
+    )
+    limit_options(parser)
+
+
+class _Stream(argparse.Action):
+    """A flag that makes other arguments optional."""
+
+    def __init__(self, instead_of: tuple[argparse.Action, ...], **named: Any) -> None:
+        super().__init__(nargs=0, default=False, **named)
+        self._instead_of = instead_of
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        option_string: str | None = None,
+    ) -> None:
+        setattr(namespace, self.dest, True)
+        for action in self._instead_of:
+            action.required = False
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run `ucfrec recommend`: write the recommendations as Parquet.
+    """Run `ucfrec recommend`: write the recommendations as Parquet, or answer a stream.
 
     Raises:
         InputError: the run or the logs cannot be used.
     """
+    if options.stream:
+        _answer_stream(options)
+        return
     from ucfrec.commands.frames import write_frames
     from ucfrec.recommending.histories import histories_of_files
     from ucfrec.recommending.recommend import recommend
@@ -55,6 +94,32 @@ def run(options: argparse.Namespace) -> None:
         )
         rows = write_frames(options.out, frames)
     print(f"{options.out}: {rows:,} rows")
+
+
+def _answer_stream(options: argparse.Namespace) -> None:
+    from ucfrec.recommending.responder import Responder
+    from ucfrec.recommending.stream import answer_stream
+    from ucfrec.runs.trained_policy import TrainedPolicy
+
+    if options.logs or options.out:
+        raise InputError("--stream reads stdin and writes stdout; leave LOGS and --out out")
+    limits = limits_given(options)
+    trained = TrainedPolicy.load(options.run, options.checkpoint)
+    responder = Responder(
+        trained,
+        limits,
+        rule=rule_given(options, trained),
+        k=options.k,
+        filter_seen=not options.keep_seen,
+        skip_unknown=options.skip_unknown,
+    )
+    # Unbuffered, so that a request is answered without waiting for the next ones.
+    with open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as source:
+        counts = answer_stream(responder, source, sys.stdout.buffer)
+    responder.close()
+    print(
+        f"ucfrec recommend: {counts.answers:,} answers, {counts.errors:,} errors", file=sys.stderr
+    )
 
 
 def _counted(batches: "Iterator[Histories]", bar: Progress) -> "Iterator[Histories]":

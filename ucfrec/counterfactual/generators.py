@@ -134,17 +134,17 @@ class TangentGenerator:
         order = near.argsort(stable=True)
         rows = torch.bincount(near, minlength=len(self._centres)).tolist()
         given = (each[order] for each in (states, actions, z, noise, length))
-        moves = self._moves(*given, rows)
+        moves = self._moves(rows, *given)
         return states + self._crm.state_std * torch.empty_like(moves).index_copy_(0, order, moves)
 
     def _moves(
         self,
+        rows: list[int],
         states: Tensor,
         actions: Tensor,
         z: Tensor,
         noise: Tensor,
         length: Tensor,
-        rows: list[int],
     ) -> Tensor:
         """Moves Δ (M, S) of steps in order of their clusters, which have so many `rows` each."""
         reward, gradient = self._reward(states, actions, z, torch.zeros_like(states))
@@ -307,7 +307,7 @@ def _faithful(
 
 def _products(matrices: Tensor, vectors: Tensor, rows: list[int]) -> Tensor:
     """Products (M, S) of matrices (C, S, S) with vectors (M, S), of which each has so many rows."""
-    parts = zip(matrices, vectors.split(rows), strict=True)
+    parts = zip(matrices, torch.split(vectors, rows), strict=True)
     return torch.cat([part @ matrix.T for matrix, part in parts])
 
 

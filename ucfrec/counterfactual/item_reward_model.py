@@ -87,11 +87,11 @@ class ItemRewardModel(nn.Module):
             Log-odds of the higher reward if rewards have two values; otherwise rewards in standard
             deviations from their mean.
         """
-        items, repeated, alike = self._exposure(shown)
+        items, repeated, alike = self.exposures(shown)
         added = self.likeness.to_all(self.likeness.profile(items, alike))
         rows, lags = torch.nonzero(items >= 0, as_tuple=True)
         added = added.index_put((rows, items[rows, lags]), repeated[rows, lags], accumulate=True)
-        added = added + self._query(states, users) @ self.vectors.T
+        added = added + self.query(states, users) @ self.vectors.T
         return self.item + self.level(states, users).unsqueeze(1) + added
 
     def score(self, states: Tensor, shown: Shown, users: Tensor | None, items: Tensor) -> Tensor:
@@ -103,7 +103,7 @@ class ItemRewardModel(nn.Module):
 
     def fixed_part(self, shown: Shown, users: Tensor | None, items: Tensor) -> Tensor:
         """The part of `score` that does not depend on the state, (B,)."""
-        before, repeated, alike = self._exposure(shown)
+        before, repeated, alike = self.exposures(shown)
         each, known = items.unsqueeze(1), self._known(users, items)
         exposure = self.likeness.to_items(self.likeness.profile(before, alike), each)
         exposure = exposure + ((before == each) * repeated).sum(1)
@@ -155,7 +155,7 @@ class ItemRewardModel(nn.Module):
             return torch.full((len(like),), last, device=like.device)
         return torch.where((users >= 0) & (users < last), users, last)
 
-    def _query(self, states: Tensor, users: Tensor | None) -> Tensor:
+    def query(self, states: Tensor, users: Tensor | None) -> Tensor:
         """What multiplies the vector of every item, (B, D)."""
         interaction = self.standardised(states) @ self.interaction
         return self.affinity[self._known(users, states)] + interaction
@@ -164,7 +164,7 @@ class ItemRewardModel(nn.Module):
         """Rewards (...) on a scale from 0 to 1."""
         return ((rewards - self.reward_low) / (self.reward_high - self.reward_low)).clamp(0, 1)
 
-    def _exposure(self, shown: Shown) -> tuple[Tensor, Tensor, Tensor]:
+    def exposures(self, shown: Shown) -> tuple[Tensor, Tensor, Tensor]:
         """Items (B, lags) shown before, and the weights (B, lags) of repetition and likeness."""
         missing = max(0, self.lags - shown.items.shape[1])
         items = nn.functional.pad(shown.items[:, : self.lags], (0, missing), value=-1)

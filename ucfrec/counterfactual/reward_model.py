@@ -133,10 +133,11 @@ class CausalRewardModel(nn.Module):
 
     def encode(self, states: Tensor, actions: Tensor, rewards: Tensor) -> Posterior:
         """The posterior q_ϕ(z | s, a, r), both fields (..., latent_dim)."""
-        given = self.given(states, actions)
-        residual = self.residual(states, actions, rewards) / self.surprise_std
-        out = self.encoder(torch.cat([given, residual.unsqueeze(-1)], dim=-1))
-        mean, log_variance = out.chunk(2, dim=-1)
+        return self._encode(self.given(states, actions), self.residual(states, actions, rewards))
+
+    def _encode(self, given: Tensor, residual: Tensor) -> Posterior:
+        surprise = (residual / self.surprise_std).unsqueeze(-1)
+        mean, log_variance = self.encoder(torch.cat([given, surprise], dim=-1)).chunk(2, dim=-1)
         return Posterior(mean, log_variance.clamp(-12.0, 6.0))
 
     def abduct(self, states: Tensor, actions: Tensor, rewards: Tensor) -> Tensor:
@@ -145,31 +146,41 @@ class CausalRewardModel(nn.Module):
 
     def predict(self, states: Tensor, actions: Tensor, z: Tensor) -> Tensor:
         """f̂_r(s, a, z), the predicted rewards (...) in reward units."""
-        return self.reward_mean + self.reward_std * self._decode(states, actions, z)
+        given = self.given(states, actions)
+        decoded = self.expected_reward(states, actions) + self._disturbance(given, z)
+        return self.reward_mean + self.reward_std * decoded
 
-    def elbo(self, states: Tensor, actions: Tensor, rewards: Tensor, noise: Tensor) -> ELBO:
-        """Both terms of Eq. 2 at z = μ + σ·noise, noise (..., latent_dim) standard normal."""
-        q = self.encode(states, actions, rewards)
+    def elbo(
+        self, states: Tensor, actions: Tensor, rewards: Tensor, expected: Tensor, noise: Tensor
+    ) -> ELBO:
+        """Both terms of Eq. 2 at z = μ + σ·noise, noise (..., latent_dim) standard normal.
+
+        `expected` (...) is the `expected_reward` of the states and actions, which stays while
+        encoder and decoder are trained.
+        """
+        given, residual = self.given(states, actions), self._normalised_reward(rewards) - expected
+        q = self._encode(given, residual)
         z = q.mean + (0.5 * q.log_variance).exp() * noise
-        error = self._decode(states, actions, z) - self._normalised_reward(rewards)
+        error = self._disturbance(given, z) - residual
         scale = self.config.decoder_std
         log_likelihood = -0.5 * ((error / scale).square() + _LOG_2PI) - math.log(scale)
         return ELBO(log_likelihood, kl_to_prior(q).sum(-1))
 
     def residual(self, states: Tensor, actions: Tensor, rewards: Tensor) -> Tensor:
         """The residual r − E[r | s, a], in standard deviations of the reward, (...)."""
-        return self._normalised_reward(rewards) - self._expected(states, actions)
+        return self._normalised_reward(rewards) - self.expected_reward(states, actions)
 
-    def _decode(self, states: Tensor, actions: Tensor, z: Tensor) -> Tensor:
-        given = self.given(states, actions)
+    def _disturbance(self, given: Tensor, z: Tensor) -> Tensor:
+        """What z adds to the expected reward, in standard deviations of the reward, (...)."""
         disturbance: Tensor = self.decoder(torch.cat([given, z], dim=-1)).squeeze(-1)
         if isinstance(self.expected, EffectsMean):
             # With z at its prior mean, the model predicts exactly E[r | s, a].
             without = torch.cat([given, torch.zeros_like(z)], dim=-1)
             disturbance = disturbance - self.decoder(without).squeeze(-1)
-        return self._expected(states, actions) + disturbance
+        return disturbance
 
-    def _expected(self, states: Tensor, actions: Tensor) -> Tensor:
+    def expected_reward(self, states: Tensor, actions: Tensor) -> Tensor:
+        """E[r | s, a], standardised as rewards are, (...); 0 without `mean_first`."""
         if not self.config.mean_first:
             return states.new_zeros(states.shape[:-1])
         if isinstance(self.expected, EffectsMean):

@@ -119,6 +119,14 @@ def _fit_mean(
 
 
 @torch.no_grad()
+def _expected(model: CausalRewardModel, transitions: Transitions) -> Tensor:
+    """The expected rewards (M,) of the steps, which the CVAE leaves as they are."""
+    chunks = (torch.split(each, _CHUNK) for each in (transitions.states, transitions.actions))
+    parts = zip(*chunks, strict=True)
+    return torch.cat([model.expected_reward(*part) for part in parts])
+
+
+@torch.no_grad()
 def _residual_deviation(model: CausalRewardModel, train: Transitions) -> float:
     """Root of the mean squared residual of the training steps."""
     total = 0.0
@@ -132,14 +140,15 @@ def _residual_deviation(model: CausalRewardModel, train: Transitions) -> float:
 def _fit_elbo(
     model: CausalRewardModel, train: Transitions, held_out: Transitions, folder: Path, seed: int
 ) -> None:
-    config = model.config
+    config, expected = model.config, _expected(model, train)
 
-    def draw(generator: np.random.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def draw(generator: np.random.Generator) -> tuple[Tensor, ...]:
         rows = torch.from_numpy(generator.integers(len(train.rewards), size=config.batch_size))
         noise = _noise(generator, config.batch_size, config.latent_dim)
-        return train.states[rows], train.actions[rows], train.rewards[rows], noise
+        given = (train.states[rows], train.actions[rows], train.rewards[rows])
+        return (*given, expected[rows], noise)
 
-    def loss(batch: tuple[Tensor, Tensor, Tensor, Tensor]) -> tuple[Tensor, Mapping[str, Tensor]]:
+    def loss(batch: tuple[Tensor, ...]) -> tuple[Tensor, Mapping[str, Tensor]]:
         log_likelihood, kl = (term.mean() for term in model.elbo(*batch))
         parts = {"log_likelihood": log_likelihood.detach(), "kl": kl.detach()}
         return config.beta * kl - log_likelihood, parts
@@ -147,8 +156,10 @@ def _fit_elbo(
     fixed = _noise(np.random.default_rng(seed), len(held_out.rewards), config.latent_dim)
 
     def validate() -> float:
-        return float(loss((held_out.states, held_out.actions, held_out.rewards, fixed))[0])
+        given = (held_out.states, held_out.actions, held_out.rewards)
+        return float(loss((*given, held_out_expected, fixed))[0])
 
+    held_out_expected = _expected(model, held_out)
     loop = _loop(config, len(train.rewards))
     fit(model, draw, loss, loop, folder, seed=seed, validate=validate, describe="reward model")
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Windows
 
-_GAIN = 10.0
+GAIN = 10.0
 """Factor on the learned weights: thousands of small updates must be able to rule an item out."""
 _DENSE = 2**24
 """Entries of the largest matrix of items and tags that is kept dense, which is faster."""
@@ -226,7 +226,7 @@ class ExposureTerm(nn.Module):
 
     def weights(self, exposed: Exposed) -> tuple[Tensor, Tensor]:
         """Weights of repetition and of likeness, (M, N) each, of the items shown."""
-        table = _GAIN * (self.common + self.by_lag)
+        table = GAIN * (self.common + self.by_lag)
         at = exposed.returns.clamp(self.knots[0], self.knots[-1])
         right = torch.searchsorted(self.knots, at).clamp(1, len(self.knots) - 1)
         low, high = self.knots[right - 1], self.knots[right]

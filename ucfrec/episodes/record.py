@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from ucfrec import schema
 from ucfrec.checksums import Sealed, sealed_record
 from ucfrec.errors import InputError
@@ -65,9 +67,28 @@ def _require_entries(path: Path, meta: Mapping[str, Any]) -> None:
         known = name in schema.STEP_DTYPES and len(sizes) == vector
         if not known or not all(type(size) is int and 1 <= size <= 2**24 for size in sizes):
             raise _bad_meta(path, f"columns.{name}", shape)
+    _require_held(path, meta)
     for name, kind in (("reward", str), ("fingerprint", str), ("source", dict)):
         if not isinstance(meta.get(name), kind):
             raise _bad_meta(path, name, meta.get(name))
+
+
+def _require_held(path: Path, meta: Mapping[str, Any]) -> None:
+    """Check that the files can hold the steps, before memory for an entry a step is asked for.
+
+    Raises:
+        InputError: they are too small, or there are fewer steps than episodes.
+    """
+    steps, episodes = meta["n_steps"], meta["n_episodes"]
+    files = [
+        path.parent / f"shard-{n:05d}" / f"{schema.REWARD}.npy" for n in range(meta["n_shards"])
+    ]
+    sizes = [file.stat().st_size for file in files if file.is_file()]
+    held = sum(sizes) // np.dtype(schema.STEP_DTYPES[schema.REWARD]).itemsize
+    if len(sizes) == len(files) and steps > held:
+        raise _bad_meta(path, "n_steps", steps)
+    if episodes > steps:
+        raise _bad_meta(path, "n_episodes", episodes)
 
 
 def _bad_meta(path: Path, name: str, value: object) -> InputError:

@@ -79,8 +79,8 @@ class ItemStates:
         ends = self.reward_low, self.reward_high
         if not all(map(_is_real, ends)) or not self.reward_low < self.reward_high:
             raise InputError(
-                f"rewards from {self.reward_low!r:.60} to {self.reward_high!r:.60} cannot be scaled "
-                "to [0, 1]; reward_low must be below reward_high"
+                f"rewards from {ends[0]!r:.60} to {ends[1]!r:.60} cannot be scaled to [0, 1]; "
+                "reward_low must be below reward_high"
             )
         # Index −1 ("no item", "unknown user") selects this last row of zeros.
         object.__setattr__(self, "_items", _with_zero_row(self.embeddings))

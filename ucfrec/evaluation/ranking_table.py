@@ -1,7 +1,6 @@
 """The table of `ucfrec rank`: policies of one store and baselines, on the same later steps."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from ucfrec.errors import InputError
 from ucfrec.evaluation.ranking import MEASURES, Period, compare, rank_steps, rankers_named
 from ucfrec.evaluation.ranking_baselines import PolicyRanker, RewardRanker, baselines
 from ucfrec.provenance import provenance
-from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.runs.trained_policy import TrainedPolicy, store_of
 
 
 def require_one_catalogue(trained: Sequence[TrainedPolicy]) -> None:
@@ -33,11 +32,7 @@ def require_one_catalogue(trained: Sequence[TrainedPolicy]) -> None:
 
 def training_store(trained: TrainedPolicy) -> EpisodeStore | None:
     """The store that the run was trained on; None where it is gone or changed."""
-    path = Path(trained.record["store"])
-    if not (path / "meta.json").is_file():
-        return None
-    store = EpisodeStore.open(path)
-    return store if store.meta["fingerprint"] == trained.record["fingerprint"] else None
+    return store_of(trained.folder, trained.record)
 
 
 def ranking_rows(

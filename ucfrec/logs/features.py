@@ -68,7 +68,7 @@ def item_tags(
         id_column: column of the ids in it.
 
     Returns:
-        (n_ids, T) int64, padded with −1, T at most `TAGS_PER_ITEM`; T is 0 without columns of lists.
+        (n_ids, T) int64, padded with −1, T at most `TAGS_PER_ITEM`, and 0 without columns of lists.
     """
     ((count,),) = connection.sql(f"SELECT count(*) FROM {ids}").fetchall()
     cases = [

@@ -26,8 +26,8 @@ HISTORIES: Final = "histories"
 
 
 @dataclass(frozen=True)
-class _Frame(Table):
-    """A data frame registered with the engine; `files` holds its name."""
+class FrameTable(Table):
+    """A data frame or Arrow table registered with the engine; `files` holds its name."""
 
     @property
     def sql(self) -> str:
@@ -102,7 +102,7 @@ def frame_histories(
     with engine_in_memory() as connection:
         connection.register(HISTORIES, columns)
         described = connection.sql(f"DESCRIBE {HISTORIES}").fetchall()
-        table = _Frame((Path(HISTORIES),), tuple((row[0], row[1]) for row in described))
+        table = FrameTable((Path(HISTORIES),), tuple((row[0], row[1]) for row in described))
         source = Path(HISTORIES)
         log = check_rows(
             connection, (table,), mapping, reward, session_by, None, source, duplicates

@@ -43,6 +43,8 @@ class OffPolicyReport:
     warnings: list[str]
     """The verdict's reasons, cautions, and remarks on the logs."""
     verdict: Verdict
+    models: ModelReport
+    """How good the models of DM, FQE and DR are."""
     returns: FloatArray
     """(S,) of the logged sessions, or pages, with all their propensities; empty if none has."""
     user: IntArray | None
@@ -130,6 +132,7 @@ def evaluate_off_policy(
         rows,
         said,
         verdict,
+        judged.models,
         returns=np.empty(0) if known is None else known.returns,
         user=None if known is None else known.user,
         terms=None if known is None else _terms(known, verdict),
@@ -241,8 +244,8 @@ def _of_the_logs(seen: float | None, logged: LoggedSessions) -> list[str]:
     said = []
     if seen is None:
         said.append(
-            "the store that the run was trained on is not there any more: whether these logs were "
-            "seen in training is not known"
+            "the store that the run was trained on is gone or has changed: whether these logs were "
+            "seen in training is not known; move the run together with its store"
         )
     if unknown := logged.unknown_items:
         said.append(

@@ -53,6 +53,14 @@ class ModelReport:
         """The numbers by name, `model_…`."""
         return {f"model_{name}": value for name, value in asdict(self).items()}
 
+    def __str__(self) -> str:
+        ended = "settled" if self.settled else "stopped"
+        return (
+            f"on other users, R² of the reward {self.reward_r2:.3g}; FQE {ended} after "
+            f"{self.iterations} regressions, TD error {self.td_bias:+.2g} in the mean, "
+            f"{self.td_loss:.3g} squared"
+        )
+
 
 @dataclass(frozen=True)
 class Fitted:

@@ -1,6 +1,5 @@
 """Finds out whether a policy is evaluated on rows that it was trained on."""
 
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -9,7 +8,7 @@ import numpy.typing as npt
 from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.runs.trained_policy import TrainedPolicy, store_of
 
 MOST_SEEN: Final = 0.05
 """Largest share of rows seen in training with which an estimate is accepted. It is above 0 because
@@ -35,10 +34,10 @@ def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
     if record["fingerprint"] == logged.meta["fingerprint"]:
         return 1.0
     try:
-        store = EpisodeStore.open(Path(record["store"]))
+        store = store_of(trained.folder, record)
     except InputError:
         return None
-    if store.meta["fingerprint"] != record["fingerprint"]:
+    if store is None:
         return None
     learnt = np.concatenate([_keys(store.split(name)) for name in ("train", "validation")])
     return float(np.isin(_keys(logged), learnt).mean())

@@ -22,13 +22,14 @@ class Dropout(nn.Dropout):
         if not self.training or self.p == 0:
             return input
         if input.device.type != "cpu":
-            return F.dropout(input, self.p)  # type: ignore[no-any-return]
+            return F.dropout(input, self.p)
         return input * kept(input.shape, self.p)
 
     def add(self, residual: Tensor, input: Tensor) -> Tensor:
         """`residual` + this dropout of `input`, both of the same shape, in one pass."""
         if not self.training or self.p == 0 or input.device.type != "cpu":
-            return residual + self(input)
+            dropped: Tensor = self(input)
+            return residual + dropped
         return torch.addcmul(residual, input, kept(input.shape, self.p))
 
 
@@ -50,8 +51,12 @@ def kept(shape: torch.Size, p: float) -> Tensor:
 
 
 def some_padding(mask: Tensor) -> Tensor | None:
-    """The mask (B, K) of steps that are no padding; None on a CPU if there is no padding at all."""
-    return None if mask.device.type == "cpu" and bool(mask.all()) else mask
+    """The mask (B, K) of steps that are no padding; None on a CPU if there is no padding at all.
+
+    A graph that is exported holds for every padding.
+    """
+    known = mask.device.type == "cpu" and not torch.compiler.is_compiling()
+    return None if known and bool(mask.all()) else mask
 
 
 class CausalDepthwise(nn.Conv1d):

@@ -1,5 +1,6 @@
 """Users' histories, read in the same way as the training logs of a run."""
 
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,11 +12,15 @@ import pandas as pd
 import pyarrow as pa
 
 from ucfrec import schema
+from ucfrec.logs.clean import EARLIEST_MS
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.histories import frame_histories, read_histories
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.runs.trained_policy import RUN, TrainedPolicy, duplicates_of
 
+_PLAIN = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP)
+_MOST_PLAIN_ROWS = 1_000_000
+"""Rows up to which a frame is read at once, not in batches of users."""
 LONGEST_HISTORY = 1000
 """Most recent rows of a user that are read; older ones only count as seen."""
 
@@ -68,6 +73,41 @@ class Histories:
             seen_owner=seen_owner,
             seen_ids=seen_ids,
             observations=observations,
+        )
+
+    @classmethod
+    def from_plain(cls, frame: pd.DataFrame, by_id: bool) -> Self | None:
+        """Read a frame that needs no SQL; None for any other frame.
+
+        Its columns are `user_id`, `item_id`, `timestamp` (ms), with `by_id` also `session_id`, all
+        int64, and `reward`, a number; no row is out of range or repeats another's user, item and
+        time.
+        """
+        columns = _plain_columns(frame, by_id)
+        if columns is None:
+            return None
+        rewards, users, items, times, *sessions = columns
+        order = np.lexsort((items, times, users))
+        rewards, users, items, times, *sessions = (each[order] for each in columns)
+        same_user = users[1:] == users[:-1]
+        if (same_user & (items[1:] == items[:-1]) & (times[1:] == times[:-1])).any():
+            return None
+        owner = np.concatenate([[0], np.cumsum(~same_user)])
+        ends = np.append(np.flatnonzero(~same_user), len(users) - 1)
+        recent = ends[owner] - np.arange(len(users)) < LONGEST_HISTORY
+        by_item = np.lexsort((items, owner))
+        seen_owner, seen = owner[by_item], items[by_item]
+        new = np.append(True, (np.diff(seen_owner) > 0) | (np.diff(seen) != 0))
+        return cls(
+            users=users[ends],
+            owner=owner[recent],
+            item_ids=items[recent],
+            rewards=rewards[recent].astype(np.float32),
+            timestamps=times[recent],
+            session_ids=sessions[0][recent] if by_id else None,
+            seen_owner=seen_owner[new],
+            seen_ids=seen[new],
+            observations=None,
         )
 
     def latest_session(self, gap_ms: float | None) -> "Histories":
@@ -145,6 +185,11 @@ def histories_of_frame(
     Raises:
         InputError: a column is missing, or has values that cannot be used.
     """
+    by_id = _session_by(trained) == schema.SESSION_ID
+    if not trained.record["observation_size"] and mapping == LogMapping():
+        plain = Histories.from_plain(frame, by_id)
+        if plain is not None:
+            return iter((plain,))
     has_rewards = schema.REWARD in getattr(frame, "columns", ())
     batches = frame_histories(
         frame,
@@ -155,6 +200,25 @@ def histories_of_frame(
         duplicates=duplicates_of(trained.record),
     )
     return map(Histories.from_batch, batches)
+
+
+def _plain_columns(frame: pd.DataFrame, by_id: bool) -> list[Array] | None:
+    """Rewards, users, items, times and perhaps sessions for `Histories.from_plain`, (N,) each."""
+    if type(frame) is not pd.DataFrame or not 0 < len(frame) <= _MOST_PLAIN_ROWS:
+        return None
+    names = [*_PLAIN, schema.SESSION_ID] if by_id else [*_PLAIN]
+    if frame.shape[1] != len(names) + 1 or not {*names, schema.REWARD} <= {*frame.columns}:
+        return None
+    keys, rewards = [frame[name].to_numpy() for name in names], frame[schema.REWARD].to_numpy()
+    if any(each.dtype != np.int64 for each in keys):
+        return None
+    if rewards.dtype not in (np.float64, np.float32, np.int64, np.bool_):
+        return None
+    rewards, times, now = rewards.astype(np.float64), keys[2], time.time() * 1000
+    fine = times.min() >= EARLIEST_MS and times.max() <= now
+    # A comparison with NaN is false too.
+    fine = fine and bool((np.abs(rewards) <= schema.LARGEST_REWARD).all())
+    return [rewards, *keys] if fine else None
 
 
 def _reward(trained: TrainedPolicy) -> Expression:

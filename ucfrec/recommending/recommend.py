@@ -68,19 +68,20 @@ def recommend(
             "this policy's actions are vectors; recommending needs a policy trained on items"
         )
     _require_whole(k)
-    index = pd.Index(trained.item_ids)
+    index = trained.item_index
     excluded = None if candidates is None else _all_but(index, candidates)
     decider = trained.decider(rule)
 
     def frames() -> Iterator[pd.DataFrame]:
         remaining = iter(batches)
         for batch in remaining:
-            known = _positions(index, batch.item_ids) >= 0
+            known = positions(index, batch.item_ids) >= 0
             if not (known.all() or skip_unknown):
                 raise _unknown(index, [batch, *remaining])
             latest = batch.rows(known).latest_session(trained.record["session_gap_ms"])
-            store = _next_steps(trained, latest, index)
-            seen = _positions(index, batch.seen_ids) if filter_seen else None
+            users = positions(trained.user_index, latest.users)
+            store = next_steps(trained, latest, positions(index, latest.item_ids), users)
+            seen = positions(index, batch.seen_ids) if filter_seen else None
             chosen = _Choice(decider, k, seen, excluded, seed)
             yield _recommended(trained, store, batch, chosen)
 
@@ -134,7 +135,7 @@ def _recommended(
     return pd.concat(frames, ignore_index=True)
 
 
-def _positions(index: "pd.Index[Any]", ids: Array) -> IntArray:
+def positions(index: "pd.Index[Any]", ids: Array) -> IntArray:
     """Position of each of `ids` (N,) in `index`, −1 for ids that it lacks."""
     wanted = pd.Index(ids)
     if pd.api.types.is_integer_dtype(index.dtype) != pd.api.types.is_integer_dtype(wanted.dtype):
@@ -150,7 +151,7 @@ def _all_but(index: "pd.Index[Any]", candidates: Sequence[Any]) -> Tensor:
     ids = np.asarray(list(candidates))
     if ids.ndim != 1 or len(ids) == 0:
         raise InputError("candidates is empty or nested; give a list of item_ids, or None for all")
-    numbers = _positions(index, ids)
+    numbers = positions(index, ids)
     if (numbers < 0).any():
         unknown = ids[numbers < 0].tolist()
         raise InputError(
@@ -165,7 +166,7 @@ def _all_but(index: "pd.Index[Any]", candidates: Sequence[Any]) -> Tensor:
 def _unknown(index: "pd.Index[Any]", batches: Iterable[Histories]) -> InputError:
     rows, items = 0, set[Any]()
     for batch in batches:
-        unknown = batch.item_ids[_positions(index, batch.item_ids) < 0]
+        unknown = batch.item_ids[positions(index, batch.item_ids) < 0]
         rows += len(unknown)
         items |= set(unknown.tolist())
     return InputError(
@@ -179,17 +180,27 @@ def _some(values: Sequence[Any]) -> str:
     return ", ".join(map(str, values[:3])) + (", …" if len(values) > 3 else "")
 
 
-def _next_steps(
-    trained: TrainedPolicy, histories: Histories, index: "pd.Index[Any]"
+def next_steps(
+    trained: TrainedPolicy, histories: Histories, known: IntArray, users: IntArray
 ) -> EpisodeStore:
-    """One episode per user: the session's steps and the next step, for which items are scored."""
+    """One episode per user: the session's steps and the next step, for which items are scored.
+
+    Args:
+        trained: the policy.
+        histories: U users with the N rows of their latest sessions.
+        known: (N,) index of each row's item in the store.
+        users: (U,) index of each user in the training store, −1 for others.
+
+    Raises:
+        InputError: the policy needs observations that the histories lack.
+    """
     n_users = len(histories.users)
     # Shifting each row by its user index leaves a free row at the end of every episode.
     places = np.arange(len(histories.owner)) + histories.owner
     lengths = np.bincount(histories.owner, minlength=n_users) + 1
     items = np.zeros(int(lengths.sum()), dtype=np.int64)
     rewards = np.zeros(len(items), dtype=np.float32)
-    items[places], rewards[places] = _positions(index, histories.item_ids), histories.rewards
+    items[places], rewards[places] = known, histories.rewards
     columns: dict[str, Array] = {schema.ITEM: items, schema.REWARD: rewards}
     expected = trained.logged_observation_size
     if expected:
@@ -202,7 +213,6 @@ def _next_steps(
             )
         seen = np.delete(observations, trained.dropped, axis=1)
         columns[schema.OBSERVATION] = np.repeat(seen, lengths, axis=0)
-    users = _positions(pd.Index(trained.user_ids), histories.users)
     return EpisodeStore.from_arrays(columns, lengths, {schema.USER: users}, trained.item_states)
 
 
@@ -229,7 +239,9 @@ def _ranked(
 ) -> pd.DataFrame:
     """Rows of the users (B,) where `some` (B,) is true, from their scores (B, n_items)."""
     k = min(choice.k, scores.shape[1])
-    items = choice.decider.rule.ranked(scores, k, uniforms(users, scores.shape[1], choice.seed))
+    rule, n_items = choice.decider.rule, scores.shape[1]
+    drawn = uniforms(users, n_items, choice.seed) if rule.temperature > 0 else None
+    items = rule.ranked(scores, k, drawn)
     values = scores.log_softmax(-1).gather(1, items)
     kept = (torch.isfinite(values) & some[:, None]).numpy()
     rank = np.cumsum(kept, axis=1)

@@ -110,6 +110,7 @@ _REQUIRED: Final[Mapping[str, Callable[[object], bool]]] = {
 _OPTIONAL: Final[Mapping[str, Callable[[object], bool]]] = {
     "command": _text,
     "store": _text,
+    "store_from_run": _or_none(_text),
     "seed": _count,
     "session_by": _or_none(_text),
     "session_gap_ms": _or_none(_number),

@@ -46,6 +46,7 @@ from ucfrec.runs.trained_policy import (
     RUN,
     USERS,
     TrainedPolicy,
+    store_from,
 )
 
 _VALIDATION_BATCHES = 16
@@ -202,6 +203,7 @@ def _begin(
         "config": dataclasses.asdict(config),
         "seed": config.seed,
         "store": str(store.path.resolve()),
+        "store_from_run": store_from(out, store.path),
         "fingerprint": store.meta["fingerprint"],
         "reward": store.meta["reward"],
         "session_by": store.meta["source"].get("session_by"),

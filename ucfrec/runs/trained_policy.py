@@ -1,12 +1,15 @@
 """A trained policy, read back from its run folder."""
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 import torch
 from torch import Tensor
 
@@ -19,7 +22,7 @@ from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.store import ITEM_STATES
+from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files import read_json
 from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors
@@ -137,6 +140,23 @@ class TrainedPolicy:
         """Name of the learner; see `learner_of`."""
         return learner_of(self.record)
 
+    @cached_property
+    def item_index(self) -> "pd.Index[Any]":
+        """Looks up `item_ids`."""
+        index: pd.Index[Any] = pd.Index(self.item_ids)  # type: ignore[arg-type]
+        return index
+
+    @cached_property
+    def user_index(self) -> "pd.Index[Any]":
+        """Looks up `user_ids`."""
+        index: pd.Index[Any] = pd.Index(self.user_ids)
+        return index
+
+    @cached_property
+    def likeness(self) -> Likeness | None:
+        """How alike the items are; None if actions are vectors."""
+        return None if self.item_states is None else Likeness.of(self.item_states)
+
     @property
     def dropped(self) -> tuple[int, ...]:
         """Columns of the logged observation that the policy does not see, ascending."""
@@ -165,9 +185,8 @@ class TrainedPolicy:
 
     def decider(self, rule: DecisionRule | None = None) -> Decider:
         """The policy under `rule`, by default the run's own."""
-        rule, likeness, states = rule or self.rule, None, self.item_states
-        if rule.tag_window and states is not None:
-            likeness = Likeness.of(states)
+        rule = rule or self.rule
+        likeness = self.likeness if rule.tag_window else None
         return Decider(self.policy, rule, self.returns, self.reward_model, likeness)
 
     def actor(
@@ -211,6 +230,51 @@ def read_record(run: Path) -> dict[str, Any]:
         sealed.require_small()
     require_run_record(run / RUN, record)
     return record
+
+
+def store_from(run: Path, store: Path) -> str | None:
+    """The folder of a store as seen from that of a run; None on another drive of Windows."""
+    try:
+        return os.path.relpath(store.resolve(), run.resolve())
+    except ValueError:
+        return None
+
+
+def store_of(run: Path, record: Mapping[str, Any]) -> EpisodeStore | None:
+    """The store that a run was trained on; None where it is gone or changed.
+
+    It is looked for where it lies as seen from the run, so that both can be moved or copied
+    together, and where it lay when the run was trained.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    places = [Path(record["store"])]
+    if from_run := record.get("store_from_run"):
+        places.insert(0, Path(os.path.normpath(run.resolve() / from_run)))
+    for path in places:
+        if (path / "meta.json").is_file():
+            store = EpisodeStore.open(path)
+            if store.meta["fingerprint"] == record["fingerprint"]:
+                return store
+    return None
+
+
+def verified(run: Path) -> None:
+    """Read every file of a run and compare it with its checksum.
+
+    Raises:
+        InputError: `run` is not a run folder, has no checksums, or a file has another content.
+    """
+    read_record(run)
+    sealed = sealed_record(run, RUN, "train again")[1]
+    if sealed is None or "policy" not in read_json(run / RUN):
+        raise InputError(
+            f"{run} cannot be verified: its training has not ended, or an older ucfrec wrote it; "
+            "train it with this one"
+        )
+    for name, fault in sealed.faults():
+        raise InputError(f"{run / name} {fault}; restore the file, or train again")
 
 
 def duplicates_of(record: Mapping[str, Any]) -> str:

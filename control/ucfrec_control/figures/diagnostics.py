@@ -26,6 +26,7 @@ from ucfrec.policies.ucf import UCFPolicy
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.run import training_views
 from ucfrec.runs.trained_policy import RUN, TrainedPolicy
+from ucfrec.runs.trained_policy import store_of as trained_store
 from ucfrec_control.learners.train import without_dropped
 
 FloatArray = npt.NDArray[np.float64]
@@ -45,9 +46,12 @@ def store_of(run: Path) -> EpisodeStore:
         InputError: the store was moved, removed or changed.
     """
     record = read_json(run / RUN)
-    store = EpisodeStore.open(record["store"])
-    if store.meta["fingerprint"] != record["fingerprint"]:
-        raise InputError(f"{store.path} is no longer the store that {run} was trained on")
+    store = trained_store(run, record)
+    if store is None:
+        raise InputError(
+            f"{run} was trained on {record['store']}, which is gone or has changed; move the run "
+            "together with its store, or train again"
+        )
     return without_dropped(store, record["dataset"])
 
 

@@ -1,6 +1,10 @@
 """D4RL and Minari files to stores: quirks, refusals, and nothing lost between the formats."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
 import warnings
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,6 +21,7 @@ from tests.support.real_data import data_folder
 from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.locks import is_lock_or_scratch
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl, write_d4rl
 from ucfrec_control.data.minari import is_minari, read_minari, write_minari
@@ -206,6 +211,39 @@ def test_both_formats_make_equal_stores(tmp_path: Path, minari_folder: Path) -> 
     assert [store.meta["source"]["format"] for store in stores] == ["d4rl", "minari"] * 2
     first, last = read_d4rl(file), read_d4rl(tmp_path / "back.hdf5")
     np.testing.assert_array_equal(first.final_observations, last.final_observations)
+
+
+KILLED = """
+import os, signal, sys
+import minari
+made = minari.create_dataset_from_buffers
+def killed(*given, **named):
+    made(*given, **named)
+    os.kill(os.getpid(), signal.SIGKILL)
+minari.create_dataset_from_buffers = killed
+from ucfrec_control.cli import main
+main(["convert", *sys.argv[1:]])
+"""
+
+
+def test_a_killed_conversion_leaves_no_dataset_and_the_next_one_no_scratch(
+    tmp_path: Path, minari_folder: Path
+) -> None:
+    file = write_hdf5(tmp_path / "hopper_medium.hdf5", hopper_like(LENGTHS))
+    ended = subprocess.run(
+        [sys.executable, "-c", KILLED, file, "mine/hopper/mine-v0"],
+        env={**os.environ, "MINARI_DATASETS_PATH": str(minari_folder)},
+        check=False,
+    )
+    assert ended.returncode == -signal.SIGKILL
+    assert not (minari_folder / "mine" / "hopper" / "mine-v0").exists()
+    assert [*minari_folder.rglob("main_data.hdf5")]
+    folder = write_minari(read_d4rl(file), "mine/hopper/mine-v0")
+    assert [path.parent.parent for path in minari_folder.rglob("main_data.hdf5")] == [folder]
+    assert not [path for path in minari_folder.rglob(".*") if is_lock_or_scratch(path.name)]
+    assert "mine/hopper/mine-v0" in minari.list_local_datasets()
+    assert read_minari("mine/hopper/mine-v0").lengths.tolist() == list(LENGTHS)
+    assert {"mine", "mine/hopper"} <= set(minari.namespace.list_local_namespaces())
 
 
 def test_minari_refusals(tmp_path: Path, minari_folder: Path) -> None:

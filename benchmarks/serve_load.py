@@ -1,0 +1,160 @@
+"""Load on `ucfrec serve` by a real client on this machine: requests per second and latency.
+
+    python benchmarks/serve_load.py RUN --results benchmarks/results/serve_load.jsonl
+
+Starts the server on a free port of the loopback interface and asks it with wrk where that is
+installed, otherwise with httpx: one client first, then many. Appends a row for each number
+of clients and prints a table. Client and server share the cores.
+"""
+
+import argparse
+import asyncio
+import json
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+
+from ucfrec.code_version import code_version
+from ucfrec.provenance import provenance
+from ucfrec.reporting.result_row import ResultRow
+from ucfrec.reporting.rows_file import append_rows
+from ucfrec.reporting.tables import markdown_table
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+RESULTS = Path("runs/serve_load/results.jsonl")
+_SCRIPT = """
+wrk.method, wrk.body = "POST", {body}
+wrk.headers["Content-Type"] = "application/json"
+response = function(status) if status ~= 200 then os.exit(1) end end
+done = function(summary, latency)
+  io.write(string.format("PERCENTILES %f %f %f %f %d\\n", latency:percentile(50) / 1000,
+    latency:percentile(90) / 1000, latency:percentile(99) / 1000, summary.duration / 1e6,
+    summary.requests))
+end
+"""
+
+
+def request(trained: TrainedPolicy, rows: int) -> bytes:
+    """A request of an unknown user with a history of random items."""
+    assert trained.item_ids is not None
+    rng = np.random.default_rng(0)
+    items = rng.choice(trained.item_ids, size=rows).tolist()
+    size = trained.record["observation_size"]
+    history: list[dict[str, Any]] = [
+        {"item_id": item, "timestamp": 1_700_000_000_000 + 1000 * n, "reward": n % 2}
+        for n, item in enumerate(items)
+    ]
+    for row in history:
+        if trained.record.get("session_by") == "session_id":
+            row["session_id"] = 1
+        if size:
+            row["observation"] = [0.0] * size
+    return json.dumps({"user_id": "load", "history": history, "k": 10}).encode()
+
+
+@contextmanager
+def served(run: Path, *options: str) -> Iterator[str]:
+    """The address of a server."""
+    command = [sys.executable, "-m", "ucfrec.commands.cli", "serve", str(run), "--port", "0"]
+    with subprocess.Popen([*command, *options], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        ready = process.stdout.readline()
+        try:
+            yield ready.split("ready at ")[1].split()[0]
+        finally:
+            process.terminate()
+
+
+def with_wrk(address: str, body: bytes, clients: int, seconds: float) -> dict[str, float]:
+    """Milliseconds and requests per second, as wrk finds them."""
+    with tempfile.NamedTemporaryFile("w", suffix=".lua") as script:
+        script.write(_SCRIPT.format(body=json.dumps(body.decode())))
+        script.flush()
+        command = ["wrk", "-t1", f"-c{clients}", f"-d{seconds:.0f}s", "-s", script.name]
+        ran = subprocess.run(
+            [*command, f"{address}/recommendations"], capture_output=True, text=True, check=True
+        )
+    found = re.search(r"PERCENTILES (.*)", ran.stdout)
+    assert found is not None, ran.stdout
+    p50, p90, p99, taken, count = map(float, found[1].split())
+    return {"rate": count / taken, "p50_ms": p50, "p90_ms": p90, "p99_ms": p99}
+
+
+async def with_httpx(address: str, body: bytes, clients: int, seconds: float) -> dict[str, float]:
+    """Milliseconds and requests per second, as clients in this process find them."""
+    taken: list[float] = []
+    until = time.perf_counter() + seconds
+
+    async def ask(http: httpx.AsyncClient) -> None:
+        while time.perf_counter() < until:
+            began = time.perf_counter()
+            answer = await http.post("/recommendations", content=body)
+            taken.append(1e3 * (time.perf_counter() - began))
+            assert answer.status_code == 200, answer.text
+
+    async with httpx.AsyncClient(base_url=address, timeout=60) as http:
+        await asyncio.gather(*(ask(http) for _ in range(clients)))
+    p50, p90, p99 = np.quantile(taken, [0.5, 0.9, 0.99]).tolist()
+    return {"rate": len(taken) / seconds, "p50_ms": p50, "p90_ms": p90, "p99_ms": p99}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", type=Path, metavar="RUN", help="run folder of `ucfrec train`")
+    parser.add_argument("--clients", type=int, nargs="+", default=[1, 8, 64])
+    parser.add_argument("--seconds", type=float, default=10.0, help="of each (default: 10)")
+    parser.add_argument("--history", type=int, default=20, help="rows of a request (default: 20)")
+    parser.add_argument("--threads", type=int, default=1, help="of a forward pass (default: 1)")
+    parser.add_argument(
+        "--results", type=Path, default=RESULTS, help=f"file of result rows (default: {RESULTS})"
+    )
+    options = parser.parse_args()
+    trained = TrainedPolicy.load(options.run)
+    body, tool = request(trained, options.history), "wrk" if shutil.which("wrk") else "httpx"
+    assert trained.item_ids is not None
+    lines = []
+    with served(options.run, "--threads", str(options.threads)) as address:
+        for clients in (1, *options.clients):
+            began = time.perf_counter()
+            given = (address, body, clients, options.seconds)
+            found = with_wrk(*given) if tool == "wrk" else asyncio.run(with_httpx(*given))
+            if not lines:
+                lines.append(())
+                continue  # the first round warms the server up
+            lines.append((clients, *(f"{value:,.1f}" for value in found.values())))
+            row = ResultRow(
+                suite="serve-load",
+                table="serve-load",
+                task=f"{len(trained.item_ids):,} items",
+                method=tool,
+                policy=trained.name,
+                conditions={
+                    "clients": clients,
+                    "history": options.history,
+                    "threads": options.threads,
+                    "seconds": options.seconds,
+                },
+                code_version=code_version(Path(__file__), "ucfrec.recommending.web"),
+                data_fingerprint=trained.record.get("fingerprint"),
+                metric="rate",
+                metrics=found,
+                wall_time_s=time.perf_counter() - began,
+                **provenance(),
+            )
+            append_rows(options.results, [row])
+    heads = ("clients", "requests/s", "p50 ms", "p90 ms", "p99 ms")
+    print(markdown_table(heads, lines[1:]))
+
+
+if __name__ == "__main__":
+    main()

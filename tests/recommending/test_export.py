@@ -1,0 +1,110 @@
+"""The exported graph gives torch's scores, and what `recommend` shows."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from tests.support.served import FULL, histories, trained_run
+from ucfrec import Recommender
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.commands.cli import main
+from ucfrec.errors import InputError
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.recommending.export import DESCRIPTION, GRAPH, export
+from ucfrec.recommending.export_graph import _CHUNK, OUTPUTS, _best
+from ucfrec.recommending.histories import histories_of_frame
+from ucfrec.recommending.recommend import recommend
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+onnxruntime = pytest.importorskip("onnxruntime")
+pytest.importorskip("onnxscript")
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
+    return trained_run(tmp_path_factory.mktemp("export"))
+
+
+def ranked(folder: Path, trained: TrainedPolicy, log: pd.DataFrame) -> pd.DataFrame:
+    """What the graph recommends, from the log and the description alone."""
+    description = json.loads((folder / DESCRIPTION).read_text())
+    length = next(i["shape"][1] for i in description["inputs"] if i["name"] == "items")
+    item_of = {item: n for n, item in enumerate(description["item_ids"])}
+    user_of = {user: n for n, user in enumerate(description["user_ids"])}
+    rows: dict[str, list[Any]] = {entry["name"]: [] for entry in description["inputs"]}
+    users = []
+    for batch in histories_of_frame(trained, log, LogMapping()):
+        latest = batch.latest_session(description["session_gap_ms"])
+        for number, user in enumerate(batch.users):
+            own = latest.owner == number
+            items = [item_of[item] for item in latest.item_ids[own].tolist()]
+            rewards = latest.rewards[own].tolist()
+            missing = max(0, length - len(items))
+            rows["items"].append([-1] * missing + items[-length:])
+            rows["rewards"].append([0.0] * missing + rewards[-length:])
+            rows["steps"].append(len(items))
+            rows["collected"].append(sum(rewards))
+            rows["users"].append(user_of.get(user, -1))
+            seen = [item_of[item] for item in batch.seen_ids[batch.seen_owner == number].tolist()]
+            rows["excluded"].append(seen + [-1] * (60 - len(seen)))
+            users.append(user)
+    dtypes = {entry["name"]: entry["dtype"] for entry in description["inputs"]}
+    given = {name: np.asarray(values, dtypes[name]) for name, values in rows.items()}
+    session = onnxruntime.InferenceSession(str(folder / GRAPH))
+    found = dict(zip(OUTPUTS, session.run(list(OUTPUTS), given), strict=True))
+    frames = []
+    for user, best, values in zip(users, found["top_items"], found["top_scores"], strict=True):
+        kept = best >= 0
+        ids = [description["item_ids"][n] for n in best[kept]]
+        frame = {"rank": range(1, len(ids) + 1), "item_id": ids, "score": values[kept]}
+        frames.append(pd.DataFrame({"user_id": user, **frame}))
+    return pd.concat(frames, ignore_index=True)
+
+
+@pytest.mark.parametrize(
+    "rule", [pytest.param(DecisionRule(3.0), marks=pytest.mark.slow, id="plain"), FULL]
+)
+def test_the_graph_recommends_what_the_policy_does(
+    trained: TrainedPolicy, tmp_path: Path, rule: DecisionRule
+) -> None:
+    assert export(trained, tmp_path / "out", rule=rule, k=24).difference <= 1e-5
+    log = histories()
+    batches = histories_of_frame(trained, log, LogMapping())
+    expected = pd.concat(recommend(trained, batches, 24, rule=rule), ignore_index=True)
+    found = ranked(tmp_path / "out", trained, log)
+    pd.testing.assert_frame_equal(found, expected, check_dtype=False, rtol=1e-5, atol=1e-5)
+
+
+def test_the_command_writes_it_whole_or_not_at_all(
+    trained: TrainedPolicy, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert main(["export", str(trained.folder), "--onnx", str(out), "--k", "25"]) == 2
+    assert "--k is 25; give a whole number from 1 to 24" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_what_scores_items_in_its_own_way_is_refused(tmp_path: Path) -> None:
+    trained = trained_run(tmp_path, "item-knn")
+    with pytest.raises(InputError, match=r"'item-knn.*cannot be exported; train"):
+        export(trained, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    assert isinstance(Recommender.load(trained.folder), Recommender)
+
+
+@pytest.mark.parametrize("n", [1000, 2 * _CHUNK + 17])
+def test_the_best_of_chunks_are_the_best_of_all(n: int) -> None:
+    scores = torch.randn(3, n, generator=torch.Generator().manual_seed(0))
+    scores[1] = -torch.inf
+    scores[2, 5:] = -torch.inf
+    items, values = _best(scores, 9)
+    expected = scores[0].log_softmax(-1).topk(9)
+    assert torch.equal(items[0], expected.indices)
+    torch.testing.assert_close(values[0], expected.values)
+    assert items[1].tolist() == [-1] * 9
+    assert sorted(items[2].tolist()) == [-1] * 4 + [0, 1, 2, 3, 4]

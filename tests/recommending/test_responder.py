@@ -1,0 +1,137 @@
+"""Answers to requests are those of `recommend`, whoever else asks at the same time."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.support.served import FULL, as_frame, histories, requests_of, responder, trained_run
+from ucfrec import Recommender
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.errors import InputError
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.recommending.histories import histories_of_frame
+from ucfrec.recommending.recommend import recommend
+from ucfrec.recommending.requests import Request
+from ucfrec.recommending.responder import Answer, Responder
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
+    return trained_run(tmp_path_factory.mktemp("served"))
+
+
+def answered(by: Responder, requests: list[dict[str, object]]) -> pd.DataFrame:
+    asked = [Request.model_validate(request) for request in requests]
+    answers = by.answers(asked)
+    assert all(isinstance(answer, Answer) for answer in answers), answers
+    return as_frame(
+        [a.as_dict(r.user_id) for a, r in zip(answers, asked, strict=True)]  # type: ignore[union-attr]
+    )
+
+
+def recommended(trained: TrainedPolicy, log: pd.DataFrame, k: int, **named: object) -> pd.DataFrame:
+    batches = histories_of_frame(trained, log, LogMapping())
+    return pd.concat(recommend(trained, batches, k, **named), ignore_index=True)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "rule", [None, FULL, DecisionRule(3.0, temperature=0.7, top_k=9)], ids=["own", "full", "drawn"]
+)
+@pytest.mark.parametrize("keep_seen", [False, True])
+def test_answers_are_those_of_recommend(
+    trained: TrainedPolicy, rule: DecisionRule | None, keep_seen: bool
+) -> None:
+    log = histories()
+    named = {"rule": rule, "filter_seen": not keep_seen}
+    expected = recommended(trained, log, 24, **named)
+    by = responder(trained, k=24, **named)
+    together = answered(by, requests_of(log))
+    pd.testing.assert_frame_equal(together, expected, check_dtype=False, rtol=1e-5, atol=1e-6)
+    alone = [answered(by, [request]) for request in requests_of(log)]
+    pd.testing.assert_frame_equal(
+        pd.concat(alone, ignore_index=True), expected, check_dtype=False, rtol=1e-5, atol=1e-6
+    )
+
+
+def test_each_request_has_its_own_k_and_candidates(trained: TrainedPolicy) -> None:
+    log = histories(users=4)
+    requests = requests_of(log)
+    asked = [
+        requests[0],
+        {**requests[1], "k": 2},
+        {**requests[2], "candidates": [5, 6, 7], "k": 9},
+        {**requests[3], "candidates": ["5"], "k": 1},
+    ]
+    by = responder(trained, filter_seen=False, k=3)
+    found = answered(by, asked)
+    assert found.groupby("user_id").size().tolist() == [3, 2, 3, 1]
+    for request in asked:
+        user = request["user_id"]
+        expected = recommended(
+            trained,
+            log[log.user_id == user],
+            int(request.get("k", 3)),
+            filter_seen=False,
+            candidates=request.get("candidates"),
+        )
+        own = found[found.user_id == user].reset_index(drop=True)
+        pd.testing.assert_frame_equal(own, expected, check_dtype=False, rtol=1e-5, atol=1e-6)
+
+
+def test_a_user_without_a_history_is_answered(trained: TrainedPolicy) -> None:
+    found = answered(responder(trained, k=4), [{"user_id": "nobody"}, {"user_id": 10**9}])
+    one, other = (found[found.user_id == user] for user in ("nobody", 10**9))
+    assert one.item_id.tolist() == other.item_id.tolist()
+    assert len(one) == 4
+
+
+def test_a_user_who_has_seen_everything_gets_nothing(trained: TrainedPolicy) -> None:
+    rows = [{"item_id": n, "timestamp": 1_700_000_000_000 + n, "reward": 1} for n in range(24)]
+    requests = [{"user_id": 1, "history": rows}, {"user_id": 2, "history": rows[:20]}]
+    none, four = responder(trained).answers([Request.model_validate(r) for r in requests])
+    assert none == Answer([], [])
+    assert isinstance(four, Answer)
+    assert set(four.items) <= {20, 21, 22, 23}
+
+
+def test_a_wrong_request_does_not_disturb_the_others(trained: TrainedPolicy) -> None:
+    requests = requests_of(histories(users=3))
+    wrong = [
+        ({"user_id": 1, "candidates": [3, 999]}, r"1 of 2 candidates .* \(999\)"),
+        ({"user_id": 1, "history": [{"item_id": "x", "timestamp": 1.7e12, "reward": 0}]}, r"\(x\)"),
+        ({"user_id": 1, "history": [{"item_id": 1, "timestamp": 1.7e12}]}, "0 has no reward;"),
+        ({"user_id": 1, "history": [{"item_id": 1, "timestamp": 5, "reward": 0}]}, "before 2000"),
+    ]
+    mixed = [wrong[0][0], requests[0], *(each for each, _ in wrong[1:]), requests[1]]
+    answers = responder(trained).answers([Request.model_validate(r) for r in mixed])
+    good = [answer for answer in answers if isinstance(answer, Answer)]
+    assert len(good) == 2
+    np.testing.assert_allclose(
+        [*good[0].scores, *good[1].scores],
+        answered(responder(trained), requests[:2]).score,
+        rtol=1e-5,
+    )
+    errors = [answer for answer in answers if isinstance(answer, InputError)]
+    for error, (_, message) in zip(errors, wrong, strict=True):
+        with pytest.raises(InputError, match=message):
+            raise error
+    skipping = responder(trained, skip_unknown=True).answers([Request.model_validate(wrong[1][0])])
+    assert isinstance(skipping[0], Answer)
+
+
+def test_nothing_of_a_request_is_kept(trained: TrainedPolicy) -> None:
+    by, requests = responder(trained), requests_of(histories(users=2))
+    before = answered(by, [{"user_id": 100}])
+    answered(by, requests)
+    pd.testing.assert_frame_equal(answered(by, [{"user_id": 100}]), before)
+
+
+def test_a_policy_of_vectors_and_a_wrong_k_are_refused(
+    trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match="k is 0; give a whole number from 1 to 1,000"):
+        responder(trained, k=0)
+    assert repr(Recommender.load(trained.folder))

@@ -1,0 +1,169 @@
+"""A stream of requests: an answer on each line, whatever the line is."""
+
+import io
+import json
+import os
+import select
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from tests.support.served import as_frame, histories, requests_of, responder, trained_run
+from ucfrec.commands.cli import main
+from ucfrec.recommending.requests import Limits
+from ucfrec.recommending.stream import answer_stream
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
+    return trained_run(tmp_path_factory.mktemp("stream"))
+
+
+class Blocks:
+    """Gives its blocks one after the other, as a pipe does."""
+
+    def __init__(self, *blocks: bytes) -> None:
+        self._blocks = iter(blocks)
+
+    def read(self, size: int, /) -> bytes:
+        return next(self._blocks, b"")
+
+
+def streamed(trained: TrainedPolicy, *blocks: bytes, **named: Any) -> list[dict[str, Any]]:
+    sink = io.BytesIO()
+    remember = named.pop("remember", 10**6)
+    answer_stream(responder(trained, **named), Blocks(*blocks), sink, remember)
+    return [json.loads(line) for line in sink.getvalue().splitlines()]
+
+
+def lines(requests: list[dict[str, Any]]) -> bytes:
+    return b"".join(json.dumps(request).encode() + b"\n" for request in requests)
+
+
+def test_a_pipe_equals_the_command_on_files(trained: TrainedPolicy, tmp_path: Path) -> None:
+    log = histories()
+    log.to_parquet(tmp_path / "log.parquet")
+    arguments = ["recommend", str(trained.folder), "--k", "7", "--tilt", "0.3"]
+    assert main([*arguments, str(tmp_path / "log.parquet"), "--out", str(tmp_path / "out")]) == 0
+    requests = requests_of(log)
+    command = [sys.executable, "-m", "ucfrec.commands.cli", *arguments, "--stream"]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        # The first answer comes while the pipe is open.
+        process.stdin.write(lines(requests[:1]))
+        process.stdin.flush()
+        assert select.select([process.stdout], [], [], 120)[0]
+        first = process.stdout.readline()
+        rest, errors = process.communicate(b"{nonsense\n" + lines(requests[1:]), timeout=120)
+    assert process.returncode == 0
+    answers = [json.loads(line) for line in (first + rest).splitlines()]
+    assert answers.pop(1)["line"] == 2
+    expected = pd.read_parquet(tmp_path / "out")
+    pd.testing.assert_frame_equal(
+        as_frame(answers), expected, check_dtype=False, rtol=1e-5, atol=1e-6
+    )
+    assert b"12 answers, 1 errors" in errors
+
+
+BAD = {
+    "no JSON": (b"{", "the request is not JSON"),
+    "not UTF-8": (b'{"user_id": "\xff"}', "the request is not JSON"),
+    "no object": (b"[1]", "the request: input should be an object"),
+    "no user": (b"{}", "user_id: field required"),
+    "a float for a user": (b'{"user_id": 1.5}', "user_id: "),
+    "true for a user": (b'{"user_id": true}', "user_id: "),
+    "a misspelt entry": (b'{"user_id": 1, "kk": 3}', "kk: extra inputs are not permitted"),
+    "no items": (b'{"user_id": 1, "k": 0}', "k: input should be greater than or equal to 1, not 0"),
+    "too many items": (b'{"user_id": 1, "k": 1001}', "1,001 k: the limit is 1,000"),
+    "no candidates": (b'{"user_id": 1, "candidates": []}', "candidates: "),
+    "NaN": (
+        b'{"user_id": 1, "history": [{"item_id": 1, "timestamp": NaN}]}',
+        "history.0.timestamp: ",
+    ),
+    "text for a time": (
+        b'{"user_id": 1, "history": [{"item_id": 1, "timestamp": "now"}]}',
+        "history.0.timestamp: ",
+    ),
+    "a large integer": (b'{"user_id": ' + b"9" * 30 + b"}", "user_id: "),
+    "deep": (b'{"user_id": ' + b"[" * 100_000 + b"}", "the request is not JSON"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_line_has_one_error_and_the_stream_goes_on(trained: TrainedPolicy, case: str) -> None:
+    line, message = BAD[case]
+    wrong, right = streamed(trained, line + b"\n\n" + lines([{"user_id": 1}]))
+    assert message in wrong["error"]
+    assert "\n" not in wrong["error"]
+    assert wrong["line"] == 1
+    assert len(right["items"]) == 10
+
+
+@pytest.mark.parametrize("size", [1, 7, 10**6])
+def test_lines_are_bounded_however_they_arrive(trained: TrainedPolicy, size: int) -> None:
+    good, long = lines([{"user_id": 1, "k": 1}]), b'{"user_id": "' + b"x" * 2000 + b'"}\n'
+    text = good + long + good + long.rstrip()
+    blocks = [text[start : start + size] for start in range(0, len(text), size)]
+    found = streamed(trained, *blocks, limits=Limits(bytes=1000))
+    assert [each.get("line") for each in found] == [None, 2, None, 4]
+    assert "more than 1,000 bytes" in found[1]["error"]
+
+
+def test_a_last_line_without_an_end_is_answered(trained: TrainedPolicy) -> None:
+    (answer,) = streamed(trained, b'{"user_id": 1, "k": 2}')
+    assert len(answer["items"]) == 2
+
+
+def test_interactions_are_added_to_what_the_stream_has_had(trained: TrainedPolicy) -> None:
+    whole = requests_of(histories(users=2))
+    one, two = whole
+    rows = one["history"]
+    parts = [
+        {"user_id": one["user_id"], "interactions": rows[:3]},
+        {"user_id": one["user_id"], "interactions": [{"item_id": 777, "timestamp": 1.7e12}]},
+        {"user_id": two["user_id"], "interactions": two["history"]},
+        {"user_id": one["user_id"], "interactions": rows[3:]},
+        {"user_id": two["user_id"]},
+    ]
+    found = streamed(trained, lines(parts))
+    assert "error" in found[1]
+    expected = streamed(trained, lines([two, one, two]))
+    pd.testing.assert_frame_equal(as_frame(found[2:]), as_frame(expected), rtol=1e-5)
+    # Users beyond the limit are forgotten, the longest unheard of first.
+    forgot = streamed(trained, lines(parts), remember=len(two["history"]))
+    alone = streamed(trained, lines([{"user_id": one["user_id"], "history": rows[3:]}]))
+    pd.testing.assert_frame_equal(as_frame(forgot[3:4]), as_frame(alone), rtol=1e-5)
+
+
+def test_a_stream_takes_no_logs(
+    trained: TrainedPolicy, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["recommend", str(trained.folder), "log.parquet", "--stream"]) == 2
+    assert "leave LOGS and --out out" in capsys.readouterr().err
+    for given, lacks in (([], "--out"), (["--out", "x"], "LOGS")):
+        with pytest.raises(SystemExit):
+            main(["recommend", str(trained.folder), *given])
+        assert f"required: {lacks}" in capsys.readouterr().err
+
+
+def test_a_reader_that_goes_away_ends_the_command_quietly(trained: TrainedPolicy) -> None:
+    command = [sys.executable, "-m", "ucfrec.commands.cli", "recommend", str(trained.folder)]
+    read, write = os.pipe()
+    os.close(read)
+    ended = subprocess.run(
+        [*command, "--stream"],
+        input=lines([{"user_id": 1}] * 9),
+        stdout=write,
+        stderr=subprocess.PIPE,
+        timeout=120,
+    )
+    os.close(write)
+    assert (ended.returncode, ended.stderr) == (0, b"")

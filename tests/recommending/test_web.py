@@ -1,0 +1,196 @@
+"""The application: answers equal to the command's, one clear error per bad request, limits."""
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from tests.support.served import FULL, as_frame, histories, requests_of, responder, trained_run
+from ucfrec.commands.cli import main
+from ucfrec.recommending.requests import Limits
+from ucfrec.recommending.responder import Responder
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+httpx = pytest.importorskip("httpx")
+pytest.importorskip("fastapi_offline")
+pytest.importorskip("prometheus_client")
+# After the check that they are installed.
+from ucfrec.recommending.web import ServerLimits, application  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
+    return trained_run(tmp_path_factory.mktemp("web"))
+
+
+@asynccontextmanager
+async def client(by: Responder, **limits: Any) -> AsyncIterator[Any]:
+    """A client of the application, without a network."""
+    app = application(by, ServerLimits(**limits))
+    transport = httpx.ASGITransport(app=app)
+    async with (
+        app.router.lifespan_context(app),
+        httpx.AsyncClient(transport=transport, base_url="http://test") as each,
+    ):
+        yield each
+
+
+class Slow:
+    """Counts the batches of a responder, and takes its time over them."""
+
+    def __init__(self, by: Responder, seconds: float) -> None:
+        self.sizes: list[int] = []
+        answer = by.answers
+
+        def slowly(requests: Sequence[Any]) -> Any:
+            self.sizes.append(len(requests))
+            time.sleep(seconds)
+            return answer(requests)
+
+        by.answers = slowly  # type: ignore[method-assign]
+
+
+def test_answers_are_those_of_the_command_and_share_passes(
+    trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    log = histories()
+    log.to_parquet(tmp_path / "log.parquet")
+    rule = ["--max-return", "--target-floor", "0.1", "--tilt", "0.7", "--tag-window", "2"]
+    arguments = [str(trained.folder), str(tmp_path / "log.parquet"), "--exclude-seen", *rule]
+    assert main(["recommend", *arguments, "--out", str(tmp_path / "out")]) == 0
+    by = responder(trained, rule=FULL)
+    slow = Slow(by, 0.05)
+
+    async def ask() -> tuple[list[dict[str, Any]], str]:
+        async with client(by, batch=8) as http:
+            posts = [http.post("/recommendations", json=each) for each in requests_of(log)]
+            found = await asyncio.gather(*posts)
+            assert {each.status_code for each in found} == {200}
+            metrics = (await http.get("/metrics")).text
+            return [each.json() for each in found], metrics
+
+    answers, metrics = asyncio.run(ask())
+    expected = pd.read_parquet(tmp_path / "out")
+    pd.testing.assert_frame_equal(
+        as_frame(answers), expected, check_dtype=False, rtol=1e-5, atol=1e-6
+    )
+    # The first starts at once, or with those that came in the same moment; the others share.
+    assert sum(slow.sizes) == 12
+    assert len(slow.sizes) <= 4
+    assert max(slow.sizes) <= 8
+    assert 'ucfrec_requests_total{status="200"} 12.0' in metrics
+    assert f"ucfrec_batch_requests_count {len(slow.sizes)}.0" in metrics
+
+
+WRONG: dict[str, tuple[bytes, int, str]] = {
+    "no JSON": (b"{", 400, "the request is not JSON"),
+    "nothing": (b"", 400, "the request is not JSON"),
+    "no user": (b"{}", 400, "user_id: field required"),
+    "of a stream": (b'{"user_id": 1, "interactions": []}', 400, "interactions: extra inputs"),
+    "too many items": (b'{"user_id": 1, "k": 6}', 400, "6 k: the limit is 5"),
+    "too much history": (
+        json.dumps({"user_id": 1, "history": [{"item_id": 1, "timestamp": 1.7e12}] * 4}).encode(),
+        400,
+        "4 rows of history: the limit is 3",
+    ),
+    "many candidates": (b'{"user_id": 1, "candidates": [1, 2, 3]}', 400, "the limit is 2"),
+    "unknown": (b'{"user_id": 1, "candidates": ["\\ud800"]}', 400, ""),
+    "too large": (b'{"user_id": "' + b"x" * 2000 + b'"}', 413, "more than 1,000 bytes"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_bad_request_has_one_error(trained: TrainedPolicy, case: str) -> None:
+    body, status, message = WRONG[case]
+    limits = Limits(bytes=1000, k=5, history=3, candidates=2)
+
+    async def chunks() -> AsyncIterator[bytes]:
+        yield body
+
+    async def ask() -> list[Any]:
+        async with client(responder(trained, limits=limits, k=5)) as http:
+            # With and without its length stated.
+            return [
+                await http.post("/recommendations", content=content)
+                for content in (body, chunks(), b'{"user_id": 1}')
+            ]
+
+    *wrong, right = asyncio.run(ask())
+    for each in wrong:
+        assert each.status_code == status
+        assert each.json().keys() == {"error"}
+        assert message in each.json()["error"]
+        assert "\n" not in each.json()["error"]
+    assert len(right.json()["items"]) == 5
+
+
+def test_what_waits_too_long_or_is_too_much_is_told_so(trained: TrainedPolicy) -> None:
+    by = responder(trained)
+    Slow(by, 0.4)
+
+    async def never() -> AsyncIterator[bytes]:
+        yield b"{"
+        await asyncio.sleep(60)
+
+    async def ask() -> tuple[list[int], int]:
+        async with client(by, timeout=0.2, queue=2, batch=1) as http:
+
+            async def post() -> int:
+                return int((await http.post("/recommendations", json={"user_id": 1})).status_code)
+
+            first = asyncio.create_task(post())
+            await asyncio.sleep(0.05)
+            rest = await asyncio.gather(*(post() for _ in range(4)))
+            unfinished = await http.post("/recommendations", content=never())
+            return [await first, *rest], unfinished.status_code
+
+    statuses, unfinished = asyncio.run(ask())
+    assert sorted(statuses) == [503, 503, 504, 504, 504]
+    assert unfinished == 408
+
+
+def test_a_defect_is_told_without_its_details(
+    trained: TrainedPolicy, capsys: pytest.CaptureFixture[str]
+) -> None:
+    by = responder(trained)
+
+    def broken(_: Sequence[Any]) -> Any:
+        raise MemoryError("of 3 GiB")
+
+    by.answers = broken  # type: ignore[method-assign]
+
+    async def ask() -> Any:
+        async with client(by) as http:
+            return await http.post("/recommendations", json={"user_id": 1})
+
+    answer = asyncio.run(ask())
+    assert answer.status_code == 500
+    assert "3 GiB" not in answer.text
+    assert "MemoryError" in capsys.readouterr().err
+
+
+def test_the_pages_describe_the_requests_and_load_nothing_from_elsewhere(
+    trained: TrainedPolicy,
+) -> None:
+    async def ask() -> list[Any]:
+        async with client(responder(trained)) as http:
+            paths = ("/health", "/openapi.json", "/docs", "/nothing", "/recommendations")
+            return [await http.get(path) for path in paths]
+
+    health, described, page, nothing, wrong_method = asyncio.run(ask())
+    assert health.json()["status"] == "ok"
+    assert health.json()["rule_hash"] == trained.rule.hash
+    body = described.json()["paths"]["/recommendations"]["post"]["requestBody"]
+    properties = body["content"]["application/json"]["schema"]["properties"]
+    assert properties.keys() == {"user_id", "history", "k", "candidates"}
+    assert "timestamp" in properties["history"]["items"]["required"]
+    assert page.status_code == 200
+    assert "https://" not in page.text
+    assert (nothing.status_code, nothing.json()) == (404, {"error": "Not Found"})
+    assert (wrong_method.status_code, wrong_method.json()) == (405, {"error": "Method Not Allowed"})

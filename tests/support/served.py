@@ -1,0 +1,70 @@
+"""A small run with everything that a decision rule can use, and requests of its users."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from tests.support.tagged import tagged_log, tagged_store
+from ucfrec import Recommender
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.recommending.requests import Limits
+from ucfrec.recommending.responder import Responder
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+SETTINGS = [
+    *("train.steps=20", "policy.dim=8", "policy.context=4", "augment.copies=0"),
+    *("policy.max_return=true", "rule.sessions=2", "rule.tilts=[0.5]", "rule.temperatures=[0.0]"),
+    *("rule.quantiles=[1.0]", "rule.tag_windows=[0]"),
+]
+FULL = DecisionRule(None, floor=0.1, tilt=0.7, exclude_seen=True, tag_window=2)
+"""A rule that uses every part of a policy."""
+
+
+def trained_run(folder: Path, policy: str = "ucf") -> TrainedPolicy:
+    """A run at `folder / "run"` on `tagged_log`, which has tags, users with features and a gap."""
+    Recommender(policy, settings=SETTINGS).fit(tagged_store(folder), folder / "run")
+    return TrainedPolicy.load(folder / "run")
+
+
+def responder(trained: TrainedPolicy, **named: Any) -> Responder:
+    """A responder with the default limits."""
+    return Responder(trained, named.pop("limits", Limits()), **named)
+
+
+def histories(users: int = 12) -> pd.DataFrame:
+    """The rows of some users, with duplicates, in no order of time."""
+    log = tagged_log()
+    log = log[log.user_id < 100 + users]
+    repeated = log.sample(40, random_state=0)
+    again = repeated.assign(reward=1 - repeated.reward)
+    return pd.concat([log, again]).sample(frac=1, random_state=1).reset_index(drop=True)
+
+
+def request_of(rows: pd.DataFrame, **more: Any) -> dict[str, Any]:
+    """The request with one user's rows as its history."""
+    columns = [name for name in rows.columns if name != "user_id"]
+    history = json.loads(rows[columns].to_json(orient="records"))
+    return {"user_id": int(rows.user_id.iloc[0]), "history": history, **more}
+
+
+def requests_of(log: pd.DataFrame, **more: Any) -> list[dict[str, Any]]:
+    """The requests of all users of a log, by user."""
+    return [request_of(rows, **more) for _, rows in log.groupby("user_id")]
+
+
+def as_frame(answers: list[dict[str, Any]]) -> pd.DataFrame:
+    """Answers in the form of `ucfrec recommend`."""
+    rows = [
+        {"user_id": answer["user_id"], "rank": rank, **item}
+        for answer in answers
+        for rank, item in enumerate(answer["items"], 1)
+    ]
+    return pd.DataFrame(rows)
+
+
+def with_rule(trained: TrainedPolicy, **parts: Any) -> DecisionRule:
+    """The run's rule with other parts."""
+    return replace(trained.rule, **parts)

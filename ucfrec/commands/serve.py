@@ -1,0 +1,103 @@
+"""`ucfrec serve`: answer requests for recommendations over HTTP."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from ucfrec.commands.options import limit_options, limits_given, rule_given, rule_options
+from ucfrec.errors import InputError
+from ucfrec.processes import Interrupted
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `ucfrec serve`."""
+    parser.add_argument("run", type=Path, metavar="RUN", help="run folder of `ucfrec train`")
+    parser.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="address to listen on; others than this machine's own are open to whoever reaches "
+        "them (default: 127.0.0.1)",
+    )
+    parser.add_argument("--port", type=int, default=8080, help="0 for a free one (default: 8080)")
+    parser.add_argument(
+        "--k", type=int, default=10, help="items, if a request does not say how many (default: 10)"
+    )
+    parser.add_argument(
+        "--keep-seen",
+        action="store_true",
+        help="also recommend items that the user has seen (default: leave them out)",
+    )
+    parser.add_argument(
+        "--skip-unknown",
+        action="store_true",
+        help="ignore rows with items outside the catalogue of the run (default: an error)",
+    )
+    parser.add_argument(
+        "--threads", type=int, metavar="N", help="of a forward pass (default: one a core)"
+    )
+    rule_options(parser)
+    limit_options(parser)
+    server = parser.add_argument_group("limits of the server")
+    server.add_argument(
+        "--max-batch", type=int, default=64, metavar="N", help="requests of a forward pass (64)"
+    )
+    server.add_argument(
+        "--max-queue", type=int, default=1024, metavar="N", help="requests that wait (1,024)"
+    )
+    server.add_argument(
+        "--timeout", type=float, default=5.0, metavar="S", help="seconds of a request (5)"
+    )
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run `ucfrec serve` until Ctrl-C or TERM, after which requests in flight are answered.
+
+    Raises:
+        InputError: the run cannot be used or has no checksums, a file of it was changed, the extra
+            `serve` is not installed, or the address cannot be listened on.
+    """
+    try:
+        import uvicorn
+
+        from ucfrec.recommending.web import ServerLimits, application
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"serving needs {error.name}, which is not installed; install ucfrec[serve]"
+        ) from None
+    import torch
+
+    from ucfrec.recommending.responder import Responder
+    from ucfrec.recommending.server import Server, listening_socket
+    from ucfrec.runs.trained_policy import TrainedPolicy, verified
+
+    if options.threads is not None:
+        if options.threads < 1:
+            raise InputError(f"--threads is {options.threads}; give 1 or more")
+        torch.set_num_threads(options.threads)
+    limits = limits_given(options)
+    of_server = ServerLimits(
+        batch=options.max_batch, queue=options.max_queue, timeout=options.timeout
+    )
+    verified(options.run)
+    trained = TrainedPolicy.load(options.run, options.checkpoint)
+    responder = Responder(
+        trained,
+        limits,
+        rule=rule_given(options, trained),
+        k=options.k,
+        filter_seen=not options.keep_seen,
+        skip_unknown=options.skip_unknown,
+    )
+    config = uvicorn.Config(
+        application(responder, of_server),
+        access_log=False,
+        log_level="warning",
+        server_header=False,
+        timeout_graceful_shutdown=int(of_server.timeout) + 1,
+    )
+    with listening_socket(options.host, options.port) as listening:
+        try:
+            Server(config, f"ucfrec serve: {trained!r}").run([listening])
+        except Interrupted:
+            # What was asked of a server that is told to stop is done.
+            print("ucfrec serve: stopped", file=sys.stderr)

@@ -1,0 +1,267 @@
+"""One user's request for recommendations, as JSON, and the history that it holds."""
+
+import json
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Final, NamedTuple, NotRequired
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, ValidationError
+
+# Of typing's TypedDict, pydantic cannot read the configuration before Python 3.12.
+from typing_extensions import TypedDict
+
+from ucfrec import schema
+from ucfrec.errors import InputError
+from ucfrec.logs.clean import DAY_MS, EARLIEST_MS
+from ucfrec.recommending.histories import LONGEST_HISTORY
+from ucfrec.recommending.row_rewards import RowRewards
+from ucfrec.runs.trained_policy import TrainedPolicy, duplicates_of
+from ucfrec.settings import settings_table
+
+Array = npt.NDArray[Any]
+Id = Annotated[StrictInt, Field(ge=-(2**63), lt=2**63)] | Annotated[str, Field(max_length=1000)]
+Number = Annotated[StrictInt | StrictFloat, Field(allow_inf_nan=False)]
+_SHOWN: Final = 60
+"""Most characters of a wrong value in a message."""
+
+
+@settings_table("")
+class Limits:
+    """The largest request that is answered."""
+
+    bytes: Annotated[int, Field(ge=1_000, le=2**30)] = 2**21
+    """Bytes of a request's JSON."""
+    k: Annotated[int, Field(ge=1, le=1_000_000)] = 1_000
+    """Items that may be asked for."""
+    history: Annotated[int, Field(ge=1, le=1_000_000)] = 5_000
+    """Rows of a user's history."""
+    candidates: Annotated[int, Field(ge=1, le=10_000_000)] = 10_000
+    """Items in a list of candidates."""
+
+
+class Row(TypedDict):
+    """One interaction of the user; other entries are feedback, for the run's reward."""
+
+    __pydantic_config__ = ConfigDict(extra="allow", strict=True)  # type: ignore[misc]
+
+    item_id: Id
+    timestamp: Annotated[Number, Field(description="Milliseconds since 1970, UTC.")]
+    reward: NotRequired[
+        Annotated[Number, Field(description="Without it, the run's reward of the feedback.")]
+    ]
+    session_id: NotRequired[Id]
+    observation: NotRequired[Annotated[list[Number], Field(max_length=100_000)]]
+
+
+class Request(BaseModel):
+    """A user, what they were shown, and what is asked for."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    user_id: Id
+    """Identifier in the training logs, or any other."""
+    history: Annotated[
+        list[Row], Field(description="The user's interactions, in any order; empty for a new user.")
+    ] = []
+    k: Annotated[int, Field(ge=1, description="Number of items.")] | None = None
+    candidates: (
+        Annotated[list[Id], Field(min_length=1, description="The only items to recommend.")] | None
+    ) = None
+
+
+class StreamRequest(Request):
+    """A request of a stream, which remembers its users."""
+
+    interactions: list[Row] = []
+    """Rows that are added to the history or, without one, to what the stream has had of the
+    user."""
+
+
+class UserHistory(NamedTuple):
+    """What a request tells about its user: n rows in the order of time."""
+
+    item_ids: Array
+    """(n,) integers or text."""
+    rewards: npt.NDArray[np.float32]
+    """(n,) in reward units."""
+    timestamps: npt.NDArray[np.int64]
+    """(n,) milliseconds."""
+    session_ids: list[Any] | None
+    """(n,); None if sessions are not split by them."""
+    seen: Array
+    """(m,) all items of the request's rows, also of those before the n."""
+    observation: list[float] | None
+    """(O,) of the last row; None if the policy has none."""
+
+
+def parsed(kind: type[Request], text: bytes, limits: Limits) -> Any:
+    """Read a request.
+
+    Args:
+        kind: `Request` or a subclass.
+        text: JSON.
+        limits: of the request.
+
+    Raises:
+        InputError: it is no such request, or too large.
+    """
+    if len(text) > limits.bytes:
+        raise InputError(f"the request has more than {limits.bytes:,} bytes; send fewer rows")
+    try:
+        request = kind.model_validate_json(text)
+    except ValidationError as error:
+        raise InputError(fault_of(error.errors(include_url=False))) from None
+    require_within(request, limits)
+    return request
+
+
+def fault_of(errors: Sequence[Any]) -> str:
+    """The first of pydantic's errors in one line, and how many there are."""
+    first = errors[0]
+    where = ".".join(str(part) for part in first["loc"] if part not in _KINDS)
+    message = first["msg"][:1].lower() + first["msg"][1:]
+    if first["type"] == "json_invalid":
+        return f"the request is not JSON ({message})"
+    given = first.get("input")
+    shown = "" if isinstance(given, (dict, list)) else f", not {_short(given)}"
+    more = f"; {len(errors) - 1} more faults" if len(errors) > 1 else ""
+    return f"{where or 'the request'}: {message}{shown}{more}"
+
+
+_KINDS: Final = ("int", "float", "str", "constrained-int", "constrained-str", "body")
+"""Parts of pydantic's places that name a type, not an entry."""
+
+
+def _short(value: object) -> str:
+    text = json.dumps(value, default=str)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
+
+
+def require_within(request: Request, limits: Limits) -> None:
+    """Check the limits of a request, but for its bytes.
+
+    Raises:
+        InputError: it asks for too much.
+    """
+    counts = {
+        "k": (request.k or 1, limits.k),
+        "rows of history": (len(request.history), limits.history),
+        "candidates": (len(request.candidates or ()), limits.candidates),
+    }
+    if isinstance(request, StreamRequest):
+        counts["interactions"] = (len(request.interactions), limits.history)
+    for name, (given, most) in counts.items():
+        if given > most:
+            raise InputError(f"{given:,} {name}: the limit is {most:,}; ask for less")
+
+
+@dataclass(frozen=True)
+class HistoryReader:
+    """Cleans the rows of requests as `ucfrec recommend` cleans those of a log."""
+
+    duplicates: str
+    """See `ucfrec.logs.prepare.PrepareOptions.duplicates`."""
+    by_session_id: bool
+    observation_size: int
+    rewards: RowRewards
+
+    @classmethod
+    def of(cls, trained: TrainedPolicy) -> "HistoryReader":
+        """The reader for a policy; its `rewards` have to be closed."""
+        return cls(
+            duplicates_of(trained.record),
+            trained.record.get("session_by") == schema.SESSION_ID,
+            trained.record["observation_size"],
+            RowRewards.of(trained),
+        )
+
+    def read(self, rows: Sequence[Row]) -> UserHistory:
+        """The history of the rows of one user.
+
+        Raises:
+            InputError: a row lacks something, or has a time or reward that cannot be used.
+        """
+        if self.observation_size and not rows:
+            raise InputError("the policy needs the last observation; give a row of history with it")
+        times = _times(rows)
+        ids = _ids([row["item_id"] for row in rows])
+        sessions = None
+        if self.by_session_id:
+            _require(rows, schema.SESSION_ID)
+            sessions = _ids([row["session_id"] for row in rows])
+        rewards = self.rewards.of_rows(rows)
+        order = self._kept_in_order(rows, ids, times, rewards, sessions)[-LONGEST_HISTORY:]
+        observation = None
+        if self.observation_size:
+            observation = self._observation(rows, order[-1])
+        return UserHistory(
+            np.asarray([ids[n] for n in order], dtype=_type(ids)),
+            np.asarray([rewards[n] for n in order], dtype=np.float32),
+            np.asarray([times[n] for n in order], dtype=np.int64),
+            None if sessions is None else [sessions[n] for n in order],
+            np.asarray(list(dict.fromkeys(ids)), dtype=_type(ids)),
+            observation,
+        )
+
+    def _kept_in_order(
+        self,
+        rows: Sequence[Row],
+        ids: Sequence[Any],
+        times: Sequence[int],
+        rewards: Sequence[float],
+        sessions: Sequence[Any] | None,
+    ) -> list[int]:
+        """Numbers of the rows without duplicates, in the order of time and then of the item."""
+        best: dict[tuple[int, Any], tuple[tuple[Any, ...], int]] = {}
+        for n, key in enumerate(zip(times, ids, strict=True)):
+            first = {"highest": -rewards[n], "lowest": rewards[n], "first": n, "last": -n}
+            # Ties are broken by the log's other columns.
+            rest = (rows[n].get("observation") or [], "" if sessions is None else sessions[n])
+            rank = (first[self.duplicates], *rest)
+            if key not in best or rank < best[key][0]:
+                best[key] = (rank, n)
+        return [n for _, (_, n) in sorted(best.items(), key=lambda entry: entry[0])]
+
+    def _observation(self, rows: Sequence[Row], last: int) -> list[float]:
+        given = rows[last].get("observation")
+        if given is None or len(given) != self.observation_size:
+            size = "none" if given is None else f"{len(given)} numbers"
+            raise InputError(
+                f"history.{last}: the observation has {size}; the policy needs "
+                f"{self.observation_size}"
+            )
+        return [float(value) for value in given]
+
+
+def _times(rows: Sequence[Row]) -> list[int]:
+    latest = time.time() * 1000 + DAY_MS
+    times = []
+    for n, row in enumerate(rows):
+        # DuckDB rounds halves away from zero.
+        when = math.floor(row["timestamp"] + 0.5)
+        if not EARLIEST_MS <= when <= latest:
+            raise InputError(
+                f"history.{n}: timestamp {row['timestamp']} is before 2000 or more than a day "
+                "ahead of now; give milliseconds since 1970"
+            )
+        times.append(when)
+    return times
+
+
+def _ids(ids: list[Any]) -> list[Any]:
+    """Identifiers of one type: all text, if some are."""
+    return ids if all(isinstance(each, int) for each in ids) else list(map(str, ids))
+
+
+def _type(ids: Sequence[Any]) -> Any:
+    return object if ids and isinstance(ids[0], str) else np.int64
+
+
+def _require(rows: Sequence[Mapping[str, Any]], name: str) -> None:
+    for n, row in enumerate(rows):
+        if row.get(name) is None:
+            raise InputError(f"history.{n} has no {name}, by which the run splits sessions")

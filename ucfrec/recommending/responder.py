@@ -1,0 +1,251 @@
+"""Answers to requests of several users at once, equal to those of `ucfrec recommend`."""
+
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+import torch
+from torch import Tensor
+
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.logged_decisions import seen_before, session_scores
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.recommending.histories import Histories
+from ucfrec.recommending.recommend import next_steps, positions, uniforms
+from ucfrec.recommending.requests import HistoryReader, Limits, Request, UserHistory
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+_SCORES: Final = 2**25
+"""Most scores of a forward pass, users × items: 128 MiB."""
+
+Array = npt.NDArray[Any]
+IntArray = npt.NDArray[np.int64]
+
+
+class Answer(NamedTuple):
+    """Items for one user, best first."""
+
+    items: list[int | str]
+    scores: list[float]
+    """Log-probabilities at temperature 1 among the items that are left, nats."""
+
+    def as_dict(self, user_id: int | str) -> dict[str, Any]:
+        """The answer to a request of a user, as a JSON object."""
+        pairs = zip(self.items, self.scores, strict=True)
+        items = [{"item_id": item, "score": score} for item, score in pairs]
+        return {"user_id": user_id, "items": items}
+
+
+class _Asked(NamedTuple):
+    """A request that can be answered."""
+
+    number: int
+    """Of the request in its batch."""
+    user_id: int | str
+    k: int
+    history: UserHistory
+    known: IntArray
+    """(n,) index of each item of the history, −1 for items that the policy does not know."""
+    left_out: IntArray
+    """(m,) index of items that are not recommended."""
+    allowed: IntArray | None
+    """(c,) index of the only items to recommend; None for all."""
+
+
+class Responder:
+    """A trained policy under its rule, which answers requests; for one thread at a time.
+
+    It keeps nothing of a request.
+    """
+
+    def __init__(
+        self,
+        trained: TrainedPolicy,
+        limits: Limits,
+        *,
+        rule: DecisionRule | None = None,
+        k: int = 10,
+        filter_seen: bool = True,
+        skip_unknown: bool = False,
+        seed: int = 0,
+    ) -> None:
+        """
+        Args:
+            trained: a policy of items.
+            limits: of a request.
+            rule: the decision rule; None for the run's own.
+            k: items for requests that do not say how many.
+            filter_seen: leave out every item that the user has seen.
+            skip_unknown: ignore rows of items that are not in the training data.
+            seed: of the draws of a rule with a temperature.
+
+        Raises:
+            InputError: the policy's actions are vectors, the rule does not fit the policy, or `k`
+                is beyond the limits.
+        """
+        if trained.item_states is None or trained.item_ids is None:
+            raise InputError(
+                "this policy's actions are vectors; recommending needs a policy trained on items"
+            )
+        if not 1 <= k <= limits.k:
+            raise InputError(f"k is {k}; give a whole number from 1 to {limits.k:,}")
+        self.trained, self.limits = trained, limits
+        self._k, self._filter_seen, self._skip_unknown, self._seed = (
+            k,
+            filter_seen,
+            skip_unknown,
+            seed,
+        )
+        decider = trained.decider(rule)
+        self.rule = decider.rule
+        self._decider = replace(decider, rule=replace(decider.rule, exclude_seen=False))
+        self._item_ids = trained.item_ids
+        self._items, self._users = _Lookup(trained.item_ids), _Lookup(trained.user_ids)
+        self._reader = HistoryReader.of(trained)
+        self._busy = threading.Lock()
+
+    def close(self) -> None:
+        """Release what reading rewards holds."""
+        self._reader.rewards.close()
+
+    def answers(self, requests: Sequence[Request]) -> list[Answer | InputError]:
+        """Answer requests with as few forward passes as memory allows.
+
+        Returns:
+            In the order of the requests: the answer, or what is wrong with the request.
+        """
+        with self._busy:
+            outcomes: list[Answer | InputError | None] = [None] * len(requests)
+            asked = []
+            for number, request in enumerate(requests):
+                try:
+                    asked.append(self._asked(number, request))
+                except InputError as error:
+                    outcomes[number] = error
+            at_once = max(1, _SCORES // len(self._item_ids))
+            for first in range(0, len(asked), at_once):
+                batch = asked[first : first + at_once]
+                for one, answer in zip(batch, self._scored(batch), strict=True):
+                    outcomes[one.number] = answer
+            return [outcome for outcome in outcomes if outcome is not None]
+
+    def _asked(self, number: int, request: Request) -> _Asked:
+        history = self._reader.read(request.history)
+        known = self._items.positions(history.item_ids)
+        if (known < 0).any() and not self._skip_unknown:
+            unknown = sorted(set(history.item_ids[known < 0].tolist()))
+            shown = ", ".join(map(str, unknown[:3])) + (", …" if len(unknown) > 3 else "")
+            raise InputError(
+                f"{int((known < 0).sum())} rows of the history have an item_id that the policy "
+                f"does not know ({shown}); leave them out"
+            )
+        seen = self._items.positions(history.seen) if self._filter_seen else np.empty(0, np.int64)
+        allowed = None if request.candidates is None else self._candidates(request.candidates)
+        k = self._k if request.k is None else request.k
+        return _Asked(number, request.user_id, k, history, known, seen[seen >= 0], allowed)
+
+    def _candidates(self, candidates: Sequence[int | str]) -> IntArray:
+        numbers = self._items.positions(_array(candidates))
+        if (numbers < 0).any():
+            unknown = [candidates[n] for n in np.flatnonzero(numbers < 0).tolist()]
+            shown = ", ".join(map(str, unknown[:3])) + (", …" if len(unknown) > 3 else "")
+            raise InputError(
+                f"{len(unknown)} of {len(candidates)} candidates are items that the policy does "
+                f"not know ({shown}); leave them out"
+            )
+        return numbers
+
+    def _scored(self, asked: Sequence[_Asked]) -> list[Answer]:
+        store = self._store(asked)
+        rows = np.arange(len(asked))
+        last = store.lengths - 1
+        left_out = torch.zeros(len(asked), len(self._item_ids), dtype=torch.bool)
+        for row, one in enumerate(asked):
+            if one.allowed is not None:
+                left_out[row] = True
+                left_out[row, one.allowed] = False
+            left_out[row, one.left_out] = True
+        if self.rule.exclude_seen:
+            left_out |= seen_before(store, rows, last)
+        # A user without any item left gets none.
+        some = ~left_out.all(1)
+        left_out[~some] = False
+        scores = session_scores(self._decider, store, rows, last, left_out)
+        return self._best(asked, scores, some)
+
+    def _store(self, asked: Sequence[_Asked]) -> EpisodeStore:
+        """The sessions of the requests with their next step."""
+        histories = [one.history for one in asked]
+        observations = None
+        if self.trained.record["observation_size"]:
+            observations = np.asarray([each.observation for each in histories], dtype=np.float32)
+        sessions = None
+        if histories[0].session_ids is not None:
+            flat = [each for history in histories for each in history.session_ids or ()]
+            sessions = _array(flat)
+        batch = Histories(
+            users=_array([one.user_id for one in asked]),
+            owner=np.repeat(np.arange(len(asked)), [len(one.known) for one in asked]),
+            item_ids=np.concatenate([one.known for one in asked]),
+            rewards=np.concatenate([each.rewards for each in histories]),
+            timestamps=np.concatenate([each.timestamps for each in histories]),
+            session_ids=sessions,
+            seen_owner=np.empty(0, np.int64),
+            seen_ids=np.empty(0, np.int64),
+            observations=observations,
+        )
+        latest = batch.rows(batch.item_ids >= 0).latest_session(
+            self.trained.record["session_gap_ms"]
+        )
+        users = self._users.positions(latest.users)
+        return next_steps(self.trained, latest, latest.item_ids, users)
+
+    def _best(self, asked: Sequence[_Asked], scores: Tensor, some: Tensor) -> list[Answer]:
+        n_items = scores.shape[1]
+        drawn = None
+        if self.rule.temperature > 0:
+            drawn = uniforms(_array([one.user_id for one in asked]), n_items, self._seed)
+        normalised = scores.log_softmax(-1)
+        answers = [Answer([], [])] * len(asked)
+        for k in {one.k for one in asked}:
+            rows = torch.tensor([n for n, one in enumerate(asked) if one.k == k])
+            chosen = self.rule.ranked(
+                scores[rows], min(k, n_items), None if drawn is None else drawn[rows]
+            )
+            values = normalised[rows].gather(1, chosen)
+            kept = torch.isfinite(values) & some[rows, None]
+            for row, items, value, keep in zip(rows.tolist(), chosen, values, kept, strict=True):
+                ids = self._item_ids[items[keep].numpy()]
+                answers[row] = Answer(ids.tolist(), value[keep].tolist())
+        return answers
+
+
+class _Lookup:
+    """Finds identifiers among those of a run, whether they are integers or text."""
+
+    def __init__(self, ids: Array) -> None:
+        self._own = pd.Index(ids)
+        self._text: pd.Index[Any] | None = None
+
+    def positions(self, ids: Array) -> IntArray:
+        """Index of each of `ids` (N,), −1 for ids that the run lacks."""
+        if not len(ids):
+            return np.empty(0, dtype=np.int64)
+        whole = pd.api.types.is_integer_dtype(self._own.dtype)
+        if whole == (ids.dtype.kind == "i"):
+            return positions(self._own, ids)
+        if self._text is None:
+            self._text = self._own.astype(str)
+        return positions(self._text, ids.astype(str).astype(object))
+
+
+def _array(ids: Sequence[Any]) -> Array:
+    """Identifiers as int64 if all are integers, otherwise as text."""
+    if all(isinstance(each, int) for each in ids):
+        return np.asarray(ids, dtype=np.int64)
+    return np.asarray(list(map(str, ids)), dtype=object)

@@ -1,0 +1,112 @@
+"""Rewards of rows in memory: as given, or by a run's reward expression."""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final
+
+import duckdb
+import pyarrow as pa
+
+from ucfrec import schema
+from ucfrec.errors import InputError
+from ucfrec.logs.binding import bind, explained, is_number
+from ucfrec.logs.engine import engine_in_memory
+from ucfrec.logs.expressions import Expression, columns_of
+from ucfrec.logs.histories import FrameTable
+from ucfrec.runs.trained_policy import RUN, TrainedPolicy
+
+_ROWS: Final = "history"
+"""Name of the rows in messages and in the engine."""
+_NAME: Final = re.compile(r"[A-Za-z_]\w*")
+
+
+class RowRewards:
+    """Computes the rewards of rows, one request after the other; not for several threads at once.
+
+    A row's `reward` counts. Rows without one have feedback, from which the run's reward expression
+    makes it: at once if the expression is the name of a column, otherwise by the engine, which
+    takes some milliseconds.
+    """
+
+    def __init__(self, expression: Expression) -> None:
+        self._expression = expression
+        self._stack = ExitStack()
+        self._connection: duckdb.DuckDBPyConnection | None = None
+
+    @classmethod
+    def of(cls, trained: TrainedPolicy) -> "RowRewards":
+        """The rewards of a policy's run."""
+        return cls(Expression(trained.record["reward"], str(trained.folder / RUN)))
+
+    def close(self) -> None:
+        """Close the engine."""
+        self._stack.close()
+
+    def of_rows(self, rows: Sequence[Mapping[str, Any]]) -> list[float]:
+        """Rewards (N,) of rows.
+
+        Raises:
+            InputError: a reward or feedback is missing, not finite or too large.
+        """
+        if not rows:
+            return []
+        given = [row.get(schema.REWARD) for row in rows]
+        if any(value is not None for value in given):
+            return _checked(given, f"no {schema.REWARD}, as other rows have")
+        name = str(self._expression)
+        if _NAME.fullmatch(name):
+            either = "no" if name == schema.REWARD else f"neither {schema.REWARD} nor"
+            return _checked([row.get(name) for row in rows], f"{either} {name}")
+        return _checked(self._evaluated(rows), "no reward")
+
+    def _evaluated(self, rows: Sequence[Mapping[str, Any]]) -> list[Any]:
+        if self._connection is None:
+            self._connection = self._stack.enter_context(engine_in_memory())
+        connection = self._connection
+        names = columns_of(connection, self._expression)
+        given = {name.casefold(): name for row in rows for name in row}
+        columns = {}
+        for name in names:
+            key = given.get(name.casefold(), name)
+            values = [row.get(key) for row in rows]
+            if all(value is None for value in values):
+                raise InputError(
+                    f"history has neither {schema.REWARD} nor {name}, which the run's reward "
+                    f"({self._expression}) needs; give one of them"
+                )
+            try:
+                columns[name] = pa.array(values)
+            except (pa.ArrowException, OverflowError) as error:
+                reason = str(error).splitlines()[0]
+                raise InputError(
+                    f"history: {name} has values of several types ({reason})"
+                ) from None
+        source = Path(_ROWS)
+        connection.register(_ROWS, pa.table(columns))
+        try:
+            described = connection.sql(f"DESCRIBE {_ROWS}").fetchall()
+            table = FrameTable((source,), tuple((row[0], row[1]) for row in described))
+            with explained(connection, (table,), source):
+                sql, kind = bind(connection, table, "for the reward", self._expression)
+                if not (is_number(kind) or kind == "BOOLEAN"):
+                    raise InputError(f"history: the run's reward is {kind} here; give numbers")
+                query = f"SELECT TRY(CAST({sql} AS DOUBLE)) FROM {table.sql}"
+                return [row[0] for row in connection.sql(query).fetchall()]
+        finally:
+            connection.unregister(_ROWS)
+
+
+def _checked(values: Sequence[Any], missing: str) -> list[float]:
+    for n, value in enumerate(values):
+        if value is None:
+            raise InputError(f"history.{n} has {missing}; give every row its reward")
+        if not isinstance(value, (int, float)) or not math.isfinite(value):
+            raise InputError(f"history.{n}: the reward is {value!r:.60}; give a finite number")
+        if abs(value) > schema.LARGEST_REWARD:
+            raise InputError(
+                f"history.{n}: the reward {value:g} is beyond ±{schema.LARGEST_REWARD:g}"
+            )
+    return [float(value) for value in values]

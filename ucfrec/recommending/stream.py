@@ -1,0 +1,166 @@
+"""Recommendations as a stream: lines of requests in, lines of answers out."""
+
+import json
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Protocol
+
+from ucfrec.errors import InputError
+from ucfrec.recommending.requests import Limits, Request, Row, StreamRequest, parsed
+from ucfrec.recommending.responder import Responder
+
+REMEMBERED: Final = 1_000_000
+"""Rows that a stream remembers; whoever was heard of longest ago is forgotten first."""
+_BLOCK: Final = 2**16
+_AT_ONCE: Final = 256
+"""Most requests of a forward pass."""
+
+
+class Readable(Protocol):
+    """A file that gives what there is, such as an unbuffered pipe."""
+
+    def read(self, size: int, /) -> bytes | None: ...
+
+
+class Writable(Protocol):
+    """A file of bytes."""
+
+    def write(self, data: bytes, /) -> Any: ...
+
+    def flush(self) -> None: ...
+
+
+@dataclass
+class Counts:
+    """What a stream has answered."""
+
+    answers: int = 0
+    errors: int = 0
+
+
+def answer_stream(
+    responder: Responder, source: Readable, sink: Writable, remember: int = REMEMBERED
+) -> Counts:
+    """Answer every line of `source` until it ends, in order; blank lines have no answer.
+
+    What has arrived is answered with one forward pass, and each answer is written at once. A line
+    that is no request is answered with `{"error": …, "line": …}`, and the stream goes on.
+
+    Args:
+        responder: answers the requests.
+        source: lines of JSON, UTF-8; see `ucfrec.recommending.requests.StreamRequest`.
+        sink: lines of JSON.
+        remember: rows that are remembered, of all users together.
+    """
+    counts, remembered = Counts(), _Remembered(remember, responder.limits)
+    for lines in _lines(source, responder.limits.bytes):
+        for answer in _answered(responder, remembered, lines):
+            sink.write(json.dumps(answer).encode() + b"\n")
+            counts.errors += "error" in answer
+            counts.answers += "error" not in answer
+        sink.flush()
+    return counts
+
+
+Line = tuple[int, bytes | None]
+"""Number of a line, from 1, and what it holds; None if it is too long."""
+
+
+def _answered(
+    responder: Responder, remembered: "_Remembered", lines: Sequence[Line]
+) -> Iterator[dict[str, Any]]:
+    """The answers to lines."""
+    waiting: list[tuple[int, StreamRequest | InputError]] = []
+    for number, line in lines:
+        try:
+            request: StreamRequest | InputError = _parsed(line, responder.limits)
+        except InputError as error:
+            request = error
+        users = {each.user_id for _, each in waiting if isinstance(each, StreamRequest)}
+        # Whether rows are remembered is known once they have been answered.
+        again = isinstance(request, StreamRequest) and request.user_id in users
+        if again or len(waiting) == _AT_ONCE:
+            yield from _together(responder, remembered, waiting)
+            waiting = []
+        waiting.append((number, request))
+    yield from _together(responder, remembered, waiting)
+
+
+def _parsed(line: bytes | None, limits: Limits) -> StreamRequest:
+    if line is None:
+        raise InputError(f"the line has more than {limits.bytes:,} bytes; send fewer rows")
+    request: StreamRequest = parsed(StreamRequest, line, limits)
+    return request
+
+
+def _together(
+    responder: Responder,
+    remembered: "_Remembered",
+    waiting: Sequence[tuple[int, StreamRequest | InputError]],
+) -> Iterator[dict[str, Any]]:
+    """The answers to requests of different users, with one forward pass."""
+    whole = {n: remembered.whole(r) for n, r in waiting if isinstance(r, StreamRequest)}
+    answers = dict(zip(whole, responder.answers(list(whole.values())), strict=True))
+    for number, request in waiting:
+        if isinstance(request, InputError):
+            yield {"error": str(request), "line": number}
+            continue
+        answer = answers[number]
+        if isinstance(answer, InputError):
+            yield {"user_id": request.user_id, "error": str(answer), "line": number}
+        else:
+            remembered.keep(request, whole[number].history)
+            yield answer.as_dict(request.user_id)
+
+
+class _Remembered:
+    """The rows of the users who were heard of last."""
+
+    def __init__(self, most: int, limits: Limits) -> None:
+        self._most, self._limits, self._count = most, limits, 0
+        self._rows: OrderedDict[int | str, list[Row]] = OrderedDict()
+
+    def whole(self, request: StreamRequest) -> Request:
+        """The request with all rows of its user as its history."""
+        given = "history" in request.model_fields_set
+        earlier = request.history if given else self._rows.get(request.user_id, [])
+        rows = [*earlier, *request.interactions]
+        if len(rows) > self._limits.history:
+            rows = sorted(rows, key=lambda row: row["timestamp"])[-self._limits.history :]
+        return Request(
+            user_id=request.user_id, k=request.k, candidates=request.candidates
+        ).model_copy(update={"history": rows})
+
+    def keep(self, request: StreamRequest, rows: list[Row]) -> None:
+        """Remember the rows of a user who has `interactions`, or was remembered."""
+        if request.interactions or request.user_id in self._rows:
+            self._count += len(rows) - len(self._rows.get(request.user_id, ()))
+            self._rows[request.user_id] = rows
+            self._rows.move_to_end(request.user_id)
+        while self._count > self._most:
+            self._count -= len(self._rows.popitem(last=False)[1])
+
+
+def _lines(source: Readable, most: int) -> Iterator[list[Line]]:
+    """Lines that arrive together, without blank ones; None for one of over `most` bytes."""
+    number, rest, too_long = 0, bytearray(), False
+    while block := source.read(_BLOCK):
+        first, *others = block.split(b"\n")
+        rest += first
+        lines: list[Line] = []
+        for following in others:
+            number += 1
+            if too_long or len(rest) > most:
+                lines.append((number, None))
+            elif rest.strip():
+                lines.append((number, bytes(rest)))
+            rest, too_long = bytearray(following), False
+        if len(rest) > most:
+            rest, too_long = bytearray(), True
+        if lines:
+            yield lines
+    if too_long or len(rest) > most:
+        yield [(number + 1, None)]
+    elif rest.strip():
+        yield [(number + 1, bytes(rest))]

@@ -1,0 +1,206 @@
+"""The web server's application: recommendations, health, metrics and a page on all of them."""
+
+import asyncio
+import json
+import sys
+import time
+import traceback
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Annotated, Any, Final
+
+from fastapi import FastAPI, Response
+from fastapi import Request as HTTPRequest
+from fastapi_offline import FastAPIOffline
+from prometheus_client import CONTENT_TYPE_LATEST
+from pydantic import Field
+from starlette.exceptions import HTTPException
+
+from ucfrec import __version__
+from ucfrec.errors import InputError
+from ucfrec.recommending.batcher import Batcher, QueueFullError
+from ucfrec.recommending.requests import Request, parsed
+from ucfrec.recommending.responder import Answer, Responder
+from ucfrec.recommending.serving_metrics import ServingMetrics
+from ucfrec.runs.trained_policy import describe_trained
+from ucfrec.settings import settings_table
+
+_JSON: Final = "application/json"
+_ERROR: Final = {
+    "type": "object",
+    "properties": {"error": {"type": "string"}},
+    "required": ["error"],
+}
+_ITEM: Final = {
+    "type": "object",
+    "properties": {
+        "item_id": {"anyOf": [{"type": "integer"}, {"type": "string"}]},
+        "score": {"type": "number", "description": "Log-probability among the items left, nats."},
+    },
+}
+_ANSWER: Final = {
+    "type": "object",
+    "properties": {
+        "user_id": {"anyOf": [{"type": "integer"}, {"type": "string"}]},
+        "items": {"type": "array", "items": _ITEM, "description": "Best first."},
+    },
+}
+_FAULTS: Final = {
+    400: "Not JSON, no such request, or beyond a limit.",
+    408: "The request's body did not arrive in time.",
+    413: "The body is too large.",
+    500: "A defect, or no memory; the server's standard error says more.",
+    503: "Too many requests wait; try again later.",
+    504: "No answer in time.",
+}
+
+
+@settings_table("")
+class ServerLimits:
+    """What the server as a whole takes on."""
+
+    batch: Annotated[int, Field(ge=1, le=4096)] = 64
+    """Requests of a forward pass."""
+    queue: Annotated[int, Field(ge=1, le=1_000_000)] = 1024
+    """Requests that may wait."""
+    timeout: Annotated[float, Field(gt=0, le=3600)] = 5.0
+    """Seconds for a request to arrive and to be answered."""
+
+
+class _RefusalError(Exception):
+    def __init__(self, status: int, message: str) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+def application(responder: Responder, limits: ServerLimits) -> FastAPI:
+    """The application of one model; it keeps no state but the model and its metrics.
+
+    Args:
+        responder: answers the requests.
+        limits: of the server.
+    """
+    metrics = ServingMetrics()
+    batcher = Batcher(responder, metrics, limits.batch, limits.queue)
+    metrics.waiting.set_function(lambda: batcher.waiting)
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        yield
+        await batcher.close()
+        responder.close()
+
+    app = FastAPIOffline(
+        title="ucfrec", version=__version__, lifespan=lifespan, redoc_url=None, docs_url="/docs"
+    )
+
+    @app.exception_handler(HTTPException)
+    async def refused(_: HTTPRequest, error: HTTPException) -> Response:
+        return _response(error.status_code, {"error": str(error.detail)}, error.headers)
+
+    @app.post("/recommendations", openapi_extra=_DESCRIBED, responses=_responses())
+    async def recommendations(http: HTTPRequest) -> Response:
+        """The next items for one user."""
+        began = time.perf_counter()
+        status, body = await _answered(http, responder, batcher, limits)
+        metrics.request(status, time.perf_counter() - began)
+        return _response(status, body, {"Retry-After": "1"} if status == 503 else None)
+
+    described = {
+        "status": "ok",
+        "policy": describe_trained(responder.trained.record),
+        "rule": str(responder.rule),
+        "rule_hash": responder.rule.hash,
+        "version": __version__,
+    }
+
+    @app.get("/health")
+    async def health() -> dict[str, str]:
+        """That the server answers, and with what model."""
+        return described
+
+    @app.get("/metrics", response_class=Response)
+    async def prometheus() -> Response:
+        """Metrics in Prometheus' text format."""
+        return Response(metrics.text(), media_type=CONTENT_TYPE_LATEST)
+
+    return app
+
+
+async def _answered(
+    http: HTTPRequest, responder: Responder, batcher: Batcher, limits: ServerLimits
+) -> tuple[int, dict[str, Any]]:
+    """HTTP status and JSON of the answer."""
+    arrived = False
+    try:
+        async with asyncio.timeout(limits.timeout):
+            body = await _body(http, responder.limits.bytes)
+            arrived = True
+            request: Request = parsed(Request, body, responder.limits)
+            outcome = await batcher.answer(request)
+    except _RefusalError as error:
+        return error.status, {"error": str(error)}
+    except InputError as error:
+        return 400, {"error": str(error)}
+    except QueueFullError:
+        return 503, {"error": "too many requests wait; try again later"}
+    except TimeoutError:
+        status = 504 if arrived else 408
+        return status, {"error": f"not done within {limits.timeout:g} s; try again later"}
+    except Exception:
+        traceback.print_exc(file=sys.stderr)
+        return 500, {"error": "the server has a defect or no memory; its log says more"}
+    if isinstance(outcome, Answer):
+        return 200, outcome.as_dict(request.user_id)
+    return 400, {"error": str(outcome)}
+
+
+async def _body(http: HTTPRequest, most: int) -> bytes:
+    """The body of a request, of which no more than `most` bytes are read."""
+    too_large = _RefusalError(413, f"the body has more than {most:,} bytes; send fewer rows")
+    stated = http.headers.get("content-length", "")
+    if stated.isdecimal() and int(stated[:20]) > most:
+        raise too_large
+    body = bytearray()
+    async for chunk in http.stream():
+        body += chunk
+        if len(body) > most:
+            raise too_large
+    return bytes(body)
+
+
+def _response(status: int, body: Any, headers: Any = None) -> Response:
+    # One-line errors may quote text that is no Unicode; \u escapes can carry it.
+    return Response(json.dumps(body), status, headers, media_type=_JSON)
+
+
+def _inline(schema: dict[str, Any]) -> dict[str, Any]:
+    """A JSON schema without references, which lie elsewhere in OpenAPI."""
+    definitions = schema.pop("$defs", {})
+
+    def inlined(value: Any) -> Any:
+        if isinstance(value, dict):
+            if "$ref" in value:
+                return inlined(definitions[value["$ref"].rpartition("/")[2]])
+            return {name: inlined(each) for name, each in value.items()}
+        return [inlined(each) for each in value] if isinstance(value, list) else value
+
+    result: dict[str, Any] = inlined(schema)
+    return result
+
+
+_DESCRIBED: Final = {
+    "requestBody": {
+        "required": True,
+        "content": {_JSON: {"schema": _inline(Request.model_json_schema())}},
+    }
+}
+
+
+def _responses() -> dict[int | str, dict[str, Any]]:
+    faults: dict[int | str, dict[str, Any]] = {
+        status: {"description": text, "content": {_JSON: {"schema": _ERROR}}}
+        for status, text in _FAULTS.items()
+    }
+    answer: dict[str, Any] = {"description": "The items.", "content": {_JSON: {"schema": _ANSWER}}}
+    return {200: answer, **faults}

@@ -45,11 +45,16 @@ def run(*arguments: str | Path) -> None:
 
 
 def logs(out: Path, until: int | None) -> list[Path]:
-    """The files of KuaiRand, their logs cut before the day `until` of April."""
-    files = log_files([data_folder("kuairand")])
+    """The folder of KuaiRand, or its files with logs that are cut before the day `until` of April.
+
+    The statistics of videos are means over the whole month, the judged days included; like the
+    adapter that is given the folder, this leaves them out.
+    """
+    folder = data_folder("kuairand")
     if until is None:
-        return files
+        return [folder]
     end = pd.Timestamp(_CHINA.format(until)).timestamp() * 1000
+    files = [file for file in log_files([folder]) if "_statistic_" not in file.name]
     given = [file for file in files if not file.name.startswith("log_")]
     for file in set(files) - set(given):
         rows = pd.read_parquet(file)

@@ -107,7 +107,7 @@ def test_the_run_of_a_killed_process_is_removed_by_the_next_fit(
     left = Path(ended.stdout.strip())
     assert (left / "run.json").exists()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    policy = Recommender("bc", settings={**SMALL, "rule.choose": False})
+    policy = Recommender("bc", settings=[*SMALL, "rule.choose=false"])
     policy.fit(EpisodeStore.open(folder / "store"))
     assert not left.exists()
     assert policy.run.is_relative_to(tmp_path)

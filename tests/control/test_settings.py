@@ -17,7 +17,7 @@ from ucfrec_control.data.collect import CollectConfig
 from ucfrec_control.data.sac import SacConfig
 from ucfrec_control.learners.rl_baselines import RLConfig
 
-SOURCE = Path(__file__).parents[2] / "control"
+SOURCE = [Path(__file__).parents[2] / name for name in ("control", "ucfrec")]
 RL = RLConfig("iql", 100, "hopper", "medium")
 
 
@@ -25,7 +25,8 @@ RL = RLConfig("iql", 100, "hopper", "medium")
 def test_every_field_means_something_and_is_read(table: Any) -> None:
     read = {
         node.attr
-        for file in SOURCE.rglob("*.py")
+        for folder in SOURCE
+        for file in folder.rglob("*.py")
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
         if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load)
     }

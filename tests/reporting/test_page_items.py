@@ -83,9 +83,9 @@ def test_no_curve_of_a_loss_that_is_switched_off(folder: Path, tmp_path: Path) -
     assert "Mask loss of the attention (Eq. 5)" not in tables
     assert "Training loss, all terms" not in tables  # it is the action loss
     assert "Training loss of the action (one batch)" in tables
-    config = record_of(folder / "ucf")["config"]
-    config["policy"] = config["policy"] | {"lambda_mask": 0.1}
-    on = rewritten(folder / "ucf", tmp_path / "on", config=config)
+    settings = [*SETTINGS, "policy.lambda_mask=0.1"]
+    on = tmp_path / "on"
+    train_run(EpisodeStore.open(folder / "store"), on, resolve_config("ucf", None, settings))
     assert "Mask loss of the attention (Eq. 5)" in page_of(tmp_path / "on.html", on).tables
 
 

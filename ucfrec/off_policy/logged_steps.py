@@ -270,6 +270,6 @@ def _require_probabilities(
         raise InputError("probabilities of the evaluated policy lie between 0 and 1")
     if not (np.isnan(propensity) | (propensity > 0) & (propensity <= most)).all():
         raise InputError(
-            "propensities must be above 0 and at most 1; correct that column, or say that they "
-            "are densities (LoggedSteps(densities=True))"
+            "propensities must be above 0 and at most 1, the probability of the item shown and not "
+            "a density; correct that column (arrays of vector actions: LoggedSteps(densities=True))"
         )

@@ -5,11 +5,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-import pandas as pd
 import torch
 from torch import Tensor
 
@@ -32,6 +31,9 @@ from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
 from ucfrec.runs.config import config_from_dict
 from ucfrec.runs.record import require_run_record
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 RUN, AUGMENTATION = "run.json", "augmentation.json"
 ITEMS, USERS = "items.parquet", "users.parquet"
@@ -115,12 +117,16 @@ class TrainedPolicy:
         """
         sizes, states = self.record["sizes"], self.item_states
         state = self.record["observation_size"] + (0 if states is None else states.size)
-        found = {RUN: (sizes["state"], state)}
-        if states is not None and self.item_ids is not None:
+        found: dict[str, tuple[Any, Any]] = {}
+        if states is not None:
             table = (sizes["items"], sizes["action"])
-            found[ITEM_STATES] = (table, tuple(states.embeddings.shape))
+            found[ITEM_STATES] = ((table, sizes["state"]), (tuple(states.embeddings.shape), state))
+        else:
+            found[RUN] = (sizes["state"], state)
+        # A store that was not made from logs has no tables of items and users.
+        if self.item_ids is not None and (self.folder / ITEMS).exists():
             found[ITEMS] = (sizes["items"], len(self.item_ids))
-        if states is not None and len(states.user_features):
+        if states is not None and len(states.user_features) and (self.folder / USERS).exists():
             found[USERS] = (len(states.user_features), len(self.user_ids))
         if self.counts is not None:
             shapes = tuple(self.counts.shown.shape), tuple(self.counts.liked.shape)
@@ -143,12 +149,16 @@ class TrainedPolicy:
     @cached_property
     def item_index(self) -> "pd.Index[Any]":
         """Looks up `item_ids`."""
+        import pandas as pd  # takes longer than the rest of this module
+
         index: pd.Index[Any] = pd.Index(self.item_ids)  # type: ignore[arg-type]
         return index
 
     @cached_property
     def user_index(self) -> "pd.Index[Any]":
         """Looks up `user_ids`."""
+        import pandas as pd
+
         index: pd.Index[Any] = pd.Index(self.user_ids)
         return index
 

@@ -212,7 +212,7 @@ def known_items(ids: list[Any]) -> Any:
     """As much of a trained policy of items as finding their numbers takes."""
     sizes = {"items": len(ids), "action": 3}
     record = {"sizes": sizes, "observation_size": 0}
-    return SimpleNamespace(record=record, item_ids=np.array(ids))
+    return SimpleNamespace(record=record, item_ids=np.array(ids), logged_observation_size=0)
 
 
 def test_items_are_found_by_what_the_logs_call_them(tmp_path: Path) -> None:

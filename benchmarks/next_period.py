@@ -87,7 +87,7 @@ def result_row(row: dict[str, Any], store: Path, folder: Path, days: str) -> Res
         interval=tuple(row["hit_rate_liked_interval"]),
         rule=str(DecisionRule.from_dict(row["decision_rule"], "the row")) if own else None,
         details={
-            name: row[f"{name}_{kind}"]
+            f"{name}_{kind}": row[f"{name}_{kind}"]
             for name in MEASURES
             for kind in ("interval", "difference")
             if f"{name}_{kind}" in row

@@ -353,7 +353,7 @@ def test_long_sessions_overflow_nothing() -> None:
     ("change", "says"),
     [
         ({"propensity": np.zeros(10)}, "propensities must be above 0"),
-        ({"propensity": np.full(10, 1.5)}, "say that they are densities"),
+        ({"propensity": np.full(10, 1.5)}, "not a density"),
         ({"target": np.full(10, 1.1)}, "between 0 and 1"),
         ({"target": np.full(10, np.nan)}, "target is not finite at 10 steps"),
         ({"reward": np.full(10, np.inf)}, "reward is not finite"),

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.signals import wait_until_handled
 from ucfrec.processes import Interrupted, interruptions_raised
 
 CHILDREN = """
@@ -38,18 +39,6 @@ def ended(process: int, seconds: float = 20) -> bool:
             return True
         time.sleep(0.05)
     return False
-
-
-def wait_until_handled(process: int, number: signal.Signals, seconds: float = 60) -> None:
-    """Return once a process has its own handler of a signal."""
-    until = time.monotonic() + seconds
-    while time.monotonic() < until:
-        status = Path(f"/proc/{process}/status").read_text()
-        handled = next(line for line in status.splitlines() if line.startswith("SigCgt:"))
-        if int(handled.split()[1], 16) >> (number - 1) & 1:
-            return
-        time.sleep(0.01)
-    raise TimeoutError(f"process {process} does not handle {number.name}")
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])

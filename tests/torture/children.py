@@ -13,6 +13,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.support.signals import wait_until_handled
+
 TIMEOUT = 300.0
 """Seconds after which a command counts as hung."""
 
@@ -159,6 +161,9 @@ def run_fresh(*arguments: object, number: int, moment: float) -> End:
     started = subprocess.Popen(
         command_line, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
     )
+    if number != signal.SIGKILL:
+        # Before that, Python's own handlers answer. TERM has a handler first of all in ucfrec.
+        wait_until_handled(started.pid, signal.SIGTERM)
     time.sleep(moment)
     started.send_signal(number)
     try:

@@ -8,6 +8,7 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.support.signals import wait_until_handled
 from tests.torture.children import Running, command, leftovers, run, run_first, run_fresh
 from tests.torture.made import Inputs, Job, said
 
@@ -68,12 +69,13 @@ class Ends:
             place, out = self._place(f"interrupt-{number}")
             moment = generator.uniform(0, 1.05 * self.seconds)
             if number % _FRESH_INTERRUPTIONS == _FRESH_INTERRUPTIONS - 1:
-                # Before that, Python's own handlers answer.
-                moment += 0.1 + generator.uniform(0, _START)
+                moment += generator.uniform(0, _START)
                 end = run_fresh(*self.job.arguments(out), number=sent, moment=moment)
             else:
                 running = Running(command(*self.job.arguments(out)))
-                time.sleep(0.05 + moment)
+                # A fork has Python's own handlers until the first line of the command.
+                wait_until_handled(running.pid, signal.SIGTERM)
+                time.sleep(moment)
                 running.send(sent)
                 end = running.wait()
             self._count(counts, end.fault([0, 128 + sent]))

@@ -78,7 +78,7 @@ class Ends:
                 time.sleep(moment)
                 running.send(sent)
                 end = running.wait()
-            # An interpreter that finalises has given its handlers back; shells say 128 + n then, too.
+            # An interpreter that finalises has no handlers any more; shells say 128 + n then, too.
             self._count(counts, end.fault([0, 128 + sent, -sent]))
             counts["interrupted"] += end.status in (128 + sent, -sent)
             self._clean(counts, place)

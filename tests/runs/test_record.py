@@ -57,6 +57,8 @@ def test_a_missing_entry_is_named(name: str) -> None:
         ("return_quantiles", {}),
         ("return_quantiles", {"0.5": float("nan")}),
         ("session_gap_ms", "soon"),
+        ("screening", {"how": "drop"}),
+        ("screening", {"dimensions": [{"dimension": 0, "causes": "no"}]}),
         ("mean_return", 10**400),
         ("policy", []),
     ],

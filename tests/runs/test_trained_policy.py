@@ -58,6 +58,14 @@ def test_absurd_sizes_are_one_clear_error(
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
+@pytest.mark.parametrize("dropped", [[3], [0, 0], [2, 1], [10**9]])
+def test_absurd_dropped_columns_are_one_clear_error(changed: Path, dropped: list[int]) -> None:
+    record = read_json(changed / "run.json")
+    write_json(changed / "run.json", record | {"dropped_observations": dropped})
+    with pytest.raises(InputError, match=r"run\.json is damaged: .* as dropped"):
+        TrainedPolicy.load(changed)
+
+
 @pytest.mark.parametrize(
     "settings", [{"dim": 16_384, "max_timestep": 10**7}, {"context": 4096, "dim": 16_384}]
 )

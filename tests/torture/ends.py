@@ -78,9 +78,12 @@ class Ends:
                 time.sleep(moment)
                 running.send(sent)
                 end = running.wait()
-            # An interpreter that finalises has no handlers any more; shells say 128 + n then, too.
             self._count(counts, end.fault([0, 128 + sent, -sent]))
             counts["interrupted"] += end.status in (128 + sent, -sent)
+            if end.status == -sent:
+                # An interpreter that finalises has no handlers any more; all must be done by then.
+                self._count(counts, f"says {end.printed[:80]}" if end.printed else "")
+                self._compare(counts, out)
             self._clean(counts, place)
         return counts
 

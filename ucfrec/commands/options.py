@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from ucfrec.evaluation.world import World
     from ucfrec.logs.mapping import Dataset, LogMapping
     from ucfrec.recommending.requests import Limits
+    from ucfrec.recommending.responder import Responder
     from ucfrec.runs.trained_policy import TrainedPolicy
 
 
@@ -141,6 +142,20 @@ def rule_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def item_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options on items that users have seen and on items that the run does not know."""
+    parser.add_argument(
+        "--keep-seen",
+        action="store_true",
+        help="also recommend items that the user has seen (default: leave them out)",
+    )
+    parser.add_argument(
+        "--skip-unknown",
+        action="store_true",
+        help="ignore rows with items outside the catalogue of the run (default: an error)",
+    )
+
+
 def limit_options(parser: argparse.ArgumentParser) -> None:
     """Add the limits of a request for recommendations."""
     limits = parser.add_argument_group("limits of a request", "beyond one, it gets an error")
@@ -171,6 +186,24 @@ def limits_given(options: argparse.Namespace) -> "Limits":
         k=options.max_k,
         history=options.max_history,
         candidates=options.max_candidates,
+    )
+
+
+def responder_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "Responder":
+    """What answers requests, by `--k`, `item_options`, `limit_options` and `rule_options`.
+
+    Raises:
+        InputError: a value is out of range, or the policy's actions are vectors.
+    """
+    from ucfrec.recommending.responder import Responder
+
+    return Responder(
+        trained,
+        limits_given(options),
+        rule=rule_given(options, trained),
+        k=options.k,
+        filter_seen=not options.keep_seen,
+        skip_unknown=options.skip_unknown,
     )
 
 

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ucfrec.commands.options import (
+    item_options,
     limit_options,
-    limits_given,
     log_options,
     logs_given,
+    responder_given,
     rule_given,
     rule_options,
 )
@@ -26,16 +27,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder of `ucfrec train`")
     logs = log_options(parser)
     parser.add_argument("--k", type=int, default=10, help="items for each user (default: 10)")
-    parser.add_argument(
-        "--keep-seen",
-        action="store_true",
-        help="also recommend items that the user has seen (default: leave them out)",
-    )
-    parser.add_argument(
-        "--skip-unknown",
-        action="store_true",
-        help="ignore rows with items outside the catalogue of the run (default: an error)",
-    )
+    item_options(parser)
     rule_options(parser)
     out = parser.add_argument("--out", type=Path, required=True, help="Parquet file to write")
     parser.add_argument(
@@ -97,22 +89,13 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _answer_stream(options: argparse.Namespace) -> None:
-    from ucfrec.recommending.responder import Responder
     from ucfrec.recommending.stream import answer_stream
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     if options.logs or options.out:
         raise InputError("--stream reads stdin and writes stdout; leave LOGS and --out out")
-    limits = limits_given(options)
     trained = TrainedPolicy.load(options.run, options.checkpoint)
-    responder = Responder(
-        trained,
-        limits,
-        rule=rule_given(options, trained),
-        k=options.k,
-        filter_seen=not options.keep_seen,
-        skip_unknown=options.skip_unknown,
-    )
+    responder = responder_given(options, trained)
     # Unbuffered, so that a request is answered without waiting for the next ones.
     with open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as source:
         counts = answer_stream(responder, source, sys.stdout.buffer)

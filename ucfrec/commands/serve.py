@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from ucfrec.commands.options import limit_options, limits_given, rule_given, rule_options
+from ucfrec.commands.options import item_options, limit_options, responder_given, rule_options
 from ucfrec.errors import InputError
 from ucfrec.processes import Interrupted
 
@@ -22,16 +22,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--k", type=int, default=10, help="items, if a request does not say how many (default: 10)"
     )
-    parser.add_argument(
-        "--keep-seen",
-        action="store_true",
-        help="also recommend items that the user has seen (default: leave them out)",
-    )
-    parser.add_argument(
-        "--skip-unknown",
-        action="store_true",
-        help="ignore rows with items outside the catalogue of the run (default: an error)",
-    )
+    item_options(parser)
     parser.add_argument(
         "--threads", type=int, metavar="N", help="of a forward pass (default: one a core)"
     )
@@ -66,7 +57,6 @@ def run(options: argparse.Namespace) -> None:
         ) from None
     import torch
 
-    from ucfrec.recommending.responder import Responder
     from ucfrec.recommending.server import Server, listening_socket
     from ucfrec.runs.trained_policy import TrainedPolicy, verified
 
@@ -74,20 +64,12 @@ def run(options: argparse.Namespace) -> None:
         if options.threads < 1:
             raise InputError(f"--threads is {options.threads}; give 1 or more")
         torch.set_num_threads(options.threads)
-    limits = limits_given(options)
     of_server = ServerLimits(
         batch=options.max_batch, queue=options.max_queue, timeout=options.timeout
     )
     verified(options.run)
     trained = TrainedPolicy.load(options.run, options.checkpoint)
-    responder = Responder(
-        trained,
-        limits,
-        rule=rule_given(options, trained),
-        k=options.k,
-        filter_seen=not options.keep_seen,
-        skip_unknown=options.skip_unknown,
-    )
+    responder = responder_given(options, trained)
     config = uvicorn.Config(
         application(responder, of_server),
         access_log=False,

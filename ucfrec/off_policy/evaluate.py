@@ -127,16 +127,11 @@ def evaluate_off_policy(
     rows = [
         as_row(name, one) | _of_whom(name, trained, rule) | about for name, one in found.items()
     ]
-    known = steps.known() if diagnosis.left_out < diagnosis.sessions else None
-    return OffPolicyReport(
-        rows,
-        said,
-        verdict,
-        judged.models,
-        returns=np.empty(0) if known is None else known.returns,
-        user=None if known is None else known.user,
-        terms=None if known is None else _terms(known, verdict),
-    )
+    if diagnosis.left_out == diagnosis.sessions:
+        return OffPolicyReport(rows, said, verdict, judged.models, np.empty(0), None, None)
+    known = steps.known()
+    terms = _terms(known, verdict)
+    return OffPolicyReport(rows, said, verdict, judged.models, known.returns, known.user, terms)
 
 
 def _of_whom(estimator: str, trained: TrainedPolicy, rule: DecisionRule) -> dict[str, Any]:

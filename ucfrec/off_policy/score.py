@@ -103,7 +103,7 @@ def logged_sessions(
             "logged action has no probability. Judge it with ucfrec evaluate"
         )
     record = trained.record
-    if not record["observation_size"]:
+    if not trained.logged_observation_size:
         mapping = LogMapping({schema.OBSERVATION: ""}).over(mapping)
     gap_ms = record["session_gap_ms"]
     # Older runs did not record `session_by`, but they did record the gap.
@@ -121,16 +121,21 @@ def logged_sessions(
                 f"{files[0]}: in all {unknown:,} rows the item is not in the store of the run; "
                 "give logs of the same catalogue"
             )
-        if store.observation_size != trained.logged_observation_size:
-            raise InputError(
-                "the policy was trained with observations of "
-                f"{trained.logged_observation_size} numbers; those of the logs have "
-                f"{store.observation_size}"
-            )
-        if store.observation_size and trained.dropped:
-            store = store.without_observation_dimensions(trained.dropped)
+        store = _as_seen(store, trained)
         users = np.asarray(pq.read_table(folder / EPISODE_USERS).column(schema.USER_ID))
         yield LoggedSessions(store, users, report, unknown)
+
+
+def _as_seen(store: EpisodeStore, trained: TrainedPolicy) -> EpisodeStore:
+    """`store` with the columns of the observations that the policy sees."""
+    if store.observation_size != trained.logged_observation_size:
+        raise InputError(
+            f"the policy was trained with observations of {trained.logged_observation_size} "
+            f"numbers; those of the logs have {store.observation_size}"
+        )
+    if not store.observation_size or not trained.dropped:
+        return store
+    return store.without_observation_dimensions(trained.dropped)
 
 
 def scored_steps(

@@ -60,6 +60,16 @@ def _object(value: object) -> bool:
     return isinstance(value, dict)
 
 
+def _screening(value: object) -> bool:
+    dimensions = value.get("dimensions") if isinstance(value, dict) else None
+    return isinstance(dimensions, list) and all(
+        isinstance(each, dict)
+        and _count(each.get("dimension"))
+        and isinstance(each.get("causes"), bool)
+        for each in dimensions
+    )
+
+
 def _config(value: object) -> bool:
     return isinstance(value, dict) and _text(value.get("policy_name")) and "seed" in value
 
@@ -120,6 +130,6 @@ _OPTIONAL: Final[Mapping[str, Callable[[object], bool]]] = {
     "versions": _object,
     "augmentation": _or_none(_object),
     "dropped_observations": _counts,
-    "screening": _object,
+    "screening": _screening,
     "policy": _object,
 }

@@ -9,10 +9,9 @@ from ucfrec.counterfactual.interventions import interventions
 from ucfrec.counterfactual.screening import ScreeningConfig, ScreeningReport, screen
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files import read_json
 from ucfrec.runs.config import Config
 from ucfrec.runs.run import train_run, training_views
-from ucfrec.runs.trained_policy import DROPPED, RUN
+from ucfrec.runs.trained_policy import DROPPED, RUN, read_record
 
 SCREENINGS: Final = ("drop", "copies")
 """Train without the columns, or add copies of the sessions that intervene on them."""
@@ -47,7 +46,7 @@ def train_screened(
         InputError: as `train_run` and `screen_store`; the run was started with another `how`; or no
             column of observed states would be left.
     """
-    started = read_json(out / RUN) if (out / RUN).exists() else None
+    started = read_record(out) if (out / RUN).exists() else None
     before = None if started is None else started.get(SCREENING, {}).get("how")
     if started is not None and before != how:
         raise InputError(

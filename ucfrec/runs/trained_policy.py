@@ -115,7 +115,13 @@ class TrainedPolicy:
         Raises:
             InputError: a file has another size than the run's record states.
         """
-        sizes, states = self.record["sizes"], self.item_states
+        sizes, states, dropped = self.record["sizes"], self.item_states, self.dropped
+        most = self.record["observation_size"] + len(dropped)
+        if list(dropped) != sorted({*dropped}) or (dropped and dropped[-1] >= most):
+            raise InputError(
+                f"{self.folder / RUN} is damaged: of {most} columns of the observations it names "
+                f"{dropped!s:.60} as dropped; {REMEDY}"
+            )
         state = self.record["observation_size"] + (0 if states is None else states.size)
         found: dict[str, tuple[Any, Any]] = {}
         if states is not None:

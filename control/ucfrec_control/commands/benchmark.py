@@ -77,7 +77,11 @@ def print_scores(rows: Sequence[ResultRow], table: str) -> None:
 def _print_rates(rows: Sequence[ResultRow]) -> None:
     for budget in dict.fromkeys(str(row.conditions["budget"]) for row in rows):
         rates = ", ".join(f"{method} {rate:g}" for method, rate in chosen_rates(budget).items())
-        how = f"chosen on validation loss: {rates}" if rates else "those of the presets"
+        how = (
+            f"chosen on validation loss: {rates}"
+            if rates
+            else "not searched: the budget's, over the presets"
+        )
         print(f"\nlearning rates of budget {budget}, {how}")
 
 

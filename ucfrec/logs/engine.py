@@ -11,6 +11,9 @@ from ucfrec.errors import InputError
 from ucfrec.locks import scratch_folder
 from ucfrec.logs.binding import glob_pattern, text
 
+BATCH_ROWS: Final = 2**17
+"""Rows of a batch read from DuckDB."""
+
 _CLOSED: Final = {
     "allow_community_extensions": False,
     "allow_persistent_secrets": False,

@@ -1,6 +1,7 @@
 """Distributions of session lengths, rewards and item popularity, compact enough for `meta.json`."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -14,19 +15,27 @@ Distribution = dict[str, Any]
 """`counts` (N), either `values` (N) or bin `edges` (N + 1; a bin includes its left edge but not its
 right one), and `quantiles` by share, e.g. `{"0.5": 3}`."""
 IntArray = npt.NDArray[np.int64]
-Binned = Callable[[float, float, int], IntArray]
-"""Counts the steps by reward in bins of equal width; see `ucfrec.logs.measures.binned_rewards`."""
+
+
+@dataclass(frozen=True)
+class RewardPasses:
+    """Passes over the steps that only rewards of many values need."""
+
+    sampled: Callable[[], npt.NDArray[Any]]
+    """See `ucfrec.logs.measures.sampled_rewards`."""
+    binned: Callable[[float, float, int], IntArray]
+    """See `ucfrec.logs.measures.binned_rewards`."""
 
 
 def distributions(
-    measures: Measures, popularity: IntArray | None, binned: Binned
+    measures: Measures, popularity: IntArray | None, passes: RewardPasses
 ) -> dict[str, Distribution]:
     """Distributions over the steps, as JSON values.
 
     Args:
         measures: of the log.
         popularity: (items,) number of steps that show each item; None for logs without items.
-        binned: counts rewards in bins, if there are many.
+        passes: over the log's rewards.
 
     Returns:
         `session_lengths`: episodes by length in steps (each piece of a session that a split cuts
@@ -36,7 +45,7 @@ def distributions(
         tables list have 0.
     """
     lengths = np.array(sorted(measures.lengths.items()), dtype=np.int64).T
-    result = {"session_lengths": _counts(*lengths), "rewards": _rewards(measures, binned)}
+    result = {"session_lengths": _counts(*lengths), "rewards": _rewards(measures, passes)}
     if popularity is not None:
         result["item_popularity"] = _counts(*np.unique(popularity, return_counts=True))
     return result
@@ -47,33 +56,37 @@ def _counts(values: IntArray, counts: IntArray) -> Distribution:
     edges = [0, *(2**power for power in range(int(values[-1]).bit_length() + 1))]
     edges = edges[1:] if values[0] > 0 else edges
     binned, _ = np.histogram(values, edges, weights=counts)
-    cumulative = np.cumsum(counts)
-    ranks = np.ceil(np.array(QUANTILES) * cumulative[-1]).clip(min=1)
-    positions = np.searchsorted(cumulative, ranks)
     return {
         "edges": edges,
         "counts": binned.astype(np.int64).tolist(),
-        "quantiles": _by_share(values[positions].tolist()),
+        "quantiles": _quantiles(values, counts),
     }
 
 
-def _rewards(measures: Measures, binned: Binned) -> Distribution:
-    sample = np.sort(np.concatenate(measures.sample))
-    ranks = np.ceil(np.array(QUANTILES) * len(sample)).astype(np.int64).clip(min=1)
-    quantiles = sample[ranks - 1].tolist() if len(sample) else [measures.lowest] * len(QUANTILES)
-    by_share = {"quantiles": _by_share(quantiles)}
+def _rewards(measures: Measures, passes: RewardPasses) -> Distribution:
     counted = measures.values
     if counted.few:
-        return {"values": counted.values.tolist(), "counts": counted.counts.tolist(), **by_share}
-    low, high = quantiles[1], quantiles[-2]
+        return {
+            "values": counted.values.tolist(),
+            "counts": counted.counts.tolist(),
+            "quantiles": _quantiles(counted.values, counted.counts),
+        }
+    sample = passes.sampled()
+    quantiles = _quantiles(sample, np.ones(len(sample), dtype=np.int64))
+    ends = list(quantiles.values())
+    low, high = ends[1], ends[-2]
     if not low < high:
         low, high = measures.lowest, measures.highest
     return {
         "edges": np.linspace(low, high, FEW_VALUES + 1).tolist(),
-        "counts": binned(low, high, FEW_VALUES).tolist(),
-        **by_share,
+        "counts": passes.binned(low, high, FEW_VALUES).tolist(),
+        "quantiles": quantiles,
     }
 
 
-def _by_share(values: list[Any]) -> dict[str, Any]:
-    return {f"{share:g}": value for share, value in zip(QUANTILES, values, strict=True)}
+def _quantiles(values: npt.NDArray[Any], counts: IntArray) -> dict[str, Any]:
+    """Quantiles, each one of the ascending values, of which there are `counts`."""
+    cumulative = np.cumsum(counts)
+    ranks = np.ceil(np.array(QUANTILES) * cumulative[-1]).clip(min=1)
+    found = values[np.searchsorted(cumulative, ranks)].tolist()
+    return {f"{share:g}": value for share, value in zip(QUANTILES, found, strict=True)}

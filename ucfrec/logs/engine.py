@@ -1,5 +1,6 @@
 """DuckDB connections that can open nothing but their inputs and a scratch folder."""
 
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,7 +27,7 @@ _CLOSED: Final = {
 
 @contextmanager
 def engine(
-    inputs: Iterable[Path], folder: Path, memory_limit: str | None = None
+    inputs: Iterable[Path], folder: Path, memory_limit: str | None = None, beside: int = 0
 ) -> Iterator[duckdb.DuckDBPyConnection]:
     """A DuckDB connection with a database on disk.
 
@@ -39,6 +40,7 @@ def engine(
             killed processes in it.
         memory_limit: size such as "2GB", beyond which rows spill to disk; None for DuckDB's
             default.
+        beside: bytes of the limit that the rest of the process needs, at most half of them.
 
     Raises:
         InputError: `memory_limit` is not a size.
@@ -52,6 +54,9 @@ def engine(
             try:
                 if memory_limit is not None:
                     connection.execute("SET memory_limit = ?", [memory_limit])
+                    if (limit := _bytes(memory_limit)) and beside:
+                        own = max(limit - beside, limit // 2)
+                        connection.execute("SET memory_limit = ?", [f"{own} B"])
             except duckdb.Error:
                 raise InputError(
                     f"memory_limit {memory_limit!r} is no size; write e.g. 2GB"
@@ -61,6 +66,15 @@ def engine(
             yield connection
         finally:
             connection.close()
+
+
+def _bytes(size: str) -> int | None:
+    """A size such as "2GB" or "1.5 GiB" in bytes; None if it is written in another way."""
+    found = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([kmgt]?)(i?)b?\s*", size.lower())
+    if found is None:
+        return None
+    base = 1024 if found[3] else 1000
+    return int(float(found[1]) * base ** " kmgt".index(found[2] or " "))
 
 
 @contextmanager

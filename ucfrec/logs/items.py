@@ -172,7 +172,6 @@ class Exposure:
         """Items that are shown: item of each column."""
         self._column = np.cumsum(counts > 0) - 1
         self._rows = SparseRows(path, len(self.trained))
-        self._by_user: list[npt.NDArray[np.float64]] = []
         self._by_item = np.zeros(len(self.trained))
 
     def add(self, users: IntArray, items: IntArray, weights: npt.NDArray[np.float64]) -> None:
@@ -188,16 +187,17 @@ class Exposure:
         rows = np.cumsum(np.append(False, users[1:] != users[:-1]))
         shape = (int(rows[-1]) + 1, len(self.trained))
         block = sparse.coo_matrix((weights, (rows, self._column[items])), shape=shape).tocsr()
-        block.data = np.log1p(block.data).astype(np.float32)
+        block.data = np.log1p(block.data)
         self._by_item += np.asarray(block.sum(axis=0, dtype=np.float64)).ravel()
-        self._by_user.append(np.asarray(block.sum(axis=1, dtype=np.float64)).ravel())
+        by_user = np.sqrt(np.asarray(block.sum(axis=1, dtype=np.float64)).ravel())
+        block.data /= np.repeat(by_user, np.diff(block.indptr))
         self._rows.append(block)
 
     def cooccurrence(self, size: int) -> npt.NDArray[np.float64]:
         """(trained items, ≤ size) unit rows from the SVD of the matrix."""
-        by_user, by_item = np.sqrt(np.concatenate(self._by_user)), np.sqrt(self._by_item)
+        by_item = np.sqrt(self._by_item)
         rank = min(size + 1, *self._rows.shape)
-        strength, directions = right_singular_vectors(self._rows, by_user, by_item, rank)
+        strength, directions = right_singular_vectors(self._rows, by_item, rank)
         # One direction holds only the popularity of items (the trivial axis of correspondence
         # analysis) and has the largest singular value; it would dominate the others.
         popular = by_item / np.linalg.norm(by_item)

@@ -20,7 +20,8 @@ IntArray = npt.NDArray[np.int64]
 FEW_VALUES: Final = 20
 """Rewards with at most this many distinct values are counted by value, others in as many bins."""
 SAMPLE_ROWS: Final = 100_000
-"""Reward quantiles are of a sample of about this many steps; a smaller log is used whole."""
+"""Quantiles of rewards of many values are of a sample of about this many steps; a smaller log is
+used whole."""
 
 
 @dataclass
@@ -86,8 +87,6 @@ class Measures:
     """Length in steps to the number of episodes."""
     values: ValueCounts = field(default_factory=ValueCounts)
     """Rewards by value."""
-    sample: list[Array] = field(default_factory=list)
-    """Rewards of a sample of steps."""
 
 
 def measure(spool: Spool, cut: Cut, log_end: int, items: int, folder: Path) -> Measures:
@@ -106,14 +105,12 @@ def measure(spool: Spool, cut: Cut, log_end: int, items: int, folder: Path) -> M
     measures = Measures(
         Spool(folder), np.zeros(items, dtype=np.int64), np.zeros(items, dtype=np.int64)
     )
-    # Sampled by hash, so that the order of rows in the files does not matter.
-    every = max(1, round(len(spool) / SAMPLE_ROWS))
     user, trained, ended = None, 0, True
     for found in episodes(spool, cut, log_end):
         if not len(found.lengths):
             continue
         _count_episodes(measures, found)
-        _count_steps(measures, found, spool, every)
+        _count_steps(measures, found, spool)
         starts = np.flatnonzero(np.append(True, found.users[1:] != found.users[:-1]))
         users = found.users[starts]
         training = np.where(found.splits == 0, found.lengths, 0)
@@ -159,7 +156,7 @@ def _count_episodes(measures: Measures, found: Episodes) -> None:
         measures.lengths[int(length)] = measures.lengths.get(int(length), 0) + int(count)
 
 
-def _count_steps(measures: Measures, found: Episodes, spool: Spool, every: int) -> None:
+def _count_steps(measures: Measures, found: Episodes, spool: Spool) -> None:
     times = found.column(spool, schema.TIMESTAMP)
     rewards = found.column(spool, schema.REWARD)
     low, high = int(times.min()), int(times.max())
@@ -176,7 +173,6 @@ def _count_steps(measures: Measures, found: Episodes, spool: Spool, every: int) 
     before = np.concatenate([[0.0], np.cumsum(rewards)])
     rest = np.repeat(before[ends], found.lengths) - before[:-1]
     measures.returns.add(rest[training], ahead[training])
-    choice = np.zeros(1, dtype=np.int64)
     if schema.ITEM in spool.names:
         choice = found.column(spool, schema.ITEM)
         items = len(measures.item_steps)
@@ -185,16 +181,26 @@ def _count_steps(measures: Measures, found: Episodes, spool: Spool, every: int) 
     if schema.PROPENSITY in spool.names:
         unknown = np.isnan(found.column(spool, schema.PROPENSITY))
         measures.unknown_propensities += int(np.count_nonzero(unknown))
-    if every > 1:
-        users = np.repeat(found.users, found.lengths)
-        rewards = rewards[_hash(users, times, choice) % np.uint64(every) == 0]
-    measures.sample.append(rewards)
 
 
-def _hash(users: Array, times: Array, choice: Array) -> npt.NDArray[np.uint64]:
-    """A number for each row that depends on its key only: the finaliser of SplitMix64."""
-    mixed = users.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
-    mixed += times.astype(np.uint64) * np.uint64(0xC2B2AE3D27D4EB4F) + choice.astype(np.uint64)
+def sampled_rewards(spool: Spool, cut: Cut, log_end: int, steps: int) -> Array:
+    """Rewards of about `SAMPLE_ROWS` of the `steps` steps, ascending; of all if there are fewer."""
+    every = max(1, round(steps / SAMPLE_ROWS))
+    sample = []
+    for found in episodes(spool, cut, log_end, BLOCK):
+        rewards = found.column(spool, schema.REWARD)
+        if every > 1:
+            # By hash, so that the order of rows in the files does not matter.
+            users = np.repeat(found.users, found.lengths)
+            keys = _hash(users, found.column(spool, schema.TIMESTAMP))
+            rewards = rewards[keys % np.uint64(every) == 0]
+        sample.append(rewards)
+    return np.sort(np.concatenate(sample))
+
+
+def _hash(users: Array, times: Array) -> npt.NDArray[np.uint64]:
+    """A number for each row that depends on its user and time: the finaliser of SplitMix64."""
+    mixed = users.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15) + times.astype(np.uint64)
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)
     return mixed ^ (mixed >> np.uint64(31))

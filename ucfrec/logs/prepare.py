@@ -10,9 +10,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Any
+from typing import Any, Final
 
 from ucfrec import schema
 from ucfrec.checksums import seal
@@ -23,7 +24,7 @@ from ucfrec.files import atomic_folder
 from ucfrec.locks import scratch_folder
 from ucfrec.logs.binding import explained, open_tables
 from ucfrec.logs.clean import DUPLICATES, require_rows
-from ucfrec.logs.distributions import IntArray, distributions
+from ucfrec.logs.distributions import RewardPasses, distributions
 from ucfrec.logs.engine import engine
 from ucfrec.logs.feature_tables import load_features
 from ucfrec.logs.ids import (
@@ -37,7 +38,7 @@ from ucfrec.logs.ids import (
     write_ids,
 )
 from ucfrec.logs.mapping import LogMapping, log_files
-from ucfrec.logs.measures import Measures, binned_rewards, measure
+from ucfrec.logs.measures import Measures, binned_rewards, measure, sampled_rewards
 from ucfrec.logs.order import count_unsorted
 from ucfrec.logs.sessions import SESSIONS, Cut, Episodes, by_sessions, episodes, split_bounds
 from ucfrec.logs.sorted_rows import SortedRows, sort_rows
@@ -46,6 +47,9 @@ from ucfrec.logs.steps import StepNumbers, write_steps
 from ucfrec.logs.summary import build_report, require_variety
 from ucfrec.logs.typed import TypedLog, typed_log
 from ucfrec.progress import progress
+
+BESIDE: Final = 400 * 2**20
+"""Bytes that `prepare` takes beside the engine: Python with its packages, and batches of rows."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,8 @@ class PrepareOptions:
     """Key of `ucfrec.logs.clean.DUPLICATES`: which of several rows with the same user, item or
     action, and time is kept; with "first" and "last" the order of files and rows matters."""
     memory_limit: str = "2GB"
-    """Memory of DuckDB, e.g. "2GB"; beyond it, rows spill to disk."""
+    """Memory of the process, e.g. "2GB", for logs of any size; rows spill to disk. From "800MB" on
+    it holds, below that half of it is the engine's."""
     temp_folder: Path | None = None
     """Folder for spilled rows; None for the parent of the store (the system's for `validate`)."""
 
@@ -235,7 +240,7 @@ def _prepared(
     inputs = (*files, *_other_inputs(mapping, like))
     with (
         scratch_folder(spill, "sorted") as scratch,
-        engine(inputs, spill, options.memory_limit) as connection,
+        engine(inputs, spill, options.memory_limit, BESIDE) as connection,
     ):
         with progress(4, "check the logs", "stages") as stage:
             tables = tuple(open_tables(connection, files))
@@ -273,10 +278,11 @@ def _cut(
 def _report(rows: SortedRows, spool: Spool, cut: Cut, measures: Measures) -> dict[str, Any]:
     shown = None if rows.log.key != schema.ITEM_ID else popularity(rows.log, measures)
 
-    def binned(low: float, high: float, bins: int) -> IntArray:
-        return binned_rewards(spool, cut, rows.last_ms, low, high, bins)
-
-    summary = distributions(measures, shown, binned)
+    given = spool, cut, rows.last_ms
+    passes = RewardPasses(
+        partial(sampled_rewards, *given, measures.steps), partial(binned_rewards, *given)
+    )
+    summary = distributions(measures, shown, passes)
     return build_report(rows, cut, measures, count_unsorted(rows.placed), summary)
 
 

@@ -99,13 +99,13 @@ def sort_rows(log: TypedLog, known_items: Path | None, duplicates: str, folder: 
     for batch in _whole_keys(_columns(batch, log) for batch in reader):
         rows.read += len(batch["fault"])
         placed = batch["fault"] < _UNPLACED
-        rows.placed.append({name: batch[name][placed] for name in ("user", "timestamp", "row")})
+        order = {name: batch[name] for name in ("user", "timestamp", "row")}
+        rows.placed.append(_where(placed, order))
         counts = np.bincount(batch["fault"] % _UNPLACED, minlength=len(reasons) + 1)
         for reason, n in zip(reasons, counts[1:], strict=True):
             rows.dropped[reason] += int(n)
         usable = batch.pop("fault") == 0
-        if not usable.all():
-            batch = {name: values[usable] for name, values in batch.items()}
+        batch = _where(usable, batch)
         kept = _kept(batch, log, duplicates, rows)
         clean = {name: values[kept] for name, values in batch.items() if name in _spooled(log)}
         size = np.abs(clean[schema.REWARD])
@@ -115,6 +115,12 @@ def sort_rows(log: TypedLog, known_items: Path | None, duplicates: str, folder: 
         rows.clean.append(clean)
     require_rewards_in_range(log, large, len(rows.clean), largest)
     return rows
+
+
+def _where(chosen: BoolArray, batch: dict[str, Array]) -> dict[str, Array]:
+    if chosen.all():
+        return batch
+    return {name: values[chosen] for name, values in batch.items()}
 
 
 def has_codes(log: TypedLog, name: str) -> bool:

@@ -14,6 +14,7 @@ from ucfrec.logs.distributions import Distribution
 from ucfrec.logs.measures import Measures
 from ucfrec.logs.sessions import Cut
 from ucfrec.logs.sorted_rows import SortedRows
+from ucfrec.remote import origin
 
 CONFLICT: Final = "duplicates with a different reward from the kept row"
 """Describes `conflicting_duplicates` of the report."""
@@ -52,7 +53,7 @@ def build_report(
     """
     log = rows.log
     report = {
-        "files": [str(file) for table in log.tables for file in table.files],
+        "files": [origin(file) for table in log.tables for file in table.files],
         "rows_read": rows.read,
         "dropped": {**rows.dropped, "short_episode": len(rows.clean) - measures.steps},
         "conflicting_duplicates": rows.conflicts,

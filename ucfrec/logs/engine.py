@@ -4,13 +4,18 @@ import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Any, Final
 
 import duckdb
+import numpy as np
+import numpy.typing as npt
 
 from ucfrec.errors import InputError
 from ucfrec.locks import scratch_folder
 from ucfrec.logs.binding import glob_pattern, text
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 BATCH_ROWS: Final = 2**17
 """Rows of a batch read from DuckDB."""
@@ -87,6 +92,24 @@ def engine_in_memory() -> Iterator[duckdb.DuckDBPyConnection]:
         yield connection
     finally:
         connection.close()
+
+
+def as_numpy(column: "pa.Array") -> npt.NDArray[Any]:
+    """A column of numbers or truth values without missing ones, copied only if it must be.
+
+    `pyarrow.Array.to_numpy` would import pandas, which takes longer than reading a small log.
+    """
+    if str(column.type) == "bool":
+        return np.from_dlpack(column.cast("uint8")).view(np.bool_)
+    return np.from_dlpack(column)
+
+
+def as_arrow(numbers: npt.NDArray[np.int64]) -> "pa.Array":
+    """Whole numbers as a column; `pyarrow.array` would import pandas."""
+    import pyarrow as pa
+
+    buffer = pa.py_buffer(np.ascontiguousarray(numbers, dtype=np.int64))
+    return pa.Array.from_buffers(pa.int64(), len(numbers), [None, buffer])
 
 
 def _set_semantics(connection: duckdb.DuckDBPyConnection) -> None:

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.logs.binding import glob_pattern, text
-from ucfrec.logs.engine import BATCH_ROWS
+from ucfrec.logs.engine import BATCH_ROWS, as_arrow, as_numpy
 from ucfrec.logs.measures import Measures
 from ucfrec.logs.sorted_rows import CODES, has_codes
 from ucfrec.logs.spool import Spool
@@ -84,7 +84,7 @@ _SCHEMA: Final = pa.schema([("code", pa.int64()), ("train_count", pa.int64())])
 
 
 def _batch(codes: IntArray, counts: IntArray) -> pa.RecordBatch:
-    return pa.record_batch([pa.array(codes), pa.array(counts)], schema=_SCHEMA)
+    return pa.record_batch([as_arrow(codes), as_arrow(counts)], schema=_SCHEMA)
 
 
 def _user_batches(users: Spool) -> Iterator[pa.RecordBatch]:
@@ -111,7 +111,7 @@ def numbers(log: TypedLog, name: str, table: str) -> Iterator[IntArray]:
         "ORDER BY code"
     )
     for batch in log.connection.sql(query).to_arrow_reader(BATCH_ROWS):
-        yield batch.column(0).to_numpy()
+        yield as_numpy(batch.column(0))
 
 
 def write_ids(log: TypedLog, folder: Path) -> dict[str, list[Any]]:
@@ -154,7 +154,7 @@ def _placed(codes: Iterator[IntArray]) -> Iterator[pa.RecordBatch]:
     begin = 0
     for batch in codes:
         places = np.arange(begin, begin + len(batch))
-        yield pa.record_batch([pa.array(places), pa.array(batch)], schema=_PLACED)
+        yield pa.record_batch([as_arrow(places), as_arrow(batch)], schema=_PLACED)
         begin += len(batch)
 
 

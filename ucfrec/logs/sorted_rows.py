@@ -16,7 +16,7 @@ import pyarrow as pa
 from ucfrec import schema
 from ucfrec.logs.binding import MAX_FLOAT
 from ucfrec.logs.clean import REASONS, faults, require_rewards_in_range
-from ucfrec.logs.engine import BATCH_ROWS
+from ucfrec.logs.engine import BATCH_ROWS, as_numpy
 from ucfrec.logs.spool import Spool
 from ucfrec.logs.typed import ROWS, TypedLog
 
@@ -182,9 +182,9 @@ def _columns(batch: pa.RecordBatch, log: TypedLog) -> dict[str, Array]:
     for name in batch.schema.names:
         column = batch.column(name)
         if name in log.vector_size:
-            columns[name] = column.flatten().to_numpy().reshape(-1, log.vector_size[name])
+            columns[name] = as_numpy(column.flatten()).reshape(-1, log.vector_size[name])
         else:
-            columns[name] = column.to_numpy(zero_copy_only=False)
+            columns[name] = as_numpy(column)
     return columns
 
 

@@ -160,7 +160,7 @@ class RuleSearch:
         return enough and candidate.support >= self._config.least_support
 
     def best(self, candidates: Sequence[Candidate]) -> Candidate:
-        """Of the allowed candidates within a standard error or the tolerance of the best, the first.
+        """The first of the allowed candidates within an error, or the tolerance, of the best.
 
         If none is allowed, the one with the most effective items.
         """

@@ -15,6 +15,7 @@ from ucfrec.episodes.record import read_store_record
 from ucfrec.errors import InputError
 from ucfrec.logs.moments import Moments
 from ucfrec.logs.spectral import SparseRows, right_singular_vectors
+from ucfrec.processes import require_blas_memory
 
 IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float32]
@@ -197,6 +198,7 @@ class Exposure:
         """(trained items, ≤ size) unit rows from the SVD of the matrix."""
         by_item = np.sqrt(self._by_item)
         rank = min(size + 1, *self._rows.shape)
+        require_blas_memory()
         strength, directions = right_singular_vectors(self._rows, by_item, rank)
         # One direction holds only the popularity of items (the trivial axis of correspondence
         # analysis) and has the largest singular value; it would dominate the others.
@@ -274,6 +276,7 @@ def _axes(known: sparse.csr_matrix, size: int) -> npt.NDArray[Any]:
         return np.eye(known.shape[1])
     from sklearn.utils.extmath import randomized_svd  # takes seconds to import
 
+    require_blas_memory()
     _, _, directions = randomized_svd(known, min(size, known.shape[0]), random_state=0)
     return np.asarray(directions.T)
 

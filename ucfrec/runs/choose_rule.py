@@ -23,6 +23,7 @@ from ucfrec.counterfactual.item_reward_report import scores_of
 from ucfrec.counterfactual.item_reward_rows import RewardRows
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.processes import require_blas_memory
 from ucfrec.progress import progress
 from ucfrec.runs.rule_config import RuleConfig
 
@@ -105,6 +106,7 @@ class RuleSearch:
         assert decider.reward_model is not None
         self._decider, self._config, self._seed = decider, config, seed
         self._store, model = validation, decider.reward_model
+        require_blas_memory()
         states = validation.item_states
         self._likeness = likeness = Likeness.of(states)
         end = SessionEnd(likeness, LoggedEnds.of(train, model.lags, _MOST_STEPS, seed))
@@ -158,7 +160,7 @@ class RuleSearch:
         return enough and candidate.support >= self._config.least_support
 
     def best(self, candidates: Sequence[Candidate]) -> Candidate:
-        """Of the allowed candidates within a standard error of the best, the first.
+        """The first of the allowed candidates within an error, or the tolerance, of the best.
 
         If none is allowed, the one with the most effective items.
         """
@@ -166,7 +168,8 @@ class RuleSearch:
         if not allowed:
             return max(candidates, key=lambda candidate: candidate.items)
         top = max(allowed, key=lambda candidate: candidate.value)
-        return next(c for c in allowed if c.value >= top.value - top.error)
+        enough = top.value - max(top.error, self._config.tolerance * abs(top.value))
+        return next(candidate for candidate in allowed if candidate.value >= enough)
 
 
 def _played(

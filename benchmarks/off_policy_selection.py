@@ -17,13 +17,18 @@ correlation with the truth, the mean regret (value of the best less that of the 
 session), how often the simultaneous band holds the values of all four, and how far the value of the
 first is off before and after the correction for having been chosen.
 
-Measured with 200 replications of 3,000 sessions (catalogue), 1,500 and 600 (far apart):
+Measured with 200 replications of 3,000 sessions (catalogue), 5,000 and 1,500 (SyntheticTaobao) and
+600 (far apart):
 
 synthetic-catalog              best  standing  stands    any rankcorr   regret    band
 SNPDIS                       100.0%  100.0%   96.0%  100.0%    0.961   0.0000   94.0%
 PDIS                         100.0%  100.0%   96.0%  100.0%    0.934   0.0000   94.5%
 SNIPS                        100.0%  100.0%   96.0%  100.0%    0.946   0.0000   93.5%
 synthetic-taobao
+SNPDIS                        98.5%   98.7%   74.5%   99.5%    0.990   0.0039   96.5%
+PDIS                          98.5%   98.7%   74.5%   99.5%    0.987   0.0044   96.5%
+SNIPS                         72.5%   65.8%   74.5%   99.5%    0.834   0.0457   91.5%
+synthetic-taobao, 1,500 sessions
 SNPDIS                        84.0%   77.9%   65.5%   98.5%    0.892   0.0292   93.5%
 PDIS                          80.0%   71.8%   65.5%   98.5%    0.869   0.0366   93.5%
 SNIPS                         54.0%   40.5%   65.5%   98.5%    0.600   0.1031   88.5%

@@ -23,6 +23,7 @@ from ucfrec.fitting.checkpoint import (
 )
 from ucfrec.fitting.metrics_log import MetricsLog
 from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.fitting.row_optimizer import RowAdamW, clip_gradients
 from ucfrec.progress import Progress, progress
 from ucfrec.settings import BatchSize, Count, LearningRate, WeightDecay, settings_table
 
@@ -159,7 +160,7 @@ def _steps(
 
 
 def _optimizer(module: nn.Module, config: LoopConfig) -> torch.optim.Optimizer:
-    return torch.optim.AdamW(
+    return RowAdamW(
         module.parameters(),
         lr=config.learning_rate,
         weight_decay=config.weight_decay,
@@ -177,7 +178,7 @@ def _descend(
     """One optimizer step on the loss `value`; returns the gradient norm before clipping."""
     optimizer.zero_grad(set_to_none=True)
     value.backward()  # type: ignore[no-untyped-call]
-    norm = nn.utils.clip_grad_norm_(module.parameters(), config.clip_norm or math.inf)
+    norm = clip_gradients(module.parameters(), config.clip_norm)
     for group in optimizer.param_groups:
         group["lr"] = _learning_rate(config, step)
     optimizer.step()

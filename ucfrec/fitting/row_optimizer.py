@@ -1,6 +1,5 @@
 """AdamW that updates only those rows of a table that a gradient has, and clipping for it."""
 
-import math
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -63,5 +62,6 @@ def clip_gradients(parameters: Iterable[nn.Parameter], largest: float) -> Tensor
         else:
             gradients.append(parameter.grad)
     norm = nn.utils.get_total_norm(gradients)
-    torch._foreach_mul_(gradients, torch.clamp((largest or math.inf) / (norm + 1e-6), max=1.0))
+    if largest:
+        torch._foreach_mul_(gradients, torch.clamp(largest / (norm + 1e-6), max=1.0))
     return norm

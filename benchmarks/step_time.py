@@ -16,6 +16,7 @@ import torch
 
 from ucfrec.code_version import code_version
 from ucfrec.episodes.windows import Windows
+from ucfrec.fitting.row_optimizer import RowAdamW
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import provenance
@@ -68,7 +69,7 @@ def main() -> None:
     for name in LEARNERS:
         settings = [f"policy.dim={options.dim}", f"policy.context={options.context}"]
         policy = policy_class(name)(resolve_config(name, None, settings).policy, SIZES)
-        learners[name] = policy, torch.optim.AdamW(policy.parameters(), fused=True)
+        learners[name] = policy, RowAdamW(policy.parameters(), fused=True)
     seconds: dict[str, list[float]] = {name: [] for name in learners}
     for turn in range(options.rounds + 2):
         for name, (policy, optimizer) in learners.items():

@@ -38,6 +38,17 @@ def progress(total: float | None, job: str, unit: str, done: float = 0) -> Itera
         display.close()
 
 
+@contextmanager
+def no_progress(total: float | None, job: str, unit: str, done: float = 0) -> Iterator[Progress]:
+    """As `progress`, and display nothing: another process does."""
+    yield _Nothing()
+
+
+class _Nothing:
+    def update(self, n: float = 1, **metrics: float) -> None:
+        pass
+
+
 class _Bar:
     """On a terminal: a tqdm bar."""
 

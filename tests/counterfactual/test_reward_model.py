@@ -133,7 +133,7 @@ def test_the_elbo_is_equation_2() -> None:
     assert torch.equal(crm.abduct(s, a, r), q.mean)
     posterior = Normal(q.mean, (0.5 * q.log_variance).exp())
     z = q.mean + posterior.stddev * noise
-    elbo = crm.elbo(s, a, r, crm.expected_reward(s, a), noise)
+    elbo = crm.elbo(crm.given(s, a), crm.residual(s, a, r), noise)
     likelihood = Normal(crm.predict(s, a, z), QUICK.decoder_std)
     expected = likelihood.log_prob(r)  # type: ignore[no-untyped-call]
     torch.testing.assert_close(elbo.log_likelihood, expected)

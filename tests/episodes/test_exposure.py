@@ -100,14 +100,20 @@ def to_all(made: ExposureTerm, shown: Exposed) -> Tensor:
     return made.added_to(zeros, shown)
 
 
+def to_some(made: ExposureTerm, shown: Exposed, items: Tensor) -> Tensor:
+    """What the term adds to the logits of `items`."""
+    zeros = torch.zeros(len(shown.items), len(items), dtype=made.common.dtype)
+    return made.added_to(zeros, shown, items)
+
+
 @given(kinds, seeds)
 def test_additions_are_those_of_loops_over_items_and_lags(kind: str, seed: int) -> None:
     made, shown = term(kind, seed), exposed(7, seed)
     expected = slowly(made, item_states(kind, seed), shown)
     everything = to_all(made, shown).detach()
     torch.testing.assert_close(everything, expected, rtol=1e-4, atol=1e-4)
-    some = torch.tensor([4, 0, 4, ITEMS - 1])
-    torch.testing.assert_close(made.to_items(shown, some).detach(), everything[:, some])
+    some = torch.tensor([0, 4, ITEMS - 1])
+    torch.testing.assert_close(to_some(made, shown, some).detach(), everything[:, some])
     own = torch.arange(7) % ITEMS
     one_each = made.to_items(shown, own.unsqueeze(1)).detach()
     assert one_each.shape == (7,)
@@ -123,11 +129,15 @@ def test_a_large_catalogue_takes_the_sparse_path_to_the_same_result(
     assert kind == "embeddings" or not made.likeness._tag_matrix().is_sparse
     dense.square().sum().backward()
     gradients = [parameter.grad for parameter in made.parameters()]
+    some = torch.tensor([1, 2, ITEMS - 2])
+    torch.testing.assert_close(to_some(made, shown, some), dense[:, some])
     monkeypatch.setattr(exposure, "_DENSE", ITEMS * TAGS - 1)
+    monkeypatch.setattr(exposure, "_FEW_TAGS", TAGS - 1)
     large = term(kind, 3)
     found = to_all(large, shown)
     assert kind == "embeddings" or large.likeness._tag_matrix().is_sparse
     torch.testing.assert_close(found, dense)
+    torch.testing.assert_close(to_some(large, shown, some), dense[:, some])
     found.square().sum().backward()
     for parameter, gradient in zip(large.parameters(), gradients, strict=True):
         torch.testing.assert_close(parameter.grad, gradient)
@@ -146,9 +156,12 @@ def test_gradients_are_those_of_differences(kind: str) -> None:
             for arguments in ((shown,), (shown, items), (shown, shown.items[:, :1].clamp(min=0)))
         )
 
-    made.forward = lambda shown, items=None: (  # type: ignore[method-assign]
-        to_all(made, shown) if items is None else made.to_items(shown, items)
-    )
+    def forward(shown: Exposed, items: Tensor | None = None) -> Tensor:
+        if items is None:
+            return to_all(made, shown)
+        return to_some(made, shown, items) if items.ndim == 1 else made.to_items(shown, items)
+
+    made.forward = forward  # type: ignore[method-assign]
     leaves = tuple(p.detach().clone().requires_grad_() for p in (made.common, made.by_lag))
     assert torch.autograd.gradcheck(additions, leaves)
 
@@ -164,7 +177,8 @@ def test_without_anything_shown_nothing_is_added(kind: str, seed: int) -> None:
     rewards, returns = torch.full((3, LAGS), HIGH), torch.tensor([-9.0, 0.0, 9.0])
     nothing = Exposed(torch.full((3, LAGS), -1), rewards, returns)
     assert (to_all(made, nothing) == 0).all()
-    assert (made.to_items(nothing, torch.arange(ITEMS)) == 0).all()
+    assert (to_some(made, nothing, torch.arange(ITEMS)) == 0).all()
+    assert (made.to_items(nothing, torch.zeros(3, 1, dtype=torch.int64)) == 0).all()
 
 
 def weights_at(made: ExposureTerm, returns: Tensor, reward: float) -> Tensor:

@@ -1,5 +1,6 @@
 """Exposure, advantage weights and the largest return, in every learner; without them, nothing."""
 
+import time
 from dataclasses import replace
 from typing import Any
 
@@ -12,6 +13,7 @@ from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.episodes.exposure import Exposed
 from ucfrec.episodes.states import ItemStates
 from ucfrec.errors import InputError
+from ucfrec.fitting.row_optimizer import RowAdamW, clip_gradients
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
 from ucfrec.policies.registry import policy_class
@@ -72,6 +74,49 @@ def test_every_learner_trains_and_acts_with_the_additions(name: str, sizes: dict
         term = policy.head.exposure  # type: ignore[union-attr]
         moved = torch.cat([parameter.flatten() for parameter in term.parameters()])
         assert (moved != 0).any(), "the exposure term learns too"
+
+
+@pytest.mark.parametrize("name", [*LEARNERS, "bc"])
+def test_every_learner_learns_from_sampled_items(name: str) -> None:
+    settings = {"sampled_above": ITEMS - 1, "sampled_items": 4, **ADDITIONS, "exposure": True}
+    policy, windows = build(name, TAGGED, **settings), random_windows(TAGGED)
+    everything = build(name, TAGGED, **{**settings, "sampled_above": ITEMS})
+    assert isinstance(policy.head, ItemHead)
+    with torch.no_grad():
+        expected = everything.eval().action_loss(windows)
+        torch.testing.assert_close(policy.eval().action_loss(windows), expected)
+    optimizer = RowAdamW(policy.parameters(), lr=1e-2)
+    policy.train()
+    for step in range(20):
+        torch.manual_seed(step)
+        optimizer.zero_grad()
+        policy.loss(windows)[0].backward()  # type: ignore[no-untyped-call]
+        assert policy.head.correction.grad is not None
+        assert policy.head.correction.grad.is_sparse
+        optimizer.step()
+    with torch.no_grad():
+        assert policy.eval().action_loss(windows) < expected - 0.05
+
+
+def test_a_step_costs_about_the_same_in_every_catalogue() -> None:
+    """A full softmax of 400,000 items would take a hundred times as long as one of 4,000."""
+    seconds, steps = {4_000: 1e9, 400_000: 1e9}, {}
+    windows = random_windows(TAGGED)
+    for n in seconds:
+        torch.manual_seed(0)
+        learner = policy_class("ucf")
+        config = learner.Config(**SMALL, sampled_above=100, sampled_items=256)
+        policy = learner(config, {**TAGGED, "items": n}).train()
+        steps[n] = policy, RowAdamW(policy.parameters(), fused=True)
+    for _ in range(8):
+        for n, (policy, optimizer) in steps.items():
+            start = time.thread_time()
+            optimizer.zero_grad()
+            policy.loss(windows)[0].backward()  # type: ignore[no-untyped-call]
+            clip_gradients(policy.parameters(), 0.25)
+            optimizer.step()
+            seconds[n] = min(seconds[n], time.thread_time() - start)
+    assert seconds[400_000] < 4 * seconds[4_000]
 
 
 @learners

@@ -1,9 +1,10 @@
 """`ucfrec train`: train a policy on an episode store."""
 
 import argparse
+import warnings
 from pathlib import Path
 
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.policies.registry import policy_names
 from ucfrec.remote import Input, uri_or_path
 
@@ -75,15 +76,26 @@ def run(options: argparse.Namespace) -> None:
     """
     import torch
 
+    from ucfrec.fitting.distributed import joined
+
+    if options.threads is not None:
+        torch.set_num_threads(options.threads)
+    with joined():
+        _train(options)
+
+
+def _train(options: argparse.Namespace) -> None:
     from ucfrec.episodes.store import EpisodeStore
+    from ucfrec.fitting.distributed import leads, wait
     from ucfrec.reporting.model_card import write_card
     from ucfrec.runs.config import resolve_config
     from ucfrec.runs.describe import describe_run
     from ucfrec.runs.refit import refit
     from ucfrec.runs.screened import describe_screened, train_screened
 
-    if options.threads is not None:
-        torch.set_num_threads(options.threads)
+    if not leads():
+        warnings.simplefilter("ignore", InputNote)  # the leader prints them
+        wait()  # until the leader has begun the run
     store = EpisodeStore.open(options.store)
     if options.refit is not None:
         if options.config is not None or options.set or options.screen:
@@ -94,6 +106,8 @@ def run(options: argparse.Namespace) -> None:
     else:
         config = resolve_config(options.policy, options.config, options.set, options.seed)
         record = train_screened(store, options.out, config, options.screen)
+    if not leads():
+        return
     card = write_card(options.out)
     print(describe_run(record))
     if options.screen:

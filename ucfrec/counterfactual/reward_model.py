@@ -51,16 +51,20 @@ class CRMConfig:
     """What E[r | s, a] is: `network`, a network of state and action; `effects`, where actions are
     items, additive effects of item, user, what was shown before and the state. Action vectors
     always have the network."""
-    learning_rate: LearningRate = 3e-4
-    """Learning rate."""
+    learning_rate: LearningRate = 4e-3
+    """Highest learning rate of the CVAE, half of which is the regression's: it rises over the first
+    twentieth of the updates, and falls to 0 along a cosine."""
     weight_decay: WeightDecay = 1e-4
     """Weight decay of AdamW."""
     batch_size: BatchSize = 256
     """Transitions per update."""
-    epochs: Annotated[int, Field(ge=1, le=100_000)] = 40
-    """Maximum number of passes over the transitions, for regression and CVAE each."""
+    epochs: Annotated[int, Field(ge=0, le=100_000)] = 0
+    """Maximum number of passes over the transitions, for regression and CVAE each; 0 selects 5, or
+    from few transitions as many as take 800 updates. The regression, which overfits rewards that
+    are mostly chance within a pass, is fitted by a sixth and a third of them first, and by all only
+    if more has helped."""
     patience: Annotated[int, Field(ge=0, le=100_000)] = 5
-    """Epochs without a better validation loss before stopping early; 0 never stops early."""
+    """Passes without a better validation loss before the CVAE stops early; 0 never stops early."""
     max_transitions: Annotated[int, Field(ge=100, le=10**9)] = 200_000
     """Maximum number of transitions to train on; from more, a random sample is drawn."""
 
@@ -150,15 +154,12 @@ class CausalRewardModel(nn.Module):
         decoded = self.expected_reward(states, actions) + self._disturbance(given, z)
         return self.reward_mean + self.reward_std * decoded
 
-    def elbo(
-        self, states: Tensor, actions: Tensor, rewards: Tensor, expected: Tensor, noise: Tensor
-    ) -> ELBO:
+    def elbo(self, given: Tensor, residual: Tensor, noise: Tensor) -> ELBO:
         """Both terms of Eq. 2 at z = μ + σ·noise, noise (..., latent_dim) standard normal.
 
-        `expected` (...) is the `expected_reward` of the states and actions, which stays while
-        encoder and decoder are trained.
+        `given` (..., S + A) and `residual` (...) are those of the methods; they stay while encoder
+        and decoder are trained.
         """
-        given, residual = self.given(states, actions), self._normalised_reward(rewards) - expected
         q = self._encode(given, residual)
         z = q.mean + (0.5 * q.log_variance).exp() * noise
         error = self._disturbance(given, z) - residual
@@ -168,7 +169,7 @@ class CausalRewardModel(nn.Module):
 
     def residual(self, states: Tensor, actions: Tensor, rewards: Tensor) -> Tensor:
         """The residual r − E[r | s, a], in standard deviations of the reward, (...)."""
-        return self._normalised_reward(rewards) - self.expected_reward(states, actions)
+        return self.normalised_rewards(rewards) - self.expected_reward(states, actions)
 
     def _disturbance(self, given: Tensor, z: Tensor) -> Tensor:
         """What z adds to the expected reward, in standard deviations of the reward, (...)."""
@@ -184,7 +185,7 @@ class CausalRewardModel(nn.Module):
         if not self.config.mean_first:
             return states.new_zeros(states.shape[:-1])
         if isinstance(self.expected, EffectsMean):
-            return self._normalised_reward(self.expected(states, actions))
+            return self.normalised_rewards(self.expected(states, actions))
         expected: Tensor = self.expected(self.given(states, actions)).squeeze(-1)
         return expected
 
@@ -207,7 +208,8 @@ class CausalRewardModel(nn.Module):
         difference = edited - states
         return torch.where(difference == 0, 0.0, difference / self.state_std)
 
-    def _normalised_reward(self, rewards: Tensor) -> Tensor:
+    def normalised_rewards(self, rewards: Tensor) -> Tensor:
+        """Rewards (...), standardised."""
         return _normalise(rewards, self.reward_mean, self.reward_std)
 
 

@@ -1,9 +1,11 @@
 """Fitting the causal reward model (Algorithm 2) and measuring its quality on held-out steps."""
 
+import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,8 +25,16 @@ _PREDICTS_NOTHING = 0.02
 """R² on held-out steps at or below which a reward model counts as useless."""
 _QUANTILES = (0.5, 0.9, 0.95, 0.99)
 _CONSTANT = 1e-6
+_EPOCHS, _LEAST_UPDATES = 5, 800
+"""Passes, or from few transitions updates, where the setting leaves the choice."""
+_MOST_VALIDATIONS = 20
+_REGRESSION_RATE = 0.5
+"""Learning rate of the regression, in that of the CVAE."""
+_REGRESSION_SHARES = (6, 3, 1)
+"""The regression is fitted by this part of the updates, one after the other, while that helps."""
 _VALIDATION_LIMIT = 20_000
 _CHUNK = 16_384
+_AT_ONCE = 1024
 
 
 @dataclass(frozen=True)
@@ -100,30 +110,56 @@ def fit_crm(
 def _fit_mean(
     model: CausalRewardModel, train: Transitions, held_out: Transitions, folder: Path, seed: int
 ) -> None:
-    def draw(generator: np.random.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        rows = torch.from_numpy(generator.integers(len(train.rewards), size=batch_size))
-        return train.states[rows], train.actions[rows], train.rewards[rows]
+    given, rewards = (
+        model.given(train.states, train.actions),
+        model.normalised_rewards(train.rewards),
+    )
+    held_out_given = model.given(held_out.states, held_out.actions)
+    held_out_rewards = model.normalised_rewards(held_out.rewards)
 
-    def loss(batch: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Mapping[str, Tensor]]:
-        return model.residual(*batch).square().mean(), {}
+    def draw(generator: np.random.Generator) -> tuple[Tensor, Tensor]:
+        rows = torch.from_numpy(generator.integers(len(rewards), size=model.config.batch_size))
+        return given[rows], rewards[rows]
+
+    def loss(batch: tuple[Tensor, Tensor]) -> tuple[Tensor, Mapping[str, Tensor]]:
+        return (batch[1] - model.expected(batch[0]).squeeze(-1)).square().mean(), {}
 
     def validate() -> float:
-        whole = (held_out.states, held_out.actions, held_out.rewards)
-        return float(model.residual(*whole).square().mean())
+        return _mean_over_chunks(loss, (held_out_given, held_out_rewards))
 
-    batch_size, loop = model.config.batch_size, _loop(model.config, len(train.rewards))
-    fit(
-        model.expected, draw, loss, loop, folder, seed=seed, validate=validate,
-        describe="expected reward",
-    )  # fmt: skip
+    first, whole = copy.deepcopy(model.expected.state_dict()), _loop(model.config, len(rewards))
+    best, kept = math.inf, first
+    for share in _REGRESSION_SHARES:
+        steps = max(1, whole.steps // share)
+        loop = replace(
+            whole,
+            steps=steps,
+            learning_rate=_REGRESSION_RATE * whole.learning_rate,
+            warmup_steps=steps // 20,
+            validate_every=max(1, steps // 3),
+        )
+        model.expected.load_state_dict(first)
+        found = fit(
+            model.expected, draw, loss, loop, folder / str(steps), seed=seed, validate=validate,
+            describe="expected reward",
+        )  # fmt: skip
+        if found.best_validation >= best:
+            break
+        best, kept = found.best_validation, copy.deepcopy(model.expected.state_dict())
+    model.expected.load_state_dict(kept)
 
 
 @torch.no_grad()
-def _expected(model: CausalRewardModel, transitions: Transitions) -> Tensor:
-    """The expected rewards (M,) of the steps, which the CVAE leaves as they are."""
-    chunks = (torch.split(each, _CHUNK) for each in (transitions.states, transitions.actions))
-    parts = zip(*chunks, strict=True)
-    return torch.cat([model.expected_reward(*part) for part in parts])
+def _inputs(model: CausalRewardModel, transitions: Transitions) -> tuple[Tensor, Tensor]:
+    """What the CVAE sees of the steps: normalised inputs (M, S + A) and residuals (M,)."""
+    fields = (transitions.states, transitions.actions, transitions.rewards)
+    chunks = (torch.split(each, _CHUNK) for each in fields)
+    parts = [
+        (model.given(states, actions), model.residual(states, actions, rewards))
+        for states, actions, rewards in zip(*chunks, strict=True)
+    ]
+    given, residuals = zip(*parts, strict=True)
+    return torch.cat(given), torch.cat(residuals)
 
 
 @torch.no_grad()
@@ -140,40 +176,49 @@ def _residual_deviation(model: CausalRewardModel, train: Transitions) -> float:
 def _fit_elbo(
     model: CausalRewardModel, train: Transitions, held_out: Transitions, folder: Path, seed: int
 ) -> None:
-    config, expected = model.config, _expected(model, train)
+    config, (given, residuals) = model.config, _inputs(model, train)
 
-    def draw(generator: np.random.Generator) -> tuple[Tensor, ...]:
-        rows = torch.from_numpy(generator.integers(len(train.rewards), size=config.batch_size))
+    def draw(generator: np.random.Generator) -> tuple[Tensor, Tensor, Tensor]:
+        rows = torch.from_numpy(generator.integers(len(residuals), size=config.batch_size))
         noise = _noise(generator, config.batch_size, config.latent_dim)
-        given = (train.states[rows], train.actions[rows], train.rewards[rows])
-        return (*given, expected[rows], noise)
+        return given[rows], residuals[rows], noise
 
-    def loss(batch: tuple[Tensor, ...]) -> tuple[Tensor, Mapping[str, Tensor]]:
+    def loss(batch: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Mapping[str, Tensor]]:
         log_likelihood, kl = (term.mean() for term in model.elbo(*batch))
         parts = {"log_likelihood": log_likelihood.detach(), "kl": kl.detach()}
         return config.beta * kl - log_likelihood, parts
 
     fixed = _noise(np.random.default_rng(seed), len(held_out.rewards), config.latent_dim)
+    held_out_inputs = _inputs(model, held_out)
 
     def validate() -> float:
-        given = (held_out.states, held_out.actions, held_out.rewards)
-        return float(loss((*given, held_out_expected, fixed))[0])
+        return _mean_over_chunks(loss, (*held_out_inputs, fixed))
 
-    held_out_expected = _expected(model, held_out)
     loop = _loop(config, len(train.rewards))
     fit(model, draw, loss, loop, folder, seed=seed, validate=validate, describe="reward model")
 
 
+def _mean_over_chunks(
+    loss: Callable[[Any], tuple[Tensor, Mapping[str, Tensor]]], rows: tuple[Tensor, ...]
+) -> float:
+    """The loss of M rows, of few at once: what a layer returns then stays in the cache."""
+    chunks = zip(*(torch.split(each, _AT_ONCE) for each in rows), strict=True)
+    total = sum(float(loss(chunk)[0]) * len(chunk[0]) for chunk in chunks)
+    return total / len(rows[0])
+
+
 def _loop(config: CRMConfig, transitions: int) -> LoopConfig:
     epoch = max(1, transitions // config.batch_size)
+    epochs = config.epochs or max(_EPOCHS, math.ceil(_LEAST_UPDATES / epoch))
     return LoopConfig(
-        steps=config.epochs * epoch,
+        steps=epochs * epoch,
         batch_size=config.batch_size,
         learning_rate=config.learning_rate,
         weight_decay=config.weight_decay,
-        warmup_steps=0,
+        warmup_steps=epochs * epoch // 20,
+        cosine=True,
         clip_norm=0.0,
-        validate_every=epoch,
+        validate_every=max(epoch, epochs * epoch // _MOST_VALIDATIONS),
         patience=config.patience,
     )
 

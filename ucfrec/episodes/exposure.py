@@ -14,6 +14,8 @@ GAIN = 10.0
 """Factor on the learned weights: thousands of small updates must be able to rule an item out."""
 _DENSE = 2**24
 """Entries of the largest matrix of items and tags that is kept dense, which is faster."""
+_FEW_TAGS = 256
+"""Tags up to which a dense matrix of the tags of some items is faster than a sparse one."""
 
 
 class Shown(NamedTuple):
@@ -142,29 +144,37 @@ class Likeness(nn.Module):
             return cast("Tensor", torch.sparse.mm(matrix, profile.T)).T
         return profile @ matrix.T
 
-    def added_to(self, values: Tensor, profile: Tensor) -> Tensor:
-        """`values` (M, n_items), which are overwritten, plus the likeness of all items."""
+    def added_to(self, values: Tensor, profile: Tensor, items: Tensor | None = None) -> Tensor:
+        """`values` (M, L), which are overwritten, plus the likeness to profiles (M, F) of `items`.
+
+        Args:
+            values: one column an item.
+            profile: see `profile`.
+            items: (L,) int64; None for all items.
+        """
         if not self.tags.shape[1]:
-            return values.addmm_(profile, self.directions.T)
-        matrix = self._tag_matrix()
+            directions = self.directions if items is None else self.directions[items]
+            return values.addmm_(profile, directions.T)
+        matrix = self._tag_matrix() if items is None else self._tags_of(items)
         if matrix.is_sparse:
-            return values.add_(self.to_all(profile))
+            return values.add_(cast("Tensor", torch.sparse.mm(matrix, profile.T)).T)
         return values.addmm_(profile, matrix.T)
 
     def to_items(self, profile: Tensor, items: Tensor) -> Tensor:
-        """Likeness to profiles (M, F) of items: (M, L) for items (L,), (M,) for items (M, 1)."""
-        if items.ndim == 2:
-            return self._to_each(profile, items[:, 0])
+        """Likeness (M,) to profiles (M, F) of one item each, (M, 1)."""
         if not self.tags.shape[1]:
-            return profile @ self.directions[items].T
-        padded = nn.functional.pad(profile, (0, 1))
-        return torch.stack([padded[:, column] for column in self.tags[items].T]).sum(0)
-
-    def _to_each(self, profile: Tensor, items: Tensor) -> Tensor:
-        if not self.tags.shape[1]:
-            return (profile * self.directions[items]).sum(1)
+            return (profile * self.directions[items[:, 0]]).sum(1)
         # Index −1 reads the column of zeros.
-        return _read(nn.functional.pad(profile, (0, 1)), self.tags[items]).sum(1)
+        return _read(nn.functional.pad(profile, (0, 1)), self.tags[items[:, 0]]).sum(1)
+
+    def _tags_of(self, items: Tensor) -> Tensor:
+        """The rows (L, n_tags) of `_tag_matrix`; sparse if a product with them is then cheaper."""
+        tags, n_tags = self.tags[items], int(self.n_tags)
+        rows, columns = torch.nonzero(tags >= 0, as_tuple=True)
+        places, shape = torch.stack([rows, tags[rows, columns]]), (len(items), n_tags)
+        ones = torch.ones_like(rows, dtype=self.directions.dtype)
+        matrix = torch.sparse_coo_tensor(places, ones, shape, check_invariants=False).coalesce()
+        return matrix if n_tags > _FEW_TAGS else matrix.to_dense()
 
     def _tag_matrix(self) -> Tensor:
         """(n_items, n_tags), 1 where the item has the tag; sparse if it has many entries."""
@@ -238,21 +248,29 @@ class ExposureTerm(nn.Module):
         liked = liked.clamp(0, 1)
         return repeated + repeated_liked * liked, alike + alike_liked * liked
 
-    def added_to(self, logits: Tensor, exposed: Exposed) -> Tensor:
-        """Logits (M, n_items) of all items with the term; the given ones are overwritten."""
+    def added_to(self, logits: Tensor, exposed: Exposed, items: Tensor | None = None) -> Tensor:
+        """Logits (M, L) of `items` with the term; the given ones are overwritten.
+
+        Args:
+            logits: one column an item.
+            exposed: what was shown before the M steps.
+            items: (L,) int64, ascending, each once; None for all items.
+        """
         repeated, alike = self.weights(exposed)
-        logits = self.likeness.added_to(logits, self.likeness.profile(exposed.items, alike))
-        rows, lags = torch.nonzero(exposed.items >= 0, as_tuple=True)
-        return logits.index_put_((rows, exposed.items[rows, lags]), repeated[rows, lags], True)
+        profile = self.likeness.profile(exposed.items, alike)
+        logits = self.likeness.added_to(logits, profile, items)
+        columns = exposed.items if items is None else columns_of(exposed.items, items)
+        rows, lags = torch.nonzero(columns >= 0, as_tuple=True)
+        return logits.index_put_((rows, columns[rows, lags]), repeated[rows, lags], True)
 
     def to_items(self, exposed: Exposed, items: Tensor) -> Tensor:
-        """Additions to the logits of items: (M, L) for items (L,), (M,) for items (M, 1)."""
+        """Additions (M,) to the logits of one item each, (M, 1)."""
         repeated, alike = self.weights(exposed)
         added = self.likeness.to_items(self.likeness.profile(exposed.items, alike), items)
-        for lag in range(self.lags):
-            shown = exposed.items[:, lag]
-            if items.ndim == 2:
-                added = added + repeated[:, lag] * (shown == items[:, 0])
-            else:
-                added = added + repeated[:, lag, None] * (shown[:, None] == items)
-        return added
+        return added + (repeated * (exposed.items == items)).sum(1)
+
+
+def columns_of(items: Tensor, among: Tensor) -> Tensor:
+    """Positions of `items` (...) in `among` (L,), int64, ascending; −1 for items not in it."""
+    columns = torch.searchsorted(among, items).clamp(max=len(among) - 1)
+    return torch.where(among[columns] == items, columns, -1)

@@ -14,6 +14,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from ucfrec.errors import InputError
+from ucfrec.fitting import distributed
 from ucfrec.fitting.checkpoint import (
     load_tensors,
     load_training,
@@ -23,7 +24,8 @@ from ucfrec.fitting.checkpoint import (
 )
 from ucfrec.fitting.metrics_log import MetricsLog
 from ucfrec.fitting.random_state import random_state_kept
-from ucfrec.progress import Progress, progress
+from ucfrec.fitting.row_optimizer import RowAdamW, clip_gradients
+from ucfrec.progress import Progress, no_progress, progress
 from ucfrec.settings import BatchSize, Count, LearningRate, WeightDecay, settings_table
 
 Batch = TypeVar("Batch")
@@ -94,6 +96,7 @@ def fit(
     seed: int,
     validate: Callable[[], float] | None = None,
     describe: str = "train",
+    rows: Callable[[Batch], float] | None = None,
 ) -> Fit:
     """Minimise `loss` over batches from `draw`, resuming from `folder` if it holds a checkpoint.
 
@@ -107,6 +110,9 @@ def fit(
         loss: the scalar to minimise, and scalars to log by name, of a batch.
         validate: the validation loss; called in evaluation mode without gradients.
         describe: name of the training in progress and error messages.
+        rows: number of rows of a batch that the loss is a mean of. With it, the processes of
+            `torchrun` train together: each draws its part of every batch, gradients and logged
+            scalars are means over all rows, and `validate` has to return the same everywhere.
 
     Raises:
         InputError: a loss or gradient is not finite, or a checkpoint is damaged or does not fit.
@@ -118,32 +124,45 @@ def fit(
     if last.exists():
         counters.update(load_training(last, module, optimizer))
     step = int(counters["step"])
-    clock, log = _Clock(step, counters["seconds"]), MetricsLog(folder, step)
+    clock, log = _Clock(step, counters["seconds"]), _log(folder, step)
+    joint = rows if distributed.processes() > 1 else None
     for step, bar in _steps(counters, config, describe):
         generator = step_generator(seed, step)
         with clock.waiting():
             batch = draw(generator)
-        torch.manual_seed(int(generator.integers(2**62)))
+        torch.manual_seed(int(generator.integers(2**62)) + distributed.rank())
         module.train()
         value, scalars = loss(batch)
-        norm = _descend(value, module, optimizer, config, step)
+        count = None if joint is None else joint(batch)
+        norm = _descend(value, module, optimizer, config, step, count)
         if step % config.validate_every and step != config.steps:
             continue
-        logged = {"loss": value.item(), "gradient_norm": norm.item(), **clock.rates(step, config)}
+        means = {"loss": value.item(), **{name: each.item() for name, each in scalars.items()}}
+        if count is not None:
+            means = distributed.joint_means(means, count)
+        logged = {"loss": means["loss"], "gradient_norm": norm.item(), **clock.rates(step, config)}
         _require_finite(logged["loss"], f"{describe}: the loss", step)
         _require_finite(logged["gradient_norm"], f"{describe}: the gradient", step)
-        logged |= {name: scalar.item() for name, scalar in scalars.items()}
-        logged |= _keep_best(module, validate, counters, step, best, describe)
-        log.add(step, logged)
-        bar.update(0, loss=logged["loss"])
+        logged |= means | _keep_best(module, validate, counters, step, best, describe)
         counters |= {"step": step, "seconds": clock.total()}
-        save_training(last, module, optimizer, counters)
+        if log is not None:
+            log.add(step, logged)
+            bar.update(0, loss=logged["loss"])
+            save_training(last, module, optimizer, counters)
         clock.restart(step)
-    log.close()
+    if log is not None:
+        log.close()
+    if joint is not None:
+        distributed.wait()  # until the leader has written the best weights
     load_weights(best, module, load_tensors(best)[0])
     module.eval()
     lowest = math.nan if validate is None else counters["best_validation"]
     return Fit(step, int(counters["best_step"]), lowest, counters["seconds"])
+
+
+def _log(folder: Path, step: int) -> MetricsLog | None:
+    """The log of the training; none for a process that is not the leader."""
+    return MetricsLog(folder, step) if distributed.leads() else None
 
 
 def _steps(
@@ -151,7 +170,8 @@ def _steps(
 ) -> Iterator[tuple[int, Progress]]:
     """Yield the remaining steps, until the last or an early stop, with their progress display."""
     step = int(counters["step"])
-    with progress(config.steps, describe, "steps", step) as bar:
+    display = progress if distributed.leads() else no_progress
+    with display(config.steps, describe, "steps", step) as bar:
         while step < config.steps and not 0 < config.patience <= counters["stale"]:
             step += 1
             yield step, bar
@@ -159,7 +179,7 @@ def _steps(
 
 
 def _optimizer(module: nn.Module, config: LoopConfig) -> torch.optim.Optimizer:
-    return torch.optim.AdamW(
+    return RowAdamW(
         module.parameters(),
         lr=config.learning_rate,
         weight_decay=config.weight_decay,
@@ -173,11 +193,17 @@ def _descend(
     optimizer: torch.optim.Optimizer,
     config: LoopConfig,
     step: int,
+    count: float | None,
 ) -> Tensor:
-    """One optimizer step on the loss `value`; returns the gradient norm before clipping."""
+    """One optimizer step on the loss `value`; returns the gradient norm before clipping.
+
+    With `count`, the number of rows of `value`, on its mean over all processes.
+    """
     optimizer.zero_grad(set_to_none=True)
     value.backward()  # type: ignore[no-untyped-call]
-    norm = nn.utils.clip_grad_norm_(module.parameters(), config.clip_norm or math.inf)
+    if count is not None:
+        distributed.average_gradients(module.parameters(), count)
+    norm = clip_gradients(module.parameters(), config.clip_norm)
     for group in optimizer.param_groups:
         group["lr"] = _learning_rate(config, step)
     optimizer.step()
@@ -245,7 +271,7 @@ def _keep_best(
     """
     if validate is None:
         counters["best_step"] = step
-        save_tensors(best, module.state_dict(), {"step": step})
+        _save_best(best, module, {"step": step})
         return {}
     module.eval()
     with torch.no_grad():
@@ -253,7 +279,12 @@ def _keep_best(
     _require_finite(loss, f"{describe}: the validation loss", step)
     if loss < counters["best_validation"]:
         counters |= {"best_validation": loss, "best_step": step, "stale": 0}
-        save_tensors(best, module.state_dict(), {"step": step, "validation_loss": loss})
+        _save_best(best, module, {"step": step, "validation_loss": loss})
     else:
         counters["stale"] += 1
     return {"validation_loss": loss}
+
+
+def _save_best(best: Path, module: nn.Module, about: dict[str, float]) -> None:
+    if distributed.leads():
+        save_tensors(best, module.state_dict(), about)

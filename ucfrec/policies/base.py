@@ -69,6 +69,16 @@ class PolicyConfig:
     """Share of the training episodes to learn from, those with the highest returns; for `bc`, 0.1
     is the 10% BC of Chen et al. (2021)."""
 
+    sampled_above: Annotated[int, Field(ge=0, le=10**12)] = 10_000
+    """Items above which training takes the softmax over sampled items instead of all, at a cost
+    that does not grow with the catalogue. Validation losses are those of all items."""
+    sampled_items: Annotated[int, Field(ge=1, le=10**7)] = 2048
+    """Items that are sampled for a training batch of a large catalogue."""
+
+    def samples_of(self, n_items: int) -> int:
+        """Items that a training batch samples from `n_items`; 0 for all."""
+        return self.sampled_items if n_items > self.sampled_above else 0
+
     @property
     def exposure_lags(self) -> int:
         """Earlier steps that the exposure term reads; 0 for no such term."""
@@ -114,7 +124,9 @@ class SequencePolicy(nn.Module, ABC):
         self.register_buffer("state_std", torch.ones(sizes["state"]))
         self.register_buffer("return_scale", torch.ones(()))
         self.register_buffer("lowest_return_to_go", torch.tensor(-torch.inf))
-        self.head = head_from(sizes, config.dim, config.exposure_lags)
+        self.head = head_from(
+            sizes, config.dim, config.exposure_lags, config.samples_of(sizes["items"])
+        )
         learns_values = config.advantage_weights or config.max_return
         self.values = ValueHead(sizes["state"], config.dim) if learns_values else None
 

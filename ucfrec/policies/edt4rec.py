@@ -129,8 +129,7 @@ def _entropy(head: nn.Module, features: Tensor, exposed: Exposed | None) -> Tens
     if isinstance(head, GaussianHead):
         return (head.deviations(features) + 0.5 * math.log(2 * math.pi * math.e)).sum(-1).mean()
     assert isinstance(head, ItemHead)
-    log_probabilities = head.predict(features, exposed).log_softmax(-1)
-    return -(log_probabilities.exp() * log_probabilities).sum(-1).mean()
+    return head.entropy(features, exposed)
 
 
 def _consistent(windows: Windows) -> Windows:

@@ -7,14 +7,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from ucfrec.episodes.exposure import Exposed, ExposureTerm, Likeness
+from ucfrec.episodes.exposure import Exposed, ExposureTerm, Likeness, columns_of
+from ucfrec.policies.item_sampling import Candidates, Proposal
 
-SAMPLED_SOFTMAX_ABOVE = 100_000
-"""Number of items above which the loss samples the denominator of the softmax."""
-SAMPLED_NEGATIVES = 4096
-"""Items sampled for it per batch."""
 EXPOSURE_KNOTS = 6
 """Returns-to-go at which an exposure term has weights of its own."""
+_AT_ONCE = 2**24
+"""Largest number of logits that a loss over all items of a large catalogue keeps at once."""
 
 
 class VectorHead(nn.Module):
@@ -55,15 +54,34 @@ class ItemHead(nn.Module):
 
     With an exposure term, what the session was shown lately moves the logits too; a dot product
     cannot say "unlike what was just shown".
+
+    With `samples`, training takes the softmax over items drawn for the batch (`Proposal`) instead
+    of all, subtracting the log of their expected number of draws from their logits (Bengio &
+    Senécal, 2008), and gradients have rows of the items that took part only. In evaluation mode
+    losses are those of all items.
     """
 
     embeddings: Tensor
     counts: Tensor
 
     def __init__(
-        self, dim: int, n_items: int, embedding_size: int, exposure: ExposureTerm | None = None
+        self,
+        dim: int,
+        n_items: int,
+        embedding_size: int,
+        exposure: ExposureTerm | None = None,
+        samples: int = 0,
     ) -> None:
+        """
+        Args:
+            dim: width of the features.
+            n_items: number of items.
+            embedding_size: of an item's fixed embedding.
+            exposure: what moves the logits, too.
+            samples: draws for the softmax of a training batch; 0 for the softmax of all items.
+        """
         super().__init__()
+        self.samples = samples
         self.exposure = exposure
         self.register_buffer("embeddings", torch.zeros(n_items, embedding_size))
         self.register_buffer("counts", torch.ones(n_items))
@@ -71,17 +89,22 @@ class ItemHead(nn.Module):
         self.correction = nn.Parameter(torch.zeros(n_items, dim))
         self.bias = nn.Parameter(torch.zeros(n_items))
         self._kept: tuple[tuple[object, ...], Tensor] | None = None
+        self._proposal: Proposal | None = None
 
     def start_from(self, embeddings: Tensor, counts: Tensor) -> None:
         """Set the embeddings (n_items, D) and, from training counts (n_items,), the bias."""
         self.embeddings.copy_(embeddings)
         self.counts.copy_(counts + 1)
+        self._proposal = None
         with torch.no_grad():
             self.bias.copy_(torch.log(self.counts / self.counts.sum()))
 
     def vectors(self, items: Tensor) -> Tensor:
         """Vectors (..., d) of int64 items (...,)."""
-        return self.project(self.embeddings[items]) + self.correction[items]  # type: ignore[no-any-return]
+        projected: Tensor = self.project(self.embeddings[items])
+        if self.samples:
+            return projected + F.embedding(items, self.correction, sparse=True)
+        return projected + self.correction[items]
 
     def all_vectors(self) -> Tensor:
         """Vectors (n_items, d) of all items.
@@ -106,10 +129,7 @@ class ItemHead(nn.Module):
 
     def embed(self, actions: Tensor) -> Tensor:
         """Embed int64 items (B, K) as (B, K, d)."""
-        if self.training or torch.is_grad_enabled():
-            self._kept = None
-            return self.vectors(actions)
-        return F.embedding(actions, self.all_vectors())
+        return self._vectors_of(actions)
 
     def predict(self, features: Tensor, exposed: Exposed | None = None) -> Tensor:
         """Logits over all items (..., n_items) from features (..., d).
@@ -125,61 +145,109 @@ class ItemHead(nn.Module):
             return self.exposure.added_to(logits, exposed)
         return logits
 
+    def logits_of(self, features: Tensor, items: Tensor, exposed: Exposed | None = None) -> Tensor:
+        """The columns (M, L) of `predict` of `items` (L,), ascending, each once."""
+        return self._logits(features, self._vectors_of(items), self._bias_of(items), items, exposed)
+
     def loss(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:
         """Mean negative log-likelihood (nats) over M steps: features (M, d), actions (M,)."""
-        return self._losses(features, actions, exposed, "mean")
+        if self.samples:
+            return self.losses(features, actions, exposed).mean()
+        return F.cross_entropy(self.predict(features, exposed), actions)
 
     def losses(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:
         """The negative log-likelihood (nats) of each of M steps, (M,), whose mean is `loss`."""
-        return self._losses(features, actions, exposed, "none")
+        if not self.samples:
+            return F.cross_entropy(self.predict(features, exposed), actions, reduction="none")
+        logit = self._logit(features, actions, exposed)
+        if not self.training:
+            return self._log_normaliser(features, exposed) - logit
+        found = self._proposal_now().draw(self.samples)
+        logits = self._weighted(features, found, exposed)
+        # The logged item counts as itself, not as one that was drawn.
+        column = columns_of(actions, found.items)
+        rows = torch.nonzero(column >= 0)[:, 0]
+        logits = logits.index_put_((rows, column[rows]), logits.new_tensor(-torch.inf))
+        return torch.logaddexp(logits.logsumexp(-1), logit) - logit
 
-    def _losses(
-        self, features: Tensor, actions: Tensor, exposed: Exposed | None, reduction: str
-    ) -> Tensor:
-        if len(self.counts) <= SAMPLED_SOFTMAX_ABOVE:
-            return F.cross_entropy(self.predict(features, exposed), actions, reduction=reduction)
-        return self.sampled_loss(features, actions, SAMPLED_NEGATIVES, exposed, reduction)
+    def entropy(self, features: Tensor, exposed: Exposed | None = None) -> Tensor:
+        """Mean entropy (nats) of the distributions at M steps; estimated from samples as losses."""
+        if not (self.samples and self.training):
+            logs = self.predict(features, exposed).log_softmax(-1)
+            of_all: Tensor = -(logs.exp() * logs).sum(-1).mean()
+            return of_all
+        found = self._proposal_now().draw(self.samples)
+        logs = self._weighted(features, found, exposed).log_softmax(-1)
+        estimate: Tensor = -(logs.exp() * (logs - found.log_weights)).sum(-1).mean()
+        return estimate
 
-    def sampled_loss(
+    def _logits(
         self,
         features: Tensor,
-        actions: Tensor,
-        negatives: int,
-        exposed: Exposed | None = None,
-        reduction: str = "mean",
+        vectors: Tensor,
+        bias: Tensor,
+        items: Tensor,
+        exposed: Exposed | None,
     ) -> Tensor:
-        """Negative log-likelihood (nats) with `negatives` sampled items in the denominator.
-
-        Negatives are drawn from the smoothed popularity Q; subtracting their log expected counts
-        from their logits keeps the estimate of the full softmax consistent (Bengio & Senécal,
-        2008). Features are (M, d), actions (M,).
-        """
-        share = self.counts / self.counts.sum()
-        drawn = torch.multinomial(share, negatives, replacement=True)
-        m, scale = len(actions), features.shape[-1] ** 0.5
-        positive = (features * self.vectors(actions)).sum(-1) / scale + self.bias[actions]
-        logits = features @ self.vectors(drawn).T / scale + self.bias[drawn]
+        logits = F.linear(features / features.shape[-1] ** 0.5, vectors, bias)
         if self.exposure is not None and exposed is not None:
-            positive = positive + self.exposure.to_items(exposed, actions.unsqueeze(1))
-            logits = logits + self.exposure.to_items(exposed, drawn)
-        logits = logits - torch.log(negatives * share[drawn])
-        accidental = drawn.unsqueeze(0) == actions.unsqueeze(1)
-        negative = logits.masked_fill(accidental, -torch.inf)
-        positive = positive.unsqueeze(1)
-        target = torch.zeros(m, dtype=torch.int64, device=features.device)
-        return F.cross_entropy(torch.cat([positive, negative], dim=1), target, reduction=reduction)
+            return self.exposure.added_to(logits, exposed, items)
+        return logits
+
+    def _weighted(self, features: Tensor, found: Candidates, exposed: Exposed | None) -> Tensor:
+        """Logits (M, L) of the candidates plus their log weights."""
+        bias = self._bias_of(found.items) + found.log_weights
+        return self._logits(features, self.vectors(found.items), bias, found.items, exposed)
+
+    def _logit(self, features: Tensor, actions: Tensor, exposed: Exposed | None) -> Tensor:
+        """Logits (M,) of the logged items."""
+        product = (features * self._vectors_of(actions)).sum(-1) / features.shape[-1] ** 0.5
+        logit: Tensor = product + self._bias_of(actions)
+        if self.exposure is not None and exposed is not None:
+            return logit + self.exposure.to_items(exposed, actions.unsqueeze(1))
+        return logit
+
+    def _log_normaliser(self, features: Tensor, exposed: Exposed | None) -> Tensor:
+        """Log of the sum (M,) of the exponentiated logits of all items, some items at once."""
+        items = torch.arange(len(self.counts), device=features.device)
+        parts = [
+            self.logits_of(features, part, exposed).logsumexp(-1)
+            for part in torch.split(items, max(1, _AT_ONCE // max(1, len(features))))
+        ]
+        return torch.stack(parts).logsumexp(0)
+
+    def _vectors_of(self, items: Tensor) -> Tensor:
+        """Vectors (..., d) of items (...); in evaluation mode without gradients, those kept."""
+        if self.training or torch.is_grad_enabled():
+            self._kept = None
+            return self.vectors(items)
+        return F.embedding(items, self.all_vectors())
+
+    def _bias_of(self, items: Tensor) -> Tensor:
+        return torch.gather(self.bias, 0, items, sparse_grad=True)
+
+    def _proposal_now(self) -> Proposal:
+        proposal = self._proposal
+        if proposal is None or proposal.share.device != self.counts.device:
+            proposal = self._proposal = Proposal(self.counts)
+        return proposal
+
+    def _load_from_state_dict(self, *arguments: Any, **named: Any) -> None:
+        super()._load_from_state_dict(*arguments, **named)
+        self._proposal = None
 
 
 Head = VectorHead | ItemHead
 
 
-def head_from(sizes: Mapping[str, Any], dim: int, lags: int = 0) -> Head:
+def head_from(sizes: Mapping[str, Any], dim: int, lags: int = 0, samples: int = 0) -> Head:
     """The head for a store's actions: items if `sizes["items"]` is above 0, otherwise vectors.
 
     Args:
         sizes: see `ucfrec.policies.base.SequencePolicy`.
         dim: width of the features.
         lags: earlier steps that an exposure term of items reads; 0 for no such term.
+        samples: see `ItemHead`.
     """
     if not sizes["items"]:
         return VectorHead(dim, sizes["action"])
@@ -187,4 +255,4 @@ def head_from(sizes: Mapping[str, Any], dim: int, lags: int = 0) -> Head:
     if lags:
         likeness = Likeness(sizes["items"], sizes["action"], sizes.get("tags", 0))
         exposure = ExposureTerm(lags, EXPOSURE_KNOTS, likeness)
-    return ItemHead(dim, sizes["items"], sizes["action"], exposure)
+    return ItemHead(dim, sizes["items"], sizes["action"], exposure, samples)

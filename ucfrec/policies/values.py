@@ -5,6 +5,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ucfrec.episodes.windows import Windows
+from ucfrec.fitting.distributed import joint_moments
 
 BEST: float = 0.99
 """τ of the expectile that stands for the best return within the logs (Reinformer)."""
@@ -69,8 +70,9 @@ def advantage_weights(values: Tensor, returns: Tensor) -> Tensor:
         returns: (M,) returns-to-go.
 
     Returns:
-        Weights with mean 1, without gradient.
+        Weights without gradient, with mean 1 over the steps of all processes.
     """
     advantage = (returns - values[:, 0]).detach()
-    weights = (advantage / advantage.std(correction=0).clamp(min=1e-6)).clamp(*_CLIP).exp()
-    return weights / weights.mean()
+    deviation = joint_moments(advantage)[1]
+    weights = (advantage / deviation.clamp(min=1e-6)).clamp(*_CLIP).exp()
+    return weights / joint_moments(weights)[0]

@@ -10,6 +10,7 @@ from ucfrec.counterfactual.item_reward_fit import refit_item_reward_model
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files import read_json
+from ucfrec.fitting import distributed
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import DROPPED, INPUTS, REWARD_MODEL, RULE, RUN, TrainedPolicy
@@ -48,6 +49,8 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> dict[str, Any]:
         store = store.without_observation_dimensions(trained.dropped)
         about[DROPPED] = list(trained.dropped)
     record = train_run(store, out, _settings(trained), about, on_all_rows=True)
+    if not distributed.leads():
+        return record
     reopen(out, RUN, record, INPUTS)
     shutil.copyfile(first / RULE, out / RULE)
     if trained.reward_model is not None:

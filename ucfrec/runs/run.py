@@ -18,12 +18,11 @@ from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model, reward_
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
-from ucfrec.episodes.windows import FloatArray, Overlay, Windows
+from ucfrec.episodes.windows import FloatArray, Overlay
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder, read_json, write_json
+from ucfrec.fitting import distributed
 from ucfrec.fitting.checkpoint import save_tensors
-from ucfrec.fitting.closed_form import fit_once
-from ucfrec.fitting.loop import Fit, fit
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.locks import claimed, remove_leftovers, remove_leftovers_within
 from ucfrec.policies.base import SequencePolicy
@@ -33,6 +32,7 @@ from ucfrec.provenance import command_line, versions
 from ucfrec.runs.choose_by_ranking import RankedChoice, choose_by_ranking
 from ucfrec.runs.choose_rule import Choice, choose_rule
 from ucfrec.runs.config import Config, config_from_dict
+from ucfrec.runs.policy_fit import fit_policy
 from ucfrec.runs.reference_losses import reference_losses
 from ucfrec.runs.samples import SAMPLES, sample_recommendations
 from ucfrec.runs.trained_policy import (
@@ -49,8 +49,6 @@ from ucfrec.runs.trained_policy import (
     store_from,
 )
 
-_VALIDATION_BATCHES = 16
-_VALIDATION_BATCH = 256
 _MOST_RETURNS = 1_000_001
 _QUANTILES = (0.5, 0.75, 0.9, 0.95, 0.99, 1.0)
 
@@ -70,6 +68,9 @@ def train_run(
     the policy; finished stages are not repeated. `out` is created after all inputs have been
     checked, so that a rejected run leaves no folder. The global random state is restored on return.
 
+    Where `torchrun` started several processes, they train the policy together; the leader does
+    the rest, and the others return once the policy is trained.
+
     Args:
         store: prepared episodes.
         out: run folder, new or interrupted.
@@ -88,6 +89,8 @@ def train_run(
             too few training episodes or constant rewards, or the learner does not support its
             actions, or another process is training in `out`.
     """
+    if not distributed.leads():
+        return _train(store, out, config, about, more_copies, on_all_rows)
     with claimed(out, "trained"):
         remove_leftovers(out.parent)
         remove_leftovers_within(out)
@@ -106,19 +109,20 @@ def _train(
     train, validation = logged, held_out = training_views(store)
     if on_all_rows:
         train = logged = store
-    if (out / RUN).exists():
-        _require_same(read_json(out / RUN), store, out, config)
-    elif config.augment.copies > 0:
-        require_rewards_vary(train)
+    if distributed.leads():
+        _require_startable(store, train, out, config)
     policy = new_policy(train, config)
-    if not (out / RUN).exists():
-        _begin(store, train, validation, out, config, about or {})
-    reopen(out, RUN, read_json(out / RUN), INPUTS)
-    record = read_json(out / RUN)
+    if distributed.leads():
+        if not (out / RUN).exists():
+            _begin(store, train, validation, out, config, about or {})
+        reopen(out, RUN, read_json(out / RUN), INPUTS)
+        distributed.wait()  # the others wait at the beginning of the command
+    record: dict[str, Any] = read_json(out / RUN)
     record["config"] = dataclasses.asdict(config)
     start = time.perf_counter() - record["wall_time_s"]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    view = policy.training_view(train, config.policy, out / "view", config.seed)
+    with distributed.leader_first():
+        view = policy.training_view(train, config.policy, out / "view", config.seed)
     returns = ReturnToGo(**record["return_to_go"])
     if not returns.per_session:
         view, validation = (each.with_return_to_go(returns) for each in (view, validation))
@@ -126,11 +130,14 @@ def _train(
         train, policy = view, new_policy(view, config)
     policy = policy.to(device)
     if config.augment.copies > 0:
-        overlay, record["augmentation"] = _counterfactuals(train, validation, out, config)
+        with distributed.leader_first():
+            overlay, record["augmentation"] = _counterfactuals(train, validation, out, config)
         more_copies = overlay if more_copies is None else overlay.joined(more_copies)
     if more_copies is not None:
         train = train.with_overlay(more_copies)
-    fitted = _fit_policy(policy, train, None if on_all_rows else validation, out, config)
+    fitted = fit_policy(policy, train, None if on_all_rows else validation, out, config)
+    if not distributed.leads():
+        return record
     chosen = "rule" in record and record.get("policy") == dataclasses.asdict(fitted)
     record["policy"] = dataclasses.asdict(fitted)
     if logged.has_items and config.rule.choose and not chosen:
@@ -140,34 +147,11 @@ def _train(
     return seal(out, RUN, record)
 
 
-def _fit_policy(
-    policy: SequencePolicy,
-    train: EpisodeStore,
-    validation: EpisodeStore | None,
-    out: Path,
-    config: Config,
-) -> Fit:
-    """Train the policy; without validation, the last weights are kept."""
-    k, device = policy.config.context, policy.state_mean.device
-    validate = None if validation is None else _validation(policy, validation, config.seed)
-    base = train.without_copies()
-    solve = policy.closed_form(base, validation or base, out / "policy", config.seed)
-    if solve is not None:
-        return fit_once(policy, solve, out / "policy", validate, config.policy_name)
-
-    def draw(generator: np.random.Generator) -> Windows:
-        return train.windows(*train.draw_steps(generator, config.train.batch_size), k).to(device)
-
-    return fit(
-        policy,
-        draw,
-        policy.loss,
-        config.train,
-        out / "policy",
-        seed=config.seed,
-        validate=validate,
-        describe=config.policy_name,
-    )
+def _require_startable(store: EpisodeStore, train: EpisodeStore, out: Path, config: Config) -> None:
+    if (out / RUN).exists():
+        _require_same(read_json(out / RUN), store, out, config)
+    elif config.augment.copies > 0:
+        require_rewards_vary(train)
 
 
 def training_views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
@@ -338,21 +322,6 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
         policy.head.scale.copy_(torch.from_numpy(np.abs(actions).max(0)).clamp(min=1.0))
     policy.start_from(base)
     return policy
-
-
-def _validation(policy: SequencePolicy, validation: EpisodeStore, seed: int) -> Any:
-    """A function that returns the mean action loss at a fixed sample of validation steps."""
-    generator = np.random.default_rng([seed, 0])
-    drawn = [
-        validation.draw_steps(generator, _VALIDATION_BATCH) for _ in range(_VALIDATION_BATCHES)
-    ]
-    k, device = policy.config.context, policy.state_mean.device
-    windows = [validation.windows(*steps, k) for steps in drawn]
-
-    def loss() -> float:
-        return float(torch.stack([policy.action_loss(w.to(device)) for w in windows]).mean())
-
-    return loss
 
 
 def _rule(

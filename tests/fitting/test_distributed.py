@@ -1,0 +1,103 @@
+"""Two processes compute what one would with all rows; alone, nothing is exchanged."""
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from tests.support.together import together
+from ucfrec.errors import InputError
+from ucfrec.fitting import distributed
+
+ROWS = torch.tensor([3, 7, 7, 0, 9])
+"""The first two are of the first process, the others of the second."""
+
+
+class Table(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.table, self.line = nn.Parameter(torch.randn(10, 3)), nn.Linear(3, 1)
+        self.unused = nn.Parameter(torch.ones(2))
+
+    def forward(self, rows: Tensor) -> Tensor:
+        vectors = F.embedding(rows, self.table, sparse=True)
+        return self.line(vectors).square().mean()  # type: ignore[no-any-return]
+
+
+def test_gradients_are_those_of_all_rows(tmp_path: Path) -> None:
+    whole = Table()
+    whole(ROWS).backward()
+
+    def work() -> None:
+        model, own = Table(), ROWS[:2] if distributed.leads() else ROWS[2:]
+        model(own).backward()
+        distributed.average_gradients(model.parameters(), len(own))
+        for found, expected in zip(model.parameters(), whole.parameters(), strict=True):
+            if expected.grad is None:
+                assert found.grad is None
+                continue
+            assert found.grad is not None
+            torch.testing.assert_close(found.grad.to_dense(), expected.grad.to_dense())
+
+    together(2, work, tmp_path)
+
+
+def test_means_and_moments_are_those_of_all_rows(tmp_path: Path) -> None:
+    values = torch.randn(7)
+
+    def work() -> None:
+        own = values[:2] if distributed.leads() else values[2:]
+        mean, deviation = distributed.joint_moments(own)
+        torch.testing.assert_close(mean, values.mean())
+        torch.testing.assert_close(deviation, values.std(correction=0))
+        means = distributed.joint_means({"one": float(own.mean())}, len(own))
+        assert means == {"one": pytest.approx(float(values.mean()), rel=1e-5)}
+
+    together(2, work, tmp_path)
+
+
+def test_every_window_of_a_batch_is_of_one_process(tmp_path: Path) -> None:
+    def work() -> None:
+        parts = torch.zeros(11)
+        parts[distributed.share(11)] += 1
+        torch.distributed.all_reduce(parts)
+        assert (parts == 1).all()
+        with pytest.raises(InputError, match=r"train\.batch_size"):
+            distributed.share(2)
+
+    together(3, work, tmp_path)
+
+
+def test_the_leader_goes_first(tmp_path: Path) -> None:
+    def work() -> None:
+        with distributed.leader_first():
+            if distributed.leads():
+                (tmp_path / "written").touch()
+            assert (tmp_path / "written").exists()
+
+    together(2, work, tmp_path)
+
+
+def test_alone_nothing_changes() -> None:
+    values = torch.randn(5)
+    with distributed.joined(), distributed.leader_first():
+        assert (distributed.processes(), distributed.rank(), distributed.leads()) == (1, 0, True)
+        assert distributed.share(9) == slice(0, 9)
+        assert torch.equal(distributed.joint_moments(values)[0], values.mean())
+        assert torch.equal(distributed.joint_moments(values)[1], values.std(correction=0))
+        assert distributed.joint_means({"x": 0.3}, 16) == {"x": 0.3}
+        distributed.wait()
+
+
+def test_a_process_that_ended_is_one_clear_error(tmp_path: Path) -> None:
+    def work() -> None:
+        if not distributed.leads():
+            os._exit(0)
+        distributed.wait()
+
+    with pytest.raises(AssertionError, match="another process of this training has ended"):
+        together(2, work, tmp_path)

@@ -1,0 +1,165 @@
+"""Processes that `torchrun` started, which train one policy together.
+
+The processes divide every batch and average their gradients, so that they take the steps of one
+process with the whole batch. The first, the leader, does everything else: it alone writes files,
+prints, and fits what comes before and after the policy; the others wait for it.
+"""
+
+import os
+import signal
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from datetime import timedelta
+
+import torch
+from torch import Tensor, distributed, nn
+
+from ucfrec.errors import InputError
+
+_LONGEST_WAIT = timedelta(days=30)
+"""How long the others wait for what the leader fits alone."""
+
+
+def processes() -> int:
+    """Number of processes that train together; 1 for an ordinary command."""
+    return distributed.get_world_size() if distributed.is_initialized() else 1
+
+
+def rank() -> int:
+    """Number of this process, 0 for the leader."""
+    return distributed.get_rank() if distributed.is_initialized() else 0
+
+
+def leads() -> bool:
+    """Whether this process is the leader, as that of an ordinary command is."""
+    return rank() == 0
+
+
+@contextmanager
+def joined() -> Iterator[None]:
+    """Join the other processes of `torchrun`, if it started this one among several.
+
+    Communication is by gloo, and by NCCL between GPUs, of which each process takes its own.
+    A process that is not the leader has nothing to save: TERM ends it at once, whatever it does.
+
+    Raises:
+        InputError: another process of the training has ended.
+    """
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        yield
+        return
+    on_gpu = torch.cuda.is_available() and distributed.is_nccl_available()
+    if on_gpu:
+        torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
+    distributed.init_process_group(
+        "cpu:gloo,cuda:nccl" if on_gpu else "gloo", timeout=_LONGEST_WAIT
+    )
+    if not leads():
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    try:
+        yield
+    except RuntimeError as error:
+        # gloo and NCCL say in many words that nobody answers; torch has no type for it.
+        if any(phrase in str(error) for phrase in ("closed by peer", "Connection re", "NCCL")):
+            raise InputError(
+                "another process of this training has ended; see what it printed, then start the "
+                "same command again, which goes on from the last checkpoint"
+            ) from None
+        raise
+    finally:
+        distributed.destroy_process_group()
+
+
+def wait() -> None:
+    """Wait until every process has come here."""
+    if processes() > 1:
+        distributed.all_reduce(torch.zeros(1))
+
+
+@contextmanager
+def leader_first() -> Iterator[None]:
+    """The leader runs the block; once it has left it, the others do, and find what it wrote."""
+    if not leads():
+        wait()
+    yield
+    if leads():
+        wait()
+
+
+def share(whole: int) -> slice:
+    """The part of `whole` windows of a batch, or of anything divided, that is this process's.
+
+    Raises:
+        InputError: there are fewer of them than processes.
+    """
+    if whole < processes():
+        raise InputError(
+            f"a batch of {whole} cannot be divided among {processes()} processes; set "
+            "train.batch_size, which counts the windows of all processes, or start fewer"
+        )
+    return slice(rank() * whole // processes(), (rank() + 1) * whole // processes())
+
+
+def joint_means(means: Mapping[str, float], count: float) -> dict[str, float]:
+    """Means over the rows of all processes, from those over the `count` rows of this one."""
+    values = torch.tensor([*(mean * count for mean in means.values()), count], dtype=torch.float64)
+    if processes() > 1:
+        distributed.all_reduce(values)
+    return dict(zip(means, (values[:-1] / values[-1]).tolist(), strict=True))
+
+
+def joint_moments(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of values (M,), of those of all processes together."""
+    if processes() == 1:
+        return values.mean(), values.std(correction=0)
+    parts = torch.stack([values.new_tensor(len(values)), values.sum(), values.square().sum()])
+    distributed.all_reduce(parts)
+    mean = parts[1] / parts[0]
+    return mean, (parts[2] / parts[0] - mean.square()).clamp(min=0).sqrt()
+
+
+def average_gradients(parameters: Iterable[nn.Parameter], count: float) -> None:
+    """Replace gradients by their means over all processes, weighted by `count`, in place.
+
+    Args:
+        parameters: the same in all processes, with gradients of the same layout.
+        count: rows of this process that its loss is a mean of.
+    """
+    of_some = [parameter for parameter in parameters if parameter.grad is not None]
+    tables = [parameter for parameter in of_some if parameter.grad.is_sparse]  # type: ignore[union-attr]
+    dense = [p.grad for p in of_some if p.grad is not None and not p.grad.is_sparse]
+    device = of_some[0].device
+    total = torch.tensor(float(count), device=device)
+    # One message takes less time than one for every gradient.
+    message = torch.cat([total.view(1), *((grad * total).flatten() for grad in dense)])
+    distributed.all_reduce(message)
+    whole = message[0]
+    parts = torch.split(message[1:], [grad.numel() for grad in dense])
+    for grad, part in zip(dense, parts, strict=True):
+        grad.copy_(part.view_as(grad) / whole)
+    for table in tables:
+        assert table.grad is not None
+        table.grad = _joint_rows(table.grad.coalesce(), total / whole)
+
+
+def _joint_rows(gradient: Tensor, weight: Tensor) -> Tensor:
+    """The sum over processes of sparse gradients times their weights."""
+    rows, values = gradient.indices()[0], gradient.values() * weight
+    sizes = [torch.zeros(1, dtype=torch.int64, device=rows.device) for _ in range(processes())]
+    distributed.all_gather(sizes, torch.tensor([len(rows)], device=rows.device))
+    counts = [int(size) for size in sizes]
+    # Messages have to be of one size, that of the largest.
+    all_rows, all_values = (
+        torch.cat([part[:n] for part, n in zip(_gathered(each, max(counts)), counts, strict=True)])
+        for each in (rows, values)
+    )
+    shape = gradient.shape
+    return torch.sparse_coo_tensor(all_rows.unsqueeze(0), all_values, shape, check_invariants=False)
+
+
+def _gathered(part: Tensor, length: int) -> list[Tensor]:
+    padded = part.new_zeros(length, *part.shape[1:])
+    padded[: len(part)] = part
+    parts = [torch.empty_like(padded) for _ in range(processes())]
+    distributed.all_gather(parts, padded)
+    return parts

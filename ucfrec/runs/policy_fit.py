@@ -1,0 +1,88 @@
+"""Fit the policy of a run, alone or together with the other processes of `torchrun`."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Windows
+from ucfrec.fitting import distributed
+from ucfrec.fitting.closed_form import fit_once
+from ucfrec.fitting.loop import Fit, fit
+from ucfrec.policies.base import SequencePolicy
+from ucfrec.runs.config import Config
+
+_VALIDATION_BATCHES = 16
+_VALIDATION_BATCH = 256
+
+
+def fit_policy(
+    policy: SequencePolicy,
+    train: EpisodeStore,
+    validation: EpisodeStore | None,
+    out: Path,
+    config: Config,
+) -> Fit:
+    """Train the policy, or resume its training.
+
+    Args:
+        policy: trained in place.
+        train: episodes to learn from, with their edited copies.
+        validation: held-out episodes; None to keep the last weights.
+        out: folder of the run.
+        config: configuration of the run.
+
+    Raises:
+        InputError: see `ucfrec.fitting.loop.fit`; or the batch has fewer windows than processes.
+    """
+    k, device = policy.config.context, policy.state_mean.device
+    base = train.without_copies()
+    solve = policy.closed_form(base, validation or base, out / "policy", config.seed)
+    alone = solve is not None
+    validate = None if validation is None else _validation(policy, validation, config.seed, alone)
+    if solve is not None:
+        with distributed.leader_first():
+            return fit_once(policy, solve, out / "policy", validate, config.policy_name)
+    own = distributed.share(config.train.batch_size)
+
+    def draw(generator: np.random.Generator) -> Windows:
+        episodes, steps = train.draw_steps(generator, config.train.batch_size)
+        return train.windows(episodes[own], steps[own], k).to(device)
+
+    return fit(
+        policy,
+        draw,
+        policy.loss,
+        config.train,
+        out / "policy",
+        seed=config.seed,
+        validate=validate,
+        describe=config.policy_name,
+        rows=lambda windows: float(windows.mask.sum()),
+    )
+
+
+def _validation(
+    policy: SequencePolicy, validation: EpisodeStore, seed: int, alone: bool
+) -> Callable[[], float]:
+    """A function that returns the mean action loss at a fixed sample of validation steps.
+
+    Unless `alone`, the processes of `torchrun` divide the sample.
+    """
+    generator = np.random.default_rng([seed, 0])
+    drawn = [
+        validation.draw_steps(generator, _VALIDATION_BATCH) for _ in range(_VALIDATION_BATCHES)
+    ]
+    k, device = policy.config.context, policy.state_mean.device
+    if not alone:
+        drawn = drawn[distributed.rank() :: distributed.processes()]
+    windows = [validation.windows(*steps, k) for steps in drawn]
+
+    def loss() -> float:
+        losses = [policy.action_loss(each.to(device)) for each in windows]
+        mean = float(torch.stack(losses).mean()) if losses else 0.0
+        return mean if alone else distributed.joint_means({"loss": mean}, len(losses))["loss"]
+
+    return loss

@@ -79,7 +79,7 @@ def begin(tmp_path: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = write_hdf5(tmp_path / f"{FILE}.hdf5", columns)
     # Begun here, where screening may be made quick, and gone on with by the command.
     quickest = ScreeningConfig(hidden=32, shared_steps=200, own_steps=100)
-    monkeypatch.setattr("ucfrec_control.learners.train.ScreeningConfig", lambda: quickest)
+    monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: quickest)
     clean = read_d4rl(file).write_store(stores_of(out) / FILE)
     distracted = add_distractor(clean, stores_of(out) / f"{FILE}-deterministic")
     tables = preset_of(dataset_of(clean), "ucf").tables

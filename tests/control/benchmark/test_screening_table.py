@@ -30,7 +30,7 @@ from ucfrec_control.figures.diagnostics import store_of
 from ucfrec_control.learners.train import train_control
 
 QUICKEST = ScreeningConfig(
-    hidden=8, shared_steps=100, own_steps=50, measurement=MeasurementConfig(hidden=8, steps=50)
+    hidden=8, shared_steps=100, own_steps=50, measurement=MeasurementConfig(trees=5)
 )
 
 

@@ -16,8 +16,9 @@ from ucfrec.reporting.statistics import grouped, summary
 from ucfrec_control.benchmark.budgets import BUDGETS as SCORE_BUDGETS
 from ucfrec_control.benchmark.budgets import MEDIUM, Budget
 from ucfrec_control.benchmark.cells import ROBUSTNESS, ROBUSTNESS_MEASUREMENT, Cell, code_of
+from ucfrec_control.benchmark.estimate import announcement
+from ucfrec_control.benchmark.folders import run_name, stores_of
 from ucfrec_control.benchmark.methods import METHODS as LEARNERS
-from ucfrec_control.benchmark.plan import run_name, stores_of
 from ucfrec_control.benchmark.rates import settings_of
 from ucfrec_control.data.distractor import CLEAN, DISTRACTORS, zoo_store
 
@@ -69,15 +70,21 @@ def robustness(
             failed.
     """
     cells = list(robustness_cells(data, folder, budget, name, chosen(METHODS, methods, "method")))
-    return run_grid(cells, ROBUSTNESS_MEASUREMENT, results, workers, "robustness")
+    said = announcement(workers)
+    return run_grid(cells, ROBUSTNESS_MEASUREMENT, results, workers, "robustness", said)
 
 
 def robustness_cells(
-    data: Path, folder: Path, budget: Budget, name: str, methods: Sequence[str]
+    data: Path,
+    folder: Path,
+    budget: Budget,
+    name: str,
+    methods: Sequence[str],
+    distractors: Sequence[str] = (),
 ) -> Iterator[Cell]:
-    """The cells of some methods; arguments as of `robustness`."""
+    """The cells of some methods and distractors (empty for all); arguments as of `robustness`."""
     for file in budget.files:
-        for distractor in DISTRACTORS:
+        for distractor in distractors or DISTRACTORS:
             store = zoo_store(data, stores_of(folder), file, distractor)
             runs = folder / f"robustness-{name}" / file / distractor
             for method in methods:

@@ -27,6 +27,7 @@ from ucfrec_control.commands.options import (
     control_grid_options,
     data_given,
     data_option,
+    rates_option,
 )
 
 
@@ -34,6 +35,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `robustness`."""
     data_option(parser)
     budget_options(parser)
+    rates_option(parser)
     control_grid_options(parser)
 
 

@@ -14,6 +14,7 @@ from ucfrec_control.benchmark.plan import cells_of
 from ucfrec_control.benchmark.reproduce import PARTS, budget_of
 from ucfrec_control.benchmark.robustness import METHODS
 from ucfrec_control.cli import main
+from ucfrec_control.data.distractor import DISTRACTORS
 
 TINY = ("train.steps=4", "train.validate_every=2", "policy.dim=16", "policy.context=3")
 
@@ -26,6 +27,7 @@ def test_a_part_has_rows_and_files_of_its_tables(name: str) -> None:
         own = budget_of(part, budget)
         assert own.files == (part.files or budget.files)
     assert part.draws == name.startswith("figure")
+    assert set(part.distractors) <= set(DISTRACTORS)
 
 
 def test_the_estimate_grows_with_steps_and_shrinks_with_workers(tmp_path: Path) -> None:
@@ -51,7 +53,8 @@ def test_one_command_makes_a_figure_and_says_beforehand_how_long(
     monkeypatch.setattr("ucfrec_control.commands.benchmark.BUDGETS", budgets)
     arguments = ["reproduce", "figure-5", "--data", str(tmp_path), "--out", str(tmp_path / "out")]
     assert main(arguments) == 0
-    printed = capsys.readouterr().out
-    assert printed.startswith("figure-5: 1 trainings of budget small, about ")
+    said = capsys.readouterr().err
+    assert "reproduce figure-5: 1 cells, 1 of them left to measure" in said
+    assert "reproduce figure-5: about 0.0 hours here with --workers 1" in said
     assert {row.method for row in read_rows(tmp_path / "out" / "results.jsonl")} == {"ucf"}
     assert list((tmp_path / "out" / "figure-5").glob("moves-*.png"))

@@ -16,7 +16,7 @@ from ucfrec.reporting.tables import NONE
 from ucfrec.runs.config import resolve_config
 from ucfrec_control.benchmark import robustness
 from ucfrec_control.benchmark.budgets import Budget
-from ucfrec_control.benchmark.plan import run_name, stores_of
+from ucfrec_control.benchmark.folders import run_name, stores_of
 from ucfrec_control.benchmark.robustness import drops, largest_drops, loss_rises
 from ucfrec_control.benchmark.screening_table import screening_rows
 from ucfrec_control.cli import main

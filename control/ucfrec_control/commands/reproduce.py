@@ -37,6 +37,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec-control reproduce`."""
+    # matplotlib takes half a second to import
+    from ucfrec_control.figures.figures import make_figures, make_row_figures
+
     part, results = PARTS[options.part], results_given(options)
     robust = part.table == ROBUSTNESS
     known = ROBUSTNESS_BUDGETS if robust else budgets_of(part.table)
@@ -50,10 +53,11 @@ def run(options: argparse.Namespace) -> None:
         print_robustness(rows)
     else:
         print_scores(rows, part.table, budget.rates)
-    if part.draws:
-        from ucfrec_control.figures.figures import make_figures
-
+    pictures = options.out / options.part
+    if part.of_runs:
         runs = list(dict.fromkeys(cell.run.parent for cell in cells))
-        made, _ = make_figures(runs, [results], options.out / options.part)
-        print("\n".join(map(str, made)))
+        made, _ = make_figures(runs, [], pictures)
+    else:
+        made = make_row_figures(rows, pictures)
+    print("\n".join(["", *map(str, made)]))
     print(f"\nrows: {results}")

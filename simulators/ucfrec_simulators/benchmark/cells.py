@@ -127,7 +127,9 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
             metrics = evaluate_policy(world, trained, cell.method, episodes, seed, rule)
             fields = {"checkpoint": checkpoint, "rule": f"{rule} ({rule.hash})"}
             row = _row(metrics | training_metrics, row_key, world, **fields)
-            rows.append(replace(row, details={**row.details, **details}))
+            # Other methods are given a rule, but do not look at its target.
+            target = row.target_return if cell.conditioned else None
+            rows.append(replace(row, details={**row.details, **details}, target_return=target))
     return rows
 
 

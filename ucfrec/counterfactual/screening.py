@@ -12,6 +12,9 @@ Where the reward can hardly be predicted, as clicks, no help is no evidence, and
 the reward helps most. There a dimension counts as without effect only if it is such a measurement
 (`ucfrec.counterfactual.measured_reward`) and does not help to predict the next state. In logs of
 items the logged observation is screened, and by that test alone.
+
+Features of items and users are not screened: a policy reads them from its run's own tables, so
+that they have the same values in the logs and wherever it acts.
 """
 
 from collections.abc import Sequence

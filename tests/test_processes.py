@@ -111,3 +111,22 @@ def test_a_command_interrupted_while_it_starts_prints_one_line(
         assert printed.endswith("interrupted\n") or "prepare: interrupted" in printed
         assert len(printed.splitlines()) == 1, printed
     assert {path.name for path in tmp_path.iterdir()} <= {"log.csv", "out"}
+
+
+def test_without_memory_linear_algebra_is_refused() -> None:
+    script = """
+import resource
+from pathlib import Path
+from ucfrec.processes import require_blas_memory
+require_blas_memory()
+now = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (now + 20 * 2**20,) * 2)
+try:
+    require_blas_memory()
+except MemoryError as error:
+    print(error)
+"""
+    if not Path("/proc/self/statm").exists():
+        pytest.skip("the address space is measured in /proc")
+    end = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert end.stdout == "no 128 MB for linear algebra\n"

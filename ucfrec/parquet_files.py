@@ -10,6 +10,8 @@ from ucfrec.errors import InputError, explain_os_error, one_line
 
 _FEW_ROWS: Final = 1_000_000
 _ROWS_PER_BYTE: Final = 10
+_NO_THREAD: Final = "Failed to launch worker thread"
+"""How Arrow says that there is no memory for the stack of a thread."""
 
 
 def require_plausible_rows(path: Path, rows: int) -> None:
@@ -52,6 +54,8 @@ def read_ids(path: Path, column: str) -> npt.NDArray[Any]:
     except FileNotFoundError as error:
         raise InputError(explain_os_error(error)) from None
     except (pa.ArrowException, OSError, KeyError, ValueError, OverflowError) as error:
+        if _NO_THREAD in str(error):
+            raise MemoryError(one_line(str(error))) from None
         raise InputError(
             f"{path} is damaged or has no column {column!r} ({one_line(str(error)):.200}); restore "
             "it, or make the store or run again"

@@ -1,5 +1,6 @@
 """How a process ends: by Ctrl-C or TERM at any moment, and with its parent."""
 
+import mmap
 import os
 import signal
 import sys
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
 ENDING: Final = (signal.SIGINT, signal.SIGTERM)
 _AGAIN: Final = 0.1
 """Seconds after which an interruption that a library swallowed is raised again."""
+_BLAS: Final = 128 * 2**20
+"""Bytes that OpenBLAS asks the operating system for at its first use, and some more."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -142,3 +145,17 @@ def _begin(begin: Callable[[], None] | None) -> None:
     end_with_parent()
     if begin is not None:
         begin()
+
+
+def require_blas_memory() -> None:
+    """Check that there is memory for linear algebra with NumPy, SciPy or scikit-learn.
+
+    Where the operating system refuses, OpenBLAS asks again for ever, in code that no signal ends.
+
+    Raises:
+        MemoryError: there is none.
+    """
+    try:
+        mmap.mmap(-1, _BLAS).close()
+    except OSError as error:
+        raise MemoryError(f"no {_BLAS / 2**20:.0f} MB for linear algebra") from error

@@ -1,6 +1,7 @@
 """Fitting the reward model of items: what it recovers, what it reads, and what it reports."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,12 +10,16 @@ import numpy.typing as npt
 import pytest
 import torch
 
-from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model
+from ucfrec.counterfactual.item_reward_fit import (
+    fit_item_reward_model,
+    refit_item_reward_model,
+)
 from ucfrec.counterfactual.item_reward_model import LAGS
 from ucfrec.counterfactual.item_reward_rows import RewardRows
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.runs.choose_rule import calibrate
 
 ITEMS, USERS, LENGTH, DIM, TAGS = 40, 150, 20, 4, 6
 
@@ -134,6 +139,31 @@ def test_item_effects_are_adjusted_for_who_saw_them(known: bool, tmp_path: Path)
 
     assert gap(crude) > 0.9
     assert abs(gap(model.item.numpy().astype(np.float64))) < 0.3 * gap(crude)
+
+
+def test_for_new_users_the_session_tells_what_users_effects_tell_of_training_rows(
+    tmp_path: Path,
+) -> None:
+    planted = log(3, taste=4.0, users=300)
+    columns = {"item": planted.items, "reward": clicks(planted)}
+    split, states = (np.arange(300) >= 200).astype(np.int64), item_states(300)
+    states = replace(states, embeddings=torch.eye(TAGS)[states.tags[:, 0]])
+    per_session = {"user": np.arange(300), "split": split}
+    store = EpisodeStore.from_arrays(columns, np.full(300, LENGTH), per_session, states)
+    model, report = fit_item_reward_model(*views(store), tmp_path / "a", seed=0)
+    assert report.new_users
+    assert "affinity" in report.kept
+    assert not model.user.any()
+    assert not model.affinity.any()
+    rows = RewardRows.of(store.split("validation"), LAGS, 10**6, 0)
+    slope, intercept = calibrate(model, rows)
+    assert 0.85 < slope < 1.15
+    assert abs(intercept) < 0.3
+    scores = model.score(rows.states, rows.shown, None, rows.items)
+    assert torch.equal(scores, model.score(rows.states, rows.shown, rows.users, rows.items))
+    again = refit_item_reward_model(tmp_path / "a", store.split("train"), tmp_path / "b", seed=0)
+    for name, value in model.state_dict().items():
+        assert torch.allclose(value, again.state_dict()[name], atol=0.05), name
 
 
 def test_rewards_of_many_values_are_fitted_in_their_units(tmp_path: Path) -> None:

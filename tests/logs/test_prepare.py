@@ -11,6 +11,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from safetensors import SafetensorError
@@ -175,6 +176,39 @@ def test_csv_and_parquet_give_the_same_store(tmp_path: Path) -> None:
     assert stores[0]["fingerprint"] == stores[1]["fingerprint"]
     assert stores[0]["reward"] == "reward * 2"
     assert steps_of(tmp_path / "csv")["user_id"].str.startswith("u").all()
+
+
+@pytest.mark.parametrize("zone", [None, "UTC", "America/New_York"])
+@pytest.mark.parametrize("unit", ["ms", "us", "ns"])
+def test_times_of_every_unit_and_zone_are_read(
+    unit: str, zone: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = make_log(users=5)
+    log["timestamp"] = log["timestamp"] // 1000 * 1000
+    prepare([write(log, tmp_path / "log.parquet")], LogMapping(), tmp_path / "wanted", SMALL)
+    table = pa.Table.from_pandas(log)
+    column = table.schema.get_field_index("timestamp")
+    times = pa.array(log["timestamp"], pa.timestamp("ms")).cast(pa.timestamp(unit))
+    named = pa.field("timestamp", pa.timestamp(unit, zone))
+    pq.write_table(table.set_column(column, named, times.cast(named.type)), tmp_path / "t.parquet")
+    features = {"item_id": range(30), "published": pa.array(range(30)).cast(named.type)}
+    pq.write_table(pa.table(features), tmp_path / "items.parquet")
+    monkeypatch.setenv("TZ", "Asia/Tokyo")
+    time.tzset()
+    try:
+        items = FeatureTable((tmp_path / "items.parquet",), "item_id")
+        with_features = LogMapping(item_features=(items,))
+        prepare([tmp_path / "t.parquet"], LogMapping(), tmp_path / "found", SMALL)
+        prepare([tmp_path / "t.parquet"], with_features, tmp_path / "featured", SMALL)
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+    found, wanted = (EpisodeStore.open(tmp_path / name).meta for name in ("found", "wanted"))
+    assert found["fingerprint"] == wanted["fingerprint"]
+    embeddings = [
+        EpisodeStore.open(tmp_path / name).item_states.embeddings for name in ("found", "featured")
+    ]
+    assert not torch.equal(*embeddings)
 
 
 def test_every_dropped_row_has_a_reason(tmp_path: Path) -> None:

@@ -84,6 +84,10 @@ class Design:
             rows=self.rows[rows],
         )
 
+    def of_unknown_users(self) -> "Design":
+        """The same rows as if no user were known."""
+        return replace(self, users=torch.full_like(self.users, self.n_users))
+
     def zeros(self, name: str) -> Tensor:
         """The effect `name`, all zero, float32."""
         dim, state = self.vectors.shape[1], self.x.shape[1]
@@ -174,14 +178,18 @@ def _exposure(model: ItemRewardModel, rows: RewardRows) -> Tensor:
     return torch.cat(parts)
 
 
-def fit_effects(design: Design, start: Effects, spreads: Mapping[str, float]) -> Effects:
+def fit_effects(
+    design: Design, start: Effects, spreads: Mapping[str, float], fixed: Effects | None = None
+) -> Effects:
     """Minimise the summed loss of `design` plus penalties on the effects named in `spreads`.
 
     Args:
         design: training rows.
         start: effects to start from; missing ones start at 0.
         spreads: of every effect of the fit; see `Design.penalty`.
+        fixed: effects that are part of the predictor, and of the result, as they are.
     """
+    given = fixed or {}
     names = ("mean", *spreads)
     curvature = 0.25 if design.binary else 1.0
     penalty = {name: design.penalty(name, spreads[name]) for name in spreads}
@@ -195,12 +203,13 @@ def fit_effects(design: Design, start: Effects, spreads: Mapping[str, float]) ->
 
     def objective(numbers: Tensor) -> Tensor:
         effects = effects_of(numbers)
-        loss = design.loss(design.predictor(effects)).sum(dtype=torch.float64)
+        loss = design.loss(design.predictor(given | effects)).sum(dtype=torch.float64)
         for name in spreads:
             loss = loss + 0.5 * penalty[name] * effects[name].square().sum(dtype=torch.float64)
         return loss
 
-    return effects_of(minimum(objective, torch.cat([part.flatten() for part in first.values()])))
+    start_numbers = torch.cat([part.flatten() for part in first.values()])
+    return given | effects_of(minimum(objective, start_numbers))
 
 
 def minimum(objective: Callable[[Tensor], Tensor], start: Tensor) -> Tensor:

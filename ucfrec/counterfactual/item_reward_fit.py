@@ -66,9 +66,14 @@ def fit_item_reward_model(
 
     Effects are added one after the other, all fitted jointly. Validation rows choose the strength
     of each effect's penalty, and whether the effect is kept: if it lowers their mean loss by more
-    than the standard error of the decrease. Where hardly any validation row is of a user with
-    training rows, a fifth of the training rows chooses for items, users and content instead: with
-    unknown users, effects of items that contain those of the users who saw them predict best.
+    than the standard error of the decrease.
+
+    Where hardly any validation row is of a user with training rows, the model is for new users. A
+    fifth of the training rows then chooses for the effects in `_LASTING`: with unknown users,
+    effects of items that contain those of the users who saw them predict best. What a user's
+    effects tell of training rows, the history of the session must tell of a new user. So the
+    effects of users are dropped once those of items are known, and the other effects are fitted
+    without them.
 
     Args:
         train: view of a store of items.
@@ -119,12 +124,27 @@ def refit_item_reward_model(
     rows = RewardRows.of(store, model.lags, max_rows, seed)
     _set_statistics(model, rows, rows, store.item_states)
     design = Design.of(model, rows)
-    mean = design.target.mean()
-    start = {"mean": torch.logit(mean) if design.binary else mean}
-    model.set_effects(fit_effects(design, start, report.kept), design.of_content)
+    effects, spreads, fixed = _mean_effect(design), dict(report.kept), Effects()
+    if report.new_users:
+        lasting: dict[str, float] = {}
+        for name in _LASTING:
+            if name in spreads:
+                lasting[name] = spreads.pop(name)
+        fixed = _of_items(fit_effects(design, effects, lasting))
+        design = design.of_unknown_users()
+    model.set_effects(fit_effects(design, effects, spreads, fixed), design.of_content)
     folder.mkdir(parents=True, exist_ok=True)
     save_tensors(folder / FITTED, model.state_dict(), dataclasses.asdict(report))
     return model.eval()
+
+
+def _mean_effect(design: Design) -> Effects:
+    mean = design.target.mean()
+    return {"mean": torch.logit(mean) if design.binary else mean}
+
+
+def _of_items(effects: Effects) -> Effects:
+    return {name: effects[name] for name in ("item", "content") if name in effects}
 
 
 class _Search:
@@ -132,9 +152,10 @@ class _Search:
 
     def __init__(self, design: Design, held_out: Design) -> None:
         self.design, self._held_out = design, held_out
-        mean = design.target.mean()
-        self.effects: Effects = {"mean": torch.logit(mean) if design.binary else mean}
+        self.effects = _mean_effect(design)
         self.kept: dict[str, int] = {}
+        self.new_users = False
+        self._fixed: Effects = {}
         self.losses = self._losses(self.effects)
         self.base_loss = self.item_loss = float(self.losses.mean())
         self.tried: list[EffectTried] = []
@@ -160,6 +181,7 @@ class _Search:
         for name in EFFECTS:
             if judge is not self and name not in _LASTING:
                 self._take(judge)
+                self._forget_users()
                 judge = self
             judge.add(name)
             if name == _CHEAP[-1]:
@@ -189,6 +211,13 @@ class _Search:
             last = [*at][-1]
             _, (self.effects, self.losses) = self._best(last, at[last], ())
 
+    def _forget_users(self) -> None:
+        """Fit further effects as for new users, with the effects of items as they are."""
+        self.new_users, self._fixed = True, _of_items(self.effects)
+        self.design = self.design.of_unknown_users()
+        self.effects = fit_effects(self.design, _mean_effect(self.design), {}, self._fixed)
+        self.losses = self._losses(self.effects)
+
     def adjust(self) -> None:
         """Choose the spreads of the effects found so far again, each given the others."""
         for name in [*self.kept]:
@@ -213,8 +242,11 @@ class _Search:
             if not 0 <= index < len(_SPREADS):
                 return float("inf")
             if index not in found:
-                spreads = {each: _SPREADS[self.kept[each]] for each in self.kept}
-                effects = fit_effects(self.design, self.effects, {**spreads, name: _SPREADS[index]})
+                spreads = {each: _SPREADS[number] for each, number in self.kept.items()}
+                if self.new_users:
+                    spreads = {each: spreads[each] for each in spreads if each not in _LASTING}
+                spreads[name] = _SPREADS[index]
+                effects = fit_effects(self.design, self.effects, spreads, self._fixed)
                 found[index] = effects, self._losses(effects)
             return float(found[index][1].mean())
 
@@ -285,6 +317,7 @@ def _report(
         validation_rows=len(held_out),
         binary=bool(model.binary),
         effects=search.report(),
+        new_users=search.new_users,
         base_loss=search.base_loss,
         item_loss=search.item_loss,
         loss=float(search.losses.mean()),

@@ -90,6 +90,9 @@ class ItemRewardReport:
     """Standard error of `gauc_gain`, over users."""
     seconds: float
     """Processor time of the fit."""
+    new_users: bool = False
+    """Whether held-out rows are of users without training rows: the effects of users only served to
+    tell those of items, and are not part of the model."""
 
     @property
     def kept(self) -> Mapping[str, float]:

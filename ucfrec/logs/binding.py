@@ -80,6 +80,15 @@ def is_vector(kind: str) -> bool:
     return _NUMBERS.fullmatch(kind) is not None
 
 
+def as_timestamp(sql: str, kind: str) -> str | None:
+    """SQL of the TIMESTAMP in UTC that a date or time of a DuckDB type means; None for others."""
+    if kind == "DATE" or kind.startswith("TIMESTAMP"):
+        # DuckDB casts TIMESTAMPTZ_NS only by way of TIMESTAMPTZ.
+        zoned = "TZ" in kind or "TIME ZONE" in kind
+        return f"{sql}::TIMESTAMPTZ::TIMESTAMP" if zoned else f"{sql}::TIMESTAMP"
+    return None
+
+
 def open_tables(connection: duckdb.DuckDBPyConnection, files: Sequence[Path]) -> list[Table]:
     """Read the columns of every file and group consecutive files with equal columns.
 

@@ -13,6 +13,7 @@ from ucfrec.errors import InputError
 from ucfrec.logs.binding import (
     MAX_FLOAT,
     Table,
+    as_timestamp,
     bind,
     explained,
     glob_pattern,
@@ -246,8 +247,8 @@ def _typed(table: Table, name: str, given: str, sql: str, kind: str) -> tuple[st
     elif name == schema.TIMESTAMP:
         if is_number(kind):
             return f"TRY_CAST(round({sql}) AS BIGINT)", "BIGINT"
-        if kind.startswith("TIMESTAMP") or kind == "DATE":
-            return f"TRY(epoch_ms({sql}::TIMESTAMP))", "BIGINT"
+        if time := as_timestamp(sql, kind):
+            return f"TRY(epoch_ms({time}))", "BIGINT"
         wanted = "use milliseconds, a date or a timestamp, e.g. --column timestamp='seconds * 1000'"
     elif name in (schema.ACTION, schema.OBSERVATION):
         if is_vector(kind):

@@ -5,7 +5,15 @@ from collections.abc import Sequence
 import duckdb
 
 from ucfrec.errors import InputError
-from ucfrec.logs.binding import bind, is_integer, is_number, is_vector, open_tables, wrong_type
+from ucfrec.logs.binding import (
+    as_timestamp,
+    bind,
+    is_integer,
+    is_number,
+    is_vector,
+    open_tables,
+    wrong_type,
+)
 from ucfrec.logs.mapping import FeatureTable, log_files
 
 
@@ -71,8 +79,8 @@ def _comparable(sql: str, kind: str) -> str | None:
     """SQL that casts a feature to DOUBLE, VARCHAR, VARCHAR[] or FLOAT[]; None if no cast does."""
     if is_number(kind):
         return f"CAST({sql} AS DOUBLE)"
-    if kind == "DATE" or kind.startswith("TIMESTAMP"):
-        return f"epoch({sql}::TIMESTAMP) / 86400"
+    if time := as_timestamp(sql, kind):
+        return f"epoch({time}) / 86400"
     if kind in ("VARCHAR", "BOOLEAN", "UUID") or kind.startswith("ENUM"):
         return f"CAST({sql} AS VARCHAR)"
     if is_vector(kind) and not is_integer(kind.partition("[")[0]):

@@ -14,6 +14,7 @@ from ucfrec import schema
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.processes import require_blas_memory
 
 IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float32]
@@ -134,6 +135,7 @@ def _cooccurrence(
     by_user = np.sqrt(np.asarray(matrix.sum(axis=1)).ravel())
     balanced = sparse.diags(1 / by_user) @ matrix @ sparse.diags(1 / by_item)
     rank = min(size + 1, *balanced.shape)
+    require_blas_memory()
     _, strength, directions = randomized_svd(balanced, rank, random_state=0)
     # One direction holds only the popularity of items (the trivial axis of correspondence
     # analysis) and has the largest singular value; it would dominate the others.
@@ -173,6 +175,7 @@ def _axes(known: sparse.csr_matrix, size: int) -> npt.NDArray[Any]:
     """(F, D ≤ `size`) right singular vectors of the rows; the identity if F ≤ `size`."""
     if known.shape[1] <= size:
         return np.eye(known.shape[1])
+    require_blas_memory()
     _, _, directions = randomized_svd(known, min(size, known.shape[0]), random_state=0)
     return np.asarray(directions.T)
 

@@ -13,6 +13,7 @@ from itertools import product
 import numpy as np
 import numpy.typing as npt
 
+from ucfrec.processes import require_blas_memory
 from ucfrec.progress import progress
 
 FloatArray = npt.NDArray[np.float64]
@@ -125,6 +126,7 @@ class _Groups:
         self._present = np.unique(group)
         self._model = None
         if len(self._present) > 1:
+            require_blas_memory()
             self._model = LogisticRegression(C=0.1, max_iter=100, tol=1e-3)
             self._model.fit(self._scaled(states), group)
 

@@ -23,6 +23,7 @@ from ucfrec.counterfactual.item_reward_report import scores_of
 from ucfrec.counterfactual.item_reward_rows import RewardRows
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.processes import require_blas_memory
 from ucfrec.progress import progress
 from ucfrec.runs.rule_config import RuleConfig
 
@@ -105,6 +106,7 @@ class RuleSearch:
         assert decider.reward_model is not None
         self._decider, self._config, self._seed = decider, config, seed
         self._store, model = validation, decider.reward_model
+        require_blas_memory()
         states = validation.item_states
         self._likeness = likeness = Likeness.of(states)
         end = SessionEnd(likeness, LoggedEnds.of(train, model.lags, _MOST_STEPS, seed))

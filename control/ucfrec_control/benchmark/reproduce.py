@@ -39,9 +39,7 @@ PARTS: Final[Mapping[str, Part]] = {
     "table-10": Part("band"),
     "figure-2": Part("lambda"),
     "figure-3": Part(ROBUSTNESS, _JUDGED, distractors=_DETERMINISTIC),
-    "figure-4": Part(
-        ROBUSTNESS, _JUDGED, distractors=(*_DETERMINISTIC, "stochastic"), of_runs=True
-    ),
+    "figure-4": Part(ROBUSTNESS, _JUDGED, distractors=(*_DETERMINISTIC, "stochastic")),
     "figure-5": Part(MAIN, ("ucf",), ("hopper_medium-zoo",), of_runs=True),
     "figure-6": Part(MAIN, ("ucf",), ("halfcheetah_medium-zoo",), of_runs=True),
 }

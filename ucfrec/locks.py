@@ -59,22 +59,22 @@ def claim(path: Path, wait: bool = False) -> Iterator[bool]:
     made = [each for each in (path.parent, *path.parent.parents) if not each.exists()]
     lock = _lock_of(path)
     _make_folder(path.parent)
+    opened = None
     try:
-        opened = _acquire(lock, None if wait else _PATIENCE)
-    except FileNotFoundError:
-        # Another process that had made the folder for nothing has removed it meanwhile.
-        _make_folder(path.parent)
-        opened = _acquire(lock, None if wait else _PATIENCE)
-    if opened is None:
-        yield False
-        return
-    try:
-        _held.add(held)
-        yield True
+        try:
+            opened = _acquire(lock, None if wait else _PATIENCE)
+        except FileNotFoundError:
+            # Another process that had made the folder for nothing has removed it meanwhile.
+            _make_folder(path.parent)
+            opened = _acquire(lock, None if wait else _PATIENCE)
+        if opened is not None:
+            _held.add(held)
+        yield opened is not None
     finally:
-        _held.discard(held)
-        _release(lock, opened)
-        _remove_empty(made)
+        if opened is not None:
+            _held.discard(held)
+            _release(lock, opened)
+            _remove_empty(made)
 
 
 @contextmanager
@@ -201,9 +201,21 @@ def _acquire(lock: Path, seconds: float | None) -> int | None:
                 return None
             time.sleep(0.01)
         except BaseException:
-            os.close(opened)
+            _give_up(lock, opened)
             raise
         os.close(opened)
+
+
+def _give_up(lock: Path, opened: int) -> None:
+    """After an interruption: close the file, and remove it if no other process holds its lock."""
+    import fcntl
+
+    try:
+        fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(opened)
+    else:
+        _release(lock, opened)
 
 
 def _same_file(lock: Path, opened: int) -> bool:

@@ -720,6 +720,20 @@ def without_checksums(store: Path) -> None:
     write_json(store / "meta.json", record)
 
 
+@pytest.mark.parametrize("middle", [[2**63 - 1, -(2**63)], [3, 3], [4, 2]])
+def test_offsets_that_do_not_ascend_are_damage(folder: Path, middle: list[int]) -> None:
+    """Differences of the first wrap around to positive numbers."""
+    write_store(folder / "store", random_episodes([3, 3, 3]))
+    path = folder / "store" / "shard-00000" / "offsets.npy"
+    np.save(path, np.array([0, *middle, np.load(path)[-1]]))
+    without_checksums(folder / "store")
+    with (
+        pytest.raises(InputError, match="do not ascend from 0"),
+        pytest.warns(InputNote, match="has no checksums"),
+    ):
+        use(EpisodeStore.open(folder / "store"))
+
+
 @pytest.mark.parametrize("column", ["reward", "item", "return_to_go", "offsets", "user"])
 def test_a_flipped_bit_of_a_column_is_found_when_it_is_used(folder: Path, column: str) -> None:
     store = write_store(folder / "store", random_episodes(LENGTHS), some_states(), shard_steps=6)

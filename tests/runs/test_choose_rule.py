@@ -132,6 +132,10 @@ def test_unsupported_and_narrow_rules_are_not_allowed(folder: Path, trained: Tra
     # Within a standard error of the best, the first, which is the simplest.
     close = replace(played, value=played.value - played.error / 2)
     assert search.best([close, played]) == close
+    # Or within the tolerance.
+    sure = replace(played, error=0.0)
+    assert search.best([replace(sure, value=0.985 * sure.value), sure]).value < sure.value
+    assert search.best([replace(sure, value=0.975 * sure.value), sure]) == sure
     assert search.best([replace(played, items=1.0), replace(played, items=1.5)]).items == 1.5
 
 

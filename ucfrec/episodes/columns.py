@@ -139,7 +139,7 @@ class Columns:
     def _starts_and_lengths(self) -> tuple[IntArray, IntArray]:
         starts, lengths, before = [], [], 0
         for offsets in self._parts(schema.OFFSETS):
-            if len(offsets) < 2 or offsets[0] != 0 or np.any(np.diff(offsets) < 1):
+            if len(offsets) < 2 or offsets[0] != 0 or np.any(offsets[1:] <= offsets[:-1]):
                 raise self._damaged(schema.OFFSETS, "do not ascend from 0")
             starts.append(offsets[:-1] + before)
             lengths.append(np.diff(offsets))

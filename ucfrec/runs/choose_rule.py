@@ -160,7 +160,7 @@ class RuleSearch:
         return enough and candidate.support >= self._config.least_support
 
     def best(self, candidates: Sequence[Candidate]) -> Candidate:
-        """Of the allowed candidates within a standard error of the best, the first.
+        """The first of the allowed candidates within an error, or the tolerance, of the best.
 
         If none is allowed, the one with the most effective items.
         """
@@ -168,7 +168,8 @@ class RuleSearch:
         if not allowed:
             return max(candidates, key=lambda candidate: candidate.items)
         top = max(allowed, key=lambda candidate: candidate.value)
-        return next(c for c in allowed if c.value >= top.value - top.error)
+        enough = top.value - max(top.error, self._config.tolerance * abs(top.value))
+        return next(candidate for candidate in allowed if candidate.value >= enough)
 
 
 def _played(

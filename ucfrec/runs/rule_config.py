@@ -45,3 +45,7 @@ class RuleConfig:
     least_items: Annotated[float, Field(ge=1, le=10**9)] = 10.0
     """Smallest effective number of items that a rule must show, the exponential of their entropy: a
     page of them; at most a quarter of the items that the log supports."""
+    tolerance: Annotated[float, Field(ge=0, lt=1)] = 0.02
+    """Share of the best estimate by which the estimate of a rule with less tilt may fall short: the
+    standard error of the sessions, which is allowed in any case, does not count what the model of
+    the users gets wrong."""

@@ -13,7 +13,7 @@ A cause fails one of these. If the logging policy did not see it, the action tel
 process that goes on, such as a position or a user's feature, is told by other dimensions (3).
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final
 
@@ -78,8 +78,18 @@ def measured_reward(
         InputError: there are too few episodes with two steps or more to hold some out.
     """
     data = _Steps.of(train, most, seed)
-    tested = range(data.columns.shape[1]) if dimensions is None else dimensions
-    return tuple(_measures(data, dimension, config, seed) for dimension in tested)
+    every = range(data.columns.shape[1])
+    tested = every if dimensions is None else dimensions
+    first = {dimension: _measures(data, dimension, (), config, seed) for dimension in tested}
+    if not any(first.values()):
+        return tuple(first.values())
+    first |= {d: _measures(data, d, (), config, seed) for d in every if d not in first}
+    found = {dimension for dimension, measures in first.items() if measures}
+    # A measurement tells of a cause too, through the reward: the others are left out of the rest.
+    return tuple(
+        d in found and (len(found) == 1 or _measures(data, d, found - {d}, config, seed))
+        for d in tested
+    )
 
 
 @dataclass(frozen=True)
@@ -116,8 +126,10 @@ class _Steps:
         )
 
 
-def _measures(data: _Steps, dimension: int, config: MeasurementConfig, seed: int) -> bool:
-    """Whether a dimension measures the reward."""
+def _measures(
+    data: _Steps, dimension: int, without: Collection[int], config: MeasurementConfig, seed: int
+) -> bool:
+    """Whether a dimension measures the reward; the columns `without` are left out of the rest."""
     values, held_out = data.columns[:, dimension], data.held_out
     alone = np.square(values[held_out] - values[~held_out].mean(dtype=np.float64))
     variance = max(float(alone.mean()), 1e-12)
@@ -135,7 +147,8 @@ def _measures(data: _Steps, dimension: int, config: MeasurementConfig, seed: int
     of_reward = saved(data.rewards)
     if not told(of_reward):
         return False
-    rest = np.column_stack([np.delete(data.columns, dimension, axis=1), data.rest])
+    others = np.delete(data.columns, [dimension, *without], axis=1)
+    rest = np.column_stack([others, data.rest])
     of_rest = saved(rest)
     if not told(of_rest) or of_reward.mean() < of_rest.mean():
         return False

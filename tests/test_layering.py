@@ -18,7 +18,7 @@ PACKAGES = {
 ORDER = (
     {"schema", "errors"},
     {"locks", "processes"},
-    {"files", "progress", "provenance", "plugins", "settings", "code_version"},
+    {"files", "progress", "remote", "provenance", "plugins", "settings", "code_version"},
     {"checksums", "parquet_files"},
     {"fitting"},
     {"episodes"},

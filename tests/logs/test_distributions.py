@@ -11,7 +11,7 @@ import pytest
 
 from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.logs import distributions
+from ucfrec.logs import measures
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 
@@ -86,7 +86,7 @@ def test_many_rewards_fall_into_equal_bins_and_none_is_lost(
     assert np.abs(np.array(found["counts"][1:-1]) - inner).max() <= 1  # a value on an edge
     assert found["counts"][0] == (rewards < found["edges"][1]).sum()
     # A larger log is sampled, to the same answer whatever the order of its rows.
-    monkeypatch.setattr(distributions, "SAMPLE_ROWS", 400)
+    monkeypatch.setattr(measures, "SAMPLE_ROWS", 400)
     (tmp_path / "again").mkdir()
     sampled = prepared(tmp_path / "again", rewards).meta["source"]["summary"]["rewards"]
     assert abs(sampled["quantiles"]["0.5"]) < 0.5

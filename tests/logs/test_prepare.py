@@ -1,6 +1,9 @@
 """From log files to episodes: nothing lost unseen, nothing leaked, nothing half-written."""
 
 import errno
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -676,3 +679,38 @@ def test_messages_do_not_repeat_line_breaks_of_foreign_text(tmp_path: Path) -> N
     with pytest.raises(InputError) as caught:
         prepare([path], LogMapping(), tmp_path / "store", SMALL)
     assert str(caught.value).isprintable()
+
+
+@pytest.mark.slow
+def test_memory_stays_within_the_limit(tmp_path: Path) -> None:
+    """A log that is larger than the limit, prepared by a process of its own."""
+    rows, limit = 6_000_000, 800_000_000
+    users = pa.array([f"user {n:050d}" for n in range(60_000)])
+    items = pa.array([f"item {n:050d}" for n in range(5_000)])
+    writer, size = None, 0
+    for part in range(12):
+        generator = np.random.default_rng(part)
+        n = rows // 12
+        table = pa.table(
+            {
+                "user_id": users.take(pa.array(generator.integers(len(users), size=n))),
+                "item_id": items.take(pa.array(generator.integers(len(items), size=n))),
+                "timestamp": START + generator.integers(10**10, size=n),
+                "reward": generator.random(n),
+            }
+        )
+        size += table.nbytes
+        writer = writer or pq.ParquetWriter(tmp_path / "log.parquet", table.schema)
+        writer.write_table(table)
+    assert writer is not None
+    writer.close()
+    assert size > limit
+    command = ["prepare", tmp_path / "log.parquet", "--out", tmp_path / "store"]
+    child = subprocess.Popen(
+        [sys.executable, "-m", "ucfrec", *map(str, command), "--memory-limit", "800MB"]
+    )
+    _, status, usage = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    assert child.returncode == 0
+    assert usage.ru_maxrss * 1024 < limit
+    assert EpisodeStore.open(tmp_path / "store").meta["n_steps"] == rows

@@ -17,6 +17,7 @@ from typing import Any, Final, Protocol, cast
 from ucfrec import __version__
 from ucfrec.errors import InputError, InputNote, explain_os_error, one_line
 from ucfrec.processes import Interrupted, interruptions_raised
+from ucfrec.remote import local_paths
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,8 @@ def run(program: Program, arguments: Sequence[str] | None) -> int:
             arguments = sys.argv[1:] if arguments is None else arguments
             options = build_parser(program, arguments).parse_args(arguments)
             name = f"{program.name} {options.command}"
-            _module(program, options.command).run(options)
+            with local_paths(options) as options:
+                _module(program, options.command).run(options)
             sys.stdout.flush()
     except Interrupted as interruption:
         if sys.stderr.isatty():

@@ -5,6 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ucfrec.remote import Input, uri_or_path
+
 if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
     from ucfrec.evaluation.world import World
@@ -61,8 +63,9 @@ def log_options(parser: argparse.ArgumentParser) -> argparse.Action:
     logs = parser.add_argument(
         "logs",
         nargs="+",
+        type=uri_or_path(Input, str),
         metavar="LOGS",
-        help="log files (.parquet, .csv, .csv.gz), folders or globs",
+        help="log files (.parquet, .csv, .csv.gz), folders or globs; also at s3://, …",
     )
     parser.add_argument(
         "--dataset",

@@ -5,12 +5,18 @@ from pathlib import Path
 
 from ucfrec.commands.options import log_options, logs_given
 from ucfrec.errors import InputError
+from ucfrec.remote import Output, origin, uri_or_path
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec prepare`."""
     log_options(parser)
-    parser.add_argument("--out", type=Path, metavar="STORE", help="new folder for the store")
+    parser.add_argument(
+        "--out",
+        type=uri_or_path(Output, Path),
+        metavar="STORE",
+        help="new folder for the store; also at s3://, gs://, hdfs://, …",
+    )
     parser.add_argument(
         "--reward",
         metavar="SQL",
@@ -45,8 +51,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--memory-limit",
         metavar="SIZE",
-        help="memory for reading the log; beyond it rows spill to a scratch folder beside the "
-        "store, to at most 90%% of the free disk (default: 2GB)",
+        help="memory of the whole command, from 800MB on; beyond it rows spill to a scratch folder "
+        "beside the store, to at most 90%% of the free disk (default: 2GB)",
     )
     parser.add_argument(
         "--validate", action="store_true", help="check the logs without writing a store"
@@ -79,4 +85,4 @@ def run(options: argparse.Namespace) -> None:
     if options.out is None:
         raise InputError("no store is named; add --out STORE, or --validate to only check the logs")
     print(format_report(prepare(files, mapping, options.out, prepared)))
-    print(f"\nstore: {options.out}")
+    print(f"\nstore: {origin(options.out)}")

@@ -17,6 +17,7 @@ from ucfrec.commands.options import (
 )
 from ucfrec.errors import InputError
 from ucfrec.progress import Progress, progress
+from ucfrec.remote import Output, origin, uri_or_path
 
 if TYPE_CHECKING:
     from ucfrec.recommending.histories import Histories
@@ -29,7 +30,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--k", type=int, default=10, help="items for each user (default: 10)")
     item_options(parser)
     rule_options(parser)
-    out = parser.add_argument("--out", type=Path, required=True, help="Parquet file to write")
+    out = parser.add_argument(
+        "--out", type=uri_or_path(Output, Path), required=True, help="Parquet file to write"
+    )
     parser.add_argument(
         "--stream",
         action=_Stream,
@@ -85,7 +88,7 @@ def run(options: argparse.Namespace) -> None:
             skip_unknown=options.skip_unknown,
         )
         rows = write_frames(options.out, frames)
-    print(f"{options.out}: {rows:,} rows")
+    print(f"{origin(options.out)}: {rows:,} rows")
 
 
 def _answer_stream(options: argparse.Namespace) -> None:

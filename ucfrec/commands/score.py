@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from ucfrec.commands.options import log_options, logs_given, rule_given, rule_options
+from ucfrec.remote import Output, origin, uri_or_path
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -11,7 +12,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder of `ucfrec train`")
     log_options(parser)
     rule_options(parser)
-    parser.add_argument("--out", type=Path, required=True, help="Parquet file to write")
+    parser.add_argument(
+        "--out", type=uri_or_path(Output, Path), required=True, help="Parquet file to write"
+    )
 
 
 def run(options: argparse.Namespace) -> None:
@@ -30,4 +33,4 @@ def run(options: argparse.Namespace) -> None:
     with logged_sessions(options.run, trained, files, mapping) as logged:
         print(format_report(logged.report))
         rows = write_frames(options.out, score(trained, logged, rule_given(options, trained)))
-    print(f"\n{options.out}: {rows:,} rows")
+    print(f"\n{origin(options.out)}: {rows:,} rows")

@@ -3,10 +3,14 @@
 import argparse
 from pathlib import Path
 
+from ucfrec.remote import Input, uri_or_path
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec screen`."""
-    parser.add_argument("store", type=Path, metavar="STORE", help="episode store to screen")
+    parser.add_argument(
+        "store", type=uri_or_path(Input, Path), metavar="STORE", help="episode store to screen"
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of the predictors (default: 0)")
     parser.add_argument(
         "--json", type=Path, metavar="FILE", help="write the report here (default: none)"

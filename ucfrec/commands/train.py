@@ -5,6 +5,7 @@ from pathlib import Path
 
 from ucfrec.errors import InputError
 from ucfrec.policies.registry import policy_names
+from ucfrec.remote import Input, uri_or_path
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -22,7 +23,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def training_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `train` for `ucfrec` and for other programs with this command."""
     parser.epilog = "Every setting, its range and meaning: ucfrec settings --policy NAME"
-    parser.add_argument("store", type=Path, metavar="STORE", help="episode store to train on")
+    parser.add_argument(
+        "store",
+        type=uri_or_path(Input, Path),
+        metavar="STORE",
+        help="episode store to train on; also at s3://, gs://, hdfs://, …",
+    )
     parser.add_argument(
         "--out",
         type=Path,

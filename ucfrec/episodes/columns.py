@@ -14,6 +14,7 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.checksums import Sealed
 from ucfrec.episodes.column_files import StepColumn, load_column
+from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.record import REMEDY, read_store_record
 from ucfrec.episodes.returns import returns_to_go
 from ucfrec.episodes.states import ItemStates
@@ -22,7 +23,6 @@ from ucfrec.errors import InputError, InputNote
 Array = npt.NDArray[Any]
 IntArray = npt.NDArray[np.int64]
 
-ITEM_STATES = "item_states.safetensors"
 _IN_MEMORY = Path("<memory>")
 
 

@@ -1,5 +1,6 @@
 """Returns-to-go, defined once for training, acting and scoring."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -73,9 +74,7 @@ class ReturnToGo:
             return np.asarray(
                 before[np.minimum(steps + self.horizon, ends)] - before[:-1], dtype=np.float32
             )
-        starts = np.repeat(offsets[:-1], lengths)
-        totals, collected = before[ends] - before[starts], before[:-1] - before[starts]
-        return np.asarray(totals - collected, dtype=np.float32)
+        return _rest(before, offsets)
 
     def asked(self, target: float, collected: "Tensor") -> "Tensor":
         """What is asked for at the next step, (B,) float64, in reward units.
@@ -131,6 +130,31 @@ def returns_to_go(
 ) -> npt.NDArray[np.float32]:
     """Returns-to-go of the whole rest of each session; see `ReturnToGo.of_logs`."""
     return ReturnToGo().of_logs(rewards, offsets)
+
+
+def returns_in_parts(
+    rewards: npt.NDArray[np.floating], offsets: npt.NDArray[np.int64], steps: int
+) -> Iterator[npt.NDArray[np.float32]]:
+    """The same numbers as `returns_to_go`, in parts of about `steps` steps, to save memory."""
+    begin, before = 0, 0.0
+    while begin < len(offsets) - 1:
+        end = int(np.searchsorted(offsets, offsets[begin] + steps))
+        end = min(max(end, begin + 1), len(offsets) - 1)
+        part = rewards[offsets[begin] : offsets[end]].astype(np.float64)
+        # Sums go on where those of the part before ended, so that they round alike.
+        sums = np.cumsum(np.concatenate([[before], part]))
+        yield _rest(sums, offsets[begin : end + 1] - offsets[begin])
+        begin, before = end, float(sums[-1])
+
+
+def _rest(
+    before: npt.NDArray[np.float64], offsets: npt.NDArray[np.int64]
+) -> npt.NDArray[np.float32]:
+    """Rest of each episode, from the sums (N + 1,) of all rewards before each step."""
+    lengths = np.diff(offsets)
+    starts, ends = np.repeat(offsets[:-1], lengths), np.repeat(offsets[1:], lengths)
+    totals, collected = before[ends] - before[starts], before[:-1] - before[starts]
+    return np.asarray(totals - collected, dtype=np.float32)
 
 
 def _discounted(

@@ -7,22 +7,17 @@ fixed order, so its results are bit-identical for every batch size.
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from ucfrec.episodes.item_table import DECAY, DISTINCT_TAGS, TAGS_PER_ITEM, WINDOW
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 
 IntArray = npt.NDArray[np.int64]
-
-DISTINCT_TAGS: Final = 1000
-"""Most tags of a catalogue that are told apart; rarer ones are left out."""
-TAGS_PER_ITEM: Final = 16
-"""Most tags that one item keeps."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +41,9 @@ class ItemStates:
     """Rewards up to this one are scaled to 0."""
     reward_high: float
     """Rewards from this one on are scaled to 1."""
-    window: int = 10
+    window: int = WINDOW
     """Number of most recent steps that enter the means."""
-    decay: float = 0.8
+    decay: float = DECAY
     """Factor by which the weight in the means falls with each step back."""
     tags: Tensor = field(default_factory=lambda: torch.zeros(0, 0, dtype=torch.int64))
     """(n_items, T) int64 numbers of each item's tags, padded with −1; T is 0 if the catalogue has

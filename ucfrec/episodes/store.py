@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.episodes.columns import ITEM_STATES, Columns
+from ucfrec.episodes.columns import Columns
+from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.view import EpisodeView

@@ -11,12 +11,13 @@ import numpy.typing as npt
 from ucfrec import schema
 from ucfrec.checksums import seal
 from ucfrec.episodes.record import RECORD
-from ucfrec.episodes.returns import returns_to_go
+from ucfrec.episodes.returns import returns_in_parts
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder
 
 Array = npt.NDArray[Any]
 BoolArray = npt.NDArray[np.bool_]
+_PART_STEPS = 2**20
 
 
 class StoreWriter:
@@ -134,7 +135,12 @@ class StoreWriter:
         for name, values in self._episode_values.items():
             np.save(self._shard / f"{name}.npy", np.concatenate(values))
         rewards = np.load(self._shard / f"{schema.REWARD}.npy", mmap_mode="r")
-        np.save(self._shard / f"{schema.RETURN_TO_GO}.npy", returns_to_go(rewards, offsets))
+        returns: _NpyFile | None = None
+        for part in returns_in_parts(rewards, offsets, _PART_STEPS):
+            returns = returns or _NpyFile(self._shard / f"{schema.RETURN_TO_GO}.npy", part)
+            returns.append(part)
+        if returns is not None:
+            returns.close()
         self._files, self._offsets, self._episode_values = {}, [], {}
         self._shards += 1
         self._steps_in_shard = 0

@@ -41,10 +41,15 @@ class Table:
         return dict(self.types)
 
     @property
+    def columnar(self) -> bool:
+        """Whether reading a column again is cheap, because text need not be parsed."""
+        return self.files[0].suffix == ".parquet"
+
+    @property
     def sql(self) -> str:
         """SQL call of the DuckDB table function that reads the files."""
         files = ", ".join(text(glob_pattern(file)) for file in self.files)
-        if self.files[0].suffix == ".parquet":
+        if self.columnar:
             return f"read_parquet([{files}])"
         types = ", ".join(f"{text(name)}: {text(kind)}" for name, kind in self.types)
         return f"read_csv([{files}], header = true, types = {{{types}}})"

@@ -1,30 +1,22 @@
-"""SQL that reads, checks and de-duplicates log rows, shared by `prepare` and `recommend`."""
+"""Which rows of a log can be used: the faults, the rule for duplicates, and both in one SQL query.
+
+`prepare` sorts and goes through the rows in batches (`ucfrec.logs.sorted_rows`); `read_histories`
+and its like, which need no order of the files and no scratch, use `check_rows`. Both keep the same
+rows.
+"""
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import duckdb
 
 from ucfrec import schema
 from ucfrec.errors import InputError
-from ucfrec.logs.binding import (
-    MAX_FLOAT,
-    Table,
-    as_timestamp,
-    bind,
-    explained,
-    glob_pattern,
-    is_integer,
-    is_number,
-    is_vector,
-    open_tables,
-    text,
-    wrong_type,
-)
-from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping
+from ucfrec.logs.binding import MAX_FLOAT, Table, explained, glob_pattern, open_tables, text
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.typed import ROWS, TypedLog, not_finite, typed_log
 
 EARLIEST_MS: Final = 946_684_800_000
 """2000-01-01 UTC in ms; rows with an earlier time are dropped as clock errors."""
@@ -52,136 +44,41 @@ DUPLICATES: Final = {
 which the kept row is the first, and its description."""
 
 
-@dataclass(frozen=True)
-class CleanLog:
-    """A log with its checked rows in the table `rows` of `connection`.
-
-    `rows` has the log columns of `columns`, `reward`, `row` (position in the files), `reason` (key
-    of `REASONS` for dropped rows, NULL for kept rows) and `conflict` (whether a duplicate has a
-    different reward from the row that is kept). The view `clean` has the kept rows.
-    """
-
-    connection: duckdb.DuckDBPyConnection
-    tables: tuple[Table, ...]
-    columns: tuple[str, ...]
-    """Log columns that the files have, `user_id` first."""
-    vector_size: dict[str, int]
-    """Dimensions of `action` and `observation`, if the log has them."""
-    session_by: str
-    """"session_id", "gap" or "user"."""
-
-    @property
-    def key(self) -> str:
-        """Column of the choice: `item_id` or `action`."""
-        return schema.ITEM_ID if schema.ITEM_ID in self.columns else schema.ACTION
-
-    @property
-    def payload(self) -> tuple[str, ...]:
-        """Log columns other than user, choice and time."""
-        return tuple(c for c in self.columns if c not in (schema.USER_ID, self.key, "timestamp"))
-
-    def id_type(self, name: str) -> str:
-        """DuckDB type of an id column: BIGINT or VARCHAR."""
-        return str(self.one(f"SELECT typeof({name}) FROM rows LIMIT 1")[0])
-
-    def one(self, sql: str) -> tuple[Any, ...]:
-        """The first row of the result of `sql`."""
-        row: tuple[Any, ...] = self.connection.sql(sql).fetchall()[0]
-        return row
-
-
-def read_log(
-    connection: duckdb.DuckDBPyConnection,
-    files: Sequence[Path],
-    mapping: LogMapping,
-    reward: str,
-    session_by: str | None,
-    known_items: Path | None,
-    folder: Path,
-    duplicates: str = "highest",
-) -> CleanLog:
-    """Read and check every row of `files`.
-
-    Of rows with the same key (user, item or action, time) one is kept, by default that with the
-    highest reward, because late feedback is logged as a second row of an impression. Ties are
-    broken by the other columns, so that the order of rows and files does not matter.
+def faults(log: TypedLog, known_items: Path | None = None) -> dict[str, str]:
+    """Reason to the SQL condition on a row of `read`; the first that holds counts.
 
     Args:
-        connection: engine that may open `files` and `known_items`.
-        files: log files.
-        mapping: log columns to the files' columns.
-        reward: scalar SQL expression over the files' columns.
-        session_by: "session_id", "gap" or "user"; None for session_id if the log has it, else gap.
-        known_items: `items.parquet` of a store: rows with other items are dropped; None for all.
-        folder: folder named when its disk is full.
-        duplicates: key of `DUPLICATES`, which of several rows with the same key is kept.
+        log: any.
+        known_items: `items.parquet` of a store: other items are a fault; None for none.
+    """
+    keys = [schema.USER_ID, log.key, schema.TIMESTAMP]
+    keys += [schema.SESSION_ID] if log.session_by == schema.SESSION_ID else []
+    latest = int(time.time() * 1000) + DAY_MS
+    conditions = {
+        "null_key": " OR ".join(f"{k} IS NULL" for k in keys if k != schema.ACTION),
+        "clock_out_of_range": f"{schema.TIMESTAMP} NOT BETWEEN {EARLIEST_MS} AND {latest}",
+    }
+    if schema.ACTION in log.vector_size:
+        conditions["vector_not_finite"] = not_finite(schema.ACTION)
+    if known_items is not None:
+        source = f"read_parquet({text(glob_pattern(known_items))})"
+        known = f"SELECT CAST(item_id AS VARCHAR) FROM {source}"
+        conditions["unknown_item"] = f"CAST({log.key} AS VARCHAR) NOT IN ({known})"
+    return conditions
+
+
+def require_rewards_in_range(log: TypedLog, large: int, rows: int, largest: float) -> None:
+    """Check the count of rewards beyond `LARGEST_REWARD`.
+
+    Args:
+        log: for the message.
+        large: how many rewards are beyond it.
+        rows: how many rewards there are.
+        largest: the largest absolute reward.
 
     Raises:
-        InputError: a file, column or type makes the log unusable, an observation is missing or not
-            finite, or a reward is too large to train with.
+        InputError: there are any.
     """
-    tables = tuple(open_tables(connection, files))
-    return check_rows(
-        connection, tables, mapping, reward, session_by, known_items, folder, duplicates
-    )
-
-
-def check_rows(
-    connection: duckdb.DuckDBPyConnection,
-    tables: tuple[Table, ...],
-    mapping: LogMapping,
-    reward: str,
-    session_by: str | None,
-    known_items: Path | None,
-    folder: Path,
-    duplicates: str = "highest",
-) -> CleanLog:
-    """`read_log` of tables that are already open."""
-    columns = _present(tables, mapping, session_by)
-    selects = [_select(connection, table, mapping, columns, reward) for table in tables]
-    with explained(connection, tables, folder):
-        for name in (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID):
-            _unify_ids(selects, name)
-        union = " UNION ALL ".join(
-            f"SELECT {', '.join(f'{sql} AS {name}' for name, (sql, _) in select.items())} "
-            f"FROM {table.sql}"
-            for select, table in zip(selects, tables, strict=True)
-        )
-        connection.execute(
-            f"CREATE TABLE read AS SELECT row_number() OVER () AS row, * FROM ({union})"
-        )
-        sizes = _vector_sizes(connection, columns)
-        by = session_by or (schema.SESSION_ID if schema.SESSION_ID in columns else "gap")
-        log = CleanLog(connection, tables, columns, sizes, by)
-        _require_observations(log)
-        connection.execute(_checked(log, known_items, duplicates))
-        connection.execute("DROP TABLE read")
-        connection.execute(
-            "CREATE VIEW clean AS SELECT * EXCLUDE (reason, conflict) FROM rows "
-            "WHERE reason IS NULL"
-        )
-        _require_rewards_in_range(log)
-    return log
-
-
-def _require_observations(log: CleanLog) -> None:
-    """Check that the table `read` has a finite observation in every row, if it has any."""
-    if schema.OBSERVATION not in log.vector_size:
-        return
-    bad, rows = log.one(f"SELECT count_if({_not_finite(schema.OBSERVATION)}), count(*) FROM read")
-    if bad:
-        raise InputError(
-            f"{log.tables[0].files[0]}: {schema.OBSERVATION} is missing or holds NaN or infinity "
-            f"in {bad:,} of {rows:,} rows; fill them in, leave those rows out, or ignore the "
-            f"column with --column {schema.OBSERVATION}="
-        )
-
-
-def _require_rewards_in_range(log: CleanLog) -> None:
-    large, rows, largest = log.one(
-        f"SELECT count_if(abs({schema.REWARD}) > {schema.LARGEST_REWARD:.0f}), count(*), "
-        f"max(abs({schema.REWARD})) FROM clean"
-    )
     if large:
         raise InputError(
             f"{log.tables[0].files[0]}: {large:,} of {rows:,} rewards are beyond "
@@ -190,152 +87,119 @@ def _require_rewards_in_range(log: CleanLog) -> None:
         )
 
 
-def _not_finite(vector: str) -> str:
-    """SQL that tells whether a vector is missing or has a number that is not finite."""
-    finite = f"list_bool_and([coalesce(isfinite(v), false) FOR v IN {vector}])"
-    return f"{vector} IS NULL OR NOT {finite}"
-
-
-def _present(
-    tables: Sequence[Table], mapping: LogMapping, session_by: str | None
-) -> tuple[str, ...]:
-    """Log columns that every file has, and the required ones, which `bind` reports if missing."""
-    named = {name: value for name, value in mapping.columns.items() if value}
-    switched_off = mapping.columns.keys() - named.keys()
-    everywhere = set.intersection(*({c.casefold() for c in t.columns} for t in tables))
-    present = (set(named) | everywhere) - switched_off
-    if session_by == schema.SESSION_ID:
-        present.add(session_by)
-    if schema.ACTION in named or (schema.ACTION in present and schema.ITEM_ID not in present):
-        key = schema.ACTION
-    else:
-        key = schema.ITEM_ID
-    optional = (name for name in OPTIONAL_COLUMNS if name in present)
-    return (schema.USER_ID, key, schema.TIMESTAMP, *optional)
-
-
-Select = dict[str, tuple[str, str]]
-"""Log column to its (SQL, DuckDB type)."""
-
-
-def _select(
+def read_log(
     connection: duckdb.DuckDBPyConnection,
-    table: Table,
+    files: Sequence[Path],
     mapping: LogMapping,
-    columns: tuple[str, ...],
     reward: str,
-) -> Select:
-    select: Select = {}
-    for name in columns:
-        given = mapping.columns.get(name) or name
-        what = f"for {name}; map it with --column {name}=..."
-        select[name] = _typed(table, name, given, *bind(connection, table, what, given))
-    sql, kind = bind(connection, table, "for the reward", reward)
-    if not (is_number(kind) or kind == "BOOLEAN"):
-        raise wrong_type(table, "reward", reward, kind, "use a numeric or boolean expression")
-    # An error in one row (division by zero, a cast) makes only that row's reward undefined.
-    select[schema.REWARD] = (f"TRY(CAST({sql} AS DOUBLE))", "DOUBLE")
-    return select
+    session_by: str | None,
+    folder: Path,
+    duplicates: str = "highest",
+) -> TypedLog:
+    """Read and check every row of `files`.
+
+    Creates the table `rows`, which is `read` with `reason` (key of `REASONS` for dropped rows, NULL
+    for kept rows), and the view `clean` of the kept rows. Of rows with the same key (user, item or
+    action, time) one is kept, by default that with the highest reward, because late feedback is
+    logged as a second row of an impression. Ties are broken by the other columns, so that the order
+    of rows and files does not matter.
+
+    Args:
+        connection: engine that may open `files`.
+        files: log files.
+        mapping: log columns to the files' columns.
+        reward: scalar SQL expression over the files' columns.
+        session_by: "session_id", "gap" or "user"; None for session_id if the log has it, else gap.
+        folder: folder named when its disk is full.
+        duplicates: key of `DUPLICATES`, which of several rows with the same key is kept.
+
+    Raises:
+        InputError: a file, column or type makes the log unusable, an observation is missing or not
+            finite, a reward is too large to train with.
+    """
+    tables = tuple(open_tables(connection, files))
+    return check_rows(connection, tables, mapping, reward, session_by, folder, duplicates)
 
 
-def _typed(table: Table, name: str, given: str, sql: str, kind: str) -> tuple[str, str]:
-    """SQL that casts a column to its type in the schema, and that DuckDB type."""
-    if name in (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID):
-        if is_integer(kind) or kind in ("VARCHAR", "UUID"):
-            return sql, kind
-        wanted = f"use integers or text, e.g. --column {name}='{given}::BIGINT'"
-    elif name == schema.TIMESTAMP:
-        if is_number(kind):
-            return f"TRY_CAST(round({sql}) AS BIGINT)", "BIGINT"
-        if time := as_timestamp(sql, kind):
-            return f"TRY(epoch_ms({time}))", "BIGINT"
-        wanted = "use milliseconds, a date or a timestamp, e.g. --column timestamp='seconds * 1000'"
-    elif name in (schema.ACTION, schema.OBSERVATION):
-        if is_vector(kind):
-            return f"TRY_CAST({sql} AS FLOAT[])", "FLOAT[]"
-        wanted = f"use a list of numbers, e.g. --column {name}='{given}::FLOAT[]'"
-    elif name == schema.PROPENSITY:
-        if is_number(kind):
-            valid = f"{sql} > 0 AND {sql} <= {MAX_FLOAT}"
-            return f"CAST(CASE WHEN {valid} THEN {sql} END AS FLOAT)", "FLOAT"
-        wanted = "use a number above 0"
-    else:
-        if is_number(kind) or kind == "BOOLEAN":
-            return f"coalesce(CAST({sql} AS BOOLEAN), false)", "BOOLEAN"
-        wanted = "use a boolean or 0 and 1"
-    raise wrong_type(table, name, given, kind, wanted)
+def check_rows(
+    connection: duckdb.DuckDBPyConnection,
+    tables: tuple[Table, ...],
+    mapping: LogMapping,
+    reward: str,
+    session_by: str | None,
+    folder: Path,
+    duplicates: str = "highest",
+) -> TypedLog:
+    """`read_log` of tables that are already open."""
+    log = typed_log(connection, tables, mapping, reward, session_by, folder)
+    with explained(connection, tables, folder):
+        connection.execute(_checked(log, duplicates))
+        connection.execute(
+            "CREATE VIEW clean AS SELECT * EXCLUDE (reason) FROM rows WHERE reason IS NULL"
+        )
+        require_rewards_in_range(
+            log,
+            *log.one(
+                f"SELECT count_if(abs({schema.REWARD}) > {schema.LARGEST_REWARD:.0f}), count(*), "
+                f"max(abs({schema.REWARD})) FROM clean"
+            ),
+        )
+    return log
 
 
-def _unify_ids(selects: list[Select], name: str) -> None:
-    """Cast ids to BIGINT if every file has integers that fit, else to text."""
-    if name not in selects[0]:
-        return
-    wide = {"UBIGINT", "HUGEINT", "UHUGEINT"}
-    kinds = {select[name][1] for select in selects}
-    whole = all(is_integer(kind) and kind not in wide for kind in kinds)
-    for select in selects:
-        select[name] = (f"CAST({select[name][0]} AS {'BIGINT' if whole else 'VARCHAR'})", "")
-
-
-def _vector_sizes(
-    connection: duckdb.DuckDBPyConnection, columns: tuple[str, ...]
-) -> dict[str, int]:
-    sizes: dict[str, int] = {}
-    for name in (schema.ACTION, schema.OBSERVATION):
-        if name not in columns:
-            continue
-        counts = connection.sql(
-            f"SELECT len({name}) AS size, count(*) AS n FROM read WHERE {name} IS NOT NULL "
-            "GROUP BY size ORDER BY n DESC, size LIMIT 4"
-        ).fetchall()
-        if len(counts) > 1:
-            lengths = ", ".join(f"{n} rows of {size}" for size, n in counts)
-            raise InputError(f"{name} has lists of unequal length: {lengths}; make them equal")
-        if not counts or counts[0][0] == 0:
-            raise InputError(
-                f"{name} is empty in every row; map another column or --column {name}="
-            )
-        sizes[name] = int(counts[0][0])
-    return sizes
-
-
-def _checked(log: CleanLog, known_items: Path | None, duplicates: str) -> str:
-    keys = [schema.USER_ID, log.key, schema.TIMESTAMP]
-    keys += [schema.SESSION_ID] if log.session_by == schema.SESSION_ID else []
-    missing = " OR ".join(f"{k} IS NULL" for k in keys if k != schema.ACTION)
-    bad_vector = _not_finite(schema.ACTION) if schema.ACTION in log.vector_size else ""
-    unknown = "false"
-    if known_items is not None:
-        source = f"read_parquet({text(glob_pattern(known_items))})"
-        known = f"SELECT CAST(item_id AS VARCHAR) FROM {source}"
-        unknown = f"CAST({log.key} AS VARCHAR) NOT IN ({known})"
-    latest = int(time.time() * 1000) + DAY_MS
+def _checked(log: TypedLog, duplicates: str) -> str:
+    cases = " ".join(f"WHEN {sql} THEN '{reason}'" for reason, sql in faults(log).items())
     order = ", ".join(("good DESC", DUPLICATES[duplicates][0], *log.payload))
     return f"""
         CREATE TABLE rows AS
         WITH faults AS (
-            SELECT *, CASE
-                WHEN {missing} THEN 'null_key'
-                WHEN {schema.TIMESTAMP} NOT BETWEEN {EARLIEST_MS} AND {latest}
-                    THEN 'clock_out_of_range'
-                WHEN {bad_vector or "false"} THEN 'vector_not_finite'
-                WHEN {unknown} THEN 'unknown_item'
-            END AS fault,
-            coalesce(abs({schema.REWARD}) <= {MAX_FLOAT}, false) AS good
-            FROM read
+            SELECT *, CASE {cases} END AS fault,
+                coalesce(abs({schema.REWARD}) <= {MAX_FLOAT}, false) AS good
+            FROM {ROWS}
         ), ranked AS (
-            SELECT *, row_number() OVER w AS rank,
-                first_value({schema.REWARD}) OVER w AS kept_reward
-            FROM faults WINDOW w AS (
+            SELECT *, row_number() OVER (
                 PARTITION BY fault, {schema.USER_ID}, {log.key}, {schema.TIMESTAMP}
                 ORDER BY {order}
-            )
+            ) AS rank
+            FROM faults
         )
-        SELECT * EXCLUDE (fault, good, rank, kept_reward), CASE
+        SELECT * EXCLUDE (fault, good, rank), CASE
             WHEN fault IS NOT NULL THEN fault
             WHEN rank > 1 THEN 'duplicate'
             WHEN NOT good THEN 'reward_not_finite'
-        END AS reason,
-        fault IS NULL AND {schema.REWARD} IS DISTINCT FROM kept_reward AS conflict
+        END AS reason
         FROM ranked
     """
+
+
+def drop_counts(log: TypedLog) -> dict[str, int]:
+    """Number of dropped rows of the table `rows` for each of `REASONS`.
+
+    Raises:
+        InputError: every row is dropped.
+    """
+    counts = dict(
+        log.connection.sql("SELECT reason, count(*) FROM rows GROUP BY reason").fetchall()
+    )
+    dropped = {reason: int(counts.get(reason, 0)) for reason in REASONS}
+    require_rows(log, counts.get(None, 0), dropped)
+    return dropped
+
+
+def require_rows(log: TypedLog, kept: int, dropped: Mapping[str, int]) -> None:
+    """Check that a row is left.
+
+    Args:
+        log: for the message.
+        kept: number of rows that are.
+        dropped: number of dropped rows by reason.
+
+    Raises:
+        InputError: none is.
+    """
+    if kept == 0:
+        reasons = "; ".join(f"{n} rows: {REASONS[reason]}" for reason, n in dropped.items() if n)
+        hint = "; is the time in milliseconds?" if dropped["clock_out_of_range"] else ""
+        raise InputError(
+            f"{log.name}: no row is left ({reasons}{hint}); correct the mapping or the log"
+        )

@@ -1,15 +1,24 @@
 """DuckDB connections that can open nothing but their inputs and a scratch folder."""
 
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Any, Final
 
 import duckdb
+import numpy as np
+import numpy.typing as npt
 
 from ucfrec.errors import InputError
 from ucfrec.locks import scratch_folder
 from ucfrec.logs.binding import glob_pattern, text
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+BATCH_ROWS: Final = 2**17
+"""Rows of a batch read from DuckDB."""
 
 _CLOSED: Final = {
     "allow_community_extensions": False,
@@ -23,7 +32,7 @@ _CLOSED: Final = {
 
 @contextmanager
 def engine(
-    inputs: Iterable[Path], folder: Path, memory_limit: str | None = None
+    inputs: Iterable[Path], folder: Path, memory_limit: str | None = None, beside: int = 0
 ) -> Iterator[duckdb.DuckDBPyConnection]:
     """A DuckDB connection with a database on disk.
 
@@ -36,6 +45,7 @@ def engine(
             killed processes in it.
         memory_limit: size such as "2GB", beyond which rows spill to disk; None for DuckDB's
             default.
+        beside: bytes of the limit that the rest of the process needs, at most half of them.
 
     Raises:
         InputError: `memory_limit` is not a size.
@@ -49,6 +59,9 @@ def engine(
             try:
                 if memory_limit is not None:
                     connection.execute("SET memory_limit = ?", [memory_limit])
+                    if (limit := _bytes(memory_limit)) and beside:
+                        own = max(limit - beside, limit // 2)
+                        connection.execute("SET memory_limit = ?", [f"{own} B"])
             except duckdb.Error:
                 raise InputError(
                     f"memory_limit {memory_limit!r} is no size; write e.g. 2GB"
@@ -58,6 +71,15 @@ def engine(
             yield connection
         finally:
             connection.close()
+
+
+def _bytes(size: str) -> int | None:
+    """A size such as "2GB" or "1.5 GiB" in bytes; None if it is written in another way."""
+    found = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([kmgt]?)(i?)b?\s*", size.lower())
+    if found is None:
+        return None
+    base = 1024 if found[3] else 1000
+    return int(float(found[1]) * base ** " kmgt".index(found[2] or " "))
 
 
 @contextmanager
@@ -70,6 +92,24 @@ def engine_in_memory() -> Iterator[duckdb.DuckDBPyConnection]:
         yield connection
     finally:
         connection.close()
+
+
+def as_numpy(column: "pa.Array") -> npt.NDArray[Any]:
+    """A column of numbers or truth values without missing ones, copied only if it must be.
+
+    `pyarrow.Array.to_numpy` would import pandas, which takes longer than reading a small log.
+    """
+    if str(column.type) == "bool":
+        return np.from_dlpack(column.cast("uint8")).view(np.bool_)
+    return np.from_dlpack(column)
+
+
+def as_arrow(numbers: npt.NDArray[np.int64]) -> "pa.Array":
+    """Whole numbers as a column; `pyarrow.array` would import pandas."""
+    import pyarrow as pa
+
+    buffer = pa.py_buffer(np.ascontiguousarray(numbers, dtype=np.int64))
+    return pa.Array.from_buffers(pa.int64(), len(numbers), [None, buffer])
 
 
 def _set_semantics(connection: duckdb.DuckDBPyConnection) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from ucfrec.episodes.states import DISTINCT_TAGS, TAGS_PER_ITEM
+from ucfrec.episodes.item_table import DISTINCT_TAGS, TAGS_PER_ITEM
 from ucfrec.errors import InputError
 
 CATEGORIES: Final = 200

@@ -12,11 +12,10 @@ import pyarrow as pa
 from ucfrec import schema
 from ucfrec.errors import InputError
 from ucfrec.logs.binding import Table, explained, quoted
-from ucfrec.logs.clean import REASONS, CleanLog, check_rows, read_log
-from ucfrec.logs.engine import engine, engine_in_memory
+from ucfrec.logs.clean import REASONS, check_rows, drop_counts, read_log
+from ucfrec.logs.engine import BATCH_ROWS, engine, engine_in_memory
 from ucfrec.logs.mapping import LogMapping, log_files
-from ucfrec.logs.prepare import BATCH_ROWS
-from ucfrec.logs.summary import drop_counts
+from ucfrec.logs.typed import TypedLog
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -28,6 +27,10 @@ HISTORIES: Final = "histories"
 @dataclass(frozen=True)
 class FrameTable(Table):
     """A data frame or Arrow table registered with the engine; `files` holds its name."""
+
+    @property
+    def columnar(self) -> bool:
+        return True
 
     @property
     def sql(self) -> str:
@@ -64,7 +67,7 @@ def read_histories(
     """
     folder, files = Path(gettempdir()), log_files(paths)
     with engine(files, folder, memory_limit) as connection:
-        log = read_log(connection, files, mapping, reward, session_by, None, folder, duplicates)
+        log = read_log(connection, files, mapping, reward, session_by, folder, duplicates)
         drop_counts(log)
         with explained(connection, log.tables, folder):
             yield from _by_user(log, last)
@@ -104,9 +107,7 @@ def frame_histories(
         described = connection.sql(f"DESCRIBE {HISTORIES}").fetchall()
         table = FrameTable((Path(HISTORIES),), tuple((row[0], row[1]) for row in described))
         source = Path(HISTORIES)
-        log = check_rows(
-            connection, (table,), mapping, reward, session_by, None, source, duplicates
-        )
+        log = check_rows(connection, (table,), mapping, reward, session_by, source, duplicates)
         _require_clean(log)
         with explained(connection, log.tables, Path(HISTORIES)):
             yield from _by_user(log, last)
@@ -151,7 +152,7 @@ def log_table(frame: "pd.DataFrame", name: str) -> pa.Table:
     return pa.table(columns)
 
 
-def _require_clean(log: CleanLog) -> None:
+def _require_clean(log: TypedLog) -> None:
     dropped = drop_counts(log)
     faults = {reason: n for reason, n in dropped.items() if n and reason != "duplicate"}
     if faults:
@@ -160,7 +161,7 @@ def _require_clean(log: CleanLog) -> None:
         raise InputError(f"{HISTORIES}: {rows}{hint}; correct those rows or leave them out")
 
 
-def _by_user(log: CleanLog, last: int) -> Iterator[pa.RecordBatch]:
+def _by_user(log: TypedLog, last: int) -> Iterator[pa.RecordBatch]:
     if log.key != schema.ITEM_ID:
         raise InputError(f"{log.tables[0].files[0]}: its actions are vectors; map item_id instead")
     lists = {

@@ -1,19 +1,20 @@
 """Item embeddings and user features, learnt from the training split only."""
 
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-import torch
 from scipy import sparse
-from sklearn.utils.extmath import randomized_svd
 
 from ucfrec import schema
-from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
+from ucfrec.episodes.item_table import ITEM_STATES, write_item_table
+from ucfrec.episodes.record import read_store_record
 from ucfrec.errors import InputError
+from ucfrec.logs.moments import Moments
+from ucfrec.logs.spectral import SparseRows, right_singular_vectors
 from ucfrec.processes import require_blas_memory
 
 IntArray = npt.NDArray[np.int64]
@@ -27,23 +28,99 @@ CONTENT_RANK: Final = 64
 """Most feature dimensions in that regression."""
 USER_SIZE: Final = 32
 """Most dimensions of the user features."""
+BLOCK_STEPS: Final = 2**19
+"""Training steps in memory at a time, or more if one user has more."""
 EXPOSURE: Final = 0.25
 """Weight of an impression without any liking; full liking adds 1."""
 
 
+@dataclass(frozen=True)
+class TrainingSteps:
+    """Training steps in which those of one user follow each other."""
+
+    users: IntArray
+    """(M,) number of the user."""
+    items: IntArray
+    """(M,) number of the item."""
+    rewards: npt.NDArray[np.float64]
+    """(M,)."""
+
+
+def training_steps(folder: Path) -> Iterator[TrainingSteps]:
+    """The training steps of a store, in batches that end between two users.
+
+    Args:
+        folder: store of a log of items, as `prepare` writes it: in order of the users.
+    """
+    held: list[TrainingSteps] = []
+    for batch in _in_order(folder):
+        held.append(batch)
+        if sum(len(each.users) for each in held) < BLOCK_STEPS:
+            continue
+        joined = _joined(held)
+        changes = np.flatnonzero(joined.users[1:] != joined.users[:-1])
+        if not len(changes):
+            held = [joined]
+            continue
+        end = int(changes[-1]) + 1
+        yield _part(joined, slice(end))
+        held = [_part(joined, slice(end, None))]
+    if held:
+        yield _joined(held)
+
+
+def _in_order(folder: Path) -> Iterator[TrainingSteps]:
+    meta, _ = read_store_record(folder)
+    for number in range(meta["n_shards"]):
+        shard = folder / f"shard-{number:05d}"
+        columns = {
+            name: np.load(shard / f"{name}.npy", mmap_mode="r") for name in (schema.ITEM, "reward")
+        }
+        offsets, users, splits = (
+            np.load(shard / f"{name}.npy") for name in (schema.OFFSETS, "user", "split")
+        )
+        begin = 0
+        while begin < len(users):
+            end = int(np.searchsorted(offsets, offsets[begin] + BLOCK_STEPS))
+            end = min(max(end, begin + 1), len(users))
+            lengths = np.diff(offsets[begin : end + 1])
+            training = np.repeat(splits[begin:end] == 0, lengths)
+            rows = slice(int(offsets[begin]), int(offsets[end]))
+            yield TrainingSteps(
+                np.repeat(users[begin:end], lengths)[training],
+                columns[schema.ITEM][rows][training].astype(np.int64),
+                columns["reward"][rows][training].astype(np.float64),
+            )
+            begin = end
+
+
+def _joined(batches: list[TrainingSteps]) -> TrainingSteps:
+    return TrainingSteps(
+        np.concatenate([batch.users for batch in batches]),
+        np.concatenate([batch.items for batch in batches]),
+        np.concatenate([batch.rewards for batch in batches]),
+    )
+
+
+def _part(batch: TrainingSteps, rows: slice) -> TrainingSteps:
+    return TrainingSteps(batch.users[rows], batch.items[rows], batch.rewards[rows])
+
+
 def write_item_states(
     folder: Path,
+    scratch: Path,
     item_features: sparse.csr_matrix | None,
     user_features: sparse.csr_matrix | None,
     n_items: int,
     n_users: int,
     size: int,
     tags: IntArray | None = None,
-) -> ItemStates:
+) -> None:
     """Learn the item embeddings and user features of the store at `folder` and write them there.
 
     Args:
         folder: episode store, which receives the file of item states.
+        scratch: folder for files that are of no use afterwards.
         item_features: (n_items, F) as from `ucfrec.logs.features.encode_features`; None for none.
         user_features: (n_users, G) likewise.
         n_items: number of items of the store.
@@ -51,45 +128,91 @@ def write_item_states(
         size: most dimensions of the item embeddings.
         tags: (n_items, T) as from `ucfrec.logs.features.item_tags`; None for none.
 
-    Returns:
-        The item states, as written.
-
     Raises:
         InputError: the rewards of the training split are all equal.
     """
-    store = EpisodeStore.open(folder).split("train")
-    episodes, steps = store.all_steps()
-    items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
-    rewards = store.step_values(schema.REWARD, episodes, steps).astype(np.float64)
-    users = store.episode_values(schema.USER)[episodes]
-    low = float(rewards.min())
-    high = min(float(rewards.max()), float(rewards.mean() + 2 * rewards.std()))
+    counts = np.zeros(n_items, dtype=np.int64)
+    trained = np.zeros(n_users, dtype=bool)
+    moments, low, highest = Moments(1), np.inf, -np.inf
+    for batch in training_steps(folder):
+        counts += np.bincount(batch.items, minlength=n_items)
+        trained[batch.users] = True
+        moments.add(batch.rewards)
+        low = min(low, float(batch.rewards.min(initial=np.inf)))
+        highest = max(highest, float(batch.rewards.max(initial=-np.inf)))
+    high = min(highest, float(moments.mean[0] + 2 * np.sqrt(moments.covariance[0, 0])))
     if not low < high:
         raise InputError(
-            f"all {len(rewards)} rewards of the training split equal {low}; choose another reward"
+            f"all {moments.count} rewards of the training split equal {low}; choose another reward"
         )
-    liking = np.clip((rewards - low) / (high - low), 0, 1)
-    embeddings = item_embeddings(users, items, liking, n_items, item_features, size)
+    matrix = Exposure(scratch / "exposure.bin", counts)
+    for batch in training_steps(folder):
+        liking = np.clip((batch.rewards - low) / (high - low), 0, 1)
+        matrix.add(batch.users, batch.items, EXPOSURE + liking)
+    embeddings = item_embeddings(matrix, item_features, size)
     user_vectors = np.zeros((n_users, 0), dtype=np.float32)
     if user_features is not None:
-        known = np.unique(users)
+        known = np.flatnonzero(trained)
         user_vectors = _reduced(user_features, known, USER_SIZE)
         spread = user_vectors[known].std(axis=0)
         user_vectors /= np.where(spread > 0, spread, 1)
-    states = ItemStates(torch.from_numpy(embeddings), torch.from_numpy(user_vectors), low, high)
-    if tags is not None:
-        states = replace(states, tags=torch.from_numpy(tags))
-    states.save(folder / ITEM_STATES)
-    return states
+    write_item_table(folder / ITEM_STATES, embeddings, user_vectors, low, high, tags)
+
+
+class Exposure:
+    """The user × item matrix of exposure and liking, on disk."""
+
+    def __init__(self, path: Path, counts: IntArray) -> None:
+        """
+        Args:
+            path: of a new file for scratch.
+            counts: (n_items,) number of training steps that show each item.
+        """
+        self.counts = counts
+        self.trained = np.flatnonzero(counts)
+        """Items that are shown: item of each column."""
+        self._column = np.cumsum(counts > 0) - 1
+        self._rows = SparseRows(path, len(self.trained))
+        self._by_item = np.zeros(len(self.trained))
+
+    def add(self, users: IntArray, items: IntArray, weights: npt.NDArray[np.float64]) -> None:
+        """Add steps.
+
+        Args:
+            users: (M,) user of each step; those of one user follow each other, in one call.
+            items: (M,) item shown.
+            weights: (M,) above 0; those of one user and item are added up.
+        """
+        if not len(users):
+            return
+        rows = np.cumsum(np.append(False, users[1:] != users[:-1]))
+        shape = (int(rows[-1]) + 1, len(self.trained))
+        block = sparse.coo_matrix((weights, (rows, self._column[items])), shape=shape).tocsr()
+        block.data = np.log1p(block.data)
+        self._by_item += np.asarray(block.sum(axis=0, dtype=np.float64)).ravel()
+        by_user = np.sqrt(np.asarray(block.sum(axis=1, dtype=np.float64)).ravel())
+        block.data /= np.repeat(by_user, np.diff(block.indptr))
+        self._rows.append(block)
+
+    def cooccurrence(self, size: int) -> npt.NDArray[np.float64]:
+        """(trained items, ≤ size) unit rows from the SVD of the matrix."""
+        by_item = np.sqrt(self._by_item)
+        rank = min(size + 1, *self._rows.shape)
+        require_blas_memory()
+        strength, directions = right_singular_vectors(self._rows, by_item, rank)
+        # One direction holds only the popularity of items (the trivial axis of correspondence
+        # analysis) and has the largest singular value; it would dominate the others.
+        popular = by_item / np.linalg.norm(by_item)
+        directions = directions - np.outer(directions @ popular, popular)
+        left = np.linalg.norm(directions, axis=1)
+        # Directions beyond the rank of the matrix are 0 from the start.
+        trivial = np.where(strength > 0, left, np.inf).argmin()
+        nontrivial = np.delete(np.arange(rank), trivial) if rank > 1 else np.arange(1)
+        return _unit_rows((np.sqrt(strength)[nontrivial, None] * directions[nontrivial]).T)
 
 
 def item_embeddings(
-    users: IntArray,
-    items: IntArray,
-    liking: npt.NDArray[np.float64],
-    n_items: int,
-    features: sparse.csr_matrix | None = None,
-    size: int = 32,
+    exposure: Exposure, features: sparse.csr_matrix | None = None, size: int = 32
 ) -> FloatArray:
     """Embed items by co-occurrence in users' histories and by their features.
 
@@ -100,50 +223,26 @@ def item_embeddings(
     features themselves, reduced by SVD. No embedding has a norm above 1.
 
     Args:
-        users: (M,) user of each training step.
-        items: (M,) item shown, 0 to n_items − 1.
-        liking: (M,) reward scaled to [0, 1].
-        n_items: number of items.
+        exposure: all training steps.
         features: (n_items, F); None for none.
         size: largest D.
 
     Returns:
         (n_items, D) float32; D is below `size` if there are few users, items or features.
     """
-    trained, columns, counts = np.unique(items, return_inverse=True, return_counts=True)
+    trained = exposure.trained
+    counts = exposure.counts[trained]
     content = None if features is None else _unit_rows(_reduced(features, trained, size // 2))
     remaining = size if content is None else max(size - content.shape[1], 1)
-    cooccurrence = _cooccurrence(users, columns, EXPOSURE + liking, remaining)
+    cooccurrence = exposure.cooccurrence(remaining)
     trust = (counts / (counts + PRIOR_COUNT))[:, None]
-    combined = np.zeros((n_items, cooccurrence.shape[1]))
+    combined = np.zeros((len(exposure.counts), cooccurrence.shape[1]))
     if features is not None:
         combined = _predicted(features, trained, cooccurrence, counts)
     combined[trained] = trust * cooccurrence + (1 - trust) * combined[trained]
     if content is None:
         return np.asarray(combined, dtype=np.float32)
     return np.asarray(np.hstack([combined, content]) / np.sqrt(2), dtype=np.float32)
-
-
-def _cooccurrence(
-    users: IntArray, columns: IntArray, weights: npt.NDArray[np.float64], size: int
-) -> npt.NDArray[np.float64]:
-    """(trained items, ≤ size) unit rows from the SVD of the weighted user × item matrix."""
-    _, rows = np.unique(users, return_inverse=True)
-    matrix = sparse.coo_matrix((weights, (rows, columns))).tocsr()
-    matrix.data = np.log1p(matrix.data)
-    by_item = np.sqrt(np.asarray(matrix.sum(axis=0)).ravel())
-    by_user = np.sqrt(np.asarray(matrix.sum(axis=1)).ravel())
-    balanced = sparse.diags(1 / by_user) @ matrix @ sparse.diags(1 / by_item)
-    rank = min(size + 1, *balanced.shape)
-    require_blas_memory()
-    _, strength, directions = randomized_svd(balanced, rank, random_state=0)
-    # One direction holds only the popularity of items (the trivial axis of correspondence
-    # analysis) and has the largest singular value; it would dominate the others.
-    popular = by_item / np.linalg.norm(by_item)
-    directions = directions - np.outer(directions @ popular, popular)
-    nontrivial = np.delete(np.arange(rank), np.linalg.norm(directions, axis=1).argmin())
-    nontrivial = nontrivial if rank > 1 else np.arange(1)
-    return _unit_rows((np.sqrt(strength)[nontrivial, None] * directions[nontrivial]).T)
 
 
 def _predicted(
@@ -175,6 +274,8 @@ def _axes(known: sparse.csr_matrix, size: int) -> npt.NDArray[Any]:
     """(F, D ≤ `size`) right singular vectors of the rows; the identity if F ≤ `size`."""
     if known.shape[1] <= size:
         return np.eye(known.shape[1])
+    from sklearn.utils.extmath import randomized_svd  # takes seconds to import
+
     require_blas_memory()
     _, _, directions = randomized_svd(known, min(size, known.shape[0]), random_state=0)
     return np.asarray(directions.T)

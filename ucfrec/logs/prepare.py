@@ -1,52 +1,55 @@
 """Turn Parquet and CSV logs into an episode store: clean rows, form sessions, write episodes.
 
-One SQL pipeline on an embedded DuckDB, out of core: rows are read and checked (`clean`), grouped
-into sessions (`sessions`) and written in order to the store.
+An embedded DuckDB reads and sorts the rows once, out of core. What follows goes through the sorted
+rows in batches: faults and duplicates (`sorted_rows`), sessions (`sessions`), counts (`measures`)
+and the store (`steps`).
 """
 
-import hashlib
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from tempfile import gettempdir
 from typing import Any, Final
 
-import numpy.typing as npt
-import pyarrow as pa
-import pyarrow.parquet as pq
-
 from ucfrec import schema
 from ucfrec.checksums import seal
+from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.record import RECORD
-from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_folder
-from ucfrec.logs.binding import explained
-from ucfrec.logs.clean import DUPLICATES, CleanLog, read_log
+from ucfrec.locks import scratch_folder
+from ucfrec.logs.binding import explained, open_tables
+from ucfrec.logs.clean import DUPLICATES, require_rows
+from ucfrec.logs.distributions import RewardPasses, distributions
 from ucfrec.logs.engine import engine
 from ucfrec.logs.feature_tables import load_features
-from ucfrec.logs.mapping import LogMapping, log_files
-from ucfrec.logs.sessions import (
+from ucfrec.logs.ids import (
     EPISODE_USERS,
     ID_TABLES,
     ITEMS_FILE,
-    SESSIONS,
     USERS_FILE,
-    Cut,
-    cut_episodes,
-    episode_users,
     number_ids,
-    ordered_steps,
-    split_bounds,
+    popularity,
+    write_episode_users,
+    write_ids,
 )
-from ucfrec.logs.summary import build_report, drop_counts, require_variety
+from ucfrec.logs.mapping import LogMapping, log_files
+from ucfrec.logs.measures import Measures, binned_rewards, measure, sampled_rewards
+from ucfrec.logs.order import count_unsorted
+from ucfrec.logs.sessions import SESSIONS, Cut, Episodes, by_sessions, episodes, split_bounds
+from ucfrec.logs.sorted_rows import SortedRows, sort_rows
+from ucfrec.logs.spool import Spool
+from ucfrec.logs.steps import StepNumbers, write_steps
+from ucfrec.logs.summary import build_report, require_variety
+from ucfrec.logs.typed import TypedLog, typed_log
 from ucfrec.progress import progress
 
-BATCH_ROWS: Final = 2**17
-"""Rows of a batch read from DuckDB."""
+BESIDE: Final = 400 * 2**20
+"""Bytes that `prepare` takes beside the engine: Python with its packages, and batches of rows."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,8 @@ class PrepareOptions:
     """Key of `ucfrec.logs.clean.DUPLICATES`: which of several rows with the same user, item or
     action, and time is kept; with "first" and "last" the order of files and rows matters."""
     memory_limit: str = "2GB"
-    """Memory of DuckDB, e.g. "2GB"; beyond it, rows spill to disk."""
+    """Memory of the process, e.g. "2GB", for logs of any size; rows spill to disk. From "800MB" on
+    it holds, below that half of it is the engine's."""
     temp_folder: Path | None = None
     """Folder for spilled rows; None for the parent of the store (the system's for `validate`)."""
 
@@ -158,23 +162,19 @@ def prepare(
     with atomic_folder(out) as folder:
         spill = options.temp_folder or out.parent
         with (
-            _episodes(files, mapping, options, spill, like, keep_unknown) as (
-                log,
-                report,
-                features,
-            ),
-            explained(log.connection, log.tables, out.parent),
+            _prepared(files, mapping, options, spill, like, keep_unknown) as found,
+            explained(found.rows.log.connection, found.rows.log.tables, out.parent),
         ):
-            writer = StoreWriter(folder)
+            log, report = found.rows.log, found.report
+            numbers = StepNumbers.of(log, found.measures, found.scratch)
             with progress(report["steps"], "write the store", "steps") as bar:
-                for batch in log.connection.sql(ordered_steps(log)).to_arrow_reader(BATCH_ROWS):
-                    _append(writer, batch, log)
-                    bar.update(len(batch))
-            meta = writer.finish(report["reward"], report, _write_ids(log, folder))
+                writer = write_steps(folder, found.episodes(), found.spool, numbers, bar)
+            meta = writer.finish(report["reward"], report, write_ids(log, folder))
             if log.key == schema.ITEM_ID:
-                _write_states(log, folder, features, options.embedding_size, like)
+                _write_states(found, folder, options.embedding_size, like)
             if like is not None:
-                _copy(log, episode_users(), folder / EPISODE_USERS)
+                users = (each.users for each in found.episodes())
+                write_episode_users(log, folder / EPISODE_USERS, users)
             seal(folder, RECORD, meta)
     return report
 
@@ -197,56 +197,107 @@ def validate(
     """
     options = options or PrepareOptions()
     spill = options.temp_folder or Path(gettempdir())
-    with _episodes(log_files(paths), mapping, options, spill, None) as (_, report, _):
-        return report
+    with _prepared(log_files(paths), mapping, options, spill, None) as found:
+        return found.report
 
 
 Features = dict[str, list[str]]
 """Id column to the names of its DuckDB feature tables."""
 
 
+@dataclass(frozen=True)
+class _Prepared:
+    """A log that is sorted and counted."""
+
+    rows: SortedRows
+    spool: Spool
+    """The usable rows in the order of the store."""
+    cut: Cut
+    measures: Measures
+    features: Features
+    report: dict[str, Any]
+    scratch: Path
+    """Folder for scratch."""
+
+    def episodes(self) -> Iterator[Episodes]:
+        """Those of the store."""
+        return episodes(self.spool, self.cut, self.rows.last_ms)
+
+
 @contextmanager
-def _episodes(
+def _prepared(
     files: Sequence[Path],
     mapping: LogMapping,
     options: PrepareOptions,
     spill: Path,
     like: Path | None,
     keep_unknown: bool = False,
-) -> Iterator[tuple[CleanLog, dict[str, Any], Features]]:
-    """The log with its table `steps`, the report on it, and the feature tables."""
+) -> Iterator[_Prepared]:
+    """The log, sorted and counted, with the tables of its ids."""
     reward = options.reward or mapping.reward or schema.REWARD
     session_by = options.session_by or mapping.session_by
     known = None if like is None or keep_unknown else like / ITEMS_FILE
     inputs = (*files, *_other_inputs(mapping, like))
-    with engine(inputs, spill, options.memory_limit) as connection:
+    with (
+        scratch_folder(spill, "sorted") as scratch,
+        engine(inputs, spill, options.memory_limit, BESIDE) as connection,
+    ):
         with progress(4, "check the logs", "stages") as stage:
-            rule = options.duplicates
-            log = read_log(connection, files, mapping, reward, session_by, known, spill, rule)
-            stage.update()
+            tables = tuple(open_tables(connection, files))
+            log = typed_log(connection, tables, mapping, reward, session_by, spill)
             with explained(connection, log.tables, spill):
-                dropped = drop_counts(log)
+                rows = sort_rows(log, known, options.duplicates, scratch)
+                require_rows(log, len(rows.clean), rows.dropped)
                 if like is None:
-                    require_variety(log)
-                bounds = split_bounds(log, options.split if like is None else (1.0, 0.0, 0.0))
-                gap_ms = round(options.gap_minutes * 60_000)
-                cut = Cut(log.session_by, gap_ms, options.min_steps, bounds)
-                cut_episodes(log, cut)
+                    require_variety(rows)
                 stage.update()
-                features = {
-                    name: load_features(connection, tables, name, log.id_type(name))
-                    for name, tables in (
-                        (schema.USER_ID, mapping.user_features),
-                        (schema.ITEM_ID, mapping.item_features),
-                    )
-                    if name in log.columns and like is None
-                }
-                number_ids(log, features, like)
+                spool, cut = _cut(rows, options, like, scratch)
                 stage.update()
-                report = {"reward": reward, **build_report(log, cut, dropped)}
-                report["duplicates"] = rule
+                measures = measure(spool, cut, rows.last_ms, rows.items, scratch / "users")
                 stage.update()
-        yield log, report, features
+                features = _features(log, mapping, like)
+                number_ids(log, measures, features, like)
+                report = _report(rows, spool, cut, measures)
+                report = {"reward": reward, **report, "duplicates": options.duplicates}
+                stage.update()
+        yield _Prepared(rows, spool, cut, measures, features, report, scratch)
+
+
+def _cut(
+    rows: SortedRows, options: PrepareOptions, like: Path | None, scratch: Path
+) -> tuple[Spool, Cut]:
+    """The usable rows in the order of the store, and how they form episodes."""
+    bounds = split_bounds(rows, options.split if like is None else (1.0, 0.0, 0.0))
+    gap_ms = round(options.gap_minutes * 60_000)
+    cut = Cut(rows.log.session_by, gap_ms, options.min_steps, bounds)
+    if cut.session_by == schema.SESSION_ID:
+        return by_sessions(rows, scratch / "sessions"), cut
+    return rows.clean, cut
+
+
+def _report(rows: SortedRows, spool: Spool, cut: Cut, measures: Measures) -> dict[str, Any]:
+    shown = None if rows.log.key != schema.ITEM_ID else popularity(rows.log, measures)
+
+    given = spool, cut, rows.last_ms
+    passes = RewardPasses(
+        partial(sampled_rewards, *given, measures.steps), partial(binned_rewards, *given)
+    )
+    summary = distributions(measures, shown, passes)
+    return build_report(rows, cut, measures, count_unsorted(rows.placed), summary)
+
+
+def _features(log: TypedLog, mapping: LogMapping, like: Path | None) -> Features:
+    """Read the feature tables of users and items; none for a store like another."""
+    if like is not None:
+        return {}
+    return {
+        name: load_features(log.connection, tables, name, log.id_type(name))
+        for name, tables in (
+            (schema.USER_ID, mapping.user_features),
+            (schema.ITEM_ID, mapping.item_features),
+        )
+        if name in log.columns
+    }
 
 
 def _other_inputs(mapping: LogMapping, like: Path | None) -> Iterator[Path]:
@@ -258,64 +309,26 @@ def _other_inputs(mapping: LogMapping, like: Path | None) -> Iterator[Path]:
         yield from log_files(table.files)
 
 
-def _append(writer: StoreWriter, batch: pa.RecordBatch, log: CleanLog) -> None:
-    columns: dict[str, npt.NDArray[Any]] = {}
-    for name in batch.schema.names:
-        column = batch.column(name)
-        if name in log.vector_size:
-            columns[name] = column.flatten().to_numpy().reshape(-1, log.vector_size[name])
-        else:
-            columns[name] = column.to_numpy(zero_copy_only=False)
-    episodes = {name: columns.pop(name) for name in schema.EPISODE_DTYPES}
-    first = columns.pop("first")
-    writer.append(columns, first, episodes)
-
-
-def _write_ids(log: CleanLog, folder: Path) -> dict[str, list[Any]]:
-    """Write `users.parquet` and `items.parquet`; returns a digest of each for the fingerprint."""
-    digests: dict[str, list[Any]] = {}
-    for name, table, file in ID_TABLES:
-        if name not in log.columns:
-            continue
-        _copy(log, f"SELECT * EXCLUDE number FROM {table} ORDER BY number", folder / file)
-        digest = hashlib.sha256()
-        query = f"SELECT {name} FROM {table} ORDER BY number"
-        for batch in log.connection.sql(query).to_arrow_reader(BATCH_ROWS):
-            digest.update("\n".join(map(str, batch.column(0).to_pylist())).encode())
-        digests[name] = [digest.hexdigest()]
-    return digests
-
-
-def _copy(log: CleanLog, query: str, file: Path) -> None:
-    # DuckDB's COPY cannot write here: its connection may open only the scratch folder.
-    reader = log.connection.sql(query).to_arrow_reader(BATCH_ROWS)
-    with pq.ParquetWriter(file, reader.schema) as writer:
-        for batch in reader:
-            writer.write_batch(batch)
-
-
-def _write_states(
-    log: CleanLog, folder: Path, features: Features, size: int, like: Path | None
-) -> None:
+def _write_states(found: _Prepared, folder: Path, size: int, like: Path | None) -> None:
     """Learn the item states, or copy those of the store `like`."""
-    # Importing torch and scikit-learn takes seconds, which only checking a log must not cost.
-    from ucfrec.episodes.store import ITEM_STATES
+    # Only a store needs scipy, which takes a moment to import.
     from ucfrec.logs.features import encode_features, item_tags
     from ucfrec.logs.items import write_item_states
 
     if like is not None:
         shutil.copy(like / ITEM_STATES, folder / ITEM_STATES)
         return
-    encoded, counts = {}, {}
+    log, encoded, counts = found.rows.log, {}, {}
     for name, table, _ in ID_TABLES:
         (counts[name],) = log.one(f"SELECT count(*) FROM {table}")
-        encoded[name] = encode_features(log.connection, features[name], table, name)
+        encoded[name] = encode_features(log.connection, found.features[name], table, name)
     write_item_states(
         folder,
+        found.scratch,
         encoded[schema.ITEM_ID],
         encoded[schema.USER_ID],
         counts[schema.ITEM_ID],
         counts[schema.USER_ID],
         size,
-        item_tags(log.connection, features[schema.ITEM_ID], "items", schema.ITEM_ID),
+        item_tags(log.connection, found.features[schema.ITEM_ID], "items", schema.ITEM_ID),
     )

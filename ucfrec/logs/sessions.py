@@ -1,22 +1,22 @@
-"""SQL that cuts clean log rows into episodes and numbers their users and items."""
+"""Episodes of sorted rows: where sessions begin, how a split cuts them, which are kept."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
 
 from ucfrec import schema
-from ucfrec.errors import InputError
-from ucfrec.logs.binding import glob_pattern, text
-from ucfrec.logs.clean import CleanLog
+from ucfrec.logs.order import BLOCK, ranked
+from ucfrec.logs.sorted_rows import SortedRows
+from ucfrec.logs.spool import Spool
 
-ITEMS_FILE: Final = "items.parquet"
-USERS_FILE: Final = "users.parquet"
-EPISODE_USERS: Final = "episode_users.parquet"
-ID_TABLES: Final = (
-    (schema.USER_ID, "users", USERS_FILE),
-    (schema.ITEM_ID, "items", ITEMS_FILE),
-)
-"""Id column, its DuckDB table of ids and numbers, and the file of that table in the store."""
+Array = npt.NDArray[Any]
+BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
+
 SESSIONS: Final = (schema.SESSION_ID, "gap", "user")
 """Ways in which rows form sessions."""
 
@@ -35,145 +35,176 @@ class Cut:
     """Times (ms) at which the validation and the test split begin."""
 
 
-def split_bounds(log: CleanLog, split: tuple[float, ...]) -> tuple[int, int]:
+@dataclass(frozen=True)
+class Episodes:
+    """Consecutive episodes, with M rows in E episodes that are kept."""
+
+    begin: int
+    """First of their rows in the spool, dropped ones included."""
+    end: int
+    """Row after their last one."""
+    kept: BoolArray | slice
+    """Which of these rows are in episodes that are kept."""
+    lengths: IntArray
+    """(E,) steps."""
+    users: IntArray
+    """(E,) `user` of the spool."""
+    splits: npt.NDArray[np.uint8]
+    """(E,) 0 train, 1 validation, 2 test."""
+    begins_session: BoolArray
+    """(E,) false for the later pieces of a session that a split cuts."""
+    terminated: BoolArray
+    """(E,) false for episodes cut at a split and for sessions that may have gone on after the log
+    ended: a user's last one if sessions are users, or if it ended within the gap before the end of
+    the log."""
+
+    def column(self, spool: Spool, name: str) -> Array:
+        """(M,) or (M, size) rows of a column of the spool."""
+        return np.asarray(spool.read(name, self.begin, self.end)[self.kept])
+
+
+def split_bounds(rows: SortedRows, split: tuple[float, ...]) -> tuple[int, int]:
     """Times (ms) at which the validation and the test split begin.
 
     Args:
-        log: clean log.
+        rows: at least one usable row.
         split: three shares of the rows in order of time, or the two times (ms).
     """
     if len(split) == 2:
         return int(split[0]), int(split[1])
-    (rows, last) = log.one(f"SELECT count(*), max({schema.TIMESTAMP}) FROM clean")
-    positions = [round(rows * split[0]), round(rows * (split[0] + split[1]))]
-    # An exact quantile in bounded memory: DuckDB's aggregate would keep every time in memory.
+    n = len(rows.clean)
+    positions = [round(n * split[0]), round(n * (split[0] + split[1]))]
+    inside = [min(position, n - 1) for position in positions]
+    found = ranked(rows.clean, schema.TIMESTAMP, rows.first_ms, rows.last_ms, inside)
     begin, end = (
-        last + 1
-        if position >= rows
-        else log.one(
-            f"SELECT {schema.TIMESTAMP} FROM clean ORDER BY {schema.TIMESTAMP} "
-            f"LIMIT 1 OFFSET {position}"
-        )[0]
-        for position in positions
+        time if position < n else rows.last_ms + 1
+        for time, position in zip(found, positions, strict=True)
     )
     return begin, end
 
 
-def cut_episodes(log: CleanLog, cut: Cut) -> None:
-    """Create the table `steps` of the rows in episodes of `cut.min_steps` or more.
+def by_sessions(rows: SortedRows, folder: Path, block: int = BLOCK) -> Spool:
+    """Usable rows in order of user, first row of the session, session, time and choice.
 
-    It has the columns of `clean` except `row`, and `split` (0 train, 1 validation, 2 test),
-    `starts` (first step of a session), `first` (first step of an episode), `episode` (number within
-    the user) and `terminated`, which is false for episodes cut at a split and for sessions that may
-    have gone on after the log ended: a user's last one if sessions are users, or if it ended within
-    the gap before the end of the log.
-
-    Raises:
-        InputError: no episode remains, or none in the training split.
-    """
-    time, user = schema.TIMESTAMP, schema.USER_ID
-    if cut.session_by == schema.SESSION_ID:
-        # Sessions of one user may overlap: each stays whole, ordered by its first row.
-        source = (
-            f"SELECT *, min({time}) OVER (PARTITION BY {user}, {schema.SESSION_ID}) AS began "
-            "FROM clean"
-        )
-        order = f"began, {schema.SESSION_ID}, {time}, {log.key}"
-        starts = f"{schema.SESSION_ID} IS DISTINCT FROM lag({schema.SESSION_ID}) OVER w"
-    else:
-        source, order = "SELECT *, 0 AS began FROM clean", f"{time}, {log.key}"
-        starts = f"lag({time}) OVER w IS NULL"
-        if cut.session_by == "gap":
-            starts += f" OR {time} - lag({time}) OVER w > {cut.gap_ms}"
-    log.connection.execute(f"""
-        CREATE TABLE steps AS
-        WITH marked AS (
-            SELECT *, {starts} AS starts,
-                CAST(({time} >= {cut.bounds[0]})::INT + ({time} >= {cut.bounds[1]})::INT
-                    AS UTINYINT) AS split
-            FROM ({source}) WINDOW w AS (PARTITION BY {user} ORDER BY {order})
-        ), ended AS (
-            SELECT *, starts OR split <> lag(split) OVER w AS first,
-                coalesce(lead(starts) OVER w, {_last_row_ends(cut)}) AS ends
-            FROM marked, (SELECT max({time}) AS log_end FROM clean)
-            WINDOW w AS (PARTITION BY {user} ORDER BY {order})
-        ), numbered AS (
-            SELECT *, CAST(sum(first::INT) OVER w AS BIGINT) AS episode
-            FROM ended WINDOW w AS (PARTITION BY {user} ORDER BY {order})
-        ), measured AS (
-            SELECT * EXCLUDE (ends, began, row, log_end),
-                count(*) OVER e AS length, bool_or(ends) OVER e AS terminated
-            FROM numbered WINDOW e AS (PARTITION BY {user}, episode)
-        )
-        SELECT * EXCLUDE (length) FROM measured WHERE length >= {cut.min_steps}
-    """)
-    kept, training = log.one("SELECT count(*), count_if(split = 0) FROM steps")
-    if kept == 0:
-        (rows,) = log.one("SELECT count(*) FROM clean")
-        raise InputError(
-            f"no session is left: none of the {rows} clean rows is in an episode of "
-            f"{cut.min_steps} steps or more; lower min_steps or widen the sessions"
-        )
-    if training == 0:
-        raise InputError(
-            f"no row is in the training split (before {cut.bounds[0]} ms); choose a later split"
-        )
-
-
-def _last_row_ends(cut: Cut) -> str:
-    """SQL that tells if a user's last row ends its session for certain."""
-    if cut.session_by == schema.SESSION_ID:
-        return "true"
-    return "false" if cut.session_by == "user" else f"log_end - {schema.TIMESTAMP} > {cut.gap_ms}"
-
-
-def number_ids(log: CleanLog, listed: dict[str, list[str]], like: Path | None) -> None:
-    """Create the tables `users` and `items`: id, its `number` in sorted order, `train_count`.
+    Sessions of one user may overlap: each stays whole. All rows of one user are in memory at a
+    time.
 
     Args:
-        log: log with the table `steps`.
-        listed: log column to feature tables whose column `id` lists more users or items.
-        like: a store whose numbers are reused instead (without `train_count`); None for none.
+        rows: with the column `session`.
+        folder: of the new spool.
+        block: rows in memory at a time, or more if one user has more.
     """
-    for name, table, file in ID_TABLES:
-        if name not in log.columns:
-            continue
-        if like is not None:
-            source = f"read_parquet({text(glob_pattern(like / file))}, file_row_number = true)"
-            # Ids may be integers in the store and text in the log, or vice versa.
-            known = f"TRY_CAST({name} AS {log.id_type(name)}) AS {name}"
-            log.connection.execute(
-                f"CREATE TABLE {table} AS SELECT {known}, file_row_number AS number FROM {source}"
-            )
-            continue
-        ids = [f"SELECT DISTINCT {name} FROM steps"]
-        ids += [f"SELECT id FROM {other}" for other in listed[name]]
-        log.connection.execute(f"""
-            CREATE TABLE {table} AS
-            SELECT {name}, row_number() OVER (ORDER BY {name}) - 1 AS number,
-                coalesce(train_count, 0) AS train_count
-            FROM ({" UNION ".join(ids)}) LEFT JOIN (
-                SELECT {name}, count(*) AS train_count FROM steps WHERE split = 0 GROUP BY {name}
-            ) USING ({name})
-        """)
+    spool, clean = Spool(folder), rows.clean
+    begin = 0
+    while begin < len(clean):
+        end = _end_of_user(clean, begin, block)
+        columns = {name: clean.read(name, begin, end) for name in clean.names}
+        users, sessions = columns["user"], columns["session"]
+        # Rows are in order of time, so that the first row of a group is its earliest.
+        grouped = np.lexsort((sessions, users))
+        starts = np.concatenate([[True], np.diff(sessions[grouped]) != 0])
+        starts[1:] |= np.diff(users[grouped]) != 0
+        began = np.empty(len(users), dtype=np.int64)
+        began[grouped] = columns[schema.TIMESTAMP][grouped][starts][np.cumsum(starts) - 1]
+        order = np.lexsort((sessions, began, users))
+        spool.append({name: values[order] for name, values in columns.items()})
+        begin = end
+    return spool
 
 
-def ordered_steps(log: CleanLog) -> str:
-    """Query of the steps in the order of the store, with numbers in place of ids."""
-    columns = ["coalesce(users.number, -1) AS user", "split", "terminated", "first"]
-    joins = f"LEFT JOIN users USING ({schema.USER_ID})"
-    if log.key == schema.ITEM_ID:
-        columns.append(f"coalesce(items.number, -1) AS {schema.ITEM}")
-        joins += f" LEFT JOIN items USING ({schema.ITEM_ID})"
-    columns += [schema.TIMESTAMP, f"CAST({schema.REWARD} AS FLOAT) AS {schema.REWARD}"]
-    columns += log.vector_size
-    columns += [c for c in (schema.PROPENSITY, schema.IS_RANDOM) if c in log.columns]
-    return (
-        f"SELECT {', '.join(columns)} FROM steps {joins} "
-        f"ORDER BY {schema.USER_ID}, episode, {schema.TIMESTAMP}, {log.key}"
+def _end_of_user(spool: Spool, begin: int, rows: int) -> int:
+    """End of the last user who ends within the rows from `begin`, or of the first one."""
+    while begin + rows < len(spool):
+        users = spool.read("user", begin, begin + rows + 1)
+        changes = np.flatnonzero(users[1:] != users[:-1])
+        if len(changes):
+            return begin + int(changes[-1]) + 1
+        rows *= 2
+    return len(spool)
+
+
+def episodes(spool: Spool, cut: Cut, log_end: int, block: int = BLOCK) -> Iterator[Episodes]:
+    """The episodes of sorted rows, those with fewer than `cut.min_steps` steps left out.
+
+    Args:
+        spool: rows in the order of the store.
+        cut: how they form episodes.
+        log_end: time (ms) of the log's last usable row.
+        block: rows in memory at a time, or more if one episode has more.
+    """
+    begin = 0
+    while begin < len(spool):
+        size = block
+        while True:
+            marks = _marks(spool, cut, begin, min(begin + size, len(spool)))
+            firsts = np.flatnonzero(marks.first)
+            if len(firsts) > 1:
+                break
+            size *= 2
+        yield _episodes(marks, firsts, cut, begin, log_end)
+        begin += int(firsts[-1])
+
+
+@dataclass(frozen=True)
+class _Marks:
+    """Of rows and the one after them, which is past the end after the last row."""
+
+    times: Array
+    users: Array
+    splits: Array
+    starts: BoolArray
+    """First rows of sessions."""
+    new_user: BoolArray
+    first: BoolArray
+    """First rows of episodes."""
+
+
+def _marks(spool: Spool, cut: Cut, begin: int, end: int) -> _Marks:
+    """Marks of the rows `begin` to `end`, where an episode begins at `begin`."""
+    low, high = max(begin - 1, 0), min(end + 1, len(spool))
+    users = spool.read("user", low, high)
+    times = spool.read(schema.TIMESTAMP, low, high)
+    new_user = users[1:] != users[:-1]
+    starts = new_user
+    if cut.session_by == "gap":
+        starts = new_user | (times[1:] - times[:-1] > cut.gap_ms)
+    elif cut.session_by == schema.SESSION_ID:
+        sessions = spool.read("session", low, high)
+        starts = new_user | (sessions[1:] != sessions[:-1])
+    splits = (times >= cut.bounds[0]).astype(np.uint8) + (times >= cut.bounds[1])
+    first = starts | (splits[1:] != splits[:-1])
+    head = [np.ones(1, dtype=bool)] if begin == 0 else []
+    tail = [np.ones(1, dtype=bool)] if end == len(spool) else []
+    own = slice(begin - low, None)
+    return _Marks(
+        times[own],
+        users[own],
+        splits[own],
+        np.concatenate([*head, starts, *tail]),
+        np.concatenate([*head, new_user, *tail]),
+        np.concatenate([*head, first, *tail]),
     )
 
 
-def episode_users() -> str:
-    """Query of the user of every episode, in the order of the store."""
-    return f"SELECT {schema.USER_ID} FROM steps WHERE first ORDER BY {schema.USER_ID}, episode"
+def _episodes(marks: _Marks, firsts: IntArray, cut: Cut, begin: int, log_end: int) -> Episodes:
+    at, following = firsts[:-1], firsts[1:]
+    lengths = np.diff(firsts)
+    if cut.session_by == "gap":
+        last_ends = log_end - marks.times[following - 1] > cut.gap_ms
+    else:
+        last_ends = np.full(len(at), cut.session_by == schema.SESSION_ID)
+    terminated = np.where(marks.new_user[following], last_ends, marks.starts[following])
+    long = lengths >= cut.min_steps
+    kept: BoolArray | slice = slice(None)
+    if not long.all():
+        kept = np.repeat(long, lengths)
+    return Episodes(
+        begin,
+        begin + int(firsts[-1]),
+        kept,
+        lengths[long],
+        marks.users[at][long],
+        marks.splits[at][long].astype(np.uint8),
+        marks.starts[at][long],
+        terminated[long],
+    )

@@ -5,147 +5,99 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any, Final
 
+import numpy as np
+
 from ucfrec import schema
 from ucfrec.errors import InputError, one_line
-from ucfrec.logs.clean import DUPLICATES, REASONS, CleanLog
-from ucfrec.logs.distributions import distributions
+from ucfrec.logs.clean import DUPLICATES, REASONS
+from ucfrec.logs.distributions import Distribution
+from ucfrec.logs.measures import Measures
 from ucfrec.logs.sessions import Cut
+from ucfrec.logs.sorted_rows import SortedRows
+from ucfrec.remote import origin
 
 CONFLICT: Final = "duplicates with a different reward from the kept row"
 """Describes `conflicting_duplicates` of the report."""
 
 
-def drop_counts(log: CleanLog) -> dict[str, int]:
-    """Number of dropped rows for each of `ucfrec.logs.clean.REASONS`.
-
-    Raises:
-        InputError: every row is dropped.
-    """
-    counts = dict(
-        log.connection.sql("SELECT reason, count(*) FROM rows GROUP BY reason").fetchall()
-    )
-    dropped = {reason: int(counts.get(reason, 0)) for reason in REASONS}
-    if None not in counts:
-        reasons = "; ".join(f"{n} rows: {REASONS[reason]}" for reason, n in dropped.items() if n)
-        hint = "; is the time in milliseconds?" if dropped["clock_out_of_range"] else ""
-        raise InputError(
-            f"{_named(log)}: no row is left ({reasons}{hint}); correct the mapping or the log"
-        )
-    return dropped
-
-
-def require_variety(log: CleanLog) -> None:
-    """Check that the clean rows do not all have the same reward.
+def require_variety(rows: SortedRows) -> None:
+    """Check that the usable rows do not all have the same reward.
 
     Raises:
         InputError: all rewards are equal.
     """
-    kept, low, high = log.one("SELECT count(*), min(reward), max(reward) FROM clean")
-    if low == high:
+    if rows.lowest == rows.highest:
         raise InputError(
-            f"{_named(log)}: all {kept} rewards equal {low:g}, so there is nothing to learn; "
-            "choose another reward expression"
+            f"{rows.log.name}: all {len(rows.clean)} rewards equal {rows.lowest:g}, so there is "
+            "nothing to learn; choose another reward expression"
         )
 
 
-def _named(log: CleanLog) -> str:
-    files = [str(file) for table in log.tables for file in table.files]
-    more = f" and {len(files) - 1} more" if len(files) > 1 else ""
-    return files[0] + more
+def build_report(
+    rows: SortedRows,
+    cut: Cut,
+    measures: Measures,
+    unsorted: int,
+    summary: Mapping[str, Distribution],
+) -> dict[str, Any]:
+    """Counts and statistics of a log, as JSON values.
 
-
-def count_unsorted(log: CleanLog) -> int:
-    """Number of rows that follow a later row of the same user in the files."""
-    (unsorted,) = log.one(f"""
-        SELECT count(*) FILTER (WHERE {schema.TIMESTAMP} < latest) FROM (
-            SELECT {schema.TIMESTAMP}, max({schema.TIMESTAMP}) OVER (
-                PARTITION BY {schema.USER_ID} ORDER BY row
-                ROWS BETWEEN UNBOUNDED PRECEDING AND 1 PRECEDING
-            ) AS latest FROM rows WHERE {schema.USER_ID} IS NOT NULL
-        )
-    """)
-    return int(unsorted)
-
-
-def build_report(log: CleanLog, cut: Cut, dropped: Mapping[str, int]) -> dict[str, Any]:
-    """Counts and statistics of the tables `rows`, `clean` and `steps`, as JSON values.
-
-    Times are in ms, `reward_statistics` in units of the reward; `summary` is of
-    `ucfrec.logs.distributions`.
+    Times are in ms, `reward_statistics` in units of the reward.
 
     Args:
-        log: log with the table `steps`.
+        rows: of the log.
         cut: how its episodes were cut.
-        dropped: result of `drop_counts`.
+        measures: of the episodes.
+        unsorted: see `ucfrec.logs.order.count_unsorted`.
+        summary: of `ucfrec.logs.distributions`.
     """
-    read, conflicts = log.one("SELECT count(*), count_if(conflict) FROM rows")
-    (clean,) = log.one("SELECT count(*) FROM clean")
-    steps, episodes, users, sessions, unfinished, first_ms, last_ms = log.one(f"""
-        SELECT count(*), count_if(first), count(DISTINCT {schema.USER_ID}), count_if(starts),
-            count_if(first AND NOT terminated), min({schema.TIMESTAMP}), max({schema.TIMESTAMP})
-        FROM steps
-    """)
-    (censored,) = log.one(f"""
-        SELECT count_if(NOT terminated) FROM (
-            SELECT arg_max(terminated, episode) AS terminated FROM steps GROUP BY {schema.USER_ID}
-        )
-    """)
-    mean, deviation, low, high = log.one(
-        "SELECT avg(reward), stddev_pop(reward), min(reward), max(reward) FROM steps"
-    )
-    splits = {name: {"episodes": 0, "steps": 0} for name in schema.SPLITS}
-    for split, in_split, rows in log.connection.sql(
-        "SELECT split, count_if(first), count(*) FROM steps GROUP BY split"
-    ).fetchall():
-        splits[schema.SPLITS[split]] = {"episodes": in_split, "steps": rows}
+    log = rows.log
     report = {
-        "files": [str(file) for table in log.tables for file in table.files],
-        "rows_read": read,
-        "dropped": {**dropped, "short_episode": clean - steps},
-        "conflicting_duplicates": conflicts,
-        "unsorted_rows": count_unsorted(log),
-        "steps": steps,
-        "episodes": episodes,
-        "sessions": sessions,
-        "sessions_cut": unfinished - censored,
-        "sessions_censored": censored,
-        "return_length_share": _return_length_share(log),
-        "users": users,
-        "splits": splits,
+        "files": [origin(file) for table in log.tables for file in table.files],
+        "rows_read": rows.read,
+        "dropped": {**rows.dropped, "short_episode": len(rows.clean) - measures.steps},
+        "conflicting_duplicates": rows.conflicts,
+        "unsorted_rows": unsorted,
+        "steps": measures.steps,
+        "episodes": measures.episodes,
+        "sessions": measures.sessions,
+        "sessions_cut": measures.unfinished - measures.censored,
+        "sessions_censored": measures.censored,
+        "return_length_share": _return_length_share(measures),
+        "users": len(measures.users),
+        "splits": {
+            name: {"episodes": int(episodes), "steps": int(steps)}
+            for name, (episodes, steps) in zip(schema.SPLITS, measures.splits, strict=True)
+        },
         "session_by": cut.session_by,
         "session_gap_ms": cut.gap_ms if cut.session_by == "gap" else None,
         "split_times_ms": list(cut.bounds),
-        "time_range_ms": [first_ms, last_ms],
-        "summary": distributions(log),
-        "reward_statistics": {"mean": mean, "std": deviation, "min": low, "max": high},
+        "time_range_ms": [measures.first_ms, measures.last_ms],
+        "summary": summary,
+        "reward_statistics": {
+            "mean": float(measures.rewards.mean[0]),
+            "std": math.sqrt(measures.rewards.covariance[0, 0]),
+            "min": measures.lowest,
+            "max": measures.highest,
+        },
     }
     if log.key == schema.ITEM_ID:
-        (report["items"],) = log.one(f"SELECT count(DISTINCT {schema.ITEM_ID}) FROM steps")
+        report["items"] = int(np.count_nonzero(measures.item_steps))
     if schema.PROPENSITY in log.columns:
-        (report["unknown_propensities"],) = log.one(
-            f"SELECT count_if({schema.PROPENSITY} IS NULL) FROM steps"
-        )
+        report["unknown_propensities"] = measures.unknown_propensities
     return report
 
 
-def _return_length_share(log: CleanLog) -> float | None:
+def _return_length_share(measures: Measures) -> float | None:
     """Share of the variance of training returns-to-go that the number of steps left explains.
 
     Of the whole rest of the session; None if either does not vary.
     """
-    (correlation,) = log.one(f"""
-        SELECT corr(rest, ahead) FROM (
-            SELECT sum(reward) OVER w AS rest, count(*) OVER w AS ahead FROM steps
-            WHERE split = 0
-            WINDOW w AS (
-                PARTITION BY {schema.USER_ID}, episode ORDER BY {schema.TIMESTAMP}
-                ROWS BETWEEN CURRENT ROW AND UNBOUNDED FOLLOWING
-            )
-        )
-    """)
-    if correlation is None or not math.isfinite(correlation):
+    (rest, both), (_, ahead) = measures.returns.covariance
+    # What is left of the rounding errors of equal returns is no variance.
+    if rest <= 1e-24 * measures.returns.mean[0] ** 2 or not ahead:
         return None
-    return float(correlation**2)
+    return float(both**2 / (rest * ahead))
 
 
 def format_report(report: Mapping[str, Any]) -> str:

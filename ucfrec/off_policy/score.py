@@ -21,9 +21,9 @@ from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.locks import scratch_folder
 from ucfrec.logs.expressions import Expression
+from ucfrec.logs.ids import EPISODE_USERS
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
-from ucfrec.logs.sessions import EPISODE_USERS
 from ucfrec.progress import progress
 from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 

@@ -1,0 +1,60 @@
+"""Episodes are the same however many rows are in memory at a time."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from ucfrec.logs.binding import open_tables
+from ucfrec.logs.engine import engine
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.sessions import Cut, by_sessions, episodes
+from ucfrec.logs.sorted_rows import sort_rows
+from ucfrec.logs.typed import typed_log
+
+START = 1_700_000_000_000
+
+
+@pytest.mark.parametrize("session_by", ["gap", "user", "session_id"])
+@pytest.mark.parametrize("min_steps", [1, 3])
+def test_blocks_of_any_size_give_the_same_episodes(
+    tmp_path: Path, session_by: str, min_steps: int
+) -> None:
+    generator = np.random.default_rng(0)
+    n, path = 300, tmp_path / "log.parquet"
+    times = START + generator.permutation(5 * n)[:n]
+    pd.DataFrame(
+        {
+            "user_id": generator.geometric(0.2, n),
+            "item_id": generator.integers(9, size=n),
+            "timestamp": times,
+            "reward": generator.random(n),
+            "session_id": generator.integers(3, size=n),
+        }
+    ).to_parquet(path)
+    cut = Cut(session_by, 20, min_steps, (START + 900, START + 1200))
+    results = []
+    with engine([path], tmp_path) as connection:
+        tables = tuple(open_tables(connection, [path]))
+        log = typed_log(connection, tables, LogMapping(), "reward", session_by, tmp_path)
+        rows = sort_rows(log, None, "highest", tmp_path)
+        for block in (1, 2, 7, 1000):
+            spool = rows.clean
+            if session_by == "session_id":
+                spool = by_sessions(rows, tmp_path / f"sessions{block}", block)
+            found = list(episodes(spool, cut, rows.last_ms, block))
+            names = ("lengths", "users", "splits", "begins_session", "terminated")
+            columns = [np.concatenate([getattr(each, name) for each in found]) for name in names]
+            times = np.concatenate([each.column(spool, "timestamp") for each in found])
+            results.append([*columns, times])
+    for other in results[1:]:
+        for ours, theirs in zip(results[0], other, strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+    lengths, times = results[0][0], results[0][-1]
+    assert lengths.min() >= min_steps
+    assert lengths.sum() == len(times)
+    within = np.repeat(np.arange(len(lengths)), lengths)
+    assert (np.diff(times)[np.diff(within) == 0] > 0).all()
+    if session_by == "gap":
+        assert np.diff(times)[np.diff(within) == 0].max() <= 20

@@ -1,0 +1,22 @@
+"""Rows on disk come back as they were."""
+
+from pathlib import Path
+
+import numpy as np
+
+from ucfrec.logs.spool import Spool
+
+
+def test_slices_of_rows_come_back(tmp_path: Path) -> None:
+    spool = Spool(tmp_path / "rows")
+    vectors = np.arange(30, dtype=np.float32).reshape(10, 3)
+    for begin, end in ((0, 4), (4, 4), (4, 10)):
+        spool.append({"v": vectors[begin:end], "n": np.arange(begin, end)})
+    assert (len(spool), spool.names) == (10, ("v", "n"))
+    np.testing.assert_array_equal(spool.read("v", 2, 7), vectors[2:7])
+    np.testing.assert_array_equal(spool.read("n", 9, 10), [9])
+    assert len(spool.read("v", 3, 3)) == 0
+    # Reading and appending can take turns.
+    spool.append({"v": vectors[:1], "n": np.array([10])})
+    np.testing.assert_array_equal(spool.read("n", 8, 11), [8, 9, 10])
+    spool.close()

@@ -1,0 +1,78 @@
+"""The file of item states, written without torch: preparing a log needs no tensors."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xxhash
+from safetensors import SafetensorError
+from safetensors.numpy import save_file
+
+from ucfrec.errors import InputError
+from ucfrec.files import atomic_file
+
+ITEM_STATES: Final = "item_states.safetensors"
+"""Name of the file in a store or a run."""
+DISTINCT_TAGS: Final = 1000
+"""Most tags of a catalogue that are told apart; rarer ones are left out."""
+TAGS_PER_ITEM: Final = 16
+"""Most tags that one item keeps."""
+WINDOW: Final = 10
+"""Number of most recent steps that enter the means of a state."""
+DECAY: Final = 0.8
+"""Factor by which the weight in the means falls with each step back."""
+
+
+def write_item_table(
+    path: Path,
+    embeddings: npt.NDArray[np.float32],
+    user_features: npt.NDArray[np.float32],
+    reward_low: float,
+    reward_high: float,
+    tags: npt.NDArray[np.int64] | None,
+) -> None:
+    """Write the file that `ucfrec.episodes.states.ItemStates.save` would, atomically.
+
+    Args:
+        path: of the file.
+        embeddings: (n_items, D).
+        user_features: (n_users, F).
+        reward_low: see `ItemStates`.
+        reward_high: see `ItemStates`.
+        tags: (n_items, T); None for none.
+
+    Raises:
+        InputError: the disk is full, or the folder is not writable.
+    """
+    numbers = {"window": WINDOW, "decay": DECAY}
+    numbers |= {"reward_low": reward_low, "reward_high": reward_high}
+    arrays: dict[str, npt.NDArray[Any]] = {"embeddings": embeddings, "user_features": user_features}
+    if tags is not None and tags.shape[1]:
+        arrays["tags"] = tags
+    plain = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    about = json.dumps(numbers)
+    with atomic_file(path) as scratch:
+        scratch.touch()
+        mode = scratch.stat().st_mode
+        try:
+            save_file(plain, scratch, metadata={"about": f"{about}\n{_checksum(plain, about)}"})
+            # safetensors restricts its files to their owner; give them the usual permissions.
+            scratch.chmod(mode)
+        except SafetensorError as error:
+            raise InputError(
+                f"{path} cannot be written ({error}); free disk space and run the command again"
+            ) from None
+
+
+def _checksum(arrays: Mapping[str, npt.NDArray[Any]], about: str) -> str:
+    """The checksum that `ucfrec.fitting.checkpoint.load_tensors` verifies."""
+    digest = xxhash.xxh3_64(about.encode())
+    for name in sorted(arrays):
+        array = arrays[name]
+        digest.update(f"\n{name} torch.{array.dtype.name} {list(array.shape)}\n".encode())
+        if array.size:
+            digest.update(array.reshape(-1).view(np.uint8).data)
+    return digest.hexdigest()

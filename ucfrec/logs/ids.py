@@ -1,0 +1,166 @@
+"""Users and items of a store: which ids there are, their numbers, and the files that list them."""
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from ucfrec import schema
+from ucfrec.logs.binding import glob_pattern, text
+from ucfrec.logs.engine import BATCH_ROWS, as_arrow, as_numpy
+from ucfrec.logs.measures import Measures
+from ucfrec.logs.sorted_rows import CODES, has_codes
+from ucfrec.logs.spool import Spool
+from ucfrec.logs.typed import TypedLog
+
+ITEMS_FILE: Final = "items.parquet"
+USERS_FILE: Final = "users.parquet"
+EPISODE_USERS: Final = "episode_users.parquet"
+ID_TABLES: Final = (
+    (schema.USER_ID, "users", USERS_FILE),
+    (schema.ITEM_ID, "items", ITEMS_FILE),
+)
+"""Id column, its DuckDB table of ids and numbers, and the file of that table in the store."""
+IntArray = npt.NDArray[np.int64]
+
+
+def number_ids(
+    log: TypedLog, measures: Measures, listed: Mapping[str, Sequence[str]], like: Path | None
+) -> None:
+    """Create the tables `users` and `items`: id, its `number` in sorted order, `train_count`.
+
+    Also `kept_users` and `kept_items`: ids that occur in the steps, with their `code`.
+
+    Args:
+        log: log after `ucfrec.logs.sorted_rows.sort_rows`.
+        measures: of its episodes.
+        listed: log column to feature tables whose column `id` lists more users or items.
+        like: a store whose numbers are reused instead (without `train_count`); None for none.
+    """
+    for name, table, file in ID_TABLES:
+        if name not in log.columns:
+            continue
+        _keep(log, measures, name, f"kept_{table}")
+        if like is not None:
+            source = f"read_parquet({text(glob_pattern(like / file))}, file_row_number = true)"
+            # Ids may be integers in the store and text in the log, or vice versa.
+            known = f"TRY_CAST({name} AS {log.id_type(name)}) AS {name}"
+            log.connection.execute(
+                f"CREATE TABLE {table} AS SELECT {known}, file_row_number AS number FROM {source}"
+            )
+            continue
+        ids = [f"SELECT {name} FROM kept_{table}"]
+        ids += [f"SELECT id FROM {other}" for other in listed[name]]
+        log.connection.execute(f"""
+            CREATE TABLE {table} AS
+            SELECT {name}, row_number() OVER (ORDER BY {name}) - 1 AS number,
+                coalesce(train_count, 0) AS train_count
+            FROM ({" UNION ".join(ids)}) LEFT JOIN kept_{table} USING ({name})
+        """)
+
+
+def _keep(log: TypedLog, measures: Measures, name: str, table: str) -> None:
+    """Create a table of the ids in the steps: id, `code`, `train_count`."""
+    if name == schema.ITEM_ID:
+        kept = np.flatnonzero(measures.item_steps)
+        counts = measures.item_train_steps[kept]
+        batches = iter([_batch(kept, counts)])
+    else:
+        batches = _user_batches(measures.users)
+    log.connection.register("counted", pa.RecordBatchReader.from_batches(_SCHEMA, batches))
+    coded = has_codes(log, name)
+    source = f"counted JOIN {CODES[name]} USING (code)" if coded else "counted"
+    given = f"{name}, code" if coded else f"code AS {name}, code"
+    log.connection.execute(f"CREATE TABLE {table} AS SELECT {given}, train_count FROM {source}")
+    log.connection.unregister("counted")
+
+
+_SCHEMA: Final = pa.schema([("code", pa.int64()), ("train_count", pa.int64())])
+
+
+def _batch(codes: IntArray, counts: IntArray) -> pa.RecordBatch:
+    return pa.record_batch([as_arrow(codes), as_arrow(counts)], schema=_SCHEMA)
+
+
+def _user_batches(users: Spool) -> Iterator[pa.RecordBatch]:
+    for begin in range(0, len(users), BATCH_ROWS):
+        end = min(begin + BATCH_ROWS, len(users))
+        yield _batch(users.read("user", begin, end), users.read("train_count", begin, end))
+
+
+def popularity(log: TypedLog, measures: Measures) -> IntArray:
+    """Number of steps that show each item of the table `items`, (items,)."""
+    query = "SELECT coalesce(code, -1) AS code FROM items LEFT JOIN kept_items USING (item_id)"
+    codes = log.connection.sql(query).fetchnumpy()["code"].astype(np.int64)
+    return np.asarray(np.append(measures.item_steps, 0)[codes])
+
+
+def numbers(log: TypedLog, name: str, table: str) -> Iterator[IntArray]:
+    """Numbers of the ids in the steps, in the order of their codes, in batches; −1 for unknown ids.
+
+    Yields:
+        (N,) int64; the code of an item that is in no step has no number.
+    """
+    query = (
+        f"SELECT coalesce(number, -1) AS number FROM kept_{table} LEFT JOIN {table} USING ({name}) "
+        "ORDER BY code"
+    )
+    for batch in log.connection.sql(query).to_arrow_reader(BATCH_ROWS):
+        yield as_numpy(batch.column(0))
+
+
+def write_ids(log: TypedLog, folder: Path) -> dict[str, list[Any]]:
+    """Write `users.parquet` and `items.parquet`; returns a digest of each for the fingerprint."""
+    digests: dict[str, list[Any]] = {}
+    for name, table, file in ID_TABLES:
+        if name not in log.columns:
+            continue
+        _copy(log, f"SELECT * EXCLUDE number FROM {table} ORDER BY number", folder / file)
+        digest = hashlib.sha256()
+        query = f"SELECT {name} FROM {table} ORDER BY number"
+        for batch in log.connection.sql(query).to_arrow_reader(BATCH_ROWS):
+            digest.update("\n".join(map(str, batch.column(0).to_pylist())).encode())
+        digests[name] = [digest.hexdigest()]
+    return digests
+
+
+def write_episode_users(log: TypedLog, file: Path, codes: Iterator[IntArray]) -> None:
+    """Write the user of every episode, in the order of the store.
+
+    Args:
+        log: after `number_ids`.
+        file: to write.
+        codes: code of the user of each episode, in batches.
+    """
+    reader = pa.RecordBatchReader.from_batches(_PLACED, _placed(codes))
+    log.connection.register("placed", reader)
+    _copy(
+        log,
+        f"SELECT {schema.USER_ID} FROM placed JOIN kept_users USING (code) ORDER BY place",
+        file,
+    )
+    log.connection.unregister("placed")
+
+
+_PLACED: Final = pa.schema([("place", pa.int64()), ("code", pa.int64())])
+
+
+def _placed(codes: Iterator[IntArray]) -> Iterator[pa.RecordBatch]:
+    begin = 0
+    for batch in codes:
+        places = np.arange(begin, begin + len(batch))
+        yield pa.record_batch([as_arrow(places), as_arrow(batch)], schema=_PLACED)
+        begin += len(batch)
+
+
+def _copy(log: TypedLog, query: str, file: Path) -> None:
+    # DuckDB's COPY cannot write here: its connection may open only the scratch folder.
+    reader = log.connection.sql(query).to_arrow_reader(BATCH_ROWS)
+    with pq.ParquetWriter(file, reader.schema) as writer:
+        for batch in reader:
+            writer.write_batch(batch)

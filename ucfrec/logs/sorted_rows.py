@@ -1,0 +1,267 @@
+"""The usable rows of a log in order of user, time and choice: one sort, then one pass.
+
+The engine sorts, out of core; the pass over the sorted rows, in batches, drops faulty rows and
+duplicates and writes the others to a spool with numbers in place of ids.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from ucfrec import schema
+from ucfrec.logs.binding import MAX_FLOAT
+from ucfrec.logs.clean import REASONS, faults, require_rewards_in_range
+from ucfrec.logs.engine import BATCH_ROWS, as_numpy
+from ucfrec.logs.spool import Spool
+from ucfrec.logs.typed import ROWS, TypedLog
+
+Array = npt.NDArray[Any]
+BoolArray = npt.NDArray[np.bool_]
+
+CODES: Final = {schema.USER_ID: "user_codes", schema.ITEM_ID: "item_codes"}
+"""Id column to the table of its ids and their codes, numbers in the order of the ids."""
+_SESSION_CODES: Final = "session_codes"
+_UNPLACED: Final = 128
+"""Added to the fault of rows without a user or a time, which have no place in the order."""
+
+
+@dataclass
+class SortedRows:
+    """The usable rows of a log, and what was found on the way."""
+
+    log: TypedLog
+    clean: Spool
+    """Usable rows in order of user, time and choice: `user` (int64 in the order of the ids),
+    `item` (code, int32) or `action`, `timestamp`, `reward` (float64) and, if the log has them,
+    `session` (with sessions by session_id), `observation`, `propensity` (NaN if unknown) and
+    `is_random`."""
+    placed: Spool
+    """All rows with a user and a time, in that order: `user`, `timestamp` and `row`, their position
+    in the files."""
+    items: int = 0
+    """Number of items that have a code."""
+    dropped: dict[str, int] = field(default_factory=lambda: dict.fromkeys(REASONS, 0))
+    """Number of dropped rows by reason."""
+    read: int = 0
+    """Number of rows."""
+    conflicts: int = 0
+    """Number of duplicates with another reward than the row that is kept."""
+    first_ms: int = 0
+    """Time of the earliest usable row."""
+    last_ms: int = 0
+    """Time of the latest usable row."""
+    lowest: float = np.inf
+    """Lowest reward."""
+    highest: float = -np.inf
+    """Highest reward."""
+
+    def count(self, clean: dict[str, Array]) -> None:
+        """Add usable rows to the counts."""
+        times, rewards = clean[schema.TIMESTAMP], clean[schema.REWARD]
+        if not len(times):
+            return
+        if not len(self.clean):
+            self.first_ms = int(times[0])
+        self.first_ms = min(self.first_ms, int(times.min()))
+        self.last_ms = max(self.last_ms, int(times.max()))
+        self.lowest = min(self.lowest, float(rewards.min()))
+        self.highest = max(self.highest, float(rewards.max()))
+
+
+def sort_rows(log: TypedLog, known_items: Path | None, duplicates: str, folder: Path) -> SortedRows:
+    """Sort and check every row of a log.
+
+    Of rows with the same user, choice and time one is kept, as `ucfrec.logs.clean.read_log` does.
+
+    Args:
+        log: its engine may open `known_items`.
+        known_items: `items.parquet` of a store: rows with other items are dropped; None for all.
+        duplicates: key of `ucfrec.logs.clean.DUPLICATES`.
+        folder: scratch folder of the spools.
+
+    Raises:
+        InputError: a reward is too large to train with.
+    """
+    for name, table in (*CODES.items(), (schema.SESSION_ID, _SESSION_CODES)):
+        if name in log.columns and has_codes(log, name):
+            _number(log, name, table)
+    rows = SortedRows(log, Spool(folder / "clean"), Spool(folder / "placed"))
+    if log.key == schema.ITEM_ID:
+        (rows.items,) = log.one("SELECT count(*) FROM item_codes")
+    reasons = list(REASONS)
+    large, largest = 0, 0.0
+    reader = log.connection.sql(_query(log, known_items)).to_arrow_reader(BATCH_ROWS)
+    for batch in _whole_keys(_columns(batch, log) for batch in reader):
+        rows.read += len(batch["fault"])
+        placed = batch["fault"] < _UNPLACED
+        order = {name: batch[name] for name in ("user", "timestamp", "row")}
+        rows.placed.append(_where(placed, order))
+        counts = np.bincount(batch["fault"] % _UNPLACED, minlength=len(reasons) + 1)
+        for reason, n in zip(reasons, counts[1:], strict=True):
+            rows.dropped[reason] += int(n)
+        usable = batch.pop("fault") == 0
+        batch = _where(usable, batch)
+        kept = _kept(batch, log, duplicates, rows)
+        clean = {name: values[kept] for name, values in batch.items() if name in _spooled(log)}
+        size = np.abs(clean[schema.REWARD])
+        large += int(np.count_nonzero(size > schema.LARGEST_REWARD))
+        largest = max(largest, float(size.max(initial=0)))
+        rows.count(clean)
+        rows.clean.append(clean)
+    require_rewards_in_range(log, large, len(rows.clean), largest)
+    return rows
+
+
+def _where(chosen: BoolArray, batch: dict[str, Array]) -> dict[str, Array]:
+    if chosen.all():
+        return batch
+    return {name: values[chosen] for name, values in batch.items()}
+
+
+def has_codes(log: TypedLog, name: str) -> bool:
+    """Whether the ids of a column of the log have codes; others are their own."""
+    return name == schema.ITEM_ID or log.id_type(name) != "BIGINT"
+
+
+def _number(log: TypedLog, name: str, table: str) -> None:
+    log.connection.execute(
+        f"CREATE TABLE {table} AS SELECT {name}, row_number() OVER (ORDER BY {name}) - 1 AS code "
+        f"FROM (SELECT DISTINCT {name} FROM {ROWS} WHERE {name} IS NOT NULL)"
+    )
+
+
+def _query(log: TypedLog, known_items: Path | None) -> str:
+    """SQL of all rows in order, without missing values."""
+    cases = " ".join(
+        f"WHEN {sql} THEN {list(REASONS).index(reason) + 1}"
+        for reason, sql in faults(log, known_items).items()
+    )
+    unplaced = f"{schema.USER_ID} IS NULL OR {schema.TIMESTAMP} IS NULL"
+    fault = f"CASE {cases} ELSE 0 END + CASE WHEN {unplaced} THEN {_UNPLACED} ELSE 0 END"
+    joins, user = "", schema.USER_ID
+    if has_codes(log, schema.USER_ID):
+        joins, user = f" LEFT JOIN user_codes USING ({schema.USER_ID})", "user_codes.code"
+    columns = [f"coalesce({user}, 0) AS user", f"coalesce({schema.TIMESTAMP}, 0) AS timestamp"]
+    if log.key == schema.ITEM_ID:
+        joins += f" LEFT JOIN item_codes USING ({schema.ITEM_ID})"
+        columns.append("CAST(coalesce(item_codes.code, -1) AS INTEGER) AS item")
+    else:
+        zeros = [0.0] * log.vector_size[schema.ACTION]
+        columns.append(f"CASE WHEN fault = 0 THEN action ELSE {zeros}::FLOAT[] END AS action")
+    if schema.SESSION_ID in log.columns:
+        session = schema.SESSION_ID
+        if has_codes(log, session):
+            joins += f" LEFT JOIN {_SESSION_CODES} USING ({session})"
+            session = f"{_SESSION_CODES}.code"
+        columns += [f"coalesce({session}, 0) AS session", f"{session} IS NULL AS no_session"]
+    columns.append(f"coalesce({schema.REWARD}, 'nan'::DOUBLE) AS {schema.REWARD}")
+    if schema.PROPENSITY in log.columns:
+        columns.append(f"coalesce({schema.PROPENSITY}, 'nan'::FLOAT) AS {schema.PROPENSITY}")
+    columns += [c for c in (schema.OBSERVATION, schema.IS_RANDOM) if c in log.columns]
+    choice = schema.ITEM if log.key == schema.ITEM_ID else schema.ACTION
+    return (
+        f"SELECT {', '.join(columns)}, row, fault "
+        f"FROM (SELECT *, CAST({fault} AS UTINYINT) AS fault FROM {ROWS}){joins} "
+        f"ORDER BY 1, 2, {choice}"
+    )
+
+
+def _spooled(log: TypedLog) -> set[str]:
+    names = {"user", "item", "action", "timestamp", "reward", "observation", "propensity"}
+    names.add("is_random")
+    return names | ({"session"} if log.session_by == schema.SESSION_ID else set())
+
+
+def _columns(batch: pa.RecordBatch, log: TypedLog) -> dict[str, Array]:
+    columns = {}
+    for name in batch.schema.names:
+        column = batch.column(name)
+        if name in log.vector_size:
+            columns[name] = as_numpy(column.flatten()).reshape(-1, log.vector_size[name])
+        else:
+            columns[name] = as_numpy(column)
+    return columns
+
+
+def _whole_keys(batches: Iterator[dict[str, Array]]) -> Iterator[dict[str, Array]]:
+    """The same rows in batches that end between two keys, so that no duplicates are parted."""
+    held: dict[str, Array] = {}
+    for batch in batches:
+        if held:
+            batch = {name: np.concatenate([held[name], batch[name]]) for name in batch}
+        starts = np.flatnonzero(~_same_key(batch))
+        if not len(starts):
+            held = batch
+            continue
+        end = int(starts[-1]) + 1
+        yield {name: values[:end] for name, values in batch.items()}
+        held = {name: values[end:].copy() for name, values in batch.items()}
+    if held:
+        yield held
+
+
+def _same_key(batch: dict[str, Array]) -> BoolArray:
+    """(M − 1,) whether each row but the first has the user, time and choice of the row before."""
+    user, times = batch["user"], batch["timestamp"]
+    same = (user[1:] == user[:-1]) & (times[1:] == times[:-1])
+    choice = batch[schema.ITEM] if schema.ITEM in batch else batch[schema.ACTION]
+    equal = choice[1:] == choice[:-1]
+    return np.asarray(same & (equal if equal.ndim == 1 else equal.all(axis=1)))
+
+
+def _kept(batch: dict[str, Array], log: TypedLog, duplicates: str, rows: SortedRows) -> Array:
+    """Positions of the rows to keep; the others are counted in `rows`."""
+    rewards = batch[schema.REWARD]
+    good = np.abs(rewards) <= MAX_FLOAT
+    kept = np.ones(len(rewards), dtype=bool)
+    same = _same_key(batch)
+    repeated = np.zeros(len(rewards), dtype=bool)
+    repeated[1:] |= same
+    repeated[:-1] |= same
+    if repeated.any():
+        places = np.flatnonzero(repeated)
+        # Rows that agree with the one before are of its group.
+        groups = np.cumsum(~np.concatenate([[False], same])[places])
+        some = {name: values[places] for name, values in batch.items()}
+        rule = _rule(some, duplicates)
+        order = np.lexsort([*_tie_breakers(some, log), rule, ~good[places], groups])
+        ordered = groups[order]
+        begins = np.concatenate([[True], ordered[1:] != ordered[:-1]])
+        winner = order[begins][np.cumsum(begins) - 1]
+        losers = order[~begins]
+        kept[places[losers]] = False
+        ours, theirs = some["reward"][losers], some["reward"][winner[~begins]]
+        equal = (ours == theirs) | (np.isnan(ours) & np.isnan(theirs))
+        rows.conflicts += int(np.count_nonzero(~equal))
+        rows.dropped["duplicate"] += len(losers)
+    undefined = kept & ~good
+    rows.dropped["reward_not_finite"] += int(np.count_nonzero(undefined))
+    return np.flatnonzero(kept & good)
+
+
+def _rule(some: dict[str, Array], duplicates: str) -> Array:
+    """Sort key by which the row that the rule keeps comes first."""
+    rewards = some[schema.REWARD]
+    if duplicates == "highest":
+        return np.where(np.isnan(rewards), -np.inf, -rewards)
+    if duplicates == "lowest":
+        return rewards
+    return some["row"] if duplicates == "first" else -some["row"]
+
+
+def _tie_breakers(some: dict[str, Array], log: TypedLog) -> list[Array]:
+    """Sort keys of the other columns, the least important first, as `numpy.lexsort` wants them."""
+    keys: list[Array] = []
+    for name in log.payload:
+        if name == schema.OBSERVATION:
+            keys += list(some[name].T)
+        elif name == schema.SESSION_ID:
+            keys += [some["no_session"], some["session"]]
+        else:
+            keys.append(some[name])
+    return keys[::-1]

@@ -1,0 +1,64 @@
+"""Rows on disk, column by column: written once in order, then read in slices of bounded size."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[Any]
+
+
+class Spool:
+    """Columns of equal length as files of raw numbers in a scratch folder.
+
+    Slices are read into memory, not mapped: pages of a mapped file count as the memory of a process
+    that must keep to a limit.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """
+        Args:
+            folder: of the files; it is made, and must not exist.
+        """
+        folder.mkdir()
+        self._folder = folder
+        self._files: dict[str, IO[bytes]] = {}
+        self._rows: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
+        self._length = 0
+
+    def __len__(self) -> int:
+        return self._length
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the columns, once there are rows."""
+        return tuple(self._rows)
+
+    def append(self, columns: Mapping[str, Array]) -> None:
+        """Append rows, the same columns every time.
+
+        Args:
+            columns: each (M,) or (M, size), of its own dtype, which stays the same.
+        """
+        for name, values in columns.items():
+            if name not in self._files:
+                self._files[name] = (self._folder / f"{name}.bin").open("w+b")
+                self._rows[name] = values.dtype, values.shape[1:]
+            self._files[name].write(np.ascontiguousarray(values).data)
+        self._length += len(next(iter(columns.values())))
+
+    def read(self, name: str, start: int, stop: int) -> Array:
+        """Rows `start` to `stop` of a column, after the last `append`."""
+        dtype, shape = self._rows[name]
+        size = int(np.prod(shape, dtype=np.int64))
+        file = self._files[name]
+        file.seek(start * size * dtype.itemsize)
+        values = np.fromfile(file, dtype, (stop - start) * size)
+        return values.reshape(-1, *shape)
+
+    def close(self) -> None:
+        """Close the files."""
+        for file in self._files.values():
+            file.close()

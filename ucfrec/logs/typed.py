@@ -1,0 +1,237 @@
+"""A log as one relation of typed rows: its files, its columns, its reward."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import duckdb
+
+from ucfrec import schema
+from ucfrec.errors import InputError
+from ucfrec.logs.binding import (
+    MAX_FLOAT,
+    Table,
+    as_timestamp,
+    bind,
+    explained,
+    is_integer,
+    is_number,
+    is_vector,
+    wrong_type,
+)
+from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping
+
+ROWS: Final = "read"
+"""Relation of `TypedLog`."""
+
+
+@dataclass(frozen=True)
+class TypedLog:
+    """A log whose rows, unchecked, are the relation `read` of `connection`.
+
+    `read` has the log columns of `columns` in the types of the schema, `reward` (DOUBLE) and `row`
+    (position in the files, from 1).
+    """
+
+    connection: duckdb.DuckDBPyConnection
+    tables: tuple[Table, ...]
+    columns: tuple[str, ...]
+    """Log columns that the files have, `user_id` first."""
+    vector_size: dict[str, int]
+    """Dimensions of `action` and `observation`, if the log has them."""
+    session_by: str
+    """"session_id", "gap" or "user"."""
+
+    @property
+    def key(self) -> str:
+        """Column of the choice: `item_id` or `action`."""
+        return schema.ITEM_ID if schema.ITEM_ID in self.columns else schema.ACTION
+
+    @property
+    def payload(self) -> tuple[str, ...]:
+        """Log columns other than user, choice and time."""
+        return tuple(c for c in self.columns if c not in (schema.USER_ID, self.key, "timestamp"))
+
+    @property
+    def name(self) -> str:
+        """The first file, and how many more there are, for messages."""
+        files = [str(file) for table in self.tables for file in table.files]
+        more = f" and {len(files) - 1} more" if len(files) > 1 else ""
+        return files[0] + more
+
+    def id_type(self, name: str) -> str:
+        """DuckDB type of an id column: BIGINT or VARCHAR."""
+        return str(self.one(f"SELECT typeof({name}) FROM {ROWS} LIMIT 1")[0])
+
+    def one(self, sql: str) -> tuple[Any, ...]:
+        """The first row of the result of `sql`."""
+        row: tuple[Any, ...] = self.connection.sql(sql).fetchall()[0]
+        return row
+
+
+def typed_log(
+    connection: duckdb.DuckDBPyConnection,
+    tables: tuple[Table, ...],
+    mapping: LogMapping,
+    reward: str,
+    session_by: str | None,
+    folder: Path,
+) -> TypedLog:
+    """Create `read` from tables that are open.
+
+    Args:
+        connection: engine that may open the tables.
+        tables: of the log's files.
+        mapping: log columns to the files' columns.
+        reward: scalar SQL expression over the files' columns.
+        session_by: "session_id", "gap" or "user"; None for session_id if the log has it, else gap.
+        folder: folder named when its disk is full.
+
+    Raises:
+        InputError: a file, column or type makes the log unusable, or an observation is missing or
+            not finite.
+    """
+    columns = _present(tables, mapping, session_by)
+    selects = [_select(connection, table, mapping, columns, reward) for table in tables]
+    with explained(connection, tables, folder):
+        for name in (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID):
+            _unify_ids(selects, name)
+        union = " UNION ALL ".join(
+            f"SELECT {', '.join(f'{sql} AS {name}' for name, (sql, _) in select.items())} "
+            f"FROM {table.sql}"
+            for select, table in zip(selects, tables, strict=True)
+        )
+        # Columns of Parquet files are read as often as they are needed; text is parsed once.
+        columnar = all(table.columnar for table in tables)
+        connection.execute(
+            f"CREATE {'VIEW' if columnar else 'TABLE'} {ROWS} AS "
+            f"SELECT row_number() OVER () AS row, * FROM ({union})"
+        )
+        sizes = _vector_sizes(connection, columns)
+        by = session_by or (schema.SESSION_ID if schema.SESSION_ID in columns else "gap")
+        log = TypedLog(connection, tables, columns, sizes, by)
+        _require_observations(log)
+    return log
+
+
+def _require_observations(log: TypedLog) -> None:
+    """Check that `read` has a finite observation in every row, if it has any."""
+    if schema.OBSERVATION not in log.vector_size:
+        return
+    bad, rows = log.one(f"SELECT count_if({not_finite(schema.OBSERVATION)}), count(*) FROM read")
+    if bad:
+        raise InputError(
+            f"{log.tables[0].files[0]}: {schema.OBSERVATION} is missing or holds NaN or infinity "
+            f"in {bad:,} of {rows:,} rows; fill them in, leave those rows out, or ignore the "
+            f"column with --column {schema.OBSERVATION}="
+        )
+
+
+def not_finite(vector: str) -> str:
+    """SQL that tells whether a vector is missing or has a number that is not finite."""
+    finite = f"list_bool_and([coalesce(isfinite(v), false) FOR v IN {vector}])"
+    return f"{vector} IS NULL OR NOT {finite}"
+
+
+def _present(
+    tables: Sequence[Table], mapping: LogMapping, session_by: str | None
+) -> tuple[str, ...]:
+    """Log columns that every file has, and the required ones, which `bind` reports if missing."""
+    named = {name: value for name, value in mapping.columns.items() if value}
+    switched_off = mapping.columns.keys() - named.keys()
+    everywhere = set.intersection(*({c.casefold() for c in t.columns} for t in tables))
+    present = (set(named) | everywhere) - switched_off
+    if session_by == schema.SESSION_ID:
+        present.add(session_by)
+    if schema.ACTION in named or (schema.ACTION in present and schema.ITEM_ID not in present):
+        key = schema.ACTION
+    else:
+        key = schema.ITEM_ID
+    optional = (name for name in OPTIONAL_COLUMNS if name in present)
+    return (schema.USER_ID, key, schema.TIMESTAMP, *optional)
+
+
+Select = dict[str, tuple[str, str]]
+"""Log column to its (SQL, DuckDB type)."""
+
+
+def _select(
+    connection: duckdb.DuckDBPyConnection,
+    table: Table,
+    mapping: LogMapping,
+    columns: tuple[str, ...],
+    reward: str,
+) -> Select:
+    select: Select = {}
+    for name in columns:
+        given = mapping.columns.get(name) or name
+        what = f"for {name}; map it with --column {name}=..."
+        select[name] = _typed(table, name, given, *bind(connection, table, what, given))
+    sql, kind = bind(connection, table, "for the reward", reward)
+    if not (is_number(kind) or kind == "BOOLEAN"):
+        raise wrong_type(table, "reward", reward, kind, "use a numeric or boolean expression")
+    # An error in one row (division by zero, a cast) makes only that row's reward undefined.
+    select[schema.REWARD] = (f"TRY(CAST({sql} AS DOUBLE))", "DOUBLE")
+    return select
+
+
+def _typed(table: Table, name: str, given: str, sql: str, kind: str) -> tuple[str, str]:
+    """SQL that casts a column to its type in the schema, and that DuckDB type."""
+    if name in (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID):
+        if is_integer(kind) or kind in ("VARCHAR", "UUID"):
+            return sql, kind
+        wanted = f"use integers or text, e.g. --column {name}='{given}::BIGINT'"
+    elif name == schema.TIMESTAMP:
+        if is_number(kind):
+            return f"TRY_CAST(round({sql}) AS BIGINT)", "BIGINT"
+        if time := as_timestamp(sql, kind):
+            return f"TRY(epoch_ms({time}))", "BIGINT"
+        wanted = "use milliseconds, a date or a timestamp, e.g. --column timestamp='seconds * 1000'"
+    elif name in (schema.ACTION, schema.OBSERVATION):
+        if is_vector(kind):
+            return f"TRY_CAST({sql} AS FLOAT[])", "FLOAT[]"
+        wanted = f"use a list of numbers, e.g. --column {name}='{given}::FLOAT[]'"
+    elif name == schema.PROPENSITY:
+        if is_number(kind):
+            valid = f"{sql} > 0 AND {sql} <= {MAX_FLOAT}"
+            return f"CAST(CASE WHEN {valid} THEN {sql} END AS FLOAT)", "FLOAT"
+        wanted = "use a number above 0"
+    else:
+        if is_number(kind) or kind == "BOOLEAN":
+            return f"coalesce(CAST({sql} AS BOOLEAN), false)", "BOOLEAN"
+        wanted = "use a boolean or 0 and 1"
+    raise wrong_type(table, name, given, kind, wanted)
+
+
+def _unify_ids(selects: list[Select], name: str) -> None:
+    """Cast ids to BIGINT if every file has integers that fit, else to text."""
+    if name not in selects[0]:
+        return
+    wide = {"UBIGINT", "HUGEINT", "UHUGEINT"}
+    kinds = {select[name][1] for select in selects}
+    whole = all(is_integer(kind) and kind not in wide for kind in kinds)
+    for select in selects:
+        select[name] = (f"CAST({select[name][0]} AS {'BIGINT' if whole else 'VARCHAR'})", "")
+
+
+def _vector_sizes(
+    connection: duckdb.DuckDBPyConnection, columns: tuple[str, ...]
+) -> dict[str, int]:
+    sizes: dict[str, int] = {}
+    for name in (schema.ACTION, schema.OBSERVATION):
+        if name not in columns:
+            continue
+        counts = connection.sql(
+            f"SELECT len({name}) AS size, count(*) AS n FROM read WHERE {name} IS NOT NULL "
+            "GROUP BY size ORDER BY n DESC, size LIMIT 4"
+        ).fetchall()
+        if len(counts) > 1:
+            lengths = ", ".join(f"{n} rows of {size}" for size, n in counts)
+            raise InputError(f"{name} has lists of unequal length: {lengths}; make them equal")
+        if not counts or counts[0][0] == 0:
+            raise InputError(
+                f"{name} is empty in every row; map another column or --column {name}="
+            )
+        sizes[name] = int(counts[0][0])
+    return sizes

@@ -10,6 +10,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import VectorEnv
 
 from tests.simulators.kuai.test_kuairand import QUICK, planted_store
+from tests.support.causes import QUICK as QUICK_SCREENING
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import IntArray, rollout
@@ -19,8 +20,10 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.world import World
+from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
+from ucfrec.runs.screened import train_screened
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_simulators.distractor import DistractorEnv, DistractorWorld, plant_distractor
 from ucfrec_simulators.kuai.completion import complete
@@ -173,3 +176,34 @@ def _play_and_watch(
         env, actor, 16, 0, on_step=lambda step: shown.append(actor._states[step.rows, -1].clone())
     )
     return int(played.lengths.sum()), torch.cat(shown)
+
+
+def test_screening_finds_the_distractor_among_items_and_drops_it_to_the_last_bit(
+    kuairand_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of vectors, `tests/control/benchmark/test_screening_table.py` says the same."""
+    store = EpisodeStore.open(kuairand_folder / "log" / "store")
+    monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: QUICK_SCREENING)
+    planted = plant_distractor(store, tmp_path / "planted")
+    config = resolve_config("ucf", overrides=[*TINY, "crm.epochs=1", "rule.choose=false"])
+    record = train_screened(planted, tmp_path / "dropped", config, "drop")
+    assert record["dropped_observations"] == [0]
+    train_run(store, tmp_path / "plain", config)
+    for file in ("overlay", "policy/best", "policy/last"):
+        dropped, plain = (
+            load_tensors(tmp_path / run / f"{file}.safetensors")[0] for run in ("dropped", "plain")
+        )
+        assert dropped.keys() == plain.keys()
+        for key, value in plain.items():
+            assert torch.equal(dropped[key], value), (file, key)
+    # What it earns is the same, wherever the distractor is.
+    folder = kuairand_folder / "world"
+    earned = [
+        evaluate_policy(world, TrainedPolicy.load(tmp_path / run), "ucf", 20, 0, None)["R_cum"]
+        for world, run in (
+            (World("kuairand", folder), "plain"),
+            (DistractorWorld("kuairand", folder, 0.0), "dropped"),
+            (DistractorWorld("kuairand", folder, 1.0), "dropped"),
+        )
+    ]
+    assert len(set(earned)) == 1

@@ -15,7 +15,7 @@ QUICK = ScreeningConfig(
     hidden=64,
     shared_steps=400,
     own_steps=200,
-    measurement=MeasurementConfig(hidden=48, steps=500, batch_size=256),
+    measurement=MeasurementConfig(trees=60),
 )
 SOURCE = {"where": "planted", "dataset": "planted", "env_id": None, "versions": {}}
 

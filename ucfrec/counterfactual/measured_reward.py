@@ -13,41 +13,40 @@ A cause fails one of these. If the logging policy did not see it, the action tel
 process that goes on, such as a position or a user's feature, is told by other dimensions (3).
 """
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from pydantic import Field
 from scipy import stats
-from torch import Tensor, nn
+from torch import Tensor
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import IntArray
 from ucfrec.errors import InputError
-from ucfrec.fitting.random_state import random_state_kept
-from ucfrec.settings import BatchSize, Count, LearningRate, Share, Width, settings_table
+from ucfrec.settings import Count, LearningRate, Share, settings_table
 
 CLIP: Final = 10.0
 """Standardised values beyond this many standard deviations are clipped."""
 _HELD_OUT_EVERY = 5
-_CHUNK = 4096
-_REST, _REWARD = 0, 1
+_PATIENCE = 8
+
+FloatArray = npt.NDArray[np.float32]
 
 
 @settings_table("measurement")
 class MeasurementConfig:
-    """Predictor of a dimension, and how much must be left for a cause."""
+    """Boosted trees that predict a dimension, and how much must be left for a cause."""
 
-    hidden: Width = 128
-    """Width of its two hidden layers."""
-    steps: Count = 2000
-    """Updates."""
-    batch_size: BatchSize = 512
-    """Transitions of an update."""
-    learning_rate: LearningRate = 3e-3
-    """Highest step size of the updates."""
+    trees: Count = 150
+    """Largest number of trees; fewer where rows kept apart are predicted no better."""
+    leaves: Annotated[int, Field(ge=2, le=1000)] = 15
+    """Largest number of leaves of a tree."""
+    learning_rate: LearningRate = 0.1
+    """Share of each tree's prediction that is added."""
     min_told: Share = 0.003
     """Least share of a dimension's variance that the rest must tell without the reward."""
     most_left: Share = 0.25
@@ -56,65 +55,40 @@ class MeasurementConfig:
     """Level of the tests that the rest and the reward tell of the dimension at all."""
 
 
-@dataclass(frozen=True)
-class MeasuredReward:
-    """The verdict on every observation dimension."""
-
-    flags: tuple[bool, ...]
-    """Whether the dimension measures the reward."""
-    told: tuple[float, ...]
-    """Share of the dimension's variance that the rest tells without the reward."""
-    told_by_reward: tuple[float, ...]
-    """Share that the reward alone tells."""
-    left: tuple[float, ...]
-    """Share that the rest adds to the reward."""
-    transitions: int
-
-
-@random_state_kept()
 def measured_reward(
-    train: EpisodeStore, config: MeasurementConfig, most: int, seed: int
-) -> MeasuredReward:
-    """Test every observation dimension on held-out episodes.
+    train: EpisodeStore,
+    config: MeasurementConfig,
+    most: int,
+    seed: int,
+    dimensions: Sequence[int] | None = None,
+) -> tuple[bool, ...]:
+    """Whether observation dimensions measure the reward, by their errors on held-out episodes.
 
     Args:
         train: a view of the training episodes, with observations.
         config: of the test.
         most: largest number of transitions used.
-        seed: of the predictor.
+        seed: of the transitions and of the rows kept apart.
+        dimensions: to test; None for all.
+
+    Returns:
+        One verdict for each of `dimensions`.
 
     Raises:
         InputError: there are too few episodes with two steps or more to hold some out.
     """
     data = _Steps.of(train, most, seed)
-    held_out = held_out_of(data.episodes)
-    if len(np.unique(data.episodes[held_out])) < 3:
-        raise InputError(
-            f"{train.path} has {train.n_episodes} training episodes, too few of them with two "
-            f"steps or more; screening needs at least {3 * _HELD_OUT_EVERY}"
-        )
-    torch.manual_seed(seed)
-    predictor = _fitted(data, np.flatnonzero(~held_out), config)
-    rows = np.flatnonzero(held_out)
-    flags, told, told_by_reward, left = [], [], [], []
-    for dimension in range(data.columns.shape[1]):
-        errors = _errors(predictor, data, rows, dimension)
-        variance = max(float(errors[0][0].mean()), 1e-12)
-        of_rest = (errors[0][0] - errors[1][0]) / variance
-        of_reward = (errors[0][0] - errors[0][1]) / variance
-        added = float((errors[0][1] - errors[1][1]).mean()) / variance
-        rest, reward = float(of_rest.mean()), float(of_reward.mean())
-        certain = all(
-            clustered_p_value(each, data.episodes[rows]) < config.level
-            for each in (of_rest, of_reward)
-        )
-        told.append(rest)
-        told_by_reward.append(reward)
-        left.append(added)
-        enough = certain and rest >= config.min_told
-        flags.append(enough and reward >= rest and added <= config.most_left * rest)
-    return MeasuredReward(
-        tuple(flags), tuple(told), tuple(told_by_reward), tuple(left), len(data.columns)
+    every = range(data.columns.shape[1])
+    tested = every if dimensions is None else dimensions
+    first = {dimension: _measures(data, dimension, (), config, seed) for dimension in tested}
+    if not any(first.values()):
+        return tuple(first.values())
+    first |= {d: _measures(data, d, (), config, seed) for d in every if d not in first}
+    found = {dimension for dimension, measures in first.items() if measures}
+    # A measurement tells of a cause too, through the reward: the others are left out of the rest.
+    return tuple(
+        d in found and (len(found) == 1 or _measures(data, d, found - {d}, config, seed))
+        for d in tested
     )
 
 
@@ -122,13 +96,15 @@ def measured_reward(
 class _Steps:
     """Standardised steps that have a successor."""
 
-    columns: Tensor
+    columns: FloatArray
     """(N, O) logged observations."""
-    rest: Tensor
+    rest: FloatArray
     """(N, R) the rest of the state, the action and the next one."""
-    rewards: Tensor
+    rewards: FloatArray
     """(N, 2) of the step and of the next one."""
     episodes: IntArray
+    held_out: npt.NDArray[np.bool_]
+    """(N,)."""
 
     @classmethod
     def of(cls, view: EpisodeStore, most: int, seed: int) -> "_Steps":
@@ -136,88 +112,89 @@ class _Steps:
         inner = np.flatnonzero(steps < view.lengths[episodes] - 1)
         if len(inner) > most:
             inner = np.sort(np.random.default_rng(seed).choice(inner, most, replace=False))
-        if not len(inner):
-            raise InputError(f"{view.path} has no episode of two steps; nothing can be screened")
+        held_out = held_out_of(view, episodes[inner])
         now = view.transitions(episodes[inner], steps[inner])
         then = view.transitions(episodes[inner], steps[inner] + 1)
         size = view.observation_size
         others = now.states[:, : now.states.shape[1] - size]
         return cls(
-            columns=standardised(now.states[:, -size:]),
-            rest=standardised(torch.cat([others, now.actions, then.actions], dim=1)),
-            rewards=standardised(torch.stack([now.rewards, then.rewards], dim=1)),
+            columns=standardised(now.states[:, -size:]).numpy(),
+            rest=standardised(torch.cat([others, now.actions, then.actions], dim=1)).numpy(),
+            rewards=standardised(torch.stack([now.rewards, then.rewards], dim=1)).numpy(),
             episodes=episodes[inner],
+            held_out=held_out,
         )
 
 
-class _Predictor(nn.Module):
-    """Predicts one dimension from the rest, from the reward, from both or from neither."""
+def _measures(
+    data: _Steps, dimension: int, without: Collection[int], config: MeasurementConfig, seed: int
+) -> bool:
+    """Whether a dimension measures the reward; the columns `without` are left out of the rest."""
+    values, held_out = data.columns[:, dimension], data.held_out
+    alone = np.square(values[held_out] - values[~held_out].mean(dtype=np.float64))
+    variance = max(float(alone.mean()), 1e-12)
 
-    def __init__(self, data: _Steps, hidden: int) -> None:
-        super().__init__()
-        size = data.columns.shape[1]
-        inputs = 2 * size + data.rest.shape[1] + data.rewards.shape[1] + 2
-        self.net = nn.Sequential(
-            nn.Linear(inputs, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU(),
-            nn.Linear(hidden, size),
-        )  # fmt: skip
+    def saved(inputs: FloatArray) -> npt.NDArray[np.float64]:
+        """Share (B,) of the variance that the inputs tell of held-out steps."""
+        predicted = _predicted(inputs, values, held_out, config, seed)
+        return np.asarray((alone - np.square(values[held_out] - predicted)) / variance)
 
-    def errors(self, data: _Steps, rows: Tensor, dimensions: Tensor, known: Tensor) -> Tensor:
-        """Squared errors (B,).
+    def told(shares: npt.NDArray[np.float64]) -> bool:
+        p_value = clustered_p_value(torch.from_numpy(shares), data.episodes[held_out])
+        return bool(shares.mean() >= config.min_told) and p_value < config.level
 
-        Args:
-            data: all steps.
-            rows: (B,) of them.
-            dimensions: (B,) predicted in each.
-            known: (B, 2) 1 where the rest, and the reward, are known.
-        """
-        target = nn.functional.one_hot(dimensions, data.columns.shape[1]).float()
-        rest, reward = known[:, _REST, None], known[:, _REWARD, None]
-        inputs = [
-            data.columns[rows] * (1 - target) * rest, target, data.rest[rows] * rest,
-            data.rewards[rows] * reward, known,
-        ]  # fmt: skip
-        predicted = self.net(torch.cat(inputs, dim=1))
-        squared: Tensor = ((predicted - data.columns[rows]) * target).sum(1).square()
-        return squared
+    # The cheapest first: most dimensions fail one of these.
+    of_reward = saved(data.rewards)
+    if not told(of_reward):
+        return False
+    others = np.delete(data.columns, [dimension, *without], axis=1)
+    rest = np.column_stack([others, data.rest])
+    of_rest = saved(rest)
+    if not told(of_rest) or of_reward.mean() < of_rest.mean():
+        return False
+    both = saved(np.column_stack([rest, data.rewards]))
+    return bool(both.mean() - of_reward.mean() <= config.most_left * of_rest.mean())
 
 
-def _fitted(data: _Steps, seen: npt.NDArray[Any], config: MeasurementConfig) -> _Predictor:
-    predictor, rows = _Predictor(data, config.hidden), torch.from_numpy(seen)
-    optimizer = torch.optim.Adam(predictor.parameters(), lr=config.learning_rate)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.learning_rate, config.steps)
-    for _ in range(config.steps):
-        batch = rows[torch.randint(len(rows), (config.batch_size,))]
-        dimensions = torch.randint(data.columns.shape[1], (config.batch_size,))
-        known = torch.randint(2, (config.batch_size, 2)).float()
-        loss = predictor.errors(data, batch, dimensions, known).mean()
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-        schedule.step()
-    return predictor
+def _predicted(
+    inputs: FloatArray,
+    values: FloatArray,
+    held_out: npt.NDArray[np.bool_],
+    config: MeasurementConfig,
+    seed: int,
+) -> npt.NDArray[np.float64]:
+    """`values` (N,) of the held-out rows, predicted by what was fitted to the others."""
+    from sklearn.ensemble import HistGradientBoostingRegressor  # takes a second to import
+
+    model = HistGradientBoostingRegressor(
+        learning_rate=config.learning_rate,
+        max_iter=config.trees,
+        max_leaf_nodes=config.leaves,
+        early_stopping=True,
+        n_iter_no_change=_PATIENCE,
+        random_state=seed,
+    )
+    model.fit(inputs[~held_out], values[~held_out])
+    return np.asarray(model.predict(inputs[held_out]))
 
 
-@torch.no_grad()
-def _errors(
-    predictor: _Predictor, data: _Steps, rows: IntArray, dimension: int
-) -> list[list[Tensor]]:
-    """Squared errors (B,) at `rows`, by whether the rest and whether the reward is known."""
+def held_out_of(train: EpisodeStore, episodes: IntArray) -> npt.NDArray[np.bool_]:
+    """Which steps are held out: those of every fifth episode.
 
-    def of(known: tuple[int, int]) -> Tensor:
-        parts = []
-        for chunk in torch.split(torch.from_numpy(rows), _CHUNK):
-            dimensions = torch.full((len(chunk),), dimension)
-            given = torch.tensor(known).float().expand(len(chunk), 2)
-            parts.append(predictor.errors(data, chunk, dimensions, given))
-        return torch.cat(parts)
+    Args:
+        train: a view of the training episodes.
+        episodes: (N,) of which episode each step is.
 
-    return [[of((rest, reward)) for reward in (0, 1)] for rest in (0, 1)]
-
-
-def held_out_of(episodes: IntArray) -> npt.NDArray[np.bool_]:
-    """Which steps are held out: those of every fifth episode."""
-    return np.asarray(episodes % _HELD_OUT_EVERY == _HELD_OUT_EVERY // 2)
+    Raises:
+        InputError: there are too few episodes to hold some out.
+    """
+    held_out = np.asarray(episodes % _HELD_OUT_EVERY == _HELD_OUT_EVERY // 2)
+    if len(np.unique(episodes[held_out])) < 3:
+        raise InputError(
+            f"{train.path} has {train.n_episodes} training episodes, too few of them with two "
+            f"steps or more; screening needs at least {3 * _HELD_OUT_EVERY}"
+        )
+    return held_out
 
 
 def standardised(values: Tensor) -> Tensor:

@@ -12,25 +12,33 @@ Where the reward can hardly be predicted, as clicks, no help is no evidence, and
 the reward helps most. There a dimension counts as without effect only if it is such a measurement
 (`ucfrec.counterfactual.measured_reward`) and does not help to predict the next state. In logs of
 items the logged observation is screened, and by that test alone.
+
+Features of items and users are not screened: a policy reads them from its run's own tables, so
+that they have the same values in the logs and wherever it acts.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import torch
 from pydantic import Field
-from torch import Tensor, nn
+from torch import Tensor
 
 from ucfrec.counterfactual.measured_reward import (
-    CLIP,
     MeasurementConfig,
     clustered_p_value,
-    held_out_of,
     measured_reward,
-    standardised,
+)
+from ucfrec.counterfactual.missing_dimensions import (
+    CHUNK,
+    PredictorPair,
+    StandardSteps,
+    absences_of,
+    errors_of,
+    own_pairs,
+    shared_pair,
 )
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import IntArray
@@ -38,8 +46,8 @@ from ucfrec.errors import InputError
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.settings import BatchSize, Count, LearningRate, Share, Width, settings_table
 
-_CHUNK = 1024
 _HELPED = 3
+_SAID = {True: "yes", False: "no", None: "–"}
 
 
 @settings_table("screening")
@@ -81,7 +89,7 @@ class DimensionReport:
     dimension: int
     effect: float | None
     """Share it explains of what the others leave unexplained of the next dimensions it helps most
-    (partial R², their mean), the reward given; None in logs of items, where it is not tested."""
+    (partial R², their mean), the reward given; None where it is not tested, as in logs of items."""
     helps: tuple[int, ...]
     """Those dimensions, most helped first, chosen on fitted episodes."""
     p_value: float | None
@@ -89,8 +97,8 @@ class DimensionReport:
     reward_effect: float | None
     """Share it explains of the reward's variance."""
     reward_p_value: float | None
-    measures_reward: bool
-    """Whether it tells of the reward after the fact."""
+    measures_reward: bool | None
+    """Whether it tells of the reward after the fact; None where that does not matter."""
     causes: bool
     """Whether it counts as having an effect, be it for want of evidence."""
 
@@ -126,204 +134,146 @@ def screen(train: EpisodeStore, config: ScreeningConfig, seed: int) -> Screening
         raise InputError(
             f"{train.path} has no logged observations to screen; its states are made of items"
         )
-    measures = measured_reward(train, config.measurement, config.max_transitions, seed)
+    data = StandardSteps.of(train, config.max_transitions, seed)
+
+    def measured(dimensions: Sequence[int]) -> dict[int, bool]:
+        found = measured_reward(train, config.measurement, config.max_transitions, seed, dimensions)
+        return dict(zip(dimensions, found, strict=True))
+
     if train.has_items:
-        verdicts = [
-            DimensionReport(j, None, (), None, None, None, measured, not measured)
-            for j, measured in enumerate(measures.flags)
-        ]
-        return ScreeningReport(tuple(verdicts), None, measures.transitions)
-    data = _Transitions.of(train, config.max_transitions, seed)
+        verdicts = measured(range(train.observation_size))
+        reports = [_untested(dimension, measures) for dimension, measures in verdicts.items()]
+        return ScreeningReport(tuple(reports), None, len(data.episodes))
     torch.manual_seed(seed)
-    pair = _fitted(data, config)
-    seen = np.flatnonzero(~data.held_out)
-    sample = np.random.default_rng(seed).choice(seen, min(len(seen), 4 * _CHUNK), replace=False)
-    fitted_errors, _ = _errors(pair, data, np.sort(sample))
-    next_errors, reward_errors = _errors(pair, data, np.flatnonzero(data.held_out))
-    return _report(data, fitted_errors, next_errors, reward_errors, measures.flags, config)
+    shared = shared_pair(
+        data, config.hidden, config.shared_steps, config.batch_size, config.learning_rate
+    )
+    with random_state_kept():  # whether only some are tested changes nothing else
+        r2 = _Effects.of(shared, data, (), config, seed).r2
+    tested: Sequence[int] = range(data.states.shape[1])
+    measures: dict[int, bool] = {}
+    if r2 < config.min_reward_r2:
+        # Only what measures the reward can be without effect; the effects of the rest are left out.
+        measures = measured(tested)
+        tested = [dimension for dimension, yes in measures.items() if yes]
+    effects = _Effects.of(shared, data, tested, config, seed)
+    undecided = [each.dimension for each in effects.found if each.undecided]
+    measures |= measured([dimension for dimension in undecided if dimension not in measures])
+    found = {each.dimension: each.report(measures.get(each.dimension)) for each in effects.found}
+    size = data.states.shape[1]
+    reports = [found.get(dimension) or _untested(dimension, False) for dimension in range(size)]
+    return ScreeningReport(tuple(reports), effects.r2, len(data.episodes))
+
+
+def _untested(dimension: int, measures: bool) -> DimensionReport:
+    """A verdict by whether a dimension measures the reward alone."""
+    return DimensionReport(dimension, None, (), None, None, None, measures, not measures)
+
+
+def _rows(data: StandardSteps) -> IntArray:
+    """The held-out steps."""
+    return np.flatnonzero(data.held_out)
+
+
+def _reward_variance(data: StandardSteps) -> float:
+    return max(float(data.rewards[torch.from_numpy(_rows(data))].var()), 1e-12)
+
+
+def _r2(errors: Tensor, data: StandardSteps) -> float:
+    """Held-out R² of the reward, of squared errors (B,)."""
+    return 1 - float(errors.mean()) / _reward_variance(data)
 
 
 @dataclass(frozen=True)
-class _Transitions:
-    """Standardised steps that have a successor."""
+class _Effect:
+    """What a dimension adds to the predictions."""
 
-    states: Tensor
-    """(N, S)."""
-    actions: Tensor
-    rewards: Tensor
-    """(N, 1)."""
-    changes: Tensor
-    """(N, S) of the state until the next step."""
-    episodes: IntArray
-    held_out: Any
-    """(N,) bool."""
+    dimension: int
+    effect: float
+    helps: tuple[int, ...]
+    p_value: float
+    reward_effect: float
+    reward_p_value: float
+    helps_next: bool
+    helps_reward: bool
+    """True too where the reward can hardly be predicted."""
+
+    @property
+    def undecided(self) -> bool:
+        """Whether it matters that the dimension may measure the reward."""
+        return self.helps_reward and not self.helps_next
+
+    def report(self, measures: bool | None) -> DimensionReport:
+        """The verdict; `measures` is None if it does not matter."""
+        causes = self.helps_next or (self.helps_reward and not measures)
+        return DimensionReport(
+            self.dimension, self.effect, self.helps, self.p_value, self.reward_effect,
+            self.reward_p_value, measures, causes,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Effects:
+    """The effects of some dimensions, and the R² of the reward with none missing."""
+
+    found: Sequence[_Effect]
+    r2: float
 
     @classmethod
-    def of(cls, view: EpisodeStore, most: int, seed: int) -> "_Transitions":
-        episodes, steps = view.all_steps()
-        inner = np.flatnonzero(steps < view.lengths[episodes] - 1)
-        if len(inner) > most:
-            inner = np.sort(np.random.default_rng(seed).choice(inner, most, replace=False))
-        found = view.transitions(episodes[inner], steps[inner])
-        mean, std = view.state_statistics
-        states = (found.states - mean) / torch.where(std > 1e-6, std, 1.0)
-        next_states = (found.next_states - mean) / torch.where(std > 1e-6, std, 1.0)
-        return cls(
-            states=states.clamp(-CLIP, CLIP),
-            actions=standardised(found.actions),
-            rewards=standardised(found.rewards.unsqueeze(1)),
-            changes=standardised(next_states - states),
-            episodes=episodes[inner],
-            held_out=held_out_of(episodes[inner]),
-        )
-
-
-class _Predictors(nn.Module):
-    """M perceptrons of one shape, side by side."""
-
-    def __init__(self, sizes: Sequence[int], count: int = 1) -> None:
-        super().__init__()
-        self.sizes = sizes
-        pairs = list(pairwise(sizes))
-        self.weights = nn.ParameterList(torch.randn(count, i, o) / i**0.5 for i, o in pairs)
-        self.biases = nn.ParameterList(torch.zeros(count, 1, o) for _, o in pairs)
-
-    def forward(self, inputs: Tensor) -> Tensor:
-        """(M, B, in) to (M, B, out)."""
-        hidden = inputs
-        for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            hidden = torch.baddbmm(bias, nn.functional.silu(hidden) if layer else hidden, weight)
-        return hidden
-
-    def repeated(self, count: int) -> "_Predictors":
-        """`count` copies of a single perceptron."""
-        copies = _Predictors(self.sizes, count)
-        with torch.no_grad():
-            for copy, original in zip(copies.parameters(), self.parameters(), strict=True):
-                copy.copy_(original.expand_as(copy))
-        return copies
-
-
-class _Pair(nn.Module):
-    """Predictors of the next state, the reward given, and of the reward, dimensions missing."""
-
-    def __init__(self, next_state: _Predictors, reward: _Predictors) -> None:
-        super().__init__()
-        self.next_state, self.reward = next_state, reward
-
-    def errors(self, data: _Transitions, rows: Tensor, missing: Tensor) -> tuple[Tensor, Tensor]:
-        """Squared errors (M, B, S) and (M, B); `missing` (M, 1 or B, S) is 1 where missing."""
-        missing = missing.expand(-1, len(rows), -1)
-
-        def spread(values: Tensor) -> Tensor:
-            return values[rows].expand(len(missing), -1, -1)
-
-        inputs = torch.cat([data.states[rows] * (1 - missing), missing, spread(data.actions)], 2)
-        with_reward = torch.cat([inputs, spread(data.rewards)], 2)
-        next_errors = (self.next_state(with_reward) - data.changes[rows]).square()
-        return next_errors, (self.reward(inputs) - data.rewards[rows]).square().squeeze(2)
-
-
-def _absences(size: int) -> Tensor:
-    """(S + 1, S): row j misses dimension j, the last row none."""
-    return torch.cat([torch.eye(size), torch.zeros(1, size)])
-
-
-def _fitted(data: _Transitions, config: ScreeningConfig) -> _Pair:
-    """S + 1 pairs of predictors, one for each row of `_absences`."""
-    size, width = data.states.shape[1], config.hidden
-    inputs = 2 * size + data.actions.shape[1]
-    pair = _Pair(
-        _Predictors((inputs + 1, width, width, size)), _Predictors((inputs, width, width, 1))
-    )
-    absences = _absences(size)
-
-    def some_missing() -> Tensor:
-        # A third of the rows miss nothing, so that the complete predictor is not the worst trained.
-        drawn = torch.randint(3 * size // 2 + 1, (config.batch_size,)).clamp(max=size)
-        return absences[drawn].unsqueeze(0)
-
-    _optimise(pair, data, some_missing, config.shared_steps, config.learning_rate, config)
-    pair = _Pair(pair.next_state.repeated(size + 1), pair.reward.repeated(size + 1))
-    one_missing = absences.unsqueeze(1)
-    _optimise(pair, data, lambda: one_missing, config.own_steps, config.learning_rate / 3, config)
-    return pair
-
-
-def _optimise(
-    pair: _Pair,
-    data: _Transitions,
-    missing: Callable[[], Tensor],
-    steps: int,
-    learning_rate: float,
-    config: ScreeningConfig,
-) -> None:
-    rows = torch.from_numpy(np.flatnonzero(~data.held_out))
-    optimizer = torch.optim.Adam(pair.parameters(), lr=learning_rate)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, learning_rate, steps)
-    for _ in range(steps):
-        absent = missing()
-        batch = rows[torch.randint(len(rows), (config.batch_size,))]
-        next_errors, reward_errors = pair.errors(data, batch, absent)
-        # A missing dimension's own future is no part of the rest.
-        loss = (next_errors * (1 - absent)).mean((1, 2)).sum() + reward_errors.mean(1).sum()
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-        schedule.step()
-
-
-@torch.no_grad()
-def _errors(pair: _Pair, data: _Transitions, rows: IntArray) -> tuple[Tensor, Tensor]:
-    """Squared errors at `rows`: (S + 1, B, S) and (S + 1, B)."""
-    absent = _absences(data.states.shape[1]).unsqueeze(1)
-    chunks = torch.split(torch.from_numpy(rows), _CHUNK)
-    parts = [pair.errors(data, chunk, absent) for chunk in chunks]
-    next_errors, reward_errors = zip(*parts, strict=True)
-    return torch.cat(next_errors, 1), torch.cat(reward_errors, 1)
-
-
-def _report(
-    data: _Transitions,
-    fitted_errors: Tensor,
-    next_errors: Tensor,
-    reward_errors: Tensor,
-    measures: Sequence[bool],
-    config: ScreeningConfig,
-) -> ScreeningReport:
-    size = data.states.shape[1]
-    rows = np.flatnonzero(data.held_out)
-    variance = float(data.rewards[torch.from_numpy(rows)].var())
-    fitted = fitted_errors.mean(1)
-    gain = 1 - fitted[-1] / fitted[:-1].clamp(min=1e-12)  # (S, S)
-    most_helped = gain.fill_diagonal_(-torch.inf).topk(min(_HELPED, size - 1)).indices
-    r2 = 1 - float(reward_errors[-1].mean()) / max(variance, 1e-12)
-    found = []
-    for j in range(size):
-        pair = next_errors[[j, -1]][:, :, most_helped[j]]  # (2, B, helped)
-        without, with_it = pair.minimum(pair.flatten(0, 1).quantile(1 - config.capped, dim=0))
-        saved = (without - with_it) / without.mean(0).clamp(min=1e-12)
-        effect, p_value = float(saved.mean()), clustered_p_value(saved.mean(1), data.episodes[rows])
-        more = reward_errors[j] - reward_errors[-1]
-        reward_effect = float(more.mean()) / max(variance, 1e-12)
-        reward_p_value = clustered_p_value(more, data.episodes[rows])
-        helps_next = effect >= config.min_effect and p_value < config.level
-        helps_reward = (
-            reward_effect >= config.min_reward_effect and reward_p_value < config.level
-        ) or r2 < config.min_reward_r2
-        found.append(
-            DimensionReport(
-                dimension=j,
-                effect=effect,
-                helps=tuple(most_helped[j].tolist()),
-                p_value=p_value,
-                reward_effect=reward_effect,
-                reward_p_value=reward_p_value,
-                measures_reward=measures[j],
-                causes=helps_next or (helps_reward and not measures[j]),
+    def of(
+        cls,
+        shared: PredictorPair,
+        data: StandardSteps,
+        dimensions: Sequence[int],
+        config: ScreeningConfig,
+        seed: int,
+    ) -> "_Effects":
+        absences = absences_of(data, dimensions)
+        rate = config.learning_rate / 3
+        pair = own_pairs(shared, data, absences, config.own_steps, config.batch_size, rate)
+        seen = np.flatnonzero(~data.held_out)
+        sample = np.random.default_rng(seed).choice(seen, min(len(seen), 4 * CHUNK), replace=False)
+        fitted = errors_of(pair, data, np.sort(sample), absences)[0].mean(1)
+        next_errors, reward_errors = errors_of(pair, data, _rows(data), absences)
+        r2, size = _r2(reward_errors[-1], data), data.states.shape[1]
+        gain = 1 - fitted[-1] / fitted[:-1].clamp(min=1e-12)  # (M, S)
+        gain[absences[:-1, 0] > 0] = -torch.inf
+        most_helped = gain.topk(min(_HELPED, size - 1)).indices
+        found = []
+        for row, dimension in enumerate(dimensions):
+            effect = _effect_on_next(next_errors[[row, -1]][:, :, most_helped[row]], data, config)
+            more = reward_errors[row] - reward_errors[-1]
+            of_reward = float(more.mean()) / _reward_variance(data)
+            p_value = clustered_p_value(more, data.episodes[_rows(data)])
+            found.append(
+                _Effect(
+                    dimension=dimension,
+                    effect=effect[0],
+                    helps=tuple(most_helped[row].tolist()),
+                    p_value=effect[1],
+                    reward_effect=of_reward,
+                    reward_p_value=p_value,
+                    helps_next=effect[0] >= config.min_effect and effect[1] < config.level,
+                    helps_reward=r2 < config.min_reward_r2
+                    or (of_reward >= config.min_reward_effect and p_value < config.level),
+                )
             )
-        )
-    return ScreeningReport(tuple(found), r2, len(data.states))
+        return cls(found, r2)
+
+
+def _effect_on_next(
+    pair: Tensor, data: StandardSteps, config: ScreeningConfig
+) -> tuple[float, float]:
+    """Share explained of what is left unexplained, and its p-value.
+
+    Args:
+        pair: (2, B, H) squared errors of helped dimensions, without and with a dimension.
+        data: all steps.
+        config: of the tests.
+    """
+    capped = pair.minimum(pair.flatten(0, 1).quantile(1 - config.capped, dim=0))
+    saved = (capped[0] - capped[1]) / capped[0].mean(0).clamp(min=1e-12)
+    return float(saved.mean()), clustered_p_value(saved.mean(1), data.episodes[_rows(data)])
 
 
 def describe_screening(report: ScreeningReport) -> str:
@@ -334,7 +284,7 @@ def describe_screening(report: ScreeningReport) -> str:
     lines += [
         f"{d.dimension:>9}  {_number(d.effect, '.4f'):>10}  {_number(d.p_value, '.1g'):>7}  "
         f"{_number(d.reward_effect, '.5f'):>9}  {_number(d.reward_p_value, '.1g'):>7}  "
-        f"{'yes' if d.measures_reward else 'no':>15}  {'yes' if d.causes else 'NOTHING'}"
+        f"{_SAID[d.measures_reward]:>15}  {'yes' if d.causes else 'NOTHING'}"
         for d in report.dimensions
     ]
     flagged = ", ".join(map(str, report.flagged)) or "none"

@@ -49,6 +49,7 @@ def run_grid(
     results: Path,
     workers: int,
     describe: str = "benchmark",
+    announce: Callable[[Sequence[Cell]], str] | None = None,
 ) -> list[ResultRow]:
     """Measure every cell that has no row in `results` yet.
 
@@ -62,6 +63,7 @@ def run_grid(
         results: file of result rows (JSON lines); its other rows are kept.
         workers: number of worker processes.
         describe: name of the benchmark in progress output.
+        announce: what to say of the cells that are left before they are measured.
 
     Returns:
         The rows of all cells, in the order of `cells`.
@@ -81,6 +83,9 @@ def run_grid(
     counted = f"{len(tasks)} cells, {len(missing)} of them left to measure"
     print(f"{describe}: {counted}", file=sys.stderr)
     if missing:
+        if announce is not None:
+            said = announce([tasks[name].cell for name in missing])
+            print(f"{describe}: {said}", file=sys.stderr)
         measured, failed = _measure_all({name: tasks[name] for name in missing}, workers, describe)
         found |= measured
         if failed:

@@ -29,7 +29,11 @@ def screen_store(store: EpisodeStore, seed: int) -> ScreeningReport:
 
 
 def train_screened(
-    store: EpisodeStore, out: Path, config: Config, how: str | None
+    store: EpisodeStore,
+    out: Path,
+    config: Config,
+    how: str | None,
+    about: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """`ucfrec.runs.run.train_run` after screening.
 
@@ -38,6 +42,7 @@ def train_screened(
         out: run folder; an interrupted run resumes, with the columns it started with.
         config: of the training.
         how: one of `SCREENINGS`; None to train on the store as it is.
+        about: entries that a dataset adapter adds to the record.
 
     Returns:
         The run's record.
@@ -54,27 +59,32 @@ def train_screened(
             "another run folder, or give the same options to resume"
         )
     if how is None:
-        return train_run(store, out, config)
+        return train_run(store, out, config, about)
     screening = started[SCREENING] if started is not None else _screened(store, config.seed, how)
-    flagged = [d["dimension"] for d in screening["dimensions"] if not d["causes"]]
+    flagged = flagged_columns(screening)
     if len(flagged) == store.state_size:
         raise InputError(
             f"{store.path}: screening found no effect of any of the {len(flagged)} state "
             "dimensions; the log has too few steps, or too noisy ones, to tell: train without "
             "--screen"
         )
+    entries = {**(about or {}), SCREENING: screening}
     if how == "drop":
-        return train_run(
-            without_columns(store, flagged), out, config, {SCREENING: screening, DROPPED: flagged}
-        )
+        kept = without_columns(store, flagged)
+        return train_run(kept, out, config, {**entries, DROPPED: flagged})
     train, first = training_views(store)[0], store.state_size - store.observation_size
     places = [first + column for column in flagged]
     copies = interventions(train, places, config.seed) if places else None
-    return train_run(store, out, config, {SCREENING: screening}, copies)
+    return train_run(store, out, config, entries, copies)
 
 
 def _screened(store: EpisodeStore, seed: int, how: str) -> Mapping[str, Any]:
     return {"how": how, **asdict(screen_store(store, seed))}
+
+
+def flagged_columns(screening: Mapping[str, Any]) -> list[int]:
+    """The observation columns without effect of a record's entry `SCREENING`."""
+    return [d["dimension"] for d in screening["dimensions"] if not d["causes"]]
 
 
 def without_columns(store: EpisodeStore, columns: Sequence[int]) -> EpisodeStore:
@@ -84,6 +94,5 @@ def without_columns(store: EpisodeStore, columns: Sequence[int]) -> EpisodeStore
 
 def describe_screened(record: Mapping[str, Any]) -> str:
     """One line on the screening of a run's record."""
-    dimensions = record[SCREENING]["dimensions"]
-    flagged = ", ".join(str(d["dimension"]) for d in dimensions if not d["causes"]) or "none"
+    flagged = ", ".join(map(str, flagged_columns(record[SCREENING]))) or "none"
     return f"screening     observation columns without effect: {flagged}"

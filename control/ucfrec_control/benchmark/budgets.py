@@ -1,5 +1,6 @@
 """Sizes of the control benchmarks."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -30,6 +31,8 @@ class Budget:
     """Training seeds of AntMaze; 0 for `seeds`."""
     all_targets: bool = False
     """Whether a policy is asked for every target return of its preset, or for the first."""
+    rates: Mapping[str, float] | None = None
+    """Learning rates by method; None for those that come with the package."""
 
     def files_in(self, data: Path) -> tuple[str, ...]:
         """`files`, and those of `where_present` that lie in the folder `data`."""

@@ -12,6 +12,7 @@ from ucfrec.provenance import provenance
 from ucfrec.reporting.grid import Measurement
 from ucfrec.reporting.result_row import ResultRow, RowKey
 from ucfrec.runs.config import Config, resolve_config
+from ucfrec.runs.screened import SCREENING
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_control.benchmark.score_rows import score_row
 from ucfrec_control.benchmark.screening_table import verdicts
@@ -60,7 +61,7 @@ class Cell:
     distractor: str | None = None
     """A key of `DISTRACTORS`; None outside the robustness suite."""
     screening: str | None = None
-    """As in `train_control`."""
+    """One of `ucfrec.runs.screened.SCREENINGS`; None for none."""
     all_targets: bool = False
     """As in `Budget`."""
 
@@ -122,7 +123,8 @@ def config(cell: Cell) -> dict[str, Any]:
     """The configuration of the cell's training, as a run's record has it."""
     if cell.learner in ALGORITHMS:
         return plain_config(cell.rl_config, cell.seed)
-    return asdict(cell.config)
+    screening = {} if cell.screening is None else {SCREENING: cell.screening}
+    return asdict(cell.config) | screening
 
 
 def measure_scores(cell: Cell, row_key: RowKey) -> list[ResultRow]:
@@ -162,7 +164,7 @@ def measure_robustness(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     ]
     losses = held_out_losses(TrainedPolicy.load(cell.run, "last"), store)
     metrics = {"score_at_one": evaluations[-1]["score"], **losses}
-    details = {"screening": verdicts(record["screening"], store)} if cell.screening else {}
+    details = {SCREENING: verdicts(record[SCREENING], store)} if cell.screening else {}
     fields = {"metrics": metrics, "details": details}
     return [score_row(evaluations[0], row_key, **fields, **provenance(PACKAGES))]
 

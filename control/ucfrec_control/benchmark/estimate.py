@@ -41,6 +41,9 @@ def estimated_hours(cells: Sequence[Cell], workers: int) -> float:
             kind = (world, cell.learner, cell.settings, cell.rl_steps, cell.rl_batch_size)
             if kind not in trained:
                 trained[kind] = _training(cell)
+            if not cell.episodes:
+                total += trained[kind]
+                continue
             if world not in played:
                 played[world] = _step_of(world, cell.episodes)
             rounds = -(-cell.episodes // SIDE_BY_SIDE) * _EPISODE_STEPS
@@ -50,6 +53,19 @@ def estimated_hours(cells: Sequence[Cell], workers: int) -> float:
     finally:
         torch.set_num_threads(threads)
     return total / workers / 3600
+
+
+def announcement(workers: int) -> Callable[[Sequence[Cell]], str]:
+    """What a benchmark of so many processes says of the cells that are left, before it starts."""
+
+    def said(cells: Sequence[Cell]) -> str:
+        hours = estimated_hours(cells, workers)
+        return (
+            f"about {hours:.1f} hours here with --workers {workers}, by the time of a few steps of "
+            "each training; reward models, generators and screening are not counted"
+        )
+
+    return said
 
 
 @random_state_kept()

@@ -3,11 +3,12 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from ucfrec.code_version import code_version
 from ucfrec.reporting.grid import chosen, run_grid
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec_control.benchmark.budgets import Budget
 from ucfrec_control.benchmark.cells import SCORE_MEASUREMENT, SCORES, Cell, code_of
+from ucfrec_control.benchmark.estimate import announcement
+from ucfrec_control.benchmark.folders import run_name, stores_of
 from ucfrec_control.benchmark.methods import MAIN, PURSUING, TABLES
 from ucfrec_control.benchmark.rates import settings_of
 from ucfrec_control.data.distractor import zoo_store
@@ -41,7 +42,8 @@ def benchmark(
     """
     selected = chosen(TABLES[table], methods, "method")
     cells = list(cells_of(data, folder, budget, name, table, selected))
-    return run_grid(cells, SCORE_MEASUREMENT, results, workers, f"benchmark {table}")
+    said = announcement(workers)
+    return run_grid(cells, SCORE_MEASUREMENT, results, workers, f"benchmark {table}", said)
 
 
 def cells_of(
@@ -74,13 +76,3 @@ def cells_of(
                     rl_batch_size=budget.rl_batch_size,
                     all_targets=budget.all_targets,
                 )
-
-
-def stores_of(folder: Path) -> Path:
-    """The folder of the stores that this version of the code writes."""
-    return folder / "stores" / code_version(zoo_store.__module__)
-
-
-def run_name(method: str, code: str, seed: int) -> str:
-    """The folder name of a run, with the code's version: other code must not resume it."""
-    return f"{method}-{code}-{seed}"

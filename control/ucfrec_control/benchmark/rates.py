@@ -10,12 +10,16 @@ from typing import Any, Final
 import numpy as np
 
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.files import atomic_file
 from ucfrec.provenance import provenance
 from ucfrec.reporting.grid import Measurement, chosen, run_grid
 from ucfrec.reporting.result_row import ResultRow, RowKey
 from ucfrec.reporting.statistics import grouped
 from ucfrec_control.benchmark.budgets import Budget
 from ucfrec_control.benchmark.cells import Cell, code_of, config, key
+from ucfrec_control.benchmark.estimate import announcement
+from ucfrec_control.benchmark.folders import stores_of
 from ucfrec_control.benchmark.methods import METHODS, Methods
 from ucfrec_control.data.distractor import zoo_store
 from ucfrec_control.data.trajectories import PACKAGES
@@ -60,6 +64,45 @@ def chosen_rates(budget: str) -> Mapping[str, float]:
     return rates
 
 
+def read_rates(path: Path) -> dict[str, dict[str, float]]:
+    """Rates by budget and method, of a file that `write_rates` wrote.
+
+    Raises:
+        InputError: the file is missing, or not of such tables.
+    """
+    try:
+        tables: dict[str, dict[str, float]] = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path} cannot be read ({error}); `rates --toml` writes one") from None
+    for budget, rates in tables.items():
+        for method, rate in rates.items() if isinstance(rates, Mapping) else [("", rates)]:
+            if method not in SEARCHED or not isinstance(rate, float | int) or not 0 < rate < 1:
+                raise InputError(
+                    f"{path}: {method or budget} = {rate!r:.60} is no learning rate of a method; "
+                    f"there are {', '.join(SEARCHED)}"
+                )
+    return tables
+
+
+def write_rates(path: Path, budget: str, rates: Mapping[str, float]) -> None:
+    """Write rates to a file; its tables of other budgets stay.
+
+    Raises:
+        InputError: the file exists and is not of such tables.
+    """
+    tables = (read_rates(path) if path.exists() else {}) | {budget: dict(rates)}
+    with atomic_file(path) as scratch:
+        scratch.write_text("\n".join(map(format_rates, tables.items())), encoding="utf-8")
+
+
+def format_rates(table: tuple[str, Mapping[str, float]]) -> str:
+    """A budget and its rates as a table of TOML."""
+    budget, rates = table
+    return "".join(
+        f"{line}\n" for line in (f"[{budget}]", *(f"{m} = {rate:g}" for m, rate in rates.items()))
+    )
+
+
 def settings_of(
     budget: Budget, name: str, learner: str, settings: Sequence[str]
 ) -> tuple[str, ...]:
@@ -74,7 +117,7 @@ def settings_of(
     time = _of_time(settings)
     if learner == "ucf" and time == _of_time(METHODS["dt-wo-time"][1]):
         time = ()  # the preset
-    rates = chosen_rates(name)
+    rates = chosen_rates(name) if budget.rates is None else budget.rates
     rate = next((rates.get(m) for m, own in SEARCHED.items() if own == (learner, time)), None)
     searched = () if rate is None else (f"train.{RATE}={rate:g}",)
     return (*budget.settings_of(learner), *searched, *settings)
@@ -109,21 +152,23 @@ def search_rates(
     """
     selected = chosen(SEARCHED, methods, "method")
     cells = list(_cells(data, folder, budget, name, selected, steps))
-    return run_grid(cells, _MEASUREMENT, results, workers, SUITE)
+    return run_grid(cells, _MEASUREMENT, results, workers, SUITE, announcement(workers))
 
 
 def _cells(
     data: Path, folder: Path, budget: Budget, name: str, methods: Sequence[str], steps: int | None
 ) -> Iterator[Cell]:
     shorter = () if steps is None else (f"train.steps={steps}", f"train.validate_every={steps}")
+    # Shorter trainings are runs of their own.
+    part = "" if steps is None else f"{steps}-"
     for file in budget.files_in(data):
-        store = zoo_store(data, folder / "stores", file)
+        store = zoo_store(data, stores_of(folder), file)
         for method in methods:
             learner, own = SEARCHED[method]
             code = code_of(learner, __name__)
             for rate in RATES[name]:
                 settings = (f"{_COPIES}=0", *shorter, f"train.{RATE}={rate:g}", *own)
-                for seed in range(budget.seeds):
+                for seed in range(budget.seeds_of(file)):
                     yield Cell(
                         suite=SUITE,
                         table=f"{rate:g}",
@@ -133,7 +178,7 @@ def _cells(
                         learner=learner,
                         settings=(*budget.settings_of(learner), *settings),
                         store=store,
-                        run=folder / SUITE / name / file / f"{method}-{rate:g}-{code}-{seed}",
+                        run=folder / SUITE / name / file / f"{method}-{rate:g}-{part}{code}-{seed}",
                         seed=seed,
                         episodes=0,
                         evaluation_seed=budget.evaluation_seed,

@@ -10,6 +10,7 @@ from ucfrec_control.benchmark.cells import ROBUSTNESS, Cell
 from ucfrec_control.benchmark.methods import MAIN, TABLES
 from ucfrec_control.benchmark.plan import cells_of
 from ucfrec_control.benchmark.robustness import robustness_cells
+from ucfrec_control.data.distractor import CLEAN
 
 
 @dataclass(frozen=True)
@@ -22,24 +23,28 @@ class Part:
     """Rows; empty for all of the table."""
     files: tuple[str, ...] = ()
     """Files; empty for those of the budget."""
-    draws: bool = False
-    """Whether it is a figure."""
+    distractors: tuple[str, ...] = ()
+    """Of `ROBUSTNESS`; empty for all."""
+    of_runs: bool = False
+    """Whether it is drawn of its runs, not of its rows."""
 
 
 _ABLATED = ("ucf", "ucf-wo-count", "ucf-wo-arch", "dt", "dc", "lsdt")
+_DETERMINISTIC = (CLEAN, "deterministic")
 _JUDGED = ("dt", "dc", "ucf", "ucf-dropped")
 PARTS: Final[Mapping[str, Part]] = {
     "table-1": Part(MAIN, ("iql", "cql", "dt", "dc", "lsdt", "ucf-paper", "ucf")),
     "table-3": Part(MAIN, _ABLATED),
     "table-9": Part("gate"),
     "table-10": Part("band"),
-    "figure-2": Part("lambda", draws=True),
-    "figure-3": Part(ROBUSTNESS, _JUDGED, draws=True),
-    "figure-4": Part(ROBUSTNESS, _JUDGED, draws=True),
-    "figure-5": Part(MAIN, ("ucf",), ("hopper_medium-zoo",), draws=True),
-    "figure-6": Part(MAIN, ("ucf",), ("halfcheetah_medium-zoo",), draws=True),
+    "figure-2": Part("lambda"),
+    "figure-3": Part(ROBUSTNESS, _JUDGED, distractors=_DETERMINISTIC),
+    "figure-4": Part(ROBUSTNESS, _JUDGED, distractors=(*_DETERMINISTIC, "stochastic")),
+    "figure-5": Part(MAIN, ("ucf",), ("hopper_medium-zoo",), of_runs=True),
+    "figure-6": Part(MAIN, ("ucf",), ("halfcheetah_medium-zoo",), of_runs=True),
 }
-"""By name; tables 4 to 8 are settings, and table 2 is `ucfrec benchmark recommendation`."""
+"""By name. Table 2 is `ucfrec benchmark recommendation`, tables 4 to 8 are settings, and figure 1
+is a diagram of the method."""
 
 
 def budget_of(part: Part, budget: Budget) -> Budget:
@@ -63,6 +68,6 @@ def cells_of_part(
         InputError: a file is missing.
     """
     if part.table == ROBUSTNESS:
-        return robustness_cells(data, folder, budget, name, part.methods)
+        return robustness_cells(data, folder, budget, name, part.methods, part.distractors)
     methods = part.methods or tuple(TABLES[part.table])
     return cells_of(data, folder, budget, name, part.table, methods)

@@ -12,11 +12,13 @@ from typing import Any
 
 from ucfrec.reporting.grid import chosen, run_grid
 from ucfrec.reporting.result_row import ResultRow
+from ucfrec.reporting.statistics import grouped, summary
 from ucfrec_control.benchmark.budgets import BUDGETS as SCORE_BUDGETS
 from ucfrec_control.benchmark.budgets import MEDIUM, Budget
 from ucfrec_control.benchmark.cells import ROBUSTNESS, ROBUSTNESS_MEASUREMENT, Cell, code_of
+from ucfrec_control.benchmark.estimate import announcement
+from ucfrec_control.benchmark.folders import run_name, stores_of
 from ucfrec_control.benchmark.methods import METHODS as LEARNERS
-from ucfrec_control.benchmark.plan import run_name, stores_of
 from ucfrec_control.benchmark.rates import settings_of
 from ucfrec_control.data.distractor import CLEAN, DISTRACTORS, zoo_store
 
@@ -26,17 +28,18 @@ METHODS = ("dt", "dc", "lsdt", "ucf", "ucf-wo-count", "ucf-wo-arch", *SCREENED)
 """Methods of `ucfrec_control.benchmark.plan`, and `SCREENED`."""
 
 BUDGETS = {
-    # The medium files, as in the paper. As the benchmark's, with fewer seeds and steps and half the
-    # context; no method and no distractor is left out.
+    # The medium files, as in the paper. As the benchmark's, with fewer steps and half the context;
+    # no method and no distractor is left out.
     "small": replace(
         SCORE_BUDGETS["small"],
         files=MEDIUM,
-        seeds=1,
+        seeds=2,
         settings=(*SCORE_BUDGETS["small"].settings, "train.steps=3000", "policy.context=10"),
     ),
     "full": replace(SCORE_BUDGETS["full"], files=MEDIUM, where_present=(), all_targets=False),
 }
-SHOWN = ("clean", "score", "drop", "score_at_one")
+SHOWN = ("clean", "score", "drop", "score_at_one", "drop_at_one")
+SHOWN_LARGEST = ("method", "at 0", "at 1")
 SHOWN_LOSSES = ("loss", "loss_at_zero", "rise")
 _CODE = (zoo_store.__module__, "ucfrec_control.learners.held_out_losses")
 """Further modules that the cells depend on."""
@@ -67,15 +70,21 @@ def robustness(
             failed.
     """
     cells = list(robustness_cells(data, folder, budget, name, chosen(METHODS, methods, "method")))
-    return run_grid(cells, ROBUSTNESS_MEASUREMENT, results, workers, "robustness")
+    said = announcement(workers)
+    return run_grid(cells, ROBUSTNESS_MEASUREMENT, results, workers, "robustness", said)
 
 
 def robustness_cells(
-    data: Path, folder: Path, budget: Budget, name: str, methods: Sequence[str]
+    data: Path,
+    folder: Path,
+    budget: Budget,
+    name: str,
+    methods: Sequence[str],
+    distractors: Sequence[str] = (),
 ) -> Iterator[Cell]:
-    """The cells of some methods; arguments as of `robustness`."""
+    """The cells of some methods and distractors (empty for all); arguments as of `robustness`."""
     for file in budget.files:
-        for distractor in DISTRACTORS:
+        for distractor in distractors or DISTRACTORS:
             store = zoo_store(data, stores_of(folder), file, distractor)
             runs = folder / f"robustness-{name}" / file / distractor
             for method in methods:
@@ -106,8 +115,8 @@ def drops(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
 
     `clean` and `score` are the normalised scores of the policies trained without and with the
     distractor, which is fixed to 0. `drop` is the loss in percent of `clean`: negative for a gain,
-    NaN if `clean` is not above 0. `score_at_one` is the score of the second policy, from the same
-    initial states, with the distractor fixed to 1. The last of several equal keys counts.
+    NaN if `clean` is not above 0. `score_at_one` and `drop_at_one` are of the second policy, from
+    the same initial states, with the distractor fixed to 1. The last of several equal keys counts.
 
     Args:
         rows: of one budget, as returned by `robustness`.
@@ -122,10 +131,28 @@ def drops(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
         if distractor == CLEAN or clean_metrics is None:
             continue
         clean, score = clean_metrics["score"], metrics["score"]
-        drop = 100 * (clean - score) / clean if clean > 0 else float("nan")
-        values = (clean, score, drop, metrics.get("score_at_one"))
+        at_one = metrics.get("score_at_one", float("nan"))
+        values = (clean, score, _lost(clean, score), at_one, _lost(clean, at_one))
         names = ("task", "method", "training_seed", "distractor")
         lines.append(dict(zip((*names, *SHOWN), (*pair, distractor, *values), strict=True)))
+    return lines
+
+
+def _lost(clean: float, score: float) -> float:
+    return 100 * (clean - score) / clean if clean > 0 else float("nan")
+
+
+def largest_drops(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
+    """The largest of each method's drops, in percent, with the distractor fixed to 0 and to 1: over
+    datasets and distractors, each in the mean over seeds."""
+    lines = []
+    for method, own in grouped(drops(rows), lambda line: line["method"]).items():
+        cases = grouped(own, lambda line: (line["task"], line["distractor"])).values()
+        largest = [
+            max(summary(line[name] for line in case).mean for case in cases)
+            for name in ("drop", "drop_at_one")
+        ]
+        lines.append(dict(zip(SHOWN_LARGEST, (method, *largest), strict=True)))
     return lines
 
 

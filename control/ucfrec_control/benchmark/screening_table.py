@@ -123,7 +123,7 @@ def screening_rows(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
 
     `effect` and `reward_effect` are those of the distractor on the next state and on the reward.
     `weakest_true` is the smallest effect among the true dimensions, of each the larger one of the
-    two.
+    two; dimensions that were not tested are left out.
     """
     lines = []
     for row in rows:
@@ -132,6 +132,7 @@ def screening_rows(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
             continue
         added = [d for d in verdicts if d["distractor"]]
         true = [d for d in verdicts if not d["distractor"]]
+        effects = [max(d["effect"], d["reward_effect"]) for d in true if d["effect"] is not None]
         lines.append(
             {
                 "task": row.task,
@@ -141,7 +142,7 @@ def screening_rows(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
                 "effect": added[0]["effect"] if added else NONE,
                 "reward_effect": added[0]["reward_effect"] if added else NONE,
                 "true_flagged": [d["dimension"] for d in true if d["flagged"]],
-                "weakest_true": min(max(d["effect"], d["reward_effect"]) for d in true),
+                "weakest_true": min(effects, default=NONE),
             }
         )
     return lines

@@ -24,6 +24,7 @@ from ucfrec_control.commands.options import (
     budget_options,
     control_grid_options,
     data_given,
+    rates_option,
 )
 from ucfrec_control.learners.evaluate import CHECKPOINTS
 
@@ -40,11 +41,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="every learner (main), ways to pursue reward, or a sweep over UCF's settings",
     )
     budget_options(parser)
+    rates_option(parser)
     control_grid_options(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec-control benchmark`."""
+    budget = budget_given(budgets_of(options.table), options)
     if options.show_only:
         rows = rows_given(options, SCORES, [options.table])
     else:
@@ -53,13 +56,13 @@ def run(options: argparse.Namespace) -> None:
                 data_given(options),
                 options.out,
                 results_given(options),
-                budget_given(budgets_of(options.table), options),
+                budget,
                 options.budget,
                 options.workers,
                 options.table,
                 options.method,
             )
-    print_scores(rows, options.table)
+    print_scores(rows, options.table, budget.rates)
     print(f"\nrows: {results_given(options)}")
 
 
@@ -68,15 +71,24 @@ def budgets_of(table: str) -> Mapping[str, Budget]:
     return BUDGETS if table in (MAIN, PURSUING) else SWEEPS
 
 
-def print_scores(rows: Sequence[ResultRow], table: str) -> None:
-    """Print the tables of rows of a benchmark, and how learning rates were chosen."""
+def print_scores(
+    rows: Sequence[ResultRow], table: str, given: Mapping[str, float] | None = None
+) -> None:
+    """Print the tables of rows of a benchmark, and how learning rates were chosen.
+
+    Args:
+        rows: of one table.
+        table: its name.
+        given: rates that were used instead of the package's.
+    """
     _print_tables(rows, table)
-    _print_rates(rows)
+    _print_rates(rows, given)
 
 
-def _print_rates(rows: Sequence[ResultRow]) -> None:
+def _print_rates(rows: Sequence[ResultRow], given: Mapping[str, float] | None) -> None:
     for budget in dict.fromkeys(str(row.conditions["budget"]) for row in rows):
-        rates = ", ".join(f"{method} {rate:g}" for method, rate in chosen_rates(budget).items())
+        used = chosen_rates(budget) if given is None else given
+        rates = ", ".join(f"{method} {rate:g}" for method, rate in used.items())
         how = (
             f"chosen on validation loss: {rates}"
             if rates

@@ -9,6 +9,7 @@ from typing import Any
 from ucfrec.commands.grid_options import evaluation_seed_option, grid_options
 from ucfrec.errors import InputError
 from ucfrec_control.benchmark.budgets import Budget
+from ucfrec_control.benchmark.rates import read_rates
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.minari import is_minari, read_minari
 from ucfrec_control.data.trajectories import Trajectories
@@ -47,6 +48,16 @@ def budget_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seeds", type=int, help="number of training seeds, from 0 (the budget's)")
     evaluation_seed_option(parser)
+
+
+def rates_option(parser: argparse.ArgumentParser) -> None:
+    """Add the option for learning rates other than those of the package."""
+    parser.add_argument(
+        "--rates",
+        type=Path,
+        metavar="TOML",
+        help="learning rates that `ucfrec-control rates --toml` wrote (those of the package)",
+    )
 
 
 def data_option(parser: argparse.ArgumentParser) -> None:
@@ -99,7 +110,7 @@ def budget_given(known: Mapping[str, Budget], options: argparse.Namespace) -> Bu
     """The budget named by the options, with their files and seeds.
 
     Raises:
-        InputError: `--seeds` is below 1.
+        InputError: `--seeds` is below 1, or the file of `--rates` has none of the budget.
     """
     budget = known[options.budget]
     seeds = budget.seeds if options.seeds is None else options.seeds
@@ -113,7 +124,17 @@ def budget_given(known: Mapping[str, Budget], options: argparse.Namespace) -> Bu
         seeds=seeds,
         antmaze_seeds=budget.antmaze_seeds if options.seeds is None else seeds,
         evaluation_seed=budget.evaluation_seed if evaluation_seed is None else evaluation_seed,
+        rates=_rates_given(options),
     )
+
+
+def _rates_given(options: argparse.Namespace) -> Mapping[str, float] | None:
+    if options.rates is None:
+        return None
+    found = read_rates(options.rates).get(options.budget)
+    if not found:
+        raise InputError(f"{options.rates} has no rates of budget {options.budget}")
+    return found
 
 
 def shown_score(row: Mapping[str, Any]) -> dict[str, Any]:

@@ -4,11 +4,17 @@ import argparse
 from pathlib import Path
 
 from ucfrec.commands.grid_options import results_given, rows_given
-from ucfrec.files import atomic_file
 from ucfrec.reporting.rows_file import benchmarking
 from ucfrec.reporting.tables import format_rows
 from ucfrec_control.benchmark.budgets import BUDGETS
-from ucfrec_control.benchmark.rates import RATE, SUITE, best_rates, search_rates
+from ucfrec_control.benchmark.rates import (
+    RATE,
+    SUITE,
+    best_rates,
+    format_rates,
+    search_rates,
+    write_rates,
+)
 from ucfrec_control.benchmark.tables import over_seeds
 from ucfrec_control.commands.options import (
     budget_given,
@@ -26,6 +32,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--steps", type=int, help="updates of a training (the budget's)")
     parser.add_argument("--toml", type=Path, metavar="FILE", help="write the choice here")
     control_grid_options(parser)
+    parser.set_defaults(rates=None)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -33,6 +40,9 @@ def run(options: argparse.Namespace) -> None:
     if options.show_only:
         rows = rows_given(options, SUITE)
         rows = [row for row in rows if row.conditions["budget"] == options.budget]
+        # Beside shorter trainings, which rehearse the search, only the longest count.
+        most = max((row.metrics["steps"] for row in rows), default=0.0)
+        rows = [row for row in rows if row.metrics["steps"] == most]
     else:
         with benchmarking(results_given(options)):
             rows = search_rates(
@@ -47,9 +57,7 @@ def run(options: argparse.Namespace) -> None:
             )
     by, values = ("task", "method", RATE), ("validation_loss",)
     print(format_rows(over_seeds([row.as_line() for row in rows], by, values), (*by, *values)))
-    lines = [f"[{options.budget}]", *(f"{m} = {rate:g}" for m, rate in best_rates(rows).items())]
-    text = "\n".join(lines)
-    print(f"\n{text}\n\nrows: {results_given(options)}")
+    found = best_rates(rows)
+    print(f"\n{format_rates((options.budget, found))}\nrows: {results_given(options)}")
     if options.toml is not None:
-        with atomic_file(options.toml) as scratch:
-            scratch.write_text(f"{text}\n", encoding="utf-8")
+        write_rates(options.toml, options.budget, found)

@@ -10,7 +10,7 @@ from ucfrec_control.benchmark.cells import (
     ROBUSTNESS_MEASUREMENT,
     SCORE_MEASUREMENT,
 )
-from ucfrec_control.benchmark.estimate import estimated_hours
+from ucfrec_control.benchmark.estimate import announcement
 from ucfrec_control.benchmark.reproduce import PARTS, budget_of, cells_of_part
 from ucfrec_control.benchmark.robustness import BUDGETS as ROBUSTNESS_BUDGETS
 from ucfrec_control.commands.benchmark import budgets_of, print_scores
@@ -19,6 +19,7 @@ from ucfrec_control.commands.options import (
     control_grid_options,
     data_given,
     data_option,
+    rates_option,
 )
 from ucfrec_control.commands.robustness import print_robustness
 
@@ -29,35 +30,34 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     data_option(parser)
     parser.add_argument("--budget", default="small", choices=["small", "full"])
     parser.add_argument("--seeds", type=int, help="number of training seeds (the budget's)")
+    rates_option(parser)
     control_grid_options(parser)
     parser.set_defaults(file=[], evaluation_seed=None)
 
 
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec-control reproduce`."""
+    # matplotlib takes half a second to import
+    from ucfrec_control.figures.figures import make_figures, make_row_figures
+
     part, results = PARTS[options.part], results_given(options)
     robust = part.table == ROBUSTNESS
     known = ROBUSTNESS_BUDGETS if robust else budgets_of(part.table)
     budget = budget_of(part, budget_given(known, options))
     cells = list(cells_of_part(part, data_given(options), options.out, budget, options.budget))
-    hours = estimated_hours(cells, options.workers)
-    print(
-        f"{options.part}: {len(cells)} trainings of budget {options.budget}, about {hours:.1f} "
-        f"hours here with --workers {options.workers}, by the time of a few steps of each; what "
-        "has its rows is not repeated, and reward models and generators are not counted",
-        flush=True,
-    )
     with benchmarking(results):
         how = ROBUSTNESS_MEASUREMENT if robust else SCORE_MEASUREMENT
-        rows = run_grid(cells, how, results, options.workers, f"reproduce {options.part}")
+        said = announcement(options.workers)
+        rows = run_grid(cells, how, results, options.workers, f"reproduce {options.part}", said)
     if robust:
         print_robustness(rows)
     else:
-        print_scores(rows, part.table)
-    if part.draws:
-        from ucfrec_control.figures.figures import make_figures
-
+        print_scores(rows, part.table, budget.rates)
+    pictures = options.out / options.part
+    if part.of_runs:
         runs = list(dict.fromkeys(cell.run.parent for cell in cells))
-        made, _ = make_figures(runs, [results], options.out / options.part)
-        print("\n".join(map(str, made)))
+        made, _ = make_figures(runs, [], pictures)
+    else:
+        made = make_row_figures(rows, pictures)
+    print("\n".join(["", *map(str, made)]))
     print(f"\nrows: {results}")

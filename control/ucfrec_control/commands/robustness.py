@@ -10,7 +10,14 @@ from ucfrec.reporting.tables import format_rows
 from ucfrec_control.benchmark.cells import ROBUSTNESS
 from ucfrec_control.benchmark.robustness import BUDGETS as ROBUSTNESS_BUDGETS
 from ucfrec_control.benchmark.robustness import SHOWN as SHOWN_DROPS
-from ucfrec_control.benchmark.robustness import SHOWN_LOSSES, drops, loss_rises, robustness
+from ucfrec_control.benchmark.robustness import (
+    SHOWN_LARGEST,
+    SHOWN_LOSSES,
+    drops,
+    largest_drops,
+    loss_rises,
+    robustness,
+)
 from ucfrec_control.benchmark.screening_table import SHOWN as SHOWN_SCREENING
 from ucfrec_control.benchmark.screening_table import screening_rows
 from ucfrec_control.benchmark.tables import over_seeds
@@ -20,6 +27,7 @@ from ucfrec_control.commands.options import (
     control_grid_options,
     data_given,
     data_option,
+    rates_option,
 )
 
 
@@ -27,6 +35,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `robustness`."""
     data_option(parser)
     budget_options(parser)
+    rates_option(parser)
     control_grid_options(parser)
 
 
@@ -54,4 +63,6 @@ def print_robustness(rows: Sequence[ResultRow]) -> None:
     by = ("task", "distractor", "method")
     for lines, values in ((drops(rows), SHOWN_DROPS), (loss_rises(rows), SHOWN_LOSSES)):
         print(f"{format_rows(over_seeds(lines, by, values), (*by, *values))}\n")
+    print("largest loss of a method over datasets and distractors, % of the clean score")
+    print(f"{format_rows(largest_drops(rows), SHOWN_LARGEST)}\n")
     print(format_rows(screening_rows(rows), SHOWN_SCREENING))

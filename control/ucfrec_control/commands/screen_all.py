@@ -6,7 +6,7 @@ from ucfrec.commands.grid_options import results_given, rows_given
 from ucfrec.reporting.rows_file import benchmarking
 from ucfrec.reporting.tables import format_rows
 from ucfrec_control.benchmark.budgets import BUDGETS
-from ucfrec_control.benchmark.plan import stores_of
+from ucfrec_control.benchmark.folders import stores_of
 from ucfrec_control.benchmark.screening_table import SCREENING, screening_rows, screening_table
 from ucfrec_control.benchmark.screening_table import SHOWN as SHOWN_SCREENING
 from ucfrec_control.commands.options import control_grid_options, data_given, data_option

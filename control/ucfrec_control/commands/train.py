@@ -8,7 +8,8 @@ from ucfrec.commands.train import training_options
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.describe import describe_run
-from ucfrec_control.learners.train import SCREENINGS, dataset_of, preset_of, train_control
+from ucfrec.runs.screened import describe_screened
+from ucfrec_control.learners.train import dataset_of, preset_of, train_control
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -28,6 +29,5 @@ def run(options: argparse.Namespace) -> None:
     record = train_control(store, options.out, config, screening=options.screen)
     print(describe_run(record))
     if options.screen:
-        dimensions = ", ".join(map(str, record["dataset"][SCREENINGS[options.screen]])) or "none"
-        print(f"screening     dimensions without effect: {dimensions}")
+        print(describe_screened(record))
     print(f"\nrun: {options.out}; TensorBoard can open it")

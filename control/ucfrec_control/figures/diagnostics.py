@@ -25,9 +25,9 @@ from ucfrec.fitting.checkpoint import load_tensors, load_weights
 from ucfrec.policies.ucf import UCFPolicy
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.run import training_views
-from ucfrec.runs.trained_policy import RUN, TrainedPolicy
+from ucfrec.runs.screened import without_columns
+from ucfrec.runs.trained_policy import DROPPED, RUN, TrainedPolicy
 from ucfrec.runs.trained_policy import store_of as trained_store
-from ucfrec_control.learners.train import without_dropped
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -52,7 +52,7 @@ def store_of(run: Path) -> EpisodeStore:
             f"{run} was trained on {record['store']}, which is gone or has changed; move the run "
             "together with its store, or train again"
         )
-    return without_dropped(store, record["dataset"])
+    return without_columns(store, record.get(DROPPED, ()))
 
 
 def has_copies(run: Path) -> bool:

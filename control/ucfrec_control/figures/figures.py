@@ -17,9 +17,10 @@ from ucfrec.reporting.plot_style import label, save
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.statistics import grouped
 from ucfrec.runs.trained_policy import RUN
-from ucfrec_control.benchmark.cells import ROBUSTNESS
+from ucfrec_control.benchmark.cells import ROBUSTNESS, SCORES
 from ucfrec_control.benchmark.robustness import drops, loss_rises
 from ucfrec_control.benchmark.score_rows import EVALUATE, read_scores
+from ucfrec_control.benchmark.tables import of_best_target
 from ucfrec_control.figures import diagnostics, plots
 from ucfrec_control.learners.evaluate import method_of
 
@@ -36,6 +37,7 @@ NEEDS = {
     "training": "a run among --runs (`ucfrec-control train`)",
     "returns": "rows of one dataset with two target returns or more among --results "
     "(`ucfrec-control evaluate --target … --target … --json`)",
+    "scores": "rows of `ucfrec-control benchmark` among --results",
     "lambda": "rows of ucf with two weights of the mask loss or more among --results",
     "robustness-scores": "rows of `ucfrec-control robustness` among --results",
     "robustness-drops": "such rows with and without a distractor",
@@ -93,8 +95,25 @@ def make_figures(
     found = _distinguished([run for folder in runs for run in _runs(folder)])
     rows = [row for path in results for row in read_scores(path)]
     plans = [*_of_runs(found), *_of_rows(rows)]
-    made: list[Path] = []
     missing = [f"{k}: needs {w}" for k, w in NEEDS.items() if k not in {p.kind for p in plans}]
+    made, failed = _drawn(plans, out)
+    return made, [*missing, *failed]
+
+
+def make_row_figures(rows: Sequence[ResultRow], out: Path) -> list[Path]:
+    """Draw what result rows alone have the data for; returns the files written.
+
+    Args:
+        rows: of `benchmark` or `robustness`.
+        out: folder of the figures.
+    """
+    return _drawn(list(_of_rows(rows)), out)[0]
+
+
+def _drawn(plans: Sequence[_Plan], out: Path) -> tuple[list[Path], list[str]]:
+    """The files written, and a line for each figure that lacks its data."""
+    made: list[Path] = []
+    missing: list[str] = []
     for plan in plans:
         name = f"{plan.kind}-{plan.about}"
         try:
@@ -186,11 +205,21 @@ def _training(runs: Sequence[_Run]) -> Figure:
 
 def _of_rows(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
     yield from _of_robustness([row for row in rows if row.suite == ROBUSTNESS])
+    yield from _of_tables([row for row in rows if row.suite == SCORES and row.checkpoint == "last"])
     yield from _of_targets([row for row in rows if _has_target(row)])
     swept = [row.as_line() for row in rows if _of_lambda(row)]
     for budget, own in grouped(swept, lambda line: line.get("budget", "rows")).items():
         if len({line["lambda_mask"] for line in own}) > 1:
             yield _Plan("lambda", budget, partial(plots.lambda_curves, own))
+
+
+def _of_tables(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
+    """Of several target returns the best, as the printed tables."""
+    tables = grouped(rows, lambda row: (row.conditions["budget"], row.table))
+    for (budget, table), own in tables.items():
+        lines = [row.as_line() for row in of_best_target(own)]
+        draw = partial(plots.score_panels, lines, f"{table}, budget {budget}")
+        yield _Plan("scores", f"{budget}-{table}", draw)
 
 
 def _of_robustness(rows: Sequence[ResultRow]) -> Iterator[_Plan]:

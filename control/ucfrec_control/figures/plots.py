@@ -12,11 +12,23 @@ from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from ucfrec.reporting.plot_style import COLUMN, EDITED, FACTUAL, PAGE, colors, label, styled
+from ucfrec.reporting.plot_style import (
+    COLUMN,
+    EDITED,
+    FACTUAL,
+    OURS,
+    PAGE,
+    PLAIN,
+    colors,
+    label,
+    styled,
+)
 from ucfrec.reporting.statistics import summary
 
 FloatArray = npt.NDArray[np.float64]
 Row = Mapping[str, Any]
+_PANELS = 3
+"""Most datasets side by side."""
 
 
 @styled
@@ -192,6 +204,38 @@ def robustness_bars(rows: Sequence[Row], value: str, ylabel: str, title: str = "
     axes.set_ylabel(ylabel)
     axes.grid(True, axis="y")
     _legend_below(figure, axes, len(kinds))
+    return figure
+
+
+@styled
+def score_panels(rows: Sequence[Row], title: str = "") -> Figure:
+    """Normalised scores as bars, a panel a dataset: mean over seeds, with its standard error
+    (Tables 1, 3, 9 and 10).
+
+    Args:
+        rows: lines (`ResultRow.as_line`) that differ in `task`, `method` and seed, in the order to
+            be drawn.
+    """
+    found = _by_seed(rows, ("task", "method"), "score")
+    tasks, methods = (list(dict.fromkeys(row[name] for row in rows)) for name in ("task", "method"))
+    columns = min(_PANELS, len(tasks))
+    lines = -(-len(tasks) // columns)
+    figure = Figure(figsize=(PAGE, lines * (1.1 + 0.16 * len(methods))))
+    figure.suptitle(title, fontsize=8)
+    panels = figure.subplots(lines, columns, sharey=True, squeeze=False).ravel()
+    for task, axes in zip(tasks, panels, strict=False):
+        at = [i for i, method in enumerate(methods) if (task, method) in found]
+        values = [summary(found[task, methods[i]]) for i in at]
+        shown = [OURS if methods[i] == "ucf" else PLAIN for i in at]
+        errors = [each.standard_error for each in values]
+        axes.barh(at, [each.mean for each in values], xerr=errors, color=shown, height=0.75)
+        axes.set_title(task)
+        axes.grid(True, axis="x")
+    panels[0].set_yticks(range(len(methods)), [label(method) for method in methods])
+    panels[0].invert_yaxis()
+    for axes in panels[len(tasks) :]:
+        axes.set_visible(False)
+    figure.supxlabel("normalised score", fontsize=8)
     return figure
 
 

@@ -15,16 +15,17 @@ from ucfrec.evaluation.metrics import bootstrap_interval
 from ucfrec.files import read_json
 from ucfrec.provenance import config_hash, without_folders
 from ucfrec.reporting.statistics import summary
-from ucfrec.runs.trained_policy import RUN, TrainedPolicy, learner_of
+from ucfrec.runs.screened import SCREENING, flagged_columns
+from ucfrec.runs.trained_policy import DROPPED, RUN, TrainedPolicy, learner_of
 from ucfrec_control.learners.presets import find_preset
 from ucfrec_control.learners.rl_baselines import RLPolicy, is_rl
-from ucfrec_control.learners.train import DROPPED_DIMENSIONS, SCREENINGS
 from ucfrec_control.worlds.environments import SIDE_BY_SIDE, Wrap, make_env, mismatches
 from ucfrec_control.worlds.scores import find_kind, require_task
 
 Trained = TrainedPolicy | RLPolicy
 CHECKPOINTS = ("last", "best")
 NO_TARGET = "no target return"
+_SUFFIXES = {"copies": "-screened", "drop": "-dropped"}
 SHOWN = (
     *("dataset", "method", "seed", "checkpoint", "target_return", "score", "return", "episodes"),
     "validation_loss",
@@ -126,9 +127,9 @@ def open_world(
     distractor: float = 0.0,
     **settings: Any,
 ) -> VectorEnv[Any, Any, Any]:
-    """`count` environments with the state that the policy was trained on.
+    """`count` environments that show what was logged where the policy was trained.
 
-    Distractors are fixed to `distractor`; dimensions dropped by screening are left out.
+    Distractors are fixed to `distractor`.
 
     Args:
         trained: the policy.
@@ -144,11 +145,11 @@ def open_world(
     record, dataset = trained.record, trained.record["dataset"]
     data_settings = dataset.get("env_settings", {}) if env_id == dataset["env_id"] else {}
     appended = [distractor] * len(dataset.get("distractors", []))
-    dropped = dataset.get(DROPPED_DIMENSIONS, [])
-    env = make_env(env_id, count, appended, dropped, {**data_settings, **settings}, wrappers)
+    env = make_env(env_id, count, appended, {**data_settings, **settings}, wrappers)
     observation_size = int(np.prod(env.single_observation_space.shape or ()))
     sizes = (observation_size, *(env.single_action_space.shape or ()))
-    wanted = (record["sizes"]["state"], record["sizes"]["action"])
+    logged = record["sizes"]["state"] + len(record.get(DROPPED, ()))
+    wanted = (logged, record["sizes"]["action"])
     if sizes != wanted:
         env.close()
         raise InputError(
@@ -159,10 +160,12 @@ def open_world(
 
 
 def method_of(record: Mapping[str, Any]) -> str:
-    """Name of the method of a run, with a suffix for how screening treated dimensions."""
+    """Name of the method of a run, with a suffix for how screening treated what it flagged."""
     name = record["config"]["policy_name"] if is_rl(record) else learner_of(record)
-    suffixes = {SCREENINGS["copies"]: "-screened", SCREENINGS["drop"]: "-dropped"}
-    return name + "".join(suffix for key, suffix in suffixes.items() if record["dataset"].get(key))
+    screening = record.get(SCREENING)
+    if screening is None or not flagged_columns(screening):
+        return name
+    return name + _SUFFIXES[screening["how"]]
 
 
 def rules_of(

@@ -7,8 +7,8 @@ import torch
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.runs.run import training_views
+from ucfrec.runs.screened import without_columns
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec_control.learners.train import DROPPED_DIMENSIONS, without_dropped
 
 _BATCHES, _BATCH = 8, 512
 
@@ -23,9 +23,9 @@ def held_out_losses(trained: TrainedPolicy, store: EpisodeStore) -> dict[str, fl
         `loss` with the logged states, and `loss_at_zero` with every distractor fixed to 0.
     """
     dataset = trained.record["dataset"]
-    _, validation = training_views(without_dropped(store, dataset))
+    dropped = trained.dropped
+    _, validation = training_views(without_columns(store, dropped))
     generator = np.random.default_rng(0)
-    dropped = dataset.get(DROPPED_DIMENSIONS, [])
     added = [each["dimension"] for each in dataset.get("distractors", [])]
     dimensions = [d - sum(other < d for other in dropped) for d in added if d not in dropped]
     losses = []

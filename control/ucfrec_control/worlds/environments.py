@@ -25,7 +25,6 @@ def make_env(
     env_id: str,
     count: int,
     appended: Sequence[float] = (),
-    dropped: Sequence[int] = (),
     settings: Mapping[str, Any] | None = None,
     wrappers: Sequence[Wrap] = (),
 ) -> VectorEnv[Any, Any, Any]:
@@ -39,7 +38,6 @@ def make_env(
         env_id: Gymnasium's identifier.
         count: number of environments.
         appended: constants that stand in for distractors at the end of every observation.
-        dropped: indices that are left out of the observation, counted after `appended`.
         settings: keyword arguments of the environment.
         wrappers: wrappers around each environment, the innermost first.
 
@@ -55,8 +53,6 @@ def make_env(
         wrappers = [GoalObservations, *wrappers]
     if len(appended):
         wrappers.append(partial(AppendedConstants, constants=appended))
-    if len(dropped):
-        wrappers.append(partial(WithoutDimensions, dropped=dropped))
     try:
         with warnings.catch_warnings():
             # D4RL's data needs v4, so the old version is intended.
@@ -91,23 +87,6 @@ class AppendedConstants(gymnasium.ObservationWrapper[Any, Any, Any]):
     def observation(self, observation: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Return the observation (O,) with the constants at its end, (O + number of constants,)."""
         return np.append(observation, self._constants)
-
-
-class WithoutDimensions(gymnasium.ObservationWrapper[Any, Any, Any]):
-    """Leaves out some dimensions of every observation."""
-
-    def __init__(self, env: gymnasium.Env[Any, Any], dropped: Sequence[int]) -> None:
-        super().__init__(env)
-        space = env.observation_space
-        assert isinstance(space, Box)
-        self._kept = np.setdiff1d(np.arange(len(space.low)), dropped)
-        self.observation_space = Box(
-            space.low[self._kept], space.high[self._kept], dtype=np.float64
-        )
-
-    def observation(self, observation: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Return the observation (O,) without the dropped dimensions, (O − number of dropped,)."""
-        return observation[self._kept]
 
 
 def mismatches(dataset: Mapping[str, Any], env_id: str) -> list[str]:

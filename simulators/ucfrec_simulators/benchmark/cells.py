@@ -14,7 +14,7 @@ from ucfrec.reporting.evaluation_rows import evaluation_row
 from ucfrec.reporting.grid import Measurement
 from ucfrec.reporting.result_row import ResultRow, RowKey
 from ucfrec.runs.config import Config, resolve_config
-from ucfrec.runs.run import train_run
+from ucfrec.runs.screened import SCREENING, flagged_columns, train_screened
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_simulators.distractor import DistractorWorld
 
@@ -60,6 +60,8 @@ class Cell:
     """Settings of the training, as for `--set`."""
     conditioned: bool = False
     """Whether the method takes a target return."""
+    screening: str | None = None
+    """As in `ucfrec.runs.screened.train_screened`."""
 
     @property
     def config(self) -> Config:
@@ -114,15 +116,20 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
         ]
     # Cells that differ only in their evaluation share a run.
     with claim(cell.run, wait=True):
-        record = train_run(EpisodeStore.open(cell.store), cell.run, cell.config)
+        store = EpisodeStore.open(cell.store)
+        record = train_screened(store, cell.run, cell.config, cell.screening)
     training_metrics, rows = _training_metrics(record), []
+    details = {} if cell.screening is None else {SCREENING: flagged_columns(record[SCREENING])}
     for checkpoint in CHECKPOINTS:
         trained = TrainedPolicy.load(cell.run, checkpoint)
         rule = _rule(cell, trained)
         for world in cell.worlds:
             metrics = evaluate_policy(world, trained, cell.method, episodes, seed, rule)
             fields = {"checkpoint": checkpoint, "rule": f"{rule} ({rule.hash})"}
-            rows.append(_row(metrics | training_metrics, row_key, world, **fields))
+            row = _row(metrics | training_metrics, row_key, world, **fields)
+            # Other methods are given a rule, but do not look at its target.
+            target = row.target_return if cell.conditioned else None
+            rows.append(replace(row, details={**row.details, **details}, target_return=target))
     return rows
 
 
@@ -159,7 +166,10 @@ def _rule(cell: Cell, trained: TrainedPolicy) -> DecisionRule:
 
 def config(cell: Cell) -> dict[str, Any] | None:
     """The configuration of the cell's training; None for a built-in policy."""
-    return None if cell.store is None else asdict(cell.config)
+    if cell.store is None:
+        return None
+    screening = {} if cell.screening is None else {SCREENING: cell.screening}
+    return asdict(cell.config) | screening
 
 
 MEASUREMENT: Final = Measurement(key, config, measure)

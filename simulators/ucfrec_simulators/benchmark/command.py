@@ -11,7 +11,7 @@ from ucfrec.plugins import Benchmark, BenchmarkRequest
 from ucfrec.reporting.grid import run_grid
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec_simulators.benchmark.cells import MEASUREMENT
-from ucfrec_simulators.benchmark.methods import ADDITIONS, METHODS
+from ucfrec_simulators.benchmark.methods import ADDITIONS, METHODS, SCREENED
 from ucfrec_simulators.benchmark.plan import BUDGETS, Plan
 from ucfrec_simulators.benchmark.plots import (
     plot_additions,
@@ -84,7 +84,7 @@ def run(request: BenchmarkRequest) -> str:
 def _require_known(request: BenchmarkRequest) -> None:
     for kind, given, known in (
         ("task", request.tasks, TASKS),
-        ("method", request.methods, {**METHODS, **ADDITIONS}),
+        ("method", request.methods, {**METHODS, **ADDITIONS, **SCREENED}),
     ):
         if unknown := [name for name in given if name not in known]:
             raise InputError(f"no {kind} is called {unknown[0]!r}; choose from {', '.join(known)}")

@@ -17,6 +17,8 @@ class Method:
     """Whether it takes a target return."""
     vectors: bool = True
     """Whether it also supports action vectors; False for policies of items only."""
+    screening: str | None = None
+    """One of `ucfrec.runs.screened.SCREENINGS` for logs with observations; None for none."""
 
 
 METHODS: Final[Mapping[str, Method]] = {
@@ -54,3 +56,9 @@ ADDITIONS: Final[Mapping[str, Method]] = {
 }
 """UCF without one of what this project added to the paper, or with another, and DT with exposure
 features, by their name in the table of additions."""
+SCREENED: Final[Mapping[str, Method]] = {
+    "ucf-screened": Method("ucf", screening="copies"),
+    "ucf-dropped": Method("ucf", screening="drop"),
+}
+"""UCF with copies that intervene on the observation columns that screening flags, and UCF without
+these columns, by their name in the distractor table."""

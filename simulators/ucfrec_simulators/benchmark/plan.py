@@ -17,7 +17,7 @@ from ucfrec.provenance import config_hash
 from ucfrec_simulators import sardine
 from ucfrec_simulators.benchmark import cells, tasks
 from ucfrec_simulators.benchmark.cells import Cell, EvaluationPlan
-from ucfrec_simulators.benchmark.methods import ADDITIONS, METHODS, Method
+from ucfrec_simulators.benchmark.methods import ADDITIONS, METHODS, SCREENED, Method
 from ucfrec_simulators.benchmark.tasks import TASKS, BenchmarkTask
 from ucfrec_simulators.distractor import OFF, ON, DistractorWorld, plant_distractor
 from ucfrec_simulators.folders import data_folder, folder_name
@@ -74,9 +74,10 @@ LAMBDAS: Final = (0.0, 0.05, 0.1, 0.25, 0.5, 1.0)
 BANDS: Final = ((0.05, 0.2), (0.2, 0.5), (0.5, 1.0), (1.0, 2.0))
 GATES: Final = (0.02, 0.1, 0.5, 1e6)
 """ε_r in standard deviations of the rewards; the last value disables the gate."""
-DISTRACTOR_METHODS: Final = tuple(
-    name for name, method in METHODS.items() if method.conditioned or name == "bc"
-)
+DISTRACTOR_METHODS: Final[Mapping[str, Method]] = {
+    **{name: each for name, each in METHODS.items() if each.conditioned or name == "bc"},
+    **SCREENED,
+}
 DISTRACTOR_TARGETS: Final = (1.0, 0.99)
 """Quantiles of the training returns: the default target, and one nearer to the logs."""
 MAIN: Final = (
@@ -91,7 +92,7 @@ _REAL: Final = {"kuairand": "kuairand", "kuairec": "kuairec", "virtual-taobao": 
 """Tasks that need files outside the package, and the subfolder of the data folder with them."""
 _PACKAGES: Final = {"sardine-static": sardine.PACKAGE, "sardine-boredinf": sardine.PACKAGE}
 """Tasks that need an optional package, and its name."""
-_DISTRACTED_WORLDS: Final = {"synthetic-taobao": 0, "kuairand": 2}
+_DISTRACTED_WORLDS: Final = {"synthetic-taobao": 0, "synthetic-catalog": 0, "kuairand": 2}
 """Tasks with a distractor, and the index of the world that is played. KuaiRand is played as NX_10:
 all its sessions have the same length, so early exits do not hide the distractor's effect."""
 _DISTRACTOR: Final = DistractorWorld.__module__
@@ -184,10 +185,10 @@ class Plan:
             distracted = BenchmarkTask(planted, worlds, ())
             both = {name: clean, f"{name}, distractor": distracted}
             for seed in range(self._budget.sweep_seeds):
-                for method in DISTRACTOR_METHODS:
+                for label, method in DISTRACTOR_METHODS.items():
                     for plan in plans:
                         for title, task in both.items():
-                            arguments = (title, task, method, METHODS[method], seed, plan)
+                            arguments = (title, task, label, method, seed, plan)
                             yield from self._trained("distractor", *arguments)
 
     def missing(self) -> list[str]:
@@ -241,7 +242,10 @@ class Plan:
         cuts = self._budget.cuts.get(method.policy, ())
         settings = (*self._budget.settings, *memory, *cuts, *method.settings)
         code = _code(task.worlds, policy_class(method.policy).__module__)
+        # Where nothing but items was logged, there are no columns to screen.
+        screening = method.screening if store.observation_size else None
         identity = {"policy": method.policy, "settings": settings, "code": code}
+        identity |= {} if screening is None else {"screening": screening}
         run_hash = config_hash(identity | {"data": store.meta["fingerprint"]})
         yield Cell(
             table=table,
@@ -258,6 +262,7 @@ class Plan:
             run=self._folder / "runs" / folder_name(name) / f"{method.policy}-{run_hash}-{seed}",
             settings=settings,
             conditioned=method.conditioned,
+            screening=screening,
         )
 
 

@@ -11,8 +11,9 @@ from ucfrec.runs.config import Config, resolve_config
 from ucfrec_control.benchmark import robustness
 from ucfrec_control.benchmark.budgets import BUDGETS, SWEEPS, Budget
 from ucfrec_control.benchmark.cells import code_of
+from ucfrec_control.benchmark.folders import run_name
 from ucfrec_control.benchmark.methods import MAIN, METHODS, PURSUING, TABLES
-from ucfrec_control.benchmark.plan import benchmark, run_name
+from ucfrec_control.benchmark.plan import benchmark
 from ucfrec_control.benchmark.rates import settings_of
 from ucfrec_control.commands.benchmark import budgets_of
 from ucfrec_control.learners.evaluate import load_run

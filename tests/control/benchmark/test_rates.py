@@ -1,19 +1,31 @@
 """Learning rates are chosen on validation loss alone, and the chosen ones are trained with."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from tests.support.control_files import hopper_like, write_hdf5
 from tests.support.result_rows import result_row
+from ucfrec.errors import InputError
 from ucfrec.reporting.result_row import ResultRow
-from ucfrec.reporting.rows_file import read_rows
+from ucfrec.reporting.rows_file import read_configurations, read_rows
 from ucfrec_control.benchmark import rates
 from ucfrec_control.benchmark.budgets import BUDGETS, Budget
 from ucfrec_control.benchmark.methods import METHODS, TABLES
-from ucfrec_control.benchmark.rates import RATES, SEARCHED, best_rates, chosen_rates, settings_of
+from ucfrec_control.benchmark.rates import (
+    RATES,
+    SEARCHED,
+    best_rates,
+    chosen_rates,
+    read_rates,
+    settings_of,
+    write_rates,
+)
 from ucfrec_control.cli import main
 from ucfrec_control.learners.rl_baselines import ALGORITHMS
+
+SHORT = ("train.steps=4", "train.validate_every=2")
 
 
 def of_rate(method: str, task: str, rate: float, loss: float) -> ResultRow:
@@ -87,3 +99,39 @@ def test_the_search_writes_rows_and_a_choice_once(
     assert main(arguments) == 0
     assert read_rows(out / "results.jsonl") == rows
     assert "0 of them left" in capsys.readouterr().err
+    # A rehearsal with fewer steps is no part of the search.
+    assert main([*arguments[:-1], "2", "--toml", str(tmp_path / "rehearsed.toml")]) == 0
+    assert main(["rates", "--out", str(out), "--show-only"]) == 0
+    assert "2 of them left" in (printed := capsys.readouterr()).err
+    assert "dt-wo-time = 0.01" in printed.out.split("[small]")[-1]
+    # The choice is what the benchmark trains with.
+    monkeypatch.setattr("ucfrec_control.commands.benchmark.BUDGETS", tiny)
+    given = ["benchmark", str(tmp_path), "--out", str(out), "--method", "dt-wo-time"]
+    given += ["--rates", str(toml)]
+    monkeypatch.setitem(tiny, "small", replace(tiny["small"], settings=(*settings, *SHORT)))
+    assert main(given) == 0
+    assert "chosen on validation loss: dt-wo-time 0.01" in capsys.readouterr().out
+    trained = [row for row in read_rows(out / "results.jsonl") if row.suite == "control"]
+    configurations = read_configurations(out)
+    assert {configurations[str(row.config_hash)]["train"]["learning_rate"] for row in trained} == {
+        0.01
+    }
+
+
+def test_a_file_of_rates_keeps_its_other_budgets_and_is_checked(tmp_path: Path) -> None:
+    file = tmp_path / "rates.toml"
+    write_rates(file, "full", {"dt": 1e-4})
+    write_rates(file, "small", {"dt": 1e-2, "ucf": 3e-3})
+    write_rates(file, "full", {"dc": 1e-3})
+    assert read_rates(file) == {"full": {"dc": 0.001}, "small": {"dt": 0.01, "ucf": 0.003}}
+    for text, says in (
+        ("[small]\nnone = 0.1\n", "none = 0.1 is no learning rate of a method"),
+        ("[small]\ndt = 7\n", "dt = 7 is no"),
+        ("small = 1\n", "small = 1 is no"),
+        ("[", "cannot be read"),
+    ):
+        file.write_text(text)
+        with pytest.raises(InputError, match=says):
+            read_rates(file)
+    with pytest.raises(InputError, match="cannot be read"):
+        read_rates(tmp_path / "missing.toml")

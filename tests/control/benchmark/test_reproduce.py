@@ -5,15 +5,18 @@ from pathlib import Path
 import pytest
 
 from tests.support.control_files import hopper_like, write_hdf5
+from tests.support.result_rows import result_row
 from ucfrec.reporting.rows_file import read_rows
 from ucfrec_control.benchmark.budgets import BUDGETS, Budget
-from ucfrec_control.benchmark.cells import ROBUSTNESS
+from ucfrec_control.benchmark.cells import ROBUSTNESS, SCORES
 from ucfrec_control.benchmark.estimate import estimated_hours
 from ucfrec_control.benchmark.methods import MAIN, TABLES
 from ucfrec_control.benchmark.plan import cells_of
 from ucfrec_control.benchmark.reproduce import PARTS, budget_of
 from ucfrec_control.benchmark.robustness import METHODS
 from ucfrec_control.cli import main
+from ucfrec_control.data.distractor import DISTRACTORS
+from ucfrec_control.figures.figures import make_row_figures
 
 TINY = ("train.steps=4", "train.validate_every=2", "policy.dim=16", "policy.context=3")
 
@@ -25,7 +28,8 @@ def test_a_part_has_rows_and_files_of_its_tables(name: str) -> None:
     for budget in BUDGETS.values():
         own = budget_of(part, budget)
         assert own.files == (part.files or budget.files)
-    assert part.draws == name.startswith("figure")
+    assert set(part.distractors) <= set(DISTRACTORS)
+    assert part.of_runs == (name in ("figure-5", "figure-6"))
 
 
 def test_the_estimate_grows_with_steps_and_shrinks_with_workers(tmp_path: Path) -> None:
@@ -51,7 +55,37 @@ def test_one_command_makes_a_figure_and_says_beforehand_how_long(
     monkeypatch.setattr("ucfrec_control.commands.benchmark.BUDGETS", budgets)
     arguments = ["reproduce", "figure-5", "--data", str(tmp_path), "--out", str(tmp_path / "out")]
     assert main(arguments) == 0
-    printed = capsys.readouterr().out
-    assert printed.startswith("figure-5: 1 trainings of budget small, about ")
+    said = capsys.readouterr().err
+    assert "reproduce figure-5: 1 cells, 1 of them left to measure" in said
+    assert "reproduce figure-5: about 0.0 hours here with --workers 1" in said
     assert {row.method for row in read_rows(tmp_path / "out" / "results.jsonl")} == {"ucf"}
     assert list((tmp_path / "out" / "figure-5").glob("moves-*.png"))
+
+
+def test_every_other_part_is_drawn_of_its_rows(tmp_path: Path) -> None:
+    for part in PARTS.values():
+        robust = part.table == ROBUSTNESS
+        rows = [
+            result_row(
+                10.0 * number + seed,
+                suite=ROBUSTNESS if robust else SCORES,
+                table=part.table,
+                metric="score",
+                task="d",
+                method=method,
+                training_seed=seed,
+                checkpoint="last",
+                conditions={
+                    "budget": "small",
+                    "distractor": distractor,
+                    "lambda_mask": number / 10,
+                },
+            )
+            for number, method in enumerate(part.methods or TABLES[part.table])
+            for distractor in part.distractors or (None,)
+            for seed in range(2)
+        ]
+        made = {file.name for file in make_row_figures(rows, tmp_path)}
+        wanted = "robustness-scores-small-d.png" if robust else f"scores-small-{part.table}.png"
+        assert wanted in made
+    assert (tmp_path / "lambda-small.png").exists()

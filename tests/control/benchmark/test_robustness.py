@@ -16,8 +16,8 @@ from ucfrec.reporting.tables import NONE
 from ucfrec.runs.config import resolve_config
 from ucfrec_control.benchmark import robustness
 from ucfrec_control.benchmark.budgets import Budget
-from ucfrec_control.benchmark.plan import run_name, stores_of
-from ucfrec_control.benchmark.robustness import drops, loss_rises
+from ucfrec_control.benchmark.folders import run_name, stores_of
+from ucfrec_control.benchmark.robustness import drops, largest_drops, loss_rises
 from ucfrec_control.benchmark.screening_table import screening_rows
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
@@ -44,6 +44,21 @@ def test_an_early_distractor_tells_of_the_next_reward(tmp_path: Path) -> None:
         np.testing.assert_array_equal(bit, high)
 
 
+def test_the_largest_drop_of_a_method_is_over_cases_in_the_mean_over_seeds() -> None:
+    rows = [
+        row("none", 50.0), row("early", 20.0), row("stochastic", 40.0),
+        row("none", 100.0, seed=1), row("early", 80.0, seed=1), row("stochastic", 10.0, seed=1),
+    ]  # fmt: skip
+    # Lost at 0: early 60 and 20%, stochastic 20 and 90%; at 1, where twice as much is earned: early
+    # 20 and −60%, stochastic −60 and 80%.
+    (line,) = largest_drops(rows)
+    assert (line["method"], line["at 0"], line["at 1"]) == (
+        "dt",
+        pytest.approx(55),
+        pytest.approx(10),
+    )
+
+
 def row(distractor: str, score: float, method: str = "dt", seed: int = 0) -> ResultRow:
     return result_row(
         score, suite="robustness", task="d", method=method, training_seed=seed, metric="score",
@@ -60,6 +75,7 @@ def test_drops_compare_with_the_same_seed_without_distractor() -> None:
     assert found.keys() == {("early", 0), ("stochastic", 0), ("early", 1)}
     early = found["early", 0]
     assert (early["clean"], early["score"], early["drop"]) == (80.0, 20.0, 75.0)
+    assert (early["score_at_one"], early["drop_at_one"]) == (40.0, 50.0)
     assert early["score_at_one"] == 40.0
     assert found["stochastic", 0]["drop"] == -25.0
     assert math.isnan(found["early", 1]["drop"])
@@ -79,7 +95,7 @@ def begin(tmp_path: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = write_hdf5(tmp_path / f"{FILE}.hdf5", columns)
     # Begun here, where screening may be made quick, and gone on with by the command.
     quickest = ScreeningConfig(hidden=32, shared_steps=200, own_steps=100)
-    monkeypatch.setattr("ucfrec_control.learners.train.ScreeningConfig", lambda: quickest)
+    monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: quickest)
     clean = read_d4rl(file).write_store(stores_of(out) / FILE)
     distracted = add_distractor(clean, stores_of(out) / f"{FILE}-deterministic")
     tables = preset_of(dataset_of(clean), "ucf").tables

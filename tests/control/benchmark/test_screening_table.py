@@ -17,11 +17,13 @@ from ucfrec.errors import InputError
 from ucfrec.files import read_json
 from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.reporting.rows_file import read_rows
+from ucfrec.reporting.tables import NONE
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import training_views
+from ucfrec.runs.screened import flagged_columns
 from ucfrec_control.benchmark import screening_table
 from ucfrec_control.benchmark.budgets import Budget
-from ucfrec_control.benchmark.plan import stores_of
+from ucfrec_control.benchmark.folders import stores_of
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.distractor import add_distractor
@@ -29,14 +31,14 @@ from ucfrec_control.figures.diagnostics import store_of
 from ucfrec_control.learners.train import train_control
 
 QUICKEST = ScreeningConfig(
-    hidden=8, shared_steps=100, own_steps=50, measurement=MeasurementConfig(hidden=8, steps=50)
+    hidden=8, shared_steps=100, own_steps=50, measurement=MeasurementConfig(trees=5)
 )
 
 
 def test_training_with_screening_records_and_resumes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("ucfrec_control.learners.train.ScreeningConfig", lambda: QUICKEST)
+    monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: QUICKEST)
     columns = hopper_like((20, 30) * 12)
     columns["rewards"] = columns["observations"][:, 0]
     columns["observations"][:, 4] = 0.0  # a constant causes nothing
@@ -47,10 +49,10 @@ def test_training_with_screening_records_and_resumes(
     arguments += ["--set", "train.steps=2", "--set", "policy.dim=8"]
     assert main(arguments) == 0
     record = read_json(Path(run) / "run.json")
-    flagged = record["dataset"]["screened"]
+    flagged = flagged_columns(record["screening"])
     assert 4 in flagged
     said = ", ".join(map(str, flagged))
-    assert f"dimensions without effect: {said}\n" in capsys.readouterr().out
+    assert f"columns without effect: {said}\n" in capsys.readouterr().out
     assert len(record["screening"]["dimensions"]) == 11
     assert main(arguments) == 0
     assert read_json(Path(run) / "run.json")["screening"] == record["screening"]
@@ -59,7 +61,7 @@ def test_training_with_screening_records_and_resumes(
 def test_screening_that_finds_no_cause_at_all_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ucfrec_control.learners.train.ScreeningConfig", lambda: QUICK)
+    monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: QUICK)
     columns = hopper_like((30,) * 60)
     columns["rewards"] = columns["actions"][:, 0]  # nothing but the action has an effect
     store = read_d4rl(write_hdf5(tmp_path / "hopper.hdf5", columns)).write_store(tmp_path / "store")
@@ -72,13 +74,13 @@ def test_screening_that_finds_no_cause_at_all_is_refused(
 def test_what_is_dropped_might_never_have_been_logged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ucfrec_control.learners.train.ScreeningConfig", lambda: QUICK)
+    monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: QUICK)
     store = planted_vectors(tmp_path / "store")
     logged = store.step_values(schema.OBSERVATION, *store.all_steps())[:, :3]
     never = with_observations(store, tmp_path / "never", logged, {})
     config = resolve_config("ucf", None, ["train.steps=4", "policy.dim=8", "crm.epochs=1"])
     record = train_control(store, tmp_path / "dropped", config, screening="drop")
-    assert record["dataset"]["unseen"] == [3, 4]
+    assert record["dropped_observations"] == [3, 4]
     assert record["sizes"]["state"] == 3
     train_control(never, tmp_path / "plain", config)
     for name in ("crm/cvae/last", "overlay", "policy/last"):
@@ -116,7 +118,9 @@ def test_every_file_is_screened_plain_and_distracted_once(
         assert row.value == len(set(report.flagged) - set(added))
         assert added == ([] if kind == "none" else [11])
     printed, before = capsys.readouterr().out, results.read_text()
-    assert f"{rows['early'].details['screening'][11]['effect']:#.3g}" in printed
+    effect = rows["early"].details["screening"][11]["effect"]
+    # Nothing tells of these rewards, so that only measurements of them are tested.
+    assert (NONE if effect is None else f"{effect:#.3g}") in printed
     assert main(arguments) == 0
     assert results.read_text() == before
 

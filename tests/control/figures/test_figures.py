@@ -86,6 +86,24 @@ def test_bars_are_as_high_as_the_drops_of_their_rows() -> None:
     assert (high - low) / 2 == pytest.approx(np.std(first, ddof=1))
 
 
+def test_a_panel_has_the_mean_scores_of_its_dataset() -> None:
+    rows = [
+        result_row(score + 2 * seed, metric="score", task=task, method=method, training_seed=seed)
+        for task, method, score in (("a", "dt", 10.0), ("a", "ucf", 30.0), ("b", "ucf", 50.0))
+        for seed in range(2)
+    ]
+    first, second = plots.score_panels([row.as_line() for row in rows]).axes
+    drawn = [
+        {round(bar.get_y() + bar.get_height() / 2): bar.get_width() for bar in axes.patches}
+        for axes in (first, second)
+    ]
+    assert drawn == [{0: 11.0, 1: 31.0}, {1: 51.0}]
+    assert [text.get_text() for text in first.get_yticklabels()] == ["DT", "UCF"]
+    (spread, *_) = (c.errorbar[2][0] for c in first.containers if getattr(c, "errorbar", None))
+    low, high = spread.get_segments()[0][:, 0]
+    assert (high - low) / 2 == pytest.approx(1.0)  # of two seeds 2 apart
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_cell_of_the_heatmap_is_the_share_that_passes_both_gates(runs: Path, kind: str) -> None:
     editing = diagnostics.Editing.of(runs / kind)

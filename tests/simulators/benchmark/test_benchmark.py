@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from tests.support.causes import QUICK
 from tests.support.real_data import data_folder
 from tests.support.result_rows import result_row
 from ucfrec.commands.cli import main
@@ -19,10 +20,11 @@ from ucfrec.evaluation.world import World
 from ucfrec.plugins import Benchmark, BenchmarkRequest, load_plugin
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows, read_configurations, read_rows
-from ucfrec.runs.trained_policy import RUN, TrainedPolicy
+from ucfrec.runs.screened import flagged_columns
+from ucfrec.runs.trained_policy import RUN, TrainedPolicy, read_record
 from ucfrec_simulators.benchmark import plan, plots
-from ucfrec_simulators.benchmark.cells import EvaluationPlan
-from ucfrec_simulators.benchmark.methods import METHODS
+from ucfrec_simulators.benchmark.cells import EvaluationPlan, config, key, measure
+from ucfrec_simulators.benchmark.methods import METHODS, SCREENED
 from ucfrec_simulators.benchmark.plan import BUDGETS, Plan
 from ucfrec_simulators.benchmark.plots import plot_distractor, plot_methods
 from ucfrec_simulators.benchmark.tables import distractor_table, method_table
@@ -168,6 +170,32 @@ def test_every_cell_of_every_table_has_a_configuration(
     assert planted.observation_size == 92
     assert [world.rate for world in distractors[0].worlds] == [0.0, 1.0]  # type: ignore[attr-defined]
     assert {cell.evaluation.target_quantile for cell in given.distractor()} == {1.0, 0.99}
+
+
+@pytest.mark.usefixtures("no_data")
+def test_screened_methods_are_rows_of_the_distractor_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: QUICK)
+    given = Plan(tmp_path, replace(TINY, sessions=300), tasks=["synthetic-catalog"])
+    wanted = ("bc", *SCREENED)
+    found = {
+        cell.method: cell
+        for cell in given.distractor()
+        if cell.method in wanted and cell.task.endswith("distractor")
+    }
+    assert found.keys() == set(wanted)
+    assert len({(cell.run, str(config(cell))) for cell in found.values()}) == 3
+    rows = {name: measure(cell, key(cell)) for name, cell in found.items()}
+    for name, own in rows.items():
+        assert {row.conditions["distractor"] for row in own} == {0.0, 1.0}
+        assert {"screening" in row.details for row in own} == {name in SCREENED}
+        assert {row.target_return is None for row in own} == {name == "bc"}
+    run = found["ucf-dropped"].run
+    assert run is not None
+    flagged = flagged_columns(read_record(run)["screening"])
+    assert {tuple(row.details["screening"]) for row in rows["ucf-dropped"]} == {tuple(flagged)}
+    assert TrainedPolicy.load(run).dropped == tuple(flagged)
 
 
 def test_unknown_tables_and_budgets_are_named(

@@ -250,11 +250,11 @@ def test_ope_tells_from_uniform_logs_what_playing_tells(
     collected = ["--behavior", "random", "--sessions", "3000", "--out", str(tmp_path / "logs")]
     assert main(["collect", "--env", "synthetic-catalog", *collected]) == 0
     out = tmp_path / "rows.json"
-    given = ["--temperature", "1", "--tilt", "0", "--json", str(out)]
+    given = ["--temperature", "1.5", "--tilt", "0", "--json", str(out)]
     assert main(["ope", run, str(tmp_path / "logs/sessions.parquet"), *given]) == 0
     rows = estimates_in(out)
     trained = TrainedPolicy.load(Path(run))
-    actor = trained.actor(512, replace(trained.rule, temperature=1.0, tilt=0.0))
+    actor = trained.actor(512, replace(trained.rule, temperature=1.5, tilt=0.0))
     env = World("synthetic-catalog", None).simulator().make(512, None)
     returns = rollout(env, actor, 2000, seed=0).returns
     truth, error = returns.mean(), returns.std() / 2000**0.5

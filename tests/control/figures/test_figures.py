@@ -248,7 +248,7 @@ def test_one_command_draws_what_it_can_and_names_what_is_missing(
     printed = capsys.readouterr()
     names = {"lambda-small", "moves-faithful", "states-faithful", "acceptance-faithful"}
     names |= {"attention-faithful", "moves-tangent", "training-hopper_medium-made"}
-    names |= {"returns-hopper_medium-made"}
+    names |= {"returns-hopper_medium-made", "scores-small-lambda"}
     assert {path.name for path in out.iterdir()} == {
         f"{name}.{kind}" for name in names for kind in ("png", "svg")
     }

@@ -2,7 +2,7 @@
 
 import sys
 
-from ucfrec.processes import end_at_once_when_interrupted
+from ucfrec.processes import end_at_once_when_interrupted, ignore_interruptions
 
 
 def main() -> int:
@@ -10,7 +10,10 @@ def main() -> int:
     end_at_once_when_interrupted()
     from ucfrec.commands.cli import main as run
 
-    return run()
+    try:
+        return run()
+    finally:
+        ignore_interruptions()
 
 
 if __name__ == "__main__":

@@ -36,11 +36,20 @@ class Interrupted(KeyboardInterrupt):
 def end_at_once_when_interrupted() -> None:
     """From now on Ctrl-C and TERM end this process with one line and status 130 or 143.
 
-    For the time in which nothing that needs an orderly end has begun, such as imports, and in which
-    nothing is left to do.
+    For the time in which nothing that needs an orderly end has begun, such as imports.
     """
     for number in ENDING:
         signal.signal(number, _end)
+
+
+def ignore_interruptions() -> None:
+    """From now on Ctrl-C and TERM change nothing: for a process whose work is done.
+
+    Its status says so, too; without this, Python gives the signals back to the operating system
+    while it ends, and the process would count as killed.
+    """
+    for number in ENDING:
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _end(number: int, _: FrameType | None) -> NoReturn:

@@ -108,21 +108,17 @@ class _Steps:
 
     @classmethod
     def of(cls, view: EpisodeStore, most: int, seed: int) -> "_Steps":
-        episodes, steps = view.all_steps()
-        inner = np.flatnonzero(steps < view.lengths[episodes] - 1)
-        if len(inner) > most:
-            inner = np.sort(np.random.default_rng(seed).choice(inner, most, replace=False))
-        held_out = held_out_of(view, episodes[inner])
-        now = view.transitions(episodes[inner], steps[inner])
-        then = view.transitions(episodes[inner], steps[inner] + 1)
+        episodes, steps = steps_with_successor(view, most, seed)
+        now = view.transitions(episodes, steps)
+        then = view.transitions(episodes, steps + 1)
         size = view.observation_size
         others = now.states[:, : now.states.shape[1] - size]
         return cls(
             columns=standardised(now.states[:, -size:]).numpy(),
             rest=standardised(torch.cat([others, now.actions, then.actions], dim=1)).numpy(),
             rewards=standardised(torch.stack([now.rewards, then.rewards], dim=1)).numpy(),
-            episodes=episodes[inner],
-            held_out=held_out,
+            episodes=episodes,
+            held_out=held_out_of(view, episodes),
         )
 
 
@@ -176,6 +172,21 @@ def _predicted(
     )
     model.fit(inputs[~held_out], values[~held_out])
     return np.asarray(model.predict(inputs[held_out]))
+
+
+def steps_with_successor(view: EpisodeStore, most: int, seed: int) -> tuple[IntArray, IntArray]:
+    """Episodes and steps (N,) that are not the last of their session; of more than `most`, so many.
+
+    Args:
+        view: any.
+        most: steps.
+        seed: of the draw.
+    """
+    episodes, steps = view.all_steps()
+    inner = np.flatnonzero(steps < view.lengths[episodes] - 1)
+    if len(inner) > most:
+        inner = np.sort(np.random.default_rng(seed).choice(inner, most, replace=False))
+    return episodes[inner], steps[inner]
 
 
 def held_out_of(train: EpisodeStore, episodes: IntArray) -> npt.NDArray[np.bool_]:

@@ -9,7 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ucfrec.counterfactual.measured_reward import CLIP, held_out_of, standardised
+from ucfrec.counterfactual.measured_reward import (
+    CLIP,
+    held_out_of,
+    standardised,
+    steps_with_successor,
+)
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import IntArray
 
@@ -34,12 +39,8 @@ class StandardSteps:
 
     @classmethod
     def of(cls, view: EpisodeStore, most: int, seed: int) -> "StandardSteps":
-        episodes, steps = view.all_steps()
-        inner = np.flatnonzero(steps < view.lengths[episodes] - 1)
-        if len(inner) > most:
-            inner = np.sort(np.random.default_rng(seed).choice(inner, most, replace=False))
-        held_out = held_out_of(view, episodes[inner])
-        found = view.transitions(episodes[inner], steps[inner])
+        episodes, steps = steps_with_successor(view, most, seed)
+        found = view.transitions(episodes, steps)
         mean, std = view.state_statistics
         states = (found.states - mean) / torch.where(std > 1e-6, std, 1.0)
         next_states = (found.next_states - mean) / torch.where(std > 1e-6, std, 1.0)
@@ -48,8 +49,8 @@ class StandardSteps:
             actions=standardised(found.actions),
             rewards=standardised(found.rewards.unsqueeze(1)),
             changes=standardised(next_states - states),
-            episodes=episodes[inner],
-            held_out=held_out,
+            episodes=episodes,
+            held_out=held_out_of(view, episodes),
         )
 
 

@@ -137,9 +137,7 @@ def fit(
         norm = _descend(value, module, optimizer, config, step, count)
         if step % config.validate_every and step != config.steps:
             continue
-        means = {"loss": value.item(), **{name: each.item() for name, each in scalars.items()}}
-        if count is not None:
-            means = distributed.joint_means(means, count)
+        means = _means({"loss": value, **scalars}, count)
         logged = {"loss": means["loss"], "gradient_norm": norm.item(), **clock.rates(step, config)}
         _require_finite(logged["loss"], f"{describe}: the loss", step)
         _require_finite(logged["gradient_norm"], f"{describe}: the gradient", step)
@@ -158,6 +156,12 @@ def fit(
     module.eval()
     lowest = math.nan if validate is None else counters["best_validation"]
     return Fit(step, int(counters["best_step"]), lowest, counters["seconds"])
+
+
+def _means(scalars: Mapping[str, Tensor], count: float | None) -> dict[str, float]:
+    """Scalars of a batch; with `count`, its rows here, their means over all processes."""
+    values = {name: scalar.item() for name, scalar in scalars.items()}
+    return values if count is None else distributed.joint_means(values, count)
 
 
 def _log(folder: Path, step: int) -> MetricsLog | None:

@@ -1,7 +1,7 @@
 """Item-embedding states: a vector that summarises a session just before step t.
 
-Training windows and acting both call `ItemStates.of_sequences`. It uses only element-wise operations
-in a fixed order, so its results are bit-identical for every batch size.
+Training windows and acting both call `ItemStates.of_sequences`. It uses only element-wise
+operations in a fixed order, so its results are bit-identical for every batch size.
 """
 
 import math
@@ -81,6 +81,8 @@ class ItemStates:
         # Index −1 ("no item", "unknown user") selects this last row of zeros.
         object.__setattr__(self, "_items", _with_zero_row(self.embeddings))
         object.__setattr__(self, "_users", _with_zero_row(self.user_features))
+        decays = [self.decay**lag for lag in reversed(range(self.window))]
+        object.__setattr__(self, "_decays", torch.tensor(decays))
 
     @property
     def size(self) -> int:
@@ -138,10 +140,11 @@ class ItemStates:
         # Another column of ones adds up the weights.
         padded = F.pad(embedded, (0, 1), value=1.0)
         sums = padded.new_zeros(2, batch, length, padded.shape[-1])
-        for lag in range(self.window):
-            seen = slice(self.window - 1 - lag, self.window - 1 - lag + length)
-            weights = counts[:, :, seen] * self.decay**lag
-            sums = sums.add_(weights.unsqueeze(-1) * padded[:, seen])
+        weights = counts.unfold(2, self.window, 1) * self._decays  # type: ignore[attr-defined]
+        of_lags = weights.unsqueeze(-1).unbind(3), padded.unfold(1, self.window, 1).unbind(-1)
+        # Floating-point sums depend on their order: the most recent item comes first.
+        for weight, vector in reversed(list(zip(*of_lags, strict=True))):
+            sums = sums.add_(weight * vector)
         means = sums[..., :-1] / sums[..., -1:].clamp(min=1e-6)
         return torch.cat(
             [

@@ -130,6 +130,24 @@ class Histories:
         np.maximum.at(latest, self.owner, row * begins)
         return self.rows(row >= latest[self.owner])
 
+    def users_between(self, first: int, end: int) -> "Histories":
+        """The users with the numbers `first` to `end` − 1, numbered from 0."""
+        rows, seen = (
+            slice(*np.searchsorted(owner, [first, end])) for owner in (self.owner, self.seen_owner)
+        )
+        sessions, observations = self.session_ids, self.observations
+        return Histories(
+            users=self.users[first:end],
+            owner=self.owner[rows] - first,
+            item_ids=self.item_ids[rows],
+            rewards=self.rewards[rows],
+            timestamps=self.timestamps[rows],
+            session_ids=None if sessions is None else sessions[rows],
+            seen_owner=self.seen_owner[seen] - first,
+            seen_ids=self.seen_ids[seen],
+            observations=None if observations is None else observations[first:end],
+        )
+
     def rows(self, keep: BoolArray) -> "Histories":
         """The same users with only the rows where `keep` (N,) is true."""
         kept = {

@@ -5,8 +5,10 @@ from typing import Final
 import torch
 from torch import Tensor
 
-_SMALLEST: Final = 16
-"""Items of the smallest block."""
+_FEW: Final = 2**16
+"""Scores up to which looking for blocks first costs more."""
+_BLOCK: Final = 128
+"""Items of the smallest block; maxima of fewer cost more."""
 
 
 def best_items(scores: Tensor, k: int) -> Tensor:
@@ -16,10 +18,10 @@ def best_items(scores: Tensor, k: int) -> Tensor:
     maxima is all that reads every score. Among equal scores any may be chosen.
     """
     n = scores.shape[1]
-    # Both searches that follow the pass are then of about the same size.
-    size = max(_SMALLEST, round((n / k) ** 0.5))
+    # Both searches that follow the pass are of about the same size.
+    size = max(_BLOCK, round((n / k) ** 0.5))
     blocks = n // size
-    if 2 * k >= blocks:
+    if scores.numel() < _FEW or 3 * k > blocks:
         return scores.topk(k, dim=-1).indices
     maxima = scores[:, : blocks * size].view(len(scores), blocks, size).amax(-1)
     first = maxima.topk(k, dim=-1, sorted=False).indices * size

@@ -54,7 +54,9 @@ class SessionScorer:
             InputError: the scores of some row are NaN.
         """
         decider = self._decider
-        windows = decider.asked(sessions.windows(self._states, self._context), sessions.collected)
+        # No learner's outputs depend on how much padding is before a session.
+        context = min(self._context, int(sessions.steps.max()) + 1)
+        windows = decider.asked(sessions.windows(self._states, context), sessions.collected)
         if self._product is None:
             # Learners may give what they keep, and scores are overwritten.
             outputs = decider.act_and_features(windows)[0].clone()

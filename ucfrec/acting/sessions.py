@@ -28,7 +28,8 @@ class Sessions:
     users: Tensor
     """(B,) int64 numbers of the users in the training logs, −1 for others."""
     observations: Tensor | None = None
-    """(B, K, O) float32 of the last K steps, the one to decide included; None without any."""
+    """(B, K, O) float32 of the last K steps or more, the one to decide included; None without
+    any."""
 
     @classmethod
     def of_rows(
@@ -85,9 +86,10 @@ class Sessions:
         items, rewards = self.items[:, -reach:], self.rewards[:, -reach:]
         numbers = self.steps.unsqueeze(1) + torch.arange(1 - context, 1)
         mask, numbers = numbers >= 0, numbers.clamp(min=0)
-        observations = self.observations
-        if observations is None:
+        if self.observations is None:
             observations = rewards.new_zeros(items.shape[0], context, 0)
+        else:
+            observations = self.observations[:, -context:]
         built = states.of_sequences(items, rewards, numbers, self.users, observations)
         # The step to decide has neither an action nor a reward yet.
         actions = F.pad(items[:, window:].clamp(min=0), (0, 1))

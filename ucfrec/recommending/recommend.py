@@ -19,7 +19,7 @@ from ucfrec.recommending.histories import Histories
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 RANK, SCORE = "rank", "score"
-USERS_AT_ONCE = 128
+_USERS_AT_ONCE = 128
 """Users of a forward pass, whose scores then stay in the processor's cache."""
 
 Array = npt.NDArray[Any]
@@ -79,12 +79,7 @@ def recommend(
             if filter_seen:
                 seen = positions(index, batch.seen_ids)
             numbered = replace(batch, item_ids=known, seen_ids=seen)
-            choice = _Choice(trained, scorer, asked, k, excluded, seed)
-            parts = [
-                choice.frame(numbered.users_between(first, first + USERS_AT_ONCE))
-                for first in range(0, len(batch.users), USERS_AT_ONCE)
-            ]
-            yield pd.concat(parts, ignore_index=True)
+            yield _Choice(trained, scorer, asked, k, excluded, seed).frame(numbered)
 
     return frames()
 
@@ -107,37 +102,47 @@ class _Choice:
     seed: int
 
     def frame(self, batch: Histories) -> pd.DataFrame:
-        """Items for the next step of users whose rows have the policy's numbers of items, −1 for
+        """Items for the next step of U users whose rows have the policy's numbers of items, −1 for
         unknown ones; those of `seen_ids` are not recommended."""
         latest = batch.rows(batch.item_ids >= 0).latest_session(
             self.trained.record["session_gap_ms"]
         )
-        users = positions(self.trained.user_index, latest.users)
-        sessions = sessions_of(self.trained, latest, users, self.scorer.length)
-        known = batch.seen_ids >= 0
-        left_out = [batch.seen_owner[known]], [batch.seen_ids[known]]
-        if self.rule.exclude_seen:
-            left_out[0].append(latest.owner)
-            left_out[1].append(latest.item_ids)
-        rows, items = (torch.from_numpy(np.concatenate(each)) for each in left_out)
-        scores = self.scorer.scores(sessions, (rows, items), self.excluded)
-        return self._ranked(batch.users, scores)
-
-    def _ranked(self, users: Array, scores: Tensor) -> pd.DataFrame:
-        """Rows of the users (B,) who have items left, from their scores (B, n_items)."""
-        item_ids, n_items = self.trained.item_ids, scores.shape[1]
+        # Sessions of about the same length share a pass, which costs as much as the longest.
+        lengths = np.bincount(latest.owner, minlength=len(latest.users))
+        order = np.argsort(lengths, kind="stable")
+        items, values = (
+            np.concatenate(each) for each in zip(*self._parts(latest, order), strict=True)
+        )
+        back = np.argsort(order, kind="stable")
+        items, values = items[back], values[back]
+        kept, item_ids = np.isfinite(values), self.trained.item_ids
         assert item_ids is not None
-        drawn = uniforms(users, n_items, self.seed) if self.rule.temperature > 0 else None
-        items, values = best_of(self.rule, scores, min(self.k, n_items), drawn)
-        kept = torch.isfinite(values).numpy()
         return pd.DataFrame(
             {
-                schema.USER_ID: np.repeat(users, kept.sum(1)),
+                schema.USER_ID: np.repeat(batch.users, kept.sum(1)),
                 RANK: np.cumsum(kept, axis=1)[kept],
-                schema.ITEM_ID: item_ids[items.numpy()[kept]],
-                SCORE: values.numpy()[kept],
+                schema.ITEM_ID: item_ids[items[kept]],
+                SCORE: values[kept],
             }
         )
+
+    def _parts(self, latest: Histories, order: IntArray) -> Iterator[tuple[Array, Array]]:
+        """Items and their log-probabilities, (M, k) each, of some users after the other."""
+        for first in range(0, len(order), _USERS_AT_ONCE):
+            part = latest.of_users(order[first : first + _USERS_AT_ONCE])
+            users = positions(self.trained.user_index, part.users)
+            sessions = sessions_of(self.trained, part, users, self.scorer.length)
+            known = part.seen_ids >= 0
+            left_out = [part.seen_owner[known]], [part.seen_ids[known]]
+            if self.rule.exclude_seen:
+                left_out[0].append(part.owner)
+                left_out[1].append(part.item_ids)
+            rows, items = (torch.from_numpy(np.concatenate(each)) for each in left_out)
+            scores = self.scorer.scores(sessions, (rows, items), self.excluded)
+            n_items = scores.shape[1]
+            drawn = uniforms(part.users, n_items, self.seed) if self.rule.temperature > 0 else None
+            best = best_of(self.rule, scores, min(self.k, n_items), drawn)
+            yield best[0].numpy(), best[1].numpy()
 
 
 def best_of(

@@ -108,7 +108,7 @@ class VirtualTaobao(TaobaoEnv):
     ) -> tuple[IntArray, IntArray]:
         with torch.inference_mode():
             logits = self._logits(users, pages, actions)
-            clicks, indices = map(_weights, logits.split([CLICK_LEVELS, PAGE_INDICES], dim=1))
+            clicks, indices = map(_weights, torch.split(logits, [CLICK_LEVELS, PAGE_INDICES], 1))
         uniforms = self.np_random.random((len(users), 2))
         return draw_categories(clicks, uniforms[:, 0]), draw_categories(indices, uniforms[:, 1])
 

@@ -82,7 +82,7 @@ def test_any_learner_can_be_asked(folder: Path, tmp_path: Path, policy: str) -> 
     before = {name: each.clone() for name, each in trained.policy.state_dict().items()}
     episodes, steps = drawn_steps(store, 9)
     left_out = torch.tensor([2]), torch.tensor([7])
-    found = trained.scorer().scores(sessions_at(store, episodes, steps), left_out)
+    found = trained.scorer().scores(sessions_at(store, episodes, steps), left_out).clone()
     assert found[2, 7] == -torch.inf
     found[2, 7] = 0.0
     expected = session_scores(trained.decider(), store, episodes, steps)

@@ -39,4 +39,4 @@ def test_windows_are_those_of_a_store(context: int, observation: int) -> None:
                 assert torch.equal(getattr(found, field.name), getattr(expected, field.name))
         collected = np.bincount(owner, rewards, minlength=len(counts))
         np.testing.assert_allclose(sessions.collected.numpy(), collected)
-        assert sessions.shown().items[2, :3].tolist() == items[30:27:-1].tolist()
+        assert sessions.shown.items[2, :3].tolist() == items[30:27:-1].tolist()

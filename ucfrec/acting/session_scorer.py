@@ -35,7 +35,6 @@ class SessionScorer:
         """Items of a session that are read."""
         self._product = _Product.of(decider)
 
-    @torch.no_grad()
     def scores(
         self,
         sessions: Sessions,
@@ -53,6 +52,17 @@ class SessionScorer:
         Raises:
             InputError: the scores of some row are NaN.
         """
+        # Learners may keep tensors, which those of inference mode would spoil for training.
+        mode = torch.no_grad() if self._product is None else torch.inference_mode()
+        with mode:
+            scores = self._scores(sessions)
+            if left_out is not None:
+                scores[left_out] = -torch.inf
+            if excluded is not None:
+                scores = scores.masked_fill_(excluded, -torch.inf)
+            return self._decider.without_recent_tags(scores, sessions.shown)
+
+    def _scores(self, sessions: Sessions) -> Tensor:
         decider = self._decider
         # No learner's outputs depend on how much padding is before a session.
         context = min(self._context, int(sessions.steps.max()) + 1)
@@ -60,15 +70,11 @@ class SessionScorer:
         if self._product is None:
             # Learners may give what they keep, and scores are overwritten.
             outputs = decider.act_and_features(windows)[0].clone()
-            scores = decider.tilted(outputs, windows, sessions.users, sessions.shown())
+            scores = decider.tilted(outputs, windows, sessions.users, sessions.shown)
         else:
             scores = self._product.scores(windows, sessions)
         decider.require_numbers(scores)
-        if left_out is not None:
-            scores[left_out] = -torch.inf
-        if excluded is not None:
-            scores = scores.masked_fill_(excluded, -torch.inf)
-        return decider.without_recent_tags(scores, sessions.shown())
+        return scores
 
 
 class _Product:
@@ -109,7 +115,7 @@ class _Product:
 
     def scores(self, windows: Windows, sessions: Sessions) -> Tensor:
         """(B, n_items) of windows of `Decider.asked`, up to a constant per row."""
-        normalized, shown = self._policy.normalized(windows), sessions.shown()
+        normalized, shown = self._policy.normalized(windows), sessions.shown
         features = self._features(normalized)
         inputs = [features / features.shape[-1] ** 0.5]
         weights = []

@@ -1,6 +1,7 @@
 """Running sessions as arrays: what was shown so far, and the windows that a policy sees of it."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -69,6 +70,7 @@ class Sessions:
             observations,
         )
 
+    @cached_property
     def shown(self) -> Shown:
         """What was shown, the latest first."""
         return Shown(self.items.flip(1), self.rewards.flip(1))

@@ -98,7 +98,7 @@ class RuleGraph(nn.Module):
         windows = self._decider.asked(sessions.windows(self.states, self.context), collected)
         normalized = self.policy.normalized(windows)
         features = self.policy.last_features(normalized)
-        shown = sessions.shown()
+        shown = sessions.shown
         scores = self.head.logits(features, shown, normalized.returns_to_go[:, -1])
         if self.reward is not None:
             scores = scores + self._rule.tilt * self.reward(windows.states[:, -1], shown, users)

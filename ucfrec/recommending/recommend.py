@@ -145,6 +145,7 @@ class _Choice:
             yield best[0].numpy(), best[1].numpy()
 
 
+@torch.inference_mode()
 def best_of(
     rule: DecisionRule, scores: Tensor, k: int, drawn: Tensor | None
 ) -> tuple[Tensor, Tensor]:

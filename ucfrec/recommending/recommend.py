@@ -20,7 +20,9 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 
 RANK, SCORE = "rank", "score"
 _USERS_AT_ONCE = 128
-"""Users of a forward pass, whose scores then stay in the processor's cache."""
+"""Most users of a forward pass; scores of more leave the processor's cache."""
+_SCORES = 2**24
+"""Most scores of a forward pass of several users, users × items: 64 MiB."""
 
 Array = npt.NDArray[Any]
 IntArray = npt.NDArray[np.int64]
@@ -128,8 +130,9 @@ class _Choice:
 
     def _parts(self, latest: Histories, order: IntArray) -> Iterator[tuple[Array, Array]]:
         """Items and their log-probabilities, (M, k) each, of some users after the other."""
-        for first in range(0, len(order), _USERS_AT_ONCE):
-            part = latest.of_users(order[first : first + _USERS_AT_ONCE])
+        at_once = users_at_once(len(self.trained.item_index))
+        for first in range(0, len(order), at_once):
+            part = latest.of_users(order[first : first + at_once])
             users = positions(self.trained.user_index, part.users)
             sessions = sessions_of(self.trained, part, users, self.scorer.length)
             known = part.seen_ids >= 0
@@ -143,6 +146,11 @@ class _Choice:
             drawn = uniforms(part.users, n_items, self.seed) if self.rule.temperature > 0 else None
             best = best_of(self.rule, scores, min(self.k, n_items), drawn)
             yield best[0].numpy(), best[1].numpy()
+
+
+def users_at_once(n_items: int) -> int:
+    """Users of a forward pass that scores `n_items` items."""
+    return max(1, min(_USERS_AT_ONCE, _SCORES // n_items))
 
 
 @torch.inference_mode()

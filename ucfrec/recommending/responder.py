@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -12,12 +12,9 @@ from torch import Tensor
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.errors import InputError
 from ucfrec.recommending.histories import Histories
-from ucfrec.recommending.recommend import best_of, sessions_of, uniforms
+from ucfrec.recommending.recommend import best_of, sessions_of, uniforms, users_at_once
 from ucfrec.recommending.requests import HistoryReader, Limits, Request, UserHistory
 from ucfrec.runs.trained_policy import TrainedPolicy
-
-_SCORES: Final = 2**25
-"""Most scores of a forward pass, users × items: 128 MiB."""
 
 Array = npt.NDArray[Any]
 IntArray = npt.NDArray[np.int64]
@@ -119,7 +116,7 @@ class Responder:
                     asked.append(self._asked(number, request))
                 except InputError as error:
                     outcomes[number] = error
-            at_once = max(1, _SCORES // len(self._item_ids))
+            at_once = users_at_once(len(self._item_ids))
             for first in range(0, len(asked), at_once):
                 batch = asked[first : first + at_once]
                 for one, answer in zip(batch, self._scored(batch), strict=True):

@@ -276,8 +276,9 @@ def cases(options: argparse.Namespace, folder: Path) -> Iterator[tuple[Case, int
     yield Case("one user", line_ways(trained), options.users), items
     if options.items:
         large = enlarged(trained, options.items)
-        yield Case("one user", line_ways(large), max(60, rounds)), options.items
-        del large
+        ways = line_ways(large)
+        yield Case("one user, large catalogue", ways, max(60, rounds)), options.items
+        del large, ways
     yield Case("one user's frame", frame_ways(options.run), options.users), items
     now, before, users = log_ways(trained, store, folder)
     yield Case("all users", (now, before), rounds, (users, users)), items
@@ -319,7 +320,7 @@ def main() -> None:
             row = ResultRow(
                 suite="acting-time",
                 table="acting-time",
-                task=f"{case.task}, {items:,} items" if items else case.task,
+                task=case.task,
                 method="ucf",
                 policy="ucf",
                 conditions={"items": items, "rounds": case.rounds, "sessions": options.sessions},

@@ -56,7 +56,15 @@ from ucfrec.runs.run import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 RESULTS = Path("runs/acting_time/results.jsonl")
-HISTORY, SESSIONS, PAGES = 20, 4096, 300
+HISTORY, SESSIONS, PAGES, LOG_USERS = 20, 4096, 300, 5000
+TASKS = (
+    "one user",
+    "one user, large catalogue",
+    "one user's frame",
+    "all users",
+    "choose the rule",
+    "VirtualTaobao",
+)
 BEGAN = 1_700_000_000_000
 Way = Callable[[], object]
 
@@ -272,20 +280,23 @@ def seconds(case: Case) -> tuple[np.ndarray, np.ndarray]:
 def cases(options: argparse.Namespace, folder: Path) -> Iterator[tuple[Case, int]]:
     """The cases, and the number of items of each."""
     trained, store = TrainedPolicy.load(options.run), EpisodeStore.open(options.store)
-    items, rounds = len(trained.item_index), options.rounds
-    yield Case("one user", line_ways(trained), options.users), items
-    if options.items:
-        large = enlarged(trained, options.items)
-        ways = line_ways(large)
+    items, rounds, wanted = len(trained.item_index), options.rounds, options.only or TASKS
+    if "one user" in wanted:
+        yield Case("one user", line_ways(trained), options.users), items
+    if "one user, large catalogue" in wanted and options.items:
+        ways = line_ways(enlarged(trained, options.items))
         yield Case("one user, large catalogue", ways, max(60, rounds)), options.items
-        del large, ways
-    yield Case("one user's frame", frame_ways(options.run), options.users), items
-    now, before, users = log_ways(trained, store, folder)
-    yield Case("all users", (now, before), rounds, (users, users)), items
-    if options.sessions:
+        del ways
+    if "one user's frame" in wanted:
+        yield Case("one user's frame", frame_ways(options.run), options.users), items
+    if "all users" in wanted:
+        some = store.select(np.arange(min(LOG_USERS, len(store))))
+        now, before, users = log_ways(trained, some, folder)
+        yield Case("all users", (now, before), rounds, (users, users)), items
+    if "choose the rule" in wanted:
         ways = rule_ways(trained, store, options.sessions)
         yield Case("choose the rule", ways, rounds), items
-    if options.original:
+    if "VirtualTaobao" in wanted and options.original:
         first, second, units = taobao_ways(options.original)
         yield Case("VirtualTaobao", (first, second), rounds, units), 0
 
@@ -299,6 +310,7 @@ def main() -> None:
     parser.add_argument("--users", type=int, default=300, help="timed rounds of one user (300)")
     parser.add_argument("--items", type=int, default=0, help="of a larger catalogue (none)")
     parser.add_argument("--original", type=Path, help="folder of the authors' VirtualTaobao")
+    parser.add_argument("--only", nargs="+", choices=TASKS, help="what to measure (everything)")
     parser.add_argument("--results", type=Path, default=RESULTS, help="file of result rows")
     options = parser.parse_args()
     torch.set_num_threads(1)

@@ -11,7 +11,7 @@ from ucfrec.logs.binding import open_tables
 from ucfrec.logs.clean import DUPLICATES, drop_counts, read_log
 from ucfrec.logs.engine import engine
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.sorted_rows import sort_rows
+from ucfrec.logs.sorted_rows import check_sorted, sorted_batches
 from ucfrec.logs.typed import typed_log
 
 START = 1_700_000_000_000
@@ -66,7 +66,7 @@ def test_both_ways_keep_the_same_rows(
     with engine([path], tmp_path) as connection:
         tables = tuple(open_tables(connection, [path]))
         log = typed_log(connection, tables, LogMapping(), "reward", session_by, tmp_path)
-        rows = sort_rows(log, None, duplicates, tmp_path)
+        rows = check_sorted(log, sorted_batches(log, None), duplicates, tmp_path)
         found = {name: rows.clean.read(name, 0, len(rows.clean)) for name in rows.clean.names}
     assert rows.dropped == dropped
     assert rows.read == 400

@@ -32,7 +32,11 @@ _CLOSED: Final = {
 
 @contextmanager
 def engine(
-    inputs: Iterable[Path], folder: Path, memory_limit: str | None = None, beside: int = 0
+    inputs: Iterable[Path],
+    folder: Path,
+    memory_limit: str | None = None,
+    beside: int = 0,
+    threads: int | None = None,
 ) -> Iterator[duckdb.DuckDBPyConnection]:
     """A DuckDB connection with a database on disk.
 
@@ -46,6 +50,7 @@ def engine(
         memory_limit: size such as "2GB", beyond which rows spill to disk; None for DuckDB's
             default.
         beside: bytes of the limit that the rest of the process needs, at most half of them.
+        threads: most threads; None for one a core.
 
     Raises:
         InputError: `memory_limit` is not a size.
@@ -66,6 +71,8 @@ def engine(
                 raise InputError(
                     f"memory_limit {memory_limit!r} is no size; write e.g. 2GB"
                 ) from None
+            if threads is not None:
+                connection.execute("SET threads = ?", [threads])
             _set_semantics(connection)
             _close(connection, inputs, str(work))
             yield connection

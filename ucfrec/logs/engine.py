@@ -64,7 +64,7 @@ def engine(
             try:
                 if memory_limit is not None:
                     connection.execute("SET memory_limit = ?", [memory_limit])
-                    if (limit := _bytes(memory_limit)) and beside:
+                    if (limit := bytes_of(memory_limit)) and beside:
                         own = max(limit - beside, limit // 2)
                         connection.execute("SET memory_limit = ?", [f"{own} B"])
             except duckdb.Error:
@@ -80,7 +80,7 @@ def engine(
             connection.close()
 
 
-def _bytes(size: str) -> int | None:
+def bytes_of(size: str) -> int | None:
     """A size such as "2GB" or "1.5 GiB" in bytes; None if it is written in another way."""
     found = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([kmgt]?)(i?)b?\s*", size.lower())
     if found is None:

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 BATCH_ROWS: Final = 2**17
-"""Rows of a batch read from DuckDB."""
+"""Most rows of a batch read from DuckDB."""
+_BATCH_BYTES: Final = 2**25
 
 _CLOSED: Final = {
     "allow_community_extensions": False,
@@ -87,6 +88,15 @@ def bytes_of(size: str) -> int | None:
         return None
     base = 1024 if found[3] else 1000
     return int(float(found[1]) * base ** " kmgt".index(found[2] or " "))
+
+
+def rows_of_batch(numbers: int) -> int:
+    """Rows of a batch, fewer if they are long.
+
+    Args:
+        numbers: of the vectors of a row, float32.
+    """
+    return min(BATCH_ROWS, max(_BATCH_BYTES // (64 + 4 * numbers), 1))
 
 
 @contextmanager

@@ -16,7 +16,7 @@ import pyarrow as pa
 from ucfrec import schema
 from ucfrec.logs.binding import MAX_FLOAT
 from ucfrec.logs.clean import REASONS, faults, require_rewards_in_range
-from ucfrec.logs.engine import BATCH_ROWS, as_numpy
+from ucfrec.logs.engine import as_numpy
 from ucfrec.logs.spool import Spool
 from ucfrec.logs.typed import ROWS, TypedLog
 
@@ -86,7 +86,7 @@ def sorted_batches(log: TypedLog, known_items: Path | None) -> Iterator[pa.Recor
     for name, table in code_tables(log):
         log.connection.execute(f"CREATE TABLE {table} AS {coded_ids(name, ROWS)}")
     query = in_order(log, f"({with_faults(log, ROWS, faults(log, known_items))})")
-    return iter(log.connection.sql(query).to_arrow_reader(BATCH_ROWS))
+    return iter(log.connection.sql(query).to_arrow_reader(log.batch_rows))
 
 
 def check_sorted(

@@ -108,7 +108,7 @@ def sorted_with_spark(
     shutil.rmtree(scratch / _TYPED)
     for _, table in code_tables(log):
         _load(connection, scratch / table, table)
-    return log, _batches(scratch / ROWS)
+    return log, _batches(scratch / ROWS, log.batch_rows)
 
 
 @dataclass
@@ -198,10 +198,10 @@ def _parts(folder: Path) -> list[Path]:
     return sorted(folder.glob("part-*.parquet"), key=lambda p: (int(p.name.split("-")[1]), p.name))
 
 
-def _batches(folder: Path) -> Iterator[pa.RecordBatch]:
+def _batches(folder: Path, rows: int = BATCH_ROWS) -> Iterator[pa.RecordBatch]:
     for part in _parts(folder):
         with pq.ParquetFile(part) as file:
-            yield from file.iter_batches(BATCH_ROWS, use_threads=False)
+            yield from file.iter_batches(rows, use_threads=False)
 
 
 def _load(connection: duckdb.DuckDBPyConnection, folder: Path, table: str) -> None:

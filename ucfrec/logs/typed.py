@@ -20,6 +20,7 @@ from ucfrec.logs.binding import (
     is_vector,
     wrong_type,
 )
+from ucfrec.logs.engine import rows_of_batch
 from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping
 
 ROWS: Final = "read"
@@ -52,6 +53,11 @@ class TypedLog:
     def payload(self) -> tuple[str, ...]:
         """Log columns other than user, choice and time."""
         return tuple(c for c in self.columns if c not in (schema.USER_ID, self.key, "timestamp"))
+
+    @property
+    def batch_rows(self) -> int:
+        """Rows of a batch of its rows."""
+        return rows_of_batch(sum(self.vector_size.values()))
 
     @property
     def name(self) -> str:

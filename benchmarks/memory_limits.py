@@ -30,9 +30,9 @@ from ucfrec.reporting.rows_file import append_rows
 from ucfrec.reporting.tables import markdown_table
 
 RESULTS = Path("runs/memory_limits/results.jsonl")
-OBSERVATION = 1024
+OBSERVATION = 4096
 """Numbers of an observation in the wide log."""
-ITEMS, ROWS_PER_USER, BATCH = 500, 20, 20_000
+ITEMS, ROWS_PER_USER, BATCH = 500, 20, 5_000
 START_MS = 1_700_000_000_000
 SMALL = ("train.steps=30", "train.validate_every=30", "policy.dim=32", "policy.context=5")
 SMALL += ("rule.choose=false", "augment.copies=0")
@@ -144,8 +144,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--folder", type=Path, required=True, help="for logs, stores and runs")
     parser.add_argument("--limit", default="1GB", help="of a command's memory (default: 1GB)")
-    parser.add_argument("--long", type=int, default=50_000_000, help="rows (default: 50000000)")
-    parser.add_argument("--wide", type=int, default=300_000, help="rows (default: 300000)")
+    parser.add_argument(
+        "--long", type=int, default=80_000_000, help="rows; 0: none (default: 80000000)"
+    )
+    parser.add_argument("--wide", type=int, default=110_000, help="rows; 0: none (default: 110000)")
     parser.add_argument("--commands", nargs="+", default=[], help="no others (default: all)")
     parser.add_argument(
         "--results", type=Path, default=RESULTS, help=f"file of result rows (default: {RESULTS})"
@@ -159,6 +161,8 @@ def main() -> None:
         ("long", options.long, make_log),
         ("wide", options.wide, make_wide_log),
     ):
+        if not rows:
+            continue
         if not (folder / f"{kind}-log").exists():
             make(folder / f"{kind}-log", rows, 0)
         for command, arguments in commands(folder, kind, limit).items():

@@ -30,9 +30,9 @@ from ucfrec.reporting.rows_file import append_rows
 from ucfrec.reporting.tables import markdown_table
 
 RESULTS = Path("runs/memory_limits/results.jsonl")
-OBSERVATION = 4096
+OBSERVATION = 1024
 """Numbers of an observation in the wide log."""
-ITEMS, ROWS_PER_USER, BATCH = 500, 20, 5_000
+ITEMS, ROWS_PER_USER, BATCH = 500, 20, 20_000
 START_MS = 1_700_000_000_000
 SMALL = ("train.steps=30", "train.validate_every=30", "policy.dim=32", "policy.context=5")
 SMALL += ("rule.choose=false", "augment.copies=0")
@@ -147,7 +147,7 @@ def main() -> None:
     parser.add_argument(
         "--long", type=int, default=80_000_000, help="rows; 0: none (default: 80000000)"
     )
-    parser.add_argument("--wide", type=int, default=110_000, help="rows; 0: none (default: 110000)")
+    parser.add_argument("--wide", type=int, default=400_000, help="rows; 0: none (default: 400000)")
     parser.add_argument("--commands", nargs="+", default=[], help="no others (default: all)")
     parser.add_argument(
         "--results", type=Path, default=RESULTS, help=f"file of result rows (default: {RESULTS})"

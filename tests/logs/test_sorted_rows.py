@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ucfrec.logs import sorted_rows
 from ucfrec.logs.binding import open_tables
 from ucfrec.logs.clean import DUPLICATES, drop_counts, read_log
 from ucfrec.logs.engine import engine
@@ -50,7 +49,7 @@ def make_log(seed: int, text: bool) -> pd.DataFrame:
 def test_both_ways_keep_the_same_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, duplicates: str, text: bool, session_by: str
 ) -> None:
-    monkeypatch.setattr(sorted_rows, "BATCH_ROWS", 64)
+    monkeypatch.setattr("ucfrec.logs.engine.BATCH_ROWS", 64)
     path = tmp_path / "log.parquet"
     make_log(len(duplicates), text).to_parquet(path)
     with engine([path], tmp_path) as connection:

@@ -119,3 +119,24 @@ def test_the_last_step_of_a_users_last_session_tells_nothing(tmp_path: Path) -> 
     # Left out: step 4 (user 0's last session), 6 (cut, not terminated) and 8 (user 1's last).
     assert logged.rewards.tolist() == [0, 1, 2, 3, 5, 7]
     assert logged.ended.tolist() == [False, True, False, False, False, False]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_drawn_ends_are_a_sample_of_all(seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    lengths = generator.integers(1, 4, 60)
+    n = int(lengths.sum())
+    columns = {"item": np.zeros(n, dtype=np.int64), "reward": np.arange(n, dtype=np.float32)}
+    states = ItemStates(torch.eye(2), torch.zeros(2, 0), 0.0, 1.0)
+    episodes = {
+        "user": np.sort(generator.integers(9, size=60)),
+        "terminated": generator.random(60) < 0.5,
+    }
+    store = EpisodeStore.from_arrays(columns, lengths, episodes, states)
+    known = LoggedEnds.of(store, 2, n, seed)
+    drawn = LoggedEnds.of(store, 2, 20, seed)
+    chosen = np.sort(np.random.default_rng(seed).choice(len(known.rewards), 20, replace=False))
+    for name in ("rewards", "steps", "ended"):
+        np.testing.assert_array_equal(getattr(drawn, name), getattr(known, name)[chosen])
+    episode = np.searchsorted(np.cumsum(lengths), known.rewards, side="right")
+    np.testing.assert_array_equal(known.ended, known.steps == lengths[episode] - 1)

@@ -43,16 +43,20 @@ class LoggedEnds:
         The last step of a user's last session, and of a session that was cut, is left out: the
         log may simply have ended there.
         """
-        episodes, steps = store.all_steps()
-        ended = steps == store.lengths[episodes] - 1
         users = store.episode_values(schema.USER) if store.has_users else np.arange(len(store))
         last_session = np.zeros(len(store), dtype=bool)
         last_session[len(store) - 1 - np.unique(users[::-1], return_index=True)[1]] = True
         unknown = last_session | ~store.terminated
-        kept = np.flatnonzero(~(ended & unknown[episodes]))
-        if len(kept) > most:
-            kept = np.sort(np.random.default_rng(seed).choice(kept, most, replace=False))
-        episodes, steps, ended = episodes[kept], steps[kept], ended[kept]
+        # Of an episode whose end is unknown, all steps but the last are known.
+        ends = np.cumsum(store.lengths - unknown)
+        kept = int(ends[-1])
+        numbers = np.arange(kept)
+        if kept > most:
+            drawn = np.random.default_rng(seed).choice(kept, most, replace=False)
+            numbers = np.sort(drawn)
+        episodes = np.searchsorted(ends, numbers, side="right")
+        steps = numbers - (ends - (store.lengths - unknown))[episodes]
+        ended = steps == store.lengths[episodes] - 1
         window = store.windows(episodes, steps, lags + 1)
         rewards = window.rewards[:, -1].double().numpy()
         return cls(Shown.before_last(window), window.actions[:, -1], rewards, steps, ended)
@@ -141,7 +145,8 @@ class LearnedSessions:
         self._users = np.full(len(store), -1)
         if store.has_users:
             self._users = store.episode_values(schema.USER).astype(np.int64)
-        rewards = np.unique(store.step_values(schema.REWARD, *store.all_steps()))
+        found = [np.unique(store.step_values(schema.REWARD, *s)) for s in store.step_batches()]
+        rewards = np.unique(np.concatenate(found))
         self._outcomes = rewards if len(rewards) == 2 else None
 
     def reset(self, seed: int) -> tuple[FloatArray, dict[str, Any]]:

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ucfrec import schema
 from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.acting.learned_sessions import LearnedSessions, LoggedEnds, SessionEnd
 from ucfrec.acting.many_rules import ManyRules
@@ -113,10 +112,7 @@ class RuleSearch:
         rows = RewardRows.of(validation, model.lags, _MOST_STEPS, seed)
         self.calibration = calibrate(model, rows)
         self._longest, self.end, self._model = int(train.lengths.max()), end, model
-        shown = np.bincount(
-            train.step_values(schema.ITEM, *train.all_steps()), minlength=len(states.embeddings)
-        )
-        self._supported = shown >= config.least_impressions
+        self._supported = train.item_counts() >= config.least_impressions
         self.least_items = min(config.least_items, self._supported.sum() / 4)
 
     def play(self, rules: Sequence[DecisionRule]) -> list[Candidate]:

@@ -245,11 +245,10 @@ def choose_rule(
     if validation.item_states.tags.shape[1]:
         played.extend(search.play([*_filtered(config, second.rule, longest)]))
         if search.fatigue is not None:
-            limited = search.best(_simplest_first(played)).rule
-            played.extend(search.play([*_limited(config, limited)]))
-            limited = search.best(_simplest_first(played)).rule
-            if limited.tag_run:
-                played.extend(search.play([*_tilted(config, limited)]))
+            # Without a tag window, which may only have served to tire nobody.
+            limited = search.play([*_limited(config, second.rule)])
+            tilted = search.play([*_tilted(config, search.best(_simplest_first(limited)).rule)])
+            played.extend([*limited, *tilted])
     best = search.best(_simplest_first(played))
     supported, least_items = search.allowed(best), float(search.least_items)
     return Choice(best.rule, played, search.calibration, search.fatigue, least_items, supported)

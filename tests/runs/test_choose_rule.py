@@ -170,8 +170,10 @@ def test_users_who_tire_are_shown_no_longer_runs(tmp_path: Path, trained: Traine
     store = tiring_store(tmp_path)
     train, validation = training_views(store)
     model, _ = fit_item_reward_model(train, validation, tmp_path / "model", 0)
-    decider = replace(trained.decider(DecisionRule(2.0)), reward_model=model)
-    found = choose_rule(decider, {0.9: 2.0, 1.0: 3.0}, train, validation, FEW, 0)
+    one_tag = torch.where(torch.arange(24) % 4 == 0, 9.0, 0.0)
+    decider = replace(with_bias(trained, one_tag), reward_model=model)
+    config = replace(FEW, tag_windows=(0,), temperatures=(1.0,), tilts=(0.0,))
+    found = choose_rule(decider, {0.9: 2.0, 1.0: 3.0}, train, validation, config, 0)
     assert found.fatigue is not None
     assert (found.fatigue.length, found.fatigue.steps) == (3, 4)
     assert found.rule.tag_run == 2

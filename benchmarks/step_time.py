@@ -1,18 +1,23 @@
 """CPU time of a training step of every policy on one thread, as a ratio to those of DT and DC.
 
-    python benchmarks/step_time.py --dim 128 --context 20
+    python benchmarks/step_time.py --dim 128 --context 20 --reference CLONE
 
 Appends the rows to runs/step_time/results.jsonl, or to --results, and prints a table. Only ratios
-are kept: the policies are timed in turn, so a slower machine slows all of them. A step of our DC
-takes 0.86 of one of its authors' code.
+are kept: the policies are timed in turn, so a slower machine slows all of them. CLONE is a clone of
+github.com/beanie00/Decision-ConvFormer, whose network is timed, too, in its authors' size (3
+layers, window of 6); it needs transformers 4.6.0, huggingface-hub 0.0.8, regex and sacremoses on
+the path (`make bench` installs them in a folder of their own).
 """
 
 import argparse
+import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor, nn
 
 from ucfrec.code_version import code_version
 from ucfrec.episodes.windows import Windows
@@ -28,6 +33,7 @@ from ucfrec.runs.config import resolve_config
 RESULTS = Path("runs/step_time/results.jsonl")
 SIZES = {"state": 91, "action": 27, "items": 0}
 LEARNERS = ("dt", "dc", "lsdt", "ucf", "dt4rec", "cdt4rec", "edt4rec", "sasrec", "bc")
+REFERENCE = "reference_dc"
 
 
 def windows(batch: int, context: int) -> Windows:
@@ -42,13 +48,61 @@ def windows(batch: int, context: int) -> Windows:
     )
 
 
-def step_seconds(policy: SequencePolicy, optimizer: torch.optim.Optimizer, batch: Windows) -> float:
-    """CPU seconds of one training step."""
-    began = time.thread_time()
-    value, _ = policy.loss(batch)
+Step = Callable[[], None]
+
+
+def step_of(policy: SequencePolicy, batch: Windows) -> Step:
+    """A training step of one of our policies."""
+    optimizer = RowAdamW(policy.parameters(), fused=True)
+
+    def step() -> None:
+        value, _ = policy.loss(batch)
+        descend(value, policy, optimizer)
+
+    return step
+
+
+def reference_step(clone: Path, dim: int, batch: Windows) -> Step:
+    """A training step of Decision ConvFormer's own code, as its trainer takes it."""
+    sys.path.insert(0, str(clone / "gym"))
+    from models.decision_convformer import DecisionConvFormer
+
+    original = torch.Tensor.to
+
+    def stays(tensor: Tensor, *args: object, **kwargs: object) -> Tensor:
+        return tensor if args == ("cuda",) else original(tensor, *args, **kwargs)  # type: ignore[call-overload,no-any-return]
+
+    torch.Tensor.to = stays  # type: ignore[method-assign,assignment]  # it always asks for a GPU
+    network = DecisionConvFormer(
+        *(SIZES["state"], SIZES["action"], dim),
+        **{"max_length": batch.states.shape[1], "max_ep_len": 1000, "n_layer": 3},
+        **{"window_size": 6, "drop_p": 0.1, "resid_pdrop": 0.1, "env_name": ""},
+    )
+    optimizer = torch.optim.AdamW(network.parameters(), lr=1e-4, weight_decay=1e-4)
+
+    def step() -> None:
+        returns = batch.returns_to_go.unsqueeze(-1)
+        predicted = network(batch.states, batch.actions, returns, batch.timesteps)
+        steps = batch.mask.reshape(-1)
+        loss = nn.functional.mse_loss(
+            *(each.reshape(-1, SIZES["action"])[steps] for each in (predicted, batch.actions))
+        )
+        descend(loss, network, optimizer)
+
+    return step
+
+
+def descend(loss: Tensor, module: nn.Module, optimizer: torch.optim.Optimizer) -> None:
     optimizer.zero_grad()
-    value.backward()  # type: ignore[no-untyped-call]
+    loss.backward()  # type: ignore[no-untyped-call]
+    nn.utils.clip_grad_norm_(module.parameters(), 0.25)
     optimizer.step()
+
+
+def seconds(step: Step) -> float:
+    """CPU seconds of a step."""
+    began = time.thread_time()
+    step()
     return time.thread_time() - began
 
 
@@ -58,6 +112,10 @@ def main() -> None:
     parser.add_argument("--context", type=int, default=20, help="steps of a window (default: 20)")
     parser.add_argument("--batch", type=int, default=64, help="windows of a batch (default: 64)")
     parser.add_argument("--rounds", type=int, default=20, help="timed rounds (default: 20)")
+    parser.add_argument("--learner", action="append", choices=LEARNERS, help="repeatable (all)")
+    parser.add_argument(
+        "--reference", type=Path, metavar="CLONE", help="Decision ConvFormer's code"
+    )
     parser.add_argument(
         "--results", type=Path, default=RESULTS, help=f"file of result rows (default: {RESULTS})"
     )
@@ -65,23 +123,27 @@ def main() -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     batch = windows(options.batch, options.context)
-    learners = {}
-    for name in LEARNERS:
+    steps: dict[str, Step] = {}
+    for name in dict.fromkeys(("dt", "dc", *(options.learner or LEARNERS))):
         settings = [f"policy.dim={options.dim}", f"policy.context={options.context}"]
-        policy = policy_class(name)(resolve_config(name, None, settings).policy, SIZES)
-        learners[name] = policy, RowAdamW(policy.parameters(), fused=True)
-    seconds: dict[str, list[float]] = {name: [] for name in learners}
-    for turn in range(options.rounds + 2):
-        for name, (policy, optimizer) in learners.items():
-            taken = step_seconds(policy, optimizer, batch)
-            if turn >= 2:
-                seconds[name].append(taken)
+        config = resolve_config(name, None, settings).policy
+        steps[name] = step_of(policy_class(name)(config, SIZES), batch)
+    if options.reference is not None:
+        steps[REFERENCE] = reference_step(options.reference, options.dim, batch)
+    taken = np.array(
+        [[seconds(step) for step in steps.values()] for _ in range(options.rounds + 2)][2:]
+    )
+    times = dict(zip(steps, taken.T, strict=True))
+    peers = {f"ratio_to_{peer}": peer for peer in ("dc", REFERENCE) if peer in steps}
     sizes = {name: getattr(options, name) for name in ("dim", "context", "batch", "rounds")}
     lines = []
-    for name in learners:
-        low, middle, high = np.quantile(np.divide(seconds[name], seconds["dt"]), [0.1, 0.5, 0.9])
-        of_dc = float(np.median(np.divide(seconds[name], seconds["dc"])))
-        lines.append((name, f"{middle:.2f} [{low:.2f}, {high:.2f}]", f"{of_dc:.3f}"))
+    for name, own in times.items():
+        low, middle, high = np.quantile(own / times["dt"], [0.1, 0.5, 0.9])
+        of_peers = {key: float(np.median(own / times[peer])) for key, peer in peers.items()}
+        of_reference = f"{of_peers[f'ratio_to_{REFERENCE}']:.3f}" if REFERENCE in steps else "–"
+        dt_ratio = f"{middle:.2f} [{low:.2f}, {high:.2f}]"
+        lines.append((name, dt_ratio, f"{of_peers['ratio_to_dc']:.3f}", of_reference))
+        module = policy_class("dc" if name == REFERENCE else name).__module__
         row = ResultRow(
             suite="step-time",
             table="step-time",
@@ -89,14 +151,15 @@ def main() -> None:
             method=name,
             policy=name,
             conditions=sizes,
-            code_version=code_version(Path(__file__), policy_class(name).__module__),
+            code_version=code_version(Path(__file__), module),
             metric="ratio",
-            metrics={"ratio": middle, "ratio_10": low, "ratio_90": high, "ratio_to_dc": of_dc},
-            wall_time_s=sum(seconds[name]),
+            metrics={"ratio": middle, "ratio_10": low, "ratio_90": high, **of_peers},
+            wall_time_s=float(own.sum()),
             **provenance(),
         )
         append_rows(options.results, [row])
-    print(markdown_table(("policy", "time of a step / DT's, median [10%, 90%]", "/ DC's"), lines))
+    header = ("policy", "time of a step / DT's, median [10%, 90%]", "/ DC's", "/ the authors' DC's")
+    print(markdown_table(header, lines))
 
 
 if __name__ == "__main__":

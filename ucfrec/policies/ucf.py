@@ -227,17 +227,17 @@ class SupervisedAttention(nn.Module):
             dropout. Each row sums to one; padded tokens get zero probability, except from their own
             row.
         """
-        batch, length, dim = states.shape
-
-        def split(x: Tensor) -> Tensor:  # (B, L, d) -> (B, H, L, d/H)
-            return x.view(batch, -1, self.heads, dim // self.heads).transpose(1, 2)
-
-        query = split(self.query(self.norm(states)))
-        key, value = map(split, self.key_value(self.norm(tokens)).chunk(2, dim=-1))
-        scores = query @ key.transpose(-2, -1) / (dim // self.heads) ** 0.5  # (B, H, Q, 3K)
-        scores = scores.masked_fill(~visible.unsqueeze(1), -torch.inf)
-        attention = scores.softmax(-1)
-        mixed = (self.dropout(attention) @ value).transpose(1, 2).reshape(batch, length, dim)
+        width = states.shape[-1] // self.heads
+        # Heads are slices, which matrix products read where they lie; heads as a dimension of the
+        # tensors would be copied before and after every product.
+        queries = self.query(self.norm(states)).split(width, -1)
+        key_value = self.key_value(self.norm(tokens)).split(width, -1)
+        keys, values = key_value[: self.heads], key_value[self.heads :]
+        scores = torch.stack([q @ k.mT for q, k in zip(queries, keys, strict=True)], 1)
+        scores = (scores / width**0.5).masked_fill(~visible.unsqueeze(1), -torch.inf)
+        attention = scores.softmax(-1)  # (B, H, Q, 3K)
+        shares = self.dropout(attention).unbind(1)
+        mixed = torch.cat([each @ value for each, value in zip(shares, values, strict=True)], -1)
         return self.out(mixed), attention
 
 

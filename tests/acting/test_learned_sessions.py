@@ -7,10 +7,12 @@ import pytest
 import torch
 
 from tests.support.tagged import tagged_store
+from ucfrec.acting.fatigue import Fatigue
 from ucfrec.acting.learned_sessions import LearnedSessions, LoggedEnds, SessionEnd
 from ucfrec.counterfactual.item_reward_fit import reward_model_sizes
 from ucfrec.counterfactual.item_reward_model import ItemRewardModel
 from ucfrec.episodes.exposure import Likeness, Shown
+from ucfrec.episodes.main_tags import MainTags
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 
@@ -50,6 +52,23 @@ def test_rewards_are_drawn_with_the_models_calibrated_probabilities(store: Episo
         assert set(np.unique(rewards)) <= {0.0, 1.0}
         assert not terminated.any()
         assert not truncated.any()
+
+
+def test_users_who_liked_one_main_tag_on_end_reward_less_for_a_while(store: EpisodeStore) -> None:
+    effects = torch.full((len(store.item_states.embeddings),), 40.0)
+    given = store, model_of(store, effects), (1.0, 0.0), never(store)
+    tired, one = LearnedSessions(*given, 3000, 50, 1, Fatigue(3, 2, 0.25)), np.zeros(3000)
+    tags = MainTags.of(store.item_states).tags
+    other = one + int((tags != tags[0]).nonzero()[0])
+    tired.reset(seed=3)
+    shares = [float(tired.step(item)[1].mean()) for item in [one, one, one, one, other, one, one]]
+    assert shares[:3] == [1.0] * 3
+    assert shares[3:5] == pytest.approx([0.25] * 2, abs=0.05)
+    # A fourth like tires for two steps, too; then the run is broken.
+    assert shares[5:] == pytest.approx([1 - 0.25 * 0.75, 1.0], abs=0.03)
+    untired = LearnedSessions(*given, 3000, 50)
+    untired.reset(seed=3)
+    assert all(untired.step(one)[1].all() for _ in range(6))
 
 
 def test_sessions_end_at_the_longest_length_and_begin_anew(store: EpisodeStore) -> None:

@@ -9,8 +9,10 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
+from ucfrec.acting.fatigue import Fatigue
 from ucfrec.acting.rollout import USER_IDS, BoolArray, FloatArray, IntArray
 from ucfrec.episodes.exposure import Likeness, Shown
+from ucfrec.episodes.main_tags import MainTags
 from ucfrec.episodes.states import ItemStates, SessionStates
 from ucfrec.episodes.store import EpisodeStore
 
@@ -121,6 +123,7 @@ class LearnedSessions:
         sessions: int,
         longest: int,
         copies: int = 1,
+        fatigue: Fatigue | None = None,
     ) -> None:
         """
         Args:
@@ -132,6 +135,7 @@ class LearnedSessions:
             longest: steps after which a session ends in any case.
             copies: how often each session is played; N is `copies` times `sessions`. Environment i
                 draws the same numbers as environment i modulo `sessions`.
+            fatigue: of the users, where rewards have two values.
         """
         from gymnasium.vector import AutoresetMode
 
@@ -148,6 +152,7 @@ class LearnedSessions:
         found = [np.unique(store.step_values(schema.REWARD, *s)) for s in store.step_batches()]
         rewards = np.unique(np.concatenate(found))
         self._outcomes = rewards if len(rewards) == 2 else None
+        self._fatigue, self._tags = fatigue, MainTags.of(self._states)
 
     def reset(self, seed: int) -> tuple[FloatArray, dict[str, Any]]:
         """Begin N sessions; all draws come from `seed`."""
@@ -185,6 +190,9 @@ class LearnedSessions:
         if self._outcomes is not None:
             low, high = self._outcomes
             chance = (rewards - low) / (high - low)
+            if self._fatigue is not None:
+                tired = self._fatigue.tired(self._tags.runs(self._shown)).numpy()
+                chance = np.where(tired, self._fatigue.factor * chance, chance)
             rewards = np.where(self._draws() < chance, high, low)
         ends = self._end.probabilities(self._shown, items, rewards, self._steps)
         self._sessions.record(items, torch.from_numpy(rewards))

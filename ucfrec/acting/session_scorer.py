@@ -60,7 +60,8 @@ class SessionScorer:
                 scores[left_out] = -torch.inf
             if excluded is not None:
                 scores = scores.masked_fill_(excluded, -torch.inf)
-            return self._decider.without_recent_tags(scores, sessions.shown)
+            scores = self._decider.without_recent_tags(scores, sessions.shown)
+            return self._decider.without_tired_tags(scores, sessions.shown)
 
     def _scores(self, sessions: Sessions) -> Tensor:
         decider = self._decider

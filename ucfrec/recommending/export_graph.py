@@ -66,6 +66,9 @@ class RuleGraph(nn.Module):
         self.policy = _with_head(policy, self.head)
         self.reward = None if not rule.tilt else _Reward(decider.reward_model)
         self.tags = _Likeness(decider.likeness) if rule.tag_window else None
+        self.main_tags = decider.main_tags
+        if self.main_tags is not None:
+            self.register_buffer("main_tag", self.main_tags.tags)
         self._decider = replace(decider, policy=self.policy)
         self._rule = decider.rule
         reach = self.context - 1 + states.window
@@ -105,15 +108,24 @@ class RuleGraph(nn.Module):
         scores = _put(scores, excluded, torch.full_like(excluded, -torch.inf, dtype=scores.dtype))
         if self.tags is not None:
             scores = self._without_recent_tags(scores, shown)
+        if self.main_tags is not None:
+            main = self.get_buffer("main_tag")
+            tired = replace(self.main_tags, tags=main).tired(shown, self._rule.tag_run).unsqueeze(1)
+            scores = _left(scores, (main == tired) & (tired >= 0))
         return scores, *_best(scores, self.k)
 
     def _without_recent_tags(self, scores: Tensor, shown: Shown) -> Tensor:
         assert self.tags is not None
         recent = shown.items[:, : self._rule.tag_window]
         alike = self.tags.to_all(recent, torch.ones_like(recent, dtype=scores.dtype))
-        left = scores.masked_fill(alike > 0, -torch.inf)
-        none = left.amax(1, keepdim=True) == -torch.inf
-        return torch.where(none, scores, left)
+        return _left(scores, alike > 0)
+
+
+def _left(scores: Tensor, without: Tensor) -> Tensor:
+    """Scores (B, n_items) with −∞ where `without`, but in rows where nothing would remain."""
+    left = scores.masked_fill(without, -torch.inf)
+    none = left.amax(1, keepdim=True) == -torch.inf
+    return torch.where(none, scores, left)
 
 
 def _with_head(policy: SequencePolicy, head: "_Head") -> SequencePolicy:

@@ -20,6 +20,7 @@ from ucfrec.checksums import sealed_record
 from ucfrec.counterfactual.item_reward_model import FITTED, ItemRewardModel
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.item_counts import TrainingCounts
+from ucfrec.episodes.main_tags import MainTags
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
@@ -204,7 +205,10 @@ class TrainedPolicy:
         """The policy under `rule`, by default the run's own."""
         rule = rule or self.rule
         likeness = self.likeness if rule.tag_window else None
-        return Decider(self.policy, rule, self.returns, self.reward_model, likeness)
+        tags = None
+        if rule.tag_run and self.item_states is not None:
+            tags = MainTags.of(self.item_states)
+        return Decider(self.policy, rule, self.returns, self.reward_model, likeness, tags)
 
     def scorer(self, rule: DecisionRule | None = None) -> SessionScorer:
         """Scores items for sessions under `rule`, by default the run's own.

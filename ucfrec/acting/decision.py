@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ucfrec.acting.best_items import best_items
 from ucfrec.episodes.exposure import Likeness, Shown
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.windows import Windows
@@ -189,7 +190,7 @@ class DecisionRule:
             by_score = scores.argsort(dim=-1, descending=True)
             places = drawn.gather(1, by_score).argsort(dim=-1, descending=True, stable=True)
             return by_score.gather(1, places)[:, :k]
-        return scores.topk(k, dim=-1).indices
+        return best_items(scores, k)
 
 
 @dataclass(frozen=True)
@@ -295,20 +296,11 @@ class Decider:
         shown: Shown | None = None,
     ) -> Tensor:
         """`scores` from the policy's outputs (B, n_items)."""
-        scores = logits
-        if self.rule.tilt:
-            scores = self.rewards(windows, users, shown).mul_(self.rule.tilt).add_(scores)
-        undefined = ~(scores.amax(1) < torch.inf)
-        if undefined.any():
-            raise InputError(
-                f"in {int(undefined.sum())} of {len(scores)} decisions scores are no numbers, as "
-                "weights of the policy or the reward model are NaN or infinite; train again, with "
-                "a lower train.learning_rate if the training diverged"
-            )
+        scores = self.tilted(logits, windows, users, shown)
+        self.require_numbers(scores)
         if forbidden is not None:
             scores = scores.masked_fill(forbidden, -torch.inf)
-        if self.rule.tag_window:
-            scores = self._without_recent_tags(scores, windows)
+        scores = self.without_recent_tags(scores, Shown.before_last(windows))
         none = torch.isneginf(scores.amax(1))
         if none.any():
             raise InputError(
@@ -316,6 +308,30 @@ class Decider:
                 "candidates, or keep seen items"
             )
         return scores
+
+    @torch.no_grad()
+    def tilted(
+        self, logits: Tensor, windows: Windows, users: Tensor | None, shown: Shown | None
+    ) -> Tensor:
+        """The policy's outputs (B, n_items) plus β f̂_r; the arguments are those of `scores`."""
+        if not self.rule.tilt:
+            return logits
+        return self.rewards(windows, users, shown).mul_(self.rule.tilt).add_(logits)
+
+    @staticmethod
+    def require_numbers(scores: Tensor) -> None:
+        """Check scores (B, n_items).
+
+        Raises:
+            InputError: those of some row are NaN, or infinitely high.
+        """
+        undefined = ~(scores.amax(1) < torch.inf)
+        if undefined.any():
+            raise InputError(
+                f"in {int(undefined.sum())} of {len(scores)} decisions scores are no numbers, as "
+                "weights of the policy or the reward model are NaN or infinite; train again, with "
+                "a lower train.learning_rate if the training diverged"
+            )
 
     @torch.no_grad()
     def rewards(
@@ -327,10 +343,14 @@ class Decider:
         scores: Tensor = self.reward_model.scores(windows.states[:, -1], shown, users)
         return scores
 
-    def _without_recent_tags(self, scores: Tensor, windows: Windows) -> Tensor:
+    def without_recent_tags(self, scores: Tensor, shown: Shown) -> Tensor:
+        """Scores (B, n_items), −∞ for items that share a tag with one of the last that sessions
+        have shown, if the rule says so and other items remain."""
+        if not self.rule.tag_window:
+            return scores
         assert self.likeness is not None
-        shown = Shown.before_last(windows).items[:, : self.rule.tag_window]
-        alike = self.likeness.to_all(self.likeness.profile(shown, torch.ones(shown.shape)))
+        recent = shown.items[:, : self.rule.tag_window]
+        alike = self.likeness.to_all(self.likeness.profile(recent, torch.ones(recent.shape)))
         left = scores.masked_fill(alike > 0, -torch.inf)
         none = torch.isneginf(left.amax(1))
         left[none] = scores[none]

@@ -22,7 +22,6 @@ from ucfrec.counterfactual.augment import (
     AugmentConfig,
     accept,
     augment,
-    counterfactual_copies,
 )
 from ucfrec.counterfactual.edit_statistics import MoveStatistics
 from ucfrec.counterfactual.generators import CSGConfig, Generator, make_generator

@@ -85,6 +85,24 @@ GOALS = (
         *("catalogue_step_time", "ratio", "items", 1.3),
         {"method": "ucf, softmax of sampled"},
     ),
+    Goal("one user, 99%, CPU ms", "acting_time", "p99_ms", "items", 2, {"task": "one user"}),
+    Goal(
+        "one user of a large catalogue, 99%, CPU ms",
+        *("acting_time", "p99_ms", "items", 20),
+        {"task": "one user, large catalogue"},
+    ),
+    Goal(
+        "all users, CPU ms each",
+        *("acting_time", "median_ms", "items", 0.4),
+        {"task": "all users"},
+    ),
+    Goal(
+        "VirtualTaobao / the authors', times faster",
+        *("acting_time", "ratio", "items", 150),
+        {"task": "VirtualTaobao"},
+        more=True,
+        inverse=True,
+    ),
     Goal(
         "two processes / one, windows a second, by batch",
         *("processes_time", "ratio", "batch", 1.6),
@@ -97,6 +115,7 @@ GOALS = (
 def measure(options: argparse.Namespace) -> None:
     """Run what has no rows yet."""
     store, run = data(options.out)
+    taobao = ["--original", str(options.taobao)] if options.taobao else []
     reference = ["--reference", str(options.reference)] if options.reference else []
     commands = {
         "step_time": [
@@ -107,7 +126,7 @@ def measure(options: argparse.Namespace) -> None:
         "catalogue_step_time": [["catalogue_step_time.py"]],
         "augmentation_time": [["augmentation_time.py"]],
         "processes_time": [["processes_time.py", str(store)]],
-        "acting_time": [["acting_time.py", str(run), str(store)]],
+        "acting_time": [["acting_time.py", str(run), str(store), "--items", "1000000", *taobao]],
         "prepare_time": [["prepare_time.py", "--folder", str(options.out)]],
     }
     if options.previous:
@@ -194,6 +213,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/bench"), help="(runs/bench)")
     parser.add_argument("--reference", type=Path, metavar="CLONE", help="Decision ConvFormer")
     parser.add_argument("--previous", type=Path, metavar="CLONE", help="an earlier ucfrec")
+    parser.add_argument("--taobao", type=Path, metavar="CLONE", help="the authors' VirtualTaobao")
     parser.add_argument("--show-only", action="store_true", help="measure nothing")
     options = parser.parse_args()
     if not options.show_only:

@@ -2,7 +2,12 @@
 
     python benchmarks/prepare_time.py --rows 200000 1000000 5000000 --rounds 5
 
-Makes random logs in a scratch folder, which is removed at the end. Every measurement is a process
+Makes random logs in a scratch folder, which is removed at the end; what makes them and what reads
+them keep a batch of rows in memory, so 100 million rows (14 GB of disk) are no trouble either:
+
+    python benchmarks/prepare_time.py --rows 1000000 100000000 --methods prepare --rounds 1
+
+Every measurement is a process
 of its own, so that its start counts and its memory is its own; the methods take turns. pandas reads
 the log into memory and does what `prepare` does, the item vectors with scikit-learn's randomised
 SVD; DuckDB sorts, sessionises and writes one Parquet file, and no more. Appends the rows to
@@ -28,16 +33,19 @@ VISITS = 7
 ROWS_PER_USER = 50
 MOST_ITEMS = 20_000
 BATCH = 2**20
+FILE_ROWS = 10 * BATCH
+"""Most rows of a Parquet file."""
 
 
-def make_log(path: Path, rows: int, seed: int) -> None:
+def make_log(folder: Path, rows: int, seed: int) -> None:
     """Write a log in no order: popular items, visits of users, one row in a hundred twice."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    folder.mkdir()
     generator = np.random.default_rng(seed)
     users, items = max(rows // ROWS_PER_USER, 10), max(100, min(MOST_ITEMS, rows // ROWS_PER_USER))
-    writer = None
+    writer: pq.ParquetWriter | None = None
     for begin in range(0, rows, BATCH):
         n = min(BATCH, rows - begin)
         user = generator.integers(users, size=n)
@@ -59,7 +67,11 @@ def make_log(path: Path, rows: int, seed: int) -> None:
                 "propensity": propensity,
             }
         )
-        writer = writer or pq.ParquetWriter(path, table.schema)
+        if begin % FILE_ROWS == 0:
+            if writer is not None:
+                writer.close()
+            path = folder / f"log-{begin // FILE_ROWS:03d}.parquet"
+            writer = pq.ParquetWriter(path, table.schema)
         writer.write_table(table)
     assert writer is not None
     writer.close()
@@ -86,7 +98,7 @@ def run_duckdb(log: Path, out: Path, memory_limit: str) -> None:
                 sum(first::INT) OVER w AS session
             FROM (
                 SELECT *, coalesce(timestamp - lag(timestamp) OVER w > {GAP_MS}, true) AS first
-                FROM read_parquet('{log}') {window}
+                FROM read_parquet('{log}/*.parquet') {window}
             ) {window}
             ORDER BY user_id, timestamp, item_id
         ) TO '{out / "log.parquet"}'
@@ -163,7 +175,7 @@ def compare(options: argparse.Namespace, rows: int, folder: Path) -> list[tuple[
     from ucfrec.reporting.result_row import ResultRow
     from ucfrec.reporting.rows_file import append_rows
 
-    log, out = folder / "log.parquet", folder / "out"
+    log, out = folder / "log", folder / "out"
     make_log(log, rows, options.seed)
     taken: dict[str, list[tuple[float, float, float]]] = {name: [] for name in options.methods}
     for _ in range(options.rounds):

@@ -15,6 +15,7 @@ from torch import Tensor
 from tests.policies.test_ucf import CATALOG, ITEMS, VECTORS, B, K, build, other, random_windows
 from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.episodes.exposure import Likeness, Shown
+from ucfrec.episodes.main_tags import MainTags
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Windows
@@ -31,6 +32,7 @@ rules = st.builds(
     top_k=st.one_of(st.none(), st.integers(1, 99)),
     exclude_seen=st.booleans(),
     tag_window=st.integers(0, 9),
+    tag_run=st.integers(0, 10),
 )
 
 
@@ -57,9 +59,10 @@ def test_the_hash_is_that_of_the_values_alone() -> None:
         DecisionRule(5.0, top_k=1),
         DecisionRule(5.0, exclude_seen=True),
         DecisionRule(5.0, tag_window=1),
+        DecisionRule(5.0, tag_run=1),
     ]
-    assert len({rule.hash for rule in [DecisionRule(5.0), *others]}) == 8
-    assert len({str(rule) for rule in others}) == 7
+    assert len({rule.hash for rule in [DecisionRule(5.0), *others]}) == 9
+    assert len({str(rule) for rule in others}) == 8
 
 
 HOSTILE: dict[str, Any] = {
@@ -258,7 +261,9 @@ def decider_of(name: str = "dt", **parts: Any) -> Decider:
     states = replace(ItemStates(torch.eye(ITEMS), torch.zeros(0, 0), 0.0, 1.0), tags=TAGS)
     rule = DecisionRule(3.0, **parts)
     model: Any = KnownRewards()
-    return Decider(build(name, CATALOG), rule, ReturnToGo(), model, Likeness.of(states))
+    return Decider(
+        build(name, CATALOG), rule, ReturnToGo(), model, Likeness.of(states), MainTags.of(states)
+    )
 
 
 def shown_in(windows: Windows, row: int, last: int) -> list[int]:
@@ -311,6 +316,27 @@ def test_the_tag_window_gives_way_where_nothing_would_be_left() -> None:
     assert first[0].nonzero()[:, 0].tolist() == [0, 1, 2, 3, 6, 7, 8, 9, 10]
 
 
+@pytest.mark.parametrize("run", [1, 2, 3])
+def test_items_of_a_main_tag_that_was_liked_on_end_are_left_out(run: int) -> None:
+    windows, collected = random_windows(CATALOG), torch.zeros(B).double()
+    items, tag = torch.arange(ITEMS), TAGS[:, 0]
+    same, other_tag = items[tag == tag[4]], int(items[tag != tag[4]][0])
+    shown = Shown(same[torch.zeros(B, 10, dtype=torch.int64)], torch.ones(B, 10))
+    shown.rewards[1, run - 1] = 0.0
+    shown.items[2, run - 1] = other_tag
+    found = torch.isfinite(decider_of(tag_run=run).scores(windows, collected, shown=shown))
+    assert found[0].tolist() == (tag != tag[4]).tolist()
+    assert found[1].all(), "one of them was not liked"
+    if run > 1:
+        assert found[2].all(), "one of them had another tag"
+    # Of what went before it does not matter, nor where nothing else is allowed.
+    shown.items[0, run:], shown.rewards[0, run:] = -1, 0.0
+    again = torch.isfinite(decider_of(tag_run=run).scores(windows, collected, shown=shown))
+    assert torch.equal(again, found)
+    given = decider_of(tag_run=run).scores(windows, collected, tag != tag[4], shown=shown)
+    assert torch.isfinite(given[0]).tolist() == (tag == tag[4]).tolist()
+
+
 def test_everything_left_out_is_an_error() -> None:
     windows, collected = random_windows(CATALOG), torch.zeros(B).double()
     forbidden = torch.zeros(B, ITEMS, dtype=torch.bool)
@@ -328,7 +354,7 @@ def test_the_steps_own_action_and_reward_are_not_read(name: str) -> None:
     actions[:, -1], rewards[:, -1] = other(actions[:, -1]), math.nan
     logged = torch.rand(windows.mask.shape)
     changed = replace(windows, actions=actions, rewards=rewards, returns_to_go=logged)
-    decider = decider_of(name, tilt=1.0, tag_window=2)
+    decider = decider_of(name, tilt=1.0, tag_window=2, tag_run=1)
     before, after = (decider.scores(each, collected) for each in (windows, changed))
     assert torch.equal(before, after)
     earlier = windows.actions.clone()
@@ -355,6 +381,11 @@ def test_a_rule_needs_what_it_uses() -> None:
     for likeness in (None, Likeness.of(states)):
         with pytest.raises(InputError, match="the store has none"):
             Decider(policy, DecisionRule(1.0, tag_window=2), likeness=likeness)
+    for tags in (None, MainTags.of(states)):
+        with pytest.raises(InputError, match="by their main tag, but the store has none"):
+            Decider(policy, DecisionRule(1.0, tag_run=2), main_tags=tags)
+    with pytest.raises(InputError, match="tag_run 11; give a whole number from 0 to 10"):
+        DecisionRule(1.0, tag_run=11)
     tagged = Likeness.of(replace(states, tags=TAGS))
     with pytest.raises(InputError, match=f"policy remembers {K - 1} "):
         Decider(policy, DecisionRule(1.0, tag_window=K), likeness=tagged)

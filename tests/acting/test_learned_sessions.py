@@ -7,10 +7,12 @@ import pytest
 import torch
 
 from tests.support.tagged import tagged_store
+from ucfrec.acting.fatigue import Fatigue
 from ucfrec.acting.learned_sessions import LearnedSessions, LoggedEnds, SessionEnd
 from ucfrec.counterfactual.item_reward_fit import reward_model_sizes
 from ucfrec.counterfactual.item_reward_model import ItemRewardModel
 from ucfrec.episodes.exposure import Likeness, Shown
+from ucfrec.episodes.main_tags import MainTags
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 
@@ -50,6 +52,23 @@ def test_rewards_are_drawn_with_the_models_calibrated_probabilities(store: Episo
         assert set(np.unique(rewards)) <= {0.0, 1.0}
         assert not terminated.any()
         assert not truncated.any()
+
+
+def test_users_who_liked_one_main_tag_on_end_reward_less_for_a_while(store: EpisodeStore) -> None:
+    effects = torch.full((len(store.item_states.embeddings),), 40.0)
+    given = store, model_of(store, effects), (1.0, 0.0), never(store)
+    tired, one = LearnedSessions(*given, 3000, 50, 1, Fatigue(3, 2, 0.25)), np.zeros(3000)
+    tags = MainTags.of(store.item_states).tags
+    other = one + int((tags != tags[0]).nonzero()[0])
+    tired.reset(seed=3)
+    shares = [float(tired.step(item)[1].mean()) for item in [one, one, one, one, other, one, one]]
+    assert shares[:3] == [1.0] * 3
+    assert shares[3:5] == pytest.approx([0.25] * 2, abs=0.05)
+    # A fourth like tires for two steps, too; then the run is broken.
+    assert shares[5:] == pytest.approx([1 - 0.25 * 0.75, 1.0], abs=0.03)
+    untired = LearnedSessions(*given, 3000, 50)
+    untired.reset(seed=3)
+    assert all(untired.step(one)[1].all() for _ in range(6))
 
 
 def test_sessions_end_at_the_longest_length_and_begin_anew(store: EpisodeStore) -> None:
@@ -119,3 +138,24 @@ def test_the_last_step_of_a_users_last_session_tells_nothing(tmp_path: Path) -> 
     # Left out: step 4 (user 0's last session), 6 (cut, not terminated) and 8 (user 1's last).
     assert logged.rewards.tolist() == [0, 1, 2, 3, 5, 7]
     assert logged.ended.tolist() == [False, True, False, False, False, False]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_drawn_ends_are_a_sample_of_all(seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    lengths = generator.integers(1, 4, 60)
+    n = int(lengths.sum())
+    columns = {"item": np.zeros(n, dtype=np.int64), "reward": np.arange(n, dtype=np.float32)}
+    states = ItemStates(torch.eye(2), torch.zeros(2, 0), 0.0, 1.0)
+    episodes = {
+        "user": np.sort(generator.integers(9, size=60)),
+        "terminated": generator.random(60) < 0.5,
+    }
+    store = EpisodeStore.from_arrays(columns, lengths, episodes, states)
+    known = LoggedEnds.of(store, 2, n, seed)
+    drawn = LoggedEnds.of(store, 2, 20, seed)
+    chosen = np.sort(np.random.default_rng(seed).choice(len(known.rewards), 20, replace=False))
+    for name in ("rewards", "steps", "ended"):
+        np.testing.assert_array_equal(getattr(drawn, name), getattr(known, name)[chosen])
+    episode = np.searchsorted(np.cumsum(lengths), known.rewards, side="right")
+    np.testing.assert_array_equal(known.ended, known.steps == lengths[episode] - 1)

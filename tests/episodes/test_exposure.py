@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from ucfrec.episodes import exposure
-from ucfrec.episodes.exposure import Exposed, ExposureTerm, Likeness
+from ucfrec.episodes.exposure import Exposed, ExposureTerm, Likeness, quantiles
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Windows
 
@@ -318,3 +319,12 @@ def test_a_term_read_back_is_the_one_saved() -> None:
     to_all(other, shown)  # a matrix of tags has been made before the weights are read
     other.load_state_dict(made.state_dict())
     torch.testing.assert_close(to_all(other, shown), expected)
+
+
+@given(
+    values=st.lists(st.floats(-(2.0**90), 2.0**90, width=32), min_size=1, max_size=60),
+    levels=st.lists(st.floats(0, 1), min_size=1, max_size=8),
+)
+def test_quantiles_are_numpys_to_the_last_bit(values: list[float], levels: list[float]) -> None:
+    found = quantiles(np.array(values, dtype=np.float32), np.array(levels))
+    np.testing.assert_array_equal(found, np.quantile(np.array(values), levels))

@@ -29,6 +29,7 @@ from tests.support.episodes import (
 )
 from ucfrec import schema
 from ucfrec.episodes import store as store_module
+from ucfrec.episodes import view as view_module
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay, Transitions, Windows
 from ucfrec.episodes.writer import StoreWriter
@@ -881,6 +882,22 @@ def test_the_same_episodes_make_the_same_bytes(folder: Path) -> None:
     for name in ("a", "b"):
         write_store(folder / name, random_episodes(LENGTHS), shard_steps=6)
     assert contents(folder / "a") == contents(folder / "b")
+
+
+def test_steps_in_batches_are_all_steps(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(view_module, "_BATCH_STEPS", 7)
+    store = write_store(folder / "store", random_episodes(LENGTHS), some_states())
+    for view in (store, store.select(np.array([2, 0, 2]))):
+        episodes, steps = zip(*view.step_batches(), strict=True)
+        assert len(episodes) == -(-view.n_steps // 7)
+        listed = view.all_steps()
+        np.testing.assert_array_equal(np.concatenate(episodes), listed[0])
+        np.testing.assert_array_equal(np.concatenate(steps), listed[1])
+        rewards, items = (view.step_values(n, *listed) for n in (schema.REWARD, schema.ITEM))
+        np.testing.assert_array_equal(view.column(schema.REWARD), rewards)
+        counts = np.bincount(items, minlength=len(view.item_states.embeddings))
+        np.testing.assert_array_equal(view.item_counts(), counts)
+    assert store.select(np.array([], dtype=np.int64)).column(schema.REWARD).shape == (0,)
 
 
 def test_views_share_mapped_columns_with_their_store(folder: Path) -> None:

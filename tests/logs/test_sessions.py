@@ -10,7 +10,7 @@ from ucfrec.logs.binding import open_tables
 from ucfrec.logs.engine import engine
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.sessions import Cut, by_sessions, episodes
-from ucfrec.logs.sorted_rows import sort_rows
+from ucfrec.logs.sorted_rows import check_sorted, sorted_batches
 from ucfrec.logs.typed import typed_log
 
 START = 1_700_000_000_000
@@ -38,7 +38,7 @@ def test_blocks_of_any_size_give_the_same_episodes(
     with engine([path], tmp_path) as connection:
         tables = tuple(open_tables(connection, [path]))
         log = typed_log(connection, tables, LogMapping(), "reward", session_by, tmp_path)
-        rows = sort_rows(log, None, "highest", tmp_path)
+        rows = check_sorted(log, sorted_batches(log, None), "highest", tmp_path)
         for block in (1, 2, 7, 1000):
             spool = rows.clean
             if session_by == "session_id":

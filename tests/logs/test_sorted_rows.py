@@ -6,12 +6,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ucfrec.logs import sorted_rows
 from ucfrec.logs.binding import open_tables
 from ucfrec.logs.clean import DUPLICATES, drop_counts, read_log
 from ucfrec.logs.engine import engine
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.sorted_rows import sort_rows
+from ucfrec.logs.sorted_rows import check_sorted, sorted_batches
 from ucfrec.logs.typed import typed_log
 
 START = 1_700_000_000_000
@@ -50,7 +49,7 @@ def make_log(seed: int, text: bool) -> pd.DataFrame:
 def test_both_ways_keep_the_same_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, duplicates: str, text: bool, session_by: str
 ) -> None:
-    monkeypatch.setattr(sorted_rows, "BATCH_ROWS", 64)
+    monkeypatch.setattr("ucfrec.logs.engine.BATCH_ROWS", 64)
     path = tmp_path / "log.parquet"
     make_log(len(duplicates), text).to_parquet(path)
     with engine([path], tmp_path) as connection:
@@ -66,7 +65,7 @@ def test_both_ways_keep_the_same_rows(
     with engine([path], tmp_path) as connection:
         tables = tuple(open_tables(connection, [path]))
         log = typed_log(connection, tables, LogMapping(), "reward", session_by, tmp_path)
-        rows = sort_rows(log, None, duplicates, tmp_path)
+        rows = check_sorted(log, sorted_batches(log, None), duplicates, tmp_path)
         found = {name: rows.clean.read(name, 0, len(rows.clean)) for name in rows.clean.names}
     assert rows.dropped == dropped
     assert rows.read == 400

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ucfrec.logs.spool import Spool
+from ucfrec.logs.spool import BLOCK, Spool
 
 
 def test_slices_of_rows_come_back(tmp_path: Path) -> None:
@@ -20,3 +20,11 @@ def test_slices_of_rows_come_back(tmp_path: Path) -> None:
     spool.append({"v": vectors[:1], "n": np.array([10])})
     np.testing.assert_array_equal(spool.read("n", 8, 11), [8, 9, 10])
     spool.close()
+
+
+def test_fewer_long_rows_are_in_memory(tmp_path: Path) -> None:
+    short, long = Spool(tmp_path / "short"), Spool(tmp_path / "long")
+    short.append({"user": np.zeros(3, dtype=np.int64)})
+    long.append({"user": np.zeros(3, dtype=np.int64), "seen": np.zeros((3, 4096), dtype="f4")})
+    assert short.block_rows == BLOCK
+    assert 0 < long.block_rows * (8 + 4 * 4096) <= 2**26

@@ -67,7 +67,11 @@ def ranked(folder: Path, trained: TrainedPolicy, log: pd.DataFrame) -> pd.DataFr
 
 
 @pytest.mark.parametrize(
-    "rule", [pytest.param(DecisionRule(3.0), marks=pytest.mark.slow, id="plain"), FULL]
+    "rule",
+    [
+        pytest.param(DecisionRule(3.0, tag_run=1), marks=pytest.mark.slow, id="run"),
+        FULL,
+    ],
 )
 def test_the_graph_recommends_what_the_policy_does(
     trained: TrainedPolicy, tmp_path: Path, rule: DecisionRule

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
@@ -19,6 +20,8 @@ from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files import read_json
+from ucfrec.logs.mapping import FeatureTable, LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.policies.heads import ItemHead
 from ucfrec.runs.choose_by_ranking import choose_by_ranking
 from ucfrec.runs.choose_rule import RuleSearch, calibrate, choose_rule
@@ -161,6 +164,50 @@ def test_every_kind_of_candidate_is_played(folder: Path, trained: TrainedPolicy)
     assert {rule.tilt for rule in rules} == set(FEW.tilts)
     assert {rule.tag_window for rule in rules} == {0, 3}  # the policy does not remember 10 steps
     assert {rule.floor is None for rule in rules} == {True, False}
+
+
+def test_users_who_tire_are_shown_no_longer_runs(tmp_path: Path, trained: TrainedPolicy) -> None:
+    store = tiring_store(tmp_path)
+    train, validation = training_views(store)
+    model, _ = fit_item_reward_model(train, validation, tmp_path / "model", 0)
+    one_tag = torch.where(torch.arange(24) % 4 == 0, 9.0, 0.0)
+    decider = replace(with_bias(trained, one_tag), reward_model=model)
+    config = replace(FEW, tag_windows=(0,), temperatures=(1.0,), tilts=(0.0,))
+    found = choose_rule(decider, {0.9: 2.0, 1.0: 3.0}, train, validation, config, 0)
+    assert found.fatigue is not None
+    assert (found.fatigue.length, found.fatigue.steps) == (3, 4)
+    assert found.rule.tag_run == 2
+    runs = {candidate.rule.tag_run for candidate in found.candidates}
+    assert runs == set(FEW.tag_runs)
+    assert found.as_dict()["fatigue"]["length"] == 3
+
+
+def tiring_store(folder: Path) -> EpisodeStore:
+    """Sessions of users who like nothing for 4 steps after 3 likes of one tag on end."""
+    rng, rows = np.random.default_rng(0), list[tuple[int, int, int, float]]()
+    for user in range(160):
+        tags, tired = list[int](), 0
+        for step in range(40):
+            item = int(rng.integers(24)) if rng.random() < 0.4 or not rows else rows[-1][1]
+            liked = rng.random() < (0.02 if tired else 0.9)
+            tags, tired = [*tags, item % 4 if liked else -1], max(0, tired - 1)
+            if tags[-3:] == [item % 4] * 3:
+                tired = 4
+            minute = 28_000_000 + 40 * user + step
+            rows.append((user, item, 60_000 * minute, float(liked)))
+    log = pd.DataFrame(rows, columns=["user_id", "item_id", "timestamp", "reward"])
+    log.to_parquet(folder / "log.parquet")
+    items = pd.DataFrame({"item_id": range(24), "tags": [[f"t{item % 4}"] for item in range(24)]})
+    items.to_parquet(folder / "items.parquet")
+    users = pd.DataFrame({"user_id": range(160), "age": np.arange(160.0)})
+    users.to_parquet(folder / "users.parquet")
+    mapping = LogMapping(
+        item_features=(FeatureTable((folder / "items.parquet",), "item_id"),),
+        user_features=(FeatureTable((folder / "users.parquet",), "user_id"),),
+    )
+    options = PrepareOptions(reward="reward", session_by="gap", gap_minutes=120, embedding_size=6)
+    prepare([folder / "log.parquet"], mapping, folder / "store", options)
+    return EpisodeStore.open(folder / "store")
 
 
 def test_tilts_below_the_first_that_overlaps_too_little_are_ranked_too(

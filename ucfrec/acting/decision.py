@@ -8,7 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ucfrec.acting.best_items import best_items
 from ucfrec.episodes.exposure import Likeness, Shown
+from ucfrec.episodes.item_table import WINDOW
+from ucfrec.episodes.main_tags import MainTags
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
@@ -26,11 +29,12 @@ _RANGES: Final = {
     "temperature": (0.0, 1e6),
     "top_k": (1, 10**9),
     "tag_window": (0, 10**4),
+    "tag_run": (0, WINDOW),
 }
 _COLDEST: Final = 1e-30
 """Temperature below which dividing by it would leave the range of float32."""
 _OPTIONAL: Final = ("target", "floor", "top_k")
-_WHOLE: Final = ("top_k", "tag_window")
+_WHOLE: Final = ("top_k", "tag_window", "tag_run")
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,9 @@ class DecisionRule:
     """Whether items that the session has shown are left out."""
     tag_window: int = 0
     """Items that share a tag with one of so many shown before are left out, unless none remain."""
+    tag_run: int = 0
+    """Items with the main tag of the so many shown before are left out, if all of these had it and
+    were liked, unless none remain; 0 for no such limit."""
 
     def __post_init__(self) -> None:
         for name, (low, high) in _RANGES.items():
@@ -116,13 +123,20 @@ class DecisionRule:
         parts += [f"the {self.top_k} best"] if self.top_k else []
         parts += ["unseen items"] if self.exclude_seen else []
         parts += [f"no tag of the last {self.tag_window}"] if self.tag_window else []
+        parts += (
+            [f"no main tag liked more than {self.tag_run} times on end"] if self.tag_run else []
+        )
         how = f"drawn at temperature {self.temperature:g}" if self.temperature else "argmax"
         return ", ".join([*parts, how])
 
     @property
     def hash(self) -> str:
         """12 hexadecimal digits that tell rules apart, for results."""
-        return config_hash(self.as_dict())
+        values = self.as_dict()
+        if not self.tag_run:
+            # Rows measured before there were tag runs keep their hash.
+            del values["tag_run"]
+        return config_hash(values)
 
     def asked(self, returns: ReturnToGo, collected: Tensor, best: Tensor | None) -> Tensor:
         """What is asked for at the next step, (B,) float64, in reward units.
@@ -189,7 +203,7 @@ class DecisionRule:
             by_score = scores.argsort(dim=-1, descending=True)
             places = drawn.gather(1, by_score).argsort(dim=-1, descending=True, stable=True)
             return by_score.gather(1, places)[:, :k]
-        return scores.topk(k, dim=-1).indices
+        return best_items(scores, k)
 
 
 @dataclass(frozen=True)
@@ -205,6 +219,8 @@ class Decider:
     """f̂_r; needed for a tilt."""
     likeness: Likeness | None = None
     """Tags of the items; needed for a tag window."""
+    main_tags: MainTags | None = None
+    """Main tags of the items; needed for a tag run."""
 
     def __post_init__(self) -> None:
         if self.rule.tilt and self.reward_model is None:
@@ -216,6 +232,11 @@ class Decider:
             raise InputError(
                 "the rule leaves out items by their tags, but the store has none; give the items a "
                 "column of lists, or set the tag window to 0"
+            )
+        if self.rule.tag_run and (self.main_tags is None or not (self.main_tags.tags >= 0).any()):
+            raise InputError(
+                "the rule leaves out items by their main tag, but the store has none; give the "
+                "items a column of lists, or set the tag run to 0"
             )
         before = self.policy.config.context - 1
         if self.rule.tag_window > before:
@@ -295,20 +316,12 @@ class Decider:
         shown: Shown | None = None,
     ) -> Tensor:
         """`scores` from the policy's outputs (B, n_items)."""
-        scores = logits
-        if self.rule.tilt:
-            scores = self.rewards(windows, users, shown).mul_(self.rule.tilt).add_(scores)
-        undefined = ~(scores.amax(1) < torch.inf)
-        if undefined.any():
-            raise InputError(
-                f"in {int(undefined.sum())} of {len(scores)} decisions scores are no numbers, as "
-                "weights of the policy or the reward model are NaN or infinite; train again, with "
-                "a lower train.learning_rate if the training diverged"
-            )
+        scores = self.tilted(logits, windows, users, shown)
+        self.require_numbers(scores)
         if forbidden is not None:
             scores = scores.masked_fill(forbidden, -torch.inf)
-        if self.rule.tag_window:
-            scores = self._without_recent_tags(scores, windows)
+        before = Shown.before_last(windows)
+        scores = self.without_tired_tags(self.without_recent_tags(scores, before), shown or before)
         none = torch.isneginf(scores.amax(1))
         if none.any():
             raise InputError(
@@ -316,6 +329,30 @@ class Decider:
                 "candidates, or keep seen items"
             )
         return scores
+
+    @torch.no_grad()
+    def tilted(
+        self, logits: Tensor, windows: Windows, users: Tensor | None, shown: Shown | None
+    ) -> Tensor:
+        """The policy's outputs (B, n_items) plus β f̂_r; the arguments are those of `scores`."""
+        if not self.rule.tilt:
+            return logits
+        return self.rewards(windows, users, shown).mul_(self.rule.tilt).add_(logits)
+
+    @staticmethod
+    def require_numbers(scores: Tensor) -> None:
+        """Check scores (B, n_items).
+
+        Raises:
+            InputError: those of some row are NaN, or infinitely high.
+        """
+        undefined = ~(scores.amax(1) < torch.inf)
+        if undefined.any():
+            raise InputError(
+                f"in {int(undefined.sum())} of {len(scores)} decisions scores are no numbers, as "
+                "weights of the policy or the reward model are NaN or infinite; train again, with "
+                "a lower train.learning_rate if the training diverged"
+            )
 
     @torch.no_grad()
     def rewards(
@@ -327,11 +364,29 @@ class Decider:
         scores: Tensor = self.reward_model.scores(windows.states[:, -1], shown, users)
         return scores
 
-    def _without_recent_tags(self, scores: Tensor, windows: Windows) -> Tensor:
+    def without_recent_tags(self, scores: Tensor, shown: Shown) -> Tensor:
+        """Scores (B, n_items), −∞ for items that share a tag with one of the last that sessions
+        have shown, if the rule says so and other items remain."""
+        if not self.rule.tag_window:
+            return scores
         assert self.likeness is not None
-        shown = Shown.before_last(windows).items[:, : self.rule.tag_window]
-        alike = self.likeness.to_all(self.likeness.profile(shown, torch.ones(shown.shape)))
-        left = scores.masked_fill(alike > 0, -torch.inf)
-        none = torch.isneginf(left.amax(1))
-        left[none] = scores[none]
-        return left
+        recent = shown.items[:, : self.rule.tag_window]
+        alike = self.likeness.to_all(self.likeness.profile(recent, torch.ones(recent.shape)))
+        return _left(scores, alike > 0)
+
+    def without_tired_tags(self, scores: Tensor, shown: Shown) -> Tensor:
+        """Scores (B, n_items), −∞ for items with the main tag of the last that sessions have shown,
+        if the rule says so, users liked enough of them on end, and other items remain."""
+        if not self.rule.tag_run:
+            return scores
+        assert self.main_tags is not None
+        tired = self.main_tags.tired(shown, self.rule.tag_run).unsqueeze(1)
+        return _left(scores, (self.main_tags.tags == tired) & (tired >= 0))
+
+
+def _left(scores: Tensor, without: Tensor) -> Tensor:
+    """Scores (B, n_items) with −∞ where `without`, but in rows where nothing would remain."""
+    left = scores.masked_fill(without, -torch.inf)
+    none = torch.isneginf(left.amax(1))
+    left[none] = scores[none]
+    return left

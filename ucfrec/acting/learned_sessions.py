@@ -9,8 +9,10 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
+from ucfrec.acting.fatigue import Fatigue
 from ucfrec.acting.rollout import USER_IDS, BoolArray, FloatArray, IntArray
 from ucfrec.episodes.exposure import Likeness, Shown
+from ucfrec.episodes.main_tags import MainTags
 from ucfrec.episodes.states import ItemStates, SessionStates
 from ucfrec.episodes.store import EpisodeStore
 
@@ -43,16 +45,20 @@ class LoggedEnds:
         The last step of a user's last session, and of a session that was cut, is left out: the
         log may simply have ended there.
         """
-        episodes, steps = store.all_steps()
-        ended = steps == store.lengths[episodes] - 1
         users = store.episode_values(schema.USER) if store.has_users else np.arange(len(store))
         last_session = np.zeros(len(store), dtype=bool)
         last_session[len(store) - 1 - np.unique(users[::-1], return_index=True)[1]] = True
         unknown = last_session | ~store.terminated
-        kept = np.flatnonzero(~(ended & unknown[episodes]))
-        if len(kept) > most:
-            kept = np.sort(np.random.default_rng(seed).choice(kept, most, replace=False))
-        episodes, steps, ended = episodes[kept], steps[kept], ended[kept]
+        # Of an episode whose end is unknown, all steps but the last are known.
+        ends = np.cumsum(store.lengths - unknown)
+        kept = int(ends[-1])
+        numbers = np.arange(kept)
+        if kept > most:
+            drawn = np.random.default_rng(seed).choice(kept, most, replace=False)
+            numbers = np.sort(drawn)
+        episodes = np.searchsorted(ends, numbers, side="right")
+        steps = numbers - (ends - (store.lengths - unknown))[episodes]
+        ended = steps == store.lengths[episodes] - 1
         window = store.windows(episodes, steps, lags + 1)
         rewards = window.rewards[:, -1].double().numpy()
         return cls(Shown.before_last(window), window.actions[:, -1], rewards, steps, ended)
@@ -117,6 +123,7 @@ class LearnedSessions:
         sessions: int,
         longest: int,
         copies: int = 1,
+        fatigue: Fatigue | None = None,
     ) -> None:
         """
         Args:
@@ -128,6 +135,7 @@ class LearnedSessions:
             longest: steps after which a session ends in any case.
             copies: how often each session is played; N is `copies` times `sessions`. Environment i
                 draws the same numbers as environment i modulo `sessions`.
+            fatigue: of the users, where rewards have two values.
         """
         from gymnasium.vector import AutoresetMode
 
@@ -141,8 +149,10 @@ class LearnedSessions:
         self._users = np.full(len(store), -1)
         if store.has_users:
             self._users = store.episode_values(schema.USER).astype(np.int64)
-        rewards = np.unique(store.step_values(schema.REWARD, *store.all_steps()))
+        found = [np.unique(store.step_values(schema.REWARD, *s)) for s in store.step_batches()]
+        rewards = np.unique(np.concatenate(found))
         self._outcomes = rewards if len(rewards) == 2 else None
+        self._fatigue, self._tags = fatigue, MainTags.of(self._states)
 
     def reset(self, seed: int) -> tuple[FloatArray, dict[str, Any]]:
         """Begin N sessions; all draws come from `seed`."""
@@ -180,6 +190,9 @@ class LearnedSessions:
         if self._outcomes is not None:
             low, high = self._outcomes
             chance = (rewards - low) / (high - low)
+            if self._fatigue is not None:
+                tired = self._fatigue.tired(self._tags.runs(self._shown)).numpy()
+                chance = np.where(tired, self._fatigue.factor * chance, chance)
             rewards = np.where(self._draws() < chance, high, low)
         ends = self._end.probabilities(self._shown, items, rewards, self._steps)
         self._sessions.record(items, torch.from_numpy(rewards))

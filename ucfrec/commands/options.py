@@ -143,6 +143,12 @@ def rule_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="leave out items that share a tag with one of the last N, unless none remain",
     )
+    rule.add_argument(
+        "--tag-run",
+        type=int,
+        metavar="N",
+        help="leave out items of one main tag once the last N had it and were liked",
+    )
 
 
 def item_options(parser: argparse.ArgumentParser) -> None:
@@ -227,6 +233,7 @@ def rule_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "Decisi
         "top_k": options.top_k,
         "exclude_seen": options.exclude_seen or None,
         "tag_window": options.tag_window,
+        "tag_run": options.tag_run,
     }
     given = {name: value for name, value in parts.items() if value is not None}
     if options.max_return:

@@ -55,6 +55,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "beside the store, to at most 90%% of the free disk (default: 2GB)",
     )
     parser.add_argument(
+        "--engine",
+        choices=["duckdb", "spark"],
+        help="what reads and sorts the rows: DuckDB on this machine, or Spark, for logs that "
+        "outgrow it; the store is the same (default: duckdb)",
+    )
+    parser.add_argument(
+        "--spark-master",
+        metavar="MASTER",
+        help="with --engine spark: its master, e.g. spark://HOST:7077; logs and STORE must lie "
+        "where every worker sees them (default: local[*], this machine)",
+    )
+    parser.add_argument(
         "--validate", action="store_true", help="check the logs without writing a store"
     )
 
@@ -69,6 +81,8 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, validate
     from ucfrec.logs.summary import format_report
 
+    if options.spark_master and options.engine != "spark":
+        raise InputError("--spark-master is for --engine spark; add it, or leave both out")
     files, mapping = logs_given(options)
     given = {
         "reward": options.reward and Expression(options.reward, "--reward"),
@@ -76,6 +90,8 @@ def run(options: argparse.Namespace) -> None:
         "gap_minutes": options.gap_minutes,
         "duplicates": options.duplicates,
         "memory_limit": options.memory_limit,
+        "engine": options.engine,
+        "spark_master": options.spark_master,
         "split": options.split and parse_split(options.split),
     }
     prepared = PrepareOptions(**{name: value for name, value in given.items() if value is not None})

@@ -80,7 +80,7 @@ class OtherActions:
             part = slice(start, start + _CHUNK)
             chunks.append(self._ask(exact, episodes[part], steps[part], count, rng))
         asked = _Asked(*(np.concatenate(parts) for parts in zip(*chunks, strict=True)))
-        rewards = self.view.step_values(schema.REWARD, *self.view.all_steps())
+        rewards = self.view.column(schema.REWARD)
         reward = asked.reward.clip(rewards.min(), rewards.max()).astype(np.float32)
         change = reward - asked.logged
         kept = asked.reproduced & (np.abs(change) > self.delta)

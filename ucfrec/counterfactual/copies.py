@@ -32,10 +32,11 @@ def require_rewards_vary(train: EpisodeStore) -> None:
     Raises:
         InputError: all training rewards are equal.
     """
-    rewards = train.step_values(schema.REWARD, *train.all_steps())
-    if (rewards == rewards[0]).all():
+    rewards = (train.step_values(schema.REWARD, *steps) for steps in train.step_batches())
+    found = np.unique([extreme for part in rewards for extreme in (part.min(), part.max())])
+    if len(found) == 1:
         raise InputError(
-            f"all {len(rewards):,} training rewards of {train.path} equal {rewards[0]:g}: there is "
+            f"all {train.n_steps:,} training rewards of {train.path} equal {found[0]:g}: there is "
             "nothing for a reward model to learn; check the reward expression, or set "
             "augment.copies=0"
         )

@@ -40,10 +40,11 @@ class RewardRows:
 
         Nothing of a step but its item and reward is read, nor anything of later steps.
         """
-        numbers = np.arange(view.n_steps)
-        if len(numbers) > limit:
+        if view.n_steps > limit:
             drawn = np.random.default_rng(seed).choice(view.n_steps, limit, replace=False)
             numbers = np.sort(drawn)
+        else:
+            numbers = np.arange(view.n_steps)
         return cls.at(view, *view.locate(numbers), lags)
 
     @classmethod

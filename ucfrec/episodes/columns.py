@@ -261,21 +261,18 @@ class Columns:
         if not self.has_items:
             return observations
         window = self.item_states.window
-        # The histories of the K steps overlap: gather their K + window − 1 steps once, then take
-        # sliding windows of them, reversed so that the most recent step comes first.
+        # The histories of the K steps overlap: gather their K + window − 1 steps once.
         width = steps.shape[1] + window - 1
         history = steps[:, -1:] - np.arange(width, 0, -1)  # (B, width), the last is step end − 1
         history_index = np.maximum(index[:, -1:] - steps[:, -1:] + history, 0)
         valid = history >= 0
         items = np.where(valid, self.step_values(schema.ITEM, history_index), -1).astype(np.int64)
         rewards = np.where(valid, self.step_values(schema.REWARD, history_index), 0)
-        view = np.lib.stride_tricks.sliding_window_view
-        users = self.user_rows[episodes][:, None]
-        return self.item_states.build(
-            torch.from_numpy(view(items, window, axis=1)[..., ::-1].copy()),
-            torch.from_numpy(view(rewards, window, axis=1)[..., ::-1].astype(np.float32)),
+        return self.item_states.of_sequences(
+            torch.from_numpy(items),
+            torch.from_numpy(rewards.astype(np.float32)),
             torch.from_numpy(np.maximum(steps, 0)),
-            torch.from_numpy(np.broadcast_to(users, steps.shape).copy()),
+            torch.from_numpy(self.user_rows[episodes]),
             observations,
         )
 

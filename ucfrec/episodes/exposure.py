@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
@@ -228,7 +229,7 @@ class ExposureTerm(nn.Module):
         self.reward_high.fill_(states.reward_high)
         levels = 1 - torch.logspace(0, -2, len(self.knots), dtype=torch.float64)
         levels = levels.sub(levels[0]).div(levels[-1] - levels[0])
-        knots = torch.from_numpy(np.quantile(returns.double().numpy(), levels.numpy()))
+        knots = torch.from_numpy(quantiles(returns.numpy(), levels.numpy()))
         # Equal quantiles are moved apart, so that there is an interval between any two knots.
         width = float(knots[-1] - knots[0]) or 1.0
         apart = 1e-3 * width * torch.arange(len(knots), dtype=torch.float64)
@@ -268,6 +269,25 @@ class ExposureTerm(nn.Module):
         repeated, alike = self.weights(exposed)
         added = self.likeness.to_items(self.likeness.profile(exposed.items, alike), items)
         return added + (repeated * (exposed.items == items)).sum(1)
+
+
+def quantiles(
+    values: npt.NDArray[np.float32], levels: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """`np.quantile` of the values in float64, without a copy of all of them in float64.
+
+    Args:
+        values: (N,), at least one.
+        levels: (L,) 0 to 1.
+    """
+    places = levels * (len(values) - 1)
+    below = np.floor(places).astype(np.int64)
+    above = np.minimum(below + 1, len(values) - 1)
+    ordered = np.partition(values, np.union1d(below, above))
+    low, high = ordered[below].astype(np.float64), ordered[above].astype(np.float64)
+    share = places - below
+    # As numpy interpolates, from the nearer value.
+    return np.where(share < 0.5, low + (high - low) * share, high - (high - low) * (1 - share))
 
 
 def columns_of(items: Tensor, among: Tensor) -> Tensor:

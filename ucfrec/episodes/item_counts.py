@@ -50,10 +50,12 @@ class TrainingCounts:
     @classmethod
     def of(cls, train: EpisodeStore) -> "TrainingCounts":
         """Count the items in `train`, a view of a store of items."""
-        steps, n = train.all_steps(), len(train.item_states.embeddings)
-        items = torch.from_numpy(train.step_values(schema.ITEM, *steps)).long()
-        liked = torch.bincount(items[liked_steps(train, *steps)], minlength=n)
-        return cls(torch.bincount(items, minlength=n), liked, train.n_episodes)
+        liked = np.zeros(len(train.item_states.embeddings), dtype=np.int64)
+        for steps in train.step_batches():
+            items = train.step_values(schema.ITEM, *steps)[liked_steps(train, *steps)]
+            liked += np.bincount(items, minlength=len(liked))
+        shown = torch.from_numpy(train.item_counts())
+        return cls(shown, torch.from_numpy(liked), train.n_episodes)
 
     def save(self, path: Path) -> None:
         """Write to one safetensors file, atomically."""

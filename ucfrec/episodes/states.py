@@ -1,7 +1,7 @@
 """Item-embedding states: a vector that summarises a session just before step t.
 
-Training windows and acting both call `ItemStates.build`. It uses only element-wise operations in a
-fixed order, so its results are bit-identical for every batch size.
+Training windows and acting both call `ItemStates.of_sequences`. It uses only element-wise
+operations in a fixed order, so its results are bit-identical for every batch size.
 """
 
 import math
@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from ucfrec.episodes.item_table import DECAY, DISTINCT_TAGS, TAGS_PER_ITEM, WINDOW
 from ucfrec.errors import InputError, damage_explained
@@ -80,6 +81,8 @@ class ItemStates:
         # Index −1 ("no item", "unknown user") selects this last row of zeros.
         object.__setattr__(self, "_items", _with_zero_row(self.embeddings))
         object.__setattr__(self, "_users", _with_zero_row(self.user_features))
+        decays = [self.decay**lag for lag in reversed(range(self.window))]
+        object.__setattr__(self, "_decays", torch.tensor(decays))
 
     @property
     def size(self) -> int:
@@ -101,32 +104,56 @@ class ItemStates:
         Returns:
             (..., S) float32.
         """
-        table: Tensor = self._items  # type: ignore[attr-defined]
-        scaled_rewards = (rewards - self.reward_low) / (self.reward_high - self.reward_low)
-        scaled_rewards = scaled_rewards.clamp(0, 1)
-        valid = (items >= 0).float()
-        item_sum = torch.zeros(*items.shape[:-1], table.shape[1])
-        liked_sum, item_weight, liked_weight = (
-            item_sum.clone(),
-            valid[..., 0] * 0,
-            valid[..., 0] * 0,
+        rows = math.prod(steps.shape)
+        states = self.of_sequences(
+            items.reshape(rows, self.window).flip(1),
+            rewards.reshape(rows, self.window).flip(1),
+            steps.reshape(rows, 1),
+            users.reshape(rows),
+            observations.reshape(rows, 1, observations.shape[-1]),
         )
-        for lag in range(self.window):
-            embedding = table[items[..., lag]]
-            weight = valid[..., lag] * self.decay**lag
-            item_sum = item_sum + weight.unsqueeze(-1) * embedding
-            item_weight = item_weight + weight
-            weight = weight * scaled_rewards[..., lag]
-            liked_sum = liked_sum + weight.unsqueeze(-1) * embedding
-            liked_weight = liked_weight + weight
+        return states.view(*steps.shape, states.shape[-1])
+
+    def of_sequences(
+        self, items: Tensor, rewards: Tensor, steps: Tensor, users: Tensor, observations: Tensor
+    ) -> Tensor:
+        """States just before K consecutive steps of each of B sessions.
+
+        Args:
+            items: (B, K + window − 1) int64 items shown before the last of the steps, the latest
+                last; −1 before the session began.
+            rewards: (B, K + window − 1) rewards of those items.
+            steps: (B, K) int64 number of each step in its session, from 0.
+            users: (B,) int64 rows of `user_features`; −1 for an unknown user.
+            observations: (B, K, O) observations logged with the steps; O may be 0.
+
+        Returns:
+            (B, K, S) float32.
+        """
+        table: Tensor = self._items  # type: ignore[attr-defined]
+        batch, length = steps.shape
+        scaled_rewards = (rewards - self.reward_low) / (self.reward_high - self.reward_low)
+        valid = (items >= 0).float()
+        # What an item counts, and what its reward makes it count.
+        counts = torch.stack([valid, scaled_rewards.clamp(0, 1) * valid])
+        embedded = table[items]
+        # Another column of ones adds up the weights.
+        padded = F.pad(embedded, (0, 1), value=1.0)
+        sums = padded.new_zeros(2, batch, length, padded.shape[-1])
+        weights = counts.unfold(2, self.window, 1) * self._decays  # type: ignore[attr-defined]
+        of_lags = weights.unsqueeze(-1).unbind(3), padded.unfold(1, self.window, 1).unbind(-1)
+        # Floating-point sums depend on their order: the most recent item comes first.
+        for weight, vector in reversed(list(zip(*of_lags, strict=True))):
+            sums = sums.add_(weight * vector)
+        means = sums[..., :-1] / sums[..., -1:].clamp(min=1e-6)
         return torch.cat(
             [
-                item_sum / item_weight.clamp(min=1e-6).unsqueeze(-1),
-                liked_sum / liked_weight.clamp(min=1e-6).unsqueeze(-1),
-                table[items[..., 0]],
-                (scaled_rewards[..., 0] * valid[..., 0]).unsqueeze(-1),
+                means[0],
+                means[1],
+                embedded[:, self.window - 1 :],
+                counts[1, :, self.window - 1 :].unsqueeze(-1),
                 torch.log1p(steps.float()).unsqueeze(-1),
-                self._users[users],  # type: ignore[attr-defined]
+                self._users[users].unsqueeze(1).expand(-1, length, -1),  # type: ignore[attr-defined]
                 observations,
             ],
             dim=-1,

@@ -262,13 +262,12 @@ class EpisodeStore(EpisodeView):
 
         Computed in float64 from at most a million steps, evenly spaced over the view.
         """
-        episodes, steps = self.all_steps()
-        stride = -(-len(steps) // _STATISTICS_STEPS)
+        stride = -(-self.n_steps // _STATISTICS_STEPS)
         total = torch.zeros(self.state_size, dtype=torch.float64)
         squares, count = total.clone(), 0
-        for chunk in range(0, len(steps), stride * 8192):
-            part = slice(chunk, chunk + stride * 8192, stride)
-            states = self.windows(episodes[part], steps[part], 1).states[:, 0].double()
+        for chunk in range(0, self.n_steps, stride * 8192):
+            part = np.arange(chunk, min(chunk + stride * 8192, self.n_steps), stride)
+            states = self.windows(*self.locate(part), 1).states[:, 0].double()
             total, squares = total + states.sum(0), squares + states.square().sum(0)
             count += len(states)
         mean = total / count

@@ -1,6 +1,6 @@
 """Views of a store: the episodes of a view, and access to their columns."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ FloatArray = npt.NDArray[np.float32]
 
 _OF_ACTIONS = (schema.ITEM, schema.ACTION, schema.REWARD, schema.RETURN_TO_GO)
 """Step columns in which an action copy differs from its source."""
+_BATCH_STEPS = 2**20
 
 
 class EpisodeView:
@@ -252,6 +253,27 @@ class EpisodeView:
         action copy, the last."""
         episodes = np.repeat(np.arange(self.n_episodes), self._counts)
         return episodes, np.arange(self.n_steps) - (self._ends - self.lengths)[episodes]
+
+    def step_batches(self) -> Iterator[tuple[IntArray, IntArray]]:
+        """`all_steps` in batches, for views whose steps are too many to list."""
+        for begin in range(0, self.n_steps, _BATCH_STEPS):
+            yield self.locate(np.arange(begin, min(begin + _BATCH_STEPS, self.n_steps)))
+
+    def column(self, name: str) -> Array:
+        """The values of a step column at `all_steps`, (n_steps,) or (n_steps, size).
+
+        Raises:
+            InputError: the store has no such column, or its files are damaged.
+        """
+        parts = [self.step_values(name, *steps) for steps in self.step_batches()]
+        return np.concatenate(parts) if parts else self.step_values(name, *self.all_steps())
+
+    def item_counts(self) -> IntArray:
+        """(n_items,) number of steps of the view that show each item; for stores of items only."""
+        counts = np.zeros(len(self.item_states.embeddings), dtype=np.int64)
+        for steps in self.step_batches():
+            counts += np.bincount(self.step_values(schema.ITEM, *steps), minlength=len(counts))
+        return counts
 
     @cached_property
     def _ends(self) -> IntArray:

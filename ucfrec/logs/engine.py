@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 BATCH_ROWS: Final = 2**17
-"""Rows of a batch read from DuckDB."""
+"""Most rows of a batch read from DuckDB."""
+_BATCH_BYTES: Final = 2**25
 
 _CLOSED: Final = {
     "allow_community_extensions": False,
@@ -32,7 +33,11 @@ _CLOSED: Final = {
 
 @contextmanager
 def engine(
-    inputs: Iterable[Path], folder: Path, memory_limit: str | None = None, beside: int = 0
+    inputs: Iterable[Path],
+    folder: Path,
+    memory_limit: str | None = None,
+    beside: int = 0,
+    threads: int | None = None,
 ) -> Iterator[duckdb.DuckDBPyConnection]:
     """A DuckDB connection with a database on disk.
 
@@ -46,6 +51,7 @@ def engine(
         memory_limit: size such as "2GB", beyond which rows spill to disk; None for DuckDB's
             default.
         beside: bytes of the limit that the rest of the process needs, at most half of them.
+        threads: most threads; None for one a core.
 
     Raises:
         InputError: `memory_limit` is not a size.
@@ -59,13 +65,15 @@ def engine(
             try:
                 if memory_limit is not None:
                     connection.execute("SET memory_limit = ?", [memory_limit])
-                    if (limit := _bytes(memory_limit)) and beside:
+                    if (limit := bytes_of(memory_limit)) and beside:
                         own = max(limit - beside, limit // 2)
                         connection.execute("SET memory_limit = ?", [f"{own} B"])
             except duckdb.Error:
                 raise InputError(
                     f"memory_limit {memory_limit!r} is no size; write e.g. 2GB"
                 ) from None
+            if threads is not None:
+                connection.execute("SET threads = ?", [threads])
             _set_semantics(connection)
             _close(connection, inputs, str(work))
             yield connection
@@ -73,13 +81,22 @@ def engine(
             connection.close()
 
 
-def _bytes(size: str) -> int | None:
+def bytes_of(size: str) -> int | None:
     """A size such as "2GB" or "1.5 GiB" in bytes; None if it is written in another way."""
     found = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([kmgt]?)(i?)b?\s*", size.lower())
     if found is None:
         return None
     base = 1024 if found[3] else 1000
     return int(float(found[1]) * base ** " kmgt".index(found[2] or " "))
+
+
+def rows_of_batch(numbers: int) -> int:
+    """Rows of a batch, fewer if they are long.
+
+    Args:
+        numbers: of the vectors of a row, float32.
+    """
+    return min(BATCH_ROWS, max(_BATCH_BYTES // (64 + 4 * numbers), 1))
 
 
 @contextmanager

@@ -37,7 +37,7 @@ def number_ids(
     Also `kept_users` and `kept_items`: ids that occur in the steps, with their `code`.
 
     Args:
-        log: log after `ucfrec.logs.sorted_rows.sort_rows`.
+        log: log with the tables of `ucfrec.logs.sorted_rows.code_tables`.
         measures: of its episodes.
         listed: log column to feature tables whose column `id` lists more users or items.
         like: a store whose numbers are reused instead (without `train_count`); None for none.

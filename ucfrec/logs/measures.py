@@ -10,9 +10,8 @@ import numpy.typing as npt
 from ucfrec import schema
 from ucfrec.errors import InputError
 from ucfrec.logs.moments import Moments
-from ucfrec.logs.order import BLOCK
 from ucfrec.logs.sessions import Cut, Episodes, episodes
-from ucfrec.logs.spool import Spool
+from ucfrec.logs.spool import BLOCK, Spool
 
 Array = npt.NDArray[Any]
 IntArray = npt.NDArray[np.int64]

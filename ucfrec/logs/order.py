@@ -6,12 +6,10 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from ucfrec.logs.spool import Spool
+from ucfrec.logs.spool import BLOCK, Spool
 
 Array = npt.NDArray[Any]
 
-BLOCK: Final = 2**19
-"""Rows of a spool that are in memory at a time."""
 _BINS: Final = 2**16
 _NEVER: Final = np.iinfo(np.int64).max
 

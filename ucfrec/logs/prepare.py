@@ -41,13 +41,14 @@ from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.measures import Measures, binned_rewards, measure, sampled_rewards
 from ucfrec.logs.order import count_unsorted
 from ucfrec.logs.sessions import SESSIONS, Cut, Episodes, by_sessions, episodes, split_bounds
-from ucfrec.logs.sorted_rows import SortedRows, sort_rows
+from ucfrec.logs.sorted_rows import SortedRows, check_sorted, sorted_batches
 from ucfrec.logs.spool import Spool
 from ucfrec.logs.steps import StepNumbers, write_steps
 from ucfrec.logs.summary import build_report, require_variety
 from ucfrec.logs.typed import TypedLog, typed_log
 from ucfrec.progress import progress
 
+ENGINES: Final = ("duckdb", "spark")
 BESIDE: Final = 400 * 2**20
 """Bytes that `prepare` takes beside the engine: Python with its packages, and batches of rows."""
 
@@ -85,7 +86,16 @@ class PrepareOptions:
     temp_folder: Path | None = None
     """Folder for spilled rows; None for the parent of the store (the system's for `validate`)."""
 
+    engine: str = "duckdb"
+    """What reads and sorts the rows, one of `ENGINES`: DuckDB on this machine, or Spark. The store
+    is the same."""
+    spark_master: str = "local[*]"
+    """With "spark": its master. Logs and the scratch folder must lie where the driver and every
+    worker see them; the memory of Spark is set in its own configuration."""
+
     def __post_init__(self) -> None:
+        if self.engine not in ENGINES:
+            raise InputError(f"engine is {self.engine!r}; use {', '.join(ENGINES)}")
         if self.session_by not in (None, *SESSIONS):
             raise InputError(f"session_by is {self.session_by!r}; use {', '.join(SESSIONS)}")
         if self.duplicates not in DUPLICATES:
@@ -244,9 +254,25 @@ def _prepared(
     ):
         with progress(4, "check the logs", "stages") as stage:
             tables = tuple(open_tables(connection, files))
-            log = typed_log(connection, tables, mapping, reward, session_by, spill)
+            if options.engine == "spark":
+                # Spark is an extra.
+                from ucfrec.logs.spark import sorted_with_spark
+
+                log, batches = sorted_with_spark(
+                    connection,
+                    tables,
+                    mapping,
+                    reward,
+                    session_by,
+                    known,
+                    scratch,
+                    options.spark_master,
+                )
+            else:
+                log = typed_log(connection, tables, mapping, reward, session_by, spill)
+                batches = sorted_batches(log, known)
             with explained(connection, log.tables, spill):
-                rows = sort_rows(log, known, options.duplicates, scratch)
+                rows = check_sorted(log, batches, options.duplicates, scratch)
                 require_rows(log, len(rows.clean), rows.dropped)
                 if like is None:
                     require_variety(rows)

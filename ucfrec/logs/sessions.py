@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ucfrec import schema
-from ucfrec.logs.order import BLOCK, ranked
+from ucfrec.logs.order import ranked
 from ucfrec.logs.sorted_rows import SortedRows
 from ucfrec.logs.spool import Spool
 
@@ -83,7 +83,7 @@ def split_bounds(rows: SortedRows, split: tuple[float, ...]) -> tuple[int, int]:
     return begin, end
 
 
-def by_sessions(rows: SortedRows, folder: Path, block: int = BLOCK) -> Spool:
+def by_sessions(rows: SortedRows, folder: Path, block: int | None = None) -> Spool:
     """Usable rows in order of user, first row of the session, session, time and choice.
 
     Sessions of one user may overlap: each stays whole. All rows of one user are in memory at a
@@ -92,9 +92,11 @@ def by_sessions(rows: SortedRows, folder: Path, block: int = BLOCK) -> Spool:
     Args:
         rows: with the column `session`.
         folder: of the new spool.
-        block: rows in memory at a time, or more if one user has more.
+        block: rows in memory at a time, or more if one user has more; None for as many as their
+            length allows.
     """
     spool, clean = Spool(folder), rows.clean
+    block = block or clean.block_rows
     begin = 0
     while begin < len(clean):
         end = _end_of_user(clean, begin, block)
@@ -123,16 +125,17 @@ def _end_of_user(spool: Spool, begin: int, rows: int) -> int:
     return len(spool)
 
 
-def episodes(spool: Spool, cut: Cut, log_end: int, block: int = BLOCK) -> Iterator[Episodes]:
+def episodes(spool: Spool, cut: Cut, log_end: int, block: int | None = None) -> Iterator[Episodes]:
     """The episodes of sorted rows, those with fewer than `cut.min_steps` steps left out.
 
     Args:
         spool: rows in the order of the store.
         cut: how they form episodes.
         log_end: time (ms) of the log's last usable row.
-        block: rows in memory at a time, or more if one episode has more.
+        block: rows in memory at a time, or more if one episode has more; None for as many as their
+            length allows.
     """
-    begin = 0
+    begin, block = 0, block or spool.block_rows
     while begin < len(spool):
         size = block
         while True:

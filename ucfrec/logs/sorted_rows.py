@@ -4,7 +4,7 @@ The engine sorts, out of core; the pass over the sorted rows, in batches, drops 
 duplicates and writes the others to a spool with numbers in place of ids.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -16,7 +16,7 @@ import pyarrow as pa
 from ucfrec import schema
 from ucfrec.logs.binding import MAX_FLOAT
 from ucfrec.logs.clean import REASONS, faults, require_rewards_in_range
-from ucfrec.logs.engine import BATCH_ROWS, as_numpy
+from ucfrec.logs.engine import as_numpy
 from ucfrec.logs.spool import Spool
 from ucfrec.logs.typed import ROWS, TypedLog
 
@@ -73,30 +73,42 @@ class SortedRows:
         self.highest = max(self.highest, float(rewards.max()))
 
 
-def sort_rows(log: TypedLog, known_items: Path | None, duplicates: str, folder: Path) -> SortedRows:
-    """Sort and check every row of a log.
-
-    Of rows with the same user, choice and time one is kept, as `ucfrec.logs.clean.read_log` does.
+def sorted_batches(log: TypedLog, known_items: Path | None) -> Iterator[pa.RecordBatch]:
+    """Sort every row of a log with DuckDB, and make the tables of codes.
 
     Args:
         log: its engine may open `known_items`.
         known_items: `items.parquet` of a store: rows with other items are dropped; None for all.
+
+    Returns:
+        Rows as of `in_order`.
+    """
+    for name, table in code_tables(log):
+        log.connection.execute(f"CREATE TABLE {table} AS {coded_ids(name, ROWS)}")
+    query = in_order(log, f"({with_faults(log, ROWS, faults(log, known_items))})")
+    return iter(log.connection.sql(query).to_arrow_reader(log.batch_rows))
+
+
+def check_sorted(
+    log: TypedLog, batches: Iterator[pa.RecordBatch], duplicates: str, folder: Path
+) -> SortedRows:
+    """Check every row of a log.
+
+    Of rows with the same user, choice and time one is kept, as `ucfrec.logs.clean.read_log` does.
+
+    Args:
+        log: its engine has the tables of `code_tables`.
+        batches: all its rows, as `in_order` selects them.
         duplicates: key of `ucfrec.logs.clean.DUPLICATES`.
         folder: scratch folder of the spools.
 
     Raises:
         InputError: a reward is too large to train with.
     """
-    for name, table in (*CODES.items(), (schema.SESSION_ID, _SESSION_CODES)):
-        if name in log.columns and has_codes(log, name):
-            _number(log, name, table)
     rows = SortedRows(log, Spool(folder / "clean"), Spool(folder / "placed"))
-    if log.key == schema.ITEM_ID:
-        (rows.items,) = log.one("SELECT count(*) FROM item_codes")
     reasons = list(REASONS)
     large, largest = 0, 0.0
-    reader = log.connection.sql(_query(log, known_items)).to_arrow_reader(BATCH_ROWS)
-    for batch in _whole_keys(_columns(batch, log) for batch in reader):
+    for batch in _whole_keys(_columns(batch, log) for batch in batches):
         rows.read += len(batch["fault"])
         placed = batch["fault"] < _UNPLACED
         order = {name: batch[name] for name in ("user", "timestamp", "row")}
@@ -113,6 +125,9 @@ def sort_rows(log: TypedLog, known_items: Path | None, duplicates: str, folder: 
         largest = max(largest, float(size.max(initial=0)))
         rows.count(clean)
         rows.clean.append(clean)
+    # The connection answers no query before the last batch.
+    if log.key == schema.ITEM_ID:
+        (rows.items,) = log.one("SELECT count(*) FROM item_codes")
     require_rewards_in_range(log, large, len(rows.clean), largest)
     return rows
 
@@ -128,45 +143,73 @@ def has_codes(log: TypedLog, name: str) -> bool:
     return name == schema.ITEM_ID or log.id_type(name) != "BIGINT"
 
 
-def _number(log: TypedLog, name: str, table: str) -> None:
-    log.connection.execute(
-        f"CREATE TABLE {table} AS SELECT {name}, row_number() OVER (ORDER BY {name}) - 1 AS code "
-        f"FROM (SELECT DISTINCT {name} FROM {ROWS} WHERE {name} IS NOT NULL)"
+def code_tables(log: TypedLog) -> Iterator[tuple[str, str]]:
+    """Id columns of the log that have codes, and the names of the tables of `coded_ids`."""
+    for name, table in (*CODES.items(), (schema.SESSION_ID, _SESSION_CODES)):
+        if name in log.columns and has_codes(log, name):
+            yield name, table
+
+
+# The SQL of `coded_ids` and `in_order` is run by DuckDB and by Spark, and means the same to both.
+
+
+def coded_ids(name: str, rows: str) -> str:
+    """SQL of the ids in a column of some typed rows: each with `code`, its place in their order."""
+    return (
+        f"SELECT {name}, CAST(row_number() OVER (ORDER BY {name}) - 1 AS BIGINT) AS code "
+        f"FROM (SELECT DISTINCT {name} FROM {rows} WHERE {name} IS NOT NULL) AS ids"
     )
 
 
-def _query(log: TypedLog, known_items: Path | None) -> str:
-    """SQL of all rows in order, without missing values."""
+def with_faults(log: TypedLog, rows: str, conditions: Mapping[str, str]) -> str:
+    """DuckDB's SQL of typed rows with `fault`: 0, or the number of the first fault from 1.
+
+    Args:
+        log: of the rows.
+        rows: relation of some of its typed rows.
+        conditions: as from `ucfrec.logs.clean.faults`.
+    """
     cases = " ".join(
-        f"WHEN {sql} THEN {list(REASONS).index(reason) + 1}"
-        for reason, sql in faults(log, known_items).items()
+        f"WHEN {sql} THEN {list(REASONS).index(reason) + 1}" for reason, sql in conditions.items()
     )
     unplaced = f"{schema.USER_ID} IS NULL OR {schema.TIMESTAMP} IS NULL"
     fault = f"CASE {cases} ELSE 0 END + CASE WHEN {unplaced} THEN {_UNPLACED} ELSE 0 END"
-    joins, user = "", schema.USER_ID
-    if has_codes(log, schema.USER_ID):
-        joins, user = f" LEFT JOIN user_codes USING ({schema.USER_ID})", "user_codes.code"
+    query = f"SELECT *, CAST({fault} AS SMALLINT) AS fault FROM {rows}"
+    if log.key == schema.ITEM_ID:
+        return query
+    zeros = [0.0] * log.vector_size[schema.ACTION]
+    action = f"CASE WHEN fault = 0 THEN action ELSE {zeros}::FLOAT[] END AS action"
+    return f"SELECT * REPLACE ({action}) FROM ({query})"
+
+
+def in_order(log: TypedLog, rows: str) -> str:
+    """SQL of typed rows with faults, with codes, in order, without missing values.
+
+    Args:
+        log: of the rows.
+        rows: relation of all its rows, as of `with_faults`; beside it are the tables of
+            `code_tables`.
+    """
+    coded = dict(code_tables(log))
+    joins = "".join(f" LEFT JOIN {table} USING ({name})" for name, table in coded.items())
+    number = {name: f"{table}.code" for name, table in coded.items()}
+    user = number.get(schema.USER_ID, schema.USER_ID)
     columns = [f"coalesce({user}, 0) AS user", f"coalesce({schema.TIMESTAMP}, 0) AS timestamp"]
     if log.key == schema.ITEM_ID:
-        joins += f" LEFT JOIN item_codes USING ({schema.ITEM_ID})"
-        columns.append("CAST(coalesce(item_codes.code, -1) AS INTEGER) AS item")
+        columns.append(f"CAST(coalesce({number[log.key]}, -1) AS INTEGER) AS item")
     else:
-        zeros = [0.0] * log.vector_size[schema.ACTION]
-        columns.append(f"CASE WHEN fault = 0 THEN action ELSE {zeros}::FLOAT[] END AS action")
+        columns.append(schema.ACTION)
     if schema.SESSION_ID in log.columns:
-        session = schema.SESSION_ID
-        if has_codes(log, session):
-            joins += f" LEFT JOIN {_SESSION_CODES} USING ({session})"
-            session = f"{_SESSION_CODES}.code"
+        session = number.get(schema.SESSION_ID, schema.SESSION_ID)
         columns += [f"coalesce({session}, 0) AS session", f"{session} IS NULL AS no_session"]
-    columns.append(f"coalesce({schema.REWARD}, 'nan'::DOUBLE) AS {schema.REWARD}")
+    columns.append(f"coalesce({schema.REWARD}, CAST('nan' AS DOUBLE)) AS {schema.REWARD}")
     if schema.PROPENSITY in log.columns:
-        columns.append(f"coalesce({schema.PROPENSITY}, 'nan'::FLOAT) AS {schema.PROPENSITY}")
+        nan = "CAST('nan' AS FLOAT)"
+        columns.append(f"coalesce({schema.PROPENSITY}, {nan}) AS {schema.PROPENSITY}")
     columns += [c for c in (schema.OBSERVATION, schema.IS_RANDOM) if c in log.columns]
     choice = schema.ITEM if log.key == schema.ITEM_ID else schema.ACTION
     return (
-        f"SELECT {', '.join(columns)}, row, fault "
-        f"FROM (SELECT *, CAST({fault} AS UTINYINT) AS fault FROM {ROWS}){joins} "
+        f"SELECT {', '.join(columns)}, row, fault FROM {rows} AS faulty{joins} "
         f"ORDER BY 1, 2, {choice}"
     )
 

@@ -2,12 +2,16 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[Any]
+
+BLOCK: Final = 2**19
+"""Most rows of a spool that are in memory at a time."""
+_BLOCK_BYTES: Final = 2**26
 
 
 class Spool:
@@ -35,6 +39,12 @@ class Spool:
     def names(self) -> tuple[str, ...]:
         """Names of the columns, once there are rows."""
         return tuple(self._rows)
+
+    @property
+    def block_rows(self) -> int:
+        """Rows to have in memory at a time, fewer if they are long, once there are rows."""
+        size = sum(dtype.itemsize * int(np.prod(shape)) for dtype, shape in self._rows.values())
+        return min(BLOCK, max(_BLOCK_BYTES // max(size, 1), 1))
 
     def append(self, columns: Mapping[str, Array]) -> None:
         """Append rows, the same columns every time.

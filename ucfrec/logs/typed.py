@@ -1,6 +1,6 @@
 """A log as one relation of typed rows: its files, its columns, its reward."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -20,6 +20,7 @@ from ucfrec.logs.binding import (
     is_vector,
     wrong_type,
 )
+from ucfrec.logs.engine import rows_of_batch
 from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping
 
 ROWS: Final = "read"
@@ -54,6 +55,11 @@ class TypedLog:
         return tuple(c for c in self.columns if c not in (schema.USER_ID, self.key, "timestamp"))
 
     @property
+    def batch_rows(self) -> int:
+        """Rows of a batch of its rows."""
+        return rows_of_batch(sum(self.vector_size.values()))
+
+    @property
     def name(self) -> str:
         """The first file, and how many more there are, for messages."""
         files = [str(file) for table in self.tables for file in table.files]
@@ -62,12 +68,59 @@ class TypedLog:
 
     def id_type(self, name: str) -> str:
         """DuckDB type of an id column: BIGINT or VARCHAR."""
-        return str(self.one(f"SELECT typeof({name}) FROM {ROWS} LIMIT 1")[0])
+        return str(self.one(f"DESCRIBE SELECT {name} FROM {ROWS}")[1])
 
     def one(self, sql: str) -> tuple[Any, ...]:
         """The first row of the result of `sql`."""
         row: tuple[Any, ...] = self.connection.sql(sql).fetchall()[0]
         return row
+
+
+@dataclass(frozen=True)
+class TypedColumns:
+    """SQL of the typed columns of a log."""
+
+    names: tuple[str, ...]
+    """Log columns that the files have, `user_id` first."""
+    selects: tuple[str, ...]
+    """For each table of the log, the values of these columns and of `reward`, as after SELECT."""
+    session_by: str
+    """"session_id", "gap" or "user"."""
+
+
+def typed_columns(
+    connection: duckdb.DuckDBPyConnection,
+    tables: tuple[Table, ...],
+    mapping: LogMapping,
+    reward: str,
+    session_by: str | None,
+) -> TypedColumns:
+    """Resolve the columns and the reward of a log; the arguments are those of `typed_log`.
+
+    Raises:
+        InputError: a column is missing or of an unsupported type, or an expression cannot be used.
+    """
+    columns = _present(tables, mapping, session_by)
+    selects = [_select(connection, table, mapping, columns, reward) for table in tables]
+    for name in (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID):
+        _unify_ids(selects, name)
+    return TypedColumns(
+        columns,
+        tuple(
+            ", ".join(f"{sql} AS {name}" for name, (sql, _) in select.items()) for select in selects
+        ),
+        session_by or (schema.SESSION_ID if schema.SESSION_ID in columns else "gap"),
+    )
+
+
+def numbered_rows(given: Iterable[tuple[str, str]]) -> str:
+    """SQL of typed rows with `row`, their position from 1.
+
+    Args:
+        given: for each table, values as of `TypedColumns.selects` and the SQL of the table.
+    """
+    union = " UNION ALL ".join(f"SELECT {values} FROM {table}" for values, table in given)
+    return f"SELECT row_number() OVER () AS row, * FROM ({union})"
 
 
 def typed_log(
@@ -92,37 +145,56 @@ def typed_log(
         InputError: a file, column or type makes the log unusable, or an observation is missing or
             not finite.
     """
-    columns = _present(tables, mapping, session_by)
-    selects = [_select(connection, table, mapping, columns, reward) for table in tables]
+    typed = typed_columns(connection, tables, mapping, reward, session_by)
     with explained(connection, tables, folder):
-        for name in (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID):
-            _unify_ids(selects, name)
-        union = " UNION ALL ".join(
-            f"SELECT {', '.join(f'{sql} AS {name}' for name, (sql, _) in select.items())} "
-            f"FROM {table.sql}"
-            for select, table in zip(selects, tables, strict=True)
-        )
         # Columns of Parquet files are read as often as they are needed; text is parsed once.
         columnar = all(table.columnar for table in tables)
-        connection.execute(
-            f"CREATE {'VIEW' if columnar else 'TABLE'} {ROWS} AS "
-            f"SELECT row_number() OVER () AS row, * FROM ({union})"
-        )
-        sizes = _vector_sizes(connection, columns)
-        by = session_by or (schema.SESSION_ID if schema.SESSION_ID in columns else "gap")
-        log = TypedLog(connection, tables, columns, sizes, by)
-        _require_observations(log)
-    return log
+        rows = numbered_rows(zip(typed.selects, (t.sql for t in tables), strict=True))
+        connection.execute(f"CREATE {'VIEW' if columnar else 'TABLE'} {ROWS} AS {rows}")
+        counts = {
+            name: dict(connection.sql(vector_counts(name)).fetchall())
+            for name in vectors(typed.names)
+        }
+        bad, n_rows = 0, 0
+        if schema.OBSERVATION in counts:
+            bad, n_rows = connection.sql(observation_counts()).fetchall()[0]
+    sizes = vector_sizes(counts)
+    require_observations(tables, bad, n_rows)
+    return TypedLog(connection, tables, typed.names, sizes, typed.session_by)
 
 
-def _require_observations(log: TypedLog) -> None:
-    """Check that `read` has a finite observation in every row, if it has any."""
-    if schema.OBSERVATION not in log.vector_size:
-        return
-    bad, rows = log.one(f"SELECT count_if({not_finite(schema.OBSERVATION)}), count(*) FROM read")
+def vectors(columns: Iterable[str]) -> tuple[str, ...]:
+    """Those of some log columns that are vectors."""
+    return tuple(name for name in columns if name in (schema.ACTION, schema.OBSERVATION))
+
+
+def vector_counts(name: str, rows: str = ROWS) -> str:
+    """SQL of how many vectors of each size a column has, missing ones left out."""
+    return (
+        f"SELECT len({name}) AS size, count(*) AS n FROM {rows} WHERE {name} IS NOT NULL "
+        "GROUP BY size"
+    )
+
+
+def observation_counts(rows: str = ROWS) -> str:
+    """SQL of the number of observations that are missing or not finite, and of rows."""
+    return f"SELECT count_if({not_finite(schema.OBSERVATION)}), count(*) FROM {rows}"
+
+
+def require_observations(tables: Sequence[Table], bad: int, rows: int) -> None:
+    """Check that a log has a finite observation in every row.
+
+    Args:
+        tables: of the log.
+        bad: number of rows without one.
+        rows: number of rows.
+
+    Raises:
+        InputError: there are rows without one.
+    """
     if bad:
         raise InputError(
-            f"{log.tables[0].files[0]}: {schema.OBSERVATION} is missing or holds NaN or infinity "
+            f"{tables[0].files[0]}: {schema.OBSERVATION} is missing or holds NaN or infinity "
             f"in {bad:,} of {rows:,} rows; fill them in, leave those rows out, or ignore the "
             f"column with --column {schema.OBSERVATION}="
         )
@@ -215,23 +287,24 @@ def _unify_ids(selects: list[Select], name: str) -> None:
         select[name] = (f"CAST({select[name][0]} AS {'BIGINT' if whole else 'VARCHAR'})", "")
 
 
-def _vector_sizes(
-    connection: duckdb.DuckDBPyConnection, columns: tuple[str, ...]
-) -> dict[str, int]:
+def vector_sizes(counts: Mapping[str, Mapping[int, int]]) -> dict[str, int]:
+    """Dimensions of each vector column.
+
+    Args:
+        counts: column to the number of its vectors by size, missing ones left out.
+
+    Raises:
+        InputError: a column has vectors of unequal or no size.
+    """
     sizes: dict[str, int] = {}
-    for name in (schema.ACTION, schema.OBSERVATION):
-        if name not in columns:
-            continue
-        counts = connection.sql(
-            f"SELECT len({name}) AS size, count(*) AS n FROM read WHERE {name} IS NOT NULL "
-            "GROUP BY size ORDER BY n DESC, size LIMIT 4"
-        ).fetchall()
-        if len(counts) > 1:
-            lengths = ", ".join(f"{n} rows of {size}" for size, n in counts)
+    for name, found in counts.items():
+        ordered = sorted(found.items(), key=lambda pair: (-pair[1], pair[0]))
+        if len(ordered) > 1:
+            lengths = ", ".join(f"{n} rows of {size}" for size, n in ordered[:4])
             raise InputError(f"{name} has lists of unequal length: {lengths}; make them equal")
-        if not counts or counts[0][0] == 0:
+        if not ordered or ordered[0][0] == 0:
             raise InputError(
                 f"{name} is empty in every row; map another column or --column {name}="
             )
-        sizes[name] = int(counts[0][0])
+        sizes[name] = int(ordered[0][0])
     return sizes

@@ -30,6 +30,8 @@ from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 SESSION, PROBABILITY, RANK, GREEDY = "session", "probability", "rank", "greedy_item_id"
 _STEPS_AT_ONCE = 1024
 _LOGITS_AT_ONCE = 2**24
+_MEMORY = "1GB"
+"""For reading the logs, beside the policy."""
 
 IntArray = npt.NDArray[np.int64]
 
@@ -108,14 +110,15 @@ def logged_sessions(
     gap_ms = record["session_gap_ms"]
     # Older runs did not record `session_by`, but they did record the gap.
     session_by = record.get("session_by") or (None if gap_ms is None else "gap")
-    options = PrepareOptions(Expression(record["reward"], str(run / RUN)), session_by)
+    reward = Expression(record["reward"], str(run / RUN))
+    options = PrepareOptions(reward, session_by, memory_limit=_MEMORY)
     if gap_ms is not None:
         options = replace(options, gap_minutes=gap_ms / 60_000)
     with scratch_folder(Path(gettempdir()), "logs") as scratch:
         folder = scratch / "store"
         report = prepare(files, mapping, folder, options, like=run, keep_unknown=keep_unknown)
         store = EpisodeStore.open(folder)
-        unknown = int((store.step_values(schema.ITEM, *store.all_steps()) < 0).sum())
+        unknown = int((store.column(schema.ITEM) < 0).sum())
         if unknown == store.n_steps:
             raise InputError(
                 f"{files[0]}: in all {unknown:,} rows the item is not in the store of the run; "

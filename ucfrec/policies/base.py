@@ -173,6 +173,11 @@ class SequencePolicy(nn.Module, ABC):
         """Row K − 1 of `features`, (B, d), for acting; subclasses may leave out what it ignores."""
         return self.features(windows)[:, -1]
 
+    def acting_features(self) -> Callable[[Windows], Tensor]:
+        """`last_features` of a policy in evaluation mode whose weights no longer change; subclasses
+        may prepare what then costs less."""
+        return self.last_features
+
     def normalized(self, windows: Windows) -> Windows:
         """Standardised states, and returns-to-go divided by `return_scale`.
 
@@ -284,11 +289,20 @@ class TokenEmbedding(nn.Module):
             windows: normalised.
             actions: (B, K, d) embedded actions.
         """
+        time, returns, states = self._parts(windows)
+        return self.norm(returns + time), self.norm(states + time), self.norm(actions + time)
+
+    def stacked(self, windows: Windows, actions: Tensor) -> Tensor:
+        """The same as one tensor (3, B, K, d), with fewer operations."""
+        time, returns, states = self._parts(windows)
+        return self.norm(torch.stack([returns, states, actions]) + time)  # type: ignore[no-any-return]
+
+    def _parts(self, windows: Windows) -> tuple[Tensor, Tensor, Tensor]:
+        """Embedded time, returns-to-go and states, (B, K, d) each."""
         last = self.embed_timestep.num_embeddings - 1
         time = self.embed_timestep(windows.timesteps.clamp(max=last))
         returns = self.embed_return(windows.returns_to_go.unsqueeze(-1))
-        states = self.embed_state(windows.states)
-        return self.norm(returns + time), self.norm(states + time), self.norm(actions + time)
+        return time, returns, self.embed_state(windows.states)
 
 
 def require_heads(config: PolicyConfig, heads: int) -> None:

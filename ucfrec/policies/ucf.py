@@ -1,6 +1,6 @@
 """UCF's hybrid causal architecture (paper section 3.2)."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -21,6 +21,7 @@ from ucfrec.policies.base import (
 )
 from ucfrec.policies.layers import CausalDepthwise, Dropout, some_padding
 from ucfrec.policies.losses import mask_loss, masked_mean, parent_targets
+from ucfrec.policies.ucf_last_step import StackedStreams
 from ucfrec.settings import Share, Weight, settings_table
 
 
@@ -104,6 +105,11 @@ class UCFPolicy(SequencePolicy):
         """Row K − 1 of `features`, (B, d): attention has a single query."""
         states, tokens = self._fused(windows)
         return self._outputs(states[:, -1:], tokens, _visible(windows.mask)[:, -1:])[0][:, 0]
+
+    def acting_features(self) -> Callable[[Windows], Tensor]:
+        """`last_features`, with stacked weights for a few windows."""
+        own = type(self).last_features is UCFPolicy.last_features
+        return StackedStreams(self) if own else self.last_features
 
     def _fused(self, windows: Windows) -> tuple[Tensor, Tensor]:
         """The tokens s_t (B, K, d), and all tokens (B, 3K, d), once their streams are fused."""

@@ -232,8 +232,9 @@ def _description(graph: RuleGraph, trained: TrainedPolicy, rule: DecisionRule) -
         "outputs": outputs,
         "rule": rule.as_dict(),
         "rule_hash": rule.hash,
-        "rule_notes": "the graph applies target, floor, tilt and tag_window; with exclude_seen, "
-        "put the session's items into `excluded`; with a temperature, draw from `scores`",
+        "rule_notes": "the graph applies target, floor, tilt, tag_window and tag_run; with "
+        "exclude_seen, put the session's items into `excluded`; with a temperature, draw from "
+        "`scores`",
         "policy": trained.name,
         "reward": trained.record["reward"],
         "session_by": trained.record.get("session_by"),

@@ -14,9 +14,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.sessions import Sessions
 from ucfrec.counterfactual.item_reward_model import ItemRewardModel
 from ucfrec.episodes.exposure import GAIN, ExposureTerm, Likeness, Shown
-from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
@@ -66,6 +66,9 @@ class RuleGraph(nn.Module):
         self.policy = _with_head(policy, self.head)
         self.reward = None if not rule.tilt else _Reward(decider.reward_model)
         self.tags = _Likeness(decider.likeness) if rule.tag_window else None
+        self.main_tags = decider.main_tags
+        if self.main_tags is not None:
+            self.register_buffer("main_tag", self.main_tags.tags)
         self._decider = replace(decider, policy=self.policy)
         self._rule = decider.rule
         reach = self.context - 1 + states.window
@@ -94,58 +97,35 @@ class RuleGraph(nn.Module):
             observations: (B, K, O) float32 of the last K steps, the one to decide included; None if
                 the policy has none.
         """
-        windows = self._windows(items, rewards, steps, users, observations)
-        windows = self._decider.asked(windows, collected)
+        sessions = Sessions(items, rewards, steps, collected, users, observations)
+        windows = self._decider.asked(sessions.windows(self.states, self.context), collected)
         normalized = self.policy.normalized(windows)
         features = self.policy.last_features(normalized)
-        shown = Shown(items.flip(1), rewards.flip(1))
+        shown = sessions.shown
         scores = self.head.logits(features, shown, normalized.returns_to_go[:, -1])
         if self.reward is not None:
             scores = scores + self._rule.tilt * self.reward(windows.states[:, -1], shown, users)
         scores = _put(scores, excluded, torch.full_like(excluded, -torch.inf, dtype=scores.dtype))
         if self.tags is not None:
             scores = self._without_recent_tags(scores, shown)
+        if self.main_tags is not None:
+            main = self.get_buffer("main_tag")
+            tired = replace(self.main_tags, tags=main).tired(shown, self._rule.tag_run).unsqueeze(1)
+            scores = _left(scores, (main == tired) & (tired >= 0))
         return scores, *_best(scores, self.k)
-
-    def _windows(
-        self,
-        items: Tensor,
-        rewards: Tensor,
-        steps: Tensor,
-        users: Tensor,
-        observations: Tensor | None,
-    ) -> Windows:
-        window, k = self.states.window, self.context
-        items, rewards = items[:, -(k - 1 + window) :], rewards[:, -(k - 1 + window) :]
-        numbers = steps.unsqueeze(1) + torch.arange(1 - k, 1)
-        mask, numbers = numbers >= 0, numbers.clamp(min=0)
-        if observations is None:
-            observations = rewards.new_zeros(items.shape[0], k, 0)
-        states = self.states.build(
-            items.unfold(1, window, 1).flip(-1),
-            rewards.unfold(1, window, 1).flip(-1),
-            numbers,
-            users.unsqueeze(1).expand(-1, k),
-            observations,
-        )
-        # The step to decide has neither an action nor a reward yet.
-        actions = F.pad(items[:, window:].clamp(min=0), (0, 1))
-        return Windows(
-            states=states.masked_fill(~mask.unsqueeze(-1), 0.0),
-            actions=actions,
-            rewards=F.pad(rewards[:, window:], (0, 1)),
-            returns_to_go=torch.zeros_like(actions, dtype=torch.float32),
-            timesteps=numbers,
-            mask=mask,
-        )
 
     def _without_recent_tags(self, scores: Tensor, shown: Shown) -> Tensor:
         assert self.tags is not None
         recent = shown.items[:, : self._rule.tag_window]
         alike = self.tags.to_all(recent, torch.ones_like(recent, dtype=scores.dtype))
-        left = scores.masked_fill(alike > 0, -torch.inf)
-        none = left.amax(1, keepdim=True) == -torch.inf
-        return torch.where(none, scores, left)
+        return _left(scores, alike > 0)
+
+
+def _left(scores: Tensor, without: Tensor) -> Tensor:
+    """Scores (B, n_items) with −∞ where `without`, but in rows where nothing would remain."""
+    left = scores.masked_fill(without, -torch.inf)
+    none = left.amax(1, keepdim=True) == -torch.inf
+    return torch.where(none, scores, left)
 
 
 def _with_head(policy: SequencePolicy, head: "_Head") -> SequencePolicy:

@@ -130,6 +130,23 @@ class Histories:
         np.maximum.at(latest, self.owner, row * begins)
         return self.rows(row >= latest[self.owner])
 
+    def of_users(self, numbers: IntArray) -> "Histories":
+        """The users with the given numbers (M,), in that order."""
+        owner, rows = _of_owners(self.owner, numbers)
+        seen_owner, seen = _of_owners(self.seen_owner, numbers)
+        sessions, observations = self.session_ids, self.observations
+        return Histories(
+            users=self.users[numbers],
+            owner=owner,
+            item_ids=self.item_ids[rows],
+            rewards=self.rewards[rows],
+            timestamps=self.timestamps[rows],
+            session_ids=None if sessions is None else sessions[rows],
+            seen_owner=seen_owner,
+            seen_ids=self.seen_ids[seen],
+            observations=None if observations is None else observations[numbers],
+        )
+
     def rows(self, keep: BoolArray) -> "Histories":
         """The same users with only the rows where `keep` (N,) is true."""
         kept = {
@@ -200,6 +217,15 @@ def histories_of_frame(
         duplicates=duplicates_of(trained.record),
     )
     return map(Histories.from_batch, batches)
+
+
+def _of_owners(owner: IntArray, numbers: IntArray) -> tuple[IntArray, IntArray]:
+    """Of the rows of the users `numbers` (M,), user by user: the place of the user among the M, and
+    the index in `owner`, which is sorted."""
+    starts, ends = (np.searchsorted(owner, numbers, side=side) for side in ("left", "right"))
+    lengths = ends - starts
+    place = np.repeat(np.arange(len(numbers)), lengths)
+    return place, np.arange(len(place)) + (ends - np.cumsum(lengths))[place]
 
 
 def _plain_columns(frame: pd.DataFrame, by_id: bool) -> list[Array] | None:

@@ -11,15 +11,18 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.acting.decision import Decider, DecisionRule
-from ucfrec.acting.logged_decisions import seen_before, session_scores
-from ucfrec.episodes.store import EpisodeStore
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.session_scorer import SessionScorer
+from ucfrec.acting.sessions import Sessions
 from ucfrec.errors import InputError
 from ucfrec.recommending.histories import Histories
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 RANK, SCORE = "rank", "score"
-_USERS_AT_ONCE = 1024
+_USERS_AT_ONCE = 128
+"""Most users of a forward pass; scores of more leave the processor's cache."""
+_SCORES = 2**24
+"""Most scores of a forward pass of several users, users × items: 64 MiB."""
 
 Array = npt.NDArray[Any]
 IntArray = npt.NDArray[np.int64]
@@ -63,27 +66,22 @@ def recommend(
             or of the candidates is not in the training data. Items of the logs are checked when
             their batch is read.
     """
-    if trained.item_states is None or trained.item_ids is None:
-        raise InputError(
-            "this policy's actions are vectors; recommending needs a policy trained on items"
-        )
+    scorer, asked = trained.scorer(rule), rule or trained.rule
     _require_whole(k)
     index = trained.item_index
     excluded = None if candidates is None else _all_but(index, candidates)
-    decider = trained.decider(rule)
 
     def frames() -> Iterator[pd.DataFrame]:
         remaining = iter(batches)
         for batch in remaining:
-            known = positions(index, batch.item_ids) >= 0
-            if not (known.all() or skip_unknown):
+            known = positions(index, batch.item_ids)
+            if not ((known >= 0).all() or skip_unknown):
                 raise _unknown(index, [batch, *remaining])
-            latest = batch.rows(known).latest_session(trained.record["session_gap_ms"])
-            users = positions(trained.user_index, latest.users)
-            store = next_steps(trained, latest, positions(index, latest.item_ids), users)
-            seen = positions(index, batch.seen_ids) if filter_seen else None
-            chosen = _Choice(decider, k, seen, excluded, seed)
-            yield _recommended(trained, store, batch, chosen)
+            seen = np.full(len(batch.seen_ids), -1)
+            if filter_seen:
+                seen = positions(index, batch.seen_ids)
+            numbered = replace(batch, item_ids=known, seen_ids=seen)
+            yield _Choice(trained, scorer, asked, k, excluded, seed).frame(numbered)
 
     return frames()
 
@@ -95,44 +93,86 @@ def _require_whole(k: int) -> None:
 
 @dataclass(frozen=True)
 class _Choice:
-    """How the items of one batch are chosen."""
+    """How items are chosen."""
 
-    decider: Decider
+    trained: TrainedPolicy
+    scorer: SessionScorer
+    rule: DecisionRule
     k: int
-    seen: IntArray | None
-    """(M,) index of each item of `Histories.seen_ids`, which its user is not recommended; −1 for
-    items without an index."""
     excluded: Tensor | None
     """(n_items,) true for items that no user is recommended."""
     seed: int
 
+    def frame(self, batch: Histories) -> pd.DataFrame:
+        """Items for the next step of U users whose rows have the policy's numbers of items, −1 for
+        unknown ones; those of `seen_ids` are not recommended."""
+        latest = batch.rows(batch.item_ids >= 0).latest_session(
+            self.trained.record["session_gap_ms"]
+        )
+        # Sessions of about the same length share a pass, which costs as much as the longest.
+        lengths = np.bincount(latest.owner, minlength=len(latest.users))
+        order = np.argsort(lengths, kind="stable")
+        items, values = (
+            np.concatenate(each) for each in zip(*self._parts(latest, order), strict=True)
+        )
+        back = np.argsort(order, kind="stable")
+        items, values = items[back], values[back]
+        kept, item_ids = np.isfinite(values), self.trained.item_ids
+        assert item_ids is not None
+        return pd.DataFrame(
+            {
+                schema.USER_ID: np.repeat(batch.users, kept.sum(1)),
+                RANK: np.cumsum(kept, axis=1)[kept],
+                schema.ITEM_ID: item_ids[items[kept]],
+                SCORE: values[kept],
+            }
+        )
 
-def _recommended(
-    trained: TrainedPolicy, store: EpisodeStore, batch: Histories, choice: _Choice
-) -> pd.DataFrame:
-    """Items for the last step of every episode of `store`."""
-    item_ids, frames = trained.item_ids, []
-    assert item_ids is not None
-    rule = choice.decider.rule
-    decider = replace(choice.decider, rule=replace(rule, exclude_seen=False))
-    for first in range(0, len(batch.users), _USERS_AT_ONCE):
-        rows = np.arange(first, min(first + _USERS_AT_ONCE, len(batch.users)))
-        left_out = torch.zeros(len(rows), len(item_ids), dtype=torch.bool)
-        if choice.seen is not None:
-            of_rows = slice(*np.searchsorted(batch.seen_owner, [rows[0], rows[-1] + 1]))
-            known = choice.seen[of_rows] >= 0
-            left_out[batch.seen_owner[of_rows][known] - first, choice.seen[of_rows][known]] = True
-        if choice.excluded is not None:
-            left_out |= choice.excluded
-        last = store.lengths[rows] - 1
-        if rule.exclude_seen:
-            left_out |= seen_before(store, rows, last)
-        # A user without any item left gets no row.
-        some = ~left_out.all(1)
-        left_out[~some] = False
-        scores = session_scores(decider, store, rows, last, left_out)
-        frames.append(_ranked(batch.users[rows], item_ids, scores, some, choice))
-    return pd.concat(frames, ignore_index=True)
+    def _parts(self, latest: Histories, order: IntArray) -> Iterator[tuple[Array, Array]]:
+        """Items and their log-probabilities, (M, k) each, of some users after the other."""
+        at_once = users_at_once(len(self.trained.item_index))
+        for first in range(0, len(order), at_once):
+            part = latest.of_users(order[first : first + at_once])
+            users = positions(self.trained.user_index, part.users)
+            sessions = sessions_of(self.trained, part, users, self.scorer.length)
+            known = part.seen_ids >= 0
+            left_out = [part.seen_owner[known]], [part.seen_ids[known]]
+            if self.rule.exclude_seen:
+                left_out[0].append(part.owner)
+                left_out[1].append(part.item_ids)
+            rows, items = (torch.from_numpy(np.concatenate(each)) for each in left_out)
+            scores = self.scorer.scores(sessions, (rows, items), self.excluded)
+            n_items = scores.shape[1]
+            drawn = uniforms(part.users, n_items, self.seed) if self.rule.temperature > 0 else None
+            best = best_of(self.rule, scores, min(self.k, n_items), drawn)
+            yield best[0].numpy(), best[1].numpy()
+
+
+def users_at_once(n_items: int) -> int:
+    """Users of a forward pass that scores `n_items` items."""
+    return max(1, min(_USERS_AT_ONCE, _SCORES // n_items))
+
+
+@torch.inference_mode()
+def best_of(
+    rule: DecisionRule, scores: Tensor, k: int, drawn: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """`k` items (B, k) and their log-probabilities (B, k) at temperature 1 among those left, −∞
+    for items that are left out.
+
+    Args:
+        rule: the decision rule.
+        scores: (B, n_items) of `SessionScorer.scores`; may be overwritten.
+        k: number of items, at most n_items.
+        drawn: (B, n_items) of `uniforms`; needed at a temperature above 0.
+    """
+    total = scores.logsumexp(-1, keepdim=True)
+    none = torch.isneginf(total[:, 0])
+    if none.any():
+        scores[none] = 0.0
+    items = rule.ranked(scores, k, drawn)
+    values = scores.gather(1, items) - total
+    return items, values.masked_fill(none.unsqueeze(1), -torch.inf)
 
 
 def positions(index: "pd.Index[Any]", ids: Array) -> IntArray:
@@ -180,40 +220,34 @@ def _some(values: Sequence[Any]) -> str:
     return ", ".join(map(str, values[:3])) + (", …" if len(values) > 3 else "")
 
 
-def next_steps(
-    trained: TrainedPolicy, histories: Histories, known: IntArray, users: IntArray
-) -> EpisodeStore:
-    """One episode per user: the session's steps and the next step, for which items are scored.
+def sessions_of(
+    trained: TrainedPolicy, histories: Histories, users: IntArray, length: int
+) -> Sessions:
+    """The sessions of users, each before the step for which items are scored.
 
     Args:
         trained: the policy.
-        histories: U users with the N rows of their latest sessions.
-        known: (N,) index of each row's item in the store.
+        histories: U users with the N rows of their latest sessions, whose `item_ids` are the
+            policy's numbers of items.
         users: (U,) index of each user in the training store, −1 for others.
+        length: items of a session that are read.
 
     Raises:
         InputError: the policy needs observations that the histories lack.
     """
-    n_users = len(histories.users)
-    # Shifting each row by its user index leaves a free row at the end of every episode.
-    places = np.arange(len(histories.owner)) + histories.owner
-    lengths = np.bincount(histories.owner, minlength=n_users) + 1
-    items = np.zeros(int(lengths.sum()), dtype=np.int64)
-    rewards = np.zeros(len(items), dtype=np.float32)
-    items[places], rewards[places] = known, histories.rewards
-    columns: dict[str, Array] = {schema.ITEM: items, schema.REWARD: rewards}
-    expected = trained.logged_observation_size
+    expected, observations = trained.logged_observation_size, None
     if expected:
-        observations = histories.observations
-        size = 0 if observations is None else observations.shape[1]
-        if observations is None or size != expected:
+        logged = histories.observations
+        size = 0 if logged is None else logged.shape[1]
+        if logged is None or size != expected:
             raise InputError(
                 f"the policy was trained with observations of {expected} numbers; those of the "
                 f"histories have {size}"
             )
-        seen = np.delete(observations, trained.dropped, axis=1)
-        columns[schema.OBSERVATION] = np.repeat(seen, lengths, axis=0)
-    return EpisodeStore.from_arrays(columns, lengths, {schema.USER: users}, trained.item_states)
+        seen = torch.from_numpy(np.delete(logged, trained.dropped, axis=1))
+        observations = seen.unsqueeze(1).expand(-1, trained.policy.config.context, -1)
+    rows = histories.owner, histories.item_ids, histories.rewards
+    return Sessions.of_rows(*rows, users, length, observations)
 
 
 def uniforms(users: Array, n_items: int, seed: int) -> Tensor:
@@ -232,24 +266,3 @@ def uniforms(users: Array, n_items: int, seed: int) -> Tensor:
         state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
         state ^= state >> np.uint64(31)
     return torch.from_numpy((state >> np.uint64(11)).astype(np.float64) / 2**53)
-
-
-def _ranked(
-    users: Array, item_ids: Array, scores: Tensor, some: Tensor, choice: _Choice
-) -> pd.DataFrame:
-    """Rows of the users (B,) where `some` (B,) is true, from their scores (B, n_items)."""
-    k = min(choice.k, scores.shape[1])
-    rule, n_items = choice.decider.rule, scores.shape[1]
-    drawn = uniforms(users, n_items, choice.seed) if rule.temperature > 0 else None
-    items = rule.ranked(scores, k, drawn)
-    values = scores.log_softmax(-1).gather(1, items)
-    kept = (torch.isfinite(values) & some[:, None]).numpy()
-    rank = np.cumsum(kept, axis=1)
-    return pd.DataFrame(
-        {
-            schema.USER_ID: np.repeat(users, kept.sum(1)),
-            RANK: rank[kept],
-            schema.ITEM_ID: item_ids[items.numpy()[kept]],
-            SCORE: values.numpy()[kept],
-        }
-    )

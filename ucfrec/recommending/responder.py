@@ -2,26 +2,19 @@
 
 import threading
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import pandas as pd
 import torch
 from torch import Tensor
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.logged_decisions import seen_before, session_scores
-from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.recommending.histories import Histories
-from ucfrec.recommending.recommend import next_steps, positions, uniforms
+from ucfrec.recommending.recommend import best_of, sessions_of, uniforms, users_at_once
 from ucfrec.recommending.requests import HistoryReader, Limits, Request, UserHistory
 from ucfrec.runs.trained_policy import TrainedPolicy
-
-_SCORES: Final = 2**25
-"""Most scores of a forward pass, users × items: 128 MiB."""
 
 Array = npt.NDArray[Any]
 IntArray = npt.NDArray[np.int64]
@@ -88,10 +81,8 @@ class Responder:
             InputError: the policy's actions are vectors, the rule does not fit the policy, or `k`
                 is beyond the limits.
         """
-        if trained.item_states is None or trained.item_ids is None:
-            raise InputError(
-                "this policy's actions are vectors; recommending needs a policy trained on items"
-            )
+        self._scorer = trained.scorer(rule)
+        assert trained.item_ids is not None
         if not 1 <= k <= limits.k:
             raise InputError(f"k is {k}; give a whole number from 1 to {limits.k:,}")
         self.trained, self.limits = trained, limits
@@ -101,9 +92,7 @@ class Responder:
             skip_unknown,
             seed,
         )
-        decider = trained.decider(rule)
-        self.rule = decider.rule
-        self._decider = replace(decider, rule=replace(decider.rule, exclude_seen=False))
+        self.rule = rule or trained.rule
         self._item_ids = trained.item_ids
         self._items, self._users = _Lookup(trained.item_ids), _Lookup(trained.user_ids)
         self._reader = HistoryReader.of(trained)
@@ -127,7 +116,7 @@ class Responder:
                     asked.append(self._asked(number, request))
                 except InputError as error:
                     outcomes[number] = error
-            at_once = max(1, _SCORES // len(self._item_ids))
+            at_once = users_at_once(len(self._item_ids))
             for first in range(0, len(asked), at_once):
                 batch = asked[first : first + at_once]
                 for one, answer in zip(batch, self._scored(batch), strict=True):
@@ -161,25 +150,34 @@ class Responder:
         return numbers
 
     def _scored(self, asked: Sequence[_Asked]) -> list[Answer]:
-        store = self._store(asked)
-        rows = np.arange(len(asked))
-        last = store.lengths - 1
-        left_out = torch.zeros(len(asked), len(self._item_ids), dtype=torch.bool)
+        latest = self._latest(asked)
+        users = self._users.positions(latest.users)
+        sessions = sessions_of(self.trained, latest, users, self._scorer.length)
+        left_out = [one.left_out for one in asked]
+        rows = [np.repeat(np.arange(len(asked)), [len(each) for each in left_out])]
+        if self.rule.exclude_seen:
+            rows.append(latest.owner)
+            left_out.append(latest.item_ids)
+        scores = self._scorer.scores(
+            sessions,
+            (torch.from_numpy(np.concatenate(rows)), torch.from_numpy(np.concatenate(left_out))),
+            self._excluded(asked),
+        )
+        return self._best(asked, scores)
+
+    def _excluded(self, asked: Sequence[_Asked]) -> Tensor | None:
+        """(B, n_items) true for items that are no candidates; None if all may be recommended."""
+        if all(one.allowed is None for one in asked):
+            return None
+        excluded = torch.zeros(len(asked), len(self._item_ids), dtype=torch.bool)
         for row, one in enumerate(asked):
             if one.allowed is not None:
-                left_out[row] = True
-                left_out[row, one.allowed] = False
-            left_out[row, one.left_out] = True
-        if self.rule.exclude_seen:
-            left_out |= seen_before(store, rows, last)
-        # A user without any item left gets none.
-        some = ~left_out.all(1)
-        left_out[~some] = False
-        scores = session_scores(self._decider, store, rows, last, left_out)
-        return self._best(asked, scores, some)
+                excluded[row] = True
+                excluded[row, one.allowed] = False
+        return excluded
 
-    def _store(self, asked: Sequence[_Asked]) -> EpisodeStore:
-        """The sessions of the requests with their next step."""
+    def _latest(self, asked: Sequence[_Asked]) -> Histories:
+        """The latest sessions of the requests, with the policy's numbers of items."""
         histories = [one.history for one in asked]
         observations = None
         if self.trained.record["observation_size"]:
@@ -199,29 +197,27 @@ class Responder:
             seen_ids=np.empty(0, np.int64),
             observations=observations,
         )
-        latest = batch.rows(batch.item_ids >= 0).latest_session(
+        known = batch.item_ids >= 0
+        return (batch if known.all() else batch.rows(known)).latest_session(
             self.trained.record["session_gap_ms"]
         )
-        users = self._users.positions(latest.users)
-        return next_steps(self.trained, latest, latest.item_ids, users)
 
-    def _best(self, asked: Sequence[_Asked], scores: Tensor, some: Tensor) -> list[Answer]:
-        n_items = scores.shape[1]
-        drawn = None
+    def _best(self, asked: Sequence[_Asked], scores: Tensor) -> list[Answer]:
+        n_items, drawn = scores.shape[1], None
         if self.rule.temperature > 0:
             drawn = uniforms(_array([one.user_id for one in asked]), n_items, self._seed)
-        normalised = scores.log_softmax(-1)
         answers = [Answer([], [])] * len(asked)
-        for k in {one.k for one in asked}:
-            rows = torch.tensor([n for n, one in enumerate(asked) if one.k == k])
-            chosen = self.rule.ranked(
-                scores[rows], min(k, n_items), None if drawn is None else drawn[rows]
-            )
-            values = normalised[rows].gather(1, chosen)
-            kept = torch.isfinite(values) & some[rows, None]
-            for row, items, value, keep in zip(rows.tolist(), chosen, values, kept, strict=True):
-                ids = self._item_ids[items[keep].numpy()]
-                answers[row] = Answer(ids.tolist(), value[keep].tolist())
+        sizes = [min(one.k, n_items) for one in asked]
+        for k in set(sizes):
+            rows = [n for n, size in enumerate(sizes) if size == k]
+            whole = len(rows) == len(asked)
+            of_rows = scores if whole else scores[rows]
+            draws = drawn if drawn is None or whole else drawn[rows]
+            items, values = (each.numpy() for each in best_of(self.rule, of_rows, k, draws))
+            for row, numbers, value in zip(rows, items, values, strict=True):
+                kept = np.isfinite(value)
+                ids = self._item_ids[numbers[kept]]
+                answers[row] = Answer(ids.tolist(), value[kept].tolist())
         return answers
 
 
@@ -229,19 +225,24 @@ class _Lookup:
     """Finds identifiers among those of a run, whether they are integers or text."""
 
     def __init__(self, ids: Array) -> None:
-        self._own = pd.Index(ids)
-        self._text: pd.Index[Any] | None = None
+        self._whole = ids.dtype.kind == "i"
+        self._ids = ids
+        self._order = np.argsort(ids, kind="stable") if self._whole else np.empty(0, np.int64)
+        self._sorted = ids[self._order] if self._whole else ids
+        self._text: dict[str, int] | None = None
 
     def positions(self, ids: Array) -> IntArray:
         """Index of each of `ids` (N,), −1 for ids that the run lacks."""
-        if not len(ids):
-            return np.empty(0, dtype=np.int64)
-        whole = pd.api.types.is_integer_dtype(self._own.dtype)
-        if whole == (ids.dtype.kind == "i"):
-            return positions(self._own, ids)
+        if not (len(ids) and len(self._ids)):
+            return np.full(len(ids), -1)
+        if self._whole and ids.dtype.kind == "i":
+            # One search costs less than a table for as few as a request has.
+            places = np.minimum(np.searchsorted(self._sorted, ids), len(self._sorted) - 1)
+            found: IntArray = np.where(self._sorted[places] == ids, self._order[places], -1)
+            return found
         if self._text is None:
-            self._text = self._own.astype(str)
-        return positions(self._text, ids.astype(str).astype(object))
+            self._text = {str(each): n for n, each in enumerate(self._ids.tolist())}
+        return np.array([self._text.get(str(each), -1) for each in ids.tolist()], dtype=np.int64)
 
 
 def _array(ids: Sequence[Any]) -> Array:

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ucfrec import schema
 from ucfrec.acting.decision import Decider, DecisionRule
+from ucfrec.acting.fatigue import Fatigue, LoggedRuns, fit_fatigue
 from ucfrec.acting.learned_sessions import LearnedSessions, LoggedEnds, SessionEnd
 from ucfrec.acting.many_rules import ManyRules
 from ucfrec.acting.rollout import USER_IDS
@@ -22,6 +22,7 @@ from ucfrec.counterfactual.item_reward_model import ItemRewardModel
 from ucfrec.counterfactual.item_reward_report import scores_of
 from ucfrec.counterfactual.item_reward_rows import RewardRows
 from ucfrec.episodes.exposure import Likeness
+from ucfrec.episodes.main_tags import MainTags
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.processes import require_blas_memory
 from ucfrec.progress import progress
@@ -63,6 +64,8 @@ class Choice:
     candidates: Sequence[Candidate]
     calibration: tuple[float, float]
     """Slope and intercept of the reward model's scores on validation rows."""
+    fatigue: Fatigue | None
+    """What tires the users in their model; None for nothing."""
     least_items: float
     """Smallest effective number of items that was asked for."""
     supported: bool
@@ -79,6 +82,7 @@ class Choice:
             else "; WARNING: the log supports no candidate, this one "
             "shows the most different items",
             "calibration": list(self.calibration),
+            "fatigue": None if self.fatigue is None else asdict(self.fatigue),
             "least_items": self.least_items,
             "candidates": [candidate.as_dict() for candidate in self.candidates],
         }
@@ -109,14 +113,16 @@ class RuleSearch:
         require_blas_memory()
         states = validation.item_states
         self._likeness = likeness = Likeness.of(states)
+        self._tags = MainTags.of(states)
+        logged = (
+            LoggedRuns.of(v, self._tags, model.lags, _MOST_STEPS) for v in (train, validation)
+        )
+        self.fatigue = fit_fatigue(*logged) if model.binary else None
         end = SessionEnd(likeness, LoggedEnds.of(train, model.lags, _MOST_STEPS, seed))
         rows = RewardRows.of(validation, model.lags, _MOST_STEPS, seed)
         self.calibration = calibrate(model, rows)
         self._longest, self.end, self._model = int(train.lengths.max()), end, model
-        shown = np.bincount(
-            train.step_values(schema.ITEM, *train.all_steps()), minlength=len(states.embeddings)
-        )
-        self._supported = shown >= config.least_impressions
+        self._supported = train.item_counts() >= config.least_impressions
         self.least_items = min(config.least_items, self._supported.sum() / 4)
 
     def play(self, rules: Sequence[DecisionRule]) -> list[Candidate]:
@@ -125,9 +131,11 @@ class RuleSearch:
         if not count:
             return []
         world = LearnedSessions(
-            *(self._store, self._model, self.calibration, self.end, n, self._longest, count)
+            *(self._store, self._model, self.calibration, self.end, n, self._longest, count),
+            self.fatigue,
         )
-        deciders = [replace(self._decider, rule=rule, likeness=self._likeness) for rule in rules]
+        filtering = replace(self._decider, likeness=self._likeness, main_tags=self._tags)
+        deciders = [replace(filtering, rule=rule) for rule in rules]
         users = np.arange(len(self._store.item_states.user_features))
         states = self._store.item_states
         actor = ManyRules(deciders, n, self._store.observation_size, states, users, seed=self._seed)
@@ -213,6 +221,8 @@ def choose_rule(
 ) -> Choice:
     """Choose target, floor and temperature, then the tilt, then tag window and tilt.
 
+    Where the log shows fatigue, a tag run follows, and the tilt with it.
+
     Args:
         decider: the policy under its default rule, with a reward model.
         targets: return (reward units) of each quantile in `config.quantiles`.
@@ -230,13 +240,30 @@ def choose_rule(
     longest = decider.policy.config.context - 1
     if validation.item_states.tags.shape[1]:
         played.extend(search.play([*_filtered(config, second.rule, longest)]))
+        if search.fatigue is not None:
+            # Without a tag window, which may only have served to tire nobody.
+            limited = search.play([*_limited(config, second.rule)])
+            tilted = search.play([*_tilted(config, search.best(_simplest_first(limited)).rule)])
+            played.extend([*limited, *tilted])
     best = search.best(_simplest_first(played))
     supported, least_items = search.allowed(best), float(search.least_items)
-    return Choice(best.rule, played, search.calibration, least_items, supported)
+    return Choice(best.rule, played, search.calibration, search.fatigue, least_items, supported)
 
 
 def _simplest_first(candidates: Sequence[Candidate]) -> list[Candidate]:
-    return sorted(candidates, key=lambda each: (each.rule.tag_window > 0, each.rule.tilt))
+    return sorted(candidates, key=_simplicity)
+
+
+def _simplicity(candidate: Candidate) -> tuple[float, ...]:
+    rule = candidate.rule
+    return rule.tag_run > 0, rule.tag_window > 0, rule.tilt, -rule.tag_run
+
+
+def _limited(config: RuleConfig, rule: DecisionRule) -> Iterator[DecisionRule]:
+    """Rules with a tag run."""
+    for run in config.tag_runs:
+        if run:
+            yield replace(rule, tag_run=run)
 
 
 def _filtered(config: RuleConfig, rule: DecisionRule, longest: int) -> Iterator[DecisionRule]:
@@ -260,7 +287,7 @@ def _untilted(
 
 def _tilted(config: RuleConfig, rule: DecisionRule) -> Iterator[DecisionRule]:
     for tilt in config.tilts:
-        if tilt:
+        if tilt and tilt != rule.tilt:
             yield replace(rule, tilt=tilt)
 
 

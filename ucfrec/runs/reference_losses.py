@@ -21,7 +21,7 @@ def reference_losses(counts: TrainingCounts, validation: EpisodeStore) -> dict[s
         probability is its share of the training steps with one added to every count, which is how
         the bias of `ItemHead` is initialised.
     """
-    items = torch.from_numpy(validation.step_values(schema.ITEM, *validation.all_steps())).long()
+    items = torch.from_numpy(validation.column(schema.ITEM)).long()
     smoothed = counts.shown + 1
     log_shares = torch.log(smoothed / smoothed.sum())
     return {

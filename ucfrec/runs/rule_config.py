@@ -9,6 +9,7 @@ from ucfrec.settings import Count, Share, settings_table
 _Temperature = Annotated[float, Field(ge=0, le=100)]
 _Tilt = Annotated[float, Field(ge=0, le=1000)]
 _Steps = Annotated[int, Field(ge=0, le=1000)]
+_Runs = Annotated[int, Field(ge=0, le=10)]
 _SOME = Field(strict=False, min_length=1)
 """Not strict, because TOML and JSON have lists instead of tuples."""
 
@@ -36,6 +37,9 @@ class RuleConfig:
     """Candidates for β, the weight of the reward model."""
     tag_windows: Annotated[tuple[_Steps, ...], _SOME] = (0, 3, 10)
     """Candidates for the number of steps whose tags are left out, where items have tags."""
+    tag_runs: Annotated[tuple[_Runs, ...], _SOME] = (0, 2, 3, 4, 6, 8)
+    """Candidates for how often on end one main tag may be liked, where the log shows that more
+    tires users."""
     sessions: Count = 100
     """Sessions played of each candidate."""
     least_impressions: Count = 10

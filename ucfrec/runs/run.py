@@ -231,9 +231,7 @@ def _target_returns(train: EpisodeStore, definition: ReturnToGo) -> FloatArray:
     """
     returns = train.returns
     if not definition.per_session:
-        returns = train.with_return_to_go(definition).step_values(
-            schema.RETURN_TO_GO, *train.all_steps()
-        )
+        returns = train.with_return_to_go(definition).column(schema.RETURN_TO_GO)
     kept = np.linspace(0, len(returns) - 1, min(len(returns), _MOST_RETURNS)).astype(np.int64)
     return np.asarray(np.sort(returns)[kept], dtype=np.float32)
 
@@ -303,22 +301,19 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
     policy.state_mean.copy_(mean)
     policy.state_std.copy_(torch.where(std > 1e-6, std, 1.0))
     scale = config.policy.return_scale or float(np.abs(base.returns).max()) or 1.0
-    episodes, steps = base.all_steps()
-    returns_to_go = base.step_values(schema.RETURN_TO_GO, episodes, steps)
+    returns_to_go = base.column(schema.RETURN_TO_GO)
     if not _returns(base, config).per_session and not config.policy.return_scale:
         scale = float(np.abs(returns_to_go).max()) or 1.0
     policy.return_scale.fill_(scale)
     policy.lowest_return_to_go.fill_(float(returns_to_go.min()))
     if isinstance(policy.head, ItemHead):
-        counts = np.bincount(
-            base.step_values(schema.ITEM, episodes, steps), minlength=len(policy.head.counts)
-        )
-        policy.head.start_from(base.item_states.embeddings, torch.from_numpy(counts).float())
+        counts = torch.from_numpy(base.item_counts()).float()
+        policy.head.start_from(base.item_states.embeddings, counts)
         if policy.head.exposure is not None:
             scaled = torch.from_numpy(returns_to_go) / policy.return_scale
             policy.head.exposure.start_from(base.item_states, scaled)
     else:
-        actions = base.step_values(schema.ACTION, episodes, steps)
+        actions = base.column(schema.ACTION)
         policy.head.scale.copy_(torch.from_numpy(np.abs(actions).max(0)).clamp(min=1.0))
     policy.start_from(base)
     return policy

@@ -15,10 +15,12 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
+from ucfrec.acting.session_scorer import SessionScorer
 from ucfrec.checksums import sealed_record
 from ucfrec.counterfactual.item_reward_model import FITTED, ItemRewardModel
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.item_counts import TrainingCounts
+from ucfrec.episodes.main_tags import MainTags
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
@@ -203,7 +205,41 @@ class TrainedPolicy:
         """The policy under `rule`, by default the run's own."""
         rule = rule or self.rule
         likeness = self.likeness if rule.tag_window else None
-        return Decider(self.policy, rule, self.returns, self.reward_model, likeness)
+        tags = None
+        if rule.tag_run and self.item_states is not None:
+            tags = MainTags.of(self.item_states)
+        return Decider(self.policy, rule, self.returns, self.reward_model, likeness, tags)
+
+    def scorer(self, rule: DecisionRule | None = None) -> SessionScorer:
+        """Scores items for sessions under `rule`, by default the run's own.
+
+        It is kept for the next call with the same rule and weights.
+
+        Raises:
+            InputError: the policy's actions are vectors, or the rule does not fit the policy.
+        """
+        if self.item_states is None:
+            raise InputError(
+                "this policy's actions are vectors; recommending needs a policy trained on items"
+            )
+        rule, models = rule or self.rule, (self.policy, self.reward_model)
+        weights = [
+            (id(each), each.data_ptr(), each._version)
+            for model in models
+            if model is not None
+            for each in model.state_dict(keep_vars=True).values()
+        ]
+        if self._kept.get("state") != (rule, weights):
+            # The one before goes first, for its memory.
+            self._kept.clear()
+            self._kept["scorer"] = SessionScorer(self.decider(rule), self.item_states)
+            self._kept["state"] = rule, weights
+        scorer: SessionScorer = self._kept["scorer"]
+        return scorer
+
+    @cached_property
+    def _kept(self) -> dict[str, Any]:
+        return {}
 
     def actor(
         self,

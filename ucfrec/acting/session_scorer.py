@@ -1,0 +1,199 @@
+"""`Decider.scores` of running sessions, with all that depends on the model alone kept ready."""
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from ucfrec.acting.decision import Decider
+from ucfrec.acting.sessions import Sessions
+from ucfrec.counterfactual.item_reward_model import ItemRewardModel
+from ucfrec.episodes.exposure import Exposed, Likeness, Shown
+from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.windows import Windows
+from ucfrec.policies.base import SequencePolicy
+from ucfrec.policies.heads import ItemHead
+
+
+class SessionScorer:
+    """Scores items for sessions as `Decider.scores` does, equal up to rounding.
+
+    The policy's item vectors and those of the reward model are one matrix, so that a single product
+    gives both. Policies that score items in a way of their own are asked as before.
+    """
+
+    def __init__(self, decider: Decider, states: ItemStates) -> None:
+        """
+        Args:
+            decider: a policy of items under its rule; its weights must not change afterwards.
+            states: of the run.
+        """
+        self._decider, self._states = decider, states
+        self._context = decider.policy.config.context
+        lags = 0 if decider.reward_model is None else decider.reward_model.lags
+        self.length = max(self._context - 1 + states.window, lags)
+        """Items of a session that are read."""
+        self._product = _Product.of(decider)
+
+    def scores(
+        self,
+        sessions: Sessions,
+        left_out: tuple[Tensor, Tensor] | None = None,
+        excluded: Tensor | None = None,
+    ) -> Tensor:
+        """(B, n_items) log π(i | s, Ĝ) + β f̂_r(s, i), up to a constant per row; −∞ for items left
+        out, which may be all of a row.
+
+        Args:
+            sessions: of at least `length` items each.
+            left_out: rows (N,) and items (N,) of what may not be recommended.
+            excluded: (B, n_items) or (n_items,) bool, what may not be recommended.
+
+        Raises:
+            InputError: the scores of some row are NaN.
+        """
+        # Learners may keep tensors, which those of inference mode would spoil for training.
+        mode = torch.no_grad() if self._product is None else torch.inference_mode()
+        with mode:
+            scores = self._scores(sessions)
+            if left_out is not None:
+                scores[left_out] = -torch.inf
+            if excluded is not None:
+                scores = scores.masked_fill_(excluded, -torch.inf)
+            scores = self._decider.without_recent_tags(scores, sessions.shown)
+            return self._decider.without_tired_tags(scores, sessions.shown)
+
+    def _scores(self, sessions: Sessions) -> Tensor:
+        decider = self._decider
+        # No learner's outputs depend on how much padding is before a session.
+        context = min(self._context, int(sessions.steps.max()) + 1)
+        windows = decider.asked(sessions.windows(self._states, context), sessions.collected)
+        if self._product is None:
+            # Learners may give what they keep, and scores are overwritten.
+            outputs = decider.act_and_features(windows)[0].clone()
+            scores = decider.tilted(outputs, windows, sessions.users, sessions.shown)
+        else:
+            scores = self._product.scores(windows, sessions)
+        decider.require_numbers(scores)
+        return scores
+
+
+class _Product:
+    """Scores as a product of features with one matrix of all items, plus what was shown."""
+
+    def __init__(self, decider: Decider, head: ItemHead, model: ItemRewardModel | None) -> None:
+        self._policy, self._tilt, self._model = decider.policy, decider.rule.tilt, model
+        self._features = decider.policy.acting_features()
+        self._exposure = head.exposure
+        likeness = _likenesses(head, model)
+        factors = [head.project(head.embeddings) + head.correction]
+        self._bias = head.bias.detach()
+        if model is not None:
+            factors.append(model.vectors)
+            self._bias = self._bias + self._tilt * model.item
+        self._alike = None
+        self._likeness = likeness[0] if likeness else None
+        if self._likeness is not None:
+            if self._likeness.tags.shape[1]:
+                self._alike = _TagSums(self._likeness)
+            else:
+                factors.append(self._likeness.directions)
+        self._matrix = _columns(factors)
+
+    @classmethod
+    def of(cls, decider: Decider) -> "_Product | None":
+        """None for a policy that scores items in a way of its own."""
+        policy, model = decider.policy, decider.reward_model if decider.rule.tilt else None
+        kind, head = type(policy), policy.head
+        own = kind.act is SequencePolicy.act
+        own = own and kind.act_and_features is SequencePolicy.act_and_features
+        if not own or not isinstance(head, ItemHead):
+            return None
+        first, *others = *_likenesses(head, model), None
+        alike = all(other is None or _equal(first, other) for other in others)
+        with torch.no_grad():
+            return cls(decider, head, model) if alike else None
+
+    def scores(self, windows: Windows, sessions: Sessions) -> Tensor:
+        """(B, n_items) of windows of `Decider.asked`, up to a constant per row."""
+        normalized, shown = self._policy.normalized(windows), sessions.shown
+        features = self._features(normalized)
+        inputs = [features / features.shape[-1] ** 0.5]
+        weights = []
+        if self._exposure is not None:
+            exposed = _exposed(shown, self._exposure.lags, normalized)
+            weights.append(self._exposure.weights(exposed))
+        if self._model is not None:
+            query = self._model.query(windows.states[:, -1], sessions.users)
+            inputs.append(self._tilt * query)
+            of_model = self._model.exposures(shown)[1:]
+            weights.append((self._tilt * of_model[0], self._tilt * of_model[1]))
+        if self._likeness is None:
+            return torch.addmm(self._bias, torch.cat(inputs, 1), self._matrix)
+        repeated, alike = map(_sum, zip(*weights, strict=True))
+        items = _padded(shown.items, repeated.shape[1], -1)
+        profile = self._likeness.profile(items, alike)
+        if self._alike is None:
+            inputs.append(profile)
+        scores = torch.addmm(self._bias, torch.cat(inputs, 1), self._matrix)
+        if self._alike is not None:
+            scores.add_(self._alike.of(profile))
+        rows, lags = torch.nonzero(items >= 0, as_tuple=True)
+        return scores.index_put_((rows, items[rows, lags]), repeated[rows, lags], accumulate=True)
+
+
+class _TagSums:
+    """Likeness of all items to profiles of tags: computed once for items of the same tags."""
+
+    def __init__(self, likeness: Likeness) -> None:
+        tags, n_tags = likeness.tags.numpy(), int(likeness.n_tags)
+        distinct, which = np.unique(tags, axis=0, return_inverse=True)
+        # Padding reads a column of zeros.
+        self._distinct = torch.from_numpy(np.where(distinct < 0, n_tags, distinct))
+        self._which = torch.from_numpy(which.reshape(-1).astype(np.int32))
+
+    def of(self, profile: Tensor) -> Tensor:
+        """(B, n_items) from profiles (B, n_tags)."""
+        sums = F.pad(profile, (0, 1))[:, self._distinct].sum(-1)
+        return sums.index_select(1, self._which)
+
+
+def _likenesses(head: ItemHead, model: ItemRewardModel | None) -> list[Likeness]:
+    found = [] if head.exposure is None else [head.exposure.likeness]
+    return found if model is None else [*found, model.likeness]
+
+
+def _equal(one: Likeness | None, other: Likeness) -> bool:
+    assert one is not None
+    pairs = ((one.tags, other.tags), (one.directions, other.directions))
+    return all(torch.equal(*pair) for pair in pairs)
+
+
+def _columns(factors: list[Tensor]) -> Tensor:
+    """(Σ d, n_items) of vectors (n_items, d) each. A product with one row reads this layout twice
+    as fast as vectors one after the other."""
+    # NumPy asks for large pages, which are read faster.
+    sizes = [each.shape[1] for each in factors]
+    matrix = torch.from_numpy(np.empty((sum(sizes), len(factors[0])), dtype=np.float32))
+    for part, each in zip(torch.split(matrix, sizes), factors, strict=True):
+        part.copy_(each.T)
+    return matrix
+
+
+def _exposed(shown: Shown, lags: int, normalized: Windows) -> Exposed:
+    items, rewards = _padded(shown.items[:, :lags], lags, -1), _padded(shown.rewards, lags, 0)
+    return Exposed(items, rewards, normalized.returns_to_go[:, -1])
+
+
+def _padded(values: Tensor, length: int, padding: int) -> Tensor:
+    """The first `length` columns of values (B, N), with more columns where there are fewer."""
+    missing = max(0, length - values.shape[1])
+    return F.pad(values[:, :length], (0, missing), value=padding)
+
+
+def _sum(parts: tuple[Tensor, ...]) -> Tensor:
+    """The sum of weights (B, N) with zeros for missing columns."""
+    if len(parts) == 1:
+        return parts[0]
+    length = max(each.shape[1] for each in parts)
+    return _padded(parts[0], length, 0) + _padded(parts[1], length, 0)

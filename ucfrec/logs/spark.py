@@ -1,0 +1,266 @@
+"""Sort the rows of a log with Apache Spark, for logs that outgrow one machine.
+
+Spark's workers read the files, evaluate the columns and the reward (`ucfrec.logs.spark_tasks`),
+number the ids and sort: in the scratch folder the rows are what DuckDB's sort would give, and what
+follows is the same. Workers need ucfrec and the same paths to the logs and the scratch folder.
+"""
+
+import os
+import re
+import shutil
+import sys
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import duckdb
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from ucfrec import schema
+from ucfrec.errors import InputError, one_line
+from ucfrec.logs.binding import Table, explained
+from ucfrec.logs.clean import faults
+from ucfrec.logs.engine import BATCH_ROWS
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.sorted_rows import code_tables, coded_ids, in_order, with_faults
+from ucfrec.logs.spark_tasks import Task, run_tasks
+from ucfrec.logs.typed import (
+    ROWS,
+    TypedLog,
+    numbered_rows,
+    observation_counts,
+    require_observations,
+    typed_columns,
+    vector_counts,
+    vector_sizes,
+    vectors,
+)
+
+_TYPES: Final = {"BIGINT": "bigint", "VARCHAR": "string"}
+_COLUMNS: Final = {
+    schema.ACTION: "array<float>",
+    schema.TIMESTAMP: "bigint",
+    schema.OBSERVATION: "array<float>",
+    schema.PROPENSITY: "float",
+    schema.IS_RANDOM: "boolean",
+}
+_COUNTS: Final = "file bigint, name string, size bigint, n bigint"
+_ROWS, _BAD = "rows", "bad"
+_TYPED: Final = "typed"
+_REFUSED: Final = re.compile(r"ucfrec\.errors\.InputError: ([^\n]+)")
+
+
+def sorted_with_spark(
+    connection: duckdb.DuckDBPyConnection,
+    tables: tuple[Table, ...],
+    mapping: LogMapping,
+    reward: str,
+    session_by: str | None,
+    known_items: Path | None,
+    scratch: Path,
+    master: str,
+) -> tuple[TypedLog, Iterator[pa.RecordBatch]]:
+    """Sort every row of a log.
+
+    Args:
+        connection: engine that may open the tables; it reads no row.
+        tables: of the log's files.
+        mapping: log columns to the files' columns.
+        reward: scalar SQL expression over the files' columns.
+        session_by: "session_id", "gap" or "user"; None for session_id if the log has it, else gap.
+        known_items: `items.parquet` of a store: rows with other items are dropped; None for all.
+        scratch: folder for scratch, which driver and workers see.
+        master: Spark's master, e.g. "local[*]" or "spark://host:7077".
+
+    Returns:
+        What `ucfrec.logs.typed.typed_log` and `ucfrec.logs.sorted_rows.sorted_batches` return.
+
+    Raises:
+        InputError: a file, column or type makes the log unusable, an observation is missing or not
+            finite, or Spark is missing or fails.
+    """
+    typed = typed_columns(connection, tables, mapping, reward, session_by)
+    with explained(connection, tables, scratch):
+        every = zip(typed.selects, (table.sql for table in tables), strict=True)
+        connection.execute(f"CREATE VIEW {ROWS} AS {numbered_rows(every)}")
+    files = [
+        (values, Table((file,), table.types))
+        for values, table in zip(typed.selects, tables, strict=True)
+        for file in table.files
+    ]
+    with _session(master) as spark, _failures():
+        found = _surveyed(spark, files, vectors(typed.names))
+        sizes = vector_sizes(found.vectors)
+        log = TypedLog(connection, tables, typed.names, sizes, typed.session_by)
+        require_observations(tables, found.bad, sum(found.rows))
+        tasks = _row_tasks(log, files, found.rows, known_items)
+        rows = _run(spark, tasks, _schema(log))
+        _written(spark, rows, scratch / _TYPED).createOrReplaceTempView(_TYPED)
+        for name, table in code_tables(log):
+            codes = _written(spark, spark.sql(coded_ids(name, _TYPED)), scratch / table)
+            codes.createOrReplaceTempView(table)
+        _written(spark, spark.sql(in_order(log, _TYPED)), scratch / ROWS)
+    shutil.rmtree(scratch / _TYPED)
+    for _, table in code_tables(log):
+        _load(connection, scratch / table, table)
+    return log, _batches(scratch / ROWS, log.batch_rows)
+
+
+@dataclass
+class _Survey:
+    """What must be known of all files before their rows are read."""
+
+    rows: list[int]
+    """Number of rows of each file."""
+    vectors: dict[str, Counter[int]]
+    """Vector column to the number of its vectors by size, missing ones left out."""
+    bad: int = 0
+    """Number of observations that are missing or not finite."""
+
+
+Files = Sequence[tuple[str, Table]]
+"""Of each file, the SQL of its typed columns and the table that it is."""
+
+
+def _surveyed(spark: Any, files: Files, names: Sequence[str]) -> _Survey:
+    """Count the rows of each file, and the vectors in the columns `names`."""
+    tasks = []
+    for number, (values, table) in enumerate(files):
+        rows = f"({numbered_rows([(values, table.sql)])})"
+        counts = {_ROWS: f"SELECT 0 AS size, count(*) AS n FROM {rows}"}
+        counts |= {name: vector_counts(name, rows) for name in names}
+        if schema.OBSERVATION in names:
+            counts[_BAD] = (
+                f"SELECT 0 AS size, n FROM ({observation_counts(rows)}) AS bad(n, of_rows)"
+            )
+        each = (
+            f"SELECT {number}::BIGINT AS file, '{name}' AS name, size::BIGINT AS size, "
+            f"n::BIGINT AS n FROM ({query})"
+            for name, query in counts.items()
+        )
+        tasks.append(Task(table, " UNION ALL ".join(each)))
+    survey = _Survey([0] * len(files), {name: Counter() for name in names})
+    for file, name, size, n in _run(spark, tasks, _COUNTS).collect():
+        if name == _ROWS:
+            survey.rows[file] += n
+        elif name == _BAD:
+            survey.bad += n
+        else:
+            survey.vectors[name][size] += n
+    return survey
+
+
+def _row_tasks(
+    log: TypedLog, files: Files, counts: Sequence[int], known_items: Path | None
+) -> list[Task]:
+    """Tasks that read the typed rows with faults of each file."""
+    conditions = faults(log, known_items)
+    others = () if known_items is None else (known_items,)
+    tasks, before = [], 0
+    for (values, table), n in zip(files, counts, strict=True):
+        rows = f"({numbered_rows([(values, table.sql)])})"
+        faulty = with_faults(log, rows, conditions)
+        query = f"SELECT * REPLACE (row + {before} AS row) FROM ({faulty})"
+        tasks.append(Task(table, query, others))
+        before += n
+    return tasks
+
+
+def _schema(log: TypedLog) -> str:
+    """Spark's types of the rows of `_row_tasks`."""
+    ids = (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID)
+    types = {n: _TYPES[log.id_type(n)] if n in ids else _COLUMNS[n] for n in log.columns}
+    types = {"row": "bigint", **types, schema.REWARD: "double", "fault": "smallint"}
+    return ", ".join(f"{name} {kind}" for name, kind in types.items())
+
+
+def _run(spark: Any, tasks: Sequence[Task], columns: str) -> Any:
+    """A Spark frame of the results of tasks, which its workers run."""
+    numbers = spark.range(0, len(tasks), 1, len(tasks))
+    return numbers.mapInArrow(partial(run_tasks, tasks), columns)
+
+
+def _written(spark: Any, frame: Any, folder: Path) -> Any:
+    """Write a frame to Parquet files; returns it as read from them."""
+    # Each is used several times, and Spark would compute it anew each time.
+    address = folder.absolute().as_uri()
+    frame.write.parquet(address)
+    return spark.read.parquet(address)
+
+
+def _parts(folder: Path) -> list[Path]:
+    """The files that Spark wrote to a folder, in the order of their rows."""
+    return sorted(folder.glob("part-*.parquet"), key=lambda p: (int(p.name.split("-")[1]), p.name))
+
+
+def _batches(folder: Path, rows: int = BATCH_ROWS) -> Iterator[pa.RecordBatch]:
+    for part in _parts(folder):
+        with pq.ParquetFile(part) as file:
+            yield from file.iter_batches(rows, use_threads=False)
+
+
+def _load(connection: duckdb.DuckDBPyConnection, folder: Path, table: str) -> None:
+    """Create a table of the rows in a folder."""
+    parts = _parts(folder)
+    batches = (batch for batch in _batches(folder) if batch.num_rows)
+    reader = pa.RecordBatchReader.from_batches(pq.read_schema(parts[0]), batches)
+    connection.register("given_codes", reader)
+    connection.execute(f"CREATE TABLE {table} AS SELECT * FROM given_codes")
+    connection.unregister("given_codes")
+
+
+@contextmanager
+def _session(master: str) -> Iterator[Any]:
+    """A session of Spark of its own; its cluster connection is kept if the program had one before.
+
+    Raises:
+        InputError: pyspark or Java is missing, or the master does not answer.
+    """
+    try:
+        from pyspark.errors import PySparkException
+        from pyspark.sql import SparkSession
+    except ImportError:
+        raise InputError("--engine spark needs pyspark; pip install 'ucfrec[spark]'") from None
+    if master.startswith("local"):
+        os.environ.setdefault("PYSPARK_PYTHON", sys.executable)
+    running = SparkSession.getActiveSession()
+    builder = SparkSession.builder.appName("ucfrec prepare")
+    try:
+        # The bar of `prepare` shows how far it is.
+        started = running or (
+            builder.master(master).config("spark.ui.showConsoleProgress", "false").getOrCreate()
+        )
+    except (PySparkException, OSError) as error:
+        raise InputError(
+            f"Spark cannot be started at {master!r} ({one_line(str(error)):.300}); it needs Java "
+            "17 or later, and a master such as local[*] or spark://HOST:7077"
+        ) from None
+    started.sparkContext.setLogLevel("ERROR")
+    try:
+        yield started.newSession()
+    finally:
+        if running is None:
+            started.stop()
+
+
+@contextmanager
+def _failures() -> Iterator[None]:
+    """Turn errors of Spark that occur in the block into `InputError`.
+
+    Raises:
+        InputError: a worker refused the log, or Spark failed.
+    """
+    from py4j.protocol import Py4JError
+    from pyspark.errors import PySparkException
+
+    try:
+        yield
+    except (PySparkException, Py4JError) as error:
+        if refused := _REFUSED.search(str(error)):
+            raise InputError(refused[1]) from None
+        raise InputError(f"Spark failed ({one_line(str(error)):.500}); its log says more") from None

@@ -15,23 +15,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from tests.support.planted import ACTION, CONSTANT, STATE, fitted, planted
+from tests.support.planted import ACTION, CONSTANT, STATE, STEPS, fitted, planted
+from tests.support.planted import planted_store as store
 from ucfrec import schema
 from ucfrec.counterfactual.augment import (
     AugmentationReport,
     AugmentConfig,
     accept,
     augment,
-    counterfactual_copies,
 )
 from ucfrec.counterfactual.edit_statistics import MoveStatistics
 from ucfrec.counterfactual.generators import CSGConfig, Generator, make_generator
 from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig
-from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay, Transitions
 from ucfrec.errors import InputError
 
-STEPS, EPISODES = 3_000, 60
 ALGORITHM_5 = AugmentConfig(copies=4, edits_per_copy=1, reward_quantile=0.0)
 APPENDIX_H = AugmentConfig(copies=2, edits_per_copy=0, reward_quantile=0.3)
 
@@ -39,23 +37,6 @@ APPENDIX_H = AugmentConfig(copies=2, edits_per_copy=0, reward_quantile=0.3)
 @pytest.fixture(autouse=True)
 def one_thread() -> None:
     torch.set_num_threads(1)
-
-
-@functools.cache
-def store() -> EpisodeStore:
-    """Planted steps in episodes of unequal length, the last ten for validation."""
-    rng = np.random.default_rng(5)
-    cuts = np.sort(rng.choice(np.arange(1, STEPS), EPISODES - 1, replace=False))
-    t = planted(STEPS, 3).transitions
-    columns = {
-        schema.OBSERVATION: t.states.numpy(),
-        schema.ACTION: t.actions.numpy(),
-        schema.REWARD: t.rewards.numpy(),
-    }
-    split = (np.arange(EPISODES) >= EPISODES - 10).astype(np.uint8)
-    folder = Path(tempfile.mkdtemp()) / "store"
-    lengths = np.diff(np.concatenate([[0], cuts, [STEPS]]))
-    return EpisodeStore.write(folder, columns, lengths, {schema.SPLIT: split})
 
 
 @functools.cache
@@ -195,24 +176,14 @@ def test_the_report_says_what_proposition_1_promises() -> None:
 
 
 def test_impossible_configurations_are_refused() -> None:
-    for wrong in ({"copies": 0}, {"edits_per_copy": -1}, {"reward_quantile": 1.0}):
+    for wrong in (
+        {"copies": -1},
+        {"actions": -1},
+        {"edits_per_copy": -1},
+        {"reward_quantile": 1.0},
+    ):
         with pytest.raises(InputError, match="augment"):
             augmented(replace(APPENDIX_H, **wrong))
-
-
-def test_from_views_to_an_overlay(tmp_path: Path) -> None:
-    overlay, report = counterfactual_copies(
-        store().split("train"),
-        store().split("validation"),
-        CRMConfig(epochs=2, hidden=32),
-        CSGConfig(kind="faithful", epochs=2, hidden=32),
-        replace(APPENDIX_H, epsilon_r=3.0),
-        tmp_path,
-        seed=0,
-    )
-    assert report.reward_model.validation_transitions == store().split("validation").n_steps
-    assert any(warning.startswith("edit collapse") for warning in report.warnings)
-    assert len(overlay.edit_step) > 0
 
 
 @settings(max_examples=60, deadline=None)

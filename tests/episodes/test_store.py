@@ -19,6 +19,7 @@ from tests.support.episodes import (
     Logged,
     episode_columns,
     lengths_of,
+    random_action_copies,
     random_episodes,
     random_overlay,
     some_states,
@@ -610,7 +611,7 @@ def test_tensors_whose_shapes_do_not_go_together_are_refused(folder: Path, of: s
     good: Windows | Transitions | Overlay = {
         "windows": store.windows(*at, 3),
         "transitions": store.transitions(*at),
-        "overlay": random_overlay(store, 3, seed=0)[0],
+        "overlay": random_overlay(store, 3, seed=0)[0].joined(random_action_copies(store, 4, 0)),
     }[of]
     for name, values in vars(good).items():
         for wrong in (values[1:], values[..., None, None]):
@@ -624,6 +625,7 @@ def test_an_overlay_comes_back_from_its_file(folder: Path) -> None:
     base = write_store(folder / "store", random_episodes(LENGTHS), some_states())
     for copies in (0, 5):
         overlay, _ = random_overlay(base, copies, seed=5)
+        overlay = overlay.joined(random_action_copies(base, copies, seed=6))
         overlay.save(folder / "overlay.safetensors")
         read = Overlay.load(folder / "overlay.safetensors")
         for name, values in vars(overlay).items():

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from tests.support import killed_run
-from ucfrec.counterfactual.augment import counterfactual_copies
+from ucfrec.counterfactual.copies import counterfactual_copies
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from tests.support import killed_run
+from tests.support.episodes import random_episodes, some_states, write_store
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay
@@ -77,13 +78,15 @@ def test_the_record_tells_what_was_done(store: Path, left_alone: Path) -> None:
     assert 0 < report["acceptance"] <= 1
     assert 0 <= report["moves"]["mean_move_ratio"] <= 1
     assert 0 <= report["reward_model"]["active_dimensions"] <= 16
+    assert 0 < report["actions"]["copies"] <= report["actions"]["proposals"]
 
 
 def test_edits_are_of_training_episodes_only(store: Path, left_alone: Path) -> None:
     overlay = Overlay.load(left_alone / "overlay.safetensors")
     training = EpisodeStore.open(store).split("train").episode_ids
-    assert set(overlay.copy_source) <= set(training)
+    assert set(overlay.copy_source) | set(overlay.action_source) <= set(training)
     assert len(overlay.edit_step) > 0
+    assert len(overlay.action_step) > 0
 
 
 def test_a_run_needs_nothing_but_its_folder(store: Path, left_alone: Path) -> None:
@@ -104,6 +107,38 @@ def test_without_copies_no_reward_model_is_trained(store: Path, tmp_path: Path) 
     assert "augmentation" not in record
     assert not (tmp_path / "run" / "crm").exists()
     assert TrainedPolicy.load(tmp_path / "run").name == "ucf-no-augmentation"
+
+
+def test_other_actions_alone_on_the_command_line(
+    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = (*killed_run.SETTINGS, "train.steps=4", "augment.copies=0", "augment.actions=2")
+    command = ["train", str(store), "--out", str(tmp_path / "run")]
+    main([*command, *(text for setting in settings for text in ("--set", setting))])
+    printed = capsys.readouterr().out
+    report = json.loads((tmp_path / "run" / "run.json").read_text())["augmentation"]
+    assert f"other actions {report['actions']['copies']:,} copies" in printed
+    assert "acceptance" not in printed
+    assert (report["copies"], report["proposals"]) == (0, 0)
+    assert not (tmp_path / "run" / "csg").exists()
+    assert TrainedPolicy.load(tmp_path / "run").name == "ucf"
+
+
+@pytest.mark.parametrize("learner", ["ucf", "dt4rec", "cdt4rec"])
+def test_other_items_with_every_addition(tmp_path: Path, learner: str) -> None:
+    states, episodes = some_states(), random_episodes([6] * 60)
+    for number, episode in enumerate(episodes):
+        episode.split = int(number % 5 == 0)
+    store = write_store(tmp_path / "store", episodes, states)
+    settings = [
+        *("train.steps=4", "train.batch_size=256", "policy.dim=8", "policy.context=4"),
+        *("crm.epochs=20", "crm.hidden=16", "augment.actions=2", "augment.epsilon_r=10.0"),
+        *("policy.exposure=true", "policy.advantage_weights=true", "policy.max_return=true"),
+        *("policy.return_to_go=horizon", "policy.horizon=2", "rule.choose=false"),
+    ]
+    record = train_run(store, tmp_path / "run", resolve_config(learner, None, settings))
+    assert record["augmentation"]["actions"]["copies"] > 10
+    assert np.isfinite(record["policy"]["best_validation"])
 
 
 def test_a_store_without_validation_holds_some_training_episodes_out(tmp_path: Path) -> None:

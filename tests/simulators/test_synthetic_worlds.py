@@ -172,13 +172,63 @@ def test_clicks_have_the_stated_probability() -> None:
         assert abs(group.mean() - chance) < 4 * np.sqrt(chance * (1 - chance) / len(group))
 
 
-def test_propensities_are_exact() -> None:
-    env = SyntheticCatalog(20_000, n_items=24, n_users=1)
+def test_moods_move_all_items_alike_and_are_not_told() -> None:
+    env, calm = (SyntheticCatalog(6000, n_users=3, mood=mood) for mood in (1.5, 0.0))
+    observations, info = env.reset(seed=0)
+    assert observations.shape == calm.reset(seed=0)[0].shape
+    assert info.keys() == calm.reset(seed=0)[1].keys()
+    users, good = env.users.copy(), env.good_mood.copy()
+    assert abs(good.mean() - 0.5) < 4 * np.sqrt(0.25 / 6000)
+    _, clicks, *_ = env.step(np.full(6000, 17))
+    for user in range(3):
+        log_odds = env.logits[user, 17] + np.array([-1.5, 1.5])
+        chances = 1 / (1 + np.exp(-log_odds))
+        assert env.click_probabilities[user, 17] == pytest.approx(chances.mean())
+        for mood, chance in enumerate(chances):
+            group = clicks[(users == user) & (good == mood)]
+            assert abs(group.mean() - chance) < 4 * np.sqrt(chance * (1 - chance) / len(group))
+    best = env.favourites(env.click_probabilities)
+    np.testing.assert_array_equal(best, calm.favourites(calm.click_probabilities))
+    np.testing.assert_array_equal(calm.click_probabilities, 1 / (1 + np.exp(-calm.logits)))
+    assert not calm.good_mood.any()
+    with pytest.raises(InputError, match="mood is -1"):
+        SyntheticCatalog(1, mood=-1.0)
+
+
+def even_tags_and_clicks(mood: float, behavior: str) -> np.ndarray:
+    """Click rates of odd and of even tags in a log, each relative to what causes clicks."""
+    catalogue = synthetic_catalog.simulator(mood)
+    env = catalogue.make(256, None)
+    assert isinstance(env, SyntheticCatalog)
+    lift: list[list[float]] = [[], []]
+
+    def record(step: Step) -> None:
+        assert step.user_ids is not None
+        luck = step.rewards - env.click_probabilities[step.user_ids, step.actions]
+        for odd, values in enumerate((lift[1], lift[0])):
+            values += luck[env.tags[step.actions] % 2 == odd].tolist()
+
+    rollout(env, catalogue.behaviors[behavior](env, 0), 3000, 0, record)
+    return np.array([np.mean(each) for each in lift])
+
+
+def test_moods_confound_what_was_shown_with_what_was_clicked() -> None:
+    odd, even = even_tags_and_clicks(1.5, "mixture")
+    assert even - odd > 0.05
+    for mood, behavior in ((0.0, "mixture"), (1.5, "random")):
+        odd, even = even_tags_and_clicks(mood, behavior)
+        assert abs(even - odd) < 0.03
+
+
+@pytest.mark.parametrize("mood", [0.0, 1.5])
+def test_propensities_are_exact(mood: float) -> None:
+    env = SyntheticCatalog(20_000, n_items=24, n_users=1, mood=mood)
     env.reset(seed=0)
+    env.good_mood[:] = int(mood > 0)  # all alike, so that the shares below are of one mood
     guess = SoftmaxGuess(env, 0, error=1.0, temperature=0.7, epsilon=0.2, variety=2.0)
     probabilities = guess.probabilities()
     np.testing.assert_allclose(probabilities.sum(axis=1), 1.0)
-    chosen, propensity = guess.act(env.reset(seed=0)[0], np.ones(20_000, dtype=bool))
+    chosen, propensity = guess.act(np.zeros((20_000, 0)), np.ones(20_000, dtype=bool))
     np.testing.assert_allclose(propensity, probabilities[0, chosen], rtol=1e-6)
     shares = np.bincount(chosen, minlength=24) / 20_000
     sigma = np.sqrt(probabilities[0] * (1 - probabilities[0]) / 20_000)

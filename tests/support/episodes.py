@@ -179,3 +179,19 @@ def random_overlay(
         edit_state=np.array(list(edits.values()), dtype=np.float32).reshape(-1, store.state_size),
     )
     return overlay, edits
+
+
+def random_action_copies(store: EpisodeStore, copies: int, seed: int) -> Overlay:
+    """Copies of random episodes of the view that end at a random step with a random action."""
+    rng = np.random.default_rng(seed)
+    positions = rng.integers(len(store.episode_ids), size=copies)
+    actions = rng.integers(N_ITEMS, size=copies)
+    if not store.has_items:
+        actions = rng.uniform(-1, 1, (copies, 3)).astype(np.float32)  # type: ignore[assignment]
+    return Overlay.of_actions(
+        store.episode_ids[positions],
+        rng.integers(store.lengths[positions]),
+        actions,
+        (rng.integers(-8, 25, size=copies) / 8).astype(np.float32),
+        store.state_size,
+    )

@@ -9,8 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ucfrec import schema
 from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig
 from ucfrec.counterfactual.reward_model_fit import CRMReport, fit_crm
+from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Transitions
 
 STATE, ACTION = 7, 2
@@ -18,6 +20,8 @@ CONSTANT = 6
 """The state dimension that never varies; 3, 4 and 5 are no causes of the reward."""
 _F_STD = 0.993
 """Of f over the planted states and actions."""
+STEPS, EPISODES = 3_000, 60
+"""Of `planted_store`."""
 FIT = CRMConfig(epochs=12, learning_rate=1e-3)
 
 
@@ -62,3 +66,20 @@ def affine_correlation(z: Tensor, u: Tensor) -> float:
     columns = torch.cat([z, torch.ones(len(z), 1)], dim=1).double()
     weights = torch.linalg.lstsq(columns, u.double().unsqueeze(1)).solution
     return float(torch.corrcoef(torch.stack([(columns @ weights)[:, 0], u.double()]))[0, 1])
+
+
+@functools.cache
+def planted_store() -> EpisodeStore:
+    """Planted steps in episodes of unequal length, the last ten for validation."""
+    rng = np.random.default_rng(5)
+    cuts = np.sort(rng.choice(np.arange(1, STEPS), EPISODES - 1, replace=False))
+    t = planted(STEPS, 3).transitions
+    columns = {
+        schema.OBSERVATION: t.states.numpy(),
+        schema.ACTION: t.actions.numpy(),
+        schema.REWARD: t.rewards.numpy(),
+    }
+    split = (np.arange(EPISODES) >= EPISODES - 10).astype(np.uint8)
+    folder = Path(tempfile.mkdtemp()) / "store"
+    lengths = np.diff(np.concatenate([[0], cuts, [STEPS]]))
+    return EpisodeStore.write(folder, columns, lengths, {schema.SPLIT: split})

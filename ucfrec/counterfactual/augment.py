@@ -1,13 +1,12 @@
-"""Offline counterfactual augmentation: edited copies of episodes and a report on their quality.
+"""Edited copies of episodes, and a report on their quality.
 
 Rewards, actions, next states and returns-to-go of a copy are those of its source; an overlay holds
 only the edited states (paper appendix H).
 """
 
 import copy
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -17,19 +16,15 @@ from pydantic import Field
 from torch import Tensor
 
 from ucfrec import schema
+from ucfrec.counterfactual.action_copies import ActionReport
 from ucfrec.counterfactual.edit_statistics import MoveReport, MoveStatistics
-from ucfrec.counterfactual.generators import CSGConfig, Generator, make_generator
-from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model
-from ucfrec.counterfactual.item_reward_mean import EffectsMean, EffectTransitions
-from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig
-from ucfrec.counterfactual.reward_model_fit import CRMReport, fit_crm, fit_warning
+from ucfrec.counterfactual.generators import Generator
+from ucfrec.counterfactual.reward_model import CausalRewardModel
+from ucfrec.counterfactual.reward_model_fit import CRMReport, fit_warning
+from ucfrec.counterfactual.transitions import Read
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import FloatArray, IntArray, Overlay, Transitions
-from ucfrec.errors import InputError
-from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.settings import Count, Quantile, settings_table
-
-Read = Callable[[EpisodeStore, IntArray, IntArray], Transitions]
 
 _CHUNK = 8192
 _DELTA_LEVEL = "0.95"
@@ -38,7 +33,7 @@ _ROUNDING = 1e-9
 
 @settings_table("augment")
 class AugmentConfig:
-    """How many edited copies are made, and which steps are edited.
+    """How many copies are made, with other states or other actions, and of which steps.
 
     The paper's Algorithm 5 is `copies=K, edits_per_copy=1, reward_quantile=0`: each of K accepted
     proposals makes a separate copy. The default is appendix H: few copies that contain every
@@ -46,17 +41,29 @@ class AugmentConfig:
     """
 
     copies: Annotated[int, Field(ge=0, le=1000)] = 1
-    """Maximum number of edited copies of each episode; 0 trains without copies and without a reward
-    model."""
+    """Maximum number of edited copies of each episode, whose states differ; 0 for none."""
+    actions: Annotated[int, Field(ge=0, le=1000)] = 0
+    """Number of other actions to ask about at each step: a copy of the episode up to this step ends
+    with the other action and the reward that it would have earned, where the reward model can tell.
+    With neither actions nor copies, no reward model is fitted."""
     edits_per_copy: Annotated[int, Field(ge=0, le=1_000_000)] = 0
     """Maximum number of edited steps in a copy; 0 means no limit."""
     reward_quantile: Quantile = 0.3
-    """Steps with a reward below this quantile are not edited."""
+    """Steps with a reward below this quantile are neither edited nor asked about."""
     epsilon_r: Annotated[float, Field(ge=0, le=1e15)] | None = None
     """ε_r, tolerance of the reward gate in reward units; unset, 0.1 × standard deviation of the
     rewards."""
     max_steps: Count = 2_000_000
     """Maximum number of steps to propose edits for; from a larger store, episodes are sampled."""
+
+    @property
+    def makes_copies(self) -> bool:
+        """Whether there are copies of any kind."""
+        return self.copies > 0 or self.actions > 0
+
+    def tolerance(self, crm: CausalRewardModel) -> float:
+        """ε_r, in reward units."""
+        return 0.1 * float(crm.reward_std) if self.epsilon_r is None else self.epsilon_r
 
 
 @dataclass(frozen=True)
@@ -84,6 +91,8 @@ class AugmentationReport:
     collapse."""
     reward_model: CRMReport
     """Quality of the reward model."""
+    actions: ActionReport | None = None
+    """Action copies; None if no other action was asked about."""
 
 
 def accept(
@@ -132,87 +141,16 @@ def augment(
         config: numbers of copies and edits, and the gate.
         seed: of sampling and proposals.
         read: reads transitions with the actions that the reward model was fitted to.
-
-    Raises:
-        InputError: `config.copies` is 0.
     """
-    if config.copies < 1:
-        raise InputError("augment.copies is 0; set it to at least 1 to make edited copies")
     rng = np.random.default_rng(seed)
-    epsilon_r = config.epsilon_r
-    if epsilon_r is None:
-        epsilon_r = 0.1 * float(crm.reward_std)
-    editor = _Editor(view, crm, generator, epsilon_r, seed, read)
-    episodes, steps = _candidates(view, config, rng)
+    editor = _Editor(view, crm, generator, config.tolerance(crm), seed, read)
+    episodes, steps = candidates(view, config, rng)
     if config.edits_per_copy:
         rounds = _fill_copies(editor, episodes, steps, config, rng)
     else:
         rounds = (editor.edit(episodes, steps, copy=k) for k in range(config.copies))
     overlay = _overlay(view, _join(rounds, view.state_size), config.copies)
     return overlay, _report(overlay, editor, crm_report)
-
-
-def require_rewards_vary(train: EpisodeStore) -> None:
-    """Check that the training rewards are not all equal, which a reward model cannot learn from.
-
-    Raises:
-        InputError: all training rewards are equal.
-    """
-    rewards = (train.step_values(schema.REWARD, *steps) for steps in train.step_batches())
-    found = np.unique([extreme for part in rewards for extreme in (part.min(), part.max())])
-    if len(found) == 1:
-        raise InputError(
-            f"all {train.n_steps:,} training rewards of {train.path} equal {found[0]:g}: there is "
-            "nothing for a reward model to learn; check the reward expression, or set "
-            "augment.copies=0"
-        )
-
-
-@random_state_kept()
-def counterfactual_copies(
-    train: EpisodeStore,
-    validation: EpisodeStore,
-    crm_config: CRMConfig,
-    csg_config: CSGConfig,
-    config: AugmentConfig,
-    folder: Path,
-    seed: int,
-) -> tuple[Overlay, AugmentationReport]:
-    """Fit reward model and generator, and make edited copies (lines 1 to 3 of Algorithm 1).
-
-    Args:
-        train: view to fit both models to and to copy episodes from.
-        validation: view for early stopping and for the quality of the reward model.
-        crm_config: settings of the reward model.
-        csg_config: settings of the state generator.
-        config: settings of the copies.
-        folder: of the checkpoints, which training resumes from.
-        seed: of everything random.
-
-    Raises:
-        InputError: all training rewards are equal, there are no held-out steps, or `config.copies`
-            is 0.
-    """
-    limit = max(crm_config.max_transitions, csg_config.max_transitions)
-    mean: EffectsMean | None = None
-    read: Read = EpisodeStore.transitions
-    if crm_config.mean == "effects" and train.has_items:
-        model, _ = fit_item_reward_model(train, validation, folder / "item-reward", seed)
-        mean, read = EffectsMean(model), EffectTransitions(model)
-    training = sample_transitions(train, limit, seed, read)
-    held_out = sample_transitions(validation, limit // 10, seed, read)
-    crm, crm_report = fit_crm(training, held_out, crm_config, folder / "crm", seed, mean)
-    generator = make_generator(training, crm, csg_config, folder / "csg", seed)
-    return augment(train, crm, crm_report, generator, config, seed, read)
-
-
-def sample_transitions(
-    view: EpisodeStore, limit: int, seed: int, read: Read = EpisodeStore.transitions
-) -> Transitions:
-    """All transitions of a view; if there are more than `limit`, so many drawn with replacement."""
-    if view.n_steps <= limit:
-        return read(view, *view.all_steps())
-    return read(view, *view.draw_steps(np.random.default_rng(seed), limit))
 
 
 class _Edits(NamedTuple):
@@ -280,10 +218,16 @@ class _Editor:
         return self._moves.report(self.rho_high, int((self._crm.state_std > 0).sum()))
 
 
-def _candidates(
+def candidates(
     view: EpisodeStore, config: AugmentConfig, rng: np.random.Generator
 ) -> tuple[IntArray, IntArray]:
-    """(episodes, steps) that pass the reward filter, in order of episodes."""
+    """(episodes, steps), each (M,), that pass the reward filter, in order of episodes.
+
+    Args:
+        view: the training episodes, without copies.
+        config: filter and number of steps.
+        rng: draws episodes if there are too many steps.
+    """
     order = rng.permutation(view.n_episodes)
     count = np.searchsorted(np.cumsum(view.lengths[order]), config.max_steps, side="right")
     sampled = np.sort(order[: max(1, int(count))])
@@ -366,13 +310,15 @@ def _report(overlay: Overlay, editor: _Editor, crm_report: CRMReport) -> Augment
         epsilon_r=editor.epsilon_r,
         delta=delta,
         bound=bound,
-        verdict=_verdict(moves.edits, bound, crm_report),
+        verdict=_verdict(editor.proposals, moves.edits, bound, crm_report),
         warnings=tuple(warnings),
         reward_model=crm_report,
     )
 
 
-def _verdict(edits: int, bound: float, crm_report: CRMReport) -> str:
+def _verdict(proposals: int, edits: int, bound: float, crm_report: CRMReport) -> str:
+    if proposals == 0:
+        return "no state is edited"
     if edits == 0:
         return (
             "no edit was accepted: the reward model's median error on held-out steps is "

@@ -9,6 +9,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
+from ucfrec.counterfactual.clusters import StateClusters
 from ucfrec.counterfactual.reward_model import CausalRewardModel, mlp
 from ucfrec.episodes.windows import Transitions
 from ucfrec.fitting.loop import LoopConfig, fit
@@ -103,20 +104,16 @@ class TangentGenerator:
     `CounterfactualStateGenerator`.
     """
 
-    def __init__(
-        self, crm: CausalRewardModel, centres: Tensor, covariances: Tensor, config: CSGConfig
-    ) -> None:
+    def __init__(self, crm: CausalRewardModel, clusters: StateClusters, config: CSGConfig) -> None:
         """
         Args:
             crm: the fitted reward model.
-            centres: (C, S) centres of the clusters of normalised states.
-            covariances: (C, S, S) covariance of the normalised states of each cluster.
+            clusters: of the states that edits are proposed for.
             config: band and number of Newton steps.
         """
         self._crm = crm
-        self._centres = centres
-        self._covariances = covariances
-        values, vectors = torch.linalg.eigh(covariances)
+        self._clusters = clusters
+        values, vectors = torch.linalg.eigh(clusters.covariances)
         self._roots = vectors * values.clamp(min=0).sqrt().unsqueeze(-2)
         self._config = config
         self.band = config.band
@@ -127,12 +124,12 @@ class TangentGenerator:
     ) -> Tensor:
         """See `Generator.propose`."""
         low, high = self.band
-        near = torch.cdist(self._crm.normalised_states(states), self._centres).argmin(dim=1)
+        near = self._clusters.nearest(self._crm.normalised_states(states))
         noise = torch.randn(states.shape, generator=generator)
         length = low + (high - low) * torch.rand(len(states), 1, generator=generator)
         # In order of clusters, so that no step needs a copy of its cluster's matrix.
         order = near.argsort(stable=True)
-        rows = torch.bincount(near, minlength=len(self._centres)).tolist()
+        rows = torch.bincount(near, minlength=len(self._clusters.centres)).tolist()
         given = (each[order] for each in (states, actions, z, noise, length))
         moves = self._moves(rows, *given)
         return states + self._crm.state_std * torch.empty_like(moves).index_copy_(0, order, moves)
@@ -148,14 +145,14 @@ class TangentGenerator:
     ) -> Tensor:
         """Moves Δ (M, S) of steps in order of their clusters, which have so many `rows` each."""
         reward, gradient = self._reward(states, actions, z, torch.zeros_like(states))
-        steepest = _products(self._covariances, gradient, rows)
+        steepest = _products(self._clusters.covariances, gradient, rows)
         move = _products(self._roots, noise, rows)
         move = _scaled(
             move - steepest * _ratio((gradient * move).sum(1), gradient, steepest), length
         )
         for _ in range(self._config.corrections):
             current, gradient = self._reward(states, actions, z, move)
-            steepest = _products(self._covariances, gradient, rows)
+            steepest = _products(self._clusters.covariances, gradient, rows)
             step = steepest * _ratio(current - reward, gradient, steepest)
             move = _shortened(move - _shortened(step, length), length)
         return move
@@ -216,9 +213,22 @@ class NoiseGenerator:
         return states + self._std * _scaled(noise, length)
 
 
+def state_clusters(
+    train: Transitions, crm: CausalRewardModel, config: CSGConfig, seed: int
+) -> StateClusters:
+    """Clusters of the states of the steps that `make_generator` fits to, with the same seed."""
+    states = crm.normalised_states(train.states[_high_rewards(train, config, seed)])
+    return StateClusters.of(states, config.clusters, seed)
+
+
 @random_state_kept()
 def make_generator(
-    train: Transitions, crm: CausalRewardModel, config: CSGConfig, folder: Path, seed: int
+    train: Transitions,
+    crm: CausalRewardModel,
+    config: CSGConfig,
+    folder: Path,
+    seed: int,
+    clusters: StateClusters | None = None,
 ) -> Generator:
     """Make the generator of kind `config.kind`, fitted to the steps of `train` with high rewards.
 
@@ -228,37 +238,24 @@ def make_generator(
         config: kind and settings.
         folder: of the checkpoints of `faithful`, which resumes from them.
         seed: of sampling, clustering and training.
+        clusters: the `state_clusters` of the same arguments, if they are known.
     """
     if config.kind == "noise":
         return NoiseGenerator(crm, config)
-    rng = np.random.default_rng(seed)
-    threshold = np.quantile(train.rewards.numpy(), config.reward_quantile)
-    rows = np.flatnonzero(train.rewards.numpy() >= threshold)
-    chosen = torch.from_numpy(rng.permutation(rows)[: config.max_transitions])
     if config.kind == "tangent":
-        return _tangent(crm.normalised_states(train.states[chosen]), crm, config, seed)
+        clusters = clusters or state_clusters(train, crm, config, seed)
+        return TangentGenerator(crm, clusters, config)
+    chosen = _high_rewards(train, config, seed)
     s, a, r = train.states[chosen], train.actions[chosen], train.rewards[chosen]
     return _faithful(s, a, r, crm, config, folder, seed)
 
 
-def _tangent(
-    states: Tensor, crm: CausalRewardModel, config: CSGConfig, seed: int
-) -> TangentGenerator:
-    # Imported here because it takes a second and 100 MB, and loading a policy does not need it.
-    from sklearn.cluster import MiniBatchKMeans
-
-    size = states.shape[1]
-    clusters = max(1, min(config.clusters, len(states) // (8 * size)))
-    fitted = MiniBatchKMeans(clusters, random_state=seed, n_init=1, batch_size=4096)
-    labels = torch.from_numpy(fitted.fit_predict(states.numpy()).astype(np.int64))
-    centres = torch.from_numpy(fitted.cluster_centers_).float()
-    whole = torch.cov(states.T, correction=0).reshape(size, size)
-    covariances = torch.empty(clusters, size, size)
-    for cluster in range(clusters):
-        deviations = states[labels == cluster] - centres[cluster]
-        # Shrunk towards the covariance of all states, because a cluster may have few.
-        covariances[cluster] = (deviations.T @ deviations + size * whole) / (len(deviations) + size)
-    return TangentGenerator(crm, centres, covariances, config)
+def _high_rewards(train: Transitions, config: CSGConfig, seed: int) -> Tensor:
+    """Rows of the steps to fit to, in random order."""
+    rewards = train.rewards.numpy()
+    rows = np.flatnonzero(rewards >= np.quantile(rewards, config.reward_quantile))
+    shuffled = np.random.default_rng(seed).permutation(rows)
+    return torch.from_numpy(shuffled[: config.max_transitions])
 
 
 def _faithful(

@@ -16,7 +16,7 @@ from ucfrec.checksums import Sealed
 from ucfrec.episodes.column_files import StepColumn, load_column
 from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.record import REMEDY, read_store_record
-from ucfrec.episodes.returns import returns_to_go
+from ucfrec.episodes.returns import ReturnToGo, returns_to_go
 from ucfrec.episodes.states import ItemStates
 from ucfrec.errors import InputError, InputNote
 
@@ -39,6 +39,7 @@ class Columns:
         arrays: Mapping[str, Array] | None = None,
         item_states: ItemStates | None = None,
         sealed: Sealed | None = None,
+        return_to_go: ReturnToGo | None = None,
     ) -> None:
         """
         Args:
@@ -47,7 +48,9 @@ class Columns:
             arrays: columns in memory, by name, used instead of the files of the folder.
             item_states: used instead of the file of the folder.
             sealed: checksums of the files; None if there are none.
+            return_to_go: what the returns-to-go count; None for the rest of the session.
         """
+        self.return_to_go = return_to_go or ReturnToGo()
         self.path, self.meta, self._sealed = path, meta, sealed
         self._arrays, self._item_states_in_memory = dict(arrays or {}), item_states
         self._shards = [path / f"shard-{i:05d}" for i in range(meta["n_shards"])]
@@ -110,8 +113,16 @@ class Columns:
         arrays[schema.RETURN_TO_GO] = returns_to_go(arrays[schema.REWARD], offsets)
         return cls(_IN_MEMORY, meta, arrays, item_states)
 
-    def with_step_column(self, name: str, values: Array) -> "Columns":
-        """A copy in which step column `name` is `values`, (N,) or (N, size); files stay as is."""
+    def with_step_column(
+        self, name: str, values: Array, return_to_go: ReturnToGo | None = None
+    ) -> "Columns":
+        """A copy in which step column `name` is `values`, (N,) or (N, size); files stay as is.
+
+        Args:
+            name: of the column.
+            values: of all steps.
+            return_to_go: what the returns-to-go count; None for what they counted before.
+        """
         sizes = dict(self.meta["columns"])
         if name in sizes:
             sizes[name] = list(values.shape[1:])
@@ -121,6 +132,7 @@ class Columns:
             {**self._arrays, name: values},
             self._item_states_in_memory,
             self._sealed,
+            return_to_go or self.return_to_go,
         )
         copy._steps = {other: column for other, column in self._steps.items() if other != name}
         return copy

@@ -51,6 +51,13 @@ class ReturnToGo:
         """
         return self.definition == "session"
 
+    def weights(self, ahead: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+        """How much of a reward that comes so many steps later counts, of the shape of `ahead`."""
+        if self.definition == "discounted":
+            return np.asarray(self.discount**ahead, dtype=np.float64)
+        reach = self.horizon if self.definition == "horizon" else np.inf
+        return np.asarray(ahead < reach, dtype=np.float64)
+
     def of_logs(
         self, rewards: npt.NDArray[np.floating], offsets: npt.NDArray[np.int64]
     ) -> npt.NDArray[np.float32]:

@@ -135,11 +135,11 @@ class EpisodeStore(EpisodeView):
         return self.select(np.flatnonzero(in_split))
 
     def with_overlay(self, overlay: Overlay) -> "EpisodeStore":
-        """A view with the edited copies of `overlay` appended after the episodes of this view.
+        """A view with the copies of `overlay` appended after the episodes of this view.
 
         Raises:
-            InputError: the overlay was made from another store: it copies episodes that this store
-                does not have, or its states have another size.
+            InputError: the overlay was made from another store: it copies episodes or steps that
+                this store does not have, or its states or actions have another size.
         """
         _require_own_copies(self, overlay)
         joined = overlay if self.overlay is None else self.overlay.joined(overlay)
@@ -149,11 +149,14 @@ class EpisodeStore(EpisodeView):
         """A view of the same logged episodes, without edited copies."""
         return EpisodeStore(self._columns, self._selected)
 
-    def with_returns_to_go(self, values: FloatArray) -> "EpisodeStore":
+    def with_returns_to_go(
+        self, values: FloatArray, definition: ReturnToGo | None = None
+    ) -> "EpisodeStore":
         """A view of the same episodes with other returns-to-go; the files are not changed.
 
         Args:
             values: (n_steps,) returns-to-go in reward units, in the order of `all_steps`.
+            definition: what they count; None for what they counted before.
 
         Raises:
             InputError: this view has edited copies.
@@ -162,7 +165,7 @@ class EpisodeStore(EpisodeView):
         column = self._columns.step_column(schema.RETURN_TO_GO)
         episodes, steps = self.all_steps()
         column[self._columns.starts[self._sources[episodes]] + steps] = values
-        columns = self._columns.with_step_column(schema.RETURN_TO_GO, column)
+        columns = self._columns.with_step_column(schema.RETURN_TO_GO, column, definition)
         return EpisodeStore(columns, self._selected)
 
     def with_return_to_go(self, definition: ReturnToGo) -> "EpisodeStore":
@@ -173,7 +176,7 @@ class EpisodeStore(EpisodeView):
         """
         rewards = self.step_values(schema.REWARD, *self.all_steps())
         offsets = np.concatenate([[0], np.cumsum(self.lengths)])
-        return self.with_returns_to_go(definition.of_logs(rewards, offsets))
+        return self.with_returns_to_go(definition.of_logs(rewards, offsets), definition)
 
     def without_observation_dimensions(self, dimensions: Sequence[int]) -> "EpisodeStore":
         """A view of the same episodes without some dimensions of the observations.
@@ -212,11 +215,12 @@ class EpisodeStore(EpisodeView):
         self._require_steps(episodes, ends, length)
         steps = ends[:, None] + np.arange(1 - length, 1)  # (B, K)
         mask = steps >= 0
-        index = self._columns.starts[self._sources[episodes]][:, None] + np.maximum(steps, 0)
         valid = torch.from_numpy(mask)
 
         def gather(name: str) -> Tensor:
-            values = torch.from_numpy(self._columns.step_values(name, index))
+            values = torch.from_numpy(
+                self.step_values(name, episodes[:, None], np.maximum(steps, 0))
+            )
             shape = (*valid.shape, *([1] * (values.ndim - valid.ndim)))
             return values.masked_fill(~valid.view(shape), 0)
 
@@ -289,17 +293,37 @@ def _require_no_copies(store: EpisodeStore, operation: str) -> None:
 
 
 def _require_own_copies(store: EpisodeStore, overlay: Overlay) -> None:
-    source, size = overlay.copy_source, overlay.edit_state.shape[1]
-    if len(source) and not 0 <= source.min() <= source.max() < store.meta["n_episodes"]:
-        raise InputError(
-            f"{overlay} has copies of episodes that {store.path} does not have; use the store "
-            "that the copies were made from"
-        )
+    size = overlay.edit_state.shape[1]
+    for source in (overlay.copy_source, overlay.action_source):
+        if len(source) and not 0 <= source.min() <= source.max() < store.meta["n_episodes"]:
+            raise _of_another_store(
+                overlay, f"has copies of episodes that {store.path} does not have"
+            )
     if size != store.state_size:
-        raise InputError(
-            f"{overlay} edits states of {size}; the store's have {store.state_size}; use the "
-            "store that the copies were made from"
+        raise _of_another_store(
+            overlay, f"edits states of {size}; the store's have {store.state_size}"
         )
+    if len(overlay.action_source):
+        _require_own_actions(store, overlay)
+
+
+def _require_own_actions(store: EpisodeStore, overlay: Overlay) -> None:
+    ends = EpisodeStore(store._columns, overlay.action_source).lengths
+    if not ((overlay.action_step >= 0) & (overlay.action_step < ends)).all():
+        raise _of_another_store(overlay, f"ends copies at steps that {store.path} does not have")
+    if store.has_items:
+        n_items = len(store.item_states.embeddings)
+        fits = (
+            overlay.action.ndim == 1 and 0 <= overlay.action.min() <= overlay.action.max() < n_items
+        )
+    else:
+        fits = list(overlay.action.shape[1:]) == store.meta["columns"][schema.ACTION]
+    if not fits:
+        raise _of_another_store(overlay, f"has actions that {store.path} does not know")
+
+
+def _of_another_store(overlay: Overlay, fault: str) -> InputError:
+    return InputError(f"{overlay} {fault}; use the store that the copies were made from")
 
 
 def _with_split(episodes: Mapping[str, Array] | None, lengths: IntArray) -> dict[str, Array]:

@@ -19,13 +19,17 @@ Array = npt.NDArray[Any]
 IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float32]
 
+_OF_ACTIONS = (schema.ITEM, schema.ACTION, schema.REWARD, schema.RETURN_TO_GO)
+"""Step columns in which an action copy differs from its source."""
 _BATCH_STEPS = 2**20
 
 
 class EpisodeView:
-    """Some episodes of a store: E logged episodes, followed by C edited copies of episodes.
+    """Some episodes of a store: E logged episodes, then C edited copies, then N action copies.
 
-    Wherever a method takes `episodes`, these are positions in the view, 0 to E + C − 1.
+    Wherever a method takes `episodes`, these are positions in the view, 0 to E + C + N − 1. An
+    action copy ends with the step that has another action; only this step of it counts and is
+    drawn, because the steps before it are those of its source.
     """
 
     def __init__(
@@ -35,16 +39,18 @@ class EpisodeView:
         Args:
             columns: of the store.
             episode_ids: (E,) numbers in the store of the view's episodes; None for all.
-            overlay: edited copies.
+            overlay: edited copies and action copies.
         """
         self._columns, self._selected = columns, episode_ids
         self.overlay = overlay
-        """Edited copies of episodes, or None."""
+        """Edited copies of episodes and action copies, or None."""
 
     def __repr__(self) -> str:
         facts = [f"{self.n_steps:,} steps", f"{len(self.episode_ids):,} episodes"]
         if self.overlay is not None:
             facts[1] += f" and {len(self.overlay.copy_source):,} edited copies"
+            if len(self.overlay.action_source):
+                facts[1] += f" and {len(self.overlay.action_source):,} action copies"
         if self.has_items and self._columns.has_item_states:
             facts.append(f"{len(self.item_states.embeddings):,} items")
         facts.append(f"reward={self.meta['reward']}")
@@ -75,25 +81,40 @@ class EpisodeView:
 
     @cached_property
     def _sources(self) -> IntArray:
-        """(E + C,) number in the store of every episode of the view; a copy has its source's."""
+        """(E + C + N,) number in the store of every episode; a copy has its source's."""
         if self.overlay is None:
             return self.episode_ids
-        return np.concatenate([self.episode_ids, self.overlay.copy_source])
+        copies = (self.overlay.copy_source, self.overlay.action_source)
+        return np.concatenate([self.episode_ids, *copies])
+
+    @cached_property
+    def _first_action_copy(self) -> int:
+        return self.n_episodes - (0 if self.overlay is None else len(self.overlay.action_source))
 
     @cached_property
     def lengths(self) -> IntArray:
-        """(E + C,) number of steps of each episode."""
-        return self._columns.lengths[self._sources]
+        """(E + C + N,) number of steps of each episode."""
+        lengths = self._columns.lengths[self._sources]
+        if self.overlay is not None:
+            lengths[self._first_action_copy :] = self.overlay.action_step + 1
+        return lengths
 
     @property
     def n_episodes(self) -> int:
-        """E + C, the number of episodes of the view, including copies."""
+        """E + C + N, the number of episodes of the view, including copies."""
         return len(self._sources)
 
     @cached_property
     def n_steps(self) -> int:
-        """Number of steps of the view, including those of copies."""
-        return int(self.lengths.sum())
+        """Number of steps of the view, including those of copies; 1 of each action copy."""
+        return int(self._counts.sum())
+
+    @cached_property
+    def _counts(self) -> IntArray:
+        """(E + C + N,) number of steps of each episode that count, which are its last."""
+        counts = self.lengths.copy()
+        counts[self._first_action_copy :] = 1
+        return counts
 
     @property
     def has_items(self) -> bool:
@@ -125,7 +146,7 @@ class EpisodeView:
         return self.observation_size + (self.item_states.size if self.has_items else 0)
 
     def episode_values(self, name: str) -> Array:
-        """An episode column, (E + C,); a copy has the value of its source.
+        """An episode column, (E + C + N,); a copy has the value of its source.
 
         Raises:
             InputError: the store has no such column, or its files are damaged.
@@ -134,18 +155,24 @@ class EpisodeView:
 
     @property
     def terminated(self) -> npt.NDArray[np.bool_]:
-        """(E + C,) whether each session is known to have ended with its last step."""
-        if not self._columns.has_episode_column(schema.TERMINATED):
-            return np.ones(self.n_episodes, dtype=bool)
-        return self.episode_values(schema.TERMINATED).astype(bool)
+        """(E + C + N,) whether each session is known to have ended with its last step."""
+        known = np.ones(self.n_episodes, dtype=bool)
+        if self._columns.has_episode_column(schema.TERMINATED):
+            known = self.episode_values(schema.TERMINATED).astype(bool)
+        known[self._first_action_copy :] = False
+        return known
 
     @cached_property
     def returns(self) -> FloatArray:
-        """(E + C,) undiscounted return of each episode, in reward units."""
-        return self._columns.step_values(schema.RETURN_TO_GO, self._columns.starts[self._sources])
+        """(E + C + N,) undiscounted return of each episode, in reward units."""
+        episodes = np.arange(self.n_episodes)
+        return self.step_values(schema.RETURN_TO_GO, episodes, np.zeros_like(episodes))
 
     def step_values(self, name: str, episodes: IntArray, steps: IntArray) -> Array:
-        """Values of a step column at the given steps; edits do not apply.
+        """Values of a step column at the given steps; edits of states do not apply.
+
+        In the last step of an action copy, action and reward are its own, and its returns-to-go
+        count this reward. All else is the source's.
 
         Args:
             name: of the column.
@@ -158,9 +185,41 @@ class EpisodeView:
         Raises:
             InputError: the store has no such column, or its files are damaged.
         """
-        return self._columns.step_values(
+        values = self._columns.step_values(
             name, self._columns.starts[self._sources[episodes]] + steps
         )
+        if self._first_action_copy < self.n_episodes and name in _OF_ACTIONS:
+            copies = episodes - self._first_action_copy
+            self._change_actions(name, values, *np.broadcast_arrays(copies, steps))
+        return values
+
+    def _change_actions(self, name: str, values: Array, copies: IntArray, steps: IntArray) -> None:
+        """Let `values` of a column in `_OF_ACTIONS` be those of action copies, where `copies` are.
+
+        Args:
+            name: of the column.
+            values: at the steps of the sources, changed in place.
+            copies: numbers of action copies; below 0 for other episodes.
+            steps: steps of them, of the same shape.
+        """
+        assert self.overlay is not None
+        here = np.asarray(copies >= 0)
+        ahead = self.overlay.action_step[copies[here]] - steps[here]
+        if name == schema.RETURN_TO_GO:
+            counted = self._columns.return_to_go.weights(ahead)
+            values[here] += counted * self._reward_changes[copies[here]]
+            return
+        own = self.overlay.action_reward if name == schema.REWARD else self.overlay.action
+        here[here] = ahead == 0
+        values[here] = own[copies[here]]
+
+    @cached_property
+    def _reward_changes(self) -> npt.NDArray[np.float64]:
+        """(N,) reward of each action copy less that of its source, in reward units."""
+        assert self.overlay is not None
+        index = self._columns.starts[self.overlay.action_source] + self.overlay.action_step
+        logged = self._columns.step_values(schema.REWARD, index)
+        return self.overlay.action_reward.astype(np.float64) - logged
 
     def rewards_before(self, episodes: IntArray, steps: IntArray) -> npt.NDArray[np.float64]:
         """(B,) sum of the rewards of the session before each step, in reward units.
@@ -190,8 +249,9 @@ class EpisodeView:
         return owner, np.arange(len(owner)) - np.repeat(np.cumsum(steps) - steps, steps)
 
     def all_steps(self) -> tuple[IntArray, IntArray]:
-        """(episodes, steps), each (n_steps,): every step of the view, episode by episode."""
-        episodes = np.repeat(np.arange(self.n_episodes), self.lengths)
+        """(episodes, steps), each (n_steps,): every step of the view, episode by episode; of an
+        action copy, the last."""
+        episodes = np.repeat(np.arange(self.n_episodes), self._counts)
         return episodes, np.arange(self.n_steps) - (self._ends - self.lengths)[episodes]
 
     def step_batches(self) -> Iterator[tuple[IntArray, IntArray]]:
@@ -217,7 +277,7 @@ class EpisodeView:
 
     @cached_property
     def _ends(self) -> IntArray:
-        return np.cumsum(self.lengths)
+        return np.cumsum(self._counts)
 
     def draw_steps(self, generator: np.random.Generator, count: int) -> tuple[IntArray, IntArray]:
         """(episodes, steps), each (count,): steps drawn uniformly, with replacement."""

@@ -1,8 +1,9 @@
-"""Batches gathered from a store (windows, transitions) and overlays of edited copies."""
+"""Batches gathered from a store (windows, transitions) and overlays of copies."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,7 @@ from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 
 IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float32]
+Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -96,12 +98,21 @@ class Transitions:
         return f"Transitions({steps:,} steps, states of {size}, actions of {action})"
 
 
+def _no_integers() -> IntArray:
+    return np.zeros(0, dtype=np.int64)
+
+
+def _no_floats() -> FloatArray:
+    return np.zeros(0, dtype=np.float32)
+
+
 @dataclass(frozen=True)
 class Overlay:
-    """Edited copies of episodes, stored as the edited states only.
+    """Counterfactual copies of episodes, stored as what differs from their sources.
 
-    Rewards, actions, returns-to-go and next states of a copy are those of its source (paper
-    appendix H).
+    C copies have other states at some steps: rewards, actions, returns-to-go and next states are
+    those of the source (paper appendix H). N action copies end with another action: the source up
+    to some step, at which another action earned another reward.
 
     Raises:
         InputError: the shapes do not match.
@@ -115,6 +126,14 @@ class Overlay:
     """(M,) step of the episode that each edit changes; (copy, step) is strictly increasing."""
     edit_state: FloatArray
     """(M, S) counterfactual states."""
+    action_source: IntArray = field(default_factory=_no_integers)
+    """(N,) number in the store of the episode that an action copy is of."""
+    action_step: IntArray = field(default_factory=_no_integers)
+    """(N,) step of the episode with the other action, the last of the copy."""
+    action: Array = field(default_factory=_no_integers)
+    """(N,) int64 items or (N, A) float32 vectors: the other actions."""
+    action_reward: FloatArray = field(default_factory=_no_floats)
+    """(N,) what they earned, in reward units."""
 
     def __post_init__(self) -> None:
         shape = self.edit_copy.shape
@@ -122,12 +141,28 @@ class Overlay:
             len(shape) == self.copy_source.ndim == 1
             and shape == self.edit_step.shape == self.edit_state.shape[:1]
             and self.edit_state.ndim == 2
+            and self.action_source.shape == self.action_step.shape == self.action_reward.shape
+            and (self.action_source.ndim, self.action_source.shape) == (1, self.action.shape[:1])
+            and self.action.ndim in (1, 2)
         ):
-            raise _shapes_differ(self, "copy_source (C,), edits (M,), edit_state (M, S)")
+            given = "copy_source (C,), edits (M,), edit_state (M, S), action copies (N,)"
+            raise _shapes_differ(self, given)
 
     def __repr__(self) -> str:
         edits, size = self.edit_state.shape
-        return f"Overlay({len(self.copy_source):,} copies, {edits:,} edited states of {size})"
+        facts = f"{len(self.copy_source):,} copies, {edits:,} edited states of {size}"
+        if len(self.action_source):
+            facts += f", {len(self.action_source):,} action copies"
+        return f"Overlay({facts})"
+
+    @classmethod
+    def of_actions(
+        cls, source: IntArray, step: IntArray, action: Array, reward: FloatArray, state_size: int
+    ) -> "Overlay":
+        """An overlay of action copies only, of a store whose states have `state_size` numbers."""
+        nothing = np.zeros(0, dtype=np.int64)
+        states = np.zeros((0, state_size), dtype=np.float32)
+        return cls(nothing, nothing, nothing, states, source, step, action, reward)
 
     def edits_at(self, copies: IntArray, steps: IntArray) -> tuple[IntArray, IntArray, IntArray]:
         """Find which of the given steps are edited.
@@ -159,14 +194,9 @@ class Overlay:
 
     def joined(self, other: "Overlay") -> "Overlay":
         """An overlay with the copies of this one, followed by those of `other`."""
-        renumbered = Overlay(
-            other.copy_source,
-            other.edit_copy + len(self.copy_source),
-            other.edit_step,
-            other.edit_state,
-        )
+        renumbered = replace(other, edit_copy=other.edit_copy + len(self.copy_source))
         pairs = ((getattr(self, f.name), getattr(renumbered, f.name)) for f in fields(self))
-        return Overlay(*(np.concatenate(pair) for pair in pairs))
+        return Overlay(*(_end_to_end(*pair) for pair in pairs))
 
     def save(self, path: Path) -> None:
         """Write to one safetensors file, atomically."""
@@ -183,6 +213,15 @@ class Overlay:
         tensors, _ = load_tensors(path)
         with damage_explained(path, REMEDY):
             return cls(**{name: tensor.numpy() for name, tensor in tensors.items()})
+
+
+def _end_to_end(first: Array, second: Array) -> Array:
+    # Without action copies, an overlay does not know the size of an action.
+    return (
+        np.concatenate([first, second])
+        if len(first) and len(second)
+        else max(first, second, key=len)
+    )
 
 
 def _shapes_differ(value: Windows | Transitions | Overlay, expected: str) -> InputError:

@@ -15,6 +15,7 @@ def copies_table(runs: Sequence[tuple[str, Report]]) -> Table:
     """Quality of the reward model and of the edits, one column per run (name, report)."""
     reports = [report for _, report in runs]
     models, moves = [r["reward_model"] for r in reports], [r["moves"] for r in reports]
+    asked = [r.get("actions") or {} for r in reports]
     rows: list[tuple[str, list[Any]]] = [
         ("R² of the reward model, from state and action", [m["r2_without_z"] for m in models]),
         ("R² with the abduced z, which has seen the reward", [m["r2"] for m in models]),
@@ -34,6 +35,13 @@ def copies_table(runs: Sequence[tuple[str, Report]]) -> Table:
          [f"{shown(m['effective_rank'])} of {m['dimensions']}" for m in moves]),
         ("median length of a move ‖Δ‖₂", [m["length_quantiles"].get("0.5") for m in moves]),
     ]  # fmt: skip
+    if any(asked):
+        rows += [
+            ("other actions asked about", [a.get("proposals") for a in asked]),
+            ("copies with another action", [a.get("copies") for a in asked]),
+            ("mean change of their reward", [a.get("mean_change") for a in asked]),
+            ("share of them that earns more", [a.get("earns_more") for a in asked]),
+        ]
     body = [(name, [shown(value) for value in values]) for name, values in rows]
     caption = "Reward model and edited copies, on held-out steps; δ, ε_r in units of the reward"
     return Table(caption, "", [name for name, _ in runs], body)

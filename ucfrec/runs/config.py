@@ -34,11 +34,11 @@ class Config:
     train: LoopConfig = field(default_factory=LoopConfig)
     """The training loop of the policy."""
     crm: CRMConfig = field(default_factory=CRMConfig)
-    """The causal reward model, fitted if `augment.copies` is above 0."""
+    """The causal reward model, fitted if `augment` makes copies."""
     csg: CSGConfig = field(default_factory=CSGConfig)
     """The generator of counterfactual states."""
     augment: AugmentConfig = field(default_factory=AugmentConfig)
-    """The edited copies of training episodes."""
+    """The copies of training episodes."""
     rule: RuleConfig = field(default_factory=RuleConfig)
     """The choice of the decision rule."""
     # scikit-learn accepts no larger seed.

@@ -15,12 +15,23 @@ def describe_run(record: Mapping[str, Any]) -> str:
         lines += [
             f"reward model  R² {crm['r2']:.3f} with z, {crm['r2_without_z']:.3f} without; "
             f"{crm['active_dimensions']} of {crm['latent_dim']} latent dimensions active",
-            f"edits         {report['copies']} copies, acceptance {report['acceptance']:.1%}, "
-            f"mean-move ratio {moves['mean_move_ratio']:.2f}, effective rank "
-            f"{moves['effective_rank']:.1f} of {moves['dimensions']}",
-            f"bound         δ + ε_r = {report['delta']:.3g} + {report['epsilon_r']:.3g}: "
-            f"{report['verdict']}",
         ]
+        if report["proposals"]:
+            lines.append(
+                f"edits         {report['copies']} copies, acceptance {report['acceptance']:.1%}, "
+                f"mean-move ratio {moves['mean_move_ratio']:.2f}, effective rank "
+                f"{moves['effective_rank']:.1f} of {moves['dimensions']}"
+            )
+        if (actions := report.get("actions")) is not None:
+            lines.append(
+                f"other actions {actions['copies']:,} copies of {actions['proposals']:,} asked "
+                f"about; their reward differs by {actions['mean_change']:+.3g} on average, "
+                f"{actions['earns_more']:.0%} of them earn more"
+            )
+        lines.append(
+            f"bound         δ + ε_r = {report['delta']:.3g} + {report['epsilon_r']:.3g}: "
+            f"{report['verdict']}"
+        )
         lines += [f"warning       {warning}" for warning in report["warnings"]]
     policy = record["policy"]
     lines.append(

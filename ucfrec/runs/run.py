@@ -13,7 +13,7 @@ import torch
 from ucfrec import schema
 from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.checksums import reopen, seal
-from ucfrec.counterfactual.augment import counterfactual_copies, require_rewards_vary
+from ucfrec.counterfactual.copies import counterfactual_copies, require_rewards_vary
 from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model, reward_model_sizes
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.returns import ReturnToGo
@@ -64,9 +64,9 @@ def train_run(
 ) -> dict[str, Any]:
     """Train a policy on the training episodes of `store`, or resume the run in `out`.
 
-    The stages are reward model, generator and edited copies (unless `augment.copies` is 0), then
-    the policy; finished stages are not repeated. `out` is created after all inputs have been
-    checked, so that a rejected run leaves no folder. The global random state is restored on return.
+    The stages are reward model, generator and copies (unless `augment` makes none), then the
+    policy; finished stages are not repeated. `out` is created after all inputs have been checked,
+    so that a rejected run leaves no folder. The global random state is restored on return.
 
     Where `torchrun` started several processes, they train the policy together; the leader does
     the rest, and the others return once the policy is trained.
@@ -129,7 +129,7 @@ def _train(
     if view is not train:
         train, policy = view, new_policy(view, config)
     policy = policy.to(device)
-    if config.augment.copies > 0:
+    if config.augment.makes_copies:
         with distributed.leader_first():
             overlay, record["augmentation"] = _counterfactuals(train, validation, out, config)
         more_copies = overlay if more_copies is None else overlay.joined(more_copies)
@@ -150,7 +150,7 @@ def _train(
 def _require_startable(store: EpisodeStore, train: EpisodeStore, out: Path, config: Config) -> None:
     if (out / RUN).exists():
         _require_same(read_json(out / RUN), store, out, config)
-    elif config.augment.copies > 0:
+    elif config.augment.makes_copies:
         require_rewards_vary(train)
 
 
@@ -273,7 +273,7 @@ def _difference(before: Any, now: Any) -> str:
 def _counterfactuals(
     train: EpisodeStore, validation: EpisodeStore, out: Path, config: Config
 ) -> tuple[Overlay, dict[str, Any]]:
-    """The edited copies of a run and their report; made once, then read from `out`."""
+    """The copies of a run and their report; made once, then read from `out`."""
     overlay_path, report_path = out / "overlay.safetensors", out / AUGMENTATION
     if not report_path.exists():
         overlay, report = counterfactual_copies(

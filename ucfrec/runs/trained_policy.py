@@ -351,11 +351,11 @@ def describe_trained(record: Mapping[str, Any]) -> str:
 def learner_of(record: Mapping[str, Any]) -> str:
     """Name of the learner of a run's record.
 
-    Followed by `-augmented` or `-no-augmentation` if the run's use of edited copies is not the
+    Followed by `-augmented` or `-no-augmentation` if the run's use of copies is not the
     learner's default.
     """
     config = config_from_dict(record["config"])
-    augmented = config.augment.copies > 0
+    augmented = config.augment.makes_copies
     if augmented == policy_class(config.policy_name).augmented:
         return config.policy_name
     return f"{config.policy_name}-{'augmented' if augmented else 'no-augmentation'}"

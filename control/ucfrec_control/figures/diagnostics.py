@@ -10,13 +10,14 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from ucfrec.counterfactual.augment import accept, sample_transitions
+from ucfrec.counterfactual.augment import accept
 from ucfrec.counterfactual.generators import (
     CounterfactualStateGenerator,
     TangentGenerator,
     make_generator,
 )
 from ucfrec.counterfactual.reward_model import CausalRewardModel
+from ucfrec.counterfactual.transitions import sample_transitions
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay, Transitions
 from ucfrec.errors import InputError
@@ -56,8 +57,8 @@ def store_of(run: Path) -> EpisodeStore:
 
 
 def has_copies(run: Path) -> bool:
-    """Whether counterfactual copies were made for a run."""
-    return (run / _REPORT).exists()
+    """Whether edited copies were made for a run."""
+    return (run / _REPORT).exists() and read_json(run / _REPORT)["proposals"] > 0
 
 
 def edited_states(run: Path, seed: int = 0) -> tuple[FloatArray, FloatArray]:

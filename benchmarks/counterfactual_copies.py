@@ -1,0 +1,208 @@
+"""What counterfactual copies are worth: state copies, action copies, both and tilt, against none.
+
+    python benchmarks/counterfactual_copies.py --out runs/copies
+
+Trains UCF on logs of the synthetic catalogue, of several sizes, without and with a hidden mood of
+each session that moves both what the log shows and what is clicked (a confounder, planted in
+`ucfrec_simulators.synthetic_catalog`). Every arm of a log and a training seed is evaluated in the
+same episodes of the world of its log: the evaluation seed is fixed. Policies act by argmax at the
+largest training return; only `none+tilt` chooses, on its log, a weight of the reward model.
+
+Appends the rows to results.jsonl in --out, or to --results; a measured row is not measured again.
+Prints each arm's return less that of `none`, paired by log and training seed: the mean, its
+standard error over all pairs, and that of the means of logs, which counts what logs differ by.
+"""
+
+import argparse
+import itertools
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from ucfrec.code_version import code_version
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.evaluation.evaluate import evaluate_policy
+from ucfrec.evaluation.simulated_store import simulated_store
+from ucfrec.evaluation.world import World
+from ucfrec.plugins import Simulator
+from ucfrec.reporting.evaluation_rows import evaluation_row
+from ucfrec.reporting.grid import Measurement, chosen, run_grid
+from ucfrec.reporting.result_row import ResultRow, RowKey
+from ucfrec.reporting.statistics import grouped, paired_differences, summary
+from ucfrec.reporting.tables import markdown_table
+from ucfrec.runs.config import Config, resolve_config
+from ucfrec.runs.run import train_run
+from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec_simulators import synthetic_catalog
+
+EVALUATION_SEED: Final = 1_000_000
+SIZE: Final = ("policy.dim=64", "policy.context=11", "train.learning_rate=1e-3")
+TILT: Final = (
+    *("rule.choose=true", "rule.quantiles=[1.0]"),
+    *("rule.temperatures=[0.0]", "rule.tag_windows=[0]"),
+)
+ARMS: Final = {
+    "none": ("augment.copies=0",),
+    "state": ("augment.copies=1",),
+    "action": ("augment.copies=0", "augment.actions=2"),
+    "both": ("augment.copies=1", "augment.actions=2"),
+    "none+tilt": ("augment.copies=0", *TILT),
+}
+"""Settings of each arm beside `SIZE`."""
+
+
+@dataclass(frozen=True)
+class Catalogue(World):
+    """The synthetic catalogue, with or without moods."""
+
+    mood: float = field(default=0.0, kw_only=True)
+    """See `SyntheticCatalog`."""
+
+    def simulator(self) -> Simulator:
+        """The simulator with this mood."""
+        return synthetic_catalog.simulator(self.mood)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training and its evaluation."""
+
+    out: Path
+    mood: float
+    sessions: int
+    log_seed: int
+    training_seed: int
+    arm: str
+    steps: int
+    episodes: int
+
+    @property
+    def world(self) -> Catalogue:
+        """The world of the log and of the evaluation."""
+        return Catalogue("synthetic-catalog", mood=self.mood)
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the log and its runs."""
+        return self.out / f"mood-{self.mood:g}-sessions-{self.sessions}-log-{self.log_seed}"
+
+    @property
+    def config(self) -> Config:
+        """Training configuration."""
+        given = [*SIZE, f"train.steps={self.steps}", "rule.choose=false", *ARMS[self.arm]]
+        return resolve_config("ucf", None, given, self.training_seed)
+
+
+def key(cell: Cell) -> RowKey:
+    modules = ("ucfrec.runs.run", "ucfrec.policies.ucf", "ucfrec.evaluation.evaluate")
+    return RowKey(
+        suite="counterfactual-copies",
+        table="counterfactual-copies",
+        task=f"{cell.sessions} sessions",
+        method=cell.arm,
+        policy="ucf",
+        training_seed=cell.training_seed,
+        log_seed=cell.log_seed,
+        evaluation_seed=EVALUATION_SEED,
+        conditions={"mood": cell.mood, "sessions": cell.sessions, "episodes": cell.episodes},
+        code_version=code_version(Path(__file__), *modules, "ucfrec_simulators.synthetic_catalog"),
+        data_fingerprint=EpisodeStore.open(cell.folder / "store").meta["fingerprint"],
+    )
+
+
+def config(cell: Cell) -> dict[str, Any]:
+    return asdict(cell.config)
+
+
+def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
+    run = cell.folder / f"{cell.arm}-{cell.training_seed}-{cell.steps}-{row_key.code_version}"
+    record = train_run(EpisodeStore.open(cell.folder / "store"), run, cell.config)
+    trained = TrainedPolicy.load(run)
+    found = evaluate_policy(cell.world, trained, cell.arm, cell.episodes, EVALUATION_SEED)
+    found |= {
+        "train_wall_time_s": record["wall_time_s"],
+        "validation_loss": record["policy"]["best_validation"],
+    }
+    details: dict[str, Any] = {}
+    if "augmentation" in record:
+        report = record["augmentation"]
+        found |= {"acceptance": report["acceptance"], "delta": report["delta"]}
+        found |= {"r2_without_z": report["reward_model"]["r2_without_z"]}
+        details = {"actions": report["actions"]}
+    return [evaluation_row(found, row_key, details=details, rule=str(trained.rule))]
+
+
+def difference_table(rows: Sequence[ResultRow]) -> str:
+    """Paired differences to the arm `none`, as Markdown."""
+    lines = []
+    for (mood, sessions), group in grouped(
+        rows, lambda row: (row.conditions["mood"], row.conditions["sessions"])
+    ).items():
+        of_arm = {
+            arm: {(row.log_seed, row.training_seed): row.value for row in own}
+            for arm, own in grouped(group, lambda row: row.method).items()
+        }
+        base = of_arm.get("none", {})
+        for arm, values in of_arm.items():
+            pairs = [pair for pair in values if pair in base]
+            differences = paired_differences(values, base)
+            over = summary(differences)
+            by_log = grouped(zip(pairs, differences, strict=True), lambda item: item[0][0])
+            over_logs = summary(np.mean([d for _, d in own]) for own in by_log.values())
+            compared = ["", "", "", ""]
+            if arm != "none" and pairs:
+                errors = (over.standard_error, over_logs.standard_error)
+                compared = [f"{over.mean:+.3f}", *(f"{error:.3f}" for error in errors)]
+                compared.append(str(over.count))
+            lines.append(
+                (f"{mood:g}", sessions, arm, f"{summary(values.values()).mean:.3f}", *compared)
+            )
+    head = ("mood", "sessions", "arm", "R_cum", "− none", "SE over pairs", "SE over logs", "pairs")
+    return markdown_table(head, lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder for the runs; resumed")
+    parser.add_argument(
+        "--results", type=Path, help="file of result rows (default: results.jsonl in --out)"
+    )
+    for name, kind, default, what in (
+        ("--sessions", int, [300, 1500, 6000], "sizes of the logs"),
+        ("--moods", float, [0.0, 1.5], "strengths of the hidden mood, 0 for none"),
+        ("--logs", int, [0, 1, 2], "seeds of the logs"),
+        ("--seeds", int, [0, 1, 2], "training seeds"),
+    ):
+        said = f"{what} (default: {' '.join(f'{value:g}' for value in default)})"
+        parser.add_argument(name, type=kind, nargs="+", default=default, help=said)
+    parser.add_argument(
+        "--arms", nargs="+", default=[], help=f"of {', '.join(ARMS)} (default: all)"
+    )
+    parser.add_argument("--steps", type=int, default=1000, help="of a training (default: 1000)")
+    parser.add_argument("--episodes", type=int, default=2000, help="evaluated (default: 2000)")
+    parser.add_argument("--workers", type=int, default=2, help="processes (default: 2)")
+    options = parser.parse_args()
+    cells = [
+        Cell(options.out, mood, sessions, log, seed, arm, options.steps, options.episodes)
+        for mood, sessions, log, seed, arm in itertools.product(
+            options.moods,
+            options.sessions,
+            options.logs,
+            options.seeds,
+            chosen(ARMS, options.arms, "arm"),
+        )
+    ]
+    for cell in {cell.folder: cell for cell in cells}.values():
+        simulated_store(cell.world, cell.folder, cell.sessions, cell.log_seed)
+    results = options.results or options.out / "results.jsonl"
+    measurement = Measurement(key, config, measure)
+    print(difference_table(run_grid(cells, measurement, results, options.workers, "copies")))
+
+
+if __name__ == "__main__":
+    main()

@@ -270,7 +270,8 @@ def _prepared(
                 )
             else:
                 log = typed_log(connection, tables, mapping, reward, session_by, spill)
-                batches = sorted_batches(log, known)
+                with explained(connection, log.tables, spill):
+                    batches = sorted_batches(log, known)
             with explained(connection, log.tables, spill):
                 rows = check_sorted(log, batches, options.duplicates, scratch)
                 require_rows(log, len(rows.clean), rows.dropped)

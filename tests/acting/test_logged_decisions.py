@@ -13,7 +13,7 @@ from tests.support.replay import replayed
 from tests.support.tagged import ITEMS, tagged_log, tagged_store
 from ucfrec import EpisodeStore, Recommender
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.logged_decisions import seen_before, session_scores
+from ucfrec.acting.logged_decisions import LoggedDecisions, seen_before, session_scores
 from ucfrec.evaluation.ranking import Steps
 from ucfrec.evaluation.ranking_baselines import PolicyRanker
 from ucfrec.logs import LogMapping
@@ -33,6 +33,7 @@ RULES = {
     "best": DecisionRule(3.0),
     "learned": DecisionRule(None, temperature=1.0),
     "filters": DecisionRule(3.0, temperature=2.0, top_k=9, exclude_seen=True, tag_window=2),
+    "run": DecisionRule(3.0, temperature=1.0, tag_run=2),
 }
 MORE = {"session": {}, "horizon": {"policy.return_to_go": "horizon", "policy.horizon": 2}}
 
@@ -65,6 +66,17 @@ def last_sessions(log: pd.DataFrame) -> Iterator[tuple[Any, list[int], list[floa
         latest = rows[pauses.cumsum() == pauses.sum()]
         if len(latest) > 3:
             yield user, latest.item_id.tolist(), latest.reward.tolist()
+
+
+def test_logged_sessions_are_read_as_far_back_as_a_tag_run(
+    folder: Path, trained: TrainedPolicy
+) -> None:
+    decider = trained.decider(DecisionRule(3.0, tag_run=10))
+    assert decider.policy.config.context < 10
+    assert decider.reward_model is None
+    logged = EpisodeStore.open(folder / "store")
+    known = LoggedDecisions.at(decider, logged, np.array([0]), logged.lengths[:1] - 1)
+    assert known.shown.items.shape == (1, 10)
 
 
 @pytest.mark.parametrize("rule", RULES)

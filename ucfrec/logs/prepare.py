@@ -82,7 +82,8 @@ class PrepareOptions:
     action, and time is kept; with "first" and "last" the order of files and rows matters."""
     memory_limit: str = "2GB"
     """Memory of the process, e.g. "2GB", for logs of any size; rows spill to disk. From "800MB" on
-    it holds, below that half of it is the engine's."""
+    it holds, below that half of it is the engine's. Rows with observations of hundreds of numbers
+    need more: the engine sorts some of them at once, and says so where it cannot."""
     temp_folder: Path | None = None
     """Folder for spilled rows; None for the parent of the store (the system's for `validate`)."""
 

@@ -16,7 +16,7 @@ from ucfrec.off_policy.behavior_model import BehaviorModel, fit_behavior
 from ucfrec.off_policy.columns import as_row, diagnosis_columns, verdict_columns
 from ucfrec.off_policy.diagnostics import diagnose, implied_items
 from ucfrec.off_policy.estimators import LOGGED, estimate, session_terms
-from ucfrec.off_policy.features import InputsFile, StepInputs, context_of, scores_of
+from ucfrec.off_policy.features import InputsFile, StepInputs, array_on_disk, context_of, scores_of
 from ucfrec.off_policy.fqe import ModelReport, fit_models
 from ucfrec.off_policy.item_groups import default_groups, group_items
 from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps
@@ -259,7 +259,8 @@ def logged_steps(
 ) -> JudgedSteps:
     """Collect the logged steps, the policy's probabilities and models of what it would earn.
 
-    In memory are some ten numbers a step; what the models see of it lies on disk meanwhile.
+    In memory are some ten numbers a step; what the models see of it, and the probabilities of item
+    groups, lie on disk.
 
     Args:
         trained: a policy that chooses items.
@@ -279,7 +280,7 @@ def logged_steps(
     group_of = _item_groups(trained, options, seed)
     group = np.where(items >= 0, group_of[items], -1)
     one_hot = torch.from_numpy(np.eye(group_of.max() + 1, dtype=np.float32)[group_of])
-    target, shown = np.empty(len(items)), np.empty((len(items), one_hot.shape[1]), np.float32)
+    target, shown = np.empty(len(items)), array_on_disk((len(items), one_hot.shape[1]))
     done, behavior = 0, None
     with InputsFile() as inputs:
         for batch in scored_steps(trained, store, rule):

@@ -10,6 +10,7 @@ from ucfrec import schema
 from ucfrec.checksums import Sealed
 from ucfrec.episodes.record import REMEDY
 from ucfrec.errors import InputError, one_line
+from ucfrec.remote import fetch
 
 Array = npt.NDArray[Any]
 IntArray = npt.NDArray[np.int64]
@@ -40,6 +41,7 @@ def load_column(
     if sealed is not None:
         sealed.require(file)
     path = store / file
+    fetch(path)
     try:
         # Mapping compares the header with the size of the file before it takes memory.
         values: Array = np.load(path, mmap_mode="r")

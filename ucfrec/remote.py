@@ -302,6 +302,7 @@ def _require_room(uri: str, size: int, folder: Path) -> None:
 
 def _copy(found: _Partial, target: Path, ranges: Sequence[tuple[int, int]]) -> None:
     """Copy parts of a file to the same places of its copy."""
+    complete = True
     try:
         with found.system.open_input_file(found.path) as source, target.open("r+b") as copy:
             for begin, end in ranges:
@@ -310,10 +311,11 @@ def _copy(found: _Partial, target: Path, ranges: Sequence[tuple[int, int]]) -> N
                 while begin < end and (block := source.read(min(_BLOCK, end - begin))):
                     copy.write(block)
                     begin += len(block)
+                complete = complete and begin == end
         (about,) = found.system.get_file_info([found.path])
     except (OSError, ValueError) as error:
         raise _unusable(found.uri, error) from None
-    if (about.size, about.mtime_ns) != found.about:
+    if not complete or (about.size, about.mtime_ns) != found.about:
         raise InputError(f"{found.uri}: {found.path} changed while it was read; run it again")
 
 

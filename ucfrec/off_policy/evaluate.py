@@ -16,10 +16,11 @@ from ucfrec.off_policy.behavior_model import BehaviorModel, fit_behavior
 from ucfrec.off_policy.columns import as_row, diagnosis_columns, verdict_columns
 from ucfrec.off_policy.diagnostics import diagnose, implied_items
 from ucfrec.off_policy.estimators import LOGGED, estimate, session_terms
-from ucfrec.off_policy.features import InputsFile, StepInputs, array_on_disk, context_of, scores_of
+from ucfrec.off_policy.features import InputsFile, StepInputs, context_of, scores_of
 from ucfrec.off_policy.fqe import ModelReport, fit_models
 from ucfrec.off_policy.item_groups import default_groups, group_items
 from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps
+from ucfrec.off_policy.on_disk import array_on_disk
 from ucfrec.off_policy.options import EstimateOptions
 from ucfrec.off_policy.pages import as_pages, pages_of
 from ucfrec.off_policy.score import LoggedSessions, ScoredSteps, scored_steps

@@ -1,6 +1,5 @@
 """What models of future reward see of a logged step, kept on disk in bounded memory."""
 
-import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -60,18 +59,6 @@ def context_of(batch: ScoredSteps) -> Tensor:
     parts = [batch.windows.states[:, -1], batch.returns_left[:, None]]
     parts += [] if batch.features is None else [batch.features]
     return torch.cat([part.float() for part in parts], dim=1)
-
-
-def array_on_disk(shape: tuple[int, int]) -> Float32Array:
-    """An array of zeros whose memory the system can take back, writing it to a file without a name.
-
-    Raises:
-        OSError: the disk of the system's temporary folder is full.
-    """
-    with tempfile.TemporaryFile(prefix="ucfrec-") as file:
-        # A full disk is an error now; later it would be the end of the process.
-        os.posix_fallocate(file.fileno(), 0, 4 * shape[0] * shape[1])
-        return np.memmap(file, np.float32, "r+", shape=shape)
 
 
 class InputsFile:

@@ -5,10 +5,11 @@
 Makes two logs and prepares them: one of very many rows of items (the log of prepare_time.py), and
 one of rows with long observations. Then every command runs as a process of its own, of one thread,
 and its memory is watched: what the system calls anonymous, which it cannot give back as it can
-pages of mapped files. A few training steps will do: what grows with a store grows before the first
-one. Scoring takes time a row, so the long log is trained on and the wide one judged too. Appends a
-row a command to runs/memory_limits/results.jsonl, or to --results; FOLDER is kept, and logs and
-stores that it has are not made again.
+pages of mapped files. With --cgroup the system holds each to the limit, such pages and what it
+keeps of files included. A few training steps will do: what grows with a store grows before the
+first one. Scoring takes time a row, so the long log is trained on and the wide one judged too.
+Appends a row a command to runs/memory_limits/results.jsonl, or to --results; FOLDER is kept, and
+logs and stores that it has are not made again.
 """
 
 import argparse
@@ -16,6 +17,8 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +26,7 @@ import numpy as np
 from prepare_time import make_log
 
 from ucfrec.code_version import code_version
-from ucfrec.logs.engine import bytes_of
+from ucfrec.logs.engine import anonymous_bytes, bytes_of
 from ucfrec.provenance import provenance
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows
@@ -82,17 +85,24 @@ class Measured:
     """Most memory, pages of mapped files among it."""
 
 
-def anonymous_bytes(process: int) -> int:
-    """Memory of a process that is not mapped from files."""
+@contextmanager
+def limited_group(parent: Path | None, limit: int) -> Iterator[Path | None]:
+    """A control group whose processes are killed beyond the limit (bytes); None without parent."""
+    if parent is None:
+        yield None
+        return
+    group = parent / f"ucfrec-{os.getpid()}"
+    group.mkdir()
     try:
-        lines = Path(f"/proc/{process}/status").read_text().splitlines()
-    except OSError:  # it has ended
-        return 0
-    return sum(int(line.split()[1]) * 1024 for line in lines if line.startswith("RssAnon:"))
+        unified = (parent / "cgroup.controllers").exists()
+        (group / ("memory.max" if unified else "memory.limit_in_bytes")).write_text(str(limit))
+        yield group
+    finally:
+        group.rmdir()
 
 
-def measured(arguments: list[str]) -> Measured:
-    """Run a `ucfrec` command.
+def measured(arguments: list[str], group: Path | None) -> Measured:
+    """Run a `ucfrec` command, in a control group if one is given.
 
     Raises:
         SystemExit: it fails.
@@ -103,6 +113,9 @@ def measured(arguments: list[str]) -> Measured:
         [sys.executable, "-m", "ucfrec", *arguments],
         env={**os.environ, **threads},
         stdout=subprocess.DEVNULL,
+        preexec_fn=None
+        if group is None
+        else lambda: (group / "cgroup.procs").write_text(str(os.getpid())),
     )
     most = 0
     while True:
@@ -125,17 +138,17 @@ def commands(folder: Path, kind: str, limit: int) -> dict[str, list[str]]:
     """Command to its arguments, for the log called `kind`."""
     log, store, run = (str(folder / f"{kind}-{part}") for part in ("log", "store", "run"))
     settings = [word for one in SMALL for word in ("--set", one)]
-    prepared = [log, "--reward", "is_click", "--out", store, "--memory-limit", f"{limit} B"]
+    within = ["--memory-limit", f"{limit} B"]
     found = {
-        "prepare": ["prepare", *prepared],
+        "prepare": ["prepare", log, "--reward", "is_click", "--out", store, *within],
         "train": ["train", store, "--out", run, "--threads", "1", *settings],
     }
     if kind == "wide":
         written = str(folder / "wide-scores.parquet")
         found |= {
-            "score": ["score", run, log, "--out", written],
-            "ope": ["ope", run, log, "--temperature", "1"],
-            "recommend": ["recommend", run, log, "--out", str(folder / "wide-top.parquet")],
+            "score": ["score", run, log, "--out", written, *within],
+            "ope": ["ope", run, log, "--temperature", "1", *within],
+            "recommend": ["recommend", run, log, "--out", str(folder / "top.parquet"), *within],
         }
     return found
 
@@ -147,7 +160,14 @@ def main() -> None:
     parser.add_argument(
         "--long", type=int, default=80_000_000, help="rows; 0: none (default: 80000000)"
     )
-    parser.add_argument("--wide", type=int, default=400_000, help="rows; 0: none (default: 400000)")
+    parser.add_argument("--wide", type=int, default=300_000, help="rows; 0: none (default: 300000)")
+    parser.add_argument(
+        "--cgroup",
+        type=Path,
+        metavar="FOLDER",
+        help="control group of the memory controller; commands run in one of their own in it, with "
+        "the limit, beyond which the system kills them (default: none, memory is only watched)",
+    )
     parser.add_argument("--commands", nargs="+", default=[], help="no others (default: all)")
     parser.add_argument(
         "--results", type=Path, default=RESULTS, help=f"file of result rows (default: {RESULTS})"
@@ -156,7 +176,7 @@ def main() -> None:
     folder, limit = options.folder, bytes_of(options.limit)
     assert limit is not None
     folder.mkdir(parents=True, exist_ok=True)
-    lines = []
+    lines, grouped = [], {} if options.cgroup is None else {"control group": True}
     for kind, rows, make in (
         ("long", options.long, make_log),
         ("wide", options.wide, make_wide_log),
@@ -170,13 +190,15 @@ def main() -> None:
                 continue
             if command == "prepare" and (folder / f"{kind}-store").exists():
                 continue
-            one = measured(arguments)
+            with limited_group(options.cgroup, limit) as group:
+                one = measured(arguments, group)
             store = size_of(folder / f"{kind}-store") / 2**20
             metrics = {
                 "within": float(one.anonymous_mib * 2**20 <= limit),
                 "anonymous_mib": one.anonymous_mib,
                 "resident_mib": one.resident_mib,
                 "store_mib": store,
+                "log_mib": size_of(folder / f"{kind}-log") / 2**20,
                 "limit_mib": limit / 2**20,
             }
             row = ResultRow(
@@ -185,7 +207,7 @@ def main() -> None:
                 task=f"{kind} log, {rows:,} rows",
                 method=command,
                 policy="ucf",
-                conditions={"rows": rows, "limit": options.limit, "threads": 1},
+                conditions={"rows": rows, "limit": options.limit, "threads": 1, **grouped},
                 code_version=code_version(Path(__file__), "ucfrec.commands.cli"),
                 metric="anonymous_mib",
                 metrics=metrics,

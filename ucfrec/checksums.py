@@ -16,6 +16,7 @@ import xxhash
 from ucfrec.errors import InputError, explain_os_error
 from ucfrec.files import CHECKSUM, read_json, write_sealed_json
 from ucfrec.locks import is_lock_or_scratch
+from ucfrec.remote import fetch
 
 FILES: Final = "files"
 """Entry of a record with size and checksum of the files beside it: {path: [bytes, hexadecimal]}."""
@@ -150,6 +151,7 @@ class Sealed:
     def _fault(self, name: str) -> str:
         size, stated = self.files[name]
         path = self.folder / name
+        fetch(path)
         try:
             return _size_fault(path, size) or (
                 "" if file_checksum(path) == stated else "has another content than was written"

@@ -336,6 +336,9 @@ def test_a_view_leaves_out_some_of_what_was_observed(
         assert torch.equal(seen.states[..., :-2], whole.states[..., :-3])
         assert torch.equal(seen.states[..., -2:], whole.states[..., [-3, -1]])
         assert same(replace(seen, states=whole.states), whole)
+    last = every_window(view.without_observation_dimensions([0]), 4)
+    assert torch.equal(last.states[..., -1], every_window(view, 4).states[..., -1])
+    assert last.states.shape[-1] == view.state_size - 1
     assert store.observation_size == 3
 
 

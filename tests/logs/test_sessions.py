@@ -38,7 +38,7 @@ def test_blocks_of_any_size_give_the_same_episodes(
     with engine([path], tmp_path) as connection:
         tables = tuple(open_tables(connection, [path]))
         log = typed_log(connection, tables, LogMapping(), "reward", session_by, tmp_path)
-        rows = check_sorted(log, sorted_batches(log, None), "highest", tmp_path)
+        rows = check_sorted(log, sorted_batches(log, None, tmp_path), "highest", tmp_path)
         for block in (1, 2, 7, 1000):
             spool = rows.clean
             if session_by == "session_id":

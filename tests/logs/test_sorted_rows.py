@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from ucfrec.logs.binding import open_tables
-from ucfrec.logs.clean import DUPLICATES, drop_counts, read_log
+from ucfrec.logs.clean import DUPLICATES, check_rows, drop_counts
 from ucfrec.logs.engine import engine
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.sorted_rows import check_sorted, sorted_batches
@@ -53,7 +53,9 @@ def test_both_ways_keep_the_same_rows(
     path = tmp_path / "log.parquet"
     make_log(len(duplicates), text).to_parquet(path)
     with engine([path], tmp_path) as connection:
-        log = read_log(connection, [path], LogMapping(), "reward", session_by, tmp_path, duplicates)
+        tables = tuple(open_tables(connection, [path]))
+        given = LogMapping(), "reward", session_by, tmp_path, duplicates
+        log = check_rows(connection, tables, *given)
         columns = ("timestamp", "reward", "propensity", "is_random", "observation")
         order = "user_id, timestamp, item_id"
         expected = connection.sql(
@@ -65,7 +67,7 @@ def test_both_ways_keep_the_same_rows(
     with engine([path], tmp_path) as connection:
         tables = tuple(open_tables(connection, [path]))
         log = typed_log(connection, tables, LogMapping(), "reward", session_by, tmp_path)
-        rows = check_sorted(log, sorted_batches(log, None), duplicates, tmp_path)
+        rows = check_sorted(log, sorted_batches(log, None, tmp_path), duplicates, tmp_path)
         found = {name: rows.clean.read(name, 0, len(rows.clean)) for name in rows.clean.names}
     assert rows.dropped == dropped
     assert rows.read == 400

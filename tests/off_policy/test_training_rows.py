@@ -17,8 +17,14 @@ from ucfrec.runs.trained_policy import TrainedPolicy, store_of
 
 @pytest.mark.parametrize(("seen", "expected"), [(0, 0.0), (300, 0.5)])
 def test_the_share_of_rows_seen_in_training(
-    folder: Path, trained: TrainedPolicy, tmp_path: Path, seen: int, expected: float
+    folder: Path,
+    trained: TrainedPolicy,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    seen: int,
+    expected: float,
 ) -> None:
+    monkeypatch.setattr("ucfrec.off_policy.training_rows._ROWS_AT_ONCE", 100)
     train = pd.read_parquet(folder / "train.parquet").sort_values("timestamp")
     rest = pd.read_parquet(folder / "rest.parquet").head(600 - seen)
     # The last tenth of the training log is its test split, which the run never saw.

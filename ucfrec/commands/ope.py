@@ -7,7 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ucfrec.commands.cards import card_of_estimates
-from ucfrec.commands.options import log_options, logs_given, rule_given, rule_options
+from ucfrec.commands.options import (
+    log_options,
+    logs_given,
+    memory_option,
+    rule_given,
+    rule_options,
+)
 from ucfrec.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,6 +26,7 @@ if TYPE_CHECKING:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """What `ope` takes."""
     log_options(parser)
+    memory_option(parser)
     rule_options(parser)
     parser.add_argument(
         "--targets",
@@ -174,7 +181,8 @@ def _judged(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicyRep
     files, mapping = logs_given(options)
     run = candidate.run
     trained = TrainedPolicy.load(run, options.checkpoint)
-    with logged_sessions(run, trained, files, mapping, keep_unknown=True) as logged:
+    limit = options.memory_limit
+    with logged_sessions(run, trained, files, mapping, True, limit) as logged:
         print(format_report(logged.report))
         found = evaluate_off_policy(
             run,

@@ -91,6 +91,17 @@ def log_options(parser: argparse.ArgumentParser) -> argparse.Action:
     return logs
 
 
+def memory_option(parser: argparse.ArgumentParser) -> None:
+    """Add --memory-limit, of reading logs."""
+    parser.add_argument(
+        "--memory-limit",
+        default="2GB",
+        metavar="SIZE",
+        help="memory of the process while it reads the logs, from 800MB on; beyond it rows spill "
+        "to a scratch folder (default: 2GB)",
+    )
+
+
 def rule_options(parser: argparse.ArgumentParser) -> None:
     """Add --checkpoint and the parts of a decision rule that replace those of the run's own."""
     parser.add_argument(

@@ -51,9 +51,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--memory-limit",
         metavar="SIZE",
-        help="memory of the whole command, from 800MB on (more where observations have hundreds of "
-        "numbers); beyond it rows spill to a scratch folder beside the store, to at most 90%% of "
-        "the free disk (default: 2GB)",
+        help="memory of the whole command, from 800MB on; beyond it rows spill to a scratch folder "
+        "beside the store, to at most 90%% of the free disk (default: 2GB)",
     )
     parser.add_argument(
         "--engine",

@@ -11,6 +11,7 @@ from ucfrec.commands.options import (
     limit_options,
     log_options,
     logs_given,
+    memory_option,
     responder_given,
     rule_given,
     rule_options,
@@ -27,6 +28,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec recommend`."""
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder of `ucfrec train`")
     logs = log_options(parser)
+    memory_option(parser)
     parser.add_argument("--k", type=int, default=10, help="items for each user (default: 10)")
     item_options(parser)
     rule_options(parser)
@@ -81,7 +83,7 @@ def run(options: argparse.Namespace) -> None:
     with progress(None, "recommend", "users") as bar:
         frames = recommend(
             trained,
-            _counted(histories_of_files(trained, files, mapping), bar),
+            _counted(histories_of_files(trained, files, mapping, options.memory_limit), bar),
             options.k,
             rule=rule_given(options, trained),
             filter_seen=not options.keep_seen,

@@ -3,7 +3,13 @@
 import argparse
 from pathlib import Path
 
-from ucfrec.commands.options import log_options, logs_given, rule_given, rule_options
+from ucfrec.commands.options import (
+    log_options,
+    logs_given,
+    memory_option,
+    rule_given,
+    rule_options,
+)
 from ucfrec.remote import Output, origin, uri_or_path
 
 
@@ -11,6 +17,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec score`."""
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder of `ucfrec train`")
     log_options(parser)
+    memory_option(parser)
     rule_options(parser)
     parser.add_argument(
         "--out", type=uri_or_path(Output, Path), required=True, help="Parquet file to write"
@@ -30,7 +37,8 @@ def run(options: argparse.Namespace) -> None:
 
     files, mapping = logs_given(options)
     trained = TrainedPolicy.load(options.run, options.checkpoint)
-    with logged_sessions(options.run, trained, files, mapping) as logged:
+    limit = options.memory_limit
+    with logged_sessions(options.run, trained, files, mapping, memory_limit=limit) as logged:
         print(format_report(logged.report))
         rows = write_frames(options.out, score(trained, logged, rule_given(options, trained)))
     print(f"\n{origin(options.out)}: {rows:,} rows")

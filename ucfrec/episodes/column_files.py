@@ -10,6 +10,7 @@ from ucfrec import schema
 from ucfrec.checksums import Sealed
 from ucfrec.episodes.record import REMEDY
 from ucfrec.errors import InputError, one_line
+from ucfrec.remote import fetch
 
 Array = npt.NDArray[Any]
 IntArray = npt.NDArray[np.int64]
@@ -40,6 +41,7 @@ def load_column(
     if sealed is not None:
         sealed.require(file)
     path = store / file
+    fetch(path)
     try:
         # Mapping compares the header with the size of the file before it takes memory.
         values: Array = np.load(path, mmap_mode="r")
@@ -56,12 +58,21 @@ def load_column(
 class StepColumn:
     """A step column, indexed across its shards."""
 
-    def __init__(self, parts: list[Array]) -> None:
-        self._parts = parts
+    def __init__(self, parts: list[Array], kept: IntArray | None = None) -> None:
+        """
+        Args:
+            parts: one a shard, (M,) or (M, size).
+            kept: dimensions that values have; None for all.
+        """
+        self._parts, self._kept = parts, kept
         self._bounds = np.cumsum([0] + [len(part) for part in self._parts])
 
     def __len__(self) -> int:
         return int(self._bounds[-1])
+
+    def of_dimensions(self, kept: IntArray) -> "StepColumn":
+        """The same column with some dimensions of those that it has, (K,) indices."""
+        return StepColumn(self._parts, kept if self._kept is None else self._kept[kept])
 
     def range(self) -> tuple[Any, Any]:
         """The lowest and the highest value."""
@@ -69,6 +80,10 @@ class StepColumn:
 
     def take(self, index: IntArray) -> Array:
         """A copy of the values at the indices `index`, of any shape."""
+        values = self._taken(index)
+        return values if self._kept is None else values[..., self._kept]
+
+    def _taken(self, index: IntArray) -> Array:
         if len(self._parts) == 1:
             return np.asarray(self._parts[0][index])
         shard = np.searchsorted(self._bounds[1:-1], index, side="right")

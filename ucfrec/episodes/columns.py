@@ -123,13 +123,28 @@ class Columns:
             values: of all steps.
             return_to_go: what the returns-to-go count; None for what they counted before.
         """
+        copy = self._copy(name, values.shape[1:], return_to_go)
+        copy._arrays[name] = values
+        return copy
+
+    def with_observation_dimensions(self, kept: IntArray) -> "Columns":
+        """A copy whose observations have only some dimensions, (K,) indices; files stay as is."""
+        column = self._column(schema.OBSERVATION).of_dimensions(kept)
+        copy = self._copy(schema.OBSERVATION, (len(kept),))
+        copy._steps[schema.OBSERVATION] = column
+        return copy
+
+    def _copy(
+        self, name: str, size: tuple[int, ...], return_to_go: ReturnToGo | None = None
+    ) -> "Columns":
+        """A copy with a step column that is not there yet, of the given size."""
         sizes = dict(self.meta["columns"])
         if name in sizes:
-            sizes[name] = list(values.shape[1:])
+            sizes[name] = list(size)
         copy = Columns(
             self.path,
             {**self.meta, "columns": sizes},
-            {**self._arrays, name: values},
+            self._arrays,
             self._item_states_in_memory,
             self._sealed,
             return_to_go or self.return_to_go,

@@ -189,9 +189,7 @@ class EpisodeStore(EpisodeView):
         """
         _require_no_copies(self, "remove observation dimensions from")
         kept = np.setdiff1d(np.arange(self.observation_size), dimensions)
-        column = self._columns.step_column(schema.OBSERVATION)[:, kept]
-        columns = self._columns.with_step_column(schema.OBSERVATION, column)
-        return EpisodeStore(columns, self._selected)
+        return EpisodeStore(self._columns.with_observation_dimensions(kept), self._selected)
 
     # Windows and transitions.
 

@@ -15,6 +15,7 @@ from ucfrec.errors import InputError
 from ucfrec.logs.compressed import require_plausible_size
 from ucfrec.logs.expressions import NotScalarError, columns_of, refused
 from ucfrec.parquet_files import require_plausible_rows
+from ucfrec.remote import fetch
 
 _MAGIC = re.compile(r"[\[*?]")
 _NAME = re.compile(r"[^\W\d]\w*")
@@ -139,7 +140,7 @@ def _columns(connection: duckdb.DuckDBPyConnection, file: Path) -> tuple[tuple[s
 def bind(
     connection: duckdb.DuckDBPyConnection, table: Table, what: str, given: str
 ) -> tuple[str, str]:
-    """Resolve a column name or scalar expression against the columns of `table`.
+    """Resolve a column name or scalar expression against the columns of `table`, and fetch them.
 
     Args:
         what: purpose of the expression, for messages.
@@ -154,6 +155,7 @@ def bind(
     names = {name.casefold(): name for name in table.columns}
     if given.casefold() in names:
         name = names[given.casefold()]
+        _fetch(table, [name])
         return quoted(name), table.columns[name]
     if _NAME.fullmatch(given):
         raise InputError(_missing(table, what, given))
@@ -161,13 +163,20 @@ def bind(
     like = ", ".join(f"CAST(NULL AS {kind}) AS {quoted(name)}" for name, kind in table.types)
     try:
         # DuckDB would read some names that are not columns as the current user or time.
-        for name in columns_of(connection, given):
+        used = columns_of(connection, given)
+        for name in used:
             if name.casefold() not in names:
                 raise InputError(_missing(table, what, name))
         described = connection.sql(f"DESCRIBE SELECT {sql} AS x FROM (SELECT {like})").fetchall()
     except (duckdb.Error, NotScalarError) as error:
         raise refused(what, given, str(table.files[0]), _first_line(error)) from None
+    _fetch(table, [names[name.casefold()] for name in used])
     return sql, str(described[0][1])
+
+
+def _fetch(table: Table, columns: Sequence[str]) -> None:
+    for file in table.files:
+        fetch(file, columns)
 
 
 def _missing(table: Table, what: str, name: str) -> str:
@@ -249,6 +258,7 @@ def _unreadable(
     for table in tables:
         for file in table.files:
             single = Table((file,), table.types)
+            fetch(file)
             try:
                 connection.sql(f"SELECT max(hash(t)) FROM {single.sql} AS t").fetchall()
             except duckdb.Error as error:

@@ -1,12 +1,11 @@
 """Which rows of a log can be used: the faults, the rule for duplicates, and both in one SQL query.
 
-`prepare` sorts and goes through the rows in batches (`ucfrec.logs.sorted_rows`); `read_histories`
-and its like, which need no order of the files and no scratch, use `check_rows`. Both keep the same
-rows.
+Logs in files are sorted and gone through in batches (`ucfrec.logs.sorted_rows`); logs in memory
+are checked by one query, `check_rows`. Both keep the same rows.
 """
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -14,7 +13,7 @@ import duckdb
 
 from ucfrec import schema
 from ucfrec.errors import InputError
-from ucfrec.logs.binding import MAX_FLOAT, Table, explained, glob_pattern, open_tables, text
+from ucfrec.logs.binding import MAX_FLOAT, Table, explained, glob_pattern, text
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.typed import ROWS, TypedLog, not_finite, typed_log
 
@@ -87,40 +86,6 @@ def require_rewards_in_range(log: TypedLog, large: int, rows: int, largest: floa
         )
 
 
-def read_log(
-    connection: duckdb.DuckDBPyConnection,
-    files: Sequence[Path],
-    mapping: LogMapping,
-    reward: str,
-    session_by: str | None,
-    folder: Path,
-    duplicates: str = "highest",
-) -> TypedLog:
-    """Read and check every row of `files`.
-
-    Creates the table `rows`, which is `read` with `reason` (key of `REASONS` for dropped rows, NULL
-    for kept rows), and the view `clean` of the kept rows. Of rows with the same key (user, item or
-    action, time) one is kept, by default that with the highest reward, because late feedback is
-    logged as a second row of an impression. Ties are broken by the other columns, so that the order
-    of rows and files does not matter.
-
-    Args:
-        connection: engine that may open `files`.
-        files: log files.
-        mapping: log columns to the files' columns.
-        reward: scalar SQL expression over the files' columns.
-        session_by: "session_id", "gap" or "user"; None for session_id if the log has it, else gap.
-        folder: folder named when its disk is full.
-        duplicates: key of `DUPLICATES`, which of several rows with the same key is kept.
-
-    Raises:
-        InputError: a file, column or type makes the log unusable, an observation is missing or not
-            finite, a reward is too large to train with.
-    """
-    tables = tuple(open_tables(connection, files))
-    return check_rows(connection, tables, mapping, reward, session_by, folder, duplicates)
-
-
 def check_rows(
     connection: duckdb.DuckDBPyConnection,
     tables: tuple[Table, ...],
@@ -130,7 +95,27 @@ def check_rows(
     folder: Path,
     duplicates: str = "highest",
 ) -> TypedLog:
-    """`read_log` of tables that are already open."""
+    """Read and check every row of a log by one query.
+
+    Creates the table `rows`, which is `read` with `reason` (key of `REASONS` for dropped rows, NULL
+    for kept rows), and the view `clean` of the kept rows. Of rows with the same key (user, item or
+    action, time) one is kept, by default that with the highest reward, because late feedback is
+    logged as a second row of an impression. Ties are broken by the other columns, so that the order
+    of rows and files does not matter.
+
+    Args:
+        connection: engine that may open the tables.
+        tables: of the log.
+        mapping: log columns to the tables' columns.
+        reward: scalar SQL expression over the tables' columns.
+        session_by: "session_id", "gap" or "user"; None for session_id if the log has it, else gap.
+        folder: folder named when its disk is full.
+        duplicates: key of `DUPLICATES`, which of several rows with the same key is kept.
+
+    Raises:
+        InputError: a file, column or type makes the log unusable, an observation is missing or not
+            finite, a reward is too large to train with.
+    """
     log = typed_log(connection, tables, mapping, reward, session_by, folder)
     with explained(connection, tables, folder):
         connection.execute(_checked(log, duplicates))

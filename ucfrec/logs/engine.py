@@ -1,5 +1,6 @@
 """DuckDB connections that can open nothing but their inputs and a scratch folder."""
 
+import os
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 BATCH_ROWS: Final = 2**17
 """Most rows of a batch read from DuckDB."""
 _BATCH_BYTES: Final = 2**25
+_BESIDE: Final = 370 * 2**20
+"""Bytes that going through rows takes beside the engine and what the process has already."""
 
 _CLOSED: Final = {
     "allow_community_extensions": False,
@@ -36,7 +39,7 @@ def engine(
     inputs: Iterable[Path],
     folder: Path,
     memory_limit: str | None = None,
-    beside: int = 0,
+    shared: bool = False,
     threads: int | None = None,
 ) -> Iterator[duckdb.DuckDBPyConnection]:
     """A DuckDB connection with a database on disk.
@@ -48,9 +51,9 @@ def engine(
         inputs: files that will be read.
         folder: parent of the scratch folder, which is removed at the end; so is the scratch of
             killed processes in it.
-        memory_limit: size such as "2GB", beyond which rows spill to disk; None for DuckDB's
-            default.
-        beside: bytes of the limit that the rest of the process needs, at most half of them.
+        memory_limit: size such as "2GB", of the engine or with `shared` of the process, beyond
+            which rows spill to disk; None for DuckDB's default.
+        shared: whether the rest of the process keeps to the limit too, with at most half of it.
         threads: most threads; None for one a core.
 
     Raises:
@@ -65,8 +68,8 @@ def engine(
             try:
                 if memory_limit is not None:
                     connection.execute("SET memory_limit = ?", [memory_limit])
-                    if (limit := bytes_of(memory_limit)) and beside:
-                        own = max(limit - beside, limit // 2)
+                    if (limit := bytes_of(memory_limit)) and shared:
+                        own = max(limit - anonymous_bytes() - _BESIDE, limit // 2)
                         connection.execute("SET memory_limit = ?", [f"{own} B"])
             except duckdb.Error:
                 raise InputError(
@@ -79,6 +82,22 @@ def engine(
             yield connection
         finally:
             connection.close()
+
+
+def anonymous_bytes(process: int | None = None) -> int:
+    """Memory of a process that is not mapped from files, which the system cannot take back.
+
+    Args:
+        process: its number; None for this one.
+
+    Returns:
+        0 where the system does not tell, or the process has ended.
+    """
+    try:
+        lines = Path(f"/proc/{process or os.getpid()}/status").read_text().splitlines()
+    except OSError:
+        return 0
+    return sum(int(line.split()[1]) * 1024 for line in lines if line.startswith("RssAnon:"))
 
 
 def bytes_of(size: str) -> int | None:

@@ -1,24 +1,32 @@
 """The item history of each user of a log, from files or from a data frame."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import gettempdir
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 
 from ucfrec import schema
 from ucfrec.errors import InputError
-from ucfrec.logs.binding import Table, explained, quoted
-from ucfrec.logs.clean import REASONS, check_rows, drop_counts, read_log
-from ucfrec.logs.engine import BATCH_ROWS, engine, engine_in_memory
+from ucfrec.locks import scratch_folder
+from ucfrec.logs.binding import Table, explained, open_tables, quoted
+from ucfrec.logs.clean import REASONS, check_rows, drop_counts, require_rows
+from ucfrec.logs.engine import BATCH_ROWS, as_arrow, engine, engine_in_memory
 from ucfrec.logs.mapping import LogMapping, log_files
-from ucfrec.logs.typed import TypedLog
+from ucfrec.logs.sessions import end_of_user
+from ucfrec.logs.sorted_rows import CODES, SortedRows, check_sorted, has_codes, sorted_batches
+from ucfrec.logs.typed import TypedLog, typed_log
 
 if TYPE_CHECKING:
     import pandas as pd
+
+Array = npt.NDArray[Any]
+IntArray = npt.NDArray[np.int64]
 
 HISTORIES: Final = "histories"
 """Name of a data frame in messages and in the engine."""
@@ -53,24 +61,33 @@ def read_histories(
         mapping: log columns to the files' columns.
         reward: scalar SQL expression over the files' columns.
         last: most rows of each user, the most recent ones.
-        memory_limit: size such as "2GB", beyond which rows spill to disk.
+        memory_limit: of the process, such as "2GB", for logs of any size; rows spill to disk.
         session_by: with "session_id", batches have the column `session_ids`.
         duplicates: see `PrepareOptions.duplicates`.
 
     Yields:
         Batches of users in sorted order: `user_id`; `item_ids`, `rewards` (float32), `timestamps`
-        (ms) and perhaps `session_ids`, lists of at most `last` with the most recent last; `seen`,
-        all item ids of the user, sorted; and, if the log has it, the most recent `observation`.
+        (ms) and perhaps `session_ids`, equal where the session is, lists of at most `last` with the
+        most recent last; `seen`, all item ids of the user, sorted; and, if the log has it, the most
+        recent `observation`.
 
     Raises:
         InputError: the input cannot be used.
     """
-    folder, files = Path(gettempdir()), log_files(paths)
-    with engine(files, folder, memory_limit) as connection:
-        log = read_log(connection, files, mapping, reward, session_by, folder, duplicates)
-        drop_counts(log)
-        with explained(connection, log.tables, folder):
-            yield from _by_user(log, last)
+    files = log_files(paths)
+    with (
+        scratch_folder(Path(gettempdir()), "histories") as folder,
+        engine(files, folder, memory_limit, shared=True) as connection,
+    ):
+        tables = tuple(open_tables(connection, files))
+        log = typed_log(connection, tables, mapping, reward, session_by, folder)
+        _require_items(log)
+        with explained(connection, tables, folder):
+            batches = sorted_batches(log, None, folder)
+            rows = check_sorted(log, batches, duplicates, folder)
+        require_rows(log, len(rows.clean), rows.dropped)
+        with explained(connection, tables, folder):
+            yield from _by_users(rows, last)
 
 
 def frame_histories(
@@ -81,7 +98,7 @@ def frame_histories(
     session_by: str = "user",
     duplicates: str = "highest",
 ) -> Iterator[pa.RecordBatch]:
-    """`read_histories` of a log in memory, without using the disk.
+    """`read_histories` of a log in memory, by SQL and without using the disk.
 
     Of rows with the same user, item and time one is kept, as in `read_histories`; any other row
     that `prepare` would drop is an error.
@@ -161,9 +178,80 @@ def _require_clean(log: TypedLog) -> None:
         raise InputError(f"{HISTORIES}: {rows}{hint}; correct those rows or leave them out")
 
 
-def _by_user(log: TypedLog, last: int) -> Iterator[pa.RecordBatch]:
+def _require_items(log: TypedLog) -> None:
     if log.key != schema.ITEM_ID:
         raise InputError(f"{log.tables[0].files[0]}: its actions are vectors; map item_id instead")
+
+
+def _by_users(rows: SortedRows, last: int) -> Iterator[pa.RecordBatch]:
+    """The users of sorted rows, some thousand rows at a time."""
+    clean, begin = rows.clean, 0
+    items = _ids(rows.log, schema.ITEM_ID, 0, rows.items)
+    while begin < len(clean):
+        end = end_of_user(clean, begin, clean.block_rows)
+        yield _histories(rows, begin, end, items, last)
+        begin = end
+
+
+def _histories(
+    rows: SortedRows, begin: int, end: int, items: pa.Array, last: int
+) -> pa.RecordBatch:
+    """The users of the rows from `begin` to `end`, which are all theirs."""
+    log, clean = rows.log, rows.clean
+    codes = clean.read("user", begin, end)
+    first = np.flatnonzero(np.diff(codes, prepend=codes[0] - 1))
+    ends = np.append(first[1:], len(codes))
+    kept = np.repeat(ends, ends - first) - np.arange(len(codes)) <= last
+    offsets = np.append(0, np.cumsum(kept)[ends - 1])
+
+    def lists(name: str, of: Callable[[Array], pa.Array]) -> pa.ListArray:
+        return _lists(offsets, of(clean.read(name, begin, end)[kept]))
+
+    columns: dict[str, pa.Array] = {schema.USER_ID: _users(log, codes[first])}
+    columns["item_ids"] = lists(schema.ITEM, lambda codes: items.take(as_arrow(codes)))
+    columns["rewards"] = lists(
+        schema.REWARD, lambda values: _numbers(values.astype(np.float32), pa.float32())
+    )
+    columns["timestamps"] = lists(schema.TIMESTAMP, as_arrow)
+    if log.session_by == schema.SESSION_ID:
+        columns["session_ids"] = lists("session", as_arrow)
+    # Codes of items are in the order of their ids.
+    owner = np.repeat(np.arange(len(first)), ends - first)
+    seen = np.unique(owner * max(rows.items, 1) + clean.read(schema.ITEM, begin, end))
+    bounds = np.searchsorted(seen, np.arange(len(first) + 1) * max(rows.items, 1))
+    columns["seen"] = _lists(bounds, items.take(as_arrow(seen % max(rows.items, 1))))
+    if schema.OBSERVATION in log.columns:
+        latest = [clean.read(schema.OBSERVATION, begin + row, begin + row + 1) for row in ends - 1]
+        observations = np.concatenate(latest)
+        every = np.arange(len(first) + 1) * observations.shape[1]
+        columns[schema.OBSERVATION] = _lists(every, _numbers(observations.ravel(), pa.float32()))
+    return pa.record_batch(columns)
+
+
+def _users(log: TypedLog, codes: IntArray) -> pa.Array:
+    """Identifiers (U,) of ascending codes (U,) of users."""
+    if not has_codes(log, schema.USER_ID):
+        return as_arrow(codes)
+    low = int(codes[0])
+    return _ids(log, schema.USER_ID, low, int(codes[-1]) + 1).take(as_arrow(codes - low))
+
+
+def _ids(log: TypedLog, name: str, begin: int, end: int) -> pa.Array:
+    """Identifiers with the codes from `begin` to `end`."""
+    query = f"SELECT {name} FROM {CODES[name]} WHERE code >= {begin} AND code < {end} ORDER BY code"
+    return log.connection.sql(query).to_arrow_table().column(0).combine_chunks()
+
+
+def _lists(offsets: IntArray, values: pa.Array) -> pa.ListArray:
+    return pa.ListArray.from_arrays(as_arrow(offsets).cast(pa.int32()), values)
+
+
+def _numbers(values: Array, kind: pa.DataType) -> pa.Array:
+    return pa.Array.from_buffers(kind, len(values), [None, pa.py_buffer(values)])
+
+
+def _by_user(log: TypedLog, last: int) -> Iterator[pa.RecordBatch]:
+    _require_items(log)
     lists = {
         "item_ids": schema.ITEM_ID,
         "rewards": f"CAST({schema.REWARD} AS FLOAT)",

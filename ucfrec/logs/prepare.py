@@ -49,8 +49,6 @@ from ucfrec.logs.typed import TypedLog, typed_log
 from ucfrec.progress import progress
 
 ENGINES: Final = ("duckdb", "spark")
-BESIDE: Final = 400 * 2**20
-"""Bytes that `prepare` takes beside the engine: Python with its packages, and batches of rows."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +80,7 @@ class PrepareOptions:
     action, and time is kept; with "first" and "last" the order of files and rows matters."""
     memory_limit: str = "2GB"
     """Memory of the process, e.g. "2GB", for logs of any size; rows spill to disk. From "800MB" on
-    it holds, below that half of it is the engine's. Rows with observations of hundreds of numbers
-    need more: the engine sorts some of them at once, and says so where it cannot."""
+    it holds, below that half of it is the engine's."""
     temp_folder: Path | None = None
     """Folder for spilled rows; None for the parent of the store (the system's for `validate`)."""
 
@@ -251,7 +248,7 @@ def _prepared(
     inputs = (*files, *_other_inputs(mapping, like))
     with (
         scratch_folder(spill, "sorted") as scratch,
-        engine(inputs, spill, options.memory_limit, BESIDE) as connection,
+        engine(inputs, spill, options.memory_limit, shared=True) as connection,
     ):
         with progress(4, "check the logs", "stages") as stage:
             tables = tuple(open_tables(connection, files))
@@ -272,7 +269,7 @@ def _prepared(
             else:
                 log = typed_log(connection, tables, mapping, reward, session_by, spill)
                 with explained(connection, log.tables, spill):
-                    batches = sorted_batches(log, known)
+                    batches = sorted_batches(log, known, scratch)
             with explained(connection, log.tables, spill):
                 rows = check_sorted(log, batches, options.duplicates, scratch)
                 require_rows(log, len(rows.clean), rows.dropped)

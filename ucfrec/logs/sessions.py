@@ -99,7 +99,7 @@ def by_sessions(rows: SortedRows, folder: Path, block: int | None = None) -> Spo
     block = block or clean.block_rows
     begin = 0
     while begin < len(clean):
-        end = _end_of_user(clean, begin, block)
+        end = end_of_user(clean, begin, block)
         columns = {name: clean.read(name, begin, end) for name in clean.names}
         users, sessions = columns["user"], columns["session"]
         # Rows are in order of time, so that the first row of a group is its earliest.
@@ -114,8 +114,14 @@ def by_sessions(rows: SortedRows, folder: Path, block: int | None = None) -> Spo
     return spool
 
 
-def _end_of_user(spool: Spool, begin: int, rows: int) -> int:
-    """End of the last user who ends within the rows from `begin`, or of the first one."""
+def end_of_user(spool: Spool, begin: int, rows: int) -> int:
+    """End of the last user who ends within some rows of a sorted spool, or of the first one.
+
+    Args:
+        spool: with the column `user`.
+        begin: first row of a user.
+        rows: from there.
+    """
     while begin + rows < len(spool):
         users = spool.read("user", begin, begin + rows + 1)
         changes = np.flatnonzero(users[1:] != users[:-1])

@@ -17,6 +17,7 @@ from ucfrec import schema
 from ucfrec.logs.binding import MAX_FLOAT
 from ucfrec.logs.clean import REASONS, faults, require_rewards_in_range
 from ucfrec.logs.engine import as_numpy
+from ucfrec.logs.row_vectors import RowVectors
 from ucfrec.logs.spool import Spool
 from ucfrec.logs.typed import ROWS, TypedLog
 
@@ -73,19 +74,29 @@ class SortedRows:
         self.highest = max(self.highest, float(rewards.max()))
 
 
-def sorted_batches(log: TypedLog, known_items: Path | None) -> Iterator[pa.RecordBatch]:
+def sorted_batches(
+    log: TypedLog, known_items: Path | None, folder: Path
+) -> Iterator[pa.RecordBatch]:
     """Sort every row of a log with DuckDB, and make the tables of codes.
 
     Args:
         log: its engine may open `known_items`.
         known_items: `items.parquet` of a store: rows with other items are dropped; None for all.
+        folder: scratch folder, of the observations.
 
     Returns:
         Rows as of `in_order`.
     """
     for name, table in code_tables(log):
         log.connection.execute(f"CREATE TABLE {table} AS {coded_ids(name, ROWS)}")
-    query = in_order(log, f"({with_faults(log, ROWS, faults(log, known_items))})")
+    faulty = f"({with_faults(log, ROWS, faults(log, known_items))})"
+    if schema.OBSERVATION not in log.columns:
+        return _read(log, in_order(log, faulty))
+    vectors = RowVectors(log, folder / "observations.bin")
+    return vectors.joined(_read(log, in_order(log, faulty, left_out=schema.OBSERVATION)))
+
+
+def _read(log: TypedLog, query: str) -> Iterator[pa.RecordBatch]:
     return iter(log.connection.sql(query).to_arrow_reader(log.batch_rows))
 
 
@@ -94,7 +105,7 @@ def check_sorted(
 ) -> SortedRows:
     """Check every row of a log.
 
-    Of rows with the same user, choice and time one is kept, as `ucfrec.logs.clean.read_log` does.
+    Of rows with the same user, choice and time one is kept, as `ucfrec.logs.clean.check_rows` does.
 
     Args:
         log: its engine has the tables of `code_tables`.
@@ -182,13 +193,14 @@ def with_faults(log: TypedLog, rows: str, conditions: Mapping[str, str]) -> str:
     return f"SELECT * REPLACE ({action}) FROM ({query})"
 
 
-def in_order(log: TypedLog, rows: str) -> str:
+def in_order(log: TypedLog, rows: str, left_out: str = "") -> str:
     """SQL of typed rows with faults, with codes, in order, without missing values.
 
     Args:
         log: of the rows.
         rows: relation of all its rows, as of `with_faults`; beside it are the tables of
             `code_tables`.
+        left_out: a column that is not read.
     """
     coded = dict(code_tables(log))
     joins = "".join(f" LEFT JOIN {table} USING ({name})" for name, table in coded.items())
@@ -206,7 +218,8 @@ def in_order(log: TypedLog, rows: str) -> str:
     if schema.PROPENSITY in log.columns:
         nan = "CAST('nan' AS FLOAT)"
         columns.append(f"coalesce({schema.PROPENSITY}, {nan}) AS {schema.PROPENSITY}")
-    columns += [c for c in (schema.OBSERVATION, schema.IS_RANDOM) if c in log.columns]
+    others = (schema.OBSERVATION, schema.IS_RANDOM)
+    columns += [c for c in others if c in log.columns and c != left_out]
     choice = schema.ITEM if log.key == schema.ITEM_ID else schema.ACTION
     return (
         f"SELECT {', '.join(columns)}, row, fault FROM {rows} AS faulty{joins} "

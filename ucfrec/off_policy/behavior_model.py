@@ -13,6 +13,7 @@ from itertools import product
 import numpy as np
 import numpy.typing as npt
 
+from ucfrec.off_policy.on_disk import array_on_disk
 from ucfrec.processes import require_blas_memory
 from ucfrec.progress import progress
 
@@ -143,7 +144,9 @@ class _Groups:
         return np.asarray((1 - share) * found + share * self.shares)
 
     def _scaled(self, states: Float32Array) -> Float32Array:
-        return np.asarray((states - self._mean) / self._spread, dtype=np.float32)
+        scaled = np.asarray(states - self._mean, dtype=np.float32)
+        scaled /= self._spread
+        return scaled
 
 
 def _drawn(rows: IntArray, rng: np.random.Generator) -> IntArray:
@@ -154,13 +157,14 @@ def _drawn(rows: IntArray, rng: np.random.Generator) -> IntArray:
 
 def _rows_of(states: States, wanted: IntArray) -> Callable[[IntArray], Float32Array]:
     """Looks up the states of some rows, all among `wanted` (sorted)."""
-    parts, begin = [], 0
+    table, begin = array_on_disk((0, 0)), 0
     for rows in states():
+        if not begin:
+            table = array_on_disk((len(wanted), rows.shape[1]))
         low, high = np.searchsorted(wanted, [begin, begin + len(rows)])
-        parts.append(rows[wanted[low:high] - begin])
+        table[low:high] = rows[wanted[low:high] - begin]
         begin += len(rows)
-    table = np.concatenate(parts)
-    return lambda rows: table[np.searchsorted(wanted, rows)]
+    return lambda rows: np.asarray(table[np.searchsorted(wanted, rows)])
 
 
 def _calibrated(

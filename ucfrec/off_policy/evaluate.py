@@ -20,6 +20,7 @@ from ucfrec.off_policy.features import InputsFile, StepInputs, context_of, score
 from ucfrec.off_policy.fqe import ModelReport, fit_models
 from ucfrec.off_policy.item_groups import default_groups, group_items
 from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps
+from ucfrec.off_policy.on_disk import array_on_disk
 from ucfrec.off_policy.options import EstimateOptions
 from ucfrec.off_policy.pages import as_pages, pages_of
 from ucfrec.off_policy.score import LoggedSessions, ScoredSteps, scored_steps
@@ -259,7 +260,8 @@ def logged_steps(
 ) -> JudgedSteps:
     """Collect the logged steps, the policy's probabilities and models of what it would earn.
 
-    In memory are some ten numbers a step; what the models see of it lies on disk meanwhile.
+    In memory are some ten numbers a step; what the models see of it, and the probabilities of item
+    groups, lie on disk.
 
     Args:
         trained: a policy that chooses items.
@@ -279,7 +281,7 @@ def logged_steps(
     group_of = _item_groups(trained, options, seed)
     group = np.where(items >= 0, group_of[items], -1)
     one_hot = torch.from_numpy(np.eye(group_of.max() + 1, dtype=np.float32)[group_of])
-    target, shown = np.empty(len(items)), np.empty((len(items), one_hot.shape[1]), np.float32)
+    target, shown = np.empty(len(items)), array_on_disk((len(items), one_hot.shape[1]))
     done, behavior = 0, None
     with InputsFile() as inputs:
         for batch in scored_steps(trained, store, rule):

@@ -17,6 +17,8 @@ Float32Array = npt.NDArray[np.float32]
 _PRODUCTS = 256
 _LOWEST_SCORE = -20.0
 ROWS_AT_ONCE = 8192
+_NUMBERS_AT_ONCE = 2**22
+"""Of the rows that are in memory at a time; long rows are read fewer at once."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,8 @@ class InputsFile:
         context, state, item = self._sizes
         width = context + 2 * item + 2
         self._file.seek(0)
-        while read := self._file.read(4 * width * ROWS_AT_ONCE):
+        at_once = max(1, min(ROWS_AT_ONCE, _NUMBERS_AT_ONCE // width))
+        while read := self._file.read(4 * width * at_once):
             rows = torch.from_numpy(np.frombuffer(read, dtype=np.float32).reshape(-1, width).copy())
             parts = torch.split(rows, [context, item, item, 2], dim=1)
             yield StepInputs(parts[0], state, parts[1], parts[2], parts[3])

@@ -20,6 +20,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.locks import scratch_folder
+from ucfrec.logs.engine import BATCH_ROWS
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.ids import EPISODE_USERS
 from ucfrec.logs.mapping import LogMapping
@@ -30,8 +31,6 @@ from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 SESSION, PROBABILITY, RANK, GREEDY = "session", "probability", "rank", "greedy_item_id"
 _STEPS_AT_ONCE = 1024
 _LOGITS_AT_ONCE = 2**24
-_MEMORY = "1GB"
-"""For reading the logs, beside the policy."""
 
 IntArray = npt.NDArray[np.int64]
 
@@ -77,6 +76,7 @@ def logged_sessions(
     files: Sequence[Path],
     mapping: LogMapping,
     keep_unknown: bool = False,
+    memory_limit: str = "2GB",
 ) -> Iterator[LoggedSessions]:
     """Read logs in the same way as the training logs of `run`.
 
@@ -91,6 +91,7 @@ def logged_sessions(
         files: the log files.
         mapping: which columns of the logs mean what.
         keep_unknown: keep rows whose item the run does not know.
+        memory_limit: of the process while it reads, such as "2GB"; rows spill to disk.
 
     Yields:
         The prepared logs.
@@ -111,14 +112,14 @@ def logged_sessions(
     # Older runs did not record `session_by`, but they did record the gap.
     session_by = record.get("session_by") or (None if gap_ms is None else "gap")
     reward = Expression(record["reward"], str(run / RUN))
-    options = PrepareOptions(reward, session_by, memory_limit=_MEMORY)
+    options = PrepareOptions(reward, session_by, memory_limit=memory_limit)
     if gap_ms is not None:
         options = replace(options, gap_minutes=gap_ms / 60_000)
     with scratch_folder(Path(gettempdir()), "logs") as scratch:
         folder = scratch / "store"
         report = prepare(files, mapping, folder, options, like=run, keep_unknown=keep_unknown)
         store = EpisodeStore.open(folder)
-        unknown = int((store.column(schema.ITEM) < 0).sum())
+        unknown = _unknown_items(store)
         if unknown == store.n_steps:
             raise InputError(
                 f"{files[0]}: in all {unknown:,} rows the item is not in the store of the run; "
@@ -127,6 +128,16 @@ def logged_sessions(
         store = _as_seen(store, trained)
         users = np.asarray(pq.read_table(folder / EPISODE_USERS).column(schema.USER_ID))
         yield LoggedSessions(store, users, report, unknown)
+
+
+def _unknown_items(store: EpisodeStore) -> int:
+    """Number of steps that show an item which the run does not know."""
+    steps = (
+        np.arange(begin, min(begin + BATCH_ROWS, store.n_steps))
+        for begin in range(0, store.n_steps, BATCH_ROWS)
+    )
+    items = (store.step_values(schema.ITEM, *store.locate(each)) for each in steps)
+    return sum(int((each < 0).sum()) for each in items)
 
 
 def _as_seen(store: EpisodeStore, trained: TrainedPolicy) -> EpisodeStore:

@@ -1,5 +1,6 @@
 """Finds out whether a policy is evaluated on rows that it was trained on."""
 
+from collections.abc import Iterator
 from typing import Any, Final
 
 import numpy as np
@@ -13,6 +14,8 @@ from ucfrec.runs.trained_policy import TrainedPolicy, store_of
 MOST_SEEN: Final = 0.05
 """Largest share of rows seen in training with which an estimate is accepted. It is above 0 because
 with coarse timestamps some rows of other logs have the same user, item and time by chance."""
+
+_ROWS_AT_ONCE: Final = 2**19
 
 KeyArray = npt.NDArray[np.uint64]
 
@@ -39,24 +42,31 @@ def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
         return None
     if store is None:
         return None
-    learnt = np.concatenate([_keys(store.split(name)) for name in ("train", "validation")])
-    return float(np.isin(_keys(logged), learnt).mean())
+    keys, rows = np.unique(np.concatenate(list(_keys(logged))), return_counts=True)
+    seen = np.zeros(len(keys), dtype=bool)
+    # The training data may be far larger than the logs.
+    for name in ("train", "validation"):
+        for learnt in _keys(store.split(name)):
+            places = np.minimum(np.searchsorted(keys, learnt), len(keys) - 1)
+            seen[places[keys[places] == learnt]] = True
+    return float(rows[seen].sum() / rows.sum())
 
 
-def _keys(store: EpisodeStore) -> KeyArray:
-    """Hash the (user, item, time) of each step to one number, (N,)."""
+def _keys(store: EpisodeStore) -> Iterator[KeyArray]:
+    """Hash the (user, item, time) of each step to one number; some at a time, in order."""
     if not store.n_episodes:
-        return np.zeros(0, dtype=np.uint64)
-    episodes, steps = store.all_steps()
-    users: npt.NDArray[Any] = store.episode_values(schema.USER)[episodes]
-    keys = np.zeros(len(steps), dtype=np.uint64)
-    for values in (
-        users,
-        store.step_values(schema.ITEM, episodes, steps),
-        store.step_values(schema.TIMESTAMP, episodes, steps),
-    ):
-        keys = _mixed(keys ^ values.astype(np.int64).view(np.uint64))
-    return keys
+        return
+    users: npt.NDArray[Any] = store.episode_values(schema.USER)
+    for begin in range(0, store.n_steps, _ROWS_AT_ONCE):
+        episodes, steps = store.locate(np.arange(begin, min(begin + _ROWS_AT_ONCE, store.n_steps)))
+        keys = np.zeros(len(steps), dtype=np.uint64)
+        for values in (
+            users[episodes],
+            store.step_values(schema.ITEM, episodes, steps),
+            store.step_values(schema.TIMESTAMP, episodes, steps),
+        ):
+            keys = _mixed(keys ^ values.astype(np.int64).view(np.uint64))
+        yield keys
 
 
 def _mixed(keys: KeyArray) -> KeyArray:

@@ -158,7 +158,10 @@ class Histories:
 
 
 def histories_of_files(
-    trained: TrainedPolicy, files: Sequence[str | Path], mapping: LogMapping
+    trained: TrainedPolicy,
+    files: Sequence[str | Path],
+    mapping: LogMapping,
+    memory_limit: str = "2GB",
 ) -> Iterator[Histories]:
     """Read histories from log files in batches of users, users in sorted order.
 
@@ -166,6 +169,7 @@ def histories_of_files(
         trained: policy whose reward expression, session rule and observations apply.
         files: log files, folders and globs.
         mapping: names of the columns.
+        memory_limit: of the process, such as "2GB"; rows spill to disk.
 
     Returns:
         The batches.
@@ -178,6 +182,7 @@ def histories_of_files(
         _columns_used(trained, mapping),
         _reward(trained),
         LONGEST_HISTORY,
+        memory_limit,
         session_by=_session_by(trained),
         duplicates=duplicates_of(trained.record),
     )

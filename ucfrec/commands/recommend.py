@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ucfrec.commands.options import (
+    engine_option,
     item_options,
     limit_options,
     log_options,
@@ -40,6 +41,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="instead of LOGS and --out: read requests from stdin, JSON on each line, and write "
         "answers to stdout (docs/serving.md)",
     )
+    engine_option(parser)
     limit_options(parser)
 
 

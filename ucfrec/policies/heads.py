@@ -217,8 +217,11 @@ class ItemHead(nn.Module):
         return torch.stack(parts).logsumexp(0)
 
     def _vectors_of(self, items: Tensor) -> Tensor:
-        """Vectors (..., d) of items (...); in evaluation mode without gradients, those kept."""
-        if self.training or torch.is_grad_enabled():
+        """Vectors (..., d) of items (...); in evaluation mode without gradients, those kept.
+
+        A graph that is exported computes those of its items.
+        """
+        if self.training or torch.is_grad_enabled() or torch.compiler.is_compiling():
             self._kept = None
             return self.vectors(items)
         return F.embedding(items, self.all_vectors())

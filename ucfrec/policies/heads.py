@@ -140,7 +140,7 @@ class ItemHead(nn.Module):
         """
         # Scaling the features instead of the logits saves two passes over the larger of them.
         scaled = features / features.shape[-1] ** 0.5
-        logits: Tensor = F.linear(scaled, self.all_vectors(), self.bias)
+        logits: Tensor = F.linear(scaled, self.all_vectors(), self.bias).float()
         if self.exposure is not None and exposed is not None:
             return self.exposure.added_to(logits, exposed)
         return logits
@@ -189,7 +189,7 @@ class ItemHead(nn.Module):
         items: Tensor,
         exposed: Exposed | None,
     ) -> Tensor:
-        logits = F.linear(features / features.shape[-1] ** 0.5, vectors, bias)
+        logits = F.linear(features / features.shape[-1] ** 0.5, vectors, bias).float()
         if self.exposure is not None and exposed is not None:
             return self.exposure.added_to(logits, exposed, items)
         return logits

@@ -12,6 +12,7 @@ from ucfrec.acting import item_index
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.item_index import ItemIndex
 from ucfrec.acting.sessions import Sessions
+from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.recommending.histories import histories_of_frame
@@ -90,6 +91,19 @@ def test_recommendations_are_those_of_the_exact_search(trained: TrainedPolicy) -
     pd.testing.assert_frame_equal(found[columns], exact[columns])
     first = exact.groupby("user_id").score.transform("max")
     assert (found.score - (exact.score - first)).abs().max() < 1e-4
+
+
+def test_the_command_tells_the_recall(
+    trained: TrainedPolicy, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    histories(users=5).to_parquet(tmp_path / "log.parquet")
+    out = tmp_path / "out.parquet"
+    asked = [str(trained.folder), str(tmp_path / "log.parquet"), "--out", str(out), "--k", "4"]
+    assert main(["recommend", *asked, "--approximate", "--temperature", "0"]) == 0
+    assert "recall@4 against the exact search: 1.000 (1 users)" in capsys.readouterr().out
+    assert len(pd.read_parquet(out)) == 20
+    assert main(["recommend", *asked[:-4], "--stream", "--approximate"]) == 2
+    assert "--stream" in capsys.readouterr().err
 
 
 def test_what_needs_all_scores_is_refused(trained: TrainedPolicy, tmp_path: Path) -> None:

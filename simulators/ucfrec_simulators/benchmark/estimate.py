@@ -5,13 +5,13 @@ from typing import Final
 
 from ucfrec_simulators.benchmark.cells import Cell
 
-_PER_STEP: Final = {"kuairand": 0.1, "kuairec": 0.1, "sardine-boredinf": 0.06}
+_PER_STEP: Final = {"kuairand": 0.1, "kuairec": 0.1, "sardine-boredinf": 0.1}
 """CPU seconds of a training step of width 64, by task; `_STEP` for others."""
 _BEFORE: Final = {"kuairand": 45.0, "kuairec": 45.0}
 """CPU seconds of copies and their reward model, by task; `_COPIES` for others."""
-_CHOICE: Final = {"kuairand": 35.0, "kuairec": 35.0, "sardine-boredinf": 60.0}
+_CHOICE: Final = {"kuairand": 22.0, "kuairec": 22.0, "sardine-boredinf": 65.0}
 """CPU seconds of the reward model of items and the choice of the rule; `_RULE` for others."""
-_STEP, _COPIES, _RULE = 0.04, 25.0, 15.0
+_STEP, _COPIES, _RULE = 0.06, 45.0, 15.0
 _EVALUATION: Final = 5.0
 """CPU seconds to evaluate a policy in a world."""
 

@@ -17,6 +17,8 @@ class Method:
     """Whether it takes a target return."""
     vectors: bool = True
     """Whether it also supports action vectors; False for policies of items only."""
+    tags: bool = False
+    """Whether it supports only items with tags."""
     screening: str | None = None
     """One of `ucfrec.runs.screened.SCREENINGS` for logs with observations; None for none."""
 
@@ -30,7 +32,6 @@ chosen on the log, with the tilt by the reward model."""
 LEARNERS: Final[Mapping[str, Method]] = {
     "sasrec": Method("sasrec", conditioned=False),
     "bc": Method("bc", conditioned=False),
-    "bc-25": Method("bc", ("policy.best_share=0.25",), conditioned=False),
     "bc-10": Method("bc", ("policy.best_share=0.1",), conditioned=False),
     "dt": Method("dt"),
     "dt4rec": Method("dt4rec"),
@@ -52,6 +53,7 @@ METHODS: Final[Mapping[str, Method]] = {
         ("rule.choose=false", "rule.default_tag_window=10"),
         conditioned=False,
         vectors=False,
+        tags=True,
     ),
     "item-knn": Method("item-knn", ("rule.choose=false",), conditioned=False, vectors=False),
     "crm-greedy": Method("crm-greedy", ("rule.choose=false",), conditioned=False),

@@ -54,14 +54,15 @@ BUDGETS: Final[Mapping[str, Budget]] = {
         sessions=6000,
         settings=(
             "policy.dim=64",
-            "train.steps=500",
+            "train.steps=400",
             "train.learning_rate=1e-3",
-            "train.warmup_steps=50",
-            "train.validate_every=125",
+            "train.warmup_steps=40",
+            "train.validate_every=100",
             "crm.epochs=8",
+            "rule.sessions=50",
         ),
-        cuts={"dt4rec": ("policy.negatives=1",), "edt4rec": ("policy.cql_steps=500",)},
-        evaluation=EvaluationPlan(episodes=500),
+        cuts={"dt4rec": ("policy.negatives=1",), "edt4rec": ("policy.cql_steps=400",)},
+        evaluation=EvaluationPlan(episodes=300),
     ),
     "full": Budget(
         seeds=5,
@@ -76,13 +77,13 @@ BUDGETS: Final[Mapping[str, Budget]] = {
 _CONTEXT: Final = 11
 """Context length K (steps): one more than the steps that exposure features look back."""
 
-LAMBDAS: Final = (0.0, 0.05, 0.1, 0.25, 0.5, 1.0)
+LAMBDAS: Final = (0.0, 0.1, 0.5, 1.0)
 BANDS: Final = ((0.05, 0.2), (1.0, 2.0))
 GATES: Final = (0.02, 1e6)
 """ε_r in standard deviations of the rewards; the last value disables the gate. The first λ is the
 default, and the line to compare with."""
 DISTRACTOR_METHODS: Final[Mapping[str, Method]] = {
-    **{name: METHODS[name] for name in ("bc", "dt", "cdt4rec", "edt4rec", "ucf-paper", "ucf")},
+    **{name: METHODS[name] for name in ("bc", "dt", "ucf-paper", "ucf")},
     **SCREENED,
 }
 DISTRACTOR_TARGETS: Final = (1.0, 0.99)
@@ -249,7 +250,7 @@ class Plan:
         `evaluation` is the budget's unless given.
         """
         store = EpisodeStore.open(task.store)
-        if not (store.has_items or method.vectors):
+        if not _supports(method, store):
             return
         task_name = name.partition(",")[0]
         memory = () if method.policy in _MEMORYLESS else (f"policy.context={_CONTEXT}",)
@@ -294,6 +295,12 @@ def _module(world: str) -> str:
     if world.startswith(GYMNASIUM):
         return _GYMNASIUM_WORLD
     return plugin_module("simulators", world)
+
+
+def _supports(method: Method, store: EpisodeStore) -> bool:
+    if not store.has_items:
+        return method.vectors
+    return not method.tags or bool(store.item_states.tags.shape[1])
 
 
 def _reward_spread(store: Path) -> float:

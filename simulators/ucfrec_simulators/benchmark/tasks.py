@@ -83,7 +83,7 @@ def synthetic_catalog(folder: Path, log: Log) -> BenchmarkTask:
 def sardine(name: str, folder: Path, log: Log) -> BenchmarkTask:
     """A world of SARDINE, with logs of its mixture of oracles.
 
-    A third of the sessions are collected, because they have 100 steps.
+    A twelfth of the sessions are collected, because they have 100 steps.
 
     Args:
         name: `sardine-static` or `sardine-boredinf`.
@@ -92,7 +92,7 @@ def sardine(name: str, folder: Path, log: Log) -> BenchmarkTask:
     Raises:
         InputError: `sardine-rec` is not installed.
     """
-    return simulated(World(name), folder, replace(log, sessions=max(1, log.sessions // 3)))
+    return simulated(World(name), folder, replace(log, sessions=max(1, log.sessions // 12)))
 
 
 def simulated(world: World, folder: Path, log: Log) -> BenchmarkTask:

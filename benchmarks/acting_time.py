@@ -44,7 +44,7 @@ from ucfrec.provenance import provenance
 from ucfrec.recommending.histories import Histories, histories_of_files
 from ucfrec.recommending.recommend import positions, recommend
 from ucfrec.recommending.requests import Limits
-from ucfrec.recommending.responder import Responder
+from ucfrec.recommending.responder import ENGINES, TORCH, Responder
 from ucfrec.recommending.stream import answer_stream
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows
@@ -105,7 +105,7 @@ def enlarged(trained: TrainedPolicy, items: int) -> TrainedPolicy:
     )
 
 
-def line_ways(trained: TrainedPolicy) -> tuple[Way, Way]:
+def line_ways(trained: TrainedPolicy, engine: str) -> tuple[Way, Way]:
     """Answer one line of JSON: as the stream does, and by way of a store."""
     assert trained.item_ids is not None
     rng = np.random.default_rng(0)
@@ -114,7 +114,7 @@ def line_ways(trained: TrainedPolicy) -> tuple[Way, Way]:
         for n, item in enumerate(rng.choice(trained.item_ids, size=HISTORY).tolist())
     ]
     line = json.dumps({"user_id": "someone", "history": rows, "k": 10}).encode() + b"\n"
-    responder, decider = Responder(trained, Limits()), trained.decider()
+    responder, decider = Responder(trained, Limits(), engine=engine), trained.decider()
 
     def before() -> str:
         request = json.loads(line)
@@ -282,9 +282,9 @@ def cases(options: argparse.Namespace, folder: Path) -> Iterator[tuple[Case, int
     trained, store = TrainedPolicy.load(options.run), EpisodeStore.open(options.store)
     items, rounds, wanted = len(trained.item_index), options.rounds, options.only or TASKS
     if "one user" in wanted:
-        yield Case("one user", line_ways(trained), options.users), items
+        yield Case("one user", line_ways(trained, options.engine), options.users), items
     if "one user, large catalogue" in wanted and options.items:
-        ways = line_ways(enlarged(trained, options.items))
+        ways = line_ways(enlarged(trained, options.items), options.engine)
         yield Case("one user, large catalogue", ways, max(60, rounds)), options.items
         del ways
     if "one user's frame" in wanted:
@@ -309,6 +309,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5, help="timed rounds (5)")
     parser.add_argument("--users", type=int, default=300, help="timed rounds of one user (300)")
     parser.add_argument("--items", type=int, default=0, help="of a larger catalogue (none)")
+    parser.add_argument("--engine", choices=ENGINES, default=TORCH, help="of one user (torch)")
     parser.add_argument("--original", type=Path, help="folder of the authors' VirtualTaobao")
     parser.add_argument("--only", nargs="+", choices=TASKS, help="what to measure (everything)")
     parser.add_argument("--results", type=Path, default=RESULTS, help="file of result rows")
@@ -335,7 +336,8 @@ def main() -> None:
                 task=case.task,
                 method="ucf",
                 policy="ucf",
-                conditions={"items": items, "rounds": case.rounds, "sessions": options.sessions},
+                conditions={"items": items, "rounds": case.rounds, "sessions": options.sessions}
+                | ({} if options.engine == TORCH else {"engine": options.engine}),
                 code_version=code_version(Path(__file__), "ucfrec.recommending.responder"),
                 metric="ratio",
                 metrics=found,

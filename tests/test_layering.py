@@ -40,6 +40,7 @@ TESTED_HERE = {
     "tests/policies/test_baselines.py",
     "tests/policies/test_known_answers.py",
     "tests/reporting/test_page_items.py",
+    "tests/runs/test_precision.py",
     "tests/test_docs.py",
     "tests/test_examples.py",
     "tests/test_layering.py",

@@ -3,6 +3,7 @@
 import copy
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -14,8 +15,10 @@ from tests.support.real_data import data_folder
 from ucfrec.counterfactual.augment import accept
 from ucfrec.counterfactual.edit_statistics import MoveReport, MoveStatistics
 from ucfrec.counterfactual.generators import (
+    CounterfactualStateGenerator,
     CSGConfig,
     Generator,
+    NoiseGenerator,
     _products,
     make_generator,
 )
@@ -180,3 +183,18 @@ def test_products_are_those_of_every_steps_own_matrix() -> None:
     own = matrices[torch.tensor([0, 0, 2, 2, 2, 2, 2, 2, 3])]
     expected = torch.einsum("mij,mj->mi", own, vectors)
     torch.testing.assert_close(_products(matrices, vectors, rows), expected)
+
+
+@pytest.mark.parametrize("kind", ["noise", "faithful"])
+def test_proposals_are_made_where_the_model_is(kind: Literal["noise", "faithful"]) -> None:
+    # Tensors of the device "meta" have no values, and mixing them with the CPU's is an error.
+    crm = CausalRewardModel(3, 2, CRMConfig(latent_dim=2, hidden=4)).to("meta")
+    config = CSGConfig(kind=kind, hidden=4)
+    maker = NoiseGenerator if kind == "noise" else CounterfactualStateGenerator
+    given = (torch.empty(5, size, device="meta") for size in (3, 2, 2))
+    generator = maker(crm, config)
+    if isinstance(generator, torch.nn.Module):
+        generator.to(crm.device)
+    found = generator.propose(*given, torch.Generator())
+    assert found.device == crm.device
+    assert found.shape == (5, 3)

@@ -328,3 +328,14 @@ def test_a_term_read_back_is_the_one_saved() -> None:
 def test_quantiles_are_numpys_to_the_last_bit(values: list[float], levels: list[float]) -> None:
     found = quantiles(np.array(values, dtype=np.float32), np.array(levels))
     np.testing.assert_array_equal(found, np.quantile(np.array(values), levels))
+
+
+@pytest.mark.parametrize("kind", ["tags", "embeddings"])
+def test_additions_are_float32_whatever_the_network_computes_in(kind: str) -> None:
+    made, shown = term(kind, 1), exposed(5, 2)
+    logits = torch.zeros(5, ITEMS)
+    expected = made.added_to(logits.clone(), shown)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = made.added_to(logits.clone(), shown)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, expected, rtol=0.02, atol=0.01)

@@ -1,8 +1,13 @@
 """`Decider.scores` of running sessions, with all that depends on the model alone kept ready."""
 
+import copy
+from collections.abc import Callable
+from typing import NamedTuple
+
 import numpy as np
+import numpy.typing as npt
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ucfrec.acting.decision import Decider
@@ -13,6 +18,19 @@ from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
+
+
+class Query(NamedTuple):
+    """What B sessions ask of all items."""
+
+    factors: Tensor
+    """(B, d) what multiplies the items' vectors."""
+    items: Tensor
+    """(B, N) int64 items shown before, −1 for none."""
+    repeated: Tensor
+    """(B, N) what is added to the scores of these items."""
+    alike: Tensor
+    """(B, N) what their likeness to an item counts."""
 
 
 class SessionScorer:
@@ -29,11 +47,84 @@ class SessionScorer:
             states: of the run.
         """
         self._decider, self._states = decider, states
-        self._context = decider.policy.config.context
+        self.context = decider.policy.config.context
+        """Most steps that the policy sees."""
         lags = 0 if decider.reward_model is None else decider.reward_model.lags
-        self.length = max(self._context - 1 + states.window, lags)
+        self.length = max(self.context - 1 + states.window, lags)
         """Items of a session that are read."""
         self._product = _Product.of(decider)
+        self._of_one: Callable[[Sessions], Query] | None = None
+
+    @property
+    def modules(self) -> list[nn.Module]:
+        """What `query` computes with."""
+        models = (self._decider.policy, self._decider.reward_model)
+        return [each for each in models if each is not None]
+
+    @property
+    def observation_size(self) -> int:
+        """Numbers of a logged observation, which end a state."""
+        return self._decider.policy.state_mean.shape[0] - self._states.size
+
+    @property
+    def n_items(self) -> int:
+        """Items of the catalogue."""
+        return len(self._states.embeddings)
+
+    @property
+    def n_users(self) -> int:
+        """Users of the training logs."""
+        return len(self._states.user_features)
+
+    @property
+    def has_query(self) -> bool:
+        """Whether the policy scores items by a product with their vectors."""
+        return self._product is not None
+
+    @torch.no_grad()
+    def query(self, sessions: Sessions, context: int | None = None) -> Query:
+        """What the sessions ask of all items: all of the scores that does not grow with them.
+
+        Args:
+            sessions: of at least `length` items each.
+            context: steps that the policy sees; None for all that it can.
+        """
+        assert self._product is not None
+        windows = sessions.windows(self._states, context or self.context)
+        return self._product.query(self._decider.asked(windows, sessions.collected), sessions)
+
+    def vectors(self) -> npt.NDArray[np.float32]:
+        """(n_items, d + 1) vectors of all items, whose products with `asked` are most of the
+        scores."""
+        assert self._product is not None
+        return self._product.vectors()
+
+    @torch.inference_mode()
+    def asked(self, query: Query) -> npt.NDArray[np.float32]:
+        """(B, d + 1) what multiplies `vectors`."""
+        assert self._product is not None
+        return self._product.asked(query)
+
+    @torch.inference_mode()
+    def of_items(self, sessions: Sessions, query: Query, items: Tensor, products: Tensor) -> Tensor:
+        """Scores (B, C) of some items; −∞ for those that the rule's tags leave out, even if no
+        others remain.
+
+        Args:
+            sessions: as for `scores`.
+            query: of the sessions.
+            items: (B, C) int64.
+            products: (B, C) of `asked` and the items' `vectors`.
+        """
+        assert self._product is not None
+        scores = products + self._product.added(query, items)
+        return scores.masked_fill_(_tags_left_out(self._decider, sessions.shown, items), -torch.inf)
+
+    def answering_one_with(self, query: "Callable[[Sessions], Query]") -> "SessionScorer":
+        """The same, but the query of a single session is computed by `query`."""
+        other = copy.copy(self)
+        other._of_one = query
+        return other
 
     def scores(
         self,
@@ -66,14 +157,18 @@ class SessionScorer:
     def _scores(self, sessions: Sessions) -> Tensor:
         decider = self._decider
         # No learner's outputs depend on how much padding is before a session.
-        context = min(self._context, int(sessions.steps.max()) + 1)
-        windows = decider.asked(sessions.windows(self._states, context), sessions.collected)
+        context = min(self.context, int(sessions.steps.max()) + 1)
         if self._product is None:
+            windows = decider.asked(sessions.windows(self._states, context), sessions.collected)
             # Learners may give what they keep, and scores are overwritten.
             outputs = decider.act_and_features(windows)[0].clone()
             scores = decider.tilted(outputs, windows, sessions.users, sessions.shown)
         else:
-            scores = self._product.scores(windows, sessions)
+            if self._of_one is not None and len(sessions.users) == 1:
+                query = self._of_one(sessions)
+            else:
+                query = self.query(sessions, context)
+            scores = self._product.scores(query)
         decider.require_numbers(scores)
         return scores
 
@@ -114,8 +209,52 @@ class _Product:
         with torch.no_grad():
             return cls(decider, head, model) if alike else None
 
-    def scores(self, windows: Windows, sessions: Sessions) -> Tensor:
-        """(B, n_items) of windows of `Decider.asked`, up to a constant per row."""
+    def scores(self, query: Query) -> Tensor:
+        """(B, n_items), up to a constant per row."""
+        factors, profile = self._asked(query)
+        scores = torch.addmm(self._bias, factors, self._matrix)
+        if profile is not None:
+            assert self._alike is not None
+            scores.add_(self._alike.of(profile))
+        if self._likeness is None:
+            return scores
+        rows, lags = torch.nonzero(query.items >= 0, as_tuple=True)
+        repeated = query.repeated[rows, lags]
+        return scores.index_put_((rows, query.items[rows, lags]), repeated, accumulate=True)
+
+    def vectors(self) -> npt.NDArray[np.float32]:
+        """(n_items, d + 1) what `asked` is multiplied with; the last column is the bias."""
+        vectors = np.empty((len(self._bias), len(self._matrix) + 1), dtype=np.float32)
+        vectors[:, :-1], vectors[:, -1] = self._matrix.numpy().T, self._bias.numpy()
+        return vectors
+
+    def asked(self, query: Query) -> npt.NDArray[np.float32]:
+        """(B, d + 1) what multiplies the vectors of all items."""
+        return F.pad(self._asked(query)[0], (0, 1), value=1.0).numpy()
+
+    def added(self, query: Query, items: Tensor) -> Tensor:
+        """(B, C) what the scores of items (B, C), at least 0, are more than the products."""
+        profile = self._asked(query)[1]
+        added = torch.zeros(items.shape)
+        if profile is not None:
+            assert self._alike is not None
+            added += self._alike.of_items(profile, items)
+        if self._likeness is not None:
+            same = items.unsqueeze(2) == query.items.unsqueeze(1)
+            added += (same * query.repeated.unsqueeze(1)).sum(2)
+        return added
+
+    def _asked(self, query: Query) -> tuple[Tensor, Tensor | None]:
+        """What multiplies the matrix, and the profile of tags that counts besides."""
+        if self._likeness is None:
+            return query.factors, None
+        profile = self._likeness.profile(query.items, query.alike)
+        if self._alike is None:
+            return torch.cat([query.factors, profile], 1), None
+        return query.factors, profile
+
+    def query(self, windows: Windows, sessions: Sessions) -> Query:
+        """What the scores of windows of `Decider.asked` are made from."""
         normalized, shown = self._policy.normalized(windows), sessions.shown
         features = self._features(normalized)
         inputs = [features / features.shape[-1] ** 0.5]
@@ -128,18 +267,13 @@ class _Product:
             inputs.append(self._tilt * query)
             of_model = self._model.exposures(shown)[1:]
             weights.append((self._tilt * of_model[0], self._tilt * of_model[1]))
+        factors = torch.cat(inputs, 1)
         if self._likeness is None:
-            return torch.addmm(self._bias, torch.cat(inputs, 1), self._matrix)
+            nothing = factors[:, :0]
+            return Query(factors, nothing.long(), nothing, nothing)
         repeated, alike = map(_sum, zip(*weights, strict=True))
         items = _padded(shown.items, repeated.shape[1], -1)
-        profile = self._likeness.profile(items, alike)
-        if self._alike is None:
-            inputs.append(profile)
-        scores = torch.addmm(self._bias, torch.cat(inputs, 1), self._matrix)
-        if self._alike is not None:
-            scores.add_(self._alike.of(profile))
-        rows, lags = torch.nonzero(items >= 0, as_tuple=True)
-        return scores.index_put_((rows, items[rows, lags]), repeated[rows, lags], accumulate=True)
+        return Query(factors, items, repeated, alike)
 
 
 class _TagSums:
@@ -156,6 +290,27 @@ class _TagSums:
         """(B, n_items) from profiles (B, n_tags)."""
         sums = F.pad(profile, (0, 1))[:, self._distinct].sum(-1)
         return sums.index_select(1, self._which)
+
+    def of_items(self, profile: Tensor, items: Tensor) -> Tensor:
+        """(B, C) of items (B, C) from profiles (B, n_tags)."""
+        tags = self._distinct[self._which[items].long()]  # (B, C, T)
+        return F.pad(profile, (0, 1)).gather(1, tags.flatten(1)).view(tags.shape).sum(2)
+
+
+def _tags_left_out(decider: Decider, shown: Shown, items: Tensor) -> Tensor:
+    """(B, C) whether the rule leaves out items (B, C) for their tags, as long as others remain."""
+    without = torch.zeros(items.shape, dtype=torch.bool)
+    if decider.rule.tag_window:
+        assert decider.likeness is not None
+        tags, recent = decider.likeness.tags, shown.items[:, : decider.rule.tag_window]
+        before = tags[recent.clamp(min=0)].masked_fill((recent < 0).unsqueeze(-1), -1).flatten(1)
+        for tag in tags[items].unbind(2):
+            without |= (tag.unsqueeze(2) == before.unsqueeze(1)).any(2) & (tag >= 0)
+    if decider.rule.tag_run:
+        assert decider.main_tags is not None
+        tired = decider.main_tags.tired(shown, decider.rule.tag_run).unsqueeze(1)
+        without |= (decider.main_tags.tags[items] == tired) & (tired >= 0)
+    return without
 
 
 def _likenesses(head: ItemHead, model: ItemRewardModel | None) -> list[Likeness]:

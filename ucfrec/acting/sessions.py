@@ -1,6 +1,6 @@
 """Running sessions as arrays: what was shown so far, and the windows that a policy sees of it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -69,6 +69,11 @@ class Sessions:
             torch.from_numpy(users),
             observations,
         )
+
+    def rows(self, numbers: Tensor) -> "Sessions":
+        """The sessions with the given numbers (M,)."""
+        values = (getattr(self, each.name) for each in fields(self))
+        return Sessions(*(None if each is None else each[numbers] for each in values))  # type: ignore[arg-type]
 
     @cached_property
     def shown(self) -> Shown:

@@ -193,6 +193,17 @@ def limit_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def engine_option(parser: argparse.ArgumentParser) -> None:
+    """Add what computes the network of a request that comes alone."""
+    parser.add_argument(
+        "--engine",
+        choices=("torch", "onnxruntime"),
+        default="torch",
+        help="what computes the network of a request that comes alone; onnxruntime is faster, but "
+        "needs ucfrec[export] and some 10 seconds at the start (default: torch)",
+    )
+
+
 def limits_given(options: argparse.Namespace) -> "Limits":
     """The limits that `limit_options` name.
 
@@ -210,7 +221,8 @@ def limits_given(options: argparse.Namespace) -> "Limits":
 
 
 def responder_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "Responder":
-    """What answers requests, by `--k`, `item_options`, `limit_options` and `rule_options`.
+    """What answers requests, by `--k`, `item_options`, `engine_option`, `limit_options` and
+    `rule_options`.
 
     Raises:
         InputError: a value is out of range, or the policy's actions are vectors.
@@ -224,6 +236,7 @@ def responder_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "R
         k=options.k,
         filter_seen=not options.keep_seen,
         skip_unknown=options.skip_unknown,
+        engine=options.engine,
     )
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ucfrec.commands.options import (
+    engine_option,
     item_options,
     limit_options,
     log_options,
@@ -32,6 +33,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--k", type=int, default=10, help="items for each user (default: 10)")
     item_options(parser)
     rule_options(parser)
+    parser.add_argument(
+        "--approximate",
+        action="store_true",
+        help="find the items approximately, for large catalogues: needs ucfrec[faiss] and a rule "
+        "without a temperature; says the recall (default: exactly)",
+    )
     out = parser.add_argument(
         "--out", type=uri_or_path(Output, Path), required=True, help="Parquet file to write"
     )
@@ -42,6 +49,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="instead of LOGS and --out: read requests from stdin, JSON on each line, and write "
         "answers to stdout (docs/serving.md)",
     )
+    engine_option(parser)
     limit_options(parser)
 
 
@@ -80,17 +88,28 @@ def run(options: argparse.Namespace) -> None:
 
     files, mapping = logs_given(options)
     trained = TrainedPolicy.load(options.run, options.checkpoint)
+    rule, index = rule_given(options, trained), None
+    if options.approximate:
+        from ucfrec.acting.item_index import ItemIndex
+
+        index = ItemIndex(trained.scorer(rule), rule, trained.name)
     with progress(None, "recommend", "users") as bar:
         frames = recommend(
             trained,
             _counted(histories_of_files(trained, files, mapping, options.memory_limit), bar),
             options.k,
-            rule=rule_given(options, trained),
+            rule=rule,
             filter_seen=not options.keep_seen,
             skip_unknown=options.skip_unknown,
+            index=index,
         )
         rows = write_frames(options.out, frames)
     print(f"{origin(options.out)}: {rows:,} rows")
+    if index is not None and index.wanted:
+        print(
+            f"recall@{options.k} against the exact search: {index.found / index.wanted:.3f} "
+            f"({index.sampled:,} users)"
+        )
 
 
 def _answer_stream(options: argparse.Namespace) -> None:
@@ -99,6 +118,8 @@ def _answer_stream(options: argparse.Namespace) -> None:
 
     if options.logs or options.out:
         raise InputError("--stream reads stdin and writes stdout; leave LOGS and --out out")
+    if options.approximate:
+        raise InputError("--stream finds items exactly; leave --approximate out")
     trained = TrainedPolicy.load(options.run, options.checkpoint)
     responder = responder_given(options, trained)
     # Unbuffered, so that a request is answered without waiting for the next ones.

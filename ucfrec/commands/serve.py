@@ -4,7 +4,13 @@ import argparse
 import sys
 from pathlib import Path
 
-from ucfrec.commands.options import item_options, limit_options, responder_given, rule_options
+from ucfrec.commands.options import (
+    engine_option,
+    item_options,
+    limit_options,
+    responder_given,
+    rule_options,
+)
 from ucfrec.errors import InputError
 from ucfrec.processes import Interrupted
 
@@ -27,6 +33,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--threads", type=int, metavar="N", help="of a forward pass (default: one a core)"
     )
     rule_options(parser)
+    engine_option(parser)
     limit_options(parser)
     server = parser.add_argument_group("limits of the server")
     server.add_argument(

@@ -107,12 +107,13 @@ class OtherActions:
 
         `exact` is the reward model in float64, so that a later check confirms what passes.
         """
-        factual = self.read(self.view, episodes, steps)
+        factual = self.read(self.view, episodes, steps).to(self.crm.device)
         s, a, r = (each.double() for each in (factual.states, factual.actions, factual.rewards))
         z = exact.abduct(s, a, r)
-        reproduced = ((exact.predict(s, a, z) - r).abs() <= self.epsilon_r).numpy()
+        reproduced = ((exact.predict(s, a, z) - r).abs() <= self.epsilon_r).cpu().numpy()
         rows = np.repeat(np.arange(len(steps)), count)
-        labels = self.clusters.nearest(self.crm.normalised_states(factual.states)).numpy()
+        states = self.crm.normalised_states(factual.states).cpu()
+        labels = self.clusters.nearest(states).numpy()
         actions, known = self.support.draw(labels[rows], rng)
         logged = logged_actions(self.view, episodes[rows], steps[rows])
         other = known & np.atleast_2d((actions != logged).T).any(axis=0)
@@ -121,9 +122,10 @@ class OtherActions:
         nothing = np.zeros(len(rows), dtype=np.float32)
         copies = self.view.with_overlay(self._copies(episodes[rows], steps[rows], actions, nothing))
         places = self.view.n_episodes + np.arange(len(rows))
-        given = self.read(copies, places, steps[rows]).actions.double()
-        reward = exact.predict(s[rows], given, z[rows]).numpy()
-        own = (r.numpy()[rows], reproduced[rows])
+        given = self.read(copies, places, steps[rows]).actions.to(s)
+        at = torch.from_numpy(rows).to(s.device)
+        reward = exact.predict(s[at], given, z[at]).cpu().numpy()
+        own = (r.cpu().numpy()[rows], reproduced[rows])
         return _Asked(episodes[rows], steps[rows], actions, reward, *own)
 
     def _copies(

@@ -198,7 +198,7 @@ class _Editor:
     def _chunk(
         self, episodes: IntArray, steps: IntArray
     ) -> tuple[npt.NDArray[np.bool_], FloatArray]:
-        factual = self._read(self._view, episodes, steps)
+        factual = self._read(self._view, episodes, steps).to(self._crm.device)
         z = self._crm.abduct(factual.states, factual.actions, factual.rewards)
         proposed = self._generator.propose(factual.states, factual.actions, z, self._random)
         exact = replace(
@@ -210,9 +210,9 @@ class _Editor:
         exact_z = self._exact.abduct(exact.states, exact.actions, exact.rewards)
         gates = (self.epsilon_r * (1 - _ROUNDING), self.rho_high * (1 - _ROUNDING))
         passed = accept(self._exact, exact, exact_z, proposed.double(), *gates)
-        self._moves.add(self._exact.moves(exact.states[passed], proposed[passed].double()))
+        self._moves.add(self._exact.moves(exact.states[passed], proposed[passed].double()).cpu())
         self.proposals += len(steps)
-        return passed.numpy(), proposed[passed].numpy()
+        return passed.cpu().numpy(), proposed[passed].cpu().numpy()
 
     def moves(self) -> MoveReport:
         return self._moves.report(self.rho_high, int((self._crm.state_std > 0).sum()))

@@ -20,10 +20,10 @@ class StateClusters:
 
     @classmethod
     def of(cls, states: Tensor, most: int, seed: int) -> "StateClusters":
-        """Cluster normalised states.
+        """Cluster normalised states; the clusters are on the CPU.
 
         Args:
-            states: (M, S).
+            states: (M, S), on the CPU.
             most: largest number of clusters; few states make fewer.
             seed: of the first centres and the batches.
         """
@@ -43,6 +43,10 @@ class StateClusters:
             # Shrunk towards the covariance of all states, because a cluster may have few.
             covariances[cluster] = (squares + size * whole) / (rows + size)
         return cls(centres, covariances)
+
+    def to(self, device: torch.device) -> "StateClusters":
+        """The clusters on `device`."""
+        return StateClusters(self.centres.to(device), self.covariances.to(device))
 
     def nearest(self, states: Tensor) -> Tensor:
         """(B,) cluster whose centre is nearest to each of the normalised states (B, S)."""

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from ucfrec import schema
 from ucfrec.counterfactual.action_copies import OtherActions, logged_actions
@@ -24,6 +25,8 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay
 from ucfrec.errors import InputError
 from ucfrec.fitting.random_state import random_state_kept
+
+_CPU = torch.device("cpu")
 
 
 def require_rewards_vary(train: EpisodeStore) -> None:
@@ -51,6 +54,7 @@ def counterfactual_copies(
     config: AugmentConfig,
     folder: Path,
     seed: int,
+    device: torch.device = _CPU,
 ) -> tuple[Overlay, AugmentationReport]:
     """Fit reward model and generator, and make copies (lines 1 to 3 of Algorithm 1).
 
@@ -62,6 +66,7 @@ def counterfactual_copies(
         config: settings of the copies.
         folder: of the checkpoints, which training resumes from.
         seed: of everything random.
+        device: where both models are fitted and edits are made.
 
     Raises:
         InputError: all training rewards are equal, or there are no held-out steps.
@@ -75,7 +80,7 @@ def counterfactual_copies(
     sampled = sample_steps(train, limit, seed)
     training = read(train, *sampled)
     held_out = sample_transitions(validation, limit // 10, seed, read)
-    crm, crm_report = fit_crm(training, held_out, crm_config, folder / "crm", seed, mean)
+    crm, crm_report = fit_crm(training, held_out, crm_config, folder / "crm", seed, mean, device)
     if not config.copies:
         # Nothing proposes states, so no generator is trained.
         csg_config = replace(csg_config, kind="noise")
@@ -86,7 +91,8 @@ def counterfactual_copies(
     overlay, report = augment(train, crm, crm_report, generator, config, seed, read)
     if clusters is None or not config.actions:
         return overlay, report
-    labels = clusters.nearest(crm.normalised_states(training.states)).numpy()
+    states = crm.normalised_states(training.states.to(device)).cpu()
+    labels = clusters.nearest(states).numpy()
     support = ActionSupport(labels, logged_actions(train, *sampled))
     others = OtherActions(train, crm, clusters, support, report.epsilon_r, report.delta, read)
     asked_at = candidates(train, config, np.random.default_rng(seed))

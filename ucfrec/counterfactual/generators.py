@@ -87,7 +87,7 @@ class Generator(Protocol):
             states: (M, S) states s, as logged.
             actions: (M, A) actions a.
             z: (M, latent_dim) abduced disturbances.
-            generator: source of all random numbers.
+            generator: source of all random numbers, on the CPU.
 
         Returns:
             (M, S) counterfactual states s_c, in the units of `states`.
@@ -112,9 +112,9 @@ class TangentGenerator:
             config: band and number of Newton steps.
         """
         self._crm = crm
-        self._clusters = clusters
+        self._clusters = clusters.to(crm.device)
         values, vectors = torch.linalg.eigh(clusters.covariances)
-        self._roots = vectors * values.clamp(min=0).sqrt().unsqueeze(-2)
+        self._roots = (vectors * values.clamp(min=0).sqrt().unsqueeze(-2)).to(crm.device)
         self._config = config
         self.band = config.band
 
@@ -123,10 +123,9 @@ class TangentGenerator:
         self, states: Tensor, actions: Tensor, z: Tensor, generator: torch.Generator
     ) -> Tensor:
         """See `Generator.propose`."""
-        low, high = self.band
         near = self._clusters.nearest(self._crm.normalised_states(states))
-        noise = torch.randn(states.shape, generator=generator)
-        length = low + (high - low) * torch.rand(len(states), 1, generator=generator)
+        noise = torch.randn(states.shape, generator=generator).to(states.device)
+        length = _lengths(self.band, states, generator)
         # In order of clusters, so that no step needs a copy of its cluster's matrix.
         order = near.argsort(stable=True)
         rows = torch.bincount(near, minlength=len(self._clusters.centres)).tolist()
@@ -207,9 +206,9 @@ class NoiseGenerator:
         self, states: Tensor, actions: Tensor, z: Tensor, generator: torch.Generator
     ) -> Tensor:
         """See `Generator.propose`."""
-        low, high = self.band
-        noise = torch.randn(states.shape, generator=generator) * (self._std > 0)
-        length = low + (high - low) * torch.rand(len(states), 1, generator=generator)
+        noise = torch.randn(states.shape, generator=generator).to(states.device)
+        noise = noise * (self._std > 0)
+        length = _lengths(self.band, states, generator)
         return states + self._std * _scaled(noise, length)
 
 
@@ -217,8 +216,8 @@ def state_clusters(
     train: Transitions, crm: CausalRewardModel, config: CSGConfig, seed: int
 ) -> StateClusters:
     """Clusters of the states of the steps that `make_generator` fits to, with the same seed."""
-    states = crm.normalised_states(train.states[_high_rewards(train, config, seed)])
-    return StateClusters.of(states, config.clusters, seed)
+    states = train.states[_high_rewards(train, config, seed)].to(crm.device)
+    return StateClusters.of(crm.normalised_states(states).cpu(), config.clusters, seed)
 
 
 @random_state_kept()
@@ -233,8 +232,9 @@ def make_generator(
     """Make the generator of kind `config.kind`, fitted to the steps of `train` with high rewards.
 
     Args:
-        train: M transitions to fit to.
-        crm: the fitted reward model; its parameters are frozen if the kind is `faithful`.
+        train: M transitions to fit to, on the CPU.
+        crm: the fitted reward model, whose device the generator shares; its parameters are frozen
+            if the kind is `faithful`.
         config: kind and settings.
         folder: of the checkpoints of `faithful`, which resumes from them.
         seed: of sampling, clustering and training.
@@ -246,7 +246,8 @@ def make_generator(
         clusters = clusters or state_clusters(train, crm, config, seed)
         return TangentGenerator(crm, clusters, config)
     chosen = _high_rewards(train, config, seed)
-    s, a, r = train.states[chosen], train.actions[chosen], train.rewards[chosen]
+    fields = (train.states, train.actions, train.rewards)
+    s, a, r = (each[chosen].to(crm.device) for each in fields)
     return _faithful(s, a, r, crm, config, folder, seed)
 
 
@@ -268,11 +269,12 @@ def _faithful(
     seed: int,
 ) -> CounterfactualStateGenerator:
     torch.manual_seed(seed)
-    csg = CounterfactualStateGenerator(crm, config)
+    csg = CounterfactualStateGenerator(crm, config).to(crm.device)
     low, high = config.band
 
     def draw(generator: np.random.Generator) -> Tensor:
-        return torch.from_numpy(generator.integers(len(rewards), size=config.batch_size))
+        rows = generator.integers(len(rewards), size=config.batch_size)
+        return torch.from_numpy(rows).to(crm.device)
 
     def loss(rows: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
         s, a, r = states[rows], actions[rows], rewards[rows]
@@ -300,6 +302,12 @@ def _faithful(
     crm.requires_grad_(False)
     fit(csg, draw, loss, loop, folder, seed=seed, describe="state generator")
     return csg
+
+
+def _lengths(band: tuple[float, float], states: Tensor, generator: torch.Generator) -> Tensor:
+    """(M, 1) lengths of moves from states (M, S), drawn from the band."""
+    low, high = band
+    return (low + (high - low) * torch.rand(len(states), 1, generator=generator)).to(states.device)
 
 
 def _products(matrices: Tensor, vectors: Tensor, rows: list[int]) -> Tensor:

@@ -135,6 +135,11 @@ class CausalRewardModel(nn.Module):
             self.register_buffer(f"{name}_std", torch.ones(shape))
         self.register_buffer("surprise_std", torch.ones(()))
 
+    @property
+    def device(self) -> torch.device:
+        """Where the model is, and what it is given has to be."""
+        return self.state_mean.device
+
     def encode(self, states: Tensor, actions: Tensor, rewards: Tensor) -> Posterior:
         """The posterior q_ϕ(z | s, a, r), both fields (..., latent_dim)."""
         return self._encode(self.given(states, actions), self.residual(states, actions, rewards))

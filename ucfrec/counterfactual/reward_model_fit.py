@@ -35,6 +35,7 @@ _REGRESSION_SHARES = (6, 3, 1)
 _VALIDATION_LIMIT = 20_000
 _CHUNK = 16_384
 _AT_ONCE = 1024
+_CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,7 @@ def fit_crm(
     folder: Path,
     seed: int,
     mean: EffectsMean | None = None,
+    device: torch.device = _CPU,
 ) -> tuple[CausalRewardModel, CRMReport]:
     """Train the reward model (Algorithm 2) with early stopping on held-out steps.
 
@@ -85,6 +87,7 @@ def fit_crm(
         folder: of the checkpoints, which training resumes from.
         seed: of sampling, initialisation and training.
         mean: E[r | s, a], if it was fitted before; transitions then have the actions that it reads.
+        device: where the model is fitted, and stays. What is drawn is the same on all.
 
     Returns:
         The model with the lowest validation loss, in evaluation mode, and its quality.
@@ -93,10 +96,11 @@ def fit_crm(
         InputError: all training rewards are equal, or one of the two sets is empty.
     """
     rng = np.random.default_rng(seed)
-    train = _at_most(train, config.max_transitions, rng)
-    held_out = _at_most(validation, _VALIDATION_LIMIT, rng)
+    train = _at_most(train, config.max_transitions, rng).to(device)
+    held_out = _at_most(validation, _VALIDATION_LIMIT, rng).to(device)
     torch.manual_seed(seed)
     model = CausalRewardModel(train.states.shape[1], train.actions.shape[1], config, mean)
+    model = model.to(device)
     _set_statistics(model, train, held_out)
     if config.mean_first and mean is None:
         _fit_mean(model, train, held_out, folder / "mean", seed)
@@ -118,7 +122,7 @@ def _fit_mean(
     held_out_rewards = model.normalised_rewards(held_out.rewards)
 
     def draw(generator: np.random.Generator) -> tuple[Tensor, Tensor]:
-        rows = torch.from_numpy(generator.integers(len(rewards), size=model.config.batch_size))
+        rows = _rows(generator, len(rewards), model.config.batch_size, model.device)
         return given[rows], rewards[rows]
 
     def loss(batch: tuple[Tensor, Tensor]) -> tuple[Tensor, Mapping[str, Tensor]]:
@@ -179,8 +183,8 @@ def _fit_elbo(
     config, (given, residuals) = model.config, _inputs(model, train)
 
     def draw(generator: np.random.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        rows = torch.from_numpy(generator.integers(len(residuals), size=config.batch_size))
-        noise = _noise(generator, config.batch_size, config.latent_dim)
+        rows = _rows(generator, len(residuals), config.batch_size, model.device)
+        noise = _noise(generator, config.batch_size, config.latent_dim).to(model.device)
         return given[rows], residuals[rows], noise
 
     def loss(batch: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Mapping[str, Tensor]]:
@@ -189,6 +193,7 @@ def _fit_elbo(
         return config.beta * kl - log_likelihood, parts
 
     fixed = _noise(np.random.default_rng(seed), len(held_out.rewards), config.latent_dim)
+    fixed = fixed.to(model.device)
     held_out_inputs = _inputs(model, held_out)
 
     def validate() -> float:
@@ -314,6 +319,10 @@ def _statistics(values: Tensor) -> tuple[Tensor, Tensor]:
 def _at_most(transitions: Transitions, limit: int, rng: np.random.Generator) -> Transitions:
     rows = torch.from_numpy(rng.permutation(len(transitions.rewards))[:limit])
     return Transitions(*(getattr(transitions, field.name)[rows] for field in fields(transitions)))
+
+
+def _rows(generator: np.random.Generator, most: int, rows: int, device: torch.device) -> Tensor:
+    return torch.from_numpy(generator.integers(most, size=rows)).to(device)
 
 
 def _noise(generator: np.random.Generator, rows: int, size: int) -> Tensor:

@@ -130,7 +130,8 @@ class Likeness(nn.Module):
         """
         weights = weights.masked_fill(items < 0, 0.0)
         if not self.tags.shape[1]:
-            return torch.einsum("mn,mnf->mf", weights, self.directions[items])
+            profile = torch.einsum("mn,mnf->mf", weights, self.directions[items])
+            return profile.to(weights.dtype)
         tags, padding = self.tags[items], int(self.n_tags)
         places = torch.where(tags < 0, padding, tags).flatten(1)
         spread = weights.unsqueeze(-1).expand(tags.shape).flatten(1)
@@ -153,13 +154,15 @@ class Likeness(nn.Module):
             profile: see `profile`.
             items: (L,) int64; None for all items.
         """
-        if not self.tags.shape[1]:
-            directions = self.directions if items is None else self.directions[items]
-            return values.addmm_(profile, directions.T)
-        matrix = self._tag_matrix() if items is None else self._tags_of(items)
-        if matrix.is_sparse:
-            return values.add_(cast("Tensor", torch.sparse.mm(matrix, profile.T)).T)
-        return values.addmm_(profile, matrix.T)
+        # Scores are float32, whatever the network computes in.
+        with torch.autocast(values.device.type, enabled=False):
+            if not self.tags.shape[1]:
+                directions = self.directions if items is None else self.directions[items]
+                return values.addmm_(profile, directions.T)
+            matrix = self._tag_matrix() if items is None else self._tags_of(items)
+            if matrix.is_sparse:
+                return values.add_(cast("Tensor", torch.sparse.mm(matrix, profile.T)).T)
+            return values.addmm_(profile, matrix.T)
 
     def to_items(self, profile: Tensor, items: Tensor) -> Tensor:
         """Likeness (M,) to profiles (M, F) of one item each, (M, 1)."""
@@ -239,7 +242,8 @@ class ExposureTerm(nn.Module):
         """Weights of repetition and of likeness, (M, N) each, of the items shown."""
         table = GAIN * (self.common + self.by_lag)
         at = exposed.returns.clamp(self.knots[0], self.knots[-1])
-        right = torch.searchsorted(self.knots, at).clamp(1, len(self.knots) - 1)
+        # ONNX has no search in a sorted list, and these are few.
+        right = (self.knots < at.unsqueeze(1)).sum(1).clamp(1, len(self.knots) - 1)
         low, high = self.knots[right - 1], self.knots[right]
         share = ((at - low) / (high - low)).view(1, -1, 1)
         repeated, repeated_liked, alike, alike_liked = (

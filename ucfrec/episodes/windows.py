@@ -93,6 +93,10 @@ class Transitions:
         ):
             raise _shapes_differ(self, "(M,), states and next_states (M, S), actions (M, A)")
 
+    def to(self, device: torch.device) -> "Transitions":
+        """The steps on `device`."""
+        return Transitions(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
     def __repr__(self) -> str:
         (steps, size), action = self.states.shape, self.actions.shape[1]
         return f"Transitions({steps:,} steps, states of {size}, actions of {action})"

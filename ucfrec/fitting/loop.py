@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -57,6 +57,9 @@ class LoopConfig:
     """Norm to which larger gradients are clipped; 0 disables clipping."""
     validate_every: Count = 500
     """Steps between validations, checkpoints and log lines."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Numbers in which the policy's products are computed; `bfloat16` is for GPUs. Weights, losses
+    and optimizer are float32 with both."""
     patience: Annotated[int, Field(ge=0, le=10**9)] = 0
     """Number of consecutive validations without improvement after which training stops early; 0
     disables early stopping."""

@@ -140,7 +140,7 @@ class ItemHead(nn.Module):
         """
         # Scaling the features instead of the logits saves two passes over the larger of them.
         scaled = features / features.shape[-1] ** 0.5
-        logits: Tensor = F.linear(scaled, self.all_vectors(), self.bias)
+        logits: Tensor = F.linear(scaled, self.all_vectors(), self.bias).float()
         if self.exposure is not None and exposed is not None:
             return self.exposure.added_to(logits, exposed)
         return logits
@@ -189,7 +189,7 @@ class ItemHead(nn.Module):
         items: Tensor,
         exposed: Exposed | None,
     ) -> Tensor:
-        logits = F.linear(features / features.shape[-1] ** 0.5, vectors, bias)
+        logits = F.linear(features / features.shape[-1] ** 0.5, vectors, bias).float()
         if self.exposure is not None and exposed is not None:
             return self.exposure.added_to(logits, exposed, items)
         return logits
@@ -217,8 +217,11 @@ class ItemHead(nn.Module):
         return torch.stack(parts).logsumexp(0)
 
     def _vectors_of(self, items: Tensor) -> Tensor:
-        """Vectors (..., d) of items (...); in evaluation mode without gradients, those kept."""
-        if self.training or torch.is_grad_enabled():
+        """Vectors (..., d) of items (...); in evaluation mode without gradients, those kept.
+
+        A graph that is exported computes those of its items.
+        """
+        if self.training or torch.is_grad_enabled() or torch.compiler.is_compiling():
             self._kept = None
             return self.vectors(items)
         return F.embedding(items, self.all_vectors())

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ucfrec import __version__
 from ucfrec.acting.decision import DecisionRule
@@ -57,7 +57,7 @@ def export(
         InputError: the extra `export` is not installed, the policy cannot be exported, the graph's
             scores differ from torch's, or `out` exists.
     """
-    _require_installed()
+    require_installed()
     graph = RuleGraph(trained, rule or trained.rule, k).eval()
     arguments = random_sessions(graph, trained, 3, seed=0)
     with atomic_folder(out) as scratch:
@@ -69,14 +69,19 @@ def export(
     return Exported(size, difference)
 
 
-def _require_installed() -> None:
+def require_installed() -> None:
+    """Check that the extra `export` is installed.
+
+    Raises:
+        InputError: it is not.
+    """
     try:
         import onnx  # noqa: F401
         import onnxruntime  # noqa: F401
         import onnxscript  # noqa: F401
     except ModuleNotFoundError as error:
         raise InputError(
-            f"the export needs {error.name}, which is not installed; install ucfrec[export]"
+            f"ONNX needs {error.name}, which is not installed; install ucfrec[export]"
         ) from None
 
 
@@ -115,14 +120,41 @@ def _write(graph: RuleGraph, arguments: Mapping[str, Tensor], path: Path, name: 
     given = tuple(arguments.values())
     if graph.observation_size == 0:
         given = (*given, None)  # type: ignore[arg-type]
+    remedy = "use `ucfrec serve` or `recommend --stream`"
+    write_graph(graph, given, path, (list(arguments), list(OUTPUTS)), name, remedy, shapes)
+
+
+def write_graph(
+    module: nn.Module,
+    arguments: tuple[Tensor, ...],
+    path: Path,
+    names: tuple[list[str], list[str]],
+    kind: str,
+    remedy: str,
+    shapes: dict[str, Any] | None = None,
+) -> None:
+    """Write a module as an ONNX graph, its weights beside it.
+
+    Args:
+        module: in evaluation mode.
+        arguments: an example.
+        path: file to write.
+        names: of the inputs and of the outputs.
+        kind: of the policy, for messages.
+        remedy: what to do where it cannot be exported.
+        shapes: sizes that may vary; None for those of the example alone.
+
+    Raises:
+        InputError: torch cannot export it.
+    """
     try:
         with _quiet(), torch.no_grad():
             torch.onnx.export(
-                graph,
-                given,
+                module,
+                arguments,
                 path,
-                input_names=list(arguments),
-                output_names=list(OUTPUTS),
+                input_names=names[0],
+                output_names=names[1],
                 dynamic_shapes=shapes,
                 opset_version=_OPSET,
                 dynamo=True,
@@ -134,8 +166,7 @@ def _write(graph: RuleGraph, arguments: Mapping[str, Tensor], path: Path, name: 
     except Exception as error:  # torch's exporter has no class of errors of its own for all of them
         reason = str(error).strip().splitlines() or [type(error).__name__]
         raise InputError(
-            f"torch cannot export policies of kind {name!r} ({reason[0]:.160}); use `ucfrec serve` "
-            "or `recommend --stream`"
+            f"torch cannot export policies of kind {kind!r} ({reason[0]:.160}); {remedy}"
         ) from None
 
 

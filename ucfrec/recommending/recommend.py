@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.item_index import ItemIndex
 from ucfrec.acting.session_scorer import SessionScorer
 from ucfrec.acting.sessions import Sessions
 from ucfrec.errors import InputError
@@ -38,6 +39,7 @@ def recommend(
     candidates: Sequence[Any] | None = None,
     skip_unknown: bool = False,
     seed: int = 0,
+    index: ItemIndex | None = None,
 ) -> Iterator[pd.DataFrame]:
     """`k` next items of every user, by the decision rule.
 
@@ -55,11 +57,12 @@ def recommend(
         candidates: the only item_ids to recommend, for all users; None for all items.
         skip_unknown: ignore rows of items that are not in the training data.
         seed: of the draws of a rule with a temperature.
+        index: finds the items approximately, by the same rule; None to find them exactly.
 
     Returns:
         One frame per batch: `user_id`, `rank` (from 1), `item_id`, `score` (log-probability at
-        temperature 1 among the items that are left, nats); k rows per user, fewer if fewer items
-        remain.
+        temperature 1 among the items that are left, nats; with an index, less that of the user's
+        best item); k rows per user, fewer if fewer items remain.
 
     Raises:
         InputError: an argument is wrong, the policy's actions are vectors, or an item of the logs
@@ -68,20 +71,20 @@ def recommend(
     """
     scorer, asked = trained.scorer(rule), rule or trained.rule
     _require_whole(k)
-    index = trained.item_index
-    excluded = None if candidates is None else _all_but(index, candidates)
+    known_ids = trained.item_index
+    excluded = None if candidates is None else _all_but(known_ids, candidates)
 
     def frames() -> Iterator[pd.DataFrame]:
         remaining = iter(batches)
         for batch in remaining:
-            known = positions(index, batch.item_ids)
+            known = positions(known_ids, batch.item_ids)
             if not ((known >= 0).all() or skip_unknown):
-                raise _unknown(index, [batch, *remaining])
+                raise _unknown(known_ids, [batch, *remaining])
             seen = np.full(len(batch.seen_ids), -1)
             if filter_seen:
-                seen = positions(index, batch.seen_ids)
+                seen = positions(known_ids, batch.seen_ids)
             numbered = replace(batch, item_ids=known, seen_ids=seen)
-            yield _Choice(trained, scorer, asked, k, excluded, seed).frame(numbered)
+            yield _Choice(trained, scorer, asked, k, excluded, seed, index).frame(numbered)
 
     return frames()
 
@@ -102,6 +105,7 @@ class _Choice:
     excluded: Tensor | None
     """(n_items,) true for items that no user is recommended."""
     seed: int
+    index: ItemIndex | None
 
     def frame(self, batch: Histories) -> pd.DataFrame:
         """Items for the next step of U users whose rows have the policy's numbers of items, −1 for
@@ -131,6 +135,8 @@ class _Choice:
     def _parts(self, latest: Histories, order: IntArray) -> Iterator[tuple[Array, Array]]:
         """Items and their log-probabilities, (M, k) each, of some users after the other."""
         at_once = users_at_once(len(self.trained.item_index))
+        if self.index is not None:
+            at_once = _USERS_AT_ONCE
         for first in range(0, len(order), at_once):
             part = latest.of_users(order[first : first + at_once])
             users = positions(self.trained.user_index, part.users)
@@ -141,6 +147,11 @@ class _Choice:
                 left_out[0].append(part.owner)
                 left_out[1].append(part.item_ids)
             rows, items = (torch.from_numpy(np.concatenate(each)) for each in left_out)
+            if self.index is not None:
+                k = min(self.k, len(self.trained.item_index))
+                found = self.index.best(sessions, (rows, items), self.excluded, k)
+                yield found[0].numpy(), found[1].numpy()
+                continue
             scores = self.scorer.scores(sessions, (rows, items), self.excluded)
             n_items = scores.shape[1]
             drawn = uniforms(part.users, n_items, self.seed) if self.rule.temperature > 0 else None

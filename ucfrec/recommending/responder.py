@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,10 @@ from ucfrec.recommending.histories import Histories
 from ucfrec.recommending.recommend import best_of, sessions_of, uniforms, users_at_once
 from ucfrec.recommending.requests import HistoryReader, Limits, Request, UserHistory
 from ucfrec.runs.trained_policy import TrainedPolicy
+
+TORCH: Final = "torch"
+ONNXRUNTIME: Final = "onnxruntime"
+ENGINES: Final = (TORCH, ONNXRUNTIME)
 
 Array = npt.NDArray[Any]
 IntArray = npt.NDArray[np.int64]
@@ -66,6 +70,7 @@ class Responder:
         filter_seen: bool = True,
         skip_unknown: bool = False,
         seed: int = 0,
+        engine: str = TORCH,
     ) -> None:
         """
         Args:
@@ -76,15 +81,23 @@ class Responder:
             filter_seen: leave out every item that the user has seen.
             skip_unknown: ignore rows of items that are not in the training data.
             seed: of the draws of a rule with a temperature.
+            engine: what computes the network of a request that comes alone, one of `ENGINES`.
 
         Raises:
-            InputError: the policy's actions are vectors, the rule does not fit the policy, or `k`
-                is beyond the limits.
+            InputError: the policy's actions are vectors, the rule does not fit the policy, `k` is
+                beyond the limits, or the engine is not installed or cannot compute the policy.
         """
         self._scorer = trained.scorer(rule)
         assert trained.item_ids is not None
         if not 1 <= k <= limits.k:
             raise InputError(f"k is {k}; give a whole number from 1 to {limits.k:,}")
+        if engine not in ENGINES:
+            raise InputError(f"the engine is {engine!r}; give one of {', '.join(ENGINES)}")
+        if engine == ONNXRUNTIME:
+            from ucfrec.recommending.query_graph import QueryGraph
+
+            graph = QueryGraph(self._scorer, trained.name)
+            self._scorer = self._scorer.answering_one_with(graph)
         self.trained, self.limits = trained, limits
         self._k, self._filter_seen, self._skip_unknown, self._seed = (
             k,

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
@@ -51,10 +52,16 @@ def fit_policy(
         episodes, steps = train.draw_steps(generator, config.train.batch_size)
         return train.windows(episodes[own], steps[own], k).to(device)
 
+    def loss(windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
+        lower = config.train.precision == "bfloat16"
+        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=lower):
+            value, scalars = policy.loss(windows)
+        return value.float(), scalars
+
     return fit(
         policy,
         draw,
-        policy.loss,
+        loss,
         config.train,
         out / "policy",
         seed=config.seed,

@@ -131,7 +131,9 @@ def _train(
     policy = policy.to(device)
     if config.augment.makes_copies:
         with distributed.leader_first():
-            overlay, record["augmentation"] = _counterfactuals(train, validation, out, config)
+            overlay, record["augmentation"] = _counterfactuals(
+                train, validation, out, config, device
+            )
         more_copies = overlay if more_copies is None else overlay.joined(more_copies)
     if more_copies is not None:
         train = train.with_overlay(more_copies)
@@ -271,13 +273,17 @@ def _difference(before: Any, now: Any) -> str:
 
 
 def _counterfactuals(
-    train: EpisodeStore, validation: EpisodeStore, out: Path, config: Config
+    train: EpisodeStore,
+    validation: EpisodeStore,
+    out: Path,
+    config: Config,
+    device: torch.device,
 ) -> tuple[Overlay, dict[str, Any]]:
     """The copies of a run and their report; made once, then read from `out`."""
     overlay_path, report_path = out / "overlay.safetensors", out / AUGMENTATION
     if not report_path.exists():
         overlay, report = counterfactual_copies(
-            train, validation, config.crm, config.csg, config.augment, out, config.seed
+            *(train, validation, config.crm, config.csg, config.augment, out, config.seed, device)
         )
         overlay.save(overlay_path)
         write_json(report_path, dataclasses.asdict(report))

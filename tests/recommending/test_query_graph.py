@@ -1,0 +1,63 @@
+"""onnxruntime answers a request that comes alone as torch does."""
+
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from tests.recommending.test_responder import answered
+from tests.support.served import FULL, histories, requests_of, responder, trained_run
+from ucfrec.acting.sessions import Sessions
+from ucfrec.errors import InputError
+from ucfrec.recommending.responder import ONNXRUNTIME, Responder
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+pytest.importorskip("onnxruntime")
+pytest.importorskip("onnxscript")
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
+    return trained_run(tmp_path_factory.mktemp("query"))
+
+
+@pytest.fixture(scope="module")
+def fast(trained: TrainedPolicy) -> Responder:
+    return responder(trained, rule=FULL, k=24, engine=ONNXRUNTIME)
+
+
+@pytest.mark.slow
+def test_answers_are_those_of_torch(
+    trained: TrainedPolicy, fast: Responder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = [*requests_of(histories()), {"user_id": "new"}]
+    graph, alone = fast._scorer._of_one, []
+
+    def counted(sessions: Sessions) -> Any:
+        alone.append(len(sessions.users))
+        assert graph is not None
+        return graph(sessions)
+
+    monkeypatch.setattr(fast._scorer, "_of_one", counted)
+    expected = answered(responder(trained, rule=FULL, k=24), asked)
+    one_by_one = pd.concat([answered(fast, [each]) for each in asked], ignore_index=True)
+    pd.testing.assert_frame_equal(one_by_one, expected, rtol=1e-5, atol=1e-5)
+    assert alone == [1] * len(asked)
+    pd.testing.assert_frame_equal(answered(fast, asked), expected, rtol=1e-5, atol=1e-5)
+    assert len(alone) == len(asked)
+
+
+@pytest.mark.slow
+def test_the_run_s_own_scorer_stays_as_it_is(trained: TrainedPolicy, fast: Responder) -> None:
+    assert trained.scorer(FULL)._of_one is None
+
+
+def test_policies_that_score_in_their_own_way_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"item-knn.*use --engine torch"):
+        responder(trained_run(tmp_path, "item-knn"), engine=ONNXRUNTIME)
+
+
+def test_an_unknown_engine_is_refused(trained: TrainedPolicy) -> None:
+    with pytest.raises(InputError, match="give one of torch, onnxruntime"):
+        responder(trained, engine="gpu")

@@ -18,6 +18,7 @@ def array_on_disk(shape: tuple[int, int]) -> Float32Array:
     if 0 in shape:
         return np.zeros(shape, dtype=np.float32)
     with tempfile.TemporaryFile(prefix="ucfrec-") as file:
-        # A full disk is an error now; later it would be the end of the process.
-        os.posix_fallocate(file.fileno(), 0, 4 * shape[0] * shape[1])
+        if hasattr(os, "posix_fallocate"):  # not on macOS
+            # A full disk is an error now; later it would be the end of the process.
+            os.posix_fallocate(file.fileno(), 0, 4 * shape[0] * shape[1])
         return np.memmap(file, np.float32, "r+", shape=shape)

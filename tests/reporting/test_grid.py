@@ -1,13 +1,17 @@
 """The benchmark grid: resumed without measuring twice, nothing lost to a failure."""
 
 import json
+import os
+import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from ucfrec.errors import InputError
 from ucfrec.reporting.grid import Measurement, chosen, run_grid
@@ -85,6 +89,42 @@ def test_a_failed_cell_costs_only_itself(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=says):
         run_grid(_cells(tmp_path, -1, 5), HOW, results, 1)
     assert {row.task for row in read_rows(results)} == {"5"}
+
+
+def _where(cell: Cell, key: RowKey) -> list[ResultRow]:
+    metrics = {"process": os.getpid(), "threads": torch.get_num_threads()}
+    return [ResultRow(**vars(key), value=0.0, metric="none", metrics=metrics)]
+
+
+@pytest.mark.parametrize(("workers", "here"), [(1, True), (2, False)])
+def test_one_worker_is_this_process_and_each_has_one_thread(
+    tmp_path: Path, workers: int, here: bool
+) -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        how = replace(HOW, measure=_where)
+        rows = run_grid(_cells(tmp_path, 1, 2), how, tmp_path / "rows.jsonl", workers)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    assert {row.metrics["threads"] for row in rows} == {1}
+    assert (os.getpid() in {row.metrics["process"] for row in rows}) == here
+
+
+def _interrupted(cell: Cell, key: RowKey) -> list[ResultRow]:
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt:
+        raise RuntimeError("query interrupted") from None
+    return _square(cell, key)
+
+
+def test_an_interruption_that_a_library_renames_is_no_failed_cell(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run_grid(_cells(tmp_path, 1, 2), replace(HOW, measure=_interrupted), tmp_path / "rows", 1)
+    assert not (tmp_path / "rows").exists()
+    assert run_grid(_cells(tmp_path, 1), HOW, tmp_path / "rows", 1), "no lock is left"
 
 
 def test_a_line_that_is_no_row_is_named_before_anything_is_measured(tmp_path: Path) -> None:

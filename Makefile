@@ -4,11 +4,12 @@ PYTHON ?= python3
 #   make demo PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu"
 PIP_FLAGS ?=
 BIN := .venv/bin
-# Files of tests side by side, one a core; a file stays whole, so that what its tests share is made
-# once. One thread each, or the workers' linear algebra fights over the cores.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
+# Tests side by side, a row of files a core; who is done first takes half of what another has left,
+# so that few files are divided, and what their tests share made twice. One thread each, or the
+# workers' linear algebra fights over the cores.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: demo test test-slow torture bench lint types docs wheel clean
+.PHONY: demo test test-slow test-all torture bench lint types docs wheel clean
 
 demo: .venv/base  ## Set up and run the main job end to end on simulated logs.
 	$(BIN)/ucfrec demo --out demo-out
@@ -18,6 +19,9 @@ test: .venv/dev  ## Set up and run the tests, all but the slow ones.
 
 test-slow: .venv/dev  ## The slow tests: trainings and worlds that take many seconds each.
 	$(PYTEST) -m slow
+
+test-all: .venv/dev  ## Both, in one start.
+	$(PYTEST)
 
 # SCALE is a share of the cases. What the file of rows has for this code is not measured again.
 SCALE ?= 1

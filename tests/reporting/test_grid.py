@@ -6,12 +6,12 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 from ucfrec.errors import InputError
 from ucfrec.reporting.grid import Measurement, chosen, run_grid
@@ -45,8 +45,15 @@ def _square(cell: Cell, key: RowKey) -> list[ResultRow]:
         raise ValueError("negative")
     if number >= 100:
         time.sleep(0.2)
-    value = {"metric": "square", "metrics": {"square": float(number**2)}}
-    return [ResultRow(**vars(key), **value, checkpoint=name) for name in ("last", "best")]
+    metrics = {"square": float(number**2), "process": os.getpid(), "threads": _threads()}
+    row = ResultRow(**vars(key), metric="square", metrics=metrics)
+    return [replace(row, checkpoint=name) for name in ("last", "best")]
+
+
+def _threads() -> int:
+    import torch  # a process of the test that prints needs none
+
+    return torch.get_num_threads()
 
 
 HOW = Measurement(_key, _config, _square)
@@ -60,9 +67,27 @@ def _marks(folder: Path) -> list[str]:
     return sorted((folder / "marks").read_text().split())
 
 
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    assert torch.get_num_threads() == 2
+    torch.set_num_threads(before)
+
+
+def _measured_by(rows: Sequence[ResultRow]) -> set[float]:
+    """The processes that measured the rows, each with one thread."""
+    assert {row.metrics["threads"] for row in rows} == {1}
+    return {row.metrics["process"] for row in rows}
+
+
 def test_measures_once_and_returns_rows_in_the_order_of_cells(tmp_path: Path) -> None:
     results = tmp_path / "results" / "rows.jsonl"
-    run_grid(_cells(tmp_path, 2, 1), HOW, results, 2)
+    rows = run_grid(_cells(tmp_path, 2, 1), HOW, results, 2)
+    assert os.getpid() not in _measured_by(rows)
     rows = run_grid(_cells(tmp_path, 1, 3, 2, 3), HOW, results, 2)
     assert [(row.task, row.value, row.checkpoint) for row in rows] == [
         (str(n), float(n**2), name) for n in (1, 3, 2) for name in ("last", "best")
@@ -75,11 +100,13 @@ def test_measures_once_and_returns_rows_in_the_order_of_cells(tmp_path: Path) ->
     assert named == {"1": None, "2": {"number": [2]}, "3": {"number": [3]}}
 
 
+@pytest.mark.usefixtures("two_threads")
 def test_rows_of_other_code_are_measured_again(tmp_path: Path) -> None:
     results = tmp_path / "rows.jsonl"
     run_grid(_cells(tmp_path, 2), HOW, results, 1)
     rows = run_grid(_cells(tmp_path, 2, code="2"), HOW, results, 1)
     assert {row.code_version for row in rows} == {"2"}
+    assert _measured_by(rows) == {os.getpid()}, "one worker needs no process of its own"
     assert _marks(tmp_path) == ["2", "2"]
 
 
@@ -89,27 +116,6 @@ def test_a_failed_cell_costs_only_itself(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=says):
         run_grid(_cells(tmp_path, -1, 5), HOW, results, 1)
     assert {row.task for row in read_rows(results)} == {"5"}
-
-
-def _where(cell: Cell, key: RowKey) -> list[ResultRow]:
-    metrics = {"process": os.getpid(), "threads": torch.get_num_threads()}
-    return [ResultRow(**vars(key), value=0.0, metric="none", metrics=metrics)]
-
-
-@pytest.mark.parametrize(("workers", "here"), [(1, True), (2, False)])
-def test_one_worker_is_this_process_and_each_has_one_thread(
-    tmp_path: Path, workers: int, here: bool
-) -> None:
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        how = replace(HOW, measure=_where)
-        rows = run_grid(_cells(tmp_path, 1, 2), how, tmp_path / "rows.jsonl", workers)
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)
-    assert {row.metrics["threads"] for row in rows} == {1}
-    assert (os.getpid() in {row.metrics["process"] for row in rows}) == here
 
 
 def _interrupted(cell: Cell, key: RowKey) -> list[ResultRow]:
@@ -141,9 +147,9 @@ from pathlib import Path
 from tests.reporting.test_grid import HOW
 from ucfrec.reporting.grid import run_grid
 if __name__ == "__main__":
-    folder, *numbers = sys.argv[1:]
+    folder, workers, *numbers = sys.argv[1:]
     cells = [(folder, int(number), "1") for number in numbers]
-    rows = run_grid(cells, HOW, Path(folder) / "rows.jsonl", 2)
+    rows = run_grid(cells, HOW, Path(folder) / "rows.jsonl", int(workers))
     print(json.dumps([row.task for row in rows]))
 """
 
@@ -156,12 +162,12 @@ def test_two_processes_on_one_file_share_the_work(tmp_path: Path) -> None:
     root = str(Path(__file__).parents[2])
     running = [
         subprocess.Popen(
-            [sys.executable, str(script), str(tmp_path), *order],
+            [sys.executable, str(script), str(tmp_path), workers, *order],
             stdout=subprocess.PIPE,
             text=True,
             env={"PYTHONPATH": root, "PATH": "", "OMP_NUM_THREADS": "1"},
         )
-        for order in (numbers, numbers[::-1])
+        for workers, order in (("2", numbers), ("1", numbers[::-1]))
     ]
     said = [json.loads(process.communicate()[0]) for process in running]
     assert _marks(tmp_path) == numbers

@@ -31,8 +31,8 @@ from ucfrec.plugins import Simulator
 from ucfrec.reporting.evaluation_rows import evaluation_row
 from ucfrec.reporting.grid import Measurement, chosen, run_grid
 from ucfrec.reporting.result_row import ResultRow, RowKey
-from ucfrec.reporting.statistics import grouped, paired_differences, summary
-from ucfrec.reporting.tables import markdown_table
+from ucfrec.reporting.statistics import Summary, grouped, paired_differences, summary
+from ucfrec.reporting.tables import NONE, markdown_table, shown
 from ucfrec.runs.config import Config, resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -135,31 +135,49 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     return [evaluation_row(found, row_key, details=details, rule=str(trained.rule))]
 
 
-def difference_table(rows: Sequence[ResultRow]) -> str:
-    """Paired differences to the arm `none`, as Markdown."""
-    lines = []
-    for (mood, sessions), group in grouped(
-        rows, lambda row: (row.conditions["mood"], row.conditions["sessions"])
-    ).items():
+def compared(
+    rows: Sequence[ResultRow],
+) -> dict[tuple[float, int], dict[str, tuple[Summary, Summary]]]:
+    """Differences of each arm's return to that of `none`, by (mood, sessions).
+
+    Returns:
+        By arm, over the pairs of a log and a training seed, and over the means of logs.
+    """
+    found: dict[tuple[float, int], dict[str, tuple[Summary, Summary]]] = {}
+    sizes = grouped(rows, lambda row: (row.conditions["mood"], row.conditions["sessions"]))
+    for (mood, sessions), group in sizes.items():
         of_arm = {
             arm: {(row.log_seed, row.training_seed): row.value for row in own}
             for arm, own in grouped(group, lambda row: row.method).items()
         }
-        base = of_arm.get("none", {})
+        base, own_size = of_arm.get("none", {}), {}
         for arm, values in of_arm.items():
             pairs = [pair for pair in values if pair in base]
             differences = paired_differences(values, base)
-            over = summary(differences)
             by_log = grouped(zip(pairs, differences, strict=True), lambda item: item[0][0])
-            over_logs = summary(np.mean([d for _, d in own]) for own in by_log.values())
-            compared = ["", "", "", ""]
-            if arm != "none" and pairs:
-                errors = (over.standard_error, over_logs.standard_error)
-                compared = [f"{over.mean:+.3f}", *(f"{error:.3f}" for error in errors)]
-                compared.append(str(over.count))
-            lines.append(
-                (f"{mood:g}", sessions, arm, f"{summary(values.values()).mean:.3f}", *compared)
-            )
+            over_logs = summary(float(np.mean([d for _, d in own])) for own in by_log.values())
+            own_size[arm] = (summary(differences), over_logs)
+        found[float(str(mood)), int(str(sessions))] = own_size
+    return found
+
+
+def difference_table(rows: Sequence[ResultRow]) -> str:
+    """Paired differences to the arm `none`, as Markdown."""
+    earned = grouped(
+        rows, lambda row: (row.conditions["mood"], row.conditions["sessions"], row.method)
+    )
+    lines = []
+    for (mood, sessions), of_arm in sorted(compared(rows).items()):
+        for arm in [name for name in ARMS if name in of_arm]:
+            over, over_logs = of_arm[arm]
+            told = [NONE] * 4
+            if arm != "none" and over.count:
+                errors = (
+                    each.standard_error if each.count > 1 else None for each in (over, over_logs)
+                )
+                told = [f"{over.mean:+.3f}", *map(shown, errors), str(over.count)]
+            mean = summary(row.value for row in earned[mood, sessions, arm]).mean
+            lines.append((f"{mood:g}", sessions, arm, f"{mean:.3f}", *told))
     head = ("mood", "sessions", "arm", "R_cum", "− none", "SE over pairs", "SE over logs", "pairs")
     return markdown_table(head, lines)
 

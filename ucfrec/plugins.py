@@ -80,7 +80,9 @@ class BenchmarkRequest:
     workers: int
     """Number of parallel processes."""
     log_seed: int = 0
-    """Seed of the simulated logs."""
+    """Seed of the first simulated log of a task; the others have the seeds after it."""
+    logs: int | None = None
+    """Number of logs of each task; None for the budget's."""
     evaluation_seed: int | None = None
     """Seed of the evaluation episodes; None stands for the budget's."""
     world: "World | None" = None

@@ -48,7 +48,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--training-seeds", type=int, metavar="N", help="training seeds (default: set by --budget)"
     )
     parser.add_argument(
-        "--log-seed", type=int, default=0, help="seed of the simulated logs (default: 0)"
+        "--logs",
+        type=int,
+        metavar="N",
+        help="logs of each task: simulated with N seeds, or N parts of a given log, 1 for all "
+        "of it (default: set by --budget)",
+    )
+    parser.add_argument(
+        "--log-seed",
+        type=int,
+        default=0,
+        help="seed of the first simulated log; the others have the seeds after it (default: 0)",
     )
     evaluation_seed_option(parser)
     env_options(
@@ -74,6 +84,7 @@ def run(options: argparse.Namespace) -> None:
         results=results,
         workers=options.workers,
         log_seed=options.log_seed,
+        logs=options.logs,
         evaluation_seed=options.evaluation_seed,
         world=world_given(options) if options.env else None,
         tasks=options.task,

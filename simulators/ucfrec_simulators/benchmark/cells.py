@@ -19,7 +19,7 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_simulators.distractor import DistractorWorld
 
 SUITE: Final = "recommendation"
-CHECKPOINTS: Final = ("best", "last")
+CHECKPOINT: Final = "best"
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Cell:
     evaluation: EvaluationPlan
     code_version: str
     log_seed: int | None
-    """Seed of simulated logs; None where the logs are given."""
+    """Seed of a simulated log, or number of the part of a given log; None for all of it."""
     training_seed: int | None = None
     """None for a built-in policy, as are `store` and `run`."""
     store: Path | None = None
@@ -106,7 +106,7 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
         row_key: key of the rows.
 
     Returns:
-        One row for each world and, for trained methods, each of `CHECKPOINTS`.
+        One row for each world, of trained methods with the best validation loss.
     """
     episodes, seed = cell.evaluation.episodes, cell.evaluation.seed
     if cell.store is None or cell.run is None:
@@ -120,16 +120,15 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
         record = train_screened(store, cell.run, cell.config, cell.screening)
     training_metrics, rows = _training_metrics(record), []
     details = {} if cell.screening is None else {SCREENING: flagged_columns(record[SCREENING])}
-    for checkpoint in CHECKPOINTS:
-        trained = TrainedPolicy.load(cell.run, checkpoint)
-        rule = _rule(cell, trained)
-        for world in cell.worlds:
-            metrics = evaluate_policy(world, trained, cell.method, episodes, seed, rule)
-            fields = {"checkpoint": checkpoint, "rule": f"{rule} ({rule.hash})"}
-            row = _row(metrics | training_metrics, row_key, world, **fields)
-            # Other methods are given a rule, but do not look at its target.
-            target = row.target_return if cell.conditioned else None
-            rows.append(replace(row, details={**row.details, **details}, target_return=target))
+    trained = TrainedPolicy.load(cell.run, CHECKPOINT)
+    rule = _rule(cell, trained)
+    for world in cell.worlds:
+        metrics = evaluate_policy(world, trained, cell.method, episodes, seed, rule)
+        fields = {"checkpoint": CHECKPOINT, "rule": f"{rule} ({rule.hash})"}
+        row = _row(metrics | training_metrics, row_key, world, **fields)
+        # Other methods are given a rule, but do not look at its target.
+        target = row.target_return if cell.conditioned else None
+        rows.append(replace(row, details={**row.details, **details}, target_return=target))
     return rows
 
 

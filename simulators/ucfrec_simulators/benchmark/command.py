@@ -11,6 +11,7 @@ from ucfrec.plugins import Benchmark, BenchmarkRequest
 from ucfrec.reporting.grid import run_grid
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec_simulators.benchmark.cells import MEASUREMENT
+from ucfrec_simulators.benchmark.estimate import announcement
 from ucfrec_simulators.benchmark.methods import ADDITIONS, METHODS, SCREENED
 from ucfrec_simulators.benchmark.plan import BUDGETS, Plan
 from ucfrec_simulators.benchmark.plots import (
@@ -51,7 +52,11 @@ def run(request: BenchmarkRequest) -> str:
         seeds = request.training_seeds
         if seeds < 1:
             raise InputError(f"--training-seeds is {seeds}; train at least one")
-        budget = replace(budget, seeds=seeds, sweep_seeds=seeds)
+        budget = replace(budget, seeds=seeds)
+    if request.logs is not None:
+        if request.logs < 1:
+            raise InputError(f"--logs is {request.logs}; train on at least one")
+        budget = replace(budget, logs=request.logs)
     _require_known(request)
     plan = Plan(folder, budget, request.budget, request.log_seed, request.world, request.tasks)
     tables, parts = request.tables, []
@@ -72,7 +77,8 @@ def run(request: BenchmarkRequest) -> str:
             for cell in getattr(plan, table)()
             if not request.methods or cell.run is None or cell.method in request.methods
         ]
-        rows = run_grid(cells, MEASUREMENT, request.results, request.workers, table)
+        said = announcement(request.workers)
+        rows = run_grid(cells, MEASUREMENT, request.results, request.workers, table, said)
         parts.append(_shown(table, rows))
         if plotted:
             for _, _, draw in _SHOWN[table]:

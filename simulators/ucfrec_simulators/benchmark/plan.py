@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 from typing import Final
 
@@ -18,7 +19,7 @@ from ucfrec_simulators import sardine
 from ucfrec_simulators.benchmark import cells, tasks
 from ucfrec_simulators.benchmark.cells import Cell, EvaluationPlan
 from ucfrec_simulators.benchmark.methods import ADDITIONS, METHODS, SCREENED, Method
-from ucfrec_simulators.benchmark.tasks import TASKS, BenchmarkTask
+from ucfrec_simulators.benchmark.tasks import TASKS, BenchmarkTask, Log
 from ucfrec_simulators.distractor import OFF, ON, DistractorWorld, plant_distractor
 from ucfrec_simulators.folders import data_folder, folder_name
 
@@ -28,7 +29,11 @@ class Budget:
     """The size of a benchmark; every budget measures all methods."""
 
     seeds: int
-    """Training seeds of the main table."""
+    """Training seeds of every cell."""
+    logs: int
+    """Logs of every task: simulated ones of as many seeds, or parts of a given log."""
+    tasks: tuple[str, ...]
+    """Tasks of the main table."""
     sessions: int
     """Sessions collected where logs are simulated."""
     settings: tuple[str, ...]
@@ -36,54 +41,53 @@ class Budget:
     cuts: Mapping[str, tuple[str, ...]]
     """Further settings of single policies, by name (`ucfrec.policies.registry.policy_names`)."""
     evaluation: EvaluationPlan
-    sweep_seeds: int
-    """Training seeds of the sweeps and of the distractor table."""
 
 
+MAIN: Final = ("kuairand", "kuairec", "virtual-taobao", "synthetic-catalog", "sardine-boredinf")
 BUDGETS: Final[Mapping[str, Budget]] = {
     # Sized for two cores: smaller width, fewer steps, smaller logs, and cheaper settings of two
     # baselines; methods and seeds are not reduced.
     "small": Budget(
         seeds=3,
+        logs=2,
+        tasks=MAIN,
         sessions=6000,
         settings=(
             "policy.dim=64",
-            "train.steps=1000",
+            "train.steps=400",
             "train.learning_rate=1e-3",
-            "train.warmup_steps=100",
-            "train.validate_every=250",
+            "train.warmup_steps=40",
+            "train.validate_every=100",
             "crm.epochs=8",
+            "rule.sessions=50",
         ),
-        cuts={"dt4rec": ("policy.negatives=1",), "edt4rec": ("policy.cql_steps=1000",)},
-        evaluation=EvaluationPlan(episodes=500),
-        sweep_seeds=2,
+        cuts={"dt4rec": ("policy.negatives=1",), "edt4rec": ("policy.cql_steps=400",)},
+        evaluation=EvaluationPlan(episodes=300),
     ),
     "full": Budget(
         seeds=5,
+        logs=3,
+        tasks=(*MAIN, "sardine-static"),
         sessions=50_000,
         settings=("train.steps=20000", "train.learning_rate=3e-4"),
         cuts={},
         evaluation=EvaluationPlan(episodes=5000),
-        sweep_seeds=3,
     ),
 }
 _CONTEXT: Final = 11
 """Context length K (steps): one more than the steps that exposure features look back."""
 
-LAMBDAS: Final = (0.0, 0.05, 0.1, 0.25, 0.5, 1.0)
-BANDS: Final = ((0.05, 0.2), (0.2, 0.5), (0.5, 1.0), (1.0, 2.0))
-GATES: Final = (0.02, 0.1, 0.5, 1e6)
-"""ε_r in standard deviations of the rewards; the last value disables the gate."""
+LAMBDAS: Final = (0.0, 0.1, 0.5, 1.0)
+BANDS: Final = ((0.05, 0.2), (1.0, 2.0))
+GATES: Final = (0.02, 1e6)
+"""ε_r in standard deviations of the rewards; the last value disables the gate. The first λ is the
+default, and the line to compare with."""
 DISTRACTOR_METHODS: Final[Mapping[str, Method]] = {
-    **{name: each for name, each in METHODS.items() if each.conditioned or name == "bc"},
+    **{name: METHODS[name] for name in ("bc", "dt", "ucf-paper", "ucf")},
     **SCREENED,
 }
 DISTRACTOR_TARGETS: Final = (1.0, 0.99)
 """Quantiles of the training returns: the default target, and one nearer to the logs."""
-MAIN: Final = (
-    *("kuairand", "kuairec", "virtual-taobao", "synthetic-catalog"),
-    *("sardine-static", "sardine-boredinf"),
-)
 PURSUED: Final = ("kuairand", "synthetic-catalog", "sardine-boredinf")
 """Tasks of the table of additions, whose actions are items."""
 SWEPT: Final = ("synthetic-catalog", "synthetic-taobao")
@@ -97,6 +101,7 @@ _DISTRACTED_WORLDS: Final = {"synthetic-taobao": 0, "synthetic-catalog": 0, "kua
 all its sessions have the same length, so early exits do not hide the distractor's effect."""
 _DISTRACTOR: Final = DistractorWorld.__module__
 _GYMNASIUM_WORLD: Final = gymnasium_world.__name__
+_ADDED: Final[Mapping[str, Method]] = {"ucf": METHODS["ucf"], **ADDITIONS}
 _MEMORYLESS: Final = ("bc", "popular", "crm-greedy")
 
 
@@ -116,54 +121,47 @@ class Plan:
         folder: where logs, stores, worlds and runs are kept.
         budget: size of the benchmark.
         name: name of the budget, for the rows.
-        log_seed: seed of simulated logs.
-        world: a world whose cells the main table has instead; None for `MAIN`.
+        log_seed: seed of the first simulated log of a task; the others have the seeds after it.
+        world: a world whose cells the main table has instead; None for the budget's tasks.
         tasks: the only tasks of the tables; empty for all.
         """
         self._only = tasks
         self._folder, self._budget, self._name = folder, budget, name
         self._log_seed, self._world = log_seed, world
-        self._tasks: dict[str, BenchmarkTask] = {}
+        self._tasks: dict[tuple[str, int], BenchmarkTask] = {}
 
     def main(self) -> Iterator[Cell]:
         """Cells of Table 2 with Table 3's ablations, and of the worlds' built-in policies."""
-        for name in self._available(MAIN) if self._world is None else [self._world.title]:
-            task = self._task(name)
-            for behavior in task.behaviors:
-                code = _code(task.worlds)
-                yield Cell(
-                    *("main", self._name, name, behavior, behavior, task.worlds),
-                    *(self._budget.evaluation, code, self._seed_of_logs(name)),
-                )
-            for seed in range(self._budget.seeds):
-                for method in METHODS:
-                    yield from self._trained("main", name, task, method, METHODS[method], seed)
+        own = self._available(self._budget.tasks)
+        for name in own if self._world is None else [self._world.title]:
+            for log in range(self._budget.logs):
+                task = self._task(name, log)
+                for behavior in task.behaviors if log == 0 else ():
+                    code = _code(task.worlds)
+                    yield Cell(
+                        *("main", self._name, name, behavior, behavior, task.worlds),
+                        *(self._budget.evaluation, code, None),
+                    )
+                yield from self._all_trained("main", name, log, METHODS)
 
     def additions(self) -> Iterator[Cell]:
         """Cells of UCF with and without each addition to the paper; items only."""
-        own = {name: METHODS[name] for name in ("dt", "ucf-paper", "ucf")}
-        methods = {**own, **ADDITIONS}
         for name in self._available(PURSUED):
-            task = self._task(name)
-            for seed in range(self._budget.sweep_seeds):
-                for label, method in methods.items():
-                    yield from self._trained("additions", name, task, label, method, seed)
+            for log in range(self._budget.logs):
+                yield from self._all_trained("additions", name, log, _ADDED)
 
     def sweeps(self) -> Iterator[Cell]:
         """Cells of UCF with other λ, bands and gates; the main table has the defaults."""
         for name in self._available(SWEPT):
-            task = self._task(name)
-            task = replace(task, worlds=task.worlds[:1])
-            spread = _reward_spread(task.store)
-            sweeps = {
-                **{f"λ = {x:g}": f"policy.lambda_mask={x}" for x in LAMBDAS},
-                **{f"band {low:g}–{high:g}": f"csg.band=[{low}, {high}]" for low, high in BANDS},
-                **{f"ε_r = {x:g} σ": f"augment.epsilon_r={x * spread}" for x in GATES},
-            }
-            for label, setting in sweeps.items():
-                for seed in range(self._budget.sweep_seeds):
-                    method = Method("ucf", (setting,))
-                    yield from self._trained("sweeps", name, task, f"ucf, {label}", method, seed)
+            for log in range(self._budget.logs):
+                spread = _reward_spread(self._task(name, log).store)
+                sweeps = {
+                    **{f"λ = {x:g}": f"policy.lambda_mask={x}" for x in LAMBDAS},
+                    **{f"band {low:g}–{top:g}": f"csg.band=[{low}, {top}]" for low, top in BANDS},
+                    **{f"ε_r = {x:g} σ": f"augment.epsilon_r={x * spread}" for x in GATES},
+                }
+                methods = {f"ucf, {name}": Method("ucf", (s,)) for name, s in sweeps.items()}
+                yield from self._all_trained("sweeps", name, log, methods)
 
     def distractor(self) -> Iterator[Cell]:
         """Cells of the distractor table: methods trained without and with a distractor in the logs.
@@ -176,25 +174,27 @@ class Plan:
         for name, world_index in _DISTRACTED_WORLDS.items():
             if name not in self._available(_DISTRACTED_WORLDS):
                 continue
-            clean = self._task(name)
-            world = clean.worlds[world_index]
-            planted = clean.store.with_name("distractor-store")
-            if not planted.exists():
-                plant_distractor(EpisodeStore.open(clean.store), planted)
-            worlds = tuple(DistractorWorld(world.name, world.folder, rate) for rate in (OFF, ON))
-            distracted = BenchmarkTask(planted, worlds, ())
-            both = {name: clean, f"{name}, distractor": distracted}
-            for seed in range(self._budget.sweep_seeds):
-                for label, method in DISTRACTOR_METHODS.items():
-                    for plan in plans:
-                        for title, task in both.items():
-                            arguments = (title, task, label, method, seed, plan)
-                            yield from self._trained("distractor", *arguments)
+            for log in range(self._budget.logs):
+                clean = self._task(name, log)
+                world = clean.worlds[world_index]
+                planted = clean.store.with_name("distractor-store")
+                if not planted.exists():
+                    plant_distractor(EpisodeStore.open(clean.store), planted)
+                worlds = tuple(DistractorWorld(world.name, world.folder, r) for r in (OFF, ON))
+                distracted = BenchmarkTask(planted, worlds, ())
+                both = {name: replace(clean, worlds=(world,)), f"{name}, distractor": distracted}
+                for seed, label, plan, title in product(
+                    range(self._budget.seeds), DISTRACTOR_METHODS, plans, both
+                ):
+                    method = DISTRACTOR_METHODS[label]
+                    yield from self._trained(
+                        *("distractor", title, log, both[title], label, method, seed, plan)
+                    )
 
     def missing(self) -> list[str]:
         """Tasks of the main table that are left out: their files or package are missing."""
-        wanted = self._only or MAIN
-        return [name for name in wanted if name not in self._available(MAIN)]
+        wanted = self._only or self._budget.tasks
+        return [name for name in wanted if name not in self._available(wanted)]
 
     def _available(self, names: Iterable[str]) -> list[str]:
         return [
@@ -205,25 +205,40 @@ class Plan:
             and (name not in _PACKAGES or find_spec(_PACKAGES[name]) is not None)
         ]
 
-    def _task(self, name: str) -> BenchmarkTask:
-        if name not in self._tasks:
+    def _task(self, name: str, log: int) -> BenchmarkTask:
+        if (name, log) not in self._tasks:
             world = self._world
             made_of = (name,) if world is None else (world.name,)
             # Another version of the code may write different logs, so each version has its folder.
             code = code_version(tasks.__name__, *map(_module, tasks.LOGGED.get(name, made_of)))
-            folder = self._folder / "tasks" / f"{folder_name(name)}-{self._log_seed}-{code}"
+            number = self._number(name, log)
+            which = "whole" if number is None else str(number)
+            if name in tasks.LOGGED and number is not None:
+                which = f"{which}-of-{self._budget.logs}"
+            folder = self._folder / "tasks" / f"{folder_name(name)}-{which}-{code}"
             make = TASKS[name] if world is None else partial(tasks.simulated, world)
-            self._tasks[name] = make(folder, self._budget.sessions, self._log_seed)
-        return self._tasks[name]
+            given = Log(self._budget.sessions, self._log_seed + log, log, self._budget.logs)
+            self._tasks[name, log] = make(folder, given)
+        return self._tasks[name, log]
 
-    def _seed_of_logs(self, name: str) -> int | None:
-        """Seed of the logs; None where they are given, not simulated."""
-        return None if name in tasks.LOGGED else self._log_seed
+    def _number(self, name: str, log: int) -> int | None:
+        """Seed of a simulated log, number of the part of a given one; None for all of it."""
+        if name not in tasks.LOGGED:
+            return self._log_seed + log
+        return log if self._budget.logs > 1 else None
+
+    def _all_trained(
+        self, table: str, name: str, log: int, methods: Mapping[str, Method]
+    ) -> Iterator[Cell]:
+        for seed, label in product(range(self._budget.seeds), methods):
+            task = self._task(name, log)
+            yield from self._trained(table, name, log, task, label, methods[label], seed)
 
     def _trained(
         self,
         table: str,
         name: str,
+        log: int,
         task: BenchmarkTask,
         label: str,
         method: Method,
@@ -235,7 +250,7 @@ class Plan:
         `evaluation` is the budget's unless given.
         """
         store = EpisodeStore.open(task.store)
-        if not (store.has_items or method.vectors):
+        if not _supports(method, store):
             return
         task_name = name.partition(",")[0]
         memory = () if method.policy in _MEMORYLESS else (f"policy.context={_CONTEXT}",)
@@ -256,7 +271,7 @@ class Plan:
             worlds=task.worlds,
             evaluation=evaluation or self._budget.evaluation,
             code_version=code,
-            log_seed=self._seed_of_logs(task_name),
+            log_seed=self._number(task_name, log),
             training_seed=seed,
             store=task.store,
             run=self._folder / "runs" / folder_name(name) / f"{method.policy}-{run_hash}-{seed}",
@@ -280,6 +295,12 @@ def _module(world: str) -> str:
     if world.startswith(GYMNASIUM):
         return _GYMNASIUM_WORLD
     return plugin_module("simulators", world)
+
+
+def _supports(method: Method, store: EpisodeStore) -> bool:
+    if not store.has_items:
+        return method.vectors
+    return not method.tags or bool(store.item_states.tags.shape[1])
 
 
 def _reward_spread(store: Path) -> float:

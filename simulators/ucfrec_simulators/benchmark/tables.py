@@ -1,25 +1,51 @@
 """Tables of result rows: mean and standard deviation over seeds, as Markdown."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
+import numpy as np
+
 from ucfrec.reporting.result_row import ResultRow
-from ucfrec.reporting.statistics import grouped
-from ucfrec.reporting.tables import NONE, markdown_table, mean_and_sd
+from ucfrec.reporting.statistics import grouped, paired_differences, summary
+from ucfrec.reporting.tables import NONE, markdown_table, mean_and_sd, signed_difference
 
 DISTRACTOR_RATES: Final = (None, 0.0, 1.0)
 """Probability that the distractor is on in an evaluation; None: a world without a distractor."""
+OURS: Final = "ucf"
+_Pair = tuple[int | None, int | None]
 _SHOWN: Final = ("R_cum", "R_avg_pooled", "R_avg_episode", "length")
 
 
 def method_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
-    """One line per world and method, in the order of the rows (Tables 2 and 3 of the paper)."""
-    head = ("world", "method", "seeds", *_SHOWN, "coverage", "target")
-    lines = []
-    for (world, method), group in grouped(of_checkpoint(rows, checkpoint), _line).items():
+    """One line per world and method, in the order of the rows (Tables 2 and 3 of the paper).
+
+    Mean ± standard deviation over logs and training seeds. `− ucf` is the return less that of UCF
+    of the same log and seed: mean ± standard error over the pairs, and in brackets over the means
+    of logs, which counts what logs differ by.
+    """
+    head = ("world", "method", "logs × seeds", *_SHOWN, "coverage", "target", f"− {OURS}")
+    lines, shown = [], of_checkpoint(rows, checkpoint)
+    less = difference_to_ours(shown)
+    for (world, method), group in grouped(shown, _line).items():
         spread = [mean_and_sd(numbers(group, name)) for name in (*_SHOWN, "coverage")]
-        lines.append((world, method, len(group), *spread, _targets(group)))
+        lines.append((world, method, len(group), *spread, _targets(group), less[world, method]))
     return markdown_table(head, lines)
+
+
+def difference_to_ours(rows: Sequence[ResultRow]) -> dict[tuple[str, str], str]:
+    """By (world, method): its return less that of UCF, as in `method_table`; a dash for UCF."""
+    found: dict[tuple[str, str], str] = {}
+    for world, group in grouped(rows, lambda row: str(row.world)).items():
+        values = {
+            name: {(row.log_seed, row.training_seed): row.value for row in own}
+            for name, own in grouped(group, lambda row: row.method).items()
+        }
+        ours = values.get(OURS, {})
+        found |= {
+            (world, name): NONE if name == OURS else _less(own, ours)
+            for name, own in values.items()
+        }
+    return found
 
 
 def sweep_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
@@ -72,8 +98,24 @@ def numbers(rows: Sequence[ResultRow], name: str) -> list[float]:
     return [row.metrics[name] for row in rows if name in row.metrics]
 
 
-def _line(row: ResultRow) -> tuple[str | None, str]:
-    return row.world, row.method
+def _less(values: Mapping[_Pair, float], ours: Mapping[_Pair, float]) -> str:
+    """By how much `values` exceed `ours`; what no log or seed changes is compared with each."""
+    same = {pair: value for pair, value in values.items() if pair in ours}
+    if not same and len(values) == 1:
+        same = dict.fromkeys(ours, *values.values())
+    differences = paired_differences(same, ours)
+    if not differences:
+        return NONE
+    by_log = grouped(zip(same, differences, strict=True), lambda item: item[0][0])
+    over_logs = summary(float(np.mean([value for _, value in own])) for own in by_log.values())
+    if len(differences) == 1:
+        return f"{differences[0]:+.3g}"
+    said = signed_difference(summary(differences))
+    return said if over_logs.count == 1 else f"{said} ({over_logs.standard_error:.2g})"
+
+
+def _line(row: ResultRow) -> tuple[str, str]:
+    return str(row.world), row.method
 
 
 def _targets(rows: Sequence[ResultRow]) -> str:

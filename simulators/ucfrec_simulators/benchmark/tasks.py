@@ -1,7 +1,7 @@
 """The benchmark tasks: a store to train on, and the worlds to evaluate in."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -16,16 +16,35 @@ from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.plugins import load_plugin
 from ucfrec.schema import SESSION_ID
 from ucfrec_simulators.folders import data_folder
+from ucfrec_simulators.kuai.behaviors import BEHAVIORS
 from ucfrec_simulators.kuai.completion import complete
 from ucfrec_simulators.kuai.environment import EXITS
 from ucfrec_simulators.kuai.kuairand import read_tags
 from ucfrec_simulators.kuai.kuairec import read_categories
-from ucfrec_simulators.kuai.logs import cut_by_exit, window, write_log
+from ucfrec_simulators.kuai.logs import cut_by_exit, part_of, window, write_log
 
-KUAIRAND: Final = ("kuairand", "kuairand-nx0", "kuairand-nx10")
-KUAIREC: Final = ("kuairec", "kuairec-nx0", "kuairec-nx10")
+EXIT_PRESETS: Final = ("", "-nx0", "-nx10", "-n4", "-n4-nx0", "-n1", "-n1-nx0")
+"""What follows the name of a Kuaishou world: repeats allowed or not, ten steps without an exit, and
+exit rules that look back four items and one instead of ten."""
+KUAIRAND: Final = tuple(f"kuairand{preset}" for preset in EXIT_PRESETS)
+KUAIREC: Final = tuple(f"kuairec{preset}" for preset in EXIT_PRESETS)
+FLOORS: Final = tuple(BEHAVIORS)
 # Midnight in China (ms). The column `date` changes up to an hour too early, so it is not used.
 _APRIL_22, _APRIL_28 = 1_650_556_800_000, 1_651_075_200_000
+
+
+@dataclass(frozen=True)
+class Log:
+    """Which log of a task methods are trained on."""
+
+    sessions: int
+    """Sessions to collect where the log is simulated."""
+    seed: int
+    """Seed of these."""
+    part: int = 0
+    """Part of a given log; its sessions are dealt out among the parts."""
+    parts: int = 1
+    """Number of parts of a given log; 1 for all of it."""
 
 
 @dataclass(frozen=True)
@@ -40,53 +59,54 @@ class BenchmarkTask:
     """Built-in policies of the worlds that are evaluated as references."""
 
 
-def virtual_taobao(folder: Path, sessions: int, log_seed: int) -> BenchmarkTask:
+def virtual_taobao(folder: Path, log: Log) -> BenchmarkTask:
     """VirtualTaobao's published networks, with logs of the mixture of behaviors."""
     world = World("virtual-taobao")
-    store = simulated_store(world, folder, sessions, log_seed)
+    store = simulated_store(world, folder, log.sessions, log.seed)
     return BenchmarkTask(store, (world,), ("random", "mixture", "best-constant"))
 
 
-def synthetic_taobao(folder: Path, sessions: int, log_seed: int) -> BenchmarkTask:
+def synthetic_taobao(folder: Path, log: Log) -> BenchmarkTask:
     """SyntheticTaobao, with logs of the mixture of behaviors; the optimal policy is known."""
     world = World("synthetic-taobao")
-    store = simulated_store(world, folder, sessions, log_seed)
+    store = simulated_store(world, folder, log.sessions, log.seed)
     return BenchmarkTask(store, (world,), ("random", "mixture", "best-constant", "optimal"))
 
 
-def synthetic_catalog(folder: Path, sessions: int, log_seed: int) -> BenchmarkTask:
+def synthetic_catalog(folder: Path, log: Log) -> BenchmarkTask:
     """SyntheticCatalog, with logs of the mixture of behaviors; the optimal policy is known."""
     world = World("synthetic-catalog")
-    store = simulated_store(world, folder, sessions, log_seed)
+    store = simulated_store(world, folder, log.sessions, log.seed)
     return BenchmarkTask(store, (world,), ("random", "mixture", "optimal"))
 
 
-def sardine(name: str, folder: Path, sessions: int, log_seed: int) -> BenchmarkTask:
+def sardine(name: str, folder: Path, log: Log) -> BenchmarkTask:
     """A world of SARDINE, with logs of its mixture of oracles.
 
-    A third of the sessions are collected, because they have 100 steps.
+    A twelfth of the sessions are collected, because they have 100 steps.
 
     Args:
         name: `sardine-static` or `sardine-boredinf`.
-        folder, sessions, log_seed: as for every task.
+        folder, log: as for every task.
 
     Raises:
         InputError: `sardine-rec` is not installed.
     """
-    return simulated(World(name), folder, max(1, sessions // 3), log_seed)
+    return simulated(World(name), folder, replace(log, sessions=max(1, log.sessions // 12)))
 
 
-def simulated(world: World, folder: Path, sessions: int, log_seed: int) -> BenchmarkTask:
+def simulated(world: World, folder: Path, log: Log) -> BenchmarkTask:
     """Any world that needs no files, with logs of its mixture or, without one, of random actions.
 
     Raises:
         InputError: the world cannot be made.
     """
     behaviors = tuple(world.simulator().behaviors)
-    return BenchmarkTask(simulated_store(world, folder, sessions, log_seed), (world,), behaviors)
+    store = simulated_store(world, folder, log.sessions, log.seed)
+    return BenchmarkTask(store, (world,), behaviors)
 
 
-def kuairand(folder: Path, sessions: int, log_seed: int) -> BenchmarkTask:
+def kuairand(folder: Path, log: Log) -> BenchmarkTask:
     """KuaiRand: trained on the earlier logs, evaluated in worlds completed from the later logs.
 
     The training logs are cut into sessions by the exit rule. If the data folder has the random
@@ -109,6 +129,7 @@ def kuairand(folder: Path, sessions: int, log_seed: int) -> BenchmarkTask:
     store, filled = folder / "store", folder / "world"
     if not store.exists():
         rows = cut_by_exit(window(logs, "time_ms", learn), tags, EXITS["easyrl4rec-kuairand"])
+        rows = part_of(rows, log.part, log.parts)
         _prepare("kuairand", rows, folder / "log_standard_learn.parquet", features, store)
     if not filled.exists():
         played = folder / "world-store"
@@ -116,12 +137,10 @@ def kuairand(folder: Path, sessions: int, log_seed: int) -> BenchmarkTask:
             rows = window(logs, "time_ms", play)
             _prepare("kuairand", rows, folder / "log_standard_world.parquet", features, played)
         complete(EpisodeStore.open(played), tags, filled)
-    return BenchmarkTask(
-        store, tuple(World(name, filled) for name in KUAIRAND), ("random", "oracle")
-    )
+    return BenchmarkTask(store, tuple(World(name, filled) for name in KUAIRAND), FLOORS)
 
 
-def kuairec(folder: Path, sessions: int, log_seed: int) -> BenchmarkTask:
+def kuairec(folder: Path, log: Log) -> BenchmarkTask:
     """KuaiRec: trained on the big matrix, cut by the exit rule; evaluated on the small matrix.
 
     Raises:
@@ -135,10 +154,9 @@ def kuairec(folder: Path, sessions: int, log_seed: int) -> BenchmarkTask:
     if not store.exists():
         rows = window(logs, "timestamp", "timestamp IS NOT NULL")
         rows = cut_by_exit(rows, read_categories(source), EXITS["easyrl4rec-kuairec"])
+        rows = part_of(rows, log.part, log.parts)
         _prepare("kuairec", rows, folder / "big_matrix_cut.parquet", features, store)
-    return BenchmarkTask(
-        store, tuple(World(name, source) for name in KUAIREC), ("random", "oracle")
-    )
+    return BenchmarkTask(store, tuple(World(name, source) for name in KUAIREC), FLOORS)
 
 
 def _prepare(dataset: str, rows: pa.Table, log: Path, features: list[Path], store: Path) -> None:
@@ -150,7 +168,7 @@ def _prepare(dataset: str, rows: pa.Table, log: Path, features: list[Path], stor
     prepare(files, mapping, store, PrepareOptions())
 
 
-TASKS: Final[Mapping[str, Callable[[Path, int, int], BenchmarkTask]]] = {
+TASKS: Final[Mapping[str, Callable[[Path, Log], BenchmarkTask]]] = {
     "kuairand": kuairand,
     "kuairec": kuairec,
     "virtual-taobao": virtual_taobao,
@@ -159,7 +177,6 @@ TASKS: Final[Mapping[str, Callable[[Path, int, int], BenchmarkTask]]] = {
     "sardine-static": partial(sardine, "sardine-static"),
     "sardine-boredinf": partial(sardine, "sardine-boredinf"),
 }
-"""Makers of the tasks by name. Arguments: folder to keep it in; sessions to collect and their seed,
-where logs are simulated."""
+"""Makers of the tasks by name. Arguments: the folder to keep it in, and which log."""
 LOGGED: Final[Mapping[str, tuple[str, ...]]] = {"kuairand": KUAIRAND, "kuairec": KUAIREC}
 """Worlds of the tasks whose logs are given; any other task has the one world of its name."""

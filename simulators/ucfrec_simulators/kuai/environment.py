@@ -3,7 +3,7 @@
 Source: `BaseEnv`, `KuaiEnv` and `KuaiRandEnv` of EasyRL4Rec, and their versions in DORL and CIRS.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
@@ -11,10 +11,8 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 from gymnasium import spaces
-from gymnasium.vector import VectorEnv
 
 from ucfrec.acting.rollout import FORBIDDEN, USER_IDS, BoolArray, FloatArray, IntArray
-from ucfrec.acting.uniform import Memoryless
 from ucfrec.errors import InputError
 from ucfrec_simulators.session_env import AnyArray, SessionsEnv
 
@@ -155,26 +153,36 @@ class KuaiEnv(SessionsEnv):
         """One row per item, in the order of the table's columns: `item_id` and the list `tags`."""
         return pa.table({"item_id": pa.array(self.item_ids), "tags": pa.array(self.tags)})
 
-    def boring(self) -> BoolArray:
-        """(N, n_items) whether each item would end each session by the exit rule in this step."""
-        tiresome = self._tiresome()
+    def boring(self, exit_rule: ExitRule | None = None) -> BoolArray:
+        """(N, n_items) whether each item would end each session by the exit rule in this step.
+
+        Args:
+            exit_rule: another rule than the world's.
+        """
+        tiresome = self._tiresome(exit_rule or self.exit_rule)
         boring = np.zeros((self.num_envs, len(self._codes)), dtype=np.bool_)
         for codes in self._codes.T:
             boring |= tiresome[:, codes]
         return boring
 
-    def _tiresome(self) -> BoolArray:
+    def _tiresome(self, exit_rule: ExitRule) -> BoolArray:
         """(N, n_tags + 1) whether each tag occurred too often; the last column is padding."""
-        size, reach = self._n_tags + 1, self.exit_rule.reach(self.turns)
+        size, reach = self._n_tags + 1, exit_rule.reach(self.turns)
         # One entry per remembered item: its session, and its step in that session.
         rows = np.repeat(np.arange(self.num_envs), reach)
         steps = np.arange(len(rows)) + np.repeat(self.turns - np.cumsum(reach), reach)
         remembered = self._shown[rows, steps]
         cells = rows[:, None] * size + self._codes[remembered]
         counts = np.bincount(cells.ravel(), minlength=self.num_envs * size)
-        tiresome: BoolArray = counts.reshape(self.num_envs, size) > self.exit_rule.threshold
+        tiresome: BoolArray = counts.reshape(self.num_envs, size) > exit_rule.threshold
         tiresome[:, -1] = False
         return tiresome
+
+    def leave_out_masked(self, scores: AnyArray) -> None:
+        """Set `scores` (N, n_items) of the items that the regime masks to −∞, in place."""
+        if self.regime.masked:
+            rows, places = np.nonzero(self._shown != NOT_SHOWN)
+            scores[rows, self._shown[rows, places]] = -np.inf
 
     def _begin(self, rows: IntArray) -> None:
         self.users[rows] = self.np_random.integers(len(self.user_ids), size=len(rows))
@@ -187,7 +195,9 @@ class KuaiEnv(SessionsEnv):
             self._require_new(actions)
         rewards = np.asarray(self.rewards[self.users, actions], dtype=np.float32)
         if self.regime.steps is None:
-            bored = np.asarray(self._tiresome()[rows[:, None], self._codes[actions]].any(axis=1))
+            bored = np.asarray(
+                self._tiresome(self.exit_rule)[rows[:, None], self._codes[actions]].any(axis=1)
+            )
         else:
             bored = np.zeros(self.num_envs, dtype=np.bool_)
         self._shown[rows, self.turns] = actions
@@ -222,42 +232,9 @@ def _coded(tags: Sequence[Sequence[int]]) -> tuple[IntArray, int]:
     return codes, len(known)
 
 
-class Oracle(Memoryless):
-    """The item of highest true reward that is not masked and does not end the session.
-
-    It reads the world's rewards, which no recommender can. It is greedy and so not optimal: it does
-    not plan beyond the current step. If every item left ends the session, it plays the one of
-    highest reward.
-    """
-
-    def __init__(self, world: KuaiEnv) -> None:
-        self._world = world
-
-    def act(self, observations: FloatArray, live: BoolArray) -> tuple[IntArray, None]:
-        """The best item of each session, (N,)."""
-        world, items = self._world, np.arange(len(self._world.item_ids))
-        users = np.broadcast_to(world.users[:, None], (world.num_envs, len(items)))
-        rewards = np.array(
-            world.rewards[users, np.broadcast_to(items, users.shape)], dtype=np.float64
-        )
-        if world.regime.steps is None:
-            # Shift boring items below all others, so that they are chosen last.
-            rewards -= world.boring() * (1 + np.ptp(rewards))
-        if world.regime.masked:
-            rows, places = np.nonzero(world._shown != NOT_SHOWN)
-            rewards[rows, world._shown[rows, places]] = -np.inf
-        return rewards.argmax(axis=1), None
-
-    def inform(self, info: Mapping[str, Any]) -> None:
-        """Do nothing: the world itself is read instead of `info`."""
-
-
-def oracle(env: VectorEnv[Any, Any, Any], seed: int) -> Oracle:
-    """The greedy policy that knows every reward; `seed` is unused.
-
-    Raises:
-        InputError: `env` is not a Kuaishou world.
-    """
-    if not isinstance(env.unwrapped, KuaiEnv):
-        raise InputError(f"this behavior policy serves KuaiEnv, not {type(env).__name__}")
-    return Oracle(env.unwrapped)
+def said(regime: str, exit_rule: ExitRule) -> str:
+    """What the command line says of a world's regime, by its name, and of its exit rule."""
+    if REGIMES[regime].steps is not None:
+        return f"regime {regime}"
+    times = "a tag" if exit_rule.threshold == 0 else f"a tag shown {exit_rule.threshold + 1} times"
+    return f"regime {regime}; users leave at {times} among the {exit_rule.window} items before"

@@ -16,13 +16,20 @@ import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.acting.rollout import FloatArray
-from ucfrec.acting.uniform import Uniform
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.plugins import Simulator
 from ucfrec_simulators.folders import data_folder
+from ucfrec_simulators.kuai.behaviors import BEHAVIORS
 from ucfrec_simulators.kuai.completion import ITEMS_FILE, USERS_FILE, Completed, complete
-from ucfrec_simulators.kuai.environment import EXITS, REGIMES, ExitRule, KuaiEnv, Regime, oracle
+from ucfrec_simulators.kuai.environment import (
+    EXITS,
+    REGIMES,
+    ExitRule,
+    KuaiEnv,
+    Regime,
+    said,
+)
 from ucfrec_simulators.kuai.kuairec import parse_tags, read_columns
 
 SOURCE: Final = "https://kuairand.com (data/video_features_basic_*)"
@@ -80,12 +87,12 @@ def read_tags(path: Path) -> dict[int, tuple[int, ...]]:
     return {video: parse_tags(text) for video, text in zip(table["video_id"], tags, strict=True)}
 
 
-def simulator(regime: str) -> Simulator:
-    """The world under one of `REGIMES`, for the command line."""
+def simulator(regime: str, exit_rule: ExitRule = EXITS["easyrl4rec-kuairand"]) -> Simulator:
+    """The world under one of `REGIMES` and an exit rule, for the command line."""
     return Simulator(
-        summary=f"KuaiRand's users and videos, completed click probabilities; regime {regime}",
-        make=partial(kuairand, regime=REGIMES[regime]),
-        behaviors={"random": Uniform, "oracle": oracle},
+        summary=f"KuaiRand's videos, completed click rates; {said(regime, exit_rule)}",
+        make=partial(kuairand, exit_rule=exit_rule, regime=REGIMES[regime]),
+        behaviors=BEHAVIORS,
         feedback="is_click",
     )
 
@@ -93,6 +100,10 @@ def simulator(regime: str) -> Simulator:
 SIMULATOR: Final = simulator("FB")
 SIMULATOR_NX_0: Final = simulator("NX_0")
 SIMULATOR_NX_10: Final = simulator("NX_10")
+SIMULATOR_N4: Final = simulator("FB", EXITS["dorl-main-explore"])
+SIMULATOR_N4_NX_0: Final = simulator("NX_0", EXITS["dorl-main-explore"])
+SIMULATOR_N1: Final = simulator("FB", EXITS["dorl-main"])
+SIMULATOR_N1_NX_0: Final = simulator("NX_0", EXITS["dorl-main"])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

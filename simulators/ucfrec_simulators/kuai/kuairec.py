@@ -8,11 +8,18 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from ucfrec.acting.uniform import Uniform
 from ucfrec.errors import InputError
 from ucfrec.plugins import Simulator
 from ucfrec_simulators.folders import data_folder
-from ucfrec_simulators.kuai.environment import EXITS, REGIMES, ExitRule, KuaiEnv, Regime, oracle
+from ucfrec_simulators.kuai.behaviors import BEHAVIORS
+from ucfrec_simulators.kuai.environment import (
+    EXITS,
+    REGIMES,
+    ExitRule,
+    KuaiEnv,
+    Regime,
+    said,
+)
 
 REWARD_CAP: Final = 5.0
 CATEGORIES: Final = "item_categories.csv"
@@ -90,12 +97,12 @@ def parse_tags(text: str) -> tuple[int, ...]:
     return tuple(int(tag) for tag in text.split(",") if tag.strip())
 
 
-def simulator(regime: str) -> Simulator:
-    """The world under one of `REGIMES`, for the command line."""
+def simulator(regime: str, exit_rule: ExitRule = EXITS["easyrl4rec-kuairec"]) -> Simulator:
+    """The world under one of `REGIMES` and an exit rule, for the command line."""
     return Simulator(
-        summary=f"KuaiRec's fully observed users and videos, watch ratio up to 5; regime {regime}",
-        make=partial(kuairec, regime=REGIMES[regime]),
-        behaviors={"random": Uniform, "oracle": oracle},
+        summary=f"KuaiRec's fully observed videos, watch ratio; {said(regime, exit_rule)}",
+        make=partial(kuairec, exit_rule=exit_rule, regime=REGIMES[regime]),
+        behaviors=BEHAVIORS,
         feedback="watch_ratio",
     )
 
@@ -103,3 +110,7 @@ def simulator(regime: str) -> Simulator:
 SIMULATOR: Final = simulator("FB")
 SIMULATOR_NX_0: Final = simulator("NX_0")
 SIMULATOR_NX_10: Final = simulator("NX_10")
+SIMULATOR_N4: Final = simulator("FB", EXITS["dorl-main-explore"])
+SIMULATOR_N4_NX_0: Final = simulator("NX_0", EXITS["dorl-main-explore"])
+SIMULATOR_N1: Final = simulator("FB", EXITS["dorl-main"])
+SIMULATOR_N1_NX_0: Final = simulator("NX_0", EXITS["dorl-main"])

@@ -57,6 +57,19 @@ def cut_by_exit(rows: pa.Table, tags: Mapping[int, Sequence[int]], exit_rule: Ex
     return rows.append_column(SESSION_ID, pa.array(sessions))
 
 
+def part_of(rows: pa.Table, part: int, parts: int) -> pa.Table:
+    """The sessions of one of `parts` parts of a log, to which they are dealt out at random.
+
+    Args:
+        rows: with a `session_id`, numbered from 0.
+        part: which part, from 0.
+        parts: number of parts; 1 for all rows.
+    """
+    sessions = np.asarray(rows[SESSION_ID])
+    dealt = np.random.default_rng(0).integers(parts, size=sessions.max() + 1)
+    return rows.filter(pa.array(dealt[sessions] == part))
+
+
 def write_log(rows: pa.Table, path: Path) -> None:
     """Write rows as Parquet, atomically."""
     with atomic_file(path) as scratch:

@@ -24,21 +24,22 @@ from ucfrec.runs.screened import flagged_columns
 from ucfrec.runs.trained_policy import RUN, TrainedPolicy, read_record
 from ucfrec_simulators.benchmark import plan, plots
 from ucfrec_simulators.benchmark.cells import EvaluationPlan, config, key, measure
+from ucfrec_simulators.benchmark.estimate import announcement, estimated_hours
 from ucfrec_simulators.benchmark.methods import METHODS, SCREENED
 from ucfrec_simulators.benchmark.plan import BUDGETS, Plan
 from ucfrec_simulators.benchmark.plots import plot_distractor, plot_methods
 from ucfrec_simulators.benchmark.tables import distractor_table, method_table
-from ucfrec_simulators.benchmark.tasks import kuairand
+from ucfrec_simulators.benchmark.tasks import Log, kuairand
 from ucfrec_simulators.kuai.environment import EXITS
-from ucfrec_simulators.kuai.logs import cut_by_exit, window
+from ucfrec_simulators.kuai.logs import cut_by_exit, part_of, window
 
 TINY = replace(
     BUDGETS["small"],
     seeds=2,
+    logs=1,
     sessions=60,
     settings=("policy.dim=8", "train.steps=2", "train.validate_every=2", "crm.epochs=1"),
     evaluation=EvaluationPlan(episodes=8),
-    sweep_seeds=1,
 )
 
 
@@ -52,10 +53,10 @@ def no_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(BUDGETS, "small", TINY)
+    tiny = replace(TINY, logs=2, tasks=("kuairand", "synthetic-catalog"))
+    monkeypatch.setitem(BUDGETS, "small", tiny)
     some = {name: METHODS[name] for name in ("popular", "dt")}
     monkeypatch.setattr(plan, "METHODS", some)
-    monkeypatch.setattr(plan, "MAIN", ("kuairand", "synthetic-catalog"))
     suite: Benchmark = load_plugin("benchmarks", "recommendation")
     results = tmp_path / "rows.jsonl"
     request = BenchmarkRequest("small", ["main"], tmp_path / "out", results, 1)
@@ -63,11 +64,13 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     assert "kuairand is left out" in said
     rows = read_rows(results)
     built_in = [(name, None, None) for name in ("random", "mixture", "optimal")]
-    trained = [(n, s, c) for s in (0, 1) for n in some for c in ("best", "last")]
-    assert [(r.method, r.training_seed, r.checkpoint) for r in rows] == [*built_in, *trained]
-    assert {(r.suite, r.table, r.world, r.log_seed) for r in rows} == {
-        ("recommendation", "main", "synthetic-catalog", 0)
+    trained = [(n, log, s) for log in (0, 1) for s in (0, 1) for n in some]
+    assert [(r.method, r.log_seed, r.training_seed) for r in rows] == [*built_in, *trained]
+    assert {(r.suite, r.table, r.world) for r in rows} == {
+        ("recommendation", "main", "synthetic-catalog")
     }
+    assert {r.checkpoint for r in rows if r.training_seed is not None} == {"best"}
+    assert len({r.data_fingerprint for r in rows if r.training_seed is not None}) == 2
     played = evaluate_behavior(World("synthetic-catalog"), "optimal", 8, 1_000_000)
     found = next(row for row in rows if row.method == "optimal")
     assert found.value == played["R_cum"]
@@ -96,10 +99,11 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     again = read_rows(results)[len(rows) :]
     assert {row.code_version for row in again} == {"other"}
     assert {row.method for row in again} == {"random", "mixture", "optimal", "popular"}
-    seeds = replace(request, evaluation_seed=5, log_seed=3)
+    seeds = replace(request, evaluation_seed=5, log_seed=3, logs=1)
     suite.run(seeds)
     last = read_rows(results)[-1]
     assert (last.evaluation_seed, last.log_seed) == (5, 3)
+    assert {row.log_seed for row in read_rows(results)} == {None, 0, 1, 3}
     assert last.data_fingerprint != again[-1].data_fingerprint
 
 
@@ -118,8 +122,8 @@ def test_any_gymnasium_environment_is_measured(
     title = f"{name} --observe secret"
     assert f"| {title} | dt | 1 |" in capsys.readouterr().out
     rows = read_rows(tmp_path / "out" / "results.jsonl")
-    assert [row.method for row in rows] == ["random", *["item-knn"] * 2, *["dt"] * 2]
-    assert {(row.task, row.world, row.log_seed) for row in rows} == {(title, title, 0)}
+    assert [row.method for row in rows] == ["random", "item-knn", "dt"]
+    assert {(row.task, row.world, row.log_seed) for row in rows[1:]} == {(title, title, 0)}
     random = next(row for row in rows if row.method == "random")
     assert random.metrics["length"] == 5
     assert {path.parent for path in tmp_path.rglob("run.json")} == {
@@ -130,9 +134,9 @@ def test_any_gymnasium_environment_is_measured(
 def test_sardine_is_left_out_where_it_is_not_installed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(plan, "MAIN", ("sardine-static", "synthetic-catalog"))
     monkeypatch.setitem(plan._PACKAGES, "sardine-static", "not_installed")
-    assert Plan(tmp_path, TINY).missing() == ["sardine-static"]
+    budget = replace(TINY, tasks=("sardine-static", "synthetic-catalog"))
+    assert Plan(tmp_path, budget).missing() == ["sardine-static"]
 
 
 @pytest.mark.usefixtures("no_data")
@@ -148,23 +152,28 @@ def test_a_world_has_the_code_version_of_what_it_runs_through() -> None:
 def test_every_cell_of_every_table_has_a_configuration(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(plan, "MAIN", ("synthetic-taobao", "synthetic-catalog"))
+    budget = replace(TINY, seeds=1, tasks=("synthetic-taobao", "synthetic-catalog"))
     monkeypatch.setattr(plan, "SWEPT", ("synthetic-taobao",))
     monkeypatch.setattr(plan, "PURSUED", ("synthetic-catalog",))
-    given = Plan(tmp_path, TINY)
+    given = Plan(tmp_path, budget)
     every = [*given.main(), *given.additions(), *given.sweeps(), *given.distractor()]
     trained = [cell for cell in every if cell.store is not None]
     folders = {(cell.run, cell.config) for cell in trained}
     assert len({run for run, _ in folders}) == len(folders), "a folder for every configuration"
     assert {cell.method for cell in trained} >= {"ucf", "ucf, λ = 0", "ucf, band 1–2"}
     assert not [c for c in trained if c.task == "synthetic-taobao" and c.method == "item-knn"]
+    assert not [c for c in trained if c.task == "synthetic-taobao" and c.method == "dt+"]
+    plain, plus = (
+        next(c.config for c in trained if c.method == method and c.task == "synthetic-catalog")
+        for method in ("dt", "dt+")
+    )
+    assert (plain.policy.exposure, plain.rule.choose) == (False, False)
+    assert (plus.policy.exposure, plus.rule.choose) == (True, True)
     swept = {cell.method: cell.config for cell in given.sweeps()}
-    spread = swept["ucf, ε_r = 0.1 σ"].augment.epsilon_r
+    smallest = swept["ucf, ε_r = 0.02 σ"].augment.epsilon_r
     rewards = EpisodeStore.open(trained[0].store)  # type: ignore[arg-type]
     catalog = rewards.step_values("reward", *rewards.all_steps())
-    assert spread is not None
-    assert swept["ucf, ε_r = 0.5 σ"].augment.epsilon_r == pytest.approx(5 * spread)
-    assert catalog.std() > 0
+    assert smallest == pytest.approx(0.02 * catalog.std())
     distractors = [cell for cell in given.distractor() if cell.task.endswith("distractor")]
     planted = EpisodeStore.open(distractors[0].store)  # type: ignore[arg-type]
     assert planted.observation_size == 92
@@ -252,11 +261,53 @@ def test_tables_give_means_spreads_and_paired_drops() -> None:
     clean = [r for r in every if r.conditions == {"distractor": None, "quantiles": "1"}]
     last = replace(clean[0], checkpoint="last", metrics={"R_cum": 99.0})
     assert method_table([*clean, last]).splitlines()[2] == (
-        "| w | m | 2 | 15 ± 7.1 | 0.5 ± 0 | 0.5 ± 0 | 2 ± 0 | – | 3 |"
+        "| w | m | 2 | 15 ± 7.1 | 0.5 ± 0 | 0.5 ± 0 | 2 ± 0 | – | 3 | – |"
     )
     line, less = distractor_table(every).splitlines()[2:]
     assert less == line.replace("| 1 |", "| 0.99 |")
     assert line == "| w | 1 | m | 2 | 15 ± 7.1 | 10 ± 7.1 | 12 ± 5.7 | 37.5 ± 18 |"
+
+
+def test_methods_are_compared_with_ucf_by_log_and_seed() -> None:
+    def rows(method: str, values: Mapping[tuple[int | None, int | None], float]) -> list[ResultRow]:
+        return [
+            result_row(value, method=method, log_seed=log, training_seed=seed)
+            for (log, seed), value in values.items()
+        ]
+
+    ours = {(0, 0): 10.0, (0, 1): 12.0, (1, 0): 20.0, (1, 1): 22.0}
+    other = {(0, 0): 9.0, (0, 1): 10.0, (1, 0): 15.0, (1, 1): 16.0, (1, 2): 99.0}
+    given = [*rows("random", {(None, None): 1.0}), *rows("dt", other), *rows("ucf", ours)]
+    random, dt, ucf = (line.split(" | ")[-1] for line in method_table(given).splitlines()[2:])
+    # −1, −2, −5, −6; of the logs −1.5 and −5.5.
+    assert dt == "-3.5 ± 1.2 (2) |"
+    # UCF's values less 1: ± their standard error.
+    assert random == "-15 ± 2.9 (5) |"
+    assert ucf == "– |"
+    one = method_table([*rows("dt", {(0, 0): 9.0}), *rows("ucf", ours)]).splitlines()[2]
+    assert one.endswith("| -1 |")
+    assert method_table(rows("dt", other)).endswith("| – |")
+
+
+def test_time_is_told_of_runs_once(tmp_path: Path) -> None:
+    budget = replace(TINY, seeds=1, tasks=("synthetic-catalog",))
+    cells = [cell for cell in Plan(tmp_path, budget).main() if cell.method in ("dt", "ucf")]
+    dt, ucf = (estimated_hours([cell]) for cell in cells)
+    assert 0 < dt < ucf
+    again = [replace(cell, table="additions") for cell in cells]
+    shared = estimated_hours([*cells, *again]) - dt - ucf
+    assert 0 < shared < ucf
+    assert "about 0.0 hours with --workers 2" in announcement(2)(cells)
+
+
+def test_a_given_log_is_dealt_out_by_session() -> None:
+    log = pa.table({"session_id": np.repeat(np.arange(500), 3), "row": np.arange(1500)})
+    parts = [part_of(log, part, 2) for part in (0, 1)]
+    sessions = [set(part["session_id"].to_pylist()) for part in parts]
+    assert not sessions[0] & sessions[1]
+    assert sorted(row for part in parts for row in part["row"].to_pylist()) == list(range(1500))
+    assert min(map(len, sessions)) > 200
+    assert part_of(log, 0, 1).equals(log)
 
 
 def test_pictures_show_the_means_and_the_spread_of_the_tables(tmp_path: Path) -> None:
@@ -309,7 +360,7 @@ def test_windows_drop_repeats_and_are_cut(tmp_path: Path) -> None:
 @pytest.mark.realdata
 def test_kuairand_learns_from_what_came_before_its_worlds(tmp_path: Path) -> None:
     data_folder("kuairand")
-    task = kuairand(tmp_path, 0, 0)
+    task = kuairand(tmp_path, Log(0, 0))
     learned, played = (EpisodeStore.open(tmp_path / name) for name in ("store", "world-store"))
     last, first = (
         f(store.step_values("timestamp", *store.all_steps()))
@@ -327,6 +378,7 @@ def test_kuairand_learns_from_what_came_before_its_worlds(tmp_path: Path) -> Non
         ({"methods": ["dt", "nothing"]}, "no method is called 'nothing'"),
         ({"tasks": ["nowhere"]}, "no task is called 'nowhere'"),
         ({"training_seeds": 0}, "--training-seeds is 0"),
+        ({"logs": 0}, "--logs is 0"),
     ],
 )
 def test_unknown_cells_are_refused(given: dict[str, Any], message: str, tmp_path: Path) -> None:
@@ -338,7 +390,7 @@ def test_unknown_cells_are_refused(given: dict[str, Any], message: str, tmp_path
 
 
 def test_one_task_has_the_cells_of_its_methods_alone(tmp_path: Path) -> None:
-    budget = replace(BUDGETS["small"], seeds=1, sessions=60)
+    budget = replace(BUDGETS["small"], seeds=1, logs=1, sessions=60)
     plan = Plan(tmp_path, budget, tasks=["synthetic-catalog"])
     assert {cell.task for cell in plan.main()} == {"synthetic-catalog"}
     assert plan.missing() == []

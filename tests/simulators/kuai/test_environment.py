@@ -28,7 +28,8 @@ from ucfrec.evaluation.world import World
 from ucfrec.plugins import Simulator
 from ucfrec.policies.dt import DTConfig, DTPolicy
 from ucfrec_simulators.behaviors import Constant
-from ucfrec_simulators.kuai.environment import EXITS, REGIMES, ExitRule, KuaiEnv, oracle
+from ucfrec_simulators.kuai.behaviors import MASK, oracle, random_mask
+from ucfrec_simulators.kuai.environment import EXITS, REGIMES, ExitRule, KuaiEnv
 from ucfrec_simulators.kuai.exit_cuts import sessions_by_exit
 from ucfrec_simulators.session_env import SingleSession
 
@@ -91,7 +92,7 @@ def test_gymnasium_accepts_it() -> None:
 
 
 @pytest.mark.parametrize("regime", REGIMES)
-@pytest.mark.parametrize("choose", [Uniform, oracle])
+@pytest.mark.parametrize("choose", [Uniform, oracle, random_mask])
 def test_regimes_mask_and_end_as_stated(regime: str, choose: Any) -> None:
     env = small(regime=regime)
     steps: list[Step] = []
@@ -105,10 +106,34 @@ def test_regimes_mask_and_end_as_stated(regime: str, choose: Any) -> None:
     else:
         assert played.lengths.max() <= 30
     # Seven tags and a memory of ten: everybody is bored by the eighth item.
-    assert repeats or regime != "FB" or choose is oracle
+    assert repeats or regime != "FB" or choose is not Uniform
     assert not repeats or regime == "FB"
     users = np.concatenate([step.user_ids for step in steps if step.user_ids is not None])
     assert set(users) <= set((np.arange(7) * 10 + 5).tolist())
+
+
+def test_random_items_have_no_tag_of_the_last_ten_and_are_otherwise_uniform() -> None:
+    env = KuaiEnv(
+        4000,
+        np.ones((1, 40), dtype=np.float32),
+        [(n % 20,) for n in range(40)],
+        EXITS["dorl-main"],
+        REGIMES["FB"],
+    )
+    env.reset(seed=0)
+    actor, tags = random_mask(env, 3), []
+    for _ in range(12):
+        items, propensities = actor.act(np.zeros((4000, 2)), np.ones(4000, dtype=np.bool_))
+        assert propensities is None
+        tags.append(items % 20)
+        env.step(items)
+    shown = np.stack(tags[:11])
+    assert all(len(set(session)) == 11 for session in shown.T), "ten steps are left out"
+    left = np.array([len(set(session)) for session in np.stack(tags).T])
+    assert (left == 11).any(), "the eleventh tag before may come again"
+    counts = np.bincount(np.concatenate(tags), minlength=20) / (12 * 4000)
+    assert counts == pytest.approx(0.05, abs=0.005)
+    assert not env.boring(MASK).all(axis=1).any()
 
 
 def test_uniform_choice_among_allowed_items_is_uniform() -> None:

@@ -18,8 +18,9 @@ from ucfrec.errors import InputError
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.plugins import load_plugin
+from ucfrec_simulators.kuai.behaviors import oracle
 from ucfrec_simulators.kuai.completion import CompletionConfig, complete
-from ucfrec_simulators.kuai.environment import REGIMES, oracle
+from ucfrec_simulators.kuai.environment import REGIMES
 from ucfrec_simulators.kuai.kuairand import kuairand, main, read_tags
 
 USERS, ITEMS = 60, 30

@@ -22,7 +22,7 @@ from torch.nn import functional as F
 
 from ucfrec.fitting.loop import Fit, LoopConfig, fit
 
-STEPS, EVERY = 160, 3
+STEPS, EVERY = 162, 3
 
 
 def module() -> nn.Module:

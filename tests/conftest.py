@@ -1,10 +1,12 @@
-"""Settings of every test: one thread, and the same examples every time."""
+"""Settings of every test: one thread, short validations, and the same examples every time."""
 
 from collections.abc import Iterator
 
 import pytest
 import torch
 from hypothesis import settings
+
+from tests.support.short_validation import short_validation
 
 settings.register_profile("ucfrec", deadline=None, derandomize=True, database=None, max_examples=40)
 settings.load_profile("ucfrec")
@@ -17,3 +19,10 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def few_windows() -> Iterator[None]:
+    """A training of a few steps would spend most of its time validating."""
+    with short_validation():
+        yield

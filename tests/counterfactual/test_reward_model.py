@@ -51,7 +51,7 @@ def test_the_report_measures_the_share_of_z() -> None:
 
 def test_the_plain_autoencoder_leaks_and_the_report_warns(tmp_path: Path) -> None:
     train, held_out = planted(8_000, 0).transitions, planted(4_000, 1).transitions
-    plain = replace(FIT, mean_first=False, epochs=15)
+    plain = replace(FIT, mean_first=False, epochs=8)
     _, report = fit_crm(train, held_out, plain, tmp_path, seed=0)
     assert report.z_share > 0.5
     assert report.warning.startswith("latent leak")
@@ -61,7 +61,7 @@ def test_a_reward_without_disturbance_collapses_and_the_report_warns(tmp_path: P
     train, held_out = planted(8_000, 0, share=0).transitions, planted(2_000, 1, share=0).transitions
     train = replace(train, rewards=train.states[:, 0] - train.actions[:, 1])
     held_out = replace(held_out, rewards=held_out.states[:, 0] - held_out.actions[:, 1])
-    config = replace(FIT, epochs=8, hidden=64)
+    config = replace(FIT, epochs=4, hidden=64)
     _, report = fit_crm(train, held_out, config, tmp_path, seed=0)
     assert report.z_share < 0.01
     assert "collapse" in report.warning

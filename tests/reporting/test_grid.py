@@ -1,9 +1,13 @@
 """The benchmark grid: resumed without measuring twice, nothing lost to a failure."""
 
 import json
+import os
+import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,8 +45,15 @@ def _square(cell: Cell, key: RowKey) -> list[ResultRow]:
         raise ValueError("negative")
     if number >= 100:
         time.sleep(0.2)
-    value = {"metric": "square", "metrics": {"square": float(number**2)}}
-    return [ResultRow(**vars(key), **value, checkpoint=name) for name in ("last", "best")]
+    metrics = {"square": float(number**2), "process": os.getpid(), "threads": _threads()}
+    row = ResultRow(**vars(key), metric="square", metrics=metrics)
+    return [replace(row, checkpoint=name) for name in ("last", "best")]
+
+
+def _threads() -> int:
+    import torch  # a process of the test that prints needs none
+
+    return torch.get_num_threads()
 
 
 HOW = Measurement(_key, _config, _square)
@@ -56,9 +67,27 @@ def _marks(folder: Path) -> list[str]:
     return sorted((folder / "marks").read_text().split())
 
 
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    assert torch.get_num_threads() == 2
+    torch.set_num_threads(before)
+
+
+def _measured_by(rows: Sequence[ResultRow]) -> set[float]:
+    """The processes that measured the rows, each with one thread."""
+    assert {row.metrics["threads"] for row in rows} == {1}
+    return {row.metrics["process"] for row in rows}
+
+
 def test_measures_once_and_returns_rows_in_the_order_of_cells(tmp_path: Path) -> None:
     results = tmp_path / "results" / "rows.jsonl"
-    run_grid(_cells(tmp_path, 2, 1), HOW, results, 2)
+    rows = run_grid(_cells(tmp_path, 2, 1), HOW, results, 2)
+    assert os.getpid() not in _measured_by(rows)
     rows = run_grid(_cells(tmp_path, 1, 3, 2, 3), HOW, results, 2)
     assert [(row.task, row.value, row.checkpoint) for row in rows] == [
         (str(n), float(n**2), name) for n in (1, 3, 2) for name in ("last", "best")
@@ -71,11 +100,13 @@ def test_measures_once_and_returns_rows_in_the_order_of_cells(tmp_path: Path) ->
     assert named == {"1": None, "2": {"number": [2]}, "3": {"number": [3]}}
 
 
+@pytest.mark.usefixtures("two_threads")
 def test_rows_of_other_code_are_measured_again(tmp_path: Path) -> None:
     results = tmp_path / "rows.jsonl"
     run_grid(_cells(tmp_path, 2), HOW, results, 1)
     rows = run_grid(_cells(tmp_path, 2, code="2"), HOW, results, 1)
     assert {row.code_version for row in rows} == {"2"}
+    assert _measured_by(rows) == {os.getpid()}, "one worker needs no process of its own"
     assert _marks(tmp_path) == ["2", "2"]
 
 
@@ -85,6 +116,21 @@ def test_a_failed_cell_costs_only_itself(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=says):
         run_grid(_cells(tmp_path, -1, 5), HOW, results, 1)
     assert {row.task for row in read_rows(results)} == {"5"}
+
+
+def _interrupted(cell: Cell, key: RowKey) -> list[ResultRow]:
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt:
+        raise RuntimeError("query interrupted") from None
+    return _square(cell, key)
+
+
+def test_an_interruption_that_a_library_renames_is_no_failed_cell(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run_grid(_cells(tmp_path, 1, 2), replace(HOW, measure=_interrupted), tmp_path / "rows", 1)
+    assert not (tmp_path / "rows").exists()
+    assert run_grid(_cells(tmp_path, 1), HOW, tmp_path / "rows", 1), "no lock is left"
 
 
 def test_a_line_that_is_no_row_is_named_before_anything_is_measured(tmp_path: Path) -> None:
@@ -101,9 +147,9 @@ from pathlib import Path
 from tests.reporting.test_grid import HOW
 from ucfrec.reporting.grid import run_grid
 if __name__ == "__main__":
-    folder, *numbers = sys.argv[1:]
+    folder, workers, *numbers = sys.argv[1:]
     cells = [(folder, int(number), "1") for number in numbers]
-    rows = run_grid(cells, HOW, Path(folder) / "rows.jsonl", 2)
+    rows = run_grid(cells, HOW, Path(folder) / "rows.jsonl", int(workers))
     print(json.dumps([row.task for row in rows]))
 """
 
@@ -116,12 +162,12 @@ def test_two_processes_on_one_file_share_the_work(tmp_path: Path) -> None:
     root = str(Path(__file__).parents[2])
     running = [
         subprocess.Popen(
-            [sys.executable, str(script), str(tmp_path), *order],
+            [sys.executable, str(script), str(tmp_path), workers, *order],
             stdout=subprocess.PIPE,
             text=True,
             env={"PYTHONPATH": root, "PATH": "", "OMP_NUM_THREADS": "1"},
         )
-        for order in (numbers, numbers[::-1])
+        for workers, order in (("2", numbers), ("1", numbers[::-1]))
     ]
     said = [json.loads(process.communicate()[0]) for process in running]
     assert _marks(tmp_path) == numbers

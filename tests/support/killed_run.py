@@ -11,7 +11,8 @@ from pathlib import Path
 
 import torch
 
-from tests.support.killed_training import life
+from tests.support.killed_training import life, optimizer_imported
+from tests.support.short_validation import short_validation
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
@@ -29,11 +30,13 @@ def train(store: Path, run: Path) -> None:
     # A reward model that is fitted too little does not know what other actions earn.
     copies = ("augment.actions=1", "crm.epochs=10")
     config = resolve_config("ucf", None, [*SETTINGS, *copies], seed=3)
-    train_run(EpisodeStore.open(store), run, config)
+    with short_validation():
+        train_run(EpisodeStore.open(store), run, config)
 
 
 def main() -> None:
     torch.set_num_threads(1)
+    optimizer_imported()
     store, run = map(Path, sys.argv[1:])
     moments, killed = random.Random(0), 0
     while not life(

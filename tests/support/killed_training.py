@@ -22,7 +22,7 @@ from torch.nn import functional as F
 
 from ucfrec.fitting.loop import Fit, LoopConfig, fit
 
-STEPS, EVERY = 240, 3
+STEPS, EVERY = 162, 3
 
 
 def module() -> nn.Module:
@@ -65,6 +65,11 @@ def train(folder: Path) -> Fit:
     return fit(net, draw, loss, config, folder, seed=5, validate=validate)
 
 
+def optimizer_imported() -> None:
+    """A first step imports half of torch, which every life would do again."""
+    torch.optim.AdamW(module().parameters()).step()
+
+
 def life(work: Callable[[Path], None], folder: Path, seconds: float) -> bool:
     """Work on `folder` in a fork that is killed after `seconds`; whether it came to its end."""
     child = os.fork()
@@ -90,7 +95,7 @@ def recorded(folder: Path) -> None:
 
 def main() -> None:
     torch.set_num_threads(1)
-    torch.optim.AdamW(module().parameters()).step()  # imports half of torch: once, not every life
+    optimizer_imported()
     moments = random.Random(int(sys.argv[1]))
     report = []
     for folder in map(Path, sys.argv[2:]):

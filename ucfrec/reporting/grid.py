@@ -1,16 +1,18 @@
-"""Run the measurements of a benchmark in parallel processes, resumably."""
+"""Run the measurements of a benchmark, here or in parallel processes, resumably."""
 
 import json
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import Future, as_completed
+from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from ucfrec.errors import InputError
-from ucfrec.processes import pool_of_processes, without_ctrl_c
+from ucfrec.processes import interruptions_raised, pool_of_processes, without_ctrl_c
 from ucfrec.progress import progress
 from ucfrec.provenance import config_hash, peak_memory_mib, reset_peak_memory
 from ucfrec.reporting.result_row import ResultRow, RowKey
@@ -28,12 +30,12 @@ class Measurement(Generic[Cell]):
     config: Callable[[Cell], Mapping[str, Any] | None]
     """Training configuration of the cell; None if nothing is trained."""
     measure: Callable[[Cell, RowKey], list[ResultRow]]
-    """Measures the cell; returns its rows, all with the given key. Runs in a one-thread process."""
+    """Measures the cell; returns its rows, all with the given key. Runs with one thread."""
 
 
 @dataclass(frozen=True)
 class _Task(Generic[Cell]):
-    """A cell to be measured in a worker process."""
+    """A cell to be measured."""
 
     cell: Cell
     key: RowKey
@@ -41,6 +43,10 @@ class _Task(Generic[Cell]):
     how: Measurement[Cell]
     results: Path
     wait: bool
+
+
+_Outcome = tuple[str, list[ResultRow] | BaseException]
+"""Name of a task, and its rows or why it has none."""
 
 
 def run_grid(
@@ -57,11 +63,14 @@ def run_grid(
     that fails does not stop the others and is reported at the end. Cells with the same key are
     measured once, even if several processes share `results`.
 
+    One worker, or an only cell, is measured in this process, whose peak memory during the cell is
+    then the row's; a worker process has little else in it.
+
     Args:
         cells: picklable cells.
         how: how a cell is measured.
         results: file of result rows (JSON lines); its other rows are kept.
-        workers: number of worker processes.
+        workers: number of cells that are measured at a time, each in a process of its own.
         describe: name of the benchmark in progress output.
         announce: what to say of the cells that are left before they are measured.
 
@@ -102,32 +111,69 @@ def _measure_all(
     """Rows by task name, and an error line for every failed task."""
     found: dict[str, list[ResultRow]] = {}
     failed: list[str] = []
-    waiting: dict[Future[list[ResultRow] | None], str] = {}
-    # An interrupted benchmark ends at once; its cells resume from their checkpoints.
-    with pool_of_processes(workers, _one_thread) as pool:
-        with without_ctrl_c():
-            waiting = {pool.submit(_measure, task): name for name, task in tasks.items()}
-        # Tasks that another process is measuring are waited for at the end.
-        elsewhere: dict[Future[list[ResultRow] | None], str] = {}
-        with progress(len(tasks), describe, "cells") as bar:
-            for done in chain.from_iterable(map(as_completed, (waiting, elsewhere))):
-                name = waiting.get(done) or elsewhere[done]
-                error = done.exception()
-                rows = None if error else done.result()
-                if error:
-                    failed.append(f"{tasks[name].key}: {type(error).__name__}: {error}")
-                elif rows is None:
-                    again = replace(tasks[name], wait=True)
-                    elsewhere[pool.submit(_measure, again)] = name
-                    continue
-                else:
-                    found[name] = rows
-                bar.update()
+    workers = min(workers, len(tasks))
+    outcomes = _in_processes(tasks, workers) if workers > 1 else _here(tasks)
+    with closing(outcomes), progress(len(tasks), describe, "cells") as bar:
+        for name, outcome in outcomes:
+            if isinstance(outcome, BaseException):
+                failed.append(f"{tasks[name].key}: {type(outcome).__name__}: {outcome}")
+            else:
+                found[name] = outcome
+            bar.update()
     return found, failed
 
 
-def _one_thread() -> None:
+# Tasks that another process is measuring are waited for at the end. An interrupted benchmark ends
+# at once; its cells resume from their checkpoints.
+
+
+def _in_processes(
+    tasks: Mapping[str, _Task[Cell]], workers: int
+) -> Generator[_Outcome, None, None]:
+    waiting: dict[Future[list[ResultRow] | None], str] = {}
+    with pool_of_processes(workers, _one_thread) as pool:
+        with without_ctrl_c():
+            waiting = {pool.submit(_measure, task): name for name, task in tasks.items()}
+        elsewhere: dict[Future[list[ResultRow] | None], str] = {}
+        for done in chain.from_iterable(map(as_completed, (waiting, elsewhere))):
+            name = waiting.get(done) or elsewhere[done]
+            error = done.exception()
+            rows = None if error else done.result()
+            if error is not None:
+                yield name, error
+            elif rows is not None:
+                yield name, rows
+            else:
+                again = replace(tasks[name], wait=True)
+                elsewhere[pool.submit(_measure, again)] = name
+
+
+def _here(tasks: Mapping[str, _Task[Cell]]) -> Generator[_Outcome, None, None]:
     import torch  # takes a second, and is not needed to print tables
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        left = deque(tasks.items())
+        while left:
+            name, task = left.popleft()
+            try:
+                # What a library makes of an interruption is no failure of the cell.
+                with interruptions_raised():
+                    rows = _measure(task)
+            except Exception as error:
+                yield name, error
+            else:
+                if rows is None:
+                    left.append((name, replace(task, wait=True)))
+                else:
+                    yield name, rows
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _one_thread() -> None:
+    import torch
 
     torch.set_num_threads(1)
 

@@ -9,6 +9,7 @@ import pytest
 from tests.support.control_files import hopper_like, write_hdf5
 from tests.support.result_rows import result_row
 from ucfrec import schema
+from ucfrec.counterfactual.measured_reward import MeasurementConfig
 from ucfrec.counterfactual.screening import ScreeningConfig
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import read_rows
@@ -94,7 +95,8 @@ def begin(tmp_path: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     columns["rewards"] = columns["observations"][:, 0]
     file = write_hdf5(tmp_path / f"{FILE}.hdf5", columns)
     # Begun here, where screening may be made quick, and gone on with by the command.
-    quickest = ScreeningConfig(hidden=32, shared_steps=200, own_steps=100)
+    few = MeasurementConfig(trees=5)
+    quickest = ScreeningConfig(hidden=16, shared_steps=100, own_steps=50, measurement=few)
     monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: quickest)
     clean = read_d4rl(file).write_store(stores_of(out) / FILE)
     distracted = add_distractor(clean, stores_of(out) / f"{FILE}-deterministic")

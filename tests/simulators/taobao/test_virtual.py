@@ -1,6 +1,7 @@
 """VirtualTaobao against the published dynamics, transcribed here one session at a time."""
 
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,11 @@ from gymnasium.vector import AutoresetMode
 from torch.nn import functional as F
 
 from tests.support.real_data import data_folder
-from ucfrec.acting.rollout import Episodes, rollout
+from ucfrec.acting.rollout import Episodes, FloatArray, rollout
 from ucfrec.errors import InputError
 from ucfrec_simulators.session_env import SingleSession
+from ucfrec_simulators.taobao import environment
+from ucfrec_simulators.taobao.environment import TaobaoEnv, best_constant
 from ucfrec_simulators.taobao.virtual import SIMULATOR, VirtualTaobao
 
 pytestmark = pytest.mark.realdata
@@ -25,6 +28,21 @@ GROUPS += [(60, 62), (62, 64), (64, 67), (67, 85), (85, 88)]
 def folder() -> Path:
     torch.set_num_threads(1)
     return data_folder("virtualtaobao")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def searches(folder: Path) -> Iterator[dict[int, FloatArray]]:
+    """The best constants that were searched for in these networks, by seed; none is twice."""
+    found: dict[int, FloatArray] = {}
+
+    def search(env: TaobaoEnv, seed: int) -> FloatArray:
+        if seed not in found:
+            found[seed] = best_constant(env, seed)
+        return found[seed]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(environment, "best_constant", search)
+        yield found
 
 
 def forward(weights: dict[str, torch.Tensor], x: torch.Tensor) -> torch.Tensor:
@@ -165,8 +183,12 @@ def test_the_mixture_is_mediocre_and_varied(folder: Path) -> None:
     assert np.quantile(rates, 0.95) > 2.5
 
 
-def test_same_seed_same_numbers_and_another_differs(folder: Path) -> None:
-    first, again, other = (played(folder, "mixture", 80, seed) for seed in (4, 4, 5))
+def test_same_seed_same_numbers_and_another_differs(
+    folder: Path, searches: dict[int, FloatArray]
+) -> None:
+    first, other = (played(folder, "mixture", 80, seed) for seed in (4, 5))
+    searches.clear()
+    again = played(folder, "mixture", 80, 4)
     np.testing.assert_array_equal(first.returns, again.returns)
     assert not np.array_equal(first.returns, other.returns)
 

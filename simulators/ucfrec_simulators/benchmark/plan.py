@@ -132,7 +132,7 @@ class Plan:
 
     def main(self) -> Iterator[Cell]:
         """Cells of Table 2 with Table 3's ablations, and of the worlds' built-in policies."""
-        own = self._available(self._budget.tasks)
+        own = self._available(self._only or self._budget.tasks)
         for name in own if self._world is None else [self._world.title]:
             for log in range(self._budget.logs):
                 task = self._task(name, log)

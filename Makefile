@@ -7,7 +7,7 @@ BIN := .venv/bin
 # Tests side by side, a row of files a core; who is done first takes half of what another has left,
 # so that few files are divided, and what their tests share made twice. One thread each, or the
 # workers' linear algebra fights over the cores.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal --durations 30
 
 .PHONY: demo test test-slow torture bench lint types docs wheel clean
 

@@ -276,8 +276,11 @@ def draw(files: Mapping[str, Sequence[ResultRow]], folder: Path) -> list[Path]:
             axes.set_title(f"mood {mood:g}")
             axes.axhline(0.0, color=PLAIN, linewidth=0.8)
             for arm in [name for name in ARMS if name != "none"]:
-                at = [(size, own[arm][0]) for (m, size), own in copies.items() if m == mood]
-                sizes, found = zip(*at, strict=True)
+                of_mood = sorted((size, own) for (m, size), own in copies.items() if m == mood)
+                measured = [(size, own[arm][0]) for size, own in of_mood if arm in own]
+                if not measured:
+                    continue
+                sizes, found = zip(*measured, strict=True)
                 errors = [each.standard_error if each.count > 1 else 0.0 for each in found]
                 means = [each.mean for each in found]
                 axes.errorbar(sizes, means, yerr=errors, marker="o", label=arm)

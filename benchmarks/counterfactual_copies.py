@@ -32,7 +32,7 @@ from ucfrec.reporting.evaluation_rows import evaluation_row
 from ucfrec.reporting.grid import Measurement, chosen, run_grid
 from ucfrec.reporting.result_row import ResultRow, RowKey
 from ucfrec.reporting.statistics import Summary, grouped, paired_differences, summary
-from ucfrec.reporting.tables import NONE, markdown_table, shown
+from ucfrec.reporting.tables import NONE, markdown_table
 from ucfrec.runs.config import Config, resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -172,10 +172,11 @@ def difference_table(rows: Sequence[ResultRow]) -> str:
             over, over_logs = of_arm[arm]
             told = [NONE] * 4
             if arm != "none" and over.count:
-                errors = (
-                    each.standard_error if each.count > 1 else None for each in (over, over_logs)
-                )
-                told = [f"{over.mean:+.3f}", *map(shown, errors), str(over.count)]
+                errors = [
+                    f"{each.standard_error:.3f}" if each.count > 1 else NONE
+                    for each in (over, over_logs)
+                ]
+                told = [f"{over.mean:+.3f}", *errors, str(over.count)]
             mean = summary(row.value for row in earned[mood, sessions, arm]).mean
             lines.append((f"{mood:g}", sessions, arm, f"{mean:.3f}", *told))
     head = ("mood", "sessions", "arm", "R_cum", "− none", "SE over pairs", "SE over logs", "pairs")

@@ -4,10 +4,9 @@ PYTHON ?= python3
 #   make demo PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu"
 PIP_FLAGS ?=
 BIN := .venv/bin
-# Tests side by side, a row of files a core; who is done first takes half of what another has left,
-# so that few files are divided, and what their tests share made twice. One thread each, or the
-# workers' linear algebra fights over the cores.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal --durations 30
+# Files of tests side by side, one a core; a file stays whole, so that what its tests share is made
+# once. One thread each, or the workers' linear algebra fights over the cores.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --durations 30
 
 .PHONY: demo test test-slow torture bench lint types docs wheel clean
 

@@ -17,7 +17,7 @@ test: .venv/dev  ## Set up and run the tests, all but the slow ones.
 	$(PYTEST) -m "not slow"
 
 test-slow: .venv/dev  ## The slow tests: trainings and worlds that take many seconds each.
-	$(PYTEST) -m slow --no-loadscope-reorder tests/test_examples.py tests  # the longest file first
+	$(PYTEST) -m slow --no-loadscope-reorder
 
 # SCALE is a share of the cases. What the file of rows has for this code is not measured again.
 SCALE ?= 1

@@ -136,8 +136,10 @@ def returns_and_differences(rows: Sequence[ResultRow]) -> str:
         pivot(rows, earned, METHODS),
         "R_avg, the mean reward of a session's step:",
         pivot(rows, average, METHODS),
-        "R_cum less that of `ucf` of the same log and seed, ± standard error over the pairs, in "
-        "brackets over the means of logs:",
+        fill(
+            "R_cum less that of `ucf` of the same log and seed, ± standard error over the pairs, "
+            "in brackets over the means of logs:"
+        ),
         pivot(rows, lambda world, method, _: differences[world, method], METHODS),
     ]
     return "\n\n".join(parts)

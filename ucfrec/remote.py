@@ -271,7 +271,7 @@ def _holes(
     for group in map(metadata.row_group, range(metadata.num_row_groups)):
         for column in map(group.column, range(group.num_columns)):
             offsets = (column.dictionary_page_offset, column.data_page_offset)
-            begin = min(offset for offset in offsets if offset)
+            begin = min((offset for offset in offsets if offset), default=0)
             end = begin + column.total_compressed_size
             if not 0 < begin < end <= about.size:
                 return None

@@ -337,7 +337,7 @@ def test_without_a_terminal_a_line_says_how_far_it_is(
 
 @pytest.mark.parametrize("slow", ["draw", "loss"])
 def test_speed_and_waiting_are_measured(tmp_path: Path, slow: str) -> None:
-    module, pause = linear(), 0.01
+    module, pause = linear(), 0.05  # seconds; a step on a busy machine may take some 10 ms
 
     def slow_draw(generator: np.random.Generator) -> Tensor:
         time.sleep(pause if slow == "draw" else 0)

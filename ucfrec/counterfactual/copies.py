@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import torch
@@ -26,7 +27,10 @@ from ucfrec.episodes.windows import Overlay
 from ucfrec.errors import InputError
 from ucfrec.fitting.random_state import random_state_kept
 
-_CPU = torch.device("cpu")
+MODELS: Final = ("item-reward", "crm", "csg")
+"""Folders of the checkpoints of `counterfactual_copies`; which of them there are depends on the
+settings."""
+_CPU: Final = torch.device("cpu")
 
 
 def require_rewards_vary(train: EpisodeStore) -> None:

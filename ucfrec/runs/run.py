@@ -4,6 +4,7 @@ import dataclasses
 import shutil
 import time
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,11 @@ import torch
 from ucfrec import schema
 from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.checksums import reopen, seal
-from ucfrec.counterfactual.copies import counterfactual_copies, require_rewards_vary
+from ucfrec.counterfactual.augment import AugmentConfig
+from ucfrec.counterfactual.copies import MODELS, counterfactual_copies, require_rewards_vary
+from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model, reward_model_sizes
+from ucfrec.counterfactual.reward_model import CRMConfig
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
@@ -35,6 +39,7 @@ from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.policy_fit import fit_policy
 from ucfrec.runs.reference_losses import reference_losses
 from ucfrec.runs.samples import SAMPLES, sample_recommendations
+from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec.runs.trained_policy import (
     AUGMENTATION,
     COUNTS,
@@ -51,6 +56,7 @@ from ucfrec.runs.trained_policy import (
 
 _MOST_RETURNS = 1_000_001
 _QUANTILES = (0.5, 0.75, 0.9, 0.95, 0.99, 1.0)
+_OVERLAY = "overlay.safetensors"
 
 
 @random_state_kept()
@@ -61,6 +67,7 @@ def train_run(
     about: Mapping[str, Any] | None = None,
     more_copies: Overlay | None = None,
     on_all_rows: bool = False,
+    shared: SharedStages = OWN,
 ) -> dict[str, Any]:
     """Train a policy on the training episodes of `store`, or resume the run in `out`.
 
@@ -80,6 +87,8 @@ def train_run(
             the counterfactual ones.
         on_all_rows: train on the validation and test episodes too, and keep the last weights; see
             `ucfrec.runs.refit`.
+        shared: reward models and copies that runs on the same store have in common where their
+            settings of these stages and their seeds agree; by default a run makes its own.
 
     Returns:
         The content of `run.json`: provenance, configuration and the report of every stage.
@@ -90,11 +99,11 @@ def train_run(
             actions, or another process is training in `out`.
     """
     if not distributed.leads():
-        return _train(store, out, config, about, more_copies, on_all_rows)
+        return _train(store, out, config, about, more_copies, on_all_rows, shared)
     with claimed(out, "trained"):
         remove_leftovers(out.parent)
         remove_leftovers_within(out)
-        return _train(store, out, config, about, more_copies, on_all_rows)
+        return _train(store, out, config, about, more_copies, on_all_rows, shared)
 
 
 def _train(
@@ -104,6 +113,7 @@ def _train(
     about: Mapping[str, Any] | None,
     more_copies: Overlay | None,
     on_all_rows: bool,
+    shared: SharedStages,
 ) -> dict[str, Any]:
     """`train_run` of a run that no other process trains."""
     train, validation = logged, held_out = training_views(store)
@@ -132,7 +142,9 @@ def _train(
     if config.augment.makes_copies:
         with distributed.leader_first():
             overlay, record["augmentation"] = _counterfactuals(
-                train, validation, out, config, device
+                *(train, validation, out, config, device),
+                # A learner's own view of the episodes has copies of its own.
+                shared if view is logged and returns.per_session else OWN,
             )
         more_copies = overlay if more_copies is None else overlay.joined(more_copies)
     if more_copies is not None:
@@ -143,7 +155,9 @@ def _train(
     chosen = "rule" in record and record.get("policy") == dataclasses.asdict(fitted)
     record["policy"] = dataclasses.asdict(fitted)
     if logged.has_items and config.rule.choose and not chosen:
-        record["reward_model"], record["rule"] = _rule(policy, logged, held_out, out, config)
+        record["reward_model"], record["rule"] = _rule(
+            policy, logged, held_out, out, config, shared
+        )
     record["wall_time_s"] = time.perf_counter() - start
     _write_samples(out, held_out)
     return seal(out, RUN, record)
@@ -278,16 +292,41 @@ def _counterfactuals(
     out: Path,
     config: Config,
     device: torch.device,
+    shared: SharedStages,
 ) -> tuple[Overlay, dict[str, Any]]:
     """The copies of a run and their report; made once, then read from `out`."""
-    overlay_path, report_path = out / "overlay.safetensors", out / AUGMENTATION
-    if not report_path.exists():
+    settings = (config.crm, config.csg, config.augment)
+
+    def make() -> None:
         overlay, report = counterfactual_copies(
-            *(train, validation, config.crm, config.csg, config.augment, out, config.seed, device)
+            train, validation, *settings, out, config.seed, device
         )
-        overlay.save(overlay_path)
-        write_json(report_path, dataclasses.asdict(report))
-    return Overlay.load(overlay_path), read_json(report_path)
+        overlay.save(out / _OVERLAY)
+        write_json(out / AUGMENTATION, dataclasses.asdict(report))
+
+    if not (out / AUGMENTATION).exists():
+        inputs = _inputs(train, validation, config.seed, device, *settings)
+        module = counterfactual_copies.__module__
+        shared.provide(inputs, module, out, (*MODELS, _OVERLAY, AUGMENTATION), make)
+    return Overlay.load(out / _OVERLAY), read_json(out / AUGMENTATION)
+
+
+def _inputs(
+    train: EpisodeStore,
+    validation: EpisodeStore,
+    seed: int,
+    device: torch.device,
+    *settings: CRMConfig | CSGConfig | AugmentConfig,
+) -> dict[str, Any]:
+    """All that a reward model or copies depend on, but the code."""
+    return {
+        "data": train.meta["fingerprint"],
+        "steps": [train.n_steps, validation.n_steps],
+        "state_size": train.state_size,
+        "seed": seed,
+        "device": device.type,
+        "settings": [dataclasses.asdict(table) for table in settings],
+    }
 
 
 def _sizes(store: EpisodeStore) -> dict[str, int]:
@@ -326,10 +365,18 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
 
 
 def _rule(
-    policy: SequencePolicy, train: EpisodeStore, validation: EpisodeStore, out: Path, config: Config
+    policy: SequencePolicy,
+    train: EpisodeStore,
+    validation: EpisodeStore,
+    out: Path,
+    config: Config,
+    shared: SharedStages,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Fit the reward model of items and choose the rule; returns the reports of both."""
-    model, report = fit_item_reward_model(train, validation, out / REWARD_MODEL, config.seed)
+    fit = partial(fit_item_reward_model, train, validation, out / REWARD_MODEL, config.seed)
+    inputs = _inputs(train, validation, config.seed, torch.device("cpu"))
+    shared.provide(inputs, fit_item_reward_model.__module__, out, (REWARD_MODEL,), fit)
+    model, report = fit()  # read from the folder
     trained = TrainedPolicy.load(out)
     targets = {quantile: trained.target_return(quantile) for quantile in config.rule.quantiles}
     decider = Decider(policy, trained.rule, trained.returns, model)

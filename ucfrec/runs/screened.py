@@ -11,6 +11,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.runs.config import Config
 from ucfrec.runs.run import train_run, training_views
+from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec.runs.trained_policy import DROPPED, RUN, read_record
 
 SCREENINGS: Final = ("drop", "copies")
@@ -34,6 +35,7 @@ def train_screened(
     config: Config,
     how: str | None,
     about: Mapping[str, Any] | None = None,
+    shared: SharedStages = OWN,
 ) -> dict[str, Any]:
     """`ucfrec.runs.run.train_run` after screening.
 
@@ -43,6 +45,7 @@ def train_screened(
         config: of the training.
         how: one of `SCREENINGS`; None to train on the store as it is.
         about: entries that a dataset adapter adds to the record.
+        shared: as `train_run` has it; not for a run whose columns are dropped.
 
     Returns:
         The run's record.
@@ -59,7 +62,7 @@ def train_screened(
             "another run folder, or give the same options to resume"
         )
     if how is None:
-        return train_run(store, out, config, about)
+        return train_run(store, out, config, about, shared=shared)
     screening = started[SCREENING] if started is not None else _screened(store, config.seed, how)
     flagged = flagged_columns(screening)
     if len(flagged) == store.state_size:
@@ -75,7 +78,7 @@ def train_screened(
     train, first = training_views(store)[0], store.state_size - store.observation_size
     places = [first + column for column in flagged]
     copies = interventions(train, places, config.seed) if places else None
-    return train_run(store, out, config, entries, copies)
+    return train_run(store, out, config, entries, copies, shared=shared)
 
 
 def _screened(store: EpisodeStore, seed: int, how: str) -> Mapping[str, Any]:

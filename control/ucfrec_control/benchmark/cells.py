@@ -13,6 +13,7 @@ from ucfrec.reporting.grid import Measurement
 from ucfrec.reporting.result_row import ResultRow, RowKey
 from ucfrec.runs.config import Config, resolve_config
 from ucfrec.runs.screened import SCREENING
+from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_control.benchmark.score_rows import score_row
 from ucfrec_control.benchmark.screening_table import verdicts
@@ -64,6 +65,8 @@ class Cell:
     """One of `ucfrec.runs.screened.SCREENINGS`; None for none."""
     all_targets: bool = False
     """As in `Budget`."""
+    shared: SharedStages = OWN
+    """Reward models and copies that methods have in common."""
 
     @property
     def config(self) -> Config:
@@ -133,7 +136,7 @@ def measure_scores(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     if cell.learner in ALGORITHMS:
         train_rl(store, cell.run, cell.rl_config, cell.seed)
     else:
-        train_control(store, cell.run, cell.config)
+        train_control(store, cell.run, cell.config, shared=cell.shared)
     evaluations = evaluate_run(
         cell.run, episodes=cell.episodes, seed=cell.evaluation_seed, targets=cell.targets
     )
@@ -148,7 +151,9 @@ def measure_scores(cell: Cell, row_key: RowKey) -> list[ResultRow]:
 def measure_robustness(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     """Train with the distractor, and evaluate with it fixed to 0 and to 1; returns one row."""
     store = EpisodeStore.open(cell.store)
-    record = train_control(store, cell.run, cell.config, screening=cell.screening)
+    record = train_control(
+        store, cell.run, cell.config, screening=cell.screening, shared=cell.shared
+    )
     # The last checkpoint: the best one is chosen on data in which the distractor varies.
     # All evaluations have the same initial states, with and without distractor.
     evaluations = [

@@ -8,7 +8,7 @@ from ucfrec.reporting.result_row import ResultRow
 from ucfrec_control.benchmark.budgets import Budget
 from ucfrec_control.benchmark.cells import SCORE_MEASUREMENT, SCORES, Cell, code_of
 from ucfrec_control.benchmark.estimate import announcement
-from ucfrec_control.benchmark.folders import run_name, stores_of
+from ucfrec_control.benchmark.folders import run_name, stages_of, stores_of
 from ucfrec_control.benchmark.methods import MAIN, PURSUING, TABLES
 from ucfrec_control.benchmark.rates import settings_of
 from ucfrec_control.data.distractor import zoo_store
@@ -75,4 +75,5 @@ def cells_of(
                     rl_steps=budget.rl_steps,
                     rl_batch_size=budget.rl_batch_size,
                     all_targets=budget.all_targets,
+                    shared=stages_of(folder),
                 )

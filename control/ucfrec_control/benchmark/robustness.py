@@ -17,7 +17,7 @@ from ucfrec_control.benchmark.budgets import BUDGETS as SCORE_BUDGETS
 from ucfrec_control.benchmark.budgets import MEDIUM, Budget
 from ucfrec_control.benchmark.cells import ROBUSTNESS, ROBUSTNESS_MEASUREMENT, Cell, code_of
 from ucfrec_control.benchmark.estimate import announcement
-from ucfrec_control.benchmark.folders import run_name, stores_of
+from ucfrec_control.benchmark.folders import run_name, stages_of, stores_of
 from ucfrec_control.benchmark.methods import METHODS as LEARNERS
 from ucfrec_control.benchmark.rates import settings_of
 from ucfrec_control.data.distractor import CLEAN, DISTRACTORS, zoo_store
@@ -107,6 +107,7 @@ def robustness_cells(
                         code_version=code,
                         distractor=distractor,
                         screening=SCREENED.get(method),
+                        shared=stages_of(folder),
                     )
 
 

@@ -9,6 +9,7 @@ from ucfrec.errors import InputError
 from ucfrec.provenance import versions
 from ucfrec.runs.config import Config
 from ucfrec.runs.screened import train_screened
+from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec_control.data.trajectories import PACKAGES
 from ucfrec_control.learners.presets import Preset, find_preset
 from ucfrec_control.worlds.scores import find_kind, find_task
@@ -35,7 +36,12 @@ def preset_of(dataset: Mapping[str, Any], policy: str) -> Preset:
 
 
 def train_control(
-    store: EpisodeStore, out: Path, config: Config, *, screening: str | None = None
+    store: EpisodeStore,
+    out: Path,
+    config: Config,
+    *,
+    screening: str | None = None,
+    shared: SharedStages = OWN,
 ) -> dict[str, Any]:
     """`ucfrec.runs.screened.train_screened` on a control store.
 
@@ -44,6 +50,7 @@ def train_control(
         out: run folder; an interrupted run resumes.
         config: of the training.
         screening: one of `ucfrec.runs.screened.SCREENINGS`; None for none.
+        shared: as `ucfrec.runs.run.train_run` has it.
 
     Returns:
         The run's record.
@@ -52,4 +59,4 @@ def train_control(
         InputError: as `train_screened`, or the store is not a control store.
     """
     about = {"dataset": dict(dataset_of(store)), "versions": versions(PACKAGES)}
-    return train_screened(store, out, config, screening, about)
+    return train_screened(store, out, config, screening, about, shared)

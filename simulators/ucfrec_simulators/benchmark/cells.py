@@ -15,6 +15,7 @@ from ucfrec.reporting.grid import Measurement
 from ucfrec.reporting.result_row import ResultRow, RowKey
 from ucfrec.runs.config import Config, resolve_config
 from ucfrec.runs.screened import SCREENING, flagged_columns, train_screened
+from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_simulators.distractor import DistractorWorld
 
@@ -56,6 +57,8 @@ class Cell:
     """Episode store that the method is trained on."""
     run: Path | None = None
     """Run folder."""
+    shared: SharedStages = OWN
+    """Reward models and copies that methods have in common."""
     settings: tuple[str, ...] = ()
     """Settings of the training, as for `--set`."""
     conditioned: bool = False
@@ -117,7 +120,7 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     # Cells that differ only in their evaluation share a run.
     with claim(cell.run, wait=True):
         store = EpisodeStore.open(cell.store)
-        record = train_screened(store, cell.run, cell.config, cell.screening)
+        record = train_screened(store, cell.run, cell.config, cell.screening, shared=cell.shared)
     training_metrics, rows = _training_metrics(record), []
     details = {} if cell.screening is None else {SCREENING: flagged_columns(record[SCREENING])}
     trained = TrainedPolicy.load(cell.run, CHECKPOINT)

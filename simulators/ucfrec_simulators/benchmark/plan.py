@@ -15,6 +15,7 @@ from ucfrec.evaluation import gymnasium_world
 from ucfrec.evaluation.world import GYMNASIUM, World
 from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import config_hash
+from ucfrec.runs.shared_stages import SharedStages
 from ucfrec_simulators import sardine
 from ucfrec_simulators.benchmark import cells, tasks
 from ucfrec_simulators.benchmark.cells import Cell, EvaluationPlan
@@ -275,6 +276,7 @@ class Plan:
             training_seed=seed,
             store=task.store,
             run=self._folder / "runs" / folder_name(name) / f"{method.policy}-{run_hash}-{seed}",
+            shared=SharedStages(self._folder / "stages"),
             settings=settings,
             conditioned=method.conditioned,
             screening=screening,

@@ -1,0 +1,63 @@
+"""Stages of a training that several runs on one log have in common: made once, then copied."""
+
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from ucfrec.code_version import code_version
+from ucfrec.files import atomic_folder
+from ucfrec.locks import claim
+from ucfrec.provenance import config_hash
+
+
+@dataclass(frozen=True)
+class SharedStages:
+    """A folder with finished stages, each in a folder of its own; None shares nothing."""
+
+    folder: Path | None
+
+    def provide(
+        self,
+        inputs: Mapping[str, Any],
+        module: str,
+        out: Path,
+        names: Sequence[str],
+        make: Callable[[], object],
+    ) -> None:
+        """Copy the files of a stage to the run folder `out`, or make them there and keep a copy.
+
+        Another process that needs the same stage waits until it is made.
+
+        Args:
+            inputs: all that the stage depends on but its code: data, settings, seed.
+            module: of the code of the stage; another version of it makes the stage anew.
+            out: run folder.
+            names: files and folders of the stage in `out`, those that are made; the last one marks
+                the stage as finished and is copied last.
+            make: makes them.
+        """
+        if self.folder is None:
+            make()
+            return
+        stage = self.folder / config_hash({**inputs, "code": code_version(module)})
+        with claim(stage.with_name(f"{stage.name}-made"), wait=True):
+            if stage.exists():
+                _copy(stage, out, names)
+                return
+            make()
+            with atomic_folder(stage) as scratch:
+                _copy(out, scratch, names)
+
+
+OWN: Final = SharedStages(None)
+"""For a run that makes all its stages itself."""
+
+
+def _copy(source: Path, to: Path, names: Sequence[str]) -> None:
+    for name in names:
+        if (source / name).is_dir():
+            shutil.copytree(source / name, to / name, dirs_exist_ok=True)
+        elif (source / name).exists():
+            shutil.copyfile(source / name, to / name)

@@ -58,7 +58,7 @@ def by_playing(runs: dict[str, Path]) -> list[dict[str, object]]:
     rows = [evaluate_behavior(WORLD, name, EPISODES, SEED) for name in ("random", "mixture")]
     for name, run in runs.items():
         trained = TrainedPolicy.load(run)
-        # By the run's own rule: the largest training return is asked for, the best item shown.
+        # By the run's own rule, which was chosen on its log.
         rows.append(evaluate_policy(WORLD, trained, name, EPISODES, SEED, trained.rule))
     rows.append(evaluate_behavior(WORLD, "optimal", EPISODES, SEED))
     return rows
@@ -72,10 +72,10 @@ def by_playing(runs: dict[str, Path]) -> list[dict[str, object]]:
 # hardly show, its estimate rests on a handful of users. (DM and FQE are fitted models
 # instead: they always have an answer, right or wrong.)
 #
-# One difference to the first way: there the most probable item is shown, here an item is drawn from
-# the policy's probabilities, by another decision rule. The run's own could be judged too, but a
-# policy that shows one item for certain agrees with hardly any whole session of the logs, and the
-# effective sample shrinks to almost nothing.
+# One difference to the first way: here an item is drawn from the policy's probabilities, whatever
+# the run's own rule does. That rule could be judged too, but one that shows one item for certain
+# agrees with hardly any whole session of the logs, and the effective sample shrinks to almost
+# nothing.
 
 
 def drawn(trained: TrainedPolicy) -> DecisionRule:

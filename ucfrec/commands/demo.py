@@ -70,7 +70,7 @@ def demo(out: Path, seed: int, config: DemoConfig) -> list[dict[str, Any]]:
     """Run the demo in the folder `out`; an interrupted demo that is run again resumes.
 
     Writes `out/results.json`, `out/report.html` and, in `out/<world>`, the logs, store and runs of
-    each world, for use with the other commands.
+    each world, for use with the other commands, and in `stages` what these have in common.
 
     Returns:
         The rows of `out/results.json`: one per world and policy, worlds in the order of `WORLDS`.
@@ -117,6 +117,7 @@ def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> dict[str, 
     from ucfrec.evaluation.world import World
     from ucfrec.runs.config import resolve_config
     from ucfrec.runs.run import train_run
+    from ucfrec.runs.shared_stages import SharedStages
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     torch.set_num_threads(1)
@@ -124,7 +125,8 @@ def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> dict[str, 
     size = [f"policy.dim={config.dim}"]
     size += [] if learner == "bc" else [f"policy.context={config.context}"]
     resolved = resolve_config(learner, None, [*config.settings, *size, *settings], seed)
-    train_run(EpisodeStore.open(folder / "store"), folder / name, resolved)
+    shared = SharedStages(folder / "stages")
+    train_run(EpisodeStore.open(folder / "store"), folder / name, resolved, shared=shared)
     trained = TrainedPolicy.load(folder / name)
     return evaluate_policy(
         World(folder.name),

@@ -5,13 +5,16 @@ from typing import Final
 
 from ucfrec_simulators.benchmark.cells import Cell
 
-_PER_STEP: Final = {"kuairand": 0.1, "kuairec": 0.1, "sardine-boredinf": 0.1}
-"""CPU seconds of a training step of width 64, by task; `_STEP` for others."""
-_BEFORE: Final = {"kuairand": 45.0, "kuairec": 45.0}
-"""CPU seconds of copies and their reward model, by task; `_COPIES` for others."""
-_CHOICE: Final = {"kuairand": 22.0, "kuairec": 22.0, "sardine-boredinf": 65.0}
-"""CPU seconds of the reward model of items and the choice of the rule; `_RULE` for others."""
-_STEP, _COPIES, _RULE = 0.06, 45.0, 15.0
+_STEP: Final = {"kuairand": 0.1, "kuairec": 0.1, "sardine-boredinf": 0.1}
+"""CPU seconds of a training step of width 64, by task."""
+_COPIES: Final = {"kuairand": 38.0, "kuairec": 38.0}
+"""CPU seconds of a reward model, a generator and their copies, by task."""
+_REWARDS: Final = {"sardine-boredinf": 15.0, "sardine-static": 15.0}
+"""CPU seconds of a reward model of items, by task."""
+_CHOICE: Final = {"kuairand": 12.0, "kuairec": 12.0, "sardine-boredinf": 50.0}
+"""CPU seconds of the choice of a decision rule, by task."""
+_ELSE: Final = {"step": 0.06, "copies": 45.0, "rewards": 11.0, "choice": 10.0}
+"""The same of other tasks."""
 _EVALUATION: Final = 5.0
 """CPU seconds to evaluate a policy in a world."""
 
@@ -30,14 +33,19 @@ def announcement(workers: int) -> Callable[[Sequence[Cell]], str]:
 
 
 def estimated_hours(cells: Sequence[Cell]) -> float:
-    """CPU hours of `cells`; a run that several of them share is counted once."""
-    runs = {cell.run: cell for cell in cells if cell.run is not None}
+    """CPU hours of `cells`; what several of them share is counted once."""
     evaluated = _EVALUATION * sum(len(cell.worlds) for cell in cells)
-    return (evaluated + sum(map(_training, runs.values()))) / 3600
-
-
-def _training(cell: Cell) -> float:
-    task, config = cell.task.partition(",")[0], cell.config
-    seconds = config.train.steps * _PER_STEP.get(task, _STEP)
-    seconds += _BEFORE.get(task, _COPIES) if config.augment.makes_copies else 0.0
-    return seconds + (_CHOICE.get(task, _RULE) if config.rule.choose else 0.0)
+    seconds: dict[object, float] = {}
+    for cell in cells:
+        if cell.run is None:
+            continue
+        task, config = cell.task.partition(",")[0], cell.config
+        log = cell.store, cell.training_seed
+        seconds[cell.run] = config.train.steps * _STEP.get(task, _ELSE["step"])
+        if config.rule.choose:
+            seconds[cell.run] += _CHOICE.get(task, _ELSE["choice"])
+            seconds[log] = _REWARDS.get(task, _ELSE["rewards"])
+        if config.augment.makes_copies:
+            settings = repr((config.crm, config.csg, config.augment))
+            seconds[log, settings] = _COPIES.get(task, _ELSE["copies"])
+    return (evaluated + sum(seconds.values())) / 3600

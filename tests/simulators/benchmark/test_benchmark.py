@@ -297,6 +297,8 @@ def test_time_is_told_of_runs_once(tmp_path: Path) -> None:
     again = [replace(cell, table="additions") for cell in cells]
     shared = estimated_hours([*cells, *again]) - dt - ucf
     assert 0 < shared < ucf
+    other = replace(cells[1], run=tmp_path / "other", settings=(*cells[1].settings, "policy.dim=8"))
+    assert ucf < estimated_hours([cells[1], other]) < 2 * ucf - 20 / 3600  # copies are made once
     assert "about 0.0 hours with --workers 2" in announcement(2)(cells)
 
 

@@ -79,9 +79,13 @@ def life(work: Callable[[Path], None], folder: Path, seconds: float) -> bool:
             os._exit(0)
         finally:
             os._exit(1)
-    time.sleep(seconds)
-    os.kill(child, signal.SIGKILL)
-    status = os.waitpid(child, 0)[1]
+    killed_at, ended, status = time.monotonic() + seconds, 0, 0
+    while not ended and time.monotonic() < killed_at:
+        time.sleep(min(0.01, max(0.0, killed_at - time.monotonic())))
+        ended, status = os.waitpid(child, os.WNOHANG)
+    if not ended:
+        os.kill(child, signal.SIGKILL)
+        status = os.waitpid(child, 0)[1]
     if os.WIFSIGNALED(status):
         return False
     if os.WEXITSTATUS(status):

@@ -15,7 +15,7 @@ standard error over all pairs, and that of the means of logs, which counts what 
 
 import argparse
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -183,6 +183,17 @@ def difference_table(rows: Sequence[ResultRow]) -> str:
     return markdown_table(head, lines)
 
 
+def announcement(workers: int) -> Callable[[Sequence[Cell]], str]:
+    """What a benchmark of so many processes says of the cells that are left, before it starts."""
+
+    def said(cells: Sequence[Cell]) -> str:
+        # Of one idle core: 0.05 s a step, the rest for copies and evaluation.
+        hours = sum(0.05 * cell.steps + 0.01 * cell.episodes for cell in cells) / workers / 3600
+        return f"about {hours:.1f} hours with --workers {workers} on two idle cores"
+
+    return said
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -220,7 +231,8 @@ def main() -> None:
         simulated_store(cell.world, cell.folder, cell.sessions, cell.log_seed)
     results = options.results or options.out / "results.jsonl"
     measurement = Measurement(key, config, measure)
-    print(difference_table(run_grid(cells, measurement, results, options.workers, "copies")))
+    said = announcement(options.workers)
+    print(difference_table(run_grid(cells, measurement, results, options.workers, "copies", said)))
 
 
 if __name__ == "__main__":

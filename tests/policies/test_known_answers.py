@@ -101,7 +101,8 @@ def test_planted_preferences_are_learned_and_noise_is_not(
     if noise or name in KNOWS_NOBODY:
         assert abs(right - 1 / KINDS) < 0.1
     elif name in SEES_NO_STATE:
-        # Two actions before tell the kind for certain only where both are what it prefers.
-        assert right > 0.5
+        # Two actions before tell the kind for certain only where both are what it prefers: the best
+        # answer is right in 0.625 of the sessions, chance in 0.25.
+        assert right > 0.45
     else:
         assert right > 0.9

@@ -6,6 +6,7 @@ from torch import Tensor, nn
 
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import Context, PolicyConfig, SequencePolicy
+from ucfrec.policies.layers import Dropout
 from ucfrec.settings import settings_table
 
 
@@ -29,7 +30,7 @@ class BCPolicy(SequencePolicy):
         self.net = nn.Sequential(
             nn.Linear(sizes["state"], dim),
             nn.ReLU(),
-            nn.Dropout(config.dropout),
+            Dropout(config.dropout),
             nn.Linear(dim, dim),
             nn.ReLU(),
             nn.LayerNorm(dim),

@@ -14,6 +14,7 @@ from ucfrec.policies.base import (
     TokenEmbedding,
     interleave,
 )
+from ucfrec.policies.layers import Dropout
 from ucfrec.settings import settings_table
 
 
@@ -41,7 +42,7 @@ class DCPolicy(SequencePolicy):
     def __init__(self, config: DCConfig, sizes: Mapping[str, int]) -> None:
         super().__init__(config, sizes)
         self.embed = TokenEmbedding(config, sizes["state"])
-        self.dropout = nn.Dropout(config.dropout)
+        self.dropout = Dropout(config.dropout)
         self.blocks = nn.ModuleList(_Block(config) for _ in range(config.layers))
         self.final_norm = nn.LayerNorm(config.dim)
         for module in self.blocks.modules():
@@ -69,7 +70,7 @@ class _Block(nn.Module):
         )
         self.mlp_norm = nn.LayerNorm(dim)
         self.mlp = nn.Sequential(
-            nn.Linear(dim, 4 * dim), nn.GELU(), nn.Linear(4 * dim, dim), nn.Dropout(config.dropout)
+            nn.Linear(dim, 4 * dim), nn.GELU(), nn.Linear(4 * dim, dim), Dropout(config.dropout)
         )
 
     def forward(self, hidden: Tensor, valid: Tensor) -> Tensor:

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import (
@@ -16,6 +15,7 @@ from ucfrec.policies.base import (
     interleave,
     require_heads,
 )
+from ucfrec.policies.layers import Dropout, attend
 from ucfrec.settings import settings_table
 
 
@@ -45,7 +45,7 @@ class DTPolicy(SequencePolicy):
     def __init__(self, config: DTConfig, sizes: Mapping[str, int]) -> None:
         super().__init__(config, sizes)
         self.embed = TokenEmbedding(config, sizes["state"])
-        self.dropout = nn.Dropout(config.dropout)
+        self.dropout = Dropout(config.dropout)
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.layers))
         self.final_norm = nn.LayerNorm(config.dim)
         for module in self.blocks.modules():
@@ -79,7 +79,7 @@ class Block(nn.Module):
         self.out = nn.Linear(dim, dim)
         self.mlp_norm = nn.LayerNorm(dim)
         self.mlp = nn.Sequential(nn.Linear(dim, 4 * dim), nn.ReLU(), nn.Linear(4 * dim, dim))
-        self.dropout = nn.Dropout(config.dropout)
+        self.dropout = Dropout(config.dropout)
 
     def forward(self, hidden: Tensor, visible: Tensor) -> Tensor:
         """Map (B, L, d) to (B, L, d); `visible` (B, 1, L, L) comes from `visible_tokens`."""
@@ -89,9 +89,7 @@ class Block(nn.Module):
             x.view(batch, tokens, self.heads, dim // self.heads).transpose(1, 2)
             for x in self.query_key_value(self.attention_norm(hidden)).chunk(3, dim=-1)
         )
-        mixed = F.scaled_dot_product_attention(
-            query, key, value, attn_mask=visible, dropout_p=self.rate if self.training else 0.0
-        )
+        mixed = attend(query, key, value, visible, self.rate if self.training else 0.0)
         hidden = hidden + self.dropout(self.out(mixed.transpose(1, 2).reshape(hidden.shape)))
         return hidden + self.dropout(self.mlp(self.mlp_norm(hidden)))  # type: ignore[no-any-return]
 

@@ -1,4 +1,4 @@
-"""Layers of UCF that cost less than PyTorch's on a CPU: dropout and a depthwise convolution."""
+"""Layers that cost less than PyTorch's on a CPU: dropout, attention, a depthwise convolution."""
 
 from typing import Any
 
@@ -48,6 +48,26 @@ def kept(shape: torch.Size, p: float) -> Tensor:
     levels = draws.view(torch.int16)[: mask.numel()].view(shape)
     torch.ge(levels, dropped - _LEVELS // 2, out=mask)
     return mask.mul_(_LEVELS / (_LEVELS - dropped))
+
+
+def attend(query: Tensor, key: Tensor, value: Tensor, visible: Tensor, dropout: float) -> Tensor:
+    """Scaled dot-product attention.
+
+    Args:
+        query: (B, H, L, c), as are `key` and `value`.
+        key: see `query`.
+        value: see `query`.
+        visible: (B, 1, L, L) bool, true where a row may attend to a column; somewhere in each row.
+        dropout: share of the attention weights that is dropped, as by `Dropout`.
+
+    Returns:
+        (B, H, L, c).
+    """
+    if dropout == 0 or query.device.type != "cpu":
+        return F.scaled_dot_product_attention(query, key, value, visible, dropout)
+    scores = (query * query.shape[-1] ** -0.5) @ key.transpose(-2, -1)
+    weights = scores.masked_fill(~visible, -torch.inf).softmax(-1)
+    return torch.matmul(weights * kept(weights.shape, dropout), value)
 
 
 def some_padding(mask: Tensor) -> Tensor | None:

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ucfrec.episodes.windows import Windows
+from ucfrec.policies import layers
 from ucfrec.policies.base import (
     Heads,
     Kernel,
@@ -107,10 +108,13 @@ class _Block(nn.Module):
         self.out = nn.Linear(dim, dim)
         self.norm = nn.LayerNorm(dim)
         self.mlp = nn.Sequential(
-            nn.Linear(dim, 4 * dim), nn.GELU(), nn.Linear(4 * dim, dim), nn.Dropout(config.dropout)
+            nn.Linear(dim, 4 * dim),
+            nn.GELU(),
+            nn.Linear(4 * dim, dim),
+            layers.Dropout(config.dropout),
         )
         self.mlp_norm = nn.LayerNorm(dim)
-        self.dropout = nn.Dropout(config.dropout)
+        self.dropout = layers.Dropout(config.dropout)
 
     def forward(self, hidden: Tensor, valid: Tensor) -> Tensor:
         long, short = hidden.chunk(2, dim=-1)
@@ -126,7 +130,7 @@ class _Attention(nn.Module):
         super().__init__()
         self.heads = config.heads
         self.query_key_value = nn.Linear(config.dim // 2, 3 * (config.dim // 2))
-        self.dropout = nn.Dropout(config.attention_dropout)
+        self.dropout = layers.Dropout(config.attention_dropout)
 
     def forward(self, hidden: Tensor, valid: Tensor) -> Tensor:
         batch, tokens, dim = hidden.shape
@@ -153,7 +157,7 @@ class _DynamicConvolution(nn.Module):
         self.taps = nn.Linear(dim, config.kernel_groups * config.kernel)
         self.bias = nn.Parameter(torch.zeros(dim))
         self.out = nn.Linear(dim, dim)
-        self.dropout = nn.Dropout(config.kernel_dropout)
+        self.dropout = layers.Dropout(config.kernel_dropout)
 
     def forward(self, hidden: Tensor, valid: Tensor) -> Tensor:
         batch, tokens, dim = hidden.shape

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import Layers, SequencePolicy
 from ucfrec.policies.dt import Block, DTConfig, visible_tokens
+from ucfrec.policies.layers import Dropout
 from ucfrec.settings import settings_table
 
 
@@ -31,7 +32,7 @@ class SASRecPolicy(SequencePolicy):
     def __init__(self, config: SASRecConfig, sizes: Mapping[str, int]) -> None:
         super().__init__(config, sizes)
         self.embed_timestep = nn.Embedding(config.max_timestep, config.dim)
-        self.dropout = nn.Dropout(config.dropout)
+        self.dropout = Dropout(config.dropout)
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.layers))
         self.final_norm = nn.LayerNorm(config.dim)
 

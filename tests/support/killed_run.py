@@ -40,7 +40,7 @@ def main() -> None:
     store, run = map(Path, sys.argv[1:])
     moments, killed = random.Random(0), 0
     while not life(
-        lambda folder: train(store, folder), run, moments.uniform(0.1, 1.0) * 1.3**killed
+        lambda folder: train(store, folder), run, moments.uniform(0.1, 1.0) * 1.5**killed
     ):
         killed += 1
     print(killed)

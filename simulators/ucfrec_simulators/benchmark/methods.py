@@ -74,7 +74,8 @@ ADDITIONS: Final[Mapping[str, Method]] = {
     "ucf-wo-rule": Method("ucf", ("rule.choose=false",), vectors=False),
     "ucf-weights": Method("ucf", ("policy.advantage_weights=true",)),
     "ucf-max-return": Method("ucf", ("policy.max_return=true",)),
-    "ucf-actions": Method("ucf", ("augment.actions=2",), vectors=False),
+    "ucf-actions": Method("ucf", ("augment.copies=0", "augment.actions=2"), vectors=False),
+    "ucf-both": Method("ucf", ("augment.actions=2",), vectors=False),
 }
 """UCF without one of what this project added to the paper, or with something more, by their name in
 the table of additions."""

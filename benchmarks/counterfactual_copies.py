@@ -31,7 +31,7 @@ from ucfrec.plugins import Simulator
 from ucfrec.reporting.evaluation_rows import evaluation_row
 from ucfrec.reporting.grid import Measurement, chosen, run_grid
 from ucfrec.reporting.result_row import ResultRow, RowKey
-from ucfrec.reporting.statistics import Summary, grouped, paired_differences, summary
+from ucfrec.reporting.statistics import Summary, grouped, summary
 from ucfrec.reporting.tables import NONE, markdown_table
 from ucfrec.runs.config import Config, resolve_config
 from ucfrec.runs.run import train_run
@@ -135,52 +135,97 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     return [evaluation_row(found, row_key, details=details, rule=str(trained.rule))]
 
 
-def compared(
-    rows: Sequence[ResultRow],
-) -> dict[tuple[float, int], dict[str, tuple[Summary, Summary]]]:
-    """Differences of each arm's return to that of `none`, by (mood, sessions).
+Pair = tuple[int | None, int | None]
+"""Seeds of a log and of a training on it."""
+Differences = dict[str, tuple[Summary, Summary]]
+"""By arm, over pairs and over the means of logs."""
 
-    Returns:
-        By arm, over the pairs of a log and a training seed, and over the means of logs.
-    """
-    found: dict[tuple[float, int], dict[str, tuple[Summary, Summary]]] = {}
-    sizes = grouped(rows, lambda row: (row.conditions["mood"], row.conditions["sessions"]))
-    for (mood, sessions), group in sizes.items():
-        of_arm = {
-            arm: {(row.log_seed, row.training_seed): row.value for row in own}
-            for arm, own in grouped(group, lambda row: row.method).items()
-        }
-        base, own_size = of_arm.get("none", {}), {}
-        for arm, values in of_arm.items():
-            pairs = [pair for pair in values if pair in base]
-            differences = paired_differences(values, base)
-            by_log = grouped(zip(pairs, differences, strict=True), lambda item: item[0][0])
-            over_logs = summary(float(np.mean([d for _, d in own])) for own in by_log.values())
-            own_size[arm] = (summary(differences), over_logs)
-        found[float(str(mood)), int(str(sessions))] = own_size
+
+def compared(rows: Sequence[ResultRow]) -> dict[tuple[float, int], Differences]:
+    """Differences of each arm's return to that of `none`, by (mood, sessions)."""
+    found = {}
+    for (mood, sessions), own in grouped(rows, _case).items():
+        of_arm = _by_arm(own)
+        base = of_arm.get("none", {})
+        found[mood, sessions] = {arm: _summaries(_less(v, base)) for arm, v in of_arm.items()}
     return found
 
 
+def over_sizes(rows: Sequence[ResultRow]) -> dict[float, Differences]:
+    """The same in percent of the mean return of `none` at a size, in the mean over sizes, by mood.
+
+    Pairs that lack a size are left out, and moods with one size.
+    """
+    found = {}
+    for mood, group in grouped(rows, lambda row: _case(row)[0]).items():
+        sizes = grouped(group, lambda row: _case(row)[1])
+        relative: dict[str, dict[Pair, list[float]]] = {}
+        for own in sizes.values():
+            of_arm = _by_arm(own)
+            base = of_arm.get("none", {})
+            for arm, values in of_arm.items():
+                for pair, difference in _less(values, base).items():
+                    share = 100 * difference / float(np.mean([*base.values()]))
+                    relative.setdefault(arm, {}).setdefault(pair, []).append(share)
+        if len(sizes) > 1:
+            found[mood] = {
+                arm: _summaries(
+                    {p: float(np.mean(v)) for p, v in of.items() if len(v) == len(sizes)}
+                )
+                for arm, of in relative.items()
+            }
+    return found
+
+
+def _case(row: ResultRow) -> tuple[float, int]:
+    return float(str(row.conditions["mood"])), int(str(row.conditions["sessions"]))
+
+
+def _by_arm(rows: Sequence[ResultRow]) -> dict[str, dict[Pair, float]]:
+    return {
+        arm: {(row.log_seed, row.training_seed): row.value for row in own}
+        for arm, own in grouped(rows, lambda row: row.method).items()
+    }
+
+
+def _less(values: dict[Pair, float], base: dict[Pair, float]) -> dict[Pair, float]:
+    return {pair: value - base[pair] for pair, value in values.items() if pair in base}
+
+
+def _summaries(differences: dict[Pair, float]) -> tuple[Summary, Summary]:
+    by_log = grouped(differences.items(), lambda item: item[0][0]).values()
+    over_logs = summary(float(np.mean([d for _, d in own])) for own in by_log)
+    return summary(differences.values()), over_logs
+
+
 def difference_table(rows: Sequence[ResultRow]) -> str:
-    """Paired differences to the arm `none`, as Markdown."""
-    earned = grouped(
-        rows, lambda row: (row.conditions["mood"], row.conditions["sessions"], row.method)
-    )
-    lines = []
+    """Paired differences to the arm `none`, as Markdown; over all sizes in percent."""
+    cases, lines = grouped(rows, lambda row: (*_case(row), row.method)), []
     for (mood, sessions), of_arm in sorted(compared(rows).items()):
-        for arm in [name for name in ARMS if name in of_arm]:
-            over, over_logs = of_arm[arm]
-            told = [NONE] * 4
-            if arm != "none" and over.count:
-                errors = [
-                    f"{each.standard_error:.3f}" if each.count > 1 else NONE
-                    for each in (over, over_logs)
-                ]
-                told = [f"{over.mean:+.3f}", *errors, str(over.count)]
-            mean = summary(row.value for row in earned[mood, sessions, arm]).mean
-            lines.append((f"{mood:g}", sessions, arm, f"{mean:.3f}", *told))
+        for arm in _in_order(of_arm):
+            mean = f"{summary(row.value for row in cases[mood, sessions, arm]).mean:.3f}"
+            lines.append((f"{mood:g}", sessions, arm, mean, *_told(arm, of_arm, 3, "")))
+    for mood, of_arm in sorted(over_sizes(rows).items()):
+        arms = [name for name in _in_order(of_arm) if name != "none"]
+        lines += [(f"{mood:g}", "all", arm, NONE, *_told(arm, of_arm, 1, "%")) for arm in arms]
     head = ("mood", "sessions", "arm", "R_cum", "− none", "SE over pairs", "SE over logs", "pairs")
     return markdown_table(head, lines)
+
+
+def _in_order(of_arm: Differences) -> list[str]:
+    return [name for name in ARMS if name in of_arm]
+
+
+def _told(arm: str, of_arm: Differences, digits: int, unit: str) -> list[str]:
+    """The last four columns of the table."""
+    over, over_logs = of_arm[arm]
+    if arm == "none" or not over.count:
+        return [NONE] * 4
+    errors = [
+        f"{each.standard_error:.{digits}f}{unit}" if each.count > 1 else NONE
+        for each in (over, over_logs)
+    ]
+    return [f"{over.mean:+.{digits}f}{unit}", *errors, str(over.count)]
 
 
 def announcement(workers: int) -> Callable[[Sequence[Cell]], str]:

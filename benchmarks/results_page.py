@@ -197,7 +197,8 @@ SECTIONS = (
     Section(
         "Counterfactual copies",
         "Return less that of no copies, by log and training seed, in the synthetic catalogue; "
-        "mood is the strength of a planted confounder of each session.",
+        "mood is the strength of a planted confounder of each session. Over all sizes: in percent "
+        "of the return without copies.",
         "python benchmarks/counterfactual_copies.py --out runs/copies",
         of("counterfactual_copies", "counterfactual-copies"),
         difference_table,

@@ -7,9 +7,9 @@ import os
 import re
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -335,27 +335,34 @@ def test_without_a_terminal_a_line_says_how_far_it_is(
     assert capsys.readouterr().err.startswith("critic: 13 of 16 steps")
 
 
-@pytest.mark.parametrize("slow", ["draw", "loss"])
-def test_speed_and_waiting_are_measured(tmp_path: Path, slow: str) -> None:
-    module, pause = linear(), 0.05  # seconds; a step on a busy machine may take some 10 ms
+@pytest.mark.parametrize(("draw_takes", "loss_takes"), [(0.75, 0.25), (0.0, 0.5)])
+def test_speed_and_waiting_are_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, draw_takes: float, loss_takes: float
+) -> None:
+    module, seconds = linear(), 0.0  # of a clock that no other work on the machine can slow down
+    clock = SimpleNamespace(perf_counter=lambda: seconds)
+    monkeypatch.setattr("ucfrec.fitting.loop.time", clock)
 
-    def slow_draw(generator: np.random.Generator) -> Tensor:
-        time.sleep(pause if slow == "draw" else 0)
+    def timed_draw(generator: np.random.Generator) -> Tensor:
+        nonlocal seconds
+        seconds += draw_takes
         return draw(generator)
 
-    def slow_loss(batch: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        time.sleep(pause if slow == "loss" else 0)
+    def timed_loss(batch: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        nonlocal seconds
+        seconds += loss_takes
         return squared(module)(batch)
 
     def validate() -> float:
-        time.sleep(0.4)  # counts as neither
+        nonlocal seconds
+        seconds += 4  # counts as neither
         return 0.0
 
     config = LoopConfig(steps=15, batch_size=64, validate_every=5)
-    fit(module, slow_draw, slow_loss, config, tmp_path, seed=1, validate=validate)
+    result = fit(module, timed_draw, timed_loss, config, tmp_path, seed=1, validate=validate)
+    step_takes = draw_takes + loss_takes
+    assert result.seconds == 15 * step_takes + 3 * 4
     logged = read_metrics(tmp_path)
-    for step in (10, 15):  # the first steps also import and allocate
-        assert 0 <= logged["waiting_for_data"][step] <= 1
-        assert (logged["waiting_for_data"][step] > 0.5) == (slow == "draw")
-        # Each step takes a pause at least; five steps and no validation in the time that counts.
-        assert 5 * 64 / (5 * pause + 0.4) < logged["samples_per_second"][step] <= 64 / pause
+    for step in (5, 10, 15):
+        assert logged["waiting_for_data"][step] == draw_takes / step_takes
+        assert logged["samples_per_second"][step] == 64 / step_takes

@@ -99,3 +99,32 @@ def test_an_interrupted_stage_is_not_shared(tmp_path: Path) -> None:
         shared.provide({"seed": 0}, __name__, tmp_path / "out", ("half", "whole"), make)
     assert made == [True]
     assert (tmp_path / "out" / "whole").read_text() == "whole"
+
+
+def test_a_file_that_was_being_copied_is_not_taken_for_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shared = SharedStages(tmp_path / "stages")
+    first, second = tmp_path / "first", tmp_path / "second"
+    for out in (first, second):
+        out.mkdir()
+
+    def make() -> None:
+        (first / "models").mkdir()
+        (first / "models" / "weights").write_text("weights")
+        (first / "report").write_text("the whole report")
+
+    shared.provide({"seed": 0}, __name__, first, ("models", "report"), make)
+
+    def killed(source: Path, to: Path) -> None:
+        Path(to).write_text("the wh")
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("ucfrec.runs.shared_stages.shutil.copyfile", killed)
+        with pytest.raises(KeyboardInterrupt):
+            shared.provide({"seed": 0}, __name__, second, ("report",), make)
+    assert not (second / "report").exists()
+    shared.provide({"seed": 0}, __name__, second, ("models", "report"), make)
+    assert (second / "report").read_text() == "the whole report"
+    assert (second / "models" / "weights").read_text() == "weights"

@@ -88,7 +88,8 @@ def train_run(
         on_all_rows: train on the validation and test episodes too, and keep the last weights; see
             `ucfrec.runs.refit`.
         shared: reward models and copies that runs on the same store have in common where their
-            settings of these stages and their seeds agree; by default a run makes its own.
+            settings of these stages and their seeds agree; by default a run makes its own. The
+            time of a stage is in the record of the run that made it.
 
     Returns:
         The content of `run.json`: provenance, configuration and the report of every stage.

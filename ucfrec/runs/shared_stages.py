@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ucfrec.code_version import code_version
-from ucfrec.files import atomic_folder
+from ucfrec.files import atomic_file, atomic_folder
 from ucfrec.locks import claim
 from ucfrec.provenance import config_hash
 
@@ -35,14 +35,14 @@ class SharedStages:
             module: of the code of the stage; another version of it makes the stage anew.
             out: run folder.
             names: files and folders of the stage in `out`, those that are made; the last one marks
-                the stage as finished and is copied last.
+                the stage as finished, and is copied last. No file is ever there in part.
             make: makes them.
         """
         if self.folder is None:
             make()
             return
         stage = self.folder / config_hash({**inputs, "code": code_version(module)})
-        with claim(stage.with_name(f"{stage.name}-made"), wait=True):
+        with claim(stage, wait=True):
             if stage.exists():
                 _copy(stage, out, names)
                 return
@@ -58,6 +58,11 @@ OWN: Final = SharedStages(None)
 def _copy(source: Path, to: Path, names: Sequence[str]) -> None:
     for name in names:
         if (source / name).is_dir():
-            shutil.copytree(source / name, to / name, dirs_exist_ok=True)
+            shutil.copytree(source / name, to / name, dirs_exist_ok=True, copy_function=_copy_file)
         elif (source / name).exists():
-            shutil.copyfile(source / name, to / name)
+            _copy_file(source / name, to / name)
+
+
+def _copy_file(source: str | Path, to: str | Path) -> None:
+    with atomic_file(Path(to)) as scratch:
+        shutil.copyfile(source, scratch)

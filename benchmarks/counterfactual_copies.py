@@ -10,7 +10,8 @@ largest training return; only `none+tilt` chooses, on its log, a weight of the r
 
 Appends the rows to results.jsonl in --out, or to --results; a measured row is not measured again.
 Prints each arm's return less that of `none`, paired by log and training seed: the mean, its
-standard error over all pairs, and that of the means of logs, which counts what logs differ by.
+standard error over all pairs, that of the means of logs, which counts what logs differ by, and how
+many pairs are ahead.
 """
 
 import argparse
@@ -18,7 +19,7 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -137,8 +138,21 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
 
 Pair = tuple[int | None, int | None]
 """Seeds of a log and of a training on it."""
-Differences = dict[str, tuple[Summary, Summary]]
-"""By arm, over pairs and over the means of logs."""
+
+
+class Compared(NamedTuple):
+    """Differences of one arm to `none`."""
+
+    pairs: Summary
+    """Over pairs of a log and a training seed."""
+    logs: Summary
+    """Over the means of logs."""
+    ahead: int
+    """Pairs with a difference above 0."""
+
+
+Differences = dict[str, Compared]
+"""By arm."""
 
 
 def compared(rows: Sequence[ResultRow]) -> dict[tuple[float, int], Differences]:
@@ -192,10 +206,11 @@ def _less(values: dict[Pair, float], base: dict[Pair, float]) -> dict[Pair, floa
     return {pair: value - base[pair] for pair, value in values.items() if pair in base}
 
 
-def _summaries(differences: dict[Pair, float]) -> tuple[Summary, Summary]:
+def _summaries(differences: dict[Pair, float]) -> Compared:
     by_log = grouped(differences.items(), lambda item: item[0][0]).values()
     over_logs = summary(float(np.mean([d for _, d in own])) for own in by_log)
-    return summary(differences.values()), over_logs
+    ahead = sum(difference > 0 for difference in differences.values())
+    return Compared(summary(differences.values()), over_logs, ahead)
 
 
 def difference_table(rows: Sequence[ResultRow]) -> str:
@@ -208,7 +223,7 @@ def difference_table(rows: Sequence[ResultRow]) -> str:
     for mood, of_arm in sorted(over_sizes(rows).items()):
         arms = [name for name in _in_order(of_arm) if name != "none"]
         lines += [(f"{mood:g}", "all", arm, NONE, *_told(arm, of_arm, 1, "%")) for arm in arms]
-    head = ("mood", "sessions", "arm", "R_cum", "− none", "SE over pairs", "SE over logs", "pairs")
+    head = ("mood", "sessions", "arm", "R_cum", "− none", "SE over pairs", "SE over logs", "ahead")
     return markdown_table(head, lines)
 
 
@@ -218,14 +233,14 @@ def _in_order(of_arm: Differences) -> list[str]:
 
 def _told(arm: str, of_arm: Differences, digits: int, unit: str) -> list[str]:
     """The last four columns of the table."""
-    over, over_logs = of_arm[arm]
+    over, over_logs, ahead = of_arm[arm]
     if arm == "none" or not over.count:
         return [NONE] * 4
     errors = [
         f"{each.standard_error:.{digits}f}{unit}" if each.count > 1 else NONE
         for each in (over, over_logs)
     ]
-    return [f"{over.mean:+.{digits}f}{unit}", *errors, str(over.count)]
+    return [f"{over.mean:+.{digits}f}{unit}", *errors, f"{ahead} of {over.count}"]
 
 
 def announcement(workers: int) -> Callable[[Sequence[Cell]], str]:

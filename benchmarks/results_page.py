@@ -280,7 +280,7 @@ def draw(files: Mapping[str, Sequence[ResultRow]], folder: Path) -> list[Path]:
             axes.axhline(0.0, color=PLAIN, linewidth=0.8)
             for arm in [name for name in ARMS if name != "none"]:
                 of_mood = sorted((size, own) for (m, size), own in copies.items() if m == mood)
-                measured = [(size, own[arm][0]) for size, own in of_mood if arm in own]
+                measured = [(size, own[arm].pairs) for size, own in of_mood if arm in own]
                 if not measured:
                     continue
                 sizes, found = zip(*measured, strict=True)

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.code_version import code_version, plugin_module
 from ucfrec.commands.demo import BEHAVIORS, LEARNERS, WORLDS, DemoConfig, demo
 from ucfrec.policies.registry import policy_class
@@ -38,8 +39,10 @@ def row_of(evaluation: Mapping[str, Any], seed: int, code: str) -> ResultRow:
         code_version=code,
         data_fingerprint=evaluation["fingerprint"],
     )
-    rule = "target return: the largest of training" if trained else None
-    return evaluation_row(evaluation, key, rule=rule)
+    if not trained:
+        return evaluation_row(evaluation, key)
+    rule = DecisionRule.from_dict(evaluation["decision_rule"], f"the evaluation of {name}")
+    return evaluation_row(evaluation, key, rule=f"{rule} ({rule.hash})")
 
 
 def main() -> None:

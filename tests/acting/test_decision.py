@@ -387,5 +387,7 @@ def test_a_rule_needs_what_it_uses() -> None:
     with pytest.raises(InputError, match="tag_run 11; give a whole number from 0 to 10"):
         DecisionRule(1.0, tag_run=11)
     tagged = Likeness.of(replace(states, tags=TAGS))
-    with pytest.raises(InputError, match=f"policy remembers {K - 1} "):
-        Decider(policy, DecisionRule(1.0, tag_window=K), likeness=tagged)
+    assert K < 10  # items further back than the policy sees are known from the session
+    Decider(policy, DecisionRule(1.0, tag_window=10), likeness=tagged)
+    with pytest.raises(InputError, match="of a session 10 are known"):
+        Decider(policy, DecisionRule(1.0, tag_window=11), likeness=tagged)

@@ -34,6 +34,7 @@ RULES = {
     "learned": DecisionRule(None, temperature=1.0),
     "filters": DecisionRule(3.0, temperature=2.0, top_k=9, exclude_seen=True, tag_window=2),
     "run": DecisionRule(3.0, temperature=1.0, tag_run=2),
+    "far": DecisionRule(3.0, temperature=1.0, tag_window=8),  # further than the policy sees
 }
 MORE = {"session": {}, "horizon": {"policy.return_to_go": "horizon", "policy.horizon": 2}}
 
@@ -68,15 +69,16 @@ def last_sessions(log: pd.DataFrame) -> Iterator[tuple[Any, list[int], list[floa
             yield user, latest.item_id.tolist(), latest.reward.tolist()
 
 
-def test_logged_sessions_are_read_as_far_back_as_a_tag_run(
+def test_logged_sessions_are_read_as_far_back_as_a_rule_looks(
     folder: Path, trained: TrainedPolicy
 ) -> None:
-    decider = trained.decider(DecisionRule(3.0, tag_run=10))
-    assert decider.policy.config.context < 10
-    assert decider.reward_model is None
-    logged = EpisodeStore.open(folder / "store")
-    known = LoggedDecisions.at(decider, logged, np.array([0]), logged.lengths[:1] - 1)
-    assert known.shown.items.shape == (1, 10)
+    for rule in (DecisionRule(3.0, tag_run=10), DecisionRule(3.0, tag_window=10)):
+        decider = trained.decider(rule)
+        assert decider.policy.config.context < 10
+        assert decider.reward_model is None
+        logged = EpisodeStore.open(folder / "store")
+        known = LoggedDecisions.at(decider, logged, np.array([0]), logged.lengths[:1] - 1)
+        assert known.shown.items.shape == (1, 10)
 
 
 @pytest.mark.parametrize("rule", RULES)

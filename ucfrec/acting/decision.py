@@ -238,13 +238,17 @@ class Decider:
                 "the rule leaves out items by their main tag, but the store has none; give the "
                 "items a column of lists, or set the tag run to 0"
             )
-        before = self.policy.config.context - 1
-        if self.rule.tag_window > before:
+        if self.rule.tag_window > self.known:
             raise InputError(
-                f"the rule looks at the tags of the last {self.rule.tag_window} items, but the "
-                f"policy remembers {before} (policy.context less 1); set the tag window to at most "
-                f"{before}"
+                f"the rule looks at the tags of the last {self.rule.tag_window} items, but of a "
+                f"session {self.known} are known ({WINDOW}, or policy.context less 1 if that is "
+                f"more); set the tag window to at most {self.known}"
             )
+
+    @property
+    def known(self) -> int:
+        """The number of items of a session that are known at least, once it has shown them."""
+        return max(self.policy.config.context - 1, WINDOW)
 
     @torch.no_grad()
     def asked(self, windows: Windows, collected: Tensor) -> Windows:
@@ -321,7 +325,9 @@ class Decider:
         if forbidden is not None:
             scores = scores.masked_fill(forbidden, -torch.inf)
         before = Shown.before_last(windows)
-        scores = self.without_tired_tags(self.without_recent_tags(scores, before), shown or before)
+        earlier = shown or before
+        recent = before if self.rule.tag_window < windows.mask.shape[1] else earlier
+        scores = self.without_tired_tags(self.without_recent_tags(scores, recent), earlier)
         none = torch.isneginf(scores.amax(1))
         if none.any():
             raise InputError(

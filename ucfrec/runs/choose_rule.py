@@ -8,6 +8,7 @@ the training log shows often enough, and to more than a handful of them.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -219,9 +220,10 @@ def choose_rule(
     config: RuleConfig,
     seed: int,
 ) -> Choice:
-    """Choose target, floor and temperature, then the tilt, then tag window and tilt.
+    """Choose target, floor and temperature, then the tilt.
 
-    Where the log shows fatigue, a tag run follows, and the tilt with it.
+    Where items have tags, tag window and temperature follow, and the tilt with them; where the log
+    shows fatigue, tag run and temperature, and the tilt with them.
 
     Args:
         decider: the policy under its default rule, with a reward model.
@@ -237,14 +239,14 @@ def choose_rule(
     first = search.best(played)
     played.extend(search.play([*_tilted(config, first.rule)]))
     second = search.best(_simplest_first(played))
-    longest = decider.policy.config.context - 1
     if validation.item_states.tags.shape[1]:
-        played.extend(search.play([*_filtered(config, second.rule, longest)]))
-        if search.fatigue is not None:
-            # Without a tag window, which may only have served to tire nobody.
-            limited = search.play([*_limited(config, second.rule)])
-            tilted = search.play([*_tilted(config, search.best(_simplest_first(limited)).rule)])
-            played.extend([*limited, *tilted])
+        limits = [_filtered(config, second.rule, decider.known)]
+        # Without a tag window, which may only have served to tire nobody.
+        limits += [] if search.fatigue is None else [_limited(config, second.rule)]
+        for limit in limits:
+            if limited := search.play([*limit]):
+                third = search.best(_simplest_first(limited))
+                played.extend([*limited, *search.play([*_tilted(config, third.rule)])])
     best = search.best(_simplest_first(played))
     supported, least_items = search.allowed(best), float(search.least_items)
     return Choice(best.rule, played, search.calibration, search.fatigue, least_items, supported)
@@ -259,19 +261,27 @@ def _simplicity(candidate: Candidate) -> tuple[float, ...]:
     return rule.tag_run > 0, rule.tag_window > 0, rule.tilt, -rule.tag_run
 
 
+def _filtered(config: RuleConfig, rule: DecisionRule, known: int) -> Iterator[DecisionRule]:
+    """Rules with a tag window of items that are `known`.
+
+    At all temperatures: at a low one, the log may support what the policy shows only once some
+    items are left out.
+    """
+    for temperature, window in product(_own_first(config, rule), config.tag_windows):
+        if 0 < window <= known:
+            yield replace(rule, temperature=temperature, tag_window=window)
+
+
 def _limited(config: RuleConfig, rule: DecisionRule) -> Iterator[DecisionRule]:
-    """Rules with a tag run."""
-    for run in config.tag_runs:
+    """Rules with a tag run, at all temperatures too."""
+    for temperature, run in product(_own_first(config, rule), config.tag_runs):
         if run:
-            yield replace(rule, tag_run=run)
+            yield replace(rule, temperature=temperature, tag_run=run)
 
 
-def _filtered(config: RuleConfig, rule: DecisionRule, longest: int) -> Iterator[DecisionRule]:
-    """Rules with a tag window, of steps that the policy remembers: `longest` of them."""
-    for window in config.tag_windows:
-        for tilt in config.tilts:
-            if 0 < window <= longest and (tilt >= rule.tilt or tilt == 0):
-                yield replace(rule, tag_window=window, tilt=tilt)
+def _own_first(config: RuleConfig, rule: DecisionRule) -> list[float]:
+    """Temperatures, that of `rule` first: another must be better than by chance."""
+    return sorted(config.temperatures, key=lambda each: (each != rule.temperature, -each))
 
 
 def _untilted(
@@ -287,7 +297,7 @@ def _untilted(
 
 def _tilted(config: RuleConfig, rule: DecisionRule) -> Iterator[DecisionRule]:
     for tilt in config.tilts:
-        if tilt and tilt != rule.tilt:
+        if tilt != rule.tilt:
             yield replace(rule, tilt=tilt)
 
 

@@ -166,6 +166,25 @@ def test_every_kind_of_candidate_is_played(folder: Path, trained: TrainedPolicy)
     assert {rule.floor is None for rule in rules} == {True, False}
 
 
+def test_what_the_log_supports_only_without_recent_tags_is_found(
+    folder: Path, trained: TrainedPolicy
+) -> None:
+    train, validation = training_views(EpisodeStore.open(folder / "store"))
+    # The best shows item 0 for ever, drawing shows items that the log hardly has; items 0 to 3
+    # share no tag.
+    narrow = with_bias(trained, torch.tensor([12.0, 10.0, 8.0, 6.0] + [0.0] * 20))
+    config = replace(
+        FEW,
+        least_impressions=int(train.item_counts()[:4].min()),
+        temperatures=(0.0, 4.0),
+        tilts=(0.0,),
+        tag_windows=(0, 3),
+    )
+    found = choose_rule(narrow, {0.9: 2.0, 1.0: 2.0}, train, validation, config, 0)
+    assert found.supported
+    assert found.rule == DecisionRule(2.0, temperature=0.0, tag_window=3)
+
+
 def test_users_who_tire_are_shown_no_longer_runs(tmp_path: Path, trained: TrainedPolicy) -> None:
     store = tiring_store(tmp_path)
     train, validation = training_views(store)

@@ -198,6 +198,9 @@ def test_users_who_tire_are_shown_no_longer_runs(tmp_path: Path, trained: Traine
     assert found.rule.tag_run == 2
     runs = {candidate.rule.tag_run for candidate in found.candidates}
     assert runs == set(FEW.tag_runs)
+    none = replace(config, tag_runs=(0,))
+    unlimited = choose_rule(decider, {0.9: 2.0, 1.0: 3.0}, train, validation, none, 0)
+    assert {candidate.rule.tag_run for candidate in unlimited.candidates} == {0}
     assert found.as_dict()["fatigue"]["length"] == 3
 
 

@@ -222,8 +222,8 @@ def choose_rule(
 ) -> Choice:
     """Choose target, floor and temperature, then the tilt.
 
-    Where items have tags, tag window and temperature follow, and the tilt with them; where the log
-    shows fatigue, tag run and temperature, and the tilt with them.
+    Where items have tags, tag window and temperature follow, and the tilt with the window; where
+    the log shows fatigue, tag run and temperature, and the tilt.
 
     Args:
         decider: the policy under its default rule, with a reward model.
@@ -240,13 +240,17 @@ def choose_rule(
     played.extend(search.play([*_tilted(config, first.rule)]))
     second = search.best(_simplest_first(played))
     if validation.item_states.tags.shape[1]:
-        limits = [_filtered(config, second.rule, decider.known)]
+        if filtered := search.play([*_filtered(config, second.rule, decider.known)]):
+            third = search.best(_simplest_first(filtered)).rule
+            windows = {each.rule.tag_window for each in filtered}
+            others = (replace(third, tag_window=window) for window in sorted(windows))
+            tilted = search.play([rule for other in others for rule in _tilted(config, other)])
+            played.extend([*filtered, *tilted])
         # Without a tag window, which may only have served to tire nobody.
-        limits += [] if search.fatigue is None else [_limited(config, second.rule)]
-        for limit in limits:
-            if limited := search.play([*limit]):
-                third = search.best(_simplest_first(limited))
-                played.extend([*limited, *search.play([*_tilted(config, third.rule)])])
+        runs = [] if search.fatigue is None else [*_limited(config, second.rule)]
+        if limited := search.play(runs):
+            third = search.best(_simplest_first(limited)).rule
+            played.extend([*limited, *search.play([*_tilted(config, third)])])
     best = search.best(_simplest_first(played))
     supported, least_items = search.allowed(best), float(search.least_items)
     return Choice(best.rule, played, search.calibration, search.fatigue, least_items, supported)

@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -162,7 +163,8 @@ def test_every_kind_of_candidate_is_played(folder: Path, trained: TrainedPolicy)
     assert len(set(rules)) == len(rules)
     assert {rule.temperature for rule in rules} == set(FEW.temperatures)
     assert {rule.tilt for rule in rules} == set(FEW.tilts)
-    assert {rule.tag_window for rule in rules} == {0, 3, 10}
+    together = {(rule.tag_window, rule.tilt) for rule in rules}
+    assert together == set(product((0, 3, 10), FEW.tilts))
     assert {rule.floor is None for rule in rules} == {True, False}
 
 

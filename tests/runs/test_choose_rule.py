@@ -206,6 +206,27 @@ def test_users_who_tire_are_shown_no_longer_runs(tmp_path: Path, trained: Traine
     assert found.as_dict()["fatigue"]["length"] == 3
 
 
+def test_of_rules_that_the_model_cannot_tell_apart_the_widest_draws_are_taken(
+    tmp_path: Path, trained: TrainedPolicy
+) -> None:
+    store = tiring_store(tmp_path)
+    train, validation = training_views(store)
+    model, _ = fit_item_reward_model(train, validation, tmp_path / "model", 0)
+    one_tag = torch.where(torch.arange(24) % 4 == 0, 9.0, 0.0)
+    decider = replace(with_bias(trained, one_tag), reward_model=model)
+    config = replace(FEW, tag_windows=(0,), tolerance=0.1)
+    found = choose_rule(decider, {0.9: 2.0, 1.0: 3.0}, train, validation, config, 0)
+    rule = found.rule
+    assert rule.tag_run > 0
+    same_run = [each for each in found.candidates if each.rule.tag_run == rule.tag_run]
+    drawn = {(each.rule.temperature, each.rule.tilt) for each in same_run}
+    assert drawn == set(product(config.temperatures, config.tilts))
+    top = max(each.value for each in found.candidates)
+    level = [each for each in same_run if each.value >= 0.9 * top and each.items >= 2]
+    assert len({each.rule.temperature for each in level}) > 1
+    assert rule.temperature == max(each.rule.temperature for each in level)
+
+
 def tiring_store(folder: Path) -> EpisodeStore:
     """Sessions of users who like nothing for 4 steps after 3 likes of one tag on end."""
     rng, rows = np.random.default_rng(0), list[tuple[int, int, int, float]]()

@@ -223,7 +223,8 @@ def choose_rule(
     """Choose target, floor and temperature, then the tilt.
 
     Where items have tags, tag window and temperature follow, and the tilt with the window; where
-    the log shows fatigue, tag run and temperature, and the tilt.
+    the log shows fatigue, the tag run, and temperature and tilt with it. Of rules that the model
+    cannot tell apart, the one at the highest temperature is taken, which stays nearest to the log.
 
     Args:
         decider: the policy under its default rule, with a reward model.
@@ -250,7 +251,7 @@ def choose_rule(
         runs = [] if search.fatigue is None else [*_limited(config, second.rule)]
         if limited := search.play(runs):
             third = search.best(_simplest_first(limited)).rule
-            played.extend([*limited, *search.play([*_tilted(config, third)])])
+            played.extend([*limited, *search.play([*_drawn(config, third)])])
     best = search.best(_simplest_first(played))
     supported, least_items = search.allowed(best), float(search.least_items)
     return Choice(best.rule, played, search.calibration, search.fatigue, least_items, supported)
@@ -262,7 +263,7 @@ def _simplest_first(candidates: Sequence[Candidate]) -> list[Candidate]:
 
 def _simplicity(candidate: Candidate) -> tuple[float, ...]:
     rule = candidate.rule
-    return rule.tag_run > 0, rule.tag_window > 0, rule.tilt, -rule.tag_run
+    return rule.tag_run > 0, rule.tag_window > 0, -rule.temperature, rule.tilt, -rule.tag_run
 
 
 def _filtered(config: RuleConfig, rule: DecisionRule, known: int) -> Iterator[DecisionRule]:
@@ -277,10 +278,17 @@ def _filtered(config: RuleConfig, rule: DecisionRule, known: int) -> Iterator[De
 
 
 def _limited(config: RuleConfig, rule: DecisionRule) -> Iterator[DecisionRule]:
-    """Rules with a tag run, at all temperatures too."""
-    for temperature, run in product(_own_first(config, rule), config.tag_runs):
+    """Rules with a tag run."""
+    for run in config.tag_runs:
         if run:
-            yield replace(rule, temperature=temperature, tag_run=run)
+            yield replace(rule, tag_run=run)
+
+
+def _drawn(config: RuleConfig, rule: DecisionRule) -> Iterator[DecisionRule]:
+    """The rule at every other pair of temperature and tilt."""
+    for temperature, tilt in product(config.temperatures, config.tilts):
+        if (temperature, tilt) != (rule.temperature, rule.tilt):
+            yield replace(rule, temperature=temperature, tilt=tilt)
 
 
 def _own_first(config: RuleConfig, rule: DecisionRule) -> list[float]:

@@ -191,7 +191,9 @@ def test_the_contrast_teaches_to_answer_what_was_asked(sizes: dict[str, int]) ->
         trained(policy, windows, 60)
         torch.manual_seed(0)
         normalized = policy.normalized(windows)
-        return policy.contrastive_loss(normalized, policy.features(normalized)).item()
+        encoded = policy.tokens(normalized)[1:]
+        features = policy.features(normalized)
+        return policy.contrastive_loss(normalized, encoded, features).item()
 
     assert contrast(10.0) < 0.85 * contrast(0.0)
 

@@ -9,11 +9,11 @@ from torch import Tensor
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.policies.base import SequencePolicy, interleave
-from ucfrec.policies.bc import BCConfig, BCPolicy
 from ucfrec.policies.dc import DCConfig, DCPolicy
 from ucfrec.policies.dt import DTConfig, DTPolicy
 from ucfrec.policies.losses import parent_targets
 from ucfrec.policies.lsdt import LSDTConfig, LSDTPolicy
+from ucfrec.policies.registry import policy_class
 from ucfrec.policies.ucf import UCFConfig, UCFPolicy
 
 B, K, S, A, ITEMS = 3, 7, 5, 2, 11
@@ -24,17 +24,9 @@ SMALL = {"context": K, "dim": 16}
 
 def build(name: str, sizes: dict[str, int]) -> SequencePolicy:
     torch.manual_seed(0)
-    policy: SequencePolicy
-    if name == "ucf":
-        policy = UCFPolicy(UCFConfig(**SMALL), sizes)
-    elif name == "dt":
-        policy = DTPolicy(DTConfig(**SMALL), sizes)
-    elif name == "dc":
-        policy = DCPolicy(DCConfig(**SMALL), sizes)
-    elif name == "lsdt":
-        policy = LSDTPolicy(LSDTConfig(**SMALL, kernel_groups=4), sizes)
-    else:
-        policy = BCPolicy(BCConfig(**SMALL), sizes)
+    learner = policy_class(name)
+    own = {"kernel_groups": 4} if name == "lsdt" else {}
+    policy = learner(learner.Config(**SMALL, **own), sizes)
     if sizes["items"]:
         policy.head.start_from(torch.randn(ITEMS, 4), torch.rand(ITEMS))
     for parameter in policy.parameters():
@@ -74,7 +66,9 @@ sequence = pytest.mark.parametrize("name", ["ucf", "dt", "dc", "lsdt"])
 
 
 @both_heads
-@pytest.mark.parametrize("name", ["ucf", "dt", "dc", "lsdt", "bc"])
+@pytest.mark.parametrize(
+    "name", ["ucf", "dt", "dt4rec", "cdt4rec", "edt4rec", "sasrec", "dc", "lsdt", "bc"]
+)
 def test_the_last_features_are_the_last_row_of_all(name: str, sizes: dict[str, int]) -> None:
     policy, windows = build(name, sizes), random_windows(sizes)
     with torch.no_grad():

@@ -30,8 +30,8 @@ class DT4RecConfig(DTConfig):
     recurrent_dropout: Dropout = 0.2
     """Dropout between the two layers of the recurrent encoders."""
     negatives: Annotated[int, Field(ge=1, le=1000)] = 4
-    """Wrong returns-to-go per window in the contrastive loss, each of which costs a forward pass;
-    the paper has 8."""
+    """Wrong returns-to-go per window in the contrastive loss, each of which costs a forward pass of
+    the Transformer; the paper has 8."""
     contrastive_weight: Weight = 0.1
     """Weight of the contrastive loss; 0 gives the loss of the public code."""
     temperature: Annotated[float, Field(gt=0, le=1000)] = 0.07
@@ -66,19 +66,23 @@ class DT4RecPolicy(DTPolicy):
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         """Action loss plus weighted contrastive loss over all steps, and scalars to log."""
         config, normalized = self.config, self.normalized(windows)
-        features = self.features(normalized)
+        tokens = self.tokens(normalized)
+        features = self.attended(tokens, normalized.mask)[:, 1::3]
         imitation, scalars = self.imitation(features, normalized)
         if config.contrastive_weight == 0:
             return imitation, scalars
-        contrast = self.contrastive_loss(normalized, features)
+        contrast = self.contrastive_loss(normalized, tokens[1:], features)
         scalars["contrastive_loss"] = contrast.detach()
         return imitation + config.contrastive_weight * contrast, scalars
 
-    def contrastive_loss(self, windows: Windows, features: Tensor) -> Tensor:
+    def contrastive_loss(
+        self, windows: Windows, encoded: tuple[Tensor, Tensor], features: Tensor
+    ) -> Tensor:
         """InfoNCE (nats) of the logged return against those of other windows, mean over all steps.
 
         Args:
             windows: B normalised windows.
+            encoded: their tokens s_t and a_t, (B, K, d) each, which returns do not change.
             features: (B, K, d) their features.
         """
         config, mask = self.config, windows.mask
@@ -88,7 +92,8 @@ class DT4RecPolicy(DTPolicy):
             other = torch.randperm(len(mask), device=mask.device)
             both_valid = mask & mask[other]
             returns = torch.where(both_valid, windows.returns_to_go[other], windows.returns_to_go)
-            negative = self.features(replace(windows, returns_to_go=returns))
+            asked = self.embed.returns(replace(windows, returns_to_go=returns))
+            negative = self.attended((asked, *encoded), mask)[:, 1::3]
             score = F.cosine_similarity(negative[mask], actions, dim=-1)
             # An equal return-to-go is not a negative.
             same = (returns == windows.returns_to_go)[mask]
@@ -114,10 +119,17 @@ class PromptedEmbedding(TokenEmbedding):
         """Tokens of returns-to-go, states and actions, (B, K, d) each; see `TokenEmbedding`."""
         states = _recurrent(self.states, self.embed_state(windows.states), windows.mask)
         actions = _recurrent(self.actions, actions, windows.mask)
+        time = self._time(windows)
+        return self.returns(windows), self.norm(states + time), self.norm(actions + time)
+
+    def returns(self, windows: Windows) -> Tensor:
+        """Tokens of returns-to-go alone, (B, K, d)."""
+        prompts = self.embed_return(windows.returns_to_go.unsqueeze(-1))
+        return self.norm(prompts + self._time(windows))  # type: ignore[no-any-return]
+
+    def _time(self, windows: Windows) -> Tensor:
         last = self.embed_timestep.num_embeddings - 1
-        time = self.embed_timestep(windows.timesteps.clamp(max=last))
-        returns = self.embed_return(windows.returns_to_go.unsqueeze(-1))
-        return self.norm(returns + time), self.norm(states + time), self.norm(actions + time)
+        return self.embed_timestep(windows.timesteps.clamp(max=last))  # type: ignore[no-any-return]
 
 
 class RewardPrompt(nn.Module):

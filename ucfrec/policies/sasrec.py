@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import Layers, SequencePolicy
-from ucfrec.policies.dt import Block, DTConfig, visible_tokens
+from ucfrec.policies.dt import Block, DTConfig, rows_through, visible_tokens
 from ucfrec.policies.layers import Dropout
 from ucfrec.settings import settings_table
 
@@ -38,14 +38,23 @@ class SASRecPolicy(SequencePolicy):
 
     def features(self, windows: Windows) -> Tensor:
         """Features (B, K, d); row t depends on the actions before t."""
+        hidden, visible = self._tokens(windows)
+        for block in self.blocks:
+            hidden = block(hidden, visible)
+        return self.final_norm(hidden)  # type: ignore[no-any-return]
+
+    def last_features(self, windows: Windows) -> Tensor:
+        """Row K − 1 of `features`, (B, d), without what the last block has for other steps."""
+        step = slice(-1, None)
+        return self.final_norm(rows_through(self.blocks, *self._tokens(windows), step))[:, 0]  # type: ignore[no-any-return]
+
+    def _tokens(self, windows: Windows) -> tuple[Tensor, Tensor]:
+        """The first block's tokens (B, K, d), and which of them see which, (B, 1, K, K)."""
         before = self.head.embed(windows.actions).roll(1, dims=1)
         # The first step of a window has no earlier action in the window.
         known = windows.mask & windows.mask.roll(1, dims=1)
         known[:, 0] = False
         last = self.embed_timestep.num_embeddings - 1
         time = self.embed_timestep(windows.timesteps.clamp(max=last))
-        hidden = self.dropout(before.masked_fill(~known.unsqueeze(-1), 0.0) + time)
-        visible = visible_tokens(windows.mask)
-        for block in self.blocks:
-            hidden = block(hidden, visible)
-        return self.final_norm(hidden)  # type: ignore[no-any-return]
+        tokens = before.masked_fill(~known.unsqueeze(-1), 0.0) + time
+        return self.dropout(tokens), visible_tokens(windows.mask)

@@ -35,6 +35,10 @@ class Budget:
     """Logs of every task: simulated ones of as many seeds, or parts of a given log."""
     tasks: tuple[str, ...]
     """Tasks of the main table."""
+    swept: tuple[str, ...]
+    """Tasks of the sweeps; `--task` can name all of `SWEPT`."""
+    distracted: tuple[str, ...]
+    """Tasks of the distractor table; `--task` can name all of `DISTRACTED`."""
     sessions: int
     """Sessions collected where logs are simulated."""
     settings: tuple[str, ...]
@@ -44,14 +48,23 @@ class Budget:
     evaluation: EvaluationPlan
 
 
+SWEPT: Final = ("synthetic-catalog", "synthetic-taobao")
+"""Tasks that can be swept. Not VirtualTaobao: there all sequence policies reach the maximum
+return."""
+DISTRACTED: Final = {"synthetic-taobao": 0, "synthetic-catalog": 0, "kuairand": 2}
+"""Tasks that can have a distractor, and the index of the world that is played. KuaiRand is played
+as NX_10: all its sessions have the same length, so early exits do not hide the distractor's
+effect."""
 MAIN: Final = ("kuairand", "kuairec", "virtual-taobao", "synthetic-catalog", "sardine-boredinf")
 BUDGETS: Final[Mapping[str, Budget]] = {
-    # Sized for two cores: smaller width, fewer steps, smaller logs, and cheaper settings of two
-    # baselines; methods and seeds are not reduced.
+    # Sized for two cores: smaller width, fewer steps, smaller logs, fewer tasks beside those of the
+    # main table, and cheaper settings of two baselines; methods and seeds are not reduced.
     "small": Budget(
         seeds=3,
         logs=2,
         tasks=MAIN,
+        swept=("synthetic-catalog",),
+        distracted=("synthetic-taobao", "synthetic-catalog"),
         sessions=6000,
         settings=(
             "policy.dim=64",
@@ -69,6 +82,8 @@ BUDGETS: Final[Mapping[str, Budget]] = {
         seeds=5,
         logs=3,
         tasks=(*MAIN, "sardine-static"),
+        swept=SWEPT,
+        distracted=tuple(DISTRACTED),
         sessions=50_000,
         settings=("train.steps=20000", "train.learning_rate=3e-4"),
         cuts={},
@@ -91,15 +106,10 @@ DISTRACTOR_TARGETS: Final = (1.0, 0.99)
 """Quantiles of the training returns: the default target, and one nearer to the logs."""
 PURSUED: Final = ("kuairand", "synthetic-catalog", "sardine-boredinf")
 """Tasks of the table of additions, whose actions are items."""
-SWEPT: Final = ("synthetic-catalog", "synthetic-taobao")
-"""Tasks of the sweeps. Not VirtualTaobao: there all sequence policies reach the maximum return."""
 _REAL: Final = {"kuairand": "kuairand", "kuairec": "kuairec", "virtual-taobao": "virtualtaobao"}
 """Tasks that need files outside the package, and the subfolder of the data folder with them."""
 _PACKAGES: Final = {"sardine-static": sardine.PACKAGE, "sardine-boredinf": sardine.PACKAGE}
 """Tasks that need an optional package, and its name."""
-_DISTRACTED_WORLDS: Final = {"synthetic-taobao": 0, "synthetic-catalog": 0, "kuairand": 2}
-"""Tasks with a distractor, and the index of the world that is played. KuaiRand is played as NX_10:
-all its sessions have the same length, so early exits do not hide the distractor's effect."""
 _DISTRACTOR: Final = DistractorWorld.__module__
 _GYMNASIUM_WORLD: Final = gymnasium_world.__name__
 _ADDED: Final[Mapping[str, Method]] = {"ucf": METHODS["ucf"], **ADDITIONS}
@@ -153,7 +163,7 @@ class Plan:
 
     def sweeps(self) -> Iterator[Cell]:
         """Cells of UCF with other λ, bands and gates; the main table has the defaults."""
-        for name in self._available(SWEPT):
+        for name in self._available(SWEPT if self._only else self._budget.swept):
             for log in range(self._budget.logs):
                 spread = _reward_spread(self._task(name, log).store)
                 sweeps = {
@@ -172,12 +182,10 @@ class Plan:
         would use knowledge of the intervention.
         """
         plans = [replace(self._budget.evaluation, target_quantile=q) for q in DISTRACTOR_TARGETS]
-        for name, world_index in _DISTRACTED_WORLDS.items():
-            if name not in self._available(_DISTRACTED_WORLDS):
-                continue
+        for name in self._available(DISTRACTED if self._only else self._budget.distracted):
             for log in range(self._budget.logs):
                 clean = self._task(name, log)
-                world = clean.worlds[world_index]
+                world = clean.worlds[DISTRACTED[name]]
                 planted = clean.store.with_name("distractor-store")
                 if not planted.exists():
                     plant_distractor(EpisodeStore.open(clean.store), planted)

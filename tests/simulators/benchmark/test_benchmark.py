@@ -153,7 +153,7 @@ def test_every_cell_of_every_table_has_a_configuration(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     budget = replace(TINY, seeds=1, tasks=("synthetic-taobao", "synthetic-catalog"))
-    monkeypatch.setattr(plan, "SWEPT", ("synthetic-taobao",))
+    budget = replace(budget, swept=("synthetic-taobao",))
     monkeypatch.setattr(plan, "PURSUED", ("synthetic-catalog",))
     given = Plan(tmp_path, budget)
     every = [*given.main(), *given.additions(), *given.sweeps(), *given.distractor()]
@@ -179,6 +179,14 @@ def test_every_cell_of_every_table_has_a_configuration(
     assert planted.observation_size == 92
     assert [world.rate for world in distractors[0].worlds] == [0.0, 1.0]  # type: ignore[attr-defined]
     assert {cell.evaluation.target_quantile for cell in given.distractor()} == {1.0, 0.99}
+
+
+@pytest.mark.usefixtures("no_data")
+def test_a_task_that_the_budget_leaves_out_is_swept_if_it_is_named(tmp_path: Path) -> None:
+    budget = replace(TINY, seeds=1)
+    assert {cell.task for cell in Plan(tmp_path, budget).sweeps()} == {"synthetic-catalog"}
+    named = Plan(tmp_path, budget, tasks=["synthetic-taobao"])
+    assert {cell.task for cell in named.sweeps()} == {"synthetic-taobao"}
 
 
 @pytest.mark.usefixtures("no_data")

@@ -50,6 +50,6 @@ class RuleConfig:
     """Smallest effective number of items that a rule must show, the exponential of their entropy: a
     page of them; at most a quarter of the items that the log supports."""
     tolerance: Annotated[float, Field(ge=0, lt=1)] = 0.02
-    """Share of the best estimate by which the estimate of a rule with less tilt may fall short: the
-    standard error of the sessions, which is allowed in any case, does not count what the model of
-    the users gets wrong."""
+    """Share of the best estimate by which that of a rule at a higher temperature, or with less
+    tilt, may fall short: the standard error of the sessions, which is allowed in any case, does not
+    count what the model of the users gets wrong."""

@@ -11,7 +11,7 @@ _COPIES: Final = {"kuairand": 38.0, "kuairec": 38.0}
 """CPU seconds of a reward model, a generator and their copies, by task."""
 _REWARDS: Final = {"sardine-boredinf": 15.0, "sardine-static": 15.0}
 """CPU seconds of a reward model of items, by task."""
-_CHOICE: Final = {"kuairand": 12.0, "kuairec": 12.0, "sardine-boredinf": 50.0}
+_CHOICE: Final = {"kuairand": 12.0, "kuairec": 12.0, "sardine-boredinf": 90.0}
 """CPU seconds of the choice of a decision rule, by task."""
 _ELSE: Final = {"step": 0.06, "copies": 45.0, "rewards": 11.0, "choice": 10.0}
 """The same of other tasks."""

@@ -272,7 +272,7 @@ def _filtered(config: RuleConfig, rule: DecisionRule, known: int) -> Iterator[De
     At all temperatures: at a low one, the log may support what the policy shows only once some
     items are left out.
     """
-    for temperature, window in product(_own_first(config, rule), config.tag_windows):
+    for temperature, window in product(config.temperatures, config.tag_windows):
         if 0 < window <= known:
             yield replace(rule, temperature=temperature, tag_window=window)
 
@@ -289,11 +289,6 @@ def _drawn(config: RuleConfig, rule: DecisionRule) -> Iterator[DecisionRule]:
     for temperature, tilt in product(config.temperatures, config.tilts):
         if (temperature, tilt) != (rule.temperature, rule.tilt):
             yield replace(rule, temperature=temperature, tilt=tilt)
-
-
-def _own_first(config: RuleConfig, rule: DecisionRule) -> list[float]:
-    """Temperatures, that of `rule` first: another must be better than by chance."""
-    return sorted(config.temperatures, key=lambda each: (each != rule.temperature, -each))
 
 
 def _untilted(

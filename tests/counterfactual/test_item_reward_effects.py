@@ -34,6 +34,7 @@ def design(rows: int, binary: bool, items: int = 12, users: int = 9) -> Design:
         n_tags=4,
         n_users=users,
         binary=binary,
+        weights=torch.ones(rows),
     )
 
 

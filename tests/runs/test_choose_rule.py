@@ -206,6 +206,25 @@ def test_users_who_tire_are_shown_no_longer_runs(tmp_path: Path, trained: Traine
     assert found.as_dict()["fatigue"]["length"] == 3
 
 
+def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_path: Path) -> None:
+    one = ("temperatures=[1.0]", "tilts=[0.0, 4.0]", "tag_windows=[0]", "tag_runs=[0]")
+    rule = [
+        f"rule.{each}" for each in (*one, "sessions=40", "least_items=2", "least_impressions=1")
+    ]
+    config = resolve_config("bc", None, [*SMALL, "train.validate_every=20", *rule])
+    record = train_run(tiring_store(tmp_path), tmp_path / "run", config)
+    assert record["reward_model"]["new_users"]
+    assert "tastes of training users" in record["rule"]["chosen_by"]
+    users = record["rule"]["users"]
+    assert users["steps"] == users["effective_steps"] == record["train_steps"]
+    assert list(users["calibration"]) == record["rule"]["calibration"]
+    # Nothing that acts knows these tastes.
+    model = TrainedPolicy.load(tmp_path / "run").reward_model
+    assert model is not None
+    assert not model.affinity.any()
+    assert not model.user.any()
+
+
 def test_of_rules_that_the_model_cannot_tell_apart_the_widest_draws_are_taken(
     tmp_path: Path, trained: TrainedPolicy
 ) -> None:

@@ -51,10 +51,14 @@ class Design:
     n_tags: int
     n_users: int
     binary: bool
+    weights: Tensor
+    """(M,) how many rows each row counts for."""
 
     @classmethod
-    def of(cls, model: ItemRewardModel, rows: RewardRows) -> "Design":
-        """The design of `rows`, with the statistics of `model`."""
+    def of(
+        cls, model: ItemRewardModel, rows: RewardRows, weights: Tensor | None = None
+    ) -> "Design":
+        """The design of `rows`, with the statistics of `model`; without `weights` all count one."""
         likeness, last = model.likeness, len(model.user) - 1
         n_tags = int(likeness.n_tags)
         known = (rows.users >= 0) & (rows.users < last)
@@ -70,6 +74,7 @@ class Design:
             n_tags=n_tags,
             n_users=last,
             binary=bool(model.binary),
+            weights=torch.ones(len(rows)) if weights is None else weights,
         )
 
     def select(self, rows: Tensor) -> "Design":
@@ -82,6 +87,7 @@ class Design:
             exposure=self.exposure[rows],
             target=self.target[rows],
             rows=self.rows[rows],
+            weights=self.weights[rows],
         )
 
     def of_unknown_users(self) -> "Design":
@@ -128,25 +134,33 @@ class Design:
         return tags[self.tags].sum(1) + self.vectors @ content[self.n_tags :]
 
     def squares(self, name: str) -> Tensor:
-        """Sum over rows of the squares of what each number of the effect `name` multiplies."""
-        vectors, sums = self.rows.square(), self.zeros(name)
+        """Weighted sum over rows of the squares of what each number of the effect multiplies."""
+        each = self.weights.unsqueeze(1)
+        vectors, sums = each * self.rows.square(), self.zeros(name)
         match name:
             case "mean":
-                return sums + len(self.items)
+                return sums + self.count
             case "item":
-                return sums.index_add(0, self.items, torch.ones(len(self.items)))
+                return sums.index_add(0, self.items, self.weights)
             case "user":
-                return sums.index_add(0, self.users, torch.ones(len(self.items)))
+                return sums.index_add(0, self.users, self.weights)
             case "content":
-                tags = torch.bincount(self.tags[self.items].flatten(), minlength=self.n_tags + 1)
-                return torch.cat([tags[: self.n_tags].float(), vectors.sum(0)])
+                tags = self.tags[self.items]
+                counts = torch.zeros(self.n_tags + 1)
+                counts.index_add_(0, tags.flatten(), each.expand(tags.shape).flatten())
+                return torch.cat([counts[: self.n_tags], vectors.sum(0)])
             case "affinity":
                 return sums.index_add(0, self.users, vectors)
             case "exposure":
-                return self.exposure.square().sum(0)
+                return (each * self.exposure.square()).sum(0)
             case "state":
-                return self.x.square().sum(0)
+                return (each * self.x.square()).sum(0)
         return self.x.square().T @ vectors
+
+    @property
+    def count(self) -> float:
+        """The sum of the weights."""
+        return float(self.weights.sum(dtype=torch.float64))
 
     def penalty(self, name: str, spread: float) -> float:
         """Precision of the prior of the effect `name`, twice the factor of its squares.
@@ -154,13 +168,20 @@ class Design:
         Under a Gaussian prior of this precision, the effect's contribution to the predictor of a
         mean row has the standard deviation `spread`.
         """
-        return float(self.squares(name).sum()) / len(self.items) / spread**2
+        return float(self.squares(name).sum()) / self.count / spread**2
 
     def loss(self, predictor: Tensor) -> Tensor:
-        """Log loss in nats, or half the squared error of standardised rewards, (M,)."""
+        """Weighted log loss in nats, or half the squared error of standardised rewards, (M,)."""
         if self.binary:
-            return F.binary_cross_entropy_with_logits(predictor, self.target, reduction="none")
-        return 0.5 * (predictor - self.target).square()
+            return F.binary_cross_entropy_with_logits(
+                predictor, self.target, self.weights, reduction="none"
+            )
+        return self.weights * (0.5 * (predictor - self.target).square())
+
+    def mean_effect(self) -> Effects:
+        """The effect `mean` alone, of the weighted mean of what is predicted."""
+        mean = (self.weights * self.target).sum() / self.weights.sum()
+        return {"mean": torch.logit(mean) if self.binary else mean}
 
 
 def _exposure(model: ItemRewardModel, rows: RewardRows) -> Tensor:
@@ -275,13 +296,13 @@ class _Units:
 def _units(design: Design, name: str, curvature: float, penalty: float) -> _Units:
     if name in ("state", "exposure"):
         inputs = design.x if name == "state" else design.exposure
-        factor, inverse = _factors(curvature * (inputs.T @ inputs), penalty)
+        factor, inverse = _factors(curvature * _moments(design, inputs), penalty)
         return _Units(lambda numbers: inverse @ numbers, lambda effect: factor @ effect)
     if name == "interaction":
         # The curvature is about a Kronecker product of two second moments, each with a part of the
         # penalty.
-        scale = (curvature / len(design.items)) ** 0.5
-        of_states, of_items = (scale * (rows.T @ rows) for rows in (design.x, design.rows))
+        scale = (curvature / design.count) ** 0.5
+        of_states, of_items = (scale * _moments(design, rows) for rows in (design.x, design.rows))
         ratio = float(of_states.diagonal().mean() / of_items.diagonal().mean())
         left, left_inverse = _factors(of_states, (penalty * ratio) ** 0.5)
         right, right_inverse = _factors(of_items, (penalty / ratio) ** 0.5)
@@ -291,6 +312,10 @@ def _units(design: Design, name: str, curvature: float, penalty: float) -> _Unit
         )
     unit = (curvature * design.squares(name) + penalty).clamp(min=_SMALLEST).rsqrt()
     return _Units(lambda numbers: numbers * unit, lambda effect: effect / unit)
+
+
+def _moments(design: Design, inputs: Tensor) -> Tensor:
+    return inputs.T @ (design.weights.unsqueeze(1) * inputs)
 
 
 def _factors(moments: Tensor, ridge: float) -> tuple[Tensor, Tensor]:

@@ -35,8 +35,8 @@ _FIRST: Final = 6
 _CHEAP: Final = ("item", "user", "content")
 """Effects whose spreads are searched finely, and adjusted to each other."""
 _KNOWN: Final = 0.1
-"""Least share of held-out rows of known users that can judge the effects in `_LASTING`."""
-_LASTING: Final = ("item", "user", "content", "affinity")
+"""Least share of held-out rows of known users that can judge the effects in `LASTING`."""
+LASTING: Final = ("item", "user", "content", "affinity")
 """Effects that are told apart by users who were shown several items."""
 _MAX_ROWS: Final = 500_000
 _CONSTANT: Final = 1e-6
@@ -69,7 +69,7 @@ def fit_item_reward_model(
     than the standard error of the decrease.
 
     Where hardly any validation row is of a user with training rows, the model is for new users. A
-    fifth of the training rows then chooses for the effects in `_LASTING`: with unknown users,
+    fifth of the training rows then chooses for the effects in `LASTING`: with unknown users,
     effects of items that contain those of the users who saw them predict best. What a user's
     effects tell of training rows, the history of the session must tell of a new user. So the
     effects of users are dropped once those of items are known, and the other effects are fitted
@@ -96,8 +96,8 @@ def fit_item_reward_model(
     start = time.process_time()
     rows = RewardRows.of(train, model.lags, max_rows, seed)
     held_out = RewardRows.of(validation, model.lags, max_rows, seed)
-    _set_statistics(model, rows, held_out, train.item_states)
-    search = _Search(Design.of(model, rows), Design.of(model, held_out))
+    set_statistics(model, rows, held_out, train.item_states)
+    search = EffectSearch(Design.of(model, rows), Design.of(model, held_out))
     with progress(len(EFFECTS), "item rewards", "effects") as bar:
         search.add_all(bar)
     model.set_effects(search.effects, search.design.of_content)
@@ -122,12 +122,12 @@ def refit_item_reward_model(
     report = _report_from(load_tensors(first / FITTED)[1])
     model = ItemRewardModel(reward_model_sizes(store))
     rows = RewardRows.of(store, model.lags, max_rows, seed)
-    _set_statistics(model, rows, rows, store.item_states)
+    set_statistics(model, rows, rows, store.item_states)
     design = Design.of(model, rows)
-    effects, spreads, fixed = _mean_effect(design), dict(report.kept), Effects()
+    effects, spreads, fixed = design.mean_effect(), dict(report.kept), Effects()
     if report.new_users:
         lasting: dict[str, float] = {}
-        for name in _LASTING:
+        for name in LASTING:
             if name in spreads:
                 lasting[name] = spreads.pop(name)
         fixed = _of_items(fit_effects(design, effects, lasting))
@@ -138,21 +138,16 @@ def refit_item_reward_model(
     return model.eval()
 
 
-def _mean_effect(design: Design) -> Effects:
-    mean = design.target.mean()
-    return {"mean": torch.logit(mean) if design.binary else mean}
-
-
 def _of_items(effects: Effects) -> Effects:
     return {name: effects[name] for name in ("item", "content") if name in effects}
 
 
-class _Search:
+class EffectSearch:
     """The effects found so far, and their loss on held-out rows."""
 
     def __init__(self, design: Design, held_out: Design) -> None:
-        self.design, self._held_out = design, held_out
-        self.effects = _mean_effect(design)
+        self.design, self.held_out = design, held_out
+        self.effects = design.mean_effect()
         self.kept: dict[str, int] = {}
         self.new_users = False
         self._fixed: Effects = {}
@@ -177,9 +172,9 @@ class _Search:
 
     def add_all(self, bar: Progress) -> None:
         """Add every effect that lowers the held-out loss."""
-        judge = self if self._known_users() >= _KNOWN else self._of_training()
+        judge = self if self._known_users() >= _KNOWN else self.of_training()
         for name in EFFECTS:
-            if judge is not self and name not in _LASTING:
+            if judge is not self and name not in LASTING:
                 self._take(judge)
                 self._forget_users()
                 judge = self
@@ -192,14 +187,14 @@ class _Search:
         """Share of the held-out rows whose users have training rows; 1 if no users are known."""
         seen = torch.bincount(self.design.users, minlength=self.design.n_users + 1) > 0
         seen[-1] = False
-        return float(seen[self._held_out.users].float().mean()) if seen.any() else 1.0
+        return float(seen[self.held_out.users].float().mean()) if seen.any() else 1.0
 
-    def _of_training(self) -> "_Search":
+    def of_training(self) -> "EffectSearch":
         """A search that is judged on a fifth of the training rows."""
         held_back = torch.arange(len(self.design.items)) % 5 == 4
-        return _Search(self.design.select(~held_back), self.design.select(held_back))
+        return EffectSearch(self.design.select(~held_back), self.design.select(held_back))
 
-    def _take(self, judge: "_Search") -> None:
+    def _take(self, judge: "EffectSearch") -> None:
         """Fit the effects that `judge` keeps, with its spreads, to all training rows."""
         self.tried, at = list(judge.tried), judge.kept
         if "item" in at:
@@ -215,7 +210,7 @@ class _Search:
         """Fit further effects as for new users, with the effects of items as they are."""
         self.new_users, self._fixed = True, _of_items(self.effects)
         self.design = self.design.of_unknown_users()
-        self.effects = fit_effects(self.design, _mean_effect(self.design), {}, self._fixed)
+        self.effects = fit_effects(self.design, self.design.mean_effect(), {}, self._fixed)
         self.losses = self._losses(self.effects)
 
     def adjust(self) -> None:
@@ -244,7 +239,7 @@ class _Search:
             if index not in found:
                 spreads = {each: _SPREADS[number] for each, number in self.kept.items()}
                 if self.new_users:
-                    spreads = {each: spreads[each] for each in spreads if each not in _LASTING}
+                    spreads = {each: spreads[each] for each in spreads if each not in LASTING}
                 spreads[name] = _SPREADS[index]
                 effects = fit_effects(self.design, self.effects, spreads, self._fixed)
                 found[index] = effects, self._losses(effects)
@@ -261,10 +256,10 @@ class _Search:
         return at, found[at]
 
     def _losses(self, effects: Effects) -> Tensor:
-        return self._held_out.loss(self._held_out.predictor(effects)).double()
+        return self.held_out.loss(self.held_out.predictor(effects)).double()
 
 
-def _set_statistics(
+def set_statistics(
     model: ItemRewardModel, rows: RewardRows, held_out: RewardRows, states: ItemStates
 ) -> None:
     """Set the normalisation of states, rewards and embeddings from the training rows."""
@@ -297,7 +292,7 @@ def _set_statistics(
 
 def _report(
     model: ItemRewardModel,
-    search: _Search,
+    search: EffectSearch,
     rows: RewardRows,
     held_out: RewardRows,
     states: ItemStates,

@@ -125,6 +125,27 @@ def calibration(predicted: FloatArray, observed: FloatArray) -> Calibration:
     )
 
 
+def fit_line(
+    scores: Tensor, target: Tensor, binary: bool, weights: Tensor | None = None
+) -> tuple[float, float]:
+    """Slope and intercept of the scores (M,) that fit the target (M,) best.
+
+    By logistic regression of targets 0 and 1 if `binary`, by least squares otherwise. Rows of
+    `weights` (M,) count so many times.
+    """
+    from sklearn.linear_model import LinearRegression, LogisticRegression
+
+    inputs, outcomes = scores.double().numpy().reshape(-1, 1), target.double().numpy()
+    counts = None if weights is None else weights.double().numpy()
+    if binary and 0 < outcomes.mean() < 1:
+        fitted = LogisticRegression(C=np.inf, max_iter=1000).fit(inputs, outcomes > 0, counts)
+        return float(fitted.coef_[0, 0]), float(fitted.intercept_[0])
+    if binary:
+        return 1.0, 0.0
+    fitted = LinearRegression().fit(inputs, outcomes, counts)
+    return float(fitted.coef_[0]), float(fitted.intercept_)
+
+
 def item_rates(rows: RewardRows, liked: Tensor, n_items: int) -> Tensor:
     """(n_items,) share of liked rows of each item, 10 impressions at the mean added."""
     shown = torch.bincount(rows.items, minlength=n_items).double()

@@ -1,9 +1,10 @@
 """Choose the decision rule of a run on the validation sessions of its log, never in a world.
 
 The candidates are played in a model of the users: rewards from the run's reward model, calibrated
-on validation rows, and ends of sessions from a logistic regression on the training rows. What a
-model says of a policy holds only where the log supports it, so a candidate must keep to items that
-the training log shows often enough, and to more than a handful of them.
+on validation rows, or for new users from the tastes of training users, which the policy does not
+know (`ucfrec.counterfactual.training_users`); ends of sessions from a logistic regression on the
+training rows. What a model says of a policy holds only where the log supports it, so a candidate
+must keep to items that the training log shows often enough, and to more than a handful of them.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,8 +21,9 @@ from ucfrec.acting.learned_sessions import LearnedSessions, LoggedEnds, SessionE
 from ucfrec.acting.many_rules import ManyRules
 from ucfrec.acting.rollout import USER_IDS
 from ucfrec.counterfactual.item_reward_model import ItemRewardModel
-from ucfrec.counterfactual.item_reward_report import scores_of
+from ucfrec.counterfactual.item_reward_report import fit_line, scores_of
 from ucfrec.counterfactual.item_reward_rows import RewardRows
+from ucfrec.counterfactual.training_users import TrainingUsers, sessions_of
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.main_tags import MainTags
 from ucfrec.episodes.store import EpisodeStore
@@ -64,7 +66,9 @@ class Choice:
     rule: DecisionRule
     candidates: Sequence[Candidate]
     calibration: tuple[float, float]
-    """Slope and intercept of the reward model's scores on validation rows."""
+    """Slope and intercept of the scores that rewards were drawn from, on held-out rows."""
+    users: TrainingUsers | None
+    """Whose tastes rewards were drawn from; None for the run's reward model."""
     fatigue: Fatigue | None
     """What tires the users in their model; None for nothing."""
     least_items: float
@@ -76,17 +80,29 @@ class Choice:
         """As a JSON object, with what chose the rule in words."""
         return {
             "rule": self.rule.as_dict(),
-            "chosen_by": "mean return of validation users' sessions in the run's reward model, "
-            "calibrated on validation rows; no propensities are used",
+            "chosen_by": self._chosen_by(),
             "warning": ""
             if self.supported
             else "; WARNING: the log supports no candidate, this one "
             "shows the most different items",
             "calibration": list(self.calibration),
+            "users": None if self.users is None else self.users.report(),
             "fatigue": None if self.fatigue is None else asdict(self.fatigue),
             "least_items": self.least_items,
             "candidates": [candidate.as_dict() for candidate in self.candidates],
         }
+
+    def _chosen_by(self) -> str:
+        if self.users is None:
+            return (
+                "mean return of validation users' sessions in the run's reward model, calibrated "
+                "on validation rows; no propensities are used"
+            )
+        weighted = "weighted by their propensities" if self.users.weighted else "without weights"
+        return (
+            "mean return of sessions of new users, who have the tastes of training users; these "
+            f"are fitted to {self.users.steps:,} training rows {weighted}"
+        )
 
 
 class RuleSearch:
@@ -99,6 +115,7 @@ class RuleSearch:
         validation: EpisodeStore,
         config: RuleConfig,
         seed: int,
+        users: TrainingUsers | None = None,
     ) -> None:
         """
         Args:
@@ -107,10 +124,12 @@ class RuleSearch:
             validation: sessions to begin, and to calibrate the reward model on.
             config: candidates and conditions.
             seed: of the sessions and the draws.
+            users: whose training sessions are begun instead, and whose tastes give the rewards;
+                None for the reward model's word.
         """
         assert decider.reward_model is not None
         self._decider, self._config, self._seed = decider, config, seed
-        self._store, model = validation, decider.reward_model
+        model = decider.reward_model
         require_blas_memory()
         states = validation.item_states
         self._likeness = likeness = Likeness.of(states)
@@ -120,9 +139,14 @@ class RuleSearch:
         )
         self.fatigue = fit_fatigue(*logged) if model.binary else None
         end = SessionEnd(likeness, LoggedEnds.of(train, model.lags, _MOST_STEPS, seed))
-        rows = RewardRows.of(validation, model.lags, _MOST_STEPS, seed)
-        self.calibration = calibrate(model, rows)
-        self._longest, self.end, self._model = int(train.lengths.max()), end, model
+        self._longest, self.end = int(train.lengths.max()), end
+        if users is None:
+            rows = RewardRows.of(validation, model.lags, _MOST_STEPS, seed)
+            self._store, self._model = validation, model
+            self.calibration = calibrate(model, rows)
+        else:
+            self._store, self._model = sessions_of(train, seed), users.model
+            self.calibration = users.calibration
         self._supported = train.item_counts() >= config.least_impressions
         self.least_items = min(config.least_items, self._supported.sum() / 4)
 
@@ -219,6 +243,7 @@ def choose_rule(
     validation: EpisodeStore,
     config: RuleConfig,
     seed: int,
+    users: TrainingUsers | None = None,
 ) -> Choice:
     """Choose target, floor and temperature, then the tilt.
 
@@ -233,8 +258,9 @@ def choose_rule(
         validation: validation episodes.
         config: candidates and conditions.
         seed: of the sessions and the draws.
+        users: see `RuleSearch`.
     """
-    search = RuleSearch(decider, train, validation, config, seed)
+    search = RuleSearch(decider, train, validation, config, seed, users)
     learned = decider.policy.values is not None and decider.policy.config.max_return
     played = search.play([*_untilted(config, targets, learned)])
     first = search.best(played)
@@ -254,7 +280,9 @@ def choose_rule(
             played.extend([*limited, *search.play([*_drawn(config, third)])])
     best = search.best(_simplest_first(played))
     supported, least_items = search.allowed(best), float(search.least_items)
-    return Choice(best.rule, played, search.calibration, search.fatigue, least_items, supported)
+    return Choice(
+        *(best.rule, played, search.calibration, users, search.fatigue, least_items, supported)
+    )
 
 
 def _simplest_first(candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -313,17 +341,4 @@ def calibrate(model: ItemRewardModel, rows: RewardRows) -> tuple[float, float]:
 
     By logistic regression for rewards of two values, by least squares otherwise.
     """
-    from sklearn.linear_model import LinearRegression, LogisticRegression
-
-    scores, _ = scores_of(model, rows)
-    inputs, outcomes = (
-        scores.double().numpy().reshape(-1, 1),
-        model.target(rows.rewards).double().numpy(),
-    )
-    if model.binary and 0 < outcomes.mean() < 1:
-        fitted = LogisticRegression(C=np.inf, max_iter=1000).fit(inputs, outcomes > 0)
-        return float(fitted.coef_[0, 0]), float(fitted.intercept_[0])
-    if model.binary:
-        return 1.0, 0.0
-    fitted = LinearRegression().fit(inputs, outcomes)
-    return float(fitted.coef_[0]), float(fitted.intercept_)
+    return fit_line(scores_of(model, rows)[0], model.target(rows.rewards), bool(model.binary))

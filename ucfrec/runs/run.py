@@ -19,6 +19,7 @@ from ucfrec.counterfactual.copies import MODELS, counterfactual_copies, require_
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model, reward_model_sizes
 from ucfrec.counterfactual.reward_model import CRMConfig
+from ucfrec.counterfactual.training_users import TRAINING_USERS, fit_training_users
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
@@ -383,7 +384,12 @@ def _rule(
     decider = Decider(policy, trained.rule, trained.returns, model)
     choice: Choice | RankedChoice
     if trained.returns.per_session:
-        choice = choose_rule(decider, targets, train, validation, config.rule, config.seed)
+        users = None
+        if report.new_users:
+            like = partial(fit_training_users, train, out / TRAINING_USERS, config.seed)
+            shared.provide(inputs, fit_training_users.__module__, out, (TRAINING_USERS,), like)
+            users = like()  # read from the file
+        choice = choose_rule(decider, targets, train, validation, config.rule, config.seed, users)
     else:
         choice = choose_by_ranking(decider, train, validation, config.rule, config.seed)
     write_json(out / RULE, choice.rule.as_dict())

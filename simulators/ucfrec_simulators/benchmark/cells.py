@@ -147,6 +147,7 @@ def _training_metrics(record: Mapping[str, Any]) -> dict[str, float]:
         "train_wall_time_s": record["wall_time_s"],
         "validation_loss": record["policy"]["best_validation"],
     }
+    metrics |= _promised(record.get("rule", {}))
     if "augmentation" not in record:
         return metrics
     augmentation = record["augmentation"]
@@ -156,6 +157,14 @@ def _training_metrics(record: Mapping[str, Any]) -> dict[str, float]:
         "crm_r2": model["r2"],
         "crm_r2_without_z": model["r2_without_z"],
     }
+
+
+def _promised(choice: Mapping[str, Any]) -> dict[str, float]:
+    """The return that the model of the users promised of the chosen rule, and its error."""
+    for tried in choice.get("candidates", ()):
+        if tried["rule"] == choice["rule"] and "value" in tried:
+            return {"promised": tried["value"], "promised_error": tried["error"]}
+    return {}
 
 
 def _rule(cell: Cell, trained: TrainedPolicy) -> DecisionRule:

@@ -19,16 +19,19 @@ _SHOWN: Final = ("R_cum", "R_avg_pooled", "R_avg_episode", "length")
 def method_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
     """One line per world and method, in the order of the rows (Tables 2 and 3 of the paper).
 
-    Mean ± standard deviation over logs and training seeds. `− ucf` is the return less that of UCF
+    Mean ± standard deviation over logs and training seeds. `promised` is the return that the model
+    of the users, fitted to the log, gave the chosen rule. `− ucf` is the return less that of UCF
     of the same log and seed: mean ± standard error over the pairs, and in brackets over the means
     of logs, which counts what logs differ by.
     """
-    head = ("world", "method", "logs × seeds", *_SHOWN, "coverage", "target", f"− {OURS}")
+    columns = (*_SHOWN, "coverage", "target", "promised")
+    head = ("world", "method", "logs × seeds", *columns, f"− {OURS}")
     lines, shown = [], of_checkpoint(rows, checkpoint)
     less = difference_to_ours(shown)
     for (world, method), group in grouped(shown, _line).items():
         spread = [mean_and_sd(numbers(group, name)) for name in (*_SHOWN, "coverage")]
-        lines.append((world, method, len(group), *spread, _targets(group), less[world, method]))
+        told = (_targets(group), mean_and_sd(numbers(group, "promised")))
+        lines.append((world, method, len(group), *spread, *told, less[world, method]))
     return markdown_table(head, lines)
 
 

@@ -17,6 +17,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.evaluate import evaluate_behavior
 from ucfrec.evaluation.world import World
+from ucfrec.files import read_json
 from ucfrec.plugins import Benchmark, BenchmarkRequest, load_plugin
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows, read_configurations, read_rows
@@ -55,7 +56,7 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
 ) -> None:
     tiny = replace(TINY, logs=2, tasks=("kuairand", "synthetic-catalog"))
     monkeypatch.setitem(BUDGETS, "small", tiny)
-    some = {name: METHODS[name] for name in ("popular", "dt")}
+    some = {name: METHODS[name] for name in ("popular", "dt+")}
     monkeypatch.setattr(plan, "METHODS", some)
     suite: Benchmark = load_plugin("benchmarks", "recommendation")
     results = tmp_path / "rows.jsonl"
@@ -81,8 +82,16 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     runs = {TrainedPolicy.load(path.parent).rule for path in (tmp_path / "out").rglob(RUN)}
     told = {f"{rule} ({rule.hash})" for rule in runs}
     assert {row.rule for row in rows if row.training_seed is not None} == told
-    assert {row.target_return for row in rows if row.method == "dt"} <= {r.target for r in runs}
+    assert {row.target_return for row in rows if row.method == "dt+"} <= {r.target for r in runs}
     assert {r.conditions.get("quantiles") for r in rows if r.training_seed is not None} == {"rule"}
+    records = [read_json(path) for path in (tmp_path / "out").rglob(RUN)]
+    choices = [record["rule"] for record in records if "rule" in record]
+    own = [each for one in choices for each in one["candidates"] if each["rule"] == one["rule"]]
+    of_dt = [row.metrics for row in rows if row.method == "dt+"]
+    assert len(own) == len(choices) == len(of_dt)
+    assert {each["promised"] for each in of_dt} == {each["value"] for each in own}
+    assert {each["promised_error"] for each in of_dt} == {each["error"] for each in own}
+    assert not any("promised" in row.metrics for row in rows if row.method != "dt+")
     configurations = read_configurations(tmp_path)
     dims = {configurations[str(r.config_hash)]["policy"]["dim"] for r in rows if r.config_hash}
     assert dims == {8}
@@ -269,7 +278,7 @@ def test_tables_give_means_spreads_and_paired_drops() -> None:
     clean = [r for r in every if r.conditions == {"distractor": None, "quantiles": "1"}]
     last = replace(clean[0], checkpoint="last", metrics={"R_cum": 99.0})
     assert method_table([*clean, last]).splitlines()[2] == (
-        "| w | m | 2 | 15 ± 7.1 | 0.5 ± 0 | 0.5 ± 0 | 2 ± 0 | – | 3 | – |"
+        "| w | m | 2 | 15 ± 7.1 | 0.5 ± 0 | 0.5 ± 0 | 2 ± 0 | – | 3 | – | – |"
     )
     line, less = distractor_table(every).splitlines()[2:]
     assert less == line.replace("| 1 |", "| 0.99 |")

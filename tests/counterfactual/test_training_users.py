@@ -57,10 +57,18 @@ def log_of_moods(knowing: float, told: bool = True) -> EpisodeStore:
     return store_of(items, rewards, right if told else None)
 
 
-def store_of(items: IntArray, rewards: npt.NDArray[np.bool_], right: Any) -> EpisodeStore:
+def store_of(
+    items: IntArray,
+    rewards: npt.NDArray[np.bool_],
+    right: FloatArray | None,
+    seen: npt.NDArray[np.bool_] | None = None,
+) -> EpisodeStore:
+    """A store of what (USERS, LENGTH) was shown, with `right` propensities and what was `seen`."""
     columns: dict[str, Any] = {"item": items.ravel(), "reward": rewards.ravel() * 1.0}
     if right is not None:
         columns["propensity"] = right.ravel()
+    if seen is not None:
+        columns["observation"] = seen.reshape(-1, 1).astype(np.float32)
     kinds = torch.eye(KINDS)[torch.arange(ITEMS) % KINDS]
     states = ItemStates(kinds, torch.zeros(USERS, 0), 0.0, 1.0)
     episodes = {"user": np.arange(USERS)}
@@ -99,6 +107,21 @@ def test_what_the_logs_policy_knew_makes_no_item_look_better(tmp_path: Path) -> 
     assert without[first].mean() - without[~first].mean() > 0.3
     assert abs(found[first].mean() - found[~first].mean()) < 0.1
     assert found.mean() == pytest.approx(mean, abs=0.05)
+
+
+def test_of_states_only_observations_and_features_of_users_count(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    items, seen = rng.integers(ITEMS, size=(USERS, LENGTH)), rng.random((USERS, LENGTH)) < 0.5
+    rewards = rng.random(seen.shape) < np.where(seen, LIKED, OTHER)
+    train = store_of(items, rewards, None, seen)
+    users = fit_training_users(train, tmp_path / "users", seed=0)
+    found = chances(users, RewardRows.at(train, *train.all_steps(), LAGS))
+    assert found[seen.ravel()].mean() == pytest.approx(LIKED, abs=0.03)
+    assert found[~seen.ravel()].mean() == pytest.approx(OTHER, abs=0.03)
+    states = torch.randn(3, train.state_size)
+    other = states.clone()
+    other[:, : train.item_states.size] += 1
+    assert torch.equal(users.model.level(states, None), users.model.level(other, None))
 
 
 def test_a_fit_repeats_and_is_read_again(tmp_path: Path) -> None:

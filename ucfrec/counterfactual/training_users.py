@@ -25,9 +25,8 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.counterfactual.item_reward_effects import Design, fit_effects
+from ucfrec.counterfactual.item_reward_effects import EFFECTS, Design, fit_effects
 from ucfrec.counterfactual.item_reward_fit import (
-    LASTING,
     EffectSearch,
     reward_model_sizes,
     set_statistics,
@@ -41,8 +40,6 @@ from ucfrec.progress import progress
 
 TRAINING_USERS: Final = "training_users.safetensors"
 """File of the fitted users in a run folder."""
-_EFFECTS: Final = (*LASTING, "exposure")
-"""Not those of states: what a session tells of tastes is known already."""
 _MAX_STEPS: Final = 100_000
 _LARGEST_WEIGHT: Final = 10.0
 """Larger weights are cut off, so that no single row decides."""
@@ -96,11 +93,14 @@ def fit_training_users(train: EpisodeStore, path: Path, seed: int) -> TrainingUs
     episodes, steps = sessions.all_steps()
     rows = RewardRows.at(sessions, episodes, steps, model.lags)
     set_statistics(model, rows, rows, train.item_states)
+    # What the session tells of tastes is known already: states are features and observations.
+    of_session = train.item_states.size - train.item_states.user_features.shape[1]
+    model.state_std[:of_session] = torch.inf
     weights = propensity_weights(sessions, episodes, steps, len(model.item))
     design = Design.of(model, rows, weights)
     judge = EffectSearch(design, design).of_training()
-    with progress(len(_EFFECTS), "training users", "effects") as bar:
-        for name in _EFFECTS:
+    with progress(len(EFFECTS), "training users", "effects") as bar:
+        for name in EFFECTS:
             judge.add(name)
             bar.update()
     tried = judge.report()

@@ -181,7 +181,7 @@ class Design:
     def mean_effect(self) -> Effects:
         """The effect `mean` alone, of the weighted mean of what is predicted."""
         mean = (self.weights * self.target).sum() / self.weights.sum()
-        return {"mean": torch.logit(mean) if self.binary else mean}
+        return {"mean": torch.logit(mean, _SMALLEST) if self.binary else mean}
 
 
 def _exposure(model: ItemRewardModel, rows: RewardRows) -> Tensor:

@@ -6,7 +6,7 @@ counts as liked and goes on paying. Here tastes are there before a session begin
 users, and nothing that acts knows them.
 
 Logs of policies that knew more of their users than the log tells make what they showed look better
-than it is for anybody else. Where the log has propensities p, rows are therefore weighted by
+than it is for anybody else. Where the log has all propensities p, rows are therefore weighted by
 1 / (p · items), cut off at 10, as if all items had been shown alike (inverse propensity weighting).
 So that a few rows of large weight do not pass for much knowledge of a user's tastes, the weights of
 each user's rows are scaled to add up to their effective number (Pfeffermann et al., 1998,
@@ -132,22 +132,19 @@ def propensity_weights(
 ) -> Tensor | None:
     """What logged steps (M,) count for, as if all of `items` had been shown alike.
 
-    Of each user in proportion to 1 / (p · items), cut off at 10; for nothing if p is unknown. Their
-    sum is the number of the user's steps of equal weight that tell as much, (Σ w)² / Σ w² (Kish).
-    None if no p is known.
+    Of each user in proportion to 1 / (p · items), cut off at 10. Their sum is the number of the
+    user's steps of equal weight that tell as much, (Σ w)² / Σ w² (Kish). None if the log does not
+    have every p.
     """
     if schema.PROPENSITY not in view.meta["columns"]:
         return None
     propensities = view.step_values(schema.PROPENSITY, episodes, steps).astype(np.float64)
-    known = propensities > 0
-    if not known.any():
+    if not (propensities > 0).all():
         return None
-    shares = np.divide(1 / items, propensities, out=np.zeros(len(known)), where=known)
-    shares = np.minimum(shares, _LARGEST_WEIGHT)
+    shares = np.minimum(1 / (propensities * items), _LARGEST_WEIGHT)
     users = np.unique(view.episode_values(schema.USER), return_inverse=True)[1][episodes]
     sums, squares = (np.bincount(users, weights=each) for each in (shares, np.square(shares)))
-    factors = np.divide(sums, squares, out=np.zeros(len(sums)), where=squares > 0)
-    return torch.from_numpy(shares * factors[users]).float()
+    return torch.from_numpy(shares * (sums / squares)[users]).float()
 
 
 def _read(model: ItemRewardModel, about: Mapping[str, Any]) -> TrainingUsers:

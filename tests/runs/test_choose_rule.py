@@ -27,6 +27,7 @@ from ucfrec.policies.heads import ItemHead
 from ucfrec.runs.choose_by_ranking import choose_by_ranking
 from ucfrec.runs.choose_rule import RuleSearch, calibrate, choose_rule
 from ucfrec.runs.config import config_from_dict, resolve_config
+from ucfrec.runs.describe import describe_run, promised
 from ucfrec.runs.refit import refit
 from ucfrec.runs.rule_config import RuleConfig
 from ucfrec.runs.run import train_run, training_views
@@ -77,6 +78,9 @@ def test_a_run_acts_by_the_rule_that_it_chose_and_says_how(
     best = max(chosen["candidates"], key=lambda each: each["value"])
     own = next(each for each in chosen["candidates"] if each["rule"] == chosen["rule"])
     assert own["value"] >= best["value"] - best["error"] or best["items"] < chosen["least_items"]
+    assert promised(chosen) == (own["value"], own["error"])
+    assert f"promised by it {own['value']:.4g} ±" in describe_run(record)
+    assert promised({**chosen, "candidates": []}) is None
 
 
 def test_a_tilt_pays_where_the_reward_model_knows_the_items(

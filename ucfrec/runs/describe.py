@@ -46,9 +46,23 @@ def describe_run(record: Mapping[str, Any]) -> str:
 def _describe_rule(choice: Mapping[str, Any], model: Mapping[str, Any]) -> str:
     rule = DecisionRule.from_dict(choice["rule"], "the run's record")
     gain = model["item_loss"] - model["loss"]
+    value = promised(choice)
+    told = "" if value is None else f"; return promised by it {value[0]:.4g} ± {value[1]:.2g}"
     return (
         f"items         reward model: held-out loss {model['loss']:.4f}, {gain:.4f} below that of "
         f"item effects alone\n"
         f"decision rule {rule}\n"
-        f"              chosen by {choice['chosen_by']}{choice.get('warning', '')}"
+        f"              chosen by {choice['chosen_by']}{told}{choice.get('warning', '')}"
     )
+
+
+def promised(choice: Mapping[str, Any]) -> tuple[float, float] | None:
+    """The return that the model of the users promised of the chosen rule, and its standard error.
+
+    Args:
+        choice: `rule` of a run's record; None for a rule that was not played in such a model.
+    """
+    for tried in choice.get("candidates", ()):
+        if tried["rule"] == choice["rule"] and "value" in tried:
+            return tried["value"], tried["error"]
+    return None

@@ -14,6 +14,7 @@ from ucfrec.reporting.evaluation_rows import evaluation_row
 from ucfrec.reporting.grid import Measurement
 from ucfrec.reporting.result_row import ResultRow, RowKey
 from ucfrec.runs.config import Config, resolve_config
+from ucfrec.runs.describe import promised
 from ucfrec.runs.screened import SCREENING, flagged_columns, train_screened
 from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -147,7 +148,8 @@ def _training_metrics(record: Mapping[str, Any]) -> dict[str, float]:
         "train_wall_time_s": record["wall_time_s"],
         "validation_loss": record["policy"]["best_validation"],
     }
-    metrics |= _promised(record.get("rule", {}))
+    if (value := promised(record.get("rule", {}))) is not None:
+        metrics |= {"promised": value[0], "promised_error": value[1]}
     if "augmentation" not in record:
         return metrics
     augmentation = record["augmentation"]
@@ -157,14 +159,6 @@ def _training_metrics(record: Mapping[str, Any]) -> dict[str, float]:
         "crm_r2": model["r2"],
         "crm_r2_without_z": model["r2_without_z"],
     }
-
-
-def _promised(choice: Mapping[str, Any]) -> dict[str, float]:
-    """The return that the model of the users promised of the chosen rule, and its error."""
-    for tried in choice.get("candidates", ()):
-        if tried["rule"] == choice["rule"] and "value" in tried:
-            return {"promised": tried["value"], "promised_error": tried["error"]}
-    return {}
 
 
 def _rule(cell: Cell, trained: TrainedPolicy) -> DecisionRule:

@@ -17,6 +17,7 @@ from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.rollout import rollout
 from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model
 from ucfrec.counterfactual.item_reward_rows import RewardRows
+from ucfrec.counterfactual.training_users import TRAINING_USERS, fit_training_users
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
@@ -210,23 +211,50 @@ def test_users_who_tire_are_shown_no_longer_runs(tmp_path: Path, trained: Traine
     assert found.as_dict()["fatigue"]["length"] == 3
 
 
+def test_the_most_promising_rules_are_played_in_more_sessions(
+    folder: Path, trained: TrainedPolicy
+) -> None:
+    few = replace(FEW, sessions=10)
+    search, more = (search_of(folder, trained, each) for each in (few, replace(few, sessions=40)))
+    tilts = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
+    played = search.play([DecisionRule(2.0, tilt=tilt, temperature=1.0) for tilt in tilts])
+    allowed = [each for each in played if search.allowed(each)]
+    worst = min(allowed, key=lambda each: each.value)
+    again = search.again(played, worst)
+    assert again[0].rule == worst.rule
+    assert len(again) == min(8, len(allowed))
+    highest = sorted((each.value for each in allowed), reverse=True)[: len(again) - 1]
+    found = {each.rule for each in again[1:]}
+    assert all(each.rule in found for each in allowed if each.value > highest[-1] and each != worst)
+    assert again[1] == more.play([again[1].rule])[0]
+
+
 def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_path: Path) -> None:
     one = ("temperatures=[1.0]", "tilts=[0.0, 4.0]", "tag_windows=[0]", "tag_runs=[0]")
     rule = [
         f"rule.{each}" for each in (*one, "sessions=40", "least_items=2", "least_impressions=1")
     ]
     config = resolve_config("bc", None, [*SMALL, "train.validate_every=20", *rule])
-    record = train_run(tiring_store(tmp_path), tmp_path / "run", config)
+    store = tiring_store(tmp_path)
+    record = train_run(store, tmp_path / "run", config)
     assert record["reward_model"]["new_users"]
     assert "tastes of training users" in record["rule"]["chosen_by"]
     users = record["rule"]["users"]
     assert users["steps"] == users["effective_steps"] == record["train_steps"]
     assert list(users["calibration"]) == record["rule"]["calibration"]
     # Nothing that acts knows these tastes.
-    model = TrainedPolicy.load(tmp_path / "run").reward_model
+    trained = TrainedPolicy.load(tmp_path / "run")
+    model = trained.reward_model
     assert model is not None
     assert not model.affinity.any()
     assert not model.user.any()
+    # The chosen rule was played again in four times the sessions.
+    views = training_views(store)
+    tastes = fit_training_users(views[0], tmp_path / "run" / TRAINING_USERS, config.seed)
+    decider = trained.decider(DecisionRule(2.0))
+    more = RuleSearch(decider, *views, replace(config.rule, sessions=160), config.seed, tastes)
+    (played,) = more.play([trained.rule])
+    assert promised(record["rule"]) == (played.value, played.error)
 
 
 def test_of_rules_that_the_model_cannot_tell_apart_the_widest_draws_are_taken(

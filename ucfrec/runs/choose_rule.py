@@ -36,6 +36,9 @@ IntArray = npt.NDArray[np.int64]
 
 _MOST_STEPS = 100_000
 """Logged steps that the models of the users are fitted to at most."""
+_FINALISTS, _TIMES = 8, 4
+"""Rules that are played again where users differ in their tastes, and in how many times the
+sessions: few sessions there say as much of the users as of the rules."""
 
 
 @dataclass(frozen=True)
@@ -150,9 +153,14 @@ class RuleSearch:
         self._supported = train.item_counts() >= config.least_impressions
         self.least_items = min(config.least_items, self._supported.sum() / 4)
 
-    def play(self, rules: Sequence[DecisionRule]) -> list[Candidate]:
-        """Play sessions by each of the rules, side by side, all with the same draws."""
-        n, count = self._config.sessions, len(rules)
+    def play(self, rules: Sequence[DecisionRule], times: int = 1) -> list[Candidate]:
+        """Play sessions by each of the rules, side by side, all with the same draws.
+
+        Args:
+            rules: to play.
+            times: how many times the sessions of the configuration.
+        """
+        n, count = times * self._config.sessions, len(rules)
         if not count:
             return []
         world = LearnedSessions(
@@ -191,6 +199,13 @@ class RuleSearch:
         """Whether the log supports what the candidate did."""
         enough = candidate.items >= self.least_items
         return enough and candidate.support >= self._config.least_support
+
+    def again(self, played: Sequence[Candidate], best: Candidate) -> list[Candidate]:
+        """The best and the most promising of the allowed candidates, played in more sessions."""
+        allowed = [each for each in played if self.allowed(each)]
+        promising = sorted(allowed, key=lambda each: each.value, reverse=True)
+        rules = dict.fromkeys(each.rule for each in (best, *promising))
+        return self.play([*rules][:_FINALISTS], _TIMES)
 
     def best(self, candidates: Sequence[Candidate]) -> Candidate:
         """The first of the allowed candidates within an error, or the tolerance, of the best.
@@ -248,8 +263,9 @@ def choose_rule(
     """Choose target, floor and temperature, then the tilt.
 
     Where items have tags, tag window and temperature follow, and the tilt with the window; where
-    the log shows fatigue, the tag run, and temperature and tilt with it. Of rules that the model
-    cannot tell apart, the one at the highest temperature is taken, which stays nearest to the log.
+    the log shows fatigue, the tag run, and temperature and tilt with it. With `users`, the most
+    promising rules are then played in more sessions. Of rules that the model cannot tell apart, the
+    one at the highest temperature is taken, which stays nearest to the log.
 
     Args:
         decider: the policy under its default rule, with a reward model.
@@ -279,6 +295,11 @@ def choose_rule(
             third = search.best(_simplest_first(limited)).rule
             played.extend([*limited, *search.play([*_drawn(config, third)])])
     best = search.best(_simplest_first(played))
+    if users is not None:
+        again = search.again(played, best)
+        best = search.best(_simplest_first(again))
+        rules = {each.rule for each in again}
+        played = [*(each for each in played if each.rule not in rules), *again]
     supported, least_items = search.allowed(best), float(search.least_items)
     return Choice(
         *(best.rule, played, search.calibration, users, search.fatigue, least_items, supported)

@@ -1,6 +1,7 @@
 """What models of the users promise of decision rules, and what comes in the world.
 
-    python benchmarks/promised_returns.py --out runs/promised       # ten minutes on one core
+    python benchmarks/promised_returns.py --out runs/promised           # ten minutes on one core
+    python benchmarks/promised_returns.py --out runs/promised --log 1   # nothing was decided on it
 
 In SARDINE's BoredInf, whose users are new in every session: UCF and BC are trained on 500 sessions
 of its oracles at the sizes of the benchmark's small budget. The rule of each is played at every
@@ -56,7 +57,7 @@ def users_of(store: Path, path: Path) -> TrainingUsers:
     return fit_training_users(training_views(EpisodeStore.open(store))[0], path, 0)
 
 
-def without_propensities(logs: Path, folder: Path) -> Path:
+def without_propensities(logs: Path, folder: Path, log: int) -> Path:
     """The store of the same logs without their propensities."""
     for file in logs.rglob("*.parquet"):
         target = folder / "logs" / file.relative_to(logs)
@@ -64,13 +65,15 @@ def without_propensities(logs: Path, folder: Path) -> Path:
         table = pq.read_table(file)
         kept = [name for name in table.column_names if name != PROPENSITY]
         pq.write_table(table.select(kept), target)
-    return simulated_store(WORLD, folder, SESSIONS, 0)
+    return simulated_store(WORLD, folder, SESSIONS, log)
 
 
-def measured(name: str, out: Path, seed: int) -> tuple[list[ResultRow], Mapping[str, Any]]:
+def measured(
+    name: str, out: Path, log: int, seed: int
+) -> tuple[list[ResultRow], Mapping[str, Any]]:
     """Rows of the rules of one policy, and the configuration of its training."""
-    path = simulated_store(WORLD, out / "told", SESSIONS, 0)
-    bare = without_propensities(out / "told" / "logs", out / "untold")
+    path = simulated_store(WORLD, out / "told", SESSIONS, log)
+    bare = without_propensities(out / "told" / "logs", out / "untold", log)
     store = EpisodeStore.open(path)
     config = resolve_config(name, None, (*BUDGETS["small"].settings, *POLICIES[name]), seed)
     train_run(store, out / f"{name}-{seed}", config)
@@ -85,7 +88,7 @@ def measured(name: str, out: Path, seed: int) -> tuple[list[ResultRow], Mapping[
     }
     played = {model: RuleSearch(*given, users[model]).play(rules) for model in MODELS}
     rows = [
-        row(name, seed, rule, {m: played[m][i].value for m in MODELS}, trained, store)
+        row(name, log, seed, rule, {m: played[m][i].value for m in MODELS}, trained, store)
         for i, rule in enumerate(rules)
     ]
     return rows, trained.record["config"]
@@ -93,6 +96,7 @@ def measured(name: str, out: Path, seed: int) -> tuple[list[ResultRow], Mapping[
 
 def row(
     name: str,
+    log: int,
     seed: int,
     rule: DecisionRule,
     promised: Mapping[str, float],
@@ -108,7 +112,7 @@ def row(
         method=name,
         policy=name,
         training_seed=seed,
-        log_seed=0,
+        log_seed=log,
         evaluation_seed=SEED,
         conditions={"temperature": rule.temperature, "tilt": rule.tilt, "episodes": EPISODES},
         config_hash=config_hash(trained.record["config"]),
@@ -150,17 +154,21 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, default=Path("runs/promised"))
     parser.add_argument("--results", type=Path, help="file of rows (results.jsonl in --out)")
+    parser.add_argument("--log", type=int, default=0, help="seed of the log")
     parser.add_argument("--seed", type=int, default=0, help="of the trainings")
     parser.add_argument("--show-only", action="store_true", help="print the rows at hand")
     options = parser.parse_args()
     results = options.results or options.out / "results.jsonl"
     if not options.show_only:
         for name in POLICIES:
-            found, config = measured(name, options.out, options.seed)
+            folder = options.out / f"log-{options.log}"
+            found, config = measured(name, folder, options.log, options.seed)
             known = read_rows(results) if results.exists() else []
             new = [each for each in found if not any(map(each.covers, known))]
             append_rows(results, new, config)
-    print(tables([each for each in read_rows(results) if each.training_seed == options.seed]))
+    wanted = options.log, options.seed
+    rows = [row for row in read_rows(results) if (row.log_seed, row.training_seed) == wanted]
+    print(tables(rows))
 
 
 if __name__ == "__main__":

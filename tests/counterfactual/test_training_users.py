@@ -20,6 +20,8 @@ from ucfrec.counterfactual.training_users import (
 )
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.fitting.checkpoint import save_tensors
 
 USERS, LENGTH, ITEMS, KINDS = 250, 40, 20, 5
 LIKED, OTHER = 0.8, 0.1
@@ -133,6 +135,15 @@ def test_a_fit_repeats_and_is_read_again(tmp_path: Path) -> None:
     for name, value in first.model.state_dict().items():
         assert torch.equal(value, again.model.state_dict()[name]), name
         assert torch.equal(value, read.model.state_dict()[name]), name
+
+
+def test_a_file_with_another_report_is_named(tmp_path: Path) -> None:
+    train, _ = log_of_tastes()
+    users = fit_training_users(train, tmp_path / "a", seed=0)
+    for report in ({}, {**users.report(), "calibration": 1.0}, {**users.report(), "more": 1}):
+        save_tensors(tmp_path / "b", users.model.state_dict(), report)
+        with pytest.raises(InputError, match="b is damaged"):
+            fit_training_users(train, tmp_path / "b", seed=0)
 
 
 @given(

@@ -220,7 +220,7 @@ def test_the_most_promising_rules_are_played_in_more_sessions(
     played = search.play([DecisionRule(2.0, tilt=tilt, temperature=1.0) for tilt in tilts])
     allowed = [each for each in played if search.allowed(each)]
     worst = min(allowed, key=lambda each: each.value)
-    again = search.again(played, worst)
+    again = search.play_finalists(played, worst)
     assert again[0].rule == worst.rule
     assert len(again) == min(8, len(allowed))
     highest = sorted((each.value for each in allowed), reverse=True)[: len(again) - 1]

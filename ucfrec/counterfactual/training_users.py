@@ -35,7 +35,8 @@ from ucfrec.counterfactual.item_reward_model import ItemRewardModel
 from ucfrec.counterfactual.item_reward_report import EffectTried, fit_line
 from ucfrec.counterfactual.item_reward_rows import RewardRows
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
+from ucfrec.errors import damage_explained
+from ucfrec.fitting.checkpoint import REMEDY, load_tensors, load_weights, save_tensors
 from ucfrec.progress import progress
 
 TRAINING_USERS: Final = "training_users.safetensors"
@@ -82,13 +83,14 @@ def fit_training_users(train: EpisodeStore, path: Path, seed: int) -> TrainingUs
         seed: of the sessions drawn by `sessions_of`.
 
     Raises:
-        InputError: all training rewards are equal.
+        InputError: all training rewards are equal, or the file is damaged.
     """
     model = ItemRewardModel(reward_model_sizes(train))
     if path.exists():
         tensors, about = load_tensors(path)
         load_weights(path, model, tensors)
-        return _read(model.eval(), about)
+        with damage_explained(path, REMEDY):
+            return _read(model.eval(), about)
     sessions = sessions_of(train, seed)
     episodes, steps = sessions.all_steps()
     rows = RewardRows.at(sessions, episodes, steps, model.lags)

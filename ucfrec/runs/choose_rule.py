@@ -200,7 +200,7 @@ class RuleSearch:
         enough = candidate.items >= self.least_items
         return enough and candidate.support >= self._config.least_support
 
-    def again(self, played: Sequence[Candidate], best: Candidate) -> list[Candidate]:
+    def play_finalists(self, played: Sequence[Candidate], best: Candidate) -> list[Candidate]:
         """The best and the most promising of the allowed candidates, played in more sessions."""
         allowed = [each for each in played if self.allowed(each)]
         promising = sorted(allowed, key=lambda each: each.value, reverse=True)
@@ -296,10 +296,10 @@ def choose_rule(
             played.extend([*limited, *search.play([*_drawn(config, third)])])
     best = search.best(_simplest_first(played))
     if users is not None:
-        again = search.again(played, best)
-        best = search.best(_simplest_first(again))
-        rules = {each.rule for each in again}
-        played = [*(each for each in played if each.rule not in rules), *again]
+        finalists = search.play_finalists(played, best)
+        best = search.best(_simplest_first(finalists))
+        rules = {each.rule for each in finalists}
+        played = [*(each for each in played if each.rule not in rules), *finalists]
     supported, least_items = search.allowed(best), float(search.least_items)
     return Choice(
         *(best.rule, played, search.calibration, users, search.fatigue, least_items, supported)

@@ -158,13 +158,22 @@ def additions(rows: Sequence[ResultRow]) -> str:
 
 
 def promises(rows: Sequence[ResultRow]) -> str:
-    """What was promised of the chosen rules, and what came."""
+    """What was promised of the chosen rules, and what came; then how far off it was."""
 
     def cell(world: str, method: str, group: Sequence[ResultRow]) -> str:
         said = summary(row.metrics["promised"] for row in group).mean
         return f"{said:.3g} → {summary(row.value for row in group).mean:.3g}"
 
-    return pivot(rows, cell, METHODS)
+    def off(own: Sequence[ResultRow]) -> str:
+        return f"{summary(abs(row.metrics['promised'] - row.value) for row in own).mean:.2g}"
+
+    lines = []
+    for world, own in grouped(rows, lambda row: str(row.world)).items():
+        logs = grouped(own, lambda row: str(row.log_seed)).items()
+        of_logs = ", ".join(f"log {name} {off(group)}" for name, group in logs)
+        lines.append((world, len(own), off(own), of_logs))
+    told = markdown_table(("world", "rows", "off by, mean", "by log"), lines)
+    return f"{pivot(rows, cell, METHODS)}\n\n{told}"
 
 
 def promised(files: Mapping[str, Sequence[ResultRow]]) -> Sequence[ResultRow]:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.support.served import FULL, histories, trained_run
+from tests.support.served import FULL, histories, learn_tastes, trained_run
 from ucfrec.acting import item_index
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.item_index import ItemIndex
@@ -30,6 +30,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
     with torch.no_grad():  # a policy of 20 steps has hardly any opinion
         for parameter in trained.policy.parameters():
             parameter.add_(0.3 * torch.randn(parameter.shape))
+    learn_tastes(trained)
     return trained
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.support.served import FULL, trained_run
+from tests.support.served import FULL, learn_tastes, trained_run
 from tests.support.tagged import tagged_store
 from ucfrec import Recommender, schema
 from ucfrec.acting.decision import DecisionRule
@@ -35,6 +35,7 @@ def trained(folder: Path) -> TrainedPolicy:
     with torch.no_grad():  # a policy of 20 steps has hardly any opinion
         for parameter in trained.policy.parameters():
             parameter.add_(0.3 * torch.randn(parameter.shape))
+    learn_tastes(trained)
     return trained
 
 

@@ -35,6 +35,7 @@ def design(rows: int, binary: bool, items: int = 12, users: int = 9) -> Design:
         n_users=users,
         binary=binary,
         weights=torch.ones(rows),
+        tastes=torch.from_numpy(rng.normal(size=rows)).float(),
     )
 
 
@@ -53,7 +54,8 @@ def matrix(given: Design, name: str) -> sparse.csr_matrix:
         return sparse.csr_matrix(_products(of_users, given.rows).numpy())
     if name == "interaction":
         return sparse.csr_matrix(_products(given.x, given.rows).numpy())
-    return sparse.csr_matrix({"exposure": given.exposure, "state": given.x}[name].numpy())
+    columns = {"exposure": given.exposure, "state": given.x, "tastes": given.tastes.unsqueeze(1)}
+    return sparse.csr_matrix(columns[name].numpy())
 
 
 def _products(left: Tensor, right: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 """Fitting the reward model of items: what it recovers, what it reads, and what it reports."""
 
+import copy
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from ucfrec.counterfactual.item_reward_fit import (
 )
 from ucfrec.counterfactual.item_reward_model import LAGS
 from ucfrec.counterfactual.item_reward_rows import RewardRows
+from ucfrec.counterfactual.session_tastes import MEMORY
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
@@ -155,10 +157,20 @@ def test_for_new_users_the_session_tells_what_users_effects_tell_of_training_row
     assert "affinity" in report.kept
     assert not model.user.any()
     assert not model.affinity.any()
-    rows = RewardRows.of(store.split("validation"), LAGS, 10**6, 0)
+    assert "tastes" in report.kept
+    assert model.reach == MEMORY
+    rows = RewardRows.of(store.split("validation"), model.reach, 10**6, 0)
     slope, intercept = calibrate(model, rows)
     assert 0.85 < slope < 1.15
     assert abs(intercept) < 0.3
+    # After ten steps, the session tells what its user likes, which the log never says.
+    late = (torch.arange(len(rows)) % LENGTH >= 10).numpy()
+    true = planted.predictor[split[planted.users] == 1][late]
+    scores = model.score(rows.states, rows.shown, None, rows.items).numpy()[late]
+    alone = copy.deepcopy(model)
+    alone.tastes.weigh(0.0)
+    without = alone.score(rows.states, rows.shown, None, rows.items).numpy()[late]
+    assert np.corrcoef(scores, true)[0, 1] > np.corrcoef(without, true)[0, 1] + 0.1
     scores = model.score(rows.states, rows.shown, None, rows.items)
     assert torch.equal(scores, model.score(rows.states, rows.shown, rows.users, rows.items))
     again = refit_item_reward_model(tmp_path / "a", store.split("train"), tmp_path / "b", seed=0)

@@ -104,7 +104,9 @@ def test_level_is_what_all_items_share() -> None:
     model.interaction.zero_()
     model.affinity.zero_()
     model.exposure.zero_()
-    rest = model.scores(states, shown, users) - model.level(states, users).unsqueeze(1)
+    rest = model.scores(states, shown, users) - model.level(
+        states, users, model.tastes_after(shown)
+    ).unsqueeze(1)
     torch.testing.assert_close(rest, model.item.expand(5, -1), atol=1e-5, rtol=0)
 
 

@@ -123,7 +123,10 @@ def test_of_states_only_observations_and_features_of_users_count(tmp_path: Path)
     states = torch.randn(3, train.state_size)
     other = states.clone()
     other[:, : train.item_states.size] += 1
-    assert torch.equal(users.model.level(states, None), users.model.level(other, None))
+    nothing = torch.zeros(3, users.model.vectors.shape[1] + 1)
+    assert torch.equal(
+        users.model.level(states, None, nothing), users.model.level(other, None, nothing)
+    )
 
 
 def test_a_fit_repeats_and_is_read_again(tmp_path: Path) -> None:

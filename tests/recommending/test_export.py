@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 import torch
 
-from tests.support.served import FULL, histories, trained_run
+from tests.support.served import FULL, histories, learn_tastes, trained_run
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.commands.cli import main
@@ -27,7 +27,9 @@ pytest.importorskip("onnxscript")
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
-    return trained_run(tmp_path_factory.mktemp("export"))
+    trained = trained_run(tmp_path_factory.mktemp("export"))
+    learn_tastes(trained)
+    return trained
 
 
 def ranked(folder: Path, trained: TrainedPolicy, log: pd.DataFrame) -> pd.DataFrame:

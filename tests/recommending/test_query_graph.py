@@ -7,7 +7,14 @@ import pandas as pd
 import pytest
 
 from tests.recommending.test_responder import answered
-from tests.support.served import FULL, histories, requests_of, responder, trained_run
+from tests.support.served import (
+    FULL,
+    histories,
+    learn_tastes,
+    requests_of,
+    responder,
+    trained_run,
+)
 from ucfrec.acting.sessions import Sessions
 from ucfrec.errors import InputError
 from ucfrec.recommending.responder import ONNXRUNTIME, Responder
@@ -19,7 +26,9 @@ pytest.importorskip("onnxscript")
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
-    return trained_run(tmp_path_factory.mktemp("query"))
+    trained = trained_run(tmp_path_factory.mktemp("query"))
+    learn_tastes(trained)
+    return trained
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import torch
 
 from tests.support.tagged import tagged_log, tagged_store
 from ucfrec import Recommender
@@ -27,6 +28,15 @@ def trained_run(folder: Path, policy: str = "ucf") -> TrainedPolicy:
     """A run at `folder / "run"` on `tagged_log`, which has tags, users with features and a gap."""
     Recommender(policy, settings=SETTINGS).fit(tagged_store(folder), folder / "run")
     return TrainedPolicy.load(folder / "run")
+
+
+def learn_tastes(trained: TrainedPolicy) -> None:
+    """Give the run's reward model tastes that sessions tell of, as where users are new."""
+    assert trained.reward_model is not None
+    tastes, random = trained.reward_model.tastes, torch.Generator().manual_seed(3)
+    tastes.root.copy_(torch.randn(tastes.root.shape, generator=random).tril())
+    tastes.usual.fill_(0.4)
+    tastes.weigh(1.5)
 
 
 def responder(trained: TrainedPolicy, **named: Any) -> Responder:

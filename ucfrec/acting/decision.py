@@ -250,6 +250,12 @@ class Decider:
         """The number of items of a session that are known at least, once it has shown them."""
         return max(self.policy.config.context - 1, WINDOW)
 
+    @property
+    def reach(self) -> int:
+        """Items shown before a step that the reward model and the rule read."""
+        of_model = 0 if self.reward_model is None else self.reward_model.reach
+        return max(of_model, self.rule.tag_window, self.rule.tag_run)
+
     @torch.no_grad()
     def asked(self, windows: Windows, collected: Tensor) -> Windows:
         """The windows with the returns-to-go that the rule asks for.

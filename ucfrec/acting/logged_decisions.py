@@ -55,14 +55,12 @@ class LoggedDecisions:
     ) -> "LoggedDecisions":
         """Read them from a store; the arguments are those of `session_scores`."""
         context = decider.policy.config.context
-        lags = 0 if decider.reward_model is None else decider.reward_model.lags
-        rule = decider.rule
-        reach = max(context - 1, lags, rule.tag_window, rule.tag_run)
+        reach = max(context - 1, decider.reach)
         logged = store.windows(episodes, steps, reach + 1)
         # Any known item can replace an unknown one: steps after it have weight 0.
         known = replace(logged, actions=logged.actions.clamp(min=0))
         collected = torch.from_numpy(store.rewards_before(episodes, steps))
-        if rule.exclude_seen:
+        if decider.rule.exclude_seen:
             seen = seen_before(store, episodes, steps)
             forbidden = seen if forbidden is None else forbidden | seen
         users = None

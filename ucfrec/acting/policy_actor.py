@@ -61,7 +61,9 @@ class PolicyActor:
         self._user_ids = user_ids if known else None
         self._absent = None if item_ids is None else torch.from_numpy(item_ids < 0)
         self._forbidden: Tensor | None = None
-        self._sessions = None if item_states is None else SessionStates(item_states, n)
+        self._sessions = None
+        if item_states is not None:
+            self._sessions = SessionStates(item_states, n, decider.reach)
         self._shown: Tensor | None = None
         if isinstance(policy.head, ItemHead) and decider.rule.exclude_seen:
             self._shown = torch.zeros(n, len(policy.head.bias), dtype=torch.bool)

@@ -49,8 +49,7 @@ class SessionScorer:
         self._decider, self._states = decider, states
         self.context = decider.policy.config.context
         """Most steps that the policy sees."""
-        lags = 0 if decider.reward_model is None else decider.reward_model.lags
-        self.length = max(self.context - 1 + states.window, lags)
+        self.length = max(self.context - 1 + states.window, decider.reach)
         """Items of a session that are read."""
         self._product = _Product.of(decider)
         self._of_one: Callable[[Sessions], Query] | None = None
@@ -263,7 +262,8 @@ class _Product:
             exposed = _exposed(shown, self._exposure.lags, normalized)
             weights.append(self._exposure.weights(exposed))
         if self._model is not None:
-            query = self._model.query(windows.states[:, -1], sessions.users)
+            tastes = self._model.tastes_after(shown)
+            query = self._model.query(windows.states[:, -1], sessions.users, tastes)
             inputs.append(self._tilt * query)
             of_model = self._model.exposures(shown)[1:]
             weights.append((self._tilt * of_model[0], self._tilt * of_model[1]))

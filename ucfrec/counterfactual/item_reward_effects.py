@@ -12,7 +12,9 @@ from torch.nn import functional as F
 from ucfrec.counterfactual.item_reward_model import ItemRewardModel
 from ucfrec.counterfactual.item_reward_rows import RewardRows
 
-EFFECTS: Final = ("item", "user", "content", "affinity", "exposure", "state", "interaction")
+EFFECTS: Final = (
+    *("item", "user", "content", "affinity", "tastes", "exposure", "state", "interaction"),
+)
 """In the order in which they are added to the model."""
 _ITERATIONS: Final = 100
 _HISTORY: Final = 10
@@ -53,6 +55,8 @@ class Design:
     binary: bool
     weights: Tensor
     """(M,) how many rows each row counts for."""
+    tastes: Tensor
+    """(M,) what `SessionTastes` of weight 1 add; zeros if sessions tell nothing."""
 
     @classmethod
     def of(
@@ -75,6 +79,7 @@ class Design:
             n_users=last,
             binary=bool(model.binary),
             weights=torch.ones(len(rows)) if weights is None else weights,
+            tastes=torch.zeros(len(rows)),
         )
 
     def select(self, rows: Tensor) -> "Design":
@@ -88,6 +93,7 @@ class Design:
             target=self.target[rows],
             rows=self.rows[rows],
             weights=self.weights[rows],
+            tastes=self.tastes[rows],
         )
 
     def of_unknown_users(self) -> "Design":
@@ -99,6 +105,7 @@ class Design:
         dim, state = self.vectors.shape[1], self.x.shape[1]
         shapes: Mapping[str, tuple[int, ...]] = {
             "mean": (),
+            "tastes": (),
             "item": (len(self.vectors),),
             "user": (self.n_users + 1,),
             "content": (self.n_tags + dim,),
@@ -118,6 +125,8 @@ class Design:
             total = total + self.of_content(effects["content"])[self.items]
         if "user" in effects:
             total = total + effects["user"][self.users]
+        if "tastes" in effects:
+            total = total + self.tastes * effects["tastes"]
         if "exposure" in effects:
             total = total + self.exposure @ effects["exposure"]
         if "state" in effects:
@@ -151,6 +160,8 @@ class Design:
                 return torch.cat([counts[: self.n_tags], vectors.sum(0)])
             case "affinity":
                 return sums.index_add(0, self.users, vectors)
+            case "tastes":
+                return (self.weights * self.tastes.square()).sum()
             case "exposure":
                 return (each * self.exposure.square()).sum(0)
             case "state":
@@ -188,7 +199,7 @@ def _exposure(model: ItemRewardModel, rows: RewardRows) -> Tensor:
     parts = []
     for start in range(0, len(rows), _CHUNK):
         part = slice(start, start + _CHUNK)
-        items, shown = rows.items[part].unsqueeze(1), rows.shown.at(part)
+        items, shown = rows.items[part].unsqueeze(1), rows.shown.at(part).latest(model.lags)
         likeness, liked = model.likeness, model.liked(shown.rewards)
         columns = [
             likeness.to_items(likeness.profile(earlier, torch.ones_like(earlier).float()), items)

@@ -2,9 +2,10 @@
 
 import dataclasses
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -22,6 +23,8 @@ from ucfrec.counterfactual.item_reward_report import (
     scores_of,
 )
 from ucfrec.counterfactual.item_reward_rows import RewardRows
+from ucfrec.counterfactual.session_tastes import MEMORY, root_of_tastes
+from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.item_counts import LIKED
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
@@ -34,12 +37,18 @@ _FIRST: Final = 6
 """Index of the spread that is tried first, 0.4."""
 _CHEAP: Final = ("item", "user", "content")
 """Effects whose spreads are searched finely, and adjusted to each other."""
+_STRIDES: Final = {**dict.fromkeys(_CHEAP, (2, 1)), "tastes": ()}
+"""Steps of the search of a spread, (2,) for others; one number alone needs no search."""
 _KNOWN: Final = 0.1
 """Least share of held-out rows of known users that can judge the effects in `LASTING`."""
+_SCALES: Final = (0.25, 0.5, 1.0, 2.0, 4.0)
+"""Standard deviations of tastes that are tried, relative to the noise of single steps."""
 LASTING: Final = ("item", "user", "content", "affinity")
 """Effects that are told apart by users who were shown several items."""
 _MAX_ROWS: Final = 500_000
 _CONSTANT: Final = 1e-6
+_ROWS: Final = 512
+"""Rows whose tastes are found at once; more leave the processor's cache."""
 
 
 def reward_model_sizes(store: EpisodeStore) -> dict[str, int]:
@@ -61,6 +70,7 @@ def fit_item_reward_model(
     folder: Path,
     seed: int,
     max_rows: int = _MAX_ROWS,
+    effects: Collection[str] = EFFECTS,
 ) -> tuple[ItemRewardModel, ItemRewardReport]:
     """Fit the model to training rows, or read it from `folder` if it was fitted before.
 
@@ -72,8 +82,8 @@ def fit_item_reward_model(
     fifth of the training rows then chooses for the effects in `LASTING`: with unknown users,
     effects of items that contain those of the users who saw them predict best. What a user's
     effects tell of training rows, the history of the session must tell of a new user. So the
-    effects of users are dropped once those of items are known, and the other effects are fitted
-    without them.
+    effects of users are dropped once those of items are known, but for how much users differ, which
+    is what `SessionTastes` start from, and the other effects are fitted without them.
 
     Args:
         train: view of a store of items.
@@ -81,6 +91,7 @@ def fit_item_reward_model(
         folder: receives the fitted model.
         seed: of the rows drawn from a store with more than `max_rows`.
         max_rows: most rows of each view that are used.
+        effects: those that are tried.
 
     Returns:
         The model, in evaluation mode, and its quality on the validation rows.
@@ -98,8 +109,12 @@ def fit_item_reward_model(
     held_out = RewardRows.of(validation, model.lags, max_rows, seed)
     set_statistics(model, rows, held_out, train.item_states)
     search = EffectSearch(Design.of(model, rows), Design.of(model, held_out))
+    if search.of_new_users:
+        rows = RewardRows.of(train, MEMORY, max_rows, seed)
+        held_out = RewardRows.of(validation, MEMORY, max_rows, seed)
+        search.sessions = Sessions(model, rows.shown, held_out.shown)
     with progress(len(EFFECTS), "item rewards", "effects") as bar:
-        search.add_all(bar)
+        search.add_all(bar, effects)
     model.set_effects(search.effects, search.design.of_content)
     report = _report(model, search, rows, held_out, train.item_states, start)
     folder.mkdir(parents=True, exist_ok=True)
@@ -119,9 +134,11 @@ def refit_item_reward_model(
         seed: of the rows drawn from a view with more than `max_rows`.
         max_rows: most rows that are used.
     """
-    report = _report_from(load_tensors(first / FITTED)[1])
+    tensors, about = load_tensors(first / FITTED)
+    report = _report_from(about)
     model = ItemRewardModel(reward_model_sizes(store))
-    rows = RewardRows.of(store, model.lags, max_rows, seed)
+    lags = MEMORY if "tastes" in report.kept else model.lags
+    rows = RewardRows.of(store, lags, max_rows, seed)
     set_statistics(model, rows, rows, store.item_states)
     design = Design.of(model, rows)
     effects, spreads, fixed = design.mean_effect(), dict(report.kept), Effects()
@@ -132,6 +149,11 @@ def refit_item_reward_model(
                 lasting[name] = spreads.pop(name)
         fixed = _of_items(fit_effects(design, effects, lasting))
         design = design.of_unknown_users()
+        if "tastes" in spreads:
+            alone = fit_effects(design, effects, {}, fixed)
+            set_usual(model, design, alone)
+            model.tastes.root.copy_(tensors["tastes.root"])
+            design = replace(design, tastes=told(model, rows.shown, rows.items))
     model.set_effects(fit_effects(design, effects, spreads, fixed), design.of_content)
     folder.mkdir(parents=True, exist_ok=True)
     save_tensors(folder / FITTED, model.state_dict(), dataclasses.asdict(report))
@@ -142,8 +164,39 @@ def _of_items(effects: Effects) -> Effects:
     return {name: effects[name] for name in ("item", "content") if name in effects}
 
 
+def set_usual(model: ItemRewardModel, design: Design, effects: Effects) -> None:
+    """Set what items usually earn, for `SessionTastes`, from the effects of mean and items."""
+    everywhere = effects["mean"] + effects.get("item", torch.zeros(()))
+    if "content" in effects:
+        everywhere = everywhere + design.of_content(effects["content"])
+    model.tastes.usual.copy_(torch.sigmoid(everywhere) if design.binary else everywhere)
+
+
+def told(model: ItemRewardModel, shown: Shown, items: Tensor) -> Tensor:
+    """What `SessionTastes` of weight 1, after what was shown in M sessions, add to the scores (M,)
+    of items (M,)."""
+    model.tastes.weigh(1.0)
+    added = []
+    for start in range(0, len(items), _ROWS):
+        part = slice(start, start + _ROWS)
+        tastes = model.tastes_after(shown.at(part))
+        added.append(tastes[:, 0] + (tastes[:, 1:] * model.vectors[items[part]]).sum(1))
+    return torch.cat(added)
+
+
+class Sessions(NamedTuple):
+    """What the sessions of rows showed before them, where users are new."""
+
+    model: ItemRewardModel
+    """Its `tastes` are set while effects are searched."""
+    training: Shown
+    held_out: Shown
+
+
 class EffectSearch:
     """The effects found so far, and their loss on held-out rows."""
+
+    sessions: Sessions | None = None
 
     def __init__(self, design: Design, held_out: Design) -> None:
         self.design, self.held_out = design, held_out
@@ -151,16 +204,19 @@ class EffectSearch:
         self.kept: dict[str, int] = {}
         self.new_users = False
         self._fixed: Effects = {}
+        self._root: Tensor | None = None
         self.losses = self._losses(self.effects)
         self.base_loss = self.item_loss = float(self.losses.mean())
         self.tried: list[EffectTried] = []
 
     def add(self, name: str) -> None:
         """Add the effect `name` with the best spread, if it lowers the held-out loss."""
+        if name == "tastes" and self._root is not None:
+            self._scale_tastes(self._root)
         nobody = bool((self.design.users == self.design.n_users).all())
         if not self.design.squares(name).any() or (nobody and name in ("user", "affinity")):
             return
-        at, (effects, losses) = self._best(name, _FIRST, (2, 1) if name in _CHEAP else (2,))
+        at, (effects, losses) = self._best(name, _FIRST, _STRIDES.get(name, (2,)))
         decrease = self.losses - losses
         gain = float(decrease.mean())
         error = float(decrease.std(correction=0)) / len(decrease) ** 0.5
@@ -170,24 +226,31 @@ class EffectSearch:
         if gain > error:
             self.effects, self.losses, self.kept[name] = effects, losses, at
 
-    def add_all(self, bar: Progress) -> None:
-        """Add every effect that lowers the held-out loss."""
-        judge = self if self._known_users() >= _KNOWN else self.of_training()
+    def add_all(self, bar: Progress, effects: Collection[str]) -> None:
+        """Add every one of `effects` that lowers the held-out loss."""
+        judge = self.of_training() if self.of_new_users else self
         for name in EFFECTS:
             if judge is not self and name not in LASTING:
                 self._take(judge)
                 self._forget_users()
                 judge = self
-            judge.add(name)
+            if name in effects:
+                judge.add(name)
             if name == _CHEAP[-1]:
                 judge.adjust()
             bar.update()
 
-    def _known_users(self) -> float:
-        """Share of the held-out rows whose users have training rows; 1 if no users are known."""
+    @property
+    def of_new_users(self) -> bool:
+        """Whether hardly any held-out row is of a user with training rows."""
+        seen = self._seen()
+        return bool(seen.any()) and float(seen[self.held_out.users].float().mean()) < _KNOWN
+
+    def _seen(self) -> Tensor:
+        """(n_users + 1,) bool: users with training rows."""
         seen = torch.bincount(self.design.users, minlength=self.design.n_users + 1) > 0
         seen[-1] = False
-        return float(seen[self.held_out.users].float().mean()) if seen.any() else 1.0
+        return seen
 
     def of_training(self) -> "EffectSearch":
         """A search that is judged on a fifth of the training rows."""
@@ -208,10 +271,34 @@ class EffectSearch:
 
     def _forget_users(self) -> None:
         """Fit further effects as for new users, with the effects of items as they are."""
+        if self.sessions is not None and "affinity" in self.effects:
+            seen = self._seen()
+            level = self.effects.get("user", torch.zeros(len(seen)))[seen]
+            tastes = torch.cat([level.unsqueeze(1), self.effects["affinity"][seen]], 1)
+            self._root = root_of_tastes(tastes, self.design.rows)
         self.new_users, self._fixed = True, _of_items(self.effects)
         self.design = self.design.of_unknown_users()
         self.effects = fit_effects(self.design, self.design.mean_effect(), {}, self._fixed)
         self.losses = self._losses(self.effects)
+
+    def _scale_tastes(self, root: Tensor) -> None:
+        """Choose how much users differ, relative to noise, by the held-out loss."""
+        assert self.sessions is not None
+        model, *shown = self.sessions
+        set_usual(model, self.design, self.effects)
+
+        def tell(scale: float) -> None:
+            model.tastes.root.copy_(scale * root)
+            self.design, self.held_out = (
+                replace(design, tastes=told(model, before, design.items))
+                for design, before in zip((self.design, self.held_out), shown, strict=True)
+            )
+
+        def loss(scale: float) -> float:
+            tell(scale)
+            return float(self._best("tastes", _FIRST, ())[1][1].mean())
+
+        tell(min(_SCALES, key=loss))
 
     def adjust(self) -> None:
         """Choose the spreads of the effects found so far again, each given the others."""

@@ -58,6 +58,6 @@ class EffectTransitions:
         """
         model = self._model
         read = view.transitions(episodes, steps)
-        rows = RewardRows.at(view, episodes, steps, model.lags)
+        rows = RewardRows.at(view, episodes, steps, model.reach)
         fixed = model.fixed_part(rows.shown, rows.users, rows.items)
         return replace(read, actions=torch.cat([model.vectors[rows.items], fixed[:, None]], 1))

@@ -6,6 +6,7 @@ from typing import Final
 import torch
 from torch import Tensor, nn
 
+from ucfrec.counterfactual.session_tastes import MEMORY, SessionTastes
 from ucfrec.episodes.exposure import Likeness, Shown
 
 FITTED: Final = "item_reward.safetensors"
@@ -24,7 +25,8 @@ class ItemRewardModel(nn.Module):
         η = item_i + user_u + state · x + (affinity_u + interactionᵀ x) · e_i + exposure_i,
 
     x being the standardised state, e_i the centred embedding of the item, and exposure_i what
-    repeating an item, or showing one like it, n steps after the last time adds (`Likeness`).
+    repeating an item, or showing one like it, n steps after the last time adds (`Likeness`). For
+    new users, user_u and affinity_u are what the session tells of them (`SessionTastes`).
     Item effects include those of tags and embeddings, which items without training rows have too.
     For rewards of two values the model is logistic: η is the log-odds of the higher one. Otherwise
     η is the standardised reward.
@@ -73,13 +75,19 @@ class ItemRewardModel(nn.Module):
         self.register_buffer("interaction", torch.zeros(state, dim))
         self.register_buffer("exposure", torch.zeros(4, LAGS))
         self.likeness = Likeness(items, dim, sizes.get("tags", 0))
+        self.tastes = SessionTastes(items, dim)
+
+    @property
+    def reach(self) -> int:
+        """Items shown before a step that its expected reward depends on."""
+        return max(self.lags, MEMORY) if self.tastes.known else self.lags
 
     def scores(self, states: Tensor, shown: Shown, users: Tensor | None = None) -> Tensor:
         """Linear predictors of all items, (B, n_items).
 
         Args:
             states: (B, S) before the step.
-            shown: what the sessions showed before the step; more than `lags` items have no effect.
+            shown: what the sessions showed before the step; more than `reach` items have no effect.
             users: (B,) int64 numbers in the training store, −1 for an unknown user; None if all
                 users are unknown.
 
@@ -91,8 +99,9 @@ class ItemRewardModel(nn.Module):
         added = self.likeness.to_all(self.likeness.profile(items, alike))
         rows, lags = torch.nonzero(items >= 0, as_tuple=True)
         added = added.index_put((rows, items[rows, lags]), repeated[rows, lags], accumulate=True)
-        added = added + self.query(states, users) @ self.vectors.T
-        return self.item + self.level(states, users).unsqueeze(1) + added
+        tastes = self.tastes_after(shown)
+        added = added + self.query(states, users, tastes) @ self.vectors.T
+        return self.item + self.level(states, users, tastes).unsqueeze(1) + added
 
     def score(self, states: Tensor, shown: Shown, users: Tensor | None, items: Tensor) -> Tensor:
         """Linear predictors (B,) of one item each, int64 (B,); see `scores`."""
@@ -107,13 +116,24 @@ class ItemRewardModel(nn.Module):
         each, known = items.unsqueeze(1), self._known(users, items)
         exposure = self.likeness.to_items(self.likeness.profile(before, alike), each)
         exposure = exposure + ((before == each) * repeated).sum(1)
-        affinity = (self.affinity[known] * self.vectors[items]).sum(1)
-        part: Tensor = self.item[items] + self.user[known] + affinity + exposure
+        tastes = self.tastes_after(shown)
+        affinity = ((self.affinity[known] + tastes[:, 1:]) * self.vectors[items]).sum(1)
+        part: Tensor = self.item[items] + self.user[known] + tastes[:, 0] + affinity + exposure
         return part
 
-    def level(self, states: Tensor, users: Tensor | None) -> Tensor:
-        """The part (B,) of the scores that all items share, in states (B, S) of users (B,)."""
-        return self.user[self._known(users, states)] + self.standardised(states) @ self.state
+    def level(self, states: Tensor, users: Tensor | None, tastes: Tensor) -> Tensor:
+        """The part (B,) of the scores that all items share, in states (B, S) of users (B,) with
+        `tastes_after` (B, D + 1)."""
+        of_user = self.user[self._known(users, states)] + tastes[:, 0]
+        return of_user + self.standardised(states) @ self.state
+
+    def tastes_after(self, shown: Shown) -> Tensor:
+        """What sessions told of their users' level and affinity, (B, D + 1)."""
+        if not self.tastes.known:
+            return torch.zeros(len(shown.items), self.vectors.shape[1] + 1, device=self.item.device)
+        items, rewards = shown.latest(MEMORY)
+        tastes: Tensor = self.tastes(items, self.vectors, self.target(rewards))
+        return tastes
 
     def expected(self, scores: Tensor) -> Tensor:
         """Expected rewards, in reward units, of linear predictors of any shape."""
@@ -137,12 +157,12 @@ class ItemRewardModel(nn.Module):
         self.item.copy_(effects["mean"] + effects.get("item", torch.zeros(())))
         if "content" in effects:
             self.item.add_(of_content(effects["content"]))
+        self.tastes.weigh(effects.get("tastes", 0.0))
 
     def target(self, rewards: Tensor) -> Tensor:
         """What η predicts: whether rewards (...) are the higher one, or standardised rewards."""
-        if bool(self.binary):
-            return (rewards == self.reward_high).float()
-        return ((rewards - self.reward_mean) / self.reward_std).clamp(-CLIP, CLIP)
+        standardised = ((rewards - self.reward_mean) / self.reward_std).clamp(-CLIP, CLIP)
+        return torch.where(self.binary, (rewards == self.reward_high).float(), standardised)
 
     def standardised(self, states: Tensor) -> Tensor:
         """States (..., S) in standard deviations from their training mean, clipped."""
@@ -155,10 +175,10 @@ class ItemRewardModel(nn.Module):
             return torch.full((len(like),), last, device=like.device)
         return torch.where((users >= 0) & (users < last), users, last)
 
-    def query(self, states: Tensor, users: Tensor | None) -> Tensor:
-        """What multiplies the vector of every item, (B, D)."""
+    def query(self, states: Tensor, users: Tensor | None, tastes: Tensor) -> Tensor:
+        """What multiplies the vector of every item, (B, D); the arguments are those of `level`."""
         interaction = self.standardised(states) @ self.interaction
-        return self.affinity[self._known(users, states)] + interaction
+        return self.affinity[self._known(users, states)] + tastes[:, 1:] + interaction
 
     def liked(self, rewards: Tensor) -> Tensor:
         """Rewards (...) on a scale from 0 to 1."""

@@ -107,7 +107,7 @@ def scores_of(model: ItemRewardModel, rows: RewardRows) -> tuple[Tensor, Tensor]
         part = slice(start, start + _CHUNK)
         states, users = rows.states[part], rows.users[part]
         scores.append(model.score(states, rows.shown.at(part), users, rows.items[part]))
-        levels.append(model.level(states, users))
+        levels.append(model.level(states, users, model.tastes_after(rows.shown.at(part))))
     return torch.cat(scores), torch.cat(levels)
 
 

@@ -38,7 +38,8 @@ class RewardRows:
     def of(cls, view: EpisodeStore, lags: int, limit: int, seed: int) -> "RewardRows":
         """All steps of a view of a store of items; of more than `limit`, so many drawn by `seed`.
 
-        Nothing of a step but its item and reward is read, nor anything of later steps.
+        Of what was shown earlier, the latest `lags` steps are read. Nothing of a step but its item
+        and reward is read, nor anything of later steps.
         """
         if view.n_steps > limit:
             drawn = np.random.default_rng(seed).choice(view.n_steps, limit, replace=False)

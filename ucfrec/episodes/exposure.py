@@ -37,6 +37,10 @@ class Shown(NamedTuple):
         """The sessions with the given numbers."""
         return Shown(self.items[rows], self.rewards[rows])
 
+    def latest(self, steps: int) -> "Shown":
+        """What was shown in the latest `steps` of these."""
+        return Shown(self.items[:, :steps], self.rewards[:, :steps])
+
 
 @dataclass(frozen=True)
 class Exposed:

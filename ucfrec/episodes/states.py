@@ -192,10 +192,16 @@ def _with_zero_row(table: Tensor) -> Tensor:
 class SessionStates:
     """States of N running sessions, updated after every step."""
 
-    def __init__(self, states: ItemStates, sessions: int) -> None:
-        self._states = states
-        self._items = torch.full((sessions, states.window), -1, dtype=torch.int64)
-        self._rewards = torch.zeros(sessions, states.window)
+    def __init__(self, states: ItemStates, sessions: int, memory: int = 0) -> None:
+        """
+        Args:
+            states: builds the states.
+            sessions: N.
+            memory: items of a session that `shown` tells at least.
+        """
+        self._states, length = states, max(states.window, memory)
+        self._items = torch.full((sessions, length), -1, dtype=torch.int64)
+        self._rewards = torch.zeros(sessions, length)
         self._steps = torch.zeros(sessions, dtype=torch.int64)
         self.users = torch.full((sessions,), -1, dtype=torch.int64)
         """(N,) int64 rows of the user features; −1, the default, for an unknown user."""
@@ -213,11 +219,13 @@ class SessionStates:
 
     def current(self, observations: Tensor) -> Tensor:
         """States (N, S) just before the next step, given its observations (N, O)."""
-        return self._states.build(self._items, self._rewards, self._steps, self.users, observations)
+        recent = self._items[:, : self._states.window], self._rewards[:, : self._states.window]
+        return self._states.build(*recent, self._steps, self.users, observations)
 
     @property
     def shown(self) -> tuple[Tensor, Tensor]:
-        """Items shown before the next step, (N, window), most recent first, and their rewards."""
+        """Items shown before the next step, (N, max(window, memory)), most recent first, and their
+        rewards."""
         return self._items, self._rewards
 
     def record(self, items: Tensor, rewards: Tensor) -> None:

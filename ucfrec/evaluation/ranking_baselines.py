@@ -48,7 +48,7 @@ class RewardRanker:
     def scores(self, steps: Steps) -> Tensor:
         """Predicted rewards (B, n_items), in the model's units."""
         assert self.decider.reward_model is not None
-        windows = steps.windows(self.decider.reward_model.lags + 1)
+        windows = steps.windows(self.decider.reward_model.reach + 1)
         return self.decider.rewards(windows, torch.from_numpy(steps.users))
 
 

@@ -1,6 +1,7 @@
 """Greedy policy: the action with the highest predicted immediate reward."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -13,6 +14,7 @@ from ucfrec import schema
 from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model
 from ucfrec.counterfactual.item_reward_model import ItemRewardModel
 from ucfrec.counterfactual.reward_model import mlp
+from ucfrec.counterfactual.session_tastes import MEMORY
 from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
@@ -39,6 +41,9 @@ class CRMGreedyPolicy(SequencePolicy):
     candidates: Tensor
 
     def __init__(self, config: PolicyConfig, sizes: Mapping[str, int]) -> None:
+        if sizes["items"]:
+            # The reward model reads so many items before the step.
+            config = replace(config, context=max(config.context, MEMORY + 1))
         super().__init__(config, sizes)
         self.model: ItemRewardModel | nn.Sequential
         if sizes["items"]:

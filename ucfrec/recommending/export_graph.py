@@ -72,7 +72,7 @@ class RuleGraph(nn.Module):
         self._decider = replace(decider, policy=self.policy)
         self._rule = decider.rule
         reach = self.context - 1 + states.window
-        self.length = reach if self.reward is None else max(reach, self.reward.lags)
+        self.length = max(reach, decider.reach)
         """L, items before the step that are read."""
 
     def forward(
@@ -259,5 +259,6 @@ class _Reward(nn.Module):
     def forward(self, states: Tensor, shown: Shown, users: Tensor) -> Tensor:
         items, repeated, alike = self.model.exposures(shown)
         added = _added(self.likeness.to_all(items, alike), items, repeated)
-        added = added + self.model.query(states, users) @ self.model.vectors.T
-        return self.model.item + self.model.level(states, users).unsqueeze(1) + added
+        tastes = self.model.tastes_after(shown)
+        added = added + self.model.query(states, users, tastes) @ self.model.vectors.T
+        return self.model.item + self.model.level(states, users, tastes).unsqueeze(1) + added

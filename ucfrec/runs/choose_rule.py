@@ -144,7 +144,7 @@ class RuleSearch:
         end = SessionEnd(likeness, LoggedEnds.of(train, model.lags, _MOST_STEPS, seed))
         self._longest, self.end = int(train.lengths.max()), end
         if users is None:
-            rows = RewardRows.of(validation, model.lags, _MOST_STEPS, seed)
+            rows = RewardRows.of(validation, model.reach, _MOST_STEPS, seed)
             self._store, self._model = validation, model
             self.calibration = calibrate(model, rows)
         else:

@@ -105,3 +105,19 @@ def test_the_root_is_of_how_users_differ(users: int) -> None:
         torch.testing.assert_close(
             variances / variances.sum(), expected / expected.sum(), rtol=0.2, atol=0.01
         )
+
+
+def test_users_who_differ_in_one_direction_have_a_root() -> None:
+    drawn = torch.zeros(5000, DIM + 1)
+    drawn[:, 1] = torch.randn(5000, generator=torch.Generator().manual_seed(0))
+    root = root_of_tastes(drawn, torch.eye(DIM))
+    assert torch.isfinite(root).all()
+    assert float(root[1, 1]) > 30 * float(root[2, 2]) > 0
+
+
+@pytest.mark.parametrize("broken", [torch.nan, torch.inf])
+def test_broken_weights_give_no_number(broken: float) -> None:
+    tastes, vectors = planted()
+    tastes.root[0, 0] = broken
+    items = torch.arange(5).expand(2, 5)
+    assert torch.isnan(tastes(items, vectors, torch.zeros(2, 5))).any(1).all()

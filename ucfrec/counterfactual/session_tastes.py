@@ -15,6 +15,8 @@ from torch.nn import functional as F
 
 MEMORY: Final = 50
 """Steps of a session that tell of tastes, the latest ones."""
+_LEAST: Final = 1e-6
+"""Variance of tastes in every direction, relative to the mean."""
 
 
 class SessionTastes(nn.Module):
@@ -64,7 +66,8 @@ class SessionTastes(nn.Module):
 def _solution(matrix: Tensor, right: Tensor) -> Tensor:
     """(B, K, 1) solutions of symmetric equations (B, K, K) with eigenvalues of at least 1."""
     if not torch.compiler.is_exporting():
-        return torch.cholesky_solve(right, torch.linalg.cholesky(matrix))
+        # Of weights that are NaN the solution is, too, which the decision then says.
+        return torch.cholesky_solve(right, torch.linalg.cholesky_ex(matrix).L)
     # ONNX has no factorisation: Gauss-Jordan elimination, which needs no pivots here.
     size = matrix.shape[1]
     system, units = torch.cat([matrix, right], 2), torch.eye(size).unsqueeze(2)
@@ -88,5 +91,6 @@ def root_of_tastes(tastes: Tensor, vectors: Tensor) -> Tensor:
     covariance = torch.from_numpy(ledoit_wolf(tastes.double().numpy(), assume_centered=True)[0])
     inputs = F.pad(vectors.double(), (1, 0), value=1.0)
     variance = ((inputs @ covariance) * inputs).sum(1).mean()
-    root: Tensor = torch.linalg.cholesky(covariance / variance)
+    least = _LEAST * covariance.trace() / len(covariance) * torch.eye(len(covariance))
+    root: Tensor = torch.linalg.cholesky((covariance + least) / variance)
     return root.float()

@@ -5,15 +5,15 @@ from typing import Final
 
 from ucfrec_simulators.benchmark.cells import Cell
 
-_STEP: Final = {"kuairand": 0.1, "kuairec": 0.1, "sardine-boredinf": 0.1}
+_STEP: Final = {"kuairand": 0.045, "kuairec": 0.045, "sardine-boredinf": 0.06}
 """CPU seconds of a training step of width 64, by task."""
 _COPIES: Final = {"kuairand": 38.0, "kuairec": 38.0}
 """CPU seconds of a reward model, a generator and their copies, by task."""
 _REWARDS: Final = {"sardine-boredinf": 15.0, "sardine-static": 15.0}
 """CPU seconds of a reward model of items, by task."""
-_CHOICE: Final = {"kuairand": 12.0, "kuairec": 12.0, "sardine-boredinf": 90.0}
+_CHOICE: Final = {"kuairand": 8.0, "kuairec": 8.0, "sardine-boredinf": 60.0}
 """CPU seconds of the choice of a decision rule, by task."""
-_ELSE: Final = {"step": 0.06, "copies": 45.0, "rewards": 11.0, "choice": 10.0}
+_ELSE: Final = {"step": 0.05, "copies": 40.0, "rewards": 11.0, "choice": 8.0}
 """The same of other tasks."""
 _EVALUATION: Final = 5.0
 """CPU seconds to evaluate a policy in a world."""

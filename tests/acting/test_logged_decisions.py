@@ -10,16 +10,20 @@ import pandas as pd
 import pytest
 
 from tests.support.replay import replayed
+from tests.support.served import learn_tastes
 from tests.support.tagged import ITEMS, tagged_log, tagged_store
 from ucfrec import EpisodeStore, Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.logged_decisions import LoggedDecisions, seen_before, session_scores
+from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model
+from ucfrec.counterfactual.session_tastes import MEMORY
 from ucfrec.evaluation.ranking import Steps
 from ucfrec.evaluation.ranking_baselines import PolicyRanker
 from ucfrec.logs import LogMapping
 from ucfrec.off_policy.score import logged_sessions, scored_steps
 from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
+from ucfrec.runs.run import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SETTINGS = {
@@ -35,6 +39,7 @@ RULES = {
     "filters": DecisionRule(3.0, temperature=2.0, top_k=9, exclude_seen=True, tag_window=2),
     "run": DecisionRule(3.0, temperature=1.0, tag_run=2),
     "far": DecisionRule(3.0, temperature=1.0, tag_window=8),  # further than the policy sees
+    "tilted": DecisionRule(3.0, temperature=1.0, tilt=1.0),  # by tastes learned in the session
 }
 MORE = {"session": {}, "horizon": {"policy.return_to_go": "horizon", "policy.horizon": 2}}
 
@@ -44,6 +49,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store, and a run on it for each definition of the return-to-go."""
     folder = tmp_path_factory.mktemp("decisions")
     store = tagged_store(folder)
+    fit_item_reward_model(*training_views(store), folder / "rewards", seed=0)
     for name, more in MORE.items():
         Recommender("ucf", settings=SETTINGS | more).fit(store, folder / name)
     return folder
@@ -57,6 +63,10 @@ def trained(folder: Path, request: pytest.FixtureRequest) -> TrainedPolicy:
     assert term is not None
     for parameter in term.parameters():
         parameter.data += 0.05 * (parameter.data + 1e-9).sign()
+    views = training_views(EpisodeStore.open(folder / "store"))
+    model, _ = fit_item_reward_model(*views, folder / "rewards", seed=0)
+    trained = replace(trained, reward_model=model)
+    learn_tastes(trained)
     return trained
 
 
@@ -73,12 +83,15 @@ def test_logged_sessions_are_read_as_far_back_as_a_rule_looks(
     folder: Path, trained: TrainedPolicy
 ) -> None:
     for rule in (DecisionRule(3.0, tag_run=10), DecisionRule(3.0, tag_window=10)):
-        decider = trained.decider(rule)
+        decider = replace(trained, reward_model=None).decider(rule)
         assert decider.policy.config.context < 10
-        assert decider.reward_model is None
         logged = EpisodeStore.open(folder / "store")
         known = LoggedDecisions.at(decider, logged, np.array([0]), logged.lengths[:1] - 1)
         assert known.shown.items.shape == (1, 10)
+        far = LoggedDecisions.at(
+            trained.decider(rule), logged, np.array([0]), logged.lengths[:1] - 1
+        )
+        assert far.shown.items.shape == (1, MEMORY)
 
 
 @pytest.mark.parametrize("rule", RULES)

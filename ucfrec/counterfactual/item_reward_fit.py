@@ -112,7 +112,7 @@ def fit_item_reward_model(
     if search.of_new_users:
         rows = RewardRows.of(train, MEMORY, max_rows, seed)
         held_out = RewardRows.of(validation, MEMORY, max_rows, seed)
-        search.sessions = Sessions(model, rows.shown, held_out.shown)
+        search.shown = ShownBefore(model, rows.shown, held_out.shown)
     with progress(len(EFFECTS), "item rewards", "effects") as bar:
         search.add_all(bar, effects)
     model.set_effects(search.effects, search.design.of_content)
@@ -153,7 +153,7 @@ def refit_item_reward_model(
             alone = fit_effects(design, effects, {}, fixed)
             set_usual(model, design, alone)
             model.tastes.root.copy_(tensors["tastes.root"])
-            design = replace(design, tastes=told(model, rows.shown, rows.items))
+            design = replace(design, tastes=added_by_tastes(model, rows.shown, rows.items))
     model.set_effects(fit_effects(design, effects, spreads, fixed), design.of_content)
     folder.mkdir(parents=True, exist_ok=True)
     save_tensors(folder / FITTED, model.state_dict(), dataclasses.asdict(report))
@@ -172,7 +172,7 @@ def set_usual(model: ItemRewardModel, design: Design, effects: Effects) -> None:
     model.tastes.usual.copy_(torch.sigmoid(everywhere) if design.binary else everywhere)
 
 
-def told(model: ItemRewardModel, shown: Shown, items: Tensor) -> Tensor:
+def added_by_tastes(model: ItemRewardModel, shown: Shown, items: Tensor) -> Tensor:
     """What `SessionTastes` of weight 1, after what was shown in M sessions, add to the scores (M,)
     of items (M,)."""
     model.tastes.weigh(1.0)
@@ -184,7 +184,7 @@ def told(model: ItemRewardModel, shown: Shown, items: Tensor) -> Tensor:
     return torch.cat(added)
 
 
-class Sessions(NamedTuple):
+class ShownBefore(NamedTuple):
     """What the sessions of rows showed before them, where users are new."""
 
     model: ItemRewardModel
@@ -196,7 +196,8 @@ class Sessions(NamedTuple):
 class EffectSearch:
     """The effects found so far, and their loss on held-out rows."""
 
-    sessions: Sessions | None = None
+    shown: ShownBefore | None = None
+    """Where users are new; needed to learn tastes within the session."""
 
     def __init__(self, design: Design, held_out: Design) -> None:
         self.design, self.held_out = design, held_out
@@ -271,7 +272,7 @@ class EffectSearch:
 
     def _forget_users(self) -> None:
         """Fit further effects as for new users, with the effects of items as they are."""
-        if self.sessions is not None and "affinity" in self.effects:
+        if self.shown is not None and "affinity" in self.effects:
             seen = self._seen()
             level = self.effects.get("user", torch.zeros(len(seen)))[seen]
             tastes = torch.cat([level.unsqueeze(1), self.effects["affinity"][seen]], 1)
@@ -283,14 +284,14 @@ class EffectSearch:
 
     def _scale_tastes(self, root: Tensor) -> None:
         """Choose how much users differ, relative to noise, by the held-out loss."""
-        assert self.sessions is not None
-        model, *shown = self.sessions
+        assert self.shown is not None
+        model, *shown = self.shown
         set_usual(model, self.design, self.effects)
 
         def tell(scale: float) -> None:
             model.tastes.root.copy_(scale * root)
             self.design, self.held_out = (
-                replace(design, tastes=told(model, before, design.items))
+                replace(design, tastes=added_by_tastes(model, before, design.items))
                 for design, before in zip((self.design, self.held_out), shown, strict=True)
             )
 

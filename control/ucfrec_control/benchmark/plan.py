@@ -9,7 +9,7 @@ from ucfrec_control.benchmark.budgets import Budget
 from ucfrec_control.benchmark.cells import SCORE_MEASUREMENT, SCORES, Cell, code_of
 from ucfrec_control.benchmark.estimate import announcement
 from ucfrec_control.benchmark.folders import run_name, stages_of, stores_of
-from ucfrec_control.benchmark.methods import MAIN, PURSUING, TABLES
+from ucfrec_control.benchmark.methods import MAIN, TABLES
 from ucfrec_control.benchmark.rates import settings_of
 from ucfrec_control.data.distractor import zoo_store
 
@@ -50,14 +50,14 @@ def cells_of(
     data: Path, folder: Path, budget: Budget, name: str, table: str, methods: Sequence[str]
 ) -> Iterator[Cell]:
     """The cells of some rows of a table; arguments as of `benchmark`."""
-    # A method of two sweeps shares one run: trained once, evaluated for the rows of both.
-    runs = folder / name / (table if table in (MAIN, PURSUING) else "sweeps")
+    # A method of two tables shares one run: trained once, evaluated for the rows of both.
+    runs = folder / name
     for file in budget.files_in(data):
         store = zoo_store(data, stores_of(folder), file)
         for method in methods:
             learner, method_settings = TABLES[table][method]
             code = code_of(learner)
-            for seed in range(budget.seeds_of(file)):
+            for seed in range(budget.seeds_of(file, learner)):
                 yield Cell(
                     suite=SCORES,
                     table=table,

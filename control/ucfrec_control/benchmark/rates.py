@@ -168,7 +168,7 @@ def _cells(
             code = code_of(learner, __name__)
             for rate in RATES[name]:
                 settings = (f"{_COPIES}=0", *shorter, f"train.{RATE}={rate:g}", *own)
-                for seed in range(budget.seeds_of(file)):
+                for seed in range(budget.seeds_of(file, learner)):
                     yield Cell(
                         suite=SUITE,
                         table=f"{rate:g}",

@@ -6,7 +6,7 @@ from pathlib import Path
 from ucfrec.commands.grid_options import results_given, rows_given
 from ucfrec.reporting.rows_file import benchmarking
 from ucfrec.reporting.tables import format_rows
-from ucfrec_control.benchmark.budgets import BUDGETS
+from ucfrec_control.benchmark.budgets import SEARCHES
 from ucfrec_control.benchmark.rates import (
     RATE,
     SUITE,
@@ -49,7 +49,7 @@ def run(options: argparse.Namespace) -> None:
                 data_given(options),
                 options.out,
                 results_given(options),
-                budget_given(BUDGETS, options),
+                budget_given(SEARCHES, options),
                 options.budget,
                 options.workers,
                 options.method,

@@ -55,8 +55,7 @@ def run(options: argparse.Namespace) -> None:
         print_scores(rows, part.table, budget.rates)
     pictures = options.out / options.part
     if part.of_runs:
-        runs = list(dict.fromkeys(cell.run.parent for cell in cells))
-        made, _ = make_figures(runs, [], pictures)
+        made, _ = make_figures([cell.run for cell in cells], [], pictures)
     else:
         made = make_row_figures(rows, pictures)
     print("\n".join(["", *map(str, made)]))

@@ -12,7 +12,7 @@ from ucfrec_control.benchmark import robustness
 from ucfrec_control.benchmark.budgets import BUDGETS, SWEEPS, Budget
 from ucfrec_control.benchmark.cells import code_of
 from ucfrec_control.benchmark.folders import run_name
-from ucfrec_control.benchmark.methods import MAIN, METHODS, PURSUING, TABLES
+from ucfrec_control.benchmark.methods import MAIN, METHODS, TABLES
 from ucfrec_control.benchmark.plan import benchmark
 from ucfrec_control.benchmark.rates import settings_of
 from ucfrec_control.commands.benchmark import budgets_of
@@ -70,14 +70,22 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
     assert [main[m].policy.best_share for m in ("bc", "bc-10", "bc-25")] == [1.0, 0.1, 0.25]
 
 
-def test_a_method_of_two_sweeps_is_one_configuration() -> None:
+@pytest.mark.parametrize("size", ["small", "full"])
+def test_a_method_of_two_tables_is_one_configuration(size: str) -> None:
     """They share their runs."""
-    for budget in SWEEPS.values():
-        for file in budget.files:
-            named: dict[str, Config] = {}
-            for table in TABLES.keys() - {MAIN, PURSUING}:
-                for method, config in resolved(table, budget, file).items():
-                    assert named.setdefault(method, config) == config
+    for file in SWEEPS[size].files:
+        named: dict[str, Config] = {}
+        for table in TABLES:
+            for method, config in resolved(table, budgets_of(table)[size], file).items():
+                assert named.setdefault(method, config) == config
+
+
+def test_seeds_are_fewer_for_cql_and_for_antmaze() -> None:
+    small, full = BUDGETS["small"], BUDGETS["full"]
+    files = ("hopper_medium-zoo", "antmaze-umaze-v2")
+    assert [small.seeds_of(file, "cql") for file in files] == [1, 1]
+    assert [small.seeds_of(file, "ucf") for file in files] == [4, 4]
+    assert [full.seeds_of(file, "cql") for file in files] == [5, 4]
 
 
 def test_robustness_trains_rows_of_the_benchmark() -> None:
@@ -114,7 +122,7 @@ def test_the_best_trajectories_are_cloned_and_evaluated(
     seen = np.random.default_rng(0).normal(size=(20, 11)).astype(np.float32)
     chosen = {}
     for method in rows:
-        runs = tmp_path / "runs" / "tiny" / MAIN / "hopper_medium-made"
+        runs = tmp_path / "runs" / "tiny" / "hopper_medium-made"
         run = runs / run_name(method, code_of(METHODS[method][0]), 0)
         actor = load_run(run, "last").actor(len(seen), DecisionRule(1.0))
         actor.begin(np.arange(len(seen)))

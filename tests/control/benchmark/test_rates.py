@@ -86,7 +86,7 @@ def test_the_search_writes_rows_and_a_choice_once(
     write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
     settings = ("train.batch_size=4", "train.warmup_steps=0", "policy.dim=16", "policy.context=3")
     tiny = {"small": Budget(("hopper_medium-made",), 1, 1, settings)}
-    monkeypatch.setattr("ucfrec_control.commands.rates.BUDGETS", tiny)
+    monkeypatch.setattr("ucfrec_control.commands.rates.SEARCHES", tiny)
     monkeypatch.setitem(RATES, "small", (1e-9, 1e-2))
     out, toml = tmp_path / "out", tmp_path / "rates.toml"
     arguments = ["rates", "--data", str(tmp_path), "--out", str(out), "--toml", str(toml)]

@@ -40,7 +40,7 @@ def difference_to_ours(rows: Sequence[ResultRow]) -> dict[tuple[str, str], str]:
     found: dict[tuple[str, str], str] = {}
     for world, group in grouped(rows, lambda row: str(row.world)).items():
         values = {
-            name: {(row.log_seed, row.training_seed): row.value for row in own}
+            name: {_pair(row): row.value for row in own}
             for name, own in grouped(group, lambda row: row.method).items()
         }
         ours = values.get(OURS, {})
@@ -53,7 +53,7 @@ def difference_to_ours(rows: Sequence[ResultRow]) -> dict[tuple[str, str], str]:
 
 def sweep_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
     """One line per world and setting of UCF: return, validation loss and acceptance rate."""
-    head = ("world", "setting", "seeds", "R_cum", "validation loss", "acceptance")
+    head = ("world", "setting", "logs × seeds", "R_cum", "validation loss", "acceptance")
     lines = []
     for (world, method), group in grouped(of_checkpoint(rows, checkpoint), _line).items():
         shown = ("R_cum", "validation_loss", "acceptance")
@@ -76,19 +76,19 @@ def distractor_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str
     groups = grouped(of_checkpoint(rows, checkpoint), key)
     lines = []
     for (world, quantile, method), group in sorted(groups.items(), key=lambda item: item[0][:2]):
-        by_seed = [
-            {r.training_seed: r.value for r in group if r.conditions["distractor"] == rate}
+        by_pair = [
+            {_pair(row): row.value for row in group if row.conditions["distractor"] == rate}
             for rate in DISTRACTOR_RATES
         ]
-        seeds = [s for s in by_seed[0] if all(s in other for other in by_seed)]
-        if not seeds:  # a world in which no distractor was planted
+        pairs = [pair for pair in by_pair[0] if all(pair in other for other in by_pair)]
+        if not pairs:  # a world in which no distractor was planted
             continue
-        clean, off, on = ([values[seed] for seed in seeds] for values in by_seed)
+        clean, off, on = ([values[pair] for pair in pairs] for values in by_pair)
         drop = [100 * (1 - with_it / without) for with_it, without in zip(off, clean, strict=True)]
         spread = [mean_and_sd(values) for values in (clean, off, on, drop)]
-        lines.append((world, f"{-quantile:g}", method, len(seeds), *spread))
+        lines.append((world, f"{-quantile:g}", method, len(pairs), *spread))
     shown = ("no distractor", "distractor off", "distractor on", "drop, %")
-    return markdown_table(("world", "target quantile", "method", "seeds", *shown), lines)
+    return markdown_table(("world", "target quantile", "method", "logs × seeds", *shown), lines)
 
 
 def of_checkpoint(rows: Sequence[ResultRow], checkpoint: str) -> list[ResultRow]:
@@ -115,6 +115,10 @@ def _less(values: Mapping[_Pair, float], ours: Mapping[_Pair, float]) -> str:
         return f"{differences[0]:+.3g}"
     said = signed_difference(summary(differences))
     return said if over_logs.count == 1 else f"{said} ({over_logs.standard_error:.2g})"
+
+
+def _pair(row: ResultRow) -> _Pair:
+    return row.log_seed, row.training_seed
 
 
 def _line(row: ResultRow) -> tuple[str, str]:

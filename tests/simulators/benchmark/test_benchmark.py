@@ -283,6 +283,14 @@ def test_tables_give_means_spreads_and_paired_drops() -> None:
     line, less = distractor_table(every).splitlines()[2:]
     assert less == line.replace("| 1 |", "| 0.99 |")
     assert line == "| w | 1 | m | 2 | 15 ± 7.1 | 10 ± 7.1 | 12 ± 5.7 | 37.5 ± 18 |"
+    # Seed 0 of another log is another pair: drops of 50, 25 and −100%.
+    other = distractor_rows({None: (30.0,), 0.0: (60.0,), 1.0: (40.0,)})
+    both = [*every, *(replace(row, log_seed=1) for row in other)]
+    assert (
+        distractor_table(both)
+        .splitlines()[2]
+        .endswith("| 3 | 20 ± 10 | 26.67 ± 29 | 21.33 ± 17 | -8.333 ± 80 |")
+    )
 
 
 def test_methods_are_compared_with_ucf_by_log_and_seed() -> None:

@@ -4,17 +4,18 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ucfrec.reporting.result_row import ResultRow
-from ucfrec.reporting.statistics import Summary, grouped, paired_differences, summary
+from ucfrec.reporting.statistics import Summary, grouped, summary
 from ucfrec.reporting.tables import NONE, mean_and_sd, signed_difference
 
 MEAN = "mean"
 NEAR = 0.05
 """Share of the best score by which scores may be lower and still count as level with it."""
+_BySeed = Mapping[int | None, float]
 
 
 def score_table(rows: Sequence[ResultRow], checkpoint: str) -> list[dict[str, str]]:
     """One line per method and one column per dataset: normalised score, mean ± standard error over
-    seeds, and the mean over datasets if the method has rows of all (Table 1 of the paper).
+    seeds (Table 1 of the paper); then the mean over datasets, of the seeds that all have.
 
     As in the paper, the best of a column and what comes within 5% of it are `**bold**`.
 
@@ -25,17 +26,12 @@ def score_table(rows: Sequence[ResultRow], checkpoint: str) -> list[dict[str, st
         checkpoint: "last" or "best".
     """
     kept = [r for r in rows if r.checkpoint == checkpoint or "best_step" not in r.metrics]
-    scores = {
-        pair: [row.value for row in group]
-        for pair, group in grouped(kept, lambda row: (row.method, row.task)).items()
-    }
-    tasks = list(dict.fromkeys(row.task for row in kept))
+    values, tasks = _by_seed(kept, "score"), list(dict.fromkeys(row.task for row in kept))
     cells: dict[str, dict[str, Summary]] = {}
     for method in dict.fromkeys(row.method for row in kept):
-        own = {task: summary(scores.get((method, task), ())) for task in tasks}
-        complete = all(each.count for each in own.values())
-        means = [each.mean for each in own.values()] if complete else []
-        cells[method] = {**own, MEAN: summary([summary(means).mean] if means else [])}
+        of_tasks = [values.get((method, task), {}) for task in tasks]
+        own = [summary(seeds.values()) for seeds in of_tasks]
+        cells[method] = dict(zip((*tasks, MEAN), (*own, _over_tasks(of_tasks)), strict=True))
     best = {
         name: max((c[name].mean for c in cells.values() if c[name].count), default=0.0)
         for name in (*tasks, MEAN)
@@ -87,27 +83,50 @@ def over_seeds(
     ]
 
 
-def against(rows: Sequence[ResultRow], first: str, metrics: Sequence[str]) -> list[dict[str, str]]:
-    """One line per dataset and other method: difference of `metrics` to the method `first` with the
-    same seed, mean ± standard error over the seeds that both have.
+def difference_table(
+    rows: Sequence[ResultRow], first: str, metric: str = "score"
+) -> list[dict[str, str]]:
+    """One line per method other than `first` and one column per dataset: difference of `metric` to
+    `first` with the same seed, mean ± standard error over the seeds that both have; then the mean
+    over datasets, ± its standard error over seeds, if both have rows of all.
 
     Args:
         rows: rows of one checkpoint.
         first: the reference.
-        metrics: names of metrics; one that a method does not have is a dash.
+        metric: name of a metric; of methods without it there is no line.
     """
-    groups = grouped(rows, lambda row: (row.task, row.method))
+    values, tasks = _by_seed(rows, metric), list(dict.fromkeys(row.task for row in rows))
     lines = []
-    for (task, method), group in groups.items():
-        line = {"task": task, "method": method}
-        for name in metrics:
-            reference = _by_seed(groups.get((task, first), ()), name)
-            difference = summary(paired_differences(_by_seed(group, name), reference))
-            line[name] = signed_difference(difference) if difference.count > 1 else NONE
-        if method != first and any(line[name] != NONE for name in metrics):
-            lines.append(line)
+    for method in dict.fromkeys(row.method for row in rows if row.method != first):
+        of_tasks = [
+            _less(values.get((method, task), {}), values.get((first, task), {})) for task in tasks
+        ]
+        found = [*(summary(own.values()) for own in of_tasks), _over_tasks(of_tasks)]
+        if any(each.count for each in found):
+            said = map(_difference, found)
+            lines.append({"method": method, **dict(zip((*tasks, MEAN), said, strict=True))})
     return lines
 
 
-def _by_seed(rows: Sequence[ResultRow], metric: str) -> dict[int | None, float]:
-    return {row.training_seed: row.metrics[metric] for row in rows if metric in row.metrics}
+def _by_seed(rows: Sequence[ResultRow], metric: str) -> dict[tuple[str, str], _BySeed]:
+    """The metric, where a row has it, by training seed, of each method and dataset."""
+    return {
+        pair: {row.training_seed: row.metrics[metric] for row in group if metric in row.metrics}
+        for pair, group in grouped(rows, lambda row: (row.method, row.task)).items()
+    }
+
+
+def _over_tasks(of_tasks: Sequence[_BySeed]) -> Summary:
+    """Means over datasets, of the seeds that all of them have."""
+    seeds = [seed for seed in of_tasks[0] if all(seed in own for own in of_tasks)]
+    return summary(summary(own[seed] for own in of_tasks).mean for seed in seeds)
+
+
+def _less(values: _BySeed, others: _BySeed) -> _BySeed:
+    return {seed: value - others[seed] for seed, value in values.items() if seed in others}
+
+
+def _difference(differences: Summary) -> str:
+    if differences.count > 1:
+        return signed_difference(differences)
+    return f"{differences.mean:+.3g}" if differences.count else NONE

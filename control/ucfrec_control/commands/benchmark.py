@@ -14,7 +14,7 @@ from ucfrec_control.benchmark.methods import MAIN, PURSUING, TABLES
 from ucfrec_control.benchmark.plan import benchmark
 from ucfrec_control.benchmark.rates import chosen_rates
 from ucfrec_control.benchmark.tables import (
-    against,
+    difference_table,
     of_best_target,
     over_seeds,
     score_table,
@@ -114,8 +114,10 @@ def _print_tables(rows: Sequence[ResultRow], table: str) -> None:
     print("\nlast checkpoint, mean ± standard deviation over seeds")
     print(format_rows(over_seeds([row.as_line() for row in last], by, shown), (*by, *shown)))
     reference = UCF if table == MAIN else last[0].method
-    print(f"\nless {reference} of the same seed, mean ± standard error")
-    print(format_rows(against(last, reference, values), (*by, *values)))
+    for name in values:
+        if lines := difference_table(last, reference, name):
+            print(f"\n{name} less that of {reference} of the same seed, mean ± standard error")
+            print(format_rows(lines, list(lines[0])))
 
 
 UCF = "ucf"

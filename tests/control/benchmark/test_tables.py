@@ -6,7 +6,12 @@ import pytest
 
 from tests.support.result_rows import result_row
 from ucfrec.reporting.result_row import ResultRow
-from ucfrec_control.benchmark.tables import against, of_best_target, over_seeds, score_table
+from ucfrec_control.benchmark.tables import (
+    difference_table,
+    of_best_target,
+    over_seeds,
+    score_table,
+)
 
 
 def scored(task: str, method: str, seed: int, score: float, **more: Any) -> ResultRow:
@@ -34,10 +39,10 @@ def test_a_table_of_scores_has_the_spread_over_seeds_and_a_mean_where_nothing_is
     ]
     dt, iql = score_table(rows, "last")
     # Of 10 and 20 the standard error is 5.
-    assert dt == {"method": "dt", "a": "15.0 ± 5", "b": "**45.0 ± 5**", "mean": "**30.0**"}
+    assert dt == {"method": "dt", "a": "15.0 ± 5", "b": "**45.0 ± 5**", "mean": "**30.0 ± 5**"}
     assert iql == {"method": "iql", "a": "**30.0**", "b": "–", "mean": "–"}
     best_dt, best_iql = score_table(rows, "best")
-    assert best_dt["mean"] == "**31.0**"
+    assert best_dt["mean"] == "**31.0 ± 5**"
     assert best_iql == iql
 
 
@@ -77,12 +82,18 @@ def test_what_was_not_measured_is_a_dash() -> None:
 
 
 def test_methods_are_compared_seed_by_seed() -> None:
-    scores = {"none": (10.0, 50.0, 90.0), "copies": (13.0, 51.0), "lonely": (1.0,)}
+    scores = {
+        ("none", "a"): (10.0, 50.0, 90.0), ("copies", "a"): (13.0, 51.0), ("lonely", "a"): (1.0,),
+        ("none", "b"): (20.0, 20.0, 20.0), ("copies", "b"): (22.0, 26.0),
+    }  # fmt: skip
     rows = [
-        scored("a", method, seed, score)
-        for method, seeds in scores.items()
+        scored(task, method, seed, score)
+        for (method, task), seeds in scores.items()
         for seed, score in enumerate(seeds)
     ]
-    # Of 3 and 1: their deviation √2 over √2.
-    found = against(rows, "none", ("score", "unknown"))
-    assert found == [{"task": "a", "method": "copies", "score": "+2 ± 1", "unknown": "–"}]
+    copies, lonely = difference_table(rows, "none")
+    # Of 3 and 1, and of 2 and 6: their deviation over √2. In the mean over tasks 2.5 and 3.5.
+    assert copies == {"method": "copies", "a": "+2 ± 1", "b": "+4 ± 2", "mean": "+3 ± 0.5"}
+    assert lonely == {"method": "lonely", "a": "-9", "b": "–", "mean": "–"}
+    assert difference_table(rows, "none", "unknown") == []
+    assert difference_table(rows, "missing") == []

@@ -15,14 +15,17 @@ from pathlib import Path
 from textwrap import TextWrapper
 from typing import Any
 
-from counterfactual_copies import ARMS, compared, difference_table
+from counterfactual_copies import ARMS, compared
+from counterfactual_copies import difference_table as copies_table
 
 from ucfrec.reporting.plot_style import OURS, PLAIN, save, styled
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import latest, read_rows
 from ucfrec.reporting.statistics import grouped, summary
 from ucfrec.reporting.tables import NONE, markdown_table, mean_and_sd
-from ucfrec_control.benchmark.tables import score_table
+from ucfrec_control.benchmark.robustness import SHOWN as SHOWN_DROPS
+from ucfrec_control.benchmark.robustness import SHOWN_LARGEST, drops, largest_drops
+from ucfrec_control.benchmark.tables import difference_table, over_seeds, score_table
 from ucfrec_simulators.benchmark.methods import ADDITIONS, METHODS
 from ucfrec_simulators.benchmark.tables import difference_to_ours, distractor_table, sweep_table
 
@@ -76,10 +79,8 @@ class Section:
     def text(self, files: Mapping[str, Sequence[ResultRow]]) -> str:
         """The part as Markdown."""
         rows = self.rows(files)
-        body = self.table(rows) if rows else "Not measured yet."
-        parts = [f"## {self.title}", fill(self.about), body]
-        if rows:
-            parts.append(fill(_origin(rows, self.command)))
+        about, origin = fill(self.about), fill(_origin(rows, self.command))
+        parts = [f"## {self.title}", about, self.table(rows), origin]
         return "\n\n".join(part for part in parts if part)
 
 
@@ -182,8 +183,39 @@ def promised(files: Mapping[str, Sequence[ResultRow]]) -> Sequence[ResultRow]:
 
 
 def scores(rows: Sequence[ResultRow]) -> str:
-    """Table 1's shape: last checkpoints."""
-    lines = score_table(rows, "last")
+    """Table 1's shape: last checkpoints, then what each method scores less than UCF."""
+    last = [row for row in rows if row.checkpoint == "last"]
+    parts = [
+        "Scores, mean ± standard error over seeds; bold: within 5% of the best:",
+        of_lines(score_table(last, "last")),
+        "Scores less that of `ucf` of the same seed, ± standard error:",
+        of_lines(difference_table(last, "ucf")),
+    ]
+    return "\n\n".join(parts)
+
+
+def losses_to_distractors(rows: Sequence[ResultRow]) -> str:
+    """The largest drop of each method, then all."""
+    shown = ("task", "distractor", "method")
+    largest = markdown_table(
+        SHOWN_LARGEST,
+        [
+            (line["method"], *(f"{line[at]:.1f}" for at in SHOWN_LARGEST[1:]))
+            for line in largest_drops(rows)
+        ],
+    )
+    parts = [
+        "The largest loss over files and distractors, in percent of the clean score, each the mean "
+        "over seeds:",
+        largest,
+        "Scores, mean ± standard deviation over seeds, and losses in percent:",
+        of_lines(over_seeds(drops(rows), shown, SHOWN_DROPS)),
+    ]
+    return "\n\n".join(parts)
+
+
+def of_lines(lines: Sequence[Mapping[str, Any]]) -> str:
+    """A table whose columns are those of its first line."""
     return markdown_table(list(lines[0]), [list(line.values()) for line in lines])
 
 
@@ -198,6 +230,7 @@ def of(name: str, table: str, dated: bool = True) -> Callable[..., Sequence[Resu
 
 
 RUN = "ucfrec benchmark recommendation --table"
+CONTROL = "ucfrec-control benchmark $UCFREC_DATA/control --budget small --table"
 SECTIONS = (
     Section(
         "Recommendation (Table 2)",
@@ -234,7 +267,7 @@ SECTIONS = (
         "of the return without copies.",
         "python benchmarks/counterfactual_copies.py --out runs/copies",
         of("counterfactual_copies", "counterfactual-copies"),
-        difference_table,
+        copies_table,
     ),
     Section(
         "Settings of UCF",
@@ -252,12 +285,28 @@ SECTIONS = (
     ),
     Section(
         "Control (Tables 1 and 3)",
-        "Normalised scores, mean ± standard error over seeds, small budget. **These rows are from "
-        "before learning rates were chosen for every learner**, and say less than the paper's "
-        "sizes would.",
-        "ucfrec-control benchmark $UCFREC_DATA/control --budget small --table main",
+        "Normalised scores of the last checkpoint, small budget. **These rows are from before "
+        "learning rates were chosen for every learner**, and say less than the paper's sizes "
+        "would.",
+        f"{CONTROL} main",
         of("control", "main", dated=False),
         scores,
+    ),
+    Section(
+        "Control: ways to pursue reward",
+        "All without embeddings of time steps, as UCF is: advantage weights, the largest return "
+        "that the policy expects as target, both, and the best quarter of the trajectories.",
+        f"{CONTROL} pursuing",
+        of("control", "pursuing"),
+        scores,
+    ),
+    Section(
+        "Control: what a distractor costs (Figures 3 and 4)",
+        "Policies trained with a distractor in their states and played with it fixed to 0, and the "
+        "same policies with it fixed to 1.",
+        "ucfrec-control robustness --data $UCFREC_DATA/control --budget small",
+        of("control_robustness", "robustness"),
+        losses_to_distractors,
     ),
 )
 
@@ -279,7 +328,7 @@ def page(files: Mapping[str, Sequence[ResultRow]], pictures: Sequence[str]) -> s
     shown = "\n".join(f"![{name}](assets/tables/{name}.svg)" for name in pictures)
     worlds = "\n".join(fill(f"- {world}", subsequent_indent="  ") for world in WORLDS)
     parts = ["# Tables", head, "## What each world can and cannot tell", worlds]
-    parts += [section.text(files) for section in SECTIONS]
+    parts += [section.text(files) for section in SECTIONS if section.rows(files)]
     parts += ["## The paper's Table 2", paper, PAPER]
     parts += ["## Pictures", shown] if pictures else []
     return "\n\n".join(parts) + "\n"
@@ -334,7 +383,7 @@ def main() -> None:
     )
     parser.add_argument("--check", action="store_true", help="compare instead of writing")
     options = parser.parse_args()
-    names = ("recommendation", "counterfactual_copies", "control")
+    names = ("recommendation", "counterfactual_copies", "control", "control_robustness")
     files = {name: latest(read_rows(RESULTS / f"{name}.jsonl")) for name in names}
     if not options.check and find_spec("matplotlib") is not None:
         PICTURES.mkdir(parents=True, exist_ok=True)

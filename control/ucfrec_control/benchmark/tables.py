@@ -15,7 +15,7 @@ _BySeed = Mapping[int | None, float]
 
 def score_table(rows: Sequence[ResultRow], checkpoint: str) -> list[dict[str, str]]:
     """One line per method and one column per dataset: normalised score, mean ± standard error over
-    seeds (Table 1 of the paper); then the mean over datasets, of the seeds that all have.
+    seeds (Table 1 of the paper); then the mean over datasets if the method has rows of all.
 
     As in the paper, the best of a column and what comes within 5% of it are `**bold**`.
 
@@ -88,7 +88,7 @@ def difference_table(
 ) -> list[dict[str, str]]:
     """One line per method other than `first` and one column per dataset: difference of `metric` to
     `first` with the same seed, mean ± standard error over the seeds that both have; then the mean
-    over datasets, ± its standard error over seeds, if both have rows of all.
+    over datasets if both have rows of all.
 
     Args:
         rows: rows of one checkpoint.
@@ -117,9 +117,12 @@ def _by_seed(rows: Sequence[ResultRow], metric: str) -> dict[tuple[str, str], _B
 
 
 def _over_tasks(of_tasks: Sequence[_BySeed]) -> Summary:
-    """Means over datasets, of the seeds that all of them have."""
-    seeds = [seed for seed in of_tasks[0] if all(seed in own for own in of_tasks)]
-    return summary(summary(own[seed] for own in of_tasks).mean for seed in seeds)
+    """Of the means over datasets of each seed; of one mean where datasets differ in their seeds."""
+    seeds = set(of_tasks[0])
+    if all(set(own) == seeds for own in of_tasks):
+        return summary(summary(own[seed] for own in of_tasks).mean for seed in of_tasks[0])
+    means = [summary(own.values()).mean for own in of_tasks]
+    return summary([summary(means).mean] if all(of_tasks) else [])
 
 
 def _less(values: _BySeed, others: _BySeed) -> _BySeed:

@@ -95,5 +95,8 @@ def test_methods_are_compared_seed_by_seed() -> None:
     # Of 3 and 1, and of 2 and 6: their deviation over √2. In the mean over tasks 2.5 and 3.5.
     assert copies == {"method": "copies", "a": "+2 ± 1", "b": "+4 ± 2", "mean": "+3 ± 0.5"}
     assert lonely == {"method": "lonely", "a": "-9", "b": "–", "mean": "–"}
+    more = scored("a", "copies", 2, 91.0)
+    found = difference_table([*rows, more], "none")[0]
+    assert found["mean"] == "+2.83", "no error where datasets differ in their seeds"
     assert difference_table(rows, "none", "unknown") == []
     assert difference_table(rows, "missing") == []

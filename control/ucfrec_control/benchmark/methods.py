@@ -2,6 +2,12 @@
 
 Methods = dict[str, tuple[str, tuple[str, ...]]]
 _NO_TIME = "policy.max_timestep=1"
+_ALGORITHM_5 = ("augment.copies=3", "augment.edits_per_copy=1", "augment.reward_quantile=0.0")
+PAPER: Methods = {
+    "ucf-paper": ("ucf-paper", ()),
+    "ucf-paper-algorithm-5": ("ucf-paper", _ALGORITHM_5),
+}
+"""UCF as the paper has it, with Appendix H's copies and with Algorithm 5's."""
 METHODS: Methods = {
     "bc": ("bc", ()),
     "bc-10": ("bc", ("policy.best_share=0.1",)),
@@ -16,20 +22,19 @@ METHODS: Methods = {
     "lsdt-wo-time": ("lsdt", (_NO_TIME,)),
     "ucf": ("ucf", ()),
     "ucf-w-time": ("ucf", ("policy.max_timestep=1000",)),
-    "ucf-paper": ("ucf-paper", ()),
+    **PAPER,
     "ucf-wo-count": ("ucf", ("augment.copies=0",)),
     "ucf-wo-arch": ("dt", ("augment.copies=1",)),
 }
 """Learner and settings by the name of the table's row; the last two are Table 3's ablations.
 
 UCF's preset has no embedding of time steps, the presets of DT, DC and LSDT have one; `ucf-w-time`
-and `…-wo-time` are the reverse. `ucf-paper` is UCF as the paper has it.
+and `…-wo-time` are the reverse.
 """
 
 _FAITHFUL, _NOISE = "csg.kind=faithful", "csg.kind=noise"
 _NO_GATE = "augment.epsilon_r=1e9"
 """Disables the gate on the change of the reward; the limit on a move's length stays."""
-_ALGORITHM_5 = ("augment.copies=3", "augment.edits_per_copy=1", "augment.reward_quantile=0.0")
 METHODS_WO_TIME = {"dt": "dt-wo-time", "dc": "dc-wo-time", "lsdt": "lsdt-wo-time", "ucf": "ucf"}
 """The method without embeddings of time steps, by learner."""
 _PURSUITS = {
@@ -42,9 +47,8 @@ _PURSUITS = {
 """Ways to pursue reward instead of imitating. A policy with `max_return` is asked for the largest
 return that it expects in each state."""
 MAIN, PURSUING = "main", "pursuing"
-TABLES: dict[str, Methods] = {
-    MAIN: METHODS,
-    # All without embeddings of time steps, as UCF is.
+_TABLES: dict[str, Methods] = {
+    # All but the paper's without embeddings of time steps, as UCF is.
     PURSUING: {
         f"{METHODS_WO_TIME[learner]}{name}": (learner, (_NO_TIME, *settings))
         for learner in METHODS_WO_TIME
@@ -86,4 +90,5 @@ TABLES: dict[str, Methods] = {
         },
     },
 }
+TABLES = {MAIN: METHODS, **{name: rows | PAPER for name, rows in _TABLES.items()}}
 """Rows of each table, as in `METHODS`."""

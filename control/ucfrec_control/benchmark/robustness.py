@@ -24,7 +24,7 @@ from ucfrec_control.data.distractor import CLEAN, DISTRACTORS, zoo_store
 
 SCREENED = {"ucf-screened": "copies", "ucf-dropped": "drop"}
 """UCF with copies that intervene on flagged dimensions, and UCF trained without them."""
-METHODS = ("dt", "dc", "lsdt", "ucf", "ucf-wo-count", "ucf-wo-arch", *SCREENED)
+METHODS = ("dt", "dc", "lsdt", "ucf-paper", "ucf-wo-count", "ucf-wo-arch", "ucf", *SCREENED)
 """Methods of `ucfrec_control.benchmark.plan`, and `SCREENED`."""
 
 BUDGETS = {

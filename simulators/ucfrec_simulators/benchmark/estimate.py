@@ -1,8 +1,11 @@
 """How long the cells of a benchmark take on the machine that they were measured on."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Final
 
+from ucfrec.files import read_json
+from ucfrec.runs.trained_policy import RUN
 from ucfrec_simulators.benchmark.cells import Cell
 
 _STEP: Final = {"kuairand": 0.045, "kuairec": 0.045, "sardine-boredinf": 0.06}
@@ -33,11 +36,11 @@ def announcement(workers: int) -> Callable[[Sequence[Cell]], str]:
 
 
 def estimated_hours(cells: Sequence[Cell]) -> float:
-    """CPU hours of `cells`; what several of them share is counted once."""
+    """CPU hours of `cells`; what several share is counted once, finished trainings are not."""
     evaluated = _EVALUATION * sum(len(cell.worlds) for cell in cells)
     seconds: dict[object, float] = {}
     for cell in cells:
-        if cell.run is None:
+        if cell.run is None or _finished(cell.run):
             continue
         task, config = cell.task.partition(",")[0], cell.config
         log = cell.store, cell.training_seed
@@ -49,3 +52,7 @@ def estimated_hours(cells: Sequence[Cell]) -> float:
             settings = repr((config.crm, config.csg, config.augment))
             seconds[log, settings] = _COPIES.get(task, _ELSE["copies"])
     return (evaluated + sum(seconds.values())) / 3600
+
+
+def _finished(run: Path) -> bool:
+    return (run / RUN).exists() and "policy" in read_json(run / RUN)

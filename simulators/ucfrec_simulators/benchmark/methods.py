@@ -45,6 +45,14 @@ def _with(method: Method, settings: tuple[str, ...], vectors: bool) -> Method:
     return replace(method, settings=(*method.settings, *settings), vectors=vectors)
 
 
+PAPER: Final[Mapping[str, Method]] = {
+    "ucf-paper": Method("ucf-paper"),
+    "ucf-paper-algorithm-5": Method(
+        "ucf-paper",
+        ("augment.copies=3", "augment.edits_per_copy=1", "augment.reward_quantile=0.0"),
+    ),
+}
+"""UCF as the paper has it, with Appendix H's copies and with Algorithm 5's."""
 METHODS: Final[Mapping[str, Method]] = {
     "popular": Method("popular", ("rule.choose=false",), conditioned=False),
     "item-rate": Method("item-rate", ("rule.choose=false",), conditioned=False, vectors=False),
@@ -59,15 +67,15 @@ METHODS: Final[Mapping[str, Method]] = {
     "crm-greedy": Method("crm-greedy", ("rule.choose=false",), conditioned=False),
     **{name: _with(learner, PLAIN, True) for name, learner in LEARNERS.items()},
     **{f"{name}+": _with(learner, PLUS, False) for name, learner in LEARNERS.items()},
-    "ucf-paper": Method("ucf-paper"),
+    **PAPER,
     "ucf-plain": Method("ucf", PLAIN, vectors=False),
     "ucf-wo-count": Method("ucf", ("augment.copies=0",)),
     "ucf-wo-arch": Method("dt", ("augment.copies=1", *PLUS)),
     "ucf": Method("ucf"),
 }
 """Methods by their name in the tables. A learner's name stands for it as its authors have it, `+`
-for it with `PLUS`. UCF has these additions by default, `ucf-plain` lacks them, and `ucf-paper` is
-the paper's. `ucf-wo-count` and `ucf-wo-arch` are Table 3's ablations of `ucf`."""
+for it with `PLUS`. UCF has these additions by default, `ucf-plain` lacks them. `ucf-wo-count` and
+`ucf-wo-arch` are Table 3's ablations of `ucf`."""
 ADDITIONS: Final[Mapping[str, Method]] = {
     "ucf-wo-exposure": Method("ucf", ("policy.exposure=false",), vectors=False),
     "ucf-wo-tilt": Method("ucf", ("rule.tilts=[0]",), vectors=False),

@@ -19,7 +19,7 @@ from ucfrec.runs.shared_stages import SharedStages
 from ucfrec_simulators import sardine
 from ucfrec_simulators.benchmark import cells, tasks
 from ucfrec_simulators.benchmark.cells import Cell, EvaluationPlan
-from ucfrec_simulators.benchmark.methods import ADDITIONS, METHODS, SCREENED, Method
+from ucfrec_simulators.benchmark.methods import ADDITIONS, METHODS, PAPER, SCREENED, Method
 from ucfrec_simulators.benchmark.tasks import TASKS, BenchmarkTask, Log
 from ucfrec_simulators.distractor import OFF, ON, DistractorWorld, plant_distractor
 from ucfrec_simulators.folders import data_folder, folder_name
@@ -112,7 +112,7 @@ _PACKAGES: Final = {"sardine-static": sardine.PACKAGE, "sardine-boredinf": sardi
 """Tasks that need an optional package, and its name."""
 _DISTRACTOR: Final = DistractorWorld.__module__
 _GYMNASIUM_WORLD: Final = gymnasium_world.__name__
-_ADDED: Final[Mapping[str, Method]] = {"ucf": METHODS["ucf"], **ADDITIONS}
+_ADDED: Final[Mapping[str, Method]] = {"ucf": METHODS["ucf"], **ADDITIONS, **PAPER}
 _MEMORYLESS: Final = ("bc", "popular", "crm-greedy")
 
 
@@ -172,7 +172,7 @@ class Plan:
                     **{f"ε_r = {x:g} σ": f"augment.epsilon_r={x * spread}" for x in GATES},
                 }
                 methods = {f"ucf, {name}": Method("ucf", (s,)) for name, s in sweeps.items()}
-                yield from self._all_trained("sweeps", name, log, methods)
+                yield from self._all_trained("sweeps", name, log, {**methods, **PAPER})
 
     def distractor(self) -> Iterator[Cell]:
         """Cells of the distractor table: methods trained without and with a distractor in the logs.

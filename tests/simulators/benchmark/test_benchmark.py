@@ -325,6 +325,12 @@ def test_time_is_told_of_runs_once(tmp_path: Path) -> None:
     other = replace(cells[1], run=tmp_path / "other", settings=(*cells[1].settings, "policy.dim=8"))
     assert ucf < estimated_hours([cells[1], other]) < 2 * ucf - 20 / 3600  # copies are made once
     assert "about 0.0 hours with --workers 2" in announcement(2)(cells)
+    assert cells[1].run is not None
+    cells[1].run.mkdir(parents=True)
+    (cells[1].run / "run.json").write_text('{"config": {}}')
+    assert estimated_hours([cells[1]]) == ucf, "a training that was interrupted counts"
+    (cells[1].run / "run.json").write_text('{"config": {}, "policy": {}}')
+    assert 0 < estimated_hours([cells[1]]) < dt, "only the evaluation is left of a finished run"
 
 
 def test_a_given_log_is_dealt_out_by_session() -> None:

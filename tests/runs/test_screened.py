@@ -19,6 +19,7 @@ from ucfrec.runs import screened
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.refit import refit
 from ucfrec.runs.screened import train_screened
+from ucfrec.runs.shared_stages import SharedStages
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SETTINGS = ["train.steps=4", "train.validate_every=2", "policy.dim=8", "policy.context=3"]
@@ -94,6 +95,37 @@ def test_copies_intervene_on_the_flagged_columns_of_states_of_items(tmp_path: Pa
     record = train_screened(store, tmp_path / "run", config, "copies")
     assert "dropped_observations" not in record
     assert record["sizes"]["state"] == store.state_size
+
+
+def test_runs_that_share_stages_are_screened_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    screened_stores = []
+
+    def screen(store: EpisodeStore, seed: int) -> ScreeningReport:
+        screened_stores.append((store.path, seed))
+        return verdicts(FLAGGED)(store, seed)
+
+    monkeypatch.setattr(screened, "screen_store", screen)
+    stores = [
+        planted_items(tmp_path / name, sessions, 8) for name, sessions in (("a", 30), ("b", 31))
+    ]
+    shared = SharedStages(tmp_path / "stages")
+    records = [
+        train_screened(
+            store,
+            tmp_path / f"{store.path.name}-{how}-{seed}",
+            resolve_config("bc", None, SETTINGS, seed),
+            how,
+            shared=shared,
+        )["screening"]
+        for store in stores
+        for how in ("copies", "drop")
+        for seed in (0, 1)
+    ]
+    assert screened_stores == [(store.path, 0) for store in stores]
+    assert [record.pop("how") for record in records[:3]] == ["copies", "copies", "drop"]
+    assert records[0] == records[1] == records[2]
 
 
 def test_screening_that_leaves_no_state_is_refused(

@@ -27,6 +27,7 @@ from torch import Tensor
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import IntArray
 from ucfrec.errors import InputError
+from ucfrec.progress import progress
 from ucfrec.settings import Count, LearningRate, Share, settings_table
 
 CLIP: Final = 10.0
@@ -80,10 +81,19 @@ def measured_reward(
     data = _Steps.of(train, most, seed)
     every = range(data.columns.shape[1])
     tested = every if dimensions is None else dimensions
-    first = {dimension: _measures(data, dimension, (), config, seed) for dimension in tested}
+
+    def verdicts(dimensions: Sequence[int]) -> dict[int, bool]:
+        found = {}
+        with progress(len(dimensions), "screening, what measures the reward", "dimensions") as bar:
+            for dimension in dimensions:
+                found[dimension] = _measures(data, dimension, (), config, seed)
+                bar.update()
+        return found
+
+    first = verdicts(tested)
     if not any(first.values()):
         return tuple(first.values())
-    first |= {d: _measures(data, d, (), config, seed) for d in every if d not in first}
+    first |= verdicts([dimension for dimension in every if dimension not in first])
     found = {dimension for dimension, measures in first.items() if measures}
     # A measurement tells of a cause too, through the reward: the others are left out of the rest.
     return tuple(

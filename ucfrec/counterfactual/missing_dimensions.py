@@ -17,6 +17,7 @@ from ucfrec.counterfactual.measured_reward import (
 )
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import IntArray
+from ucfrec.progress import progress
 
 CHUNK: Final = 1024
 """Transitions whose errors are computed at once."""
@@ -131,7 +132,7 @@ def shared_pair(
         drawn = torch.randint(3 * size // 2 + 1, (batch_size,)).clamp(max=size)
         return absences[drawn].unsqueeze(0)
 
-    _optimise(pair, data, some_missing, steps, batch_size, learning_rate)
+    _optimise(pair, data, some_missing, steps, batch_size, learning_rate, "screening, common")
     return pair
 
 
@@ -152,7 +153,8 @@ def own_pairs(
     """
     count = len(absences)
     pair = PredictorPair(shared.next_state.repeated(count), shared.reward.repeated(count))
-    _optimise(pair, data, lambda: absences, steps, batch_size, learning_rate)
+    describe = f"screening, {count - 1} dimensions"
+    _optimise(pair, data, lambda: absences, steps, batch_size, learning_rate, describe)
     return pair
 
 
@@ -163,20 +165,23 @@ def _optimise(
     steps: int,
     batch_size: int,
     learning_rate: float,
+    describe: str,
 ) -> None:
     rows = torch.from_numpy(np.flatnonzero(~data.held_out))
     optimizer = torch.optim.Adam(pair.parameters(), lr=learning_rate)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, learning_rate, steps)
-    for _ in range(steps):
-        absent = missing()
-        batch = rows[torch.randint(len(rows), (batch_size,))]
-        next_errors, reward_errors = pair.errors(data, batch, absent)
-        # A missing dimension's own future is no part of the rest.
-        loss = (next_errors * (1 - absent)).mean((1, 2)).sum() + reward_errors.mean(1).sum()
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-        schedule.step()
+    with progress(steps, describe, "steps") as bar:
+        for _ in range(steps):
+            absent = missing()
+            batch = rows[torch.randint(len(rows), (batch_size,))]
+            next_errors, reward_errors = pair.errors(data, batch, absent)
+            # A missing dimension's own future is no part of the rest.
+            loss = (next_errors * (1 - absent)).mean((1, 2)).sum() + reward_errors.mean(1).sum()
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()  # type: ignore[no-untyped-call]
+            optimizer.step()
+            schedule.step()
+            bar.update()
 
 
 @torch.no_grad()

@@ -3,12 +3,14 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 from ucfrec.counterfactual.interventions import interventions
 from ucfrec.counterfactual.screening import ScreeningConfig, ScreeningReport, screen
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.files import read_json, write_json
 from ucfrec.runs.config import Config
 from ucfrec.runs.run import train_run, training_views
 from ucfrec.runs.shared_stages import OWN, SharedStages
@@ -16,6 +18,9 @@ from ucfrec.runs.trained_policy import DROPPED, RUN, read_record
 
 SCREENINGS: Final = ("drop", "copies")
 """Train without the columns, or add copies of the sessions that intervene on them."""
+SEED: Final = 0
+"""Of the screening before any training: which columns cause nothing is a question to the log, and
+runs of other training seeds shall differ in their training only."""
 SCREENING: Final = "screening"
 """Entry of a run's record: `how`, and the report of `ucfrec.counterfactual.screening`."""
 
@@ -45,7 +50,8 @@ def train_screened(
         config: of the training.
         how: one of `SCREENINGS`; None to train on the store as it is.
         about: entries that a dataset adapter adds to the record.
-        shared: as `train_run` has it; not for a run whose columns are dropped.
+        shared: as `train_run` has it, and for screening; a run whose columns are dropped has its
+            other stages to itself.
 
     Returns:
         The run's record.
@@ -63,7 +69,10 @@ def train_screened(
         )
     if how is None:
         return train_run(store, out, config, about, shared=shared)
-    screening = started[SCREENING] if started is not None else _screened(store, config.seed, how)
+    if started is not None:
+        screening = started[SCREENING]
+    else:
+        screening = {"how": how, **_screened(store, shared)}
     flagged = flagged_columns(screening)
     if len(flagged) == store.state_size:
         raise InputError(
@@ -81,8 +90,18 @@ def train_screened(
     return train_run(store, out, config, entries, copies, shared=shared)
 
 
-def _screened(store: EpisodeStore, seed: int, how: str) -> Mapping[str, Any]:
-    return {"how": how, **asdict(screen_store(store, seed))}
+def _screened(store: EpisodeStore, shared: SharedStages) -> dict[str, Any]:
+    """The report of `screen_store`, as a record has it."""
+    inputs = {"screened": store.meta["fingerprint"], "steps": store.n_steps, "seed": SEED}
+    with TemporaryDirectory() as scratch:
+        file = Path(scratch) / "screening.json"
+
+        def make() -> None:
+            write_json(file, asdict(screen_store(store, SEED)))
+
+        shared.provide(inputs, screen.__module__, file.parent, (file.name,), make)
+        report: dict[str, Any] = read_json(file)
+        return report
 
 
 def flagged_columns(screening: Mapping[str, Any]) -> list[int]:

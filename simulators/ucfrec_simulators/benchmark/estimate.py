@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Final
 
 from ucfrec.files import read_json
+from ucfrec.runs.screened import SCREENING
 from ucfrec.runs.trained_policy import RUN
 from ucfrec_simulators.benchmark.cells import Cell
 
@@ -16,7 +17,9 @@ _REWARDS: Final = {"sardine-boredinf": 15.0, "sardine-static": 15.0}
 """CPU seconds of a reward model of items, by task."""
 _CHOICE: Final = {"kuairand": 8.0, "kuairec": 8.0, "sardine-boredinf": 60.0}
 """CPU seconds of the choice of a decision rule, by task."""
-_ELSE: Final = {"step": 0.05, "copies": 40.0, "rewards": 11.0, "choice": 8.0}
+_SCREENING: Final = {"synthetic-taobao": 600.0}
+"""CPU seconds of a screening, by task."""
+_ELSE: Final = {"step": 0.05, "copies": 40.0, "rewards": 11.0, "choice": 8.0, "screening": 10.0}
 """The same of other tasks."""
 _EVALUATION: Final = 5.0
 """CPU seconds to evaluate a policy in a world."""
@@ -48,6 +51,8 @@ def estimated_hours(cells: Sequence[Cell]) -> float:
         if config.rule.choose:
             seconds[cell.run] += _CHOICE.get(task, _ELSE["choice"])
             seconds[log] = _REWARDS.get(task, _ELSE["rewards"])
+        if cell.screening is not None:
+            seconds[cell.store, SCREENING] = _SCREENING.get(task, _ELSE["screening"])
         if config.augment.makes_copies:
             settings = repr((config.crm, config.csg, config.augment))
             seconds[log, settings] = _COPIES.get(task, _ELSE["copies"])

@@ -192,8 +192,9 @@ class Plan:
                 worlds = tuple(DistractorWorld(world.name, world.folder, r) for r in (OFF, ON))
                 distracted = BenchmarkTask(planted, worlds, ())
                 both = {name: replace(clean, worlds=(world,)), f"{name}, distractor": distracted}
-                for seed, label, plan, title in product(
-                    range(self._budget.seeds), DISTRACTOR_METHODS, plans, both
+                # Cells that share a run lie far apart, so that no process waits for another's.
+                for seed, plan, label, title in product(
+                    range(self._budget.seeds), plans, DISTRACTOR_METHODS, both
                 ):
                     method = DISTRACTOR_METHODS[label]
                     yield from self._trained(

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.support.causes import QUICK, planted_items, planted_vectors
+from tests.support.causes import QUICK, planted_category, planted_items, planted_vectors
 from ucfrec import schema
 from ucfrec.counterfactual.screening import describe_screening, screen
 from ucfrec.episodes.store import EpisodeStore
@@ -30,7 +30,18 @@ def test_a_few_violent_steps_do_not_decide(tmp_path: Path) -> None:
     store = planted_vectors(tmp_path / "store", jolt=40.0)
     assert screen(store.split("train"), QUICK, seed=0).flagged == (3, 4)
     # What they would decide: that nothing helps to predict what is jolted.
-    assert 0 in screen(store.split("train"), replace(QUICK, capped=0.0), seed=0).flagged
+    uncapped = screen(store.split("train"), replace(QUICK, capped=0.0), seed=0)
+    assert uncapped.dimensions[0].p_value > QUICK.level
+
+
+def test_indicators_of_a_category_are_kept_beside_a_measurement(tmp_path: Path) -> None:
+    """One by one they follow from the others, and never change within an episode."""
+    store = planted_category(tmp_path / "store")
+    report = screen(store.split("train"), QUICK, seed=0)
+    assert report.flagged == (6,)
+    indicators = report.dimensions[1:6]
+    assert all(each.reward_effect < 0.01 for each in indicators)
+    assert all(not set(each.helps) & {1, 2, 3, 4, 5} for each in report.dimensions)
 
 
 def test_too_few_trajectories_are_refused(tmp_path: Path) -> None:

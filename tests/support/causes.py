@@ -48,6 +48,29 @@ def planted_vectors(
     return EpisodeStore.write(out, columns, np.full(trajectories, length), split, source=SOURCE)
 
 
+def planted_category(out: Path, trajectories: int = 150, length: int = 12) -> EpisodeStore:
+    """Seven dimensions: 0 drives itself and the reward, 1 to 5 are indicators of a category that
+    holds throughout a trajectory and moves the reward, 6 is whether the reward is high."""
+    rng = np.random.default_rng(0)
+    shape = (trajectories, length)
+    states, actions = np.zeros((*shape, 7)), rng.uniform(-1, 1, (*shape, 1))
+    category = rng.integers(5, size=trajectories)
+    states[np.arange(trajectories), :, 1 + category] = 1.0
+    states[:, 0, 0] = rng.normal(size=trajectories)
+    for t in range(length - 1):
+        noise = 0.3 * rng.normal(size=trajectories)
+        states[:, t + 1, 0] = 0.8 * states[:, t, 0] + 0.4 * actions[:, t, 0] + noise
+    rewards = states[:, :, 0] + 0.5 * category[:, None] + 0.3 * actions[:, :, 0]
+    states[:, :, 6] = rewards > np.median(rewards)
+    columns = {
+        schema.OBSERVATION: states.reshape(-1, 7).astype(np.float32),
+        schema.ACTION: actions.reshape(-1, 1).astype(np.float32),
+        schema.REWARD: rewards.reshape(-1).astype(np.float32),
+    }
+    split = {schema.SPLIT: (np.arange(trajectories) % 20 == 10).astype(np.int8)}
+    return EpisodeStore.write(out, columns, np.full(trajectories, length), split, source=SOURCE)
+
+
 COLUMNS = ("bit", "seen by the policy", "not seen", "user", "early bit")
 """Observation columns of `planted_items`."""
 

@@ -1,6 +1,6 @@
 """Predictions of the next state and of the reward with some dimensions of the state missing."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Final
@@ -37,6 +37,11 @@ class StandardSteps:
     episodes: IntArray
     held_out: Any
     """(N,) bool."""
+
+    @property
+    def moving(self) -> Tensor:
+        """(S,) whether a dimension ever changes within an episode."""
+        return self.changes.abs().amax(0) > 0
 
     @classmethod
     def of(cls, view: EpisodeStore, most: int, seed: int) -> "StandardSteps":
@@ -101,11 +106,12 @@ class PredictorPair(nn.Module):
         return next_errors, (self.reward(inputs) - data.rewards[rows]).square().squeeze(2)
 
 
-def absences_of(data: StandardSteps, dimensions: Sequence[int]) -> Tensor:
-    """(M + 1, 1, S): row m misses the m-th of the `dimensions`, the last row none."""
-    missing = torch.zeros(len(dimensions) + 1, 1, data.states.shape[1])
-    missing[range(len(dimensions)), 0, list(dimensions)] = 1.0
-    return missing
+def absences_of(data: StandardSteps, missing: Sequence[Collection[int]]) -> Tensor:
+    """(M, 1, S): row m misses the dimensions `missing[m]`."""
+    absences = torch.zeros(len(missing), 1, data.states.shape[1])
+    for row, dimensions in enumerate(missing):
+        absences[row, 0, list(dimensions)] = 1.0
+    return absences
 
 
 def shared_pair(
@@ -125,7 +131,7 @@ def shared_pair(
     pair = PredictorPair(
         _Predictors((inputs + 1, width, width, size)), _Predictors((inputs, width, width, 1))
     )
-    absences = absences_of(data, range(size))[:, 0]
+    absences = absences_of(data, [*((dimension,) for dimension in range(size)), ()])[:, 0]
 
     def some_missing() -> Tensor:
         # A third of the rows miss nothing, so that the complete predictor is not the worst trained.
@@ -153,7 +159,7 @@ def own_pairs(
     """
     count = len(absences)
     pair = PredictorPair(shared.next_state.repeated(count), shared.reward.repeated(count))
-    describe = f"screening, {count - 1} dimensions"
+    describe = f"screening, {count} cases"
     _optimise(pair, data, lambda: absences, steps, batch_size, learning_rate, describe)
     return pair
 
@@ -188,7 +194,7 @@ def _optimise(
 def errors_of(
     pair: PredictorPair, data: StandardSteps, rows: IntArray, absences: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Squared errors at `rows`: (M + 1, B, S) and (M + 1, B)."""
+    """Squared errors at `rows`: (M, B, S) and (M, B)."""
     chunks = torch.split(torch.from_numpy(rows), CHUNK)
     parts = [pair.errors(data, chunk, absences) for chunk in chunks]
     next_errors, reward_errors = zip(*parts, strict=True)

@@ -8,17 +8,21 @@ reward this is not possible. There the improvement must be a minimum share of th
 variance; a measurement of the reward explains no more than the predictor's error. The largest
 errors of the next state are capped, so that a few falls do not decide the test.
 
-Where the reward can hardly be predicted, as clicks, no help is no evidence, and a measurement of
-the reward helps most. There a dimension counts as without effect only if it is such a measurement
-(`ucfrec.counterfactual.measured_reward`) and does not help to predict the next state. In logs of
-items the logged observation is screened, and by that test alone.
+What helps neither one by one may help together, as the indicators of a category do, which follow
+from one another. So all that would be flagged but measurements of the reward is tested once more,
+together and without these, and kept if it helps.
+
+Where the reward can hardly be predicted without what measures it, as clicks, no help is no
+evidence, and a measurement of the reward helps most. There a dimension counts as without effect
+only if it is such a measurement (`ucfrec.counterfactual.measured_reward`) and does not help to
+predict the next state. In logs of items the logged observation is screened, and by that test alone.
 
 Features of items and users are not screened: a policy reads them from its run's own tables, so
 that they have the same values in the logs and wherever it acts.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
@@ -100,7 +104,8 @@ class DimensionReport:
     measures_reward: bool | None
     """Whether it tells of the reward after the fact; None where that does not matter."""
     causes: bool
-    """Whether it counts as having an effect, be it for want of evidence."""
+    """Whether it counts as having an effect, be it for want of evidence, or with others that are no
+    help one by one."""
 
 
 @dataclass(frozen=True)
@@ -148,21 +153,65 @@ def screen(train: EpisodeStore, config: ScreeningConfig, seed: int) -> Screening
     shared = shared_pair(
         data, config.hidden, config.shared_steps, config.batch_size, config.learning_rate
     )
-    with random_state_kept():  # whether only some are tested changes nothing else
-        r2 = _Effects.of(shared, data, (), config, seed).r2
     tested: Sequence[int] = range(data.states.shape[1])
-    measures: dict[int, bool] = {}
+    with random_state_kept():  # what is found out first changes nothing else
+        r2 = _Errors.of(shared, data, [()], config, seed).r2(0)
+        measures: dict[int, bool] = {}
+        if r2 >= config.min_reward_r2:
+            # A measurement predicts the reward well, whatever else does.
+            measures = measured(_helpful(shared, data, config))
+            leaks = [dimension for dimension, yes in measures.items() if yes]
+            r2 = _Errors.of(shared, data, [leaks], config, seed).r2(0) if leaks else r2
     if r2 < config.min_reward_r2:
         # Only what measures the reward can be without effect; the effects of the rest are left out.
-        measures = measured(tested)
-        tested = [dimension for dimension, yes in measures.items() if yes]
-    effects = _Effects.of(shared, data, tested, config, seed)
+        measures |= measured([dimension for dimension in tested if dimension not in measures])
+        tested = [dimension for dimension in tested if measures[dimension]]
+    effects = _Effects.of(shared, data, tested, config, seed, r2)
     undecided = [each.dimension for each in effects.found if each.undecided]
     measures |= measured([dimension for dimension in undecided if dimension not in measures])
     found = {each.dimension: each.report(measures.get(each.dimension)) for each in effects.found}
+    flagged = [dimension for dimension, report in found.items() if not report.causes]
+    if len(flagged) > 1:
+        measures |= measured([dimension for dimension in flagged if dimension not in measures])
+        leaks = [dimension for dimension in flagged if measures[dimension]]
+        others = [dimension for dimension in flagged if not measures[dimension]]
+        together = _help_together(others, leaks, shared, data, config, seed)
+        found |= {d: replace(found[d], measures_reward=True) for d in leaks}
+        found |= {d: replace(found[d], measures_reward=False, causes=together) for d in others}
     size = data.states.shape[1]
     reports = [found.get(dimension) or _untested(dimension, False) for dimension in range(size)]
     return ScreeningReport(tuple(reports), effects.r2, len(data.episodes))
+
+
+def _helpful(shared: PredictorPair, data: StandardSteps, config: ScreeningConfig) -> list[int]:
+    """Dimensions without which the shared predictor knows less of the reward."""
+
+    def error(*missing: int) -> float:
+        return float(errors_of(shared, data, _rows(data), absences_of(data, [missing]))[1].mean())
+
+    most = error() + config.min_reward_effect * _reward_variance(data)
+    return [dimension for dimension in range(data.states.shape[1]) if error(dimension) >= most]
+
+
+def _help_together(
+    dimensions: Sequence[int],
+    leaks: Sequence[int],
+    shared: PredictorPair,
+    data: StandardSteps,
+    config: ScreeningConfig,
+    seed: int,
+) -> bool:
+    """Whether dimensions that are no help one by one are some together, `leaks` unknown.
+
+    Columns that follow from one another, as the indicators of a category, are no help each; and
+    beside a measurement of the reward its causes are none.
+    """
+    if not dimensions:
+        return False
+    errors = _Errors.of(shared, data, [(*leaks, *dimensions), leaks], config, seed)
+    of_next, of_reward = errors.effect(0, 1, config), errors.effect_on_reward(0, 1)
+    helps_reward = of_reward.counts(config.min_reward_effect, config.level)
+    return of_next.counts(config.min_effect, config.level) or helps_reward
 
 
 def _untested(dimension: int, measures: bool) -> DimensionReport:
@@ -179,9 +228,68 @@ def _reward_variance(data: StandardSteps) -> float:
     return max(float(data.rewards[torch.from_numpy(_rows(data))].var()), 1e-12)
 
 
-def _r2(errors: Tensor, data: StandardSteps) -> float:
-    """Held-out R² of the reward, of squared errors (B,)."""
-    return 1 - float(errors.mean()) / _reward_variance(data)
+@dataclass(frozen=True)
+class _Help:
+    """A share that is explained, and the p-value of none."""
+
+    share: float
+    p_value: float
+    helps: tuple[int, ...] = ()
+    """Next dimensions, most helped first."""
+
+    def counts(self, least: float, level: float) -> bool:
+        return self.share >= least and self.p_value < level
+
+
+@dataclass(frozen=True)
+class _Errors:
+    """Squared errors of predictors that each miss some dimensions."""
+
+    data: StandardSteps
+    absences: Tensor
+    """(M, 1, S)."""
+    fitted: Tensor
+    """(M, S) means over fitted steps."""
+    next_state: Tensor
+    """(M, B, S) at held-out steps."""
+    reward: Tensor
+    """(M, B) at held-out steps."""
+
+    @classmethod
+    def of(
+        cls,
+        shared: PredictorPair,
+        data: StandardSteps,
+        missing: Sequence[Collection[int]],
+        config: ScreeningConfig,
+        seed: int,
+    ) -> "_Errors":
+        absences, rate = absences_of(data, missing), config.learning_rate / 3
+        pair = own_pairs(shared, data, absences, config.own_steps, config.batch_size, rate)
+        seen = np.flatnonzero(~data.held_out)
+        sample = np.random.default_rng(seed).choice(seen, min(len(seen), 4 * CHUNK), replace=False)
+        fitted = errors_of(pair, data, np.sort(sample), absences)[0].mean(1)
+        return cls(data, absences, fitted, *errors_of(pair, data, _rows(data), absences))
+
+    def r2(self, row: int) -> float:
+        """Held-out R² of the reward."""
+        return 1 - float(self.reward[row].mean()) / _reward_variance(self.data)
+
+    def effect(self, without: int, having: int, config: ScreeningConfig) -> _Help:
+        """What row `without` leaves unexplained of the next dimensions that `having` helps most."""
+        gain = 1 - self.fitted[having] / self.fitted[without].clamp(min=1e-12)
+        gain[(self.absences[without, 0] > 0) | ~self.data.moving] = -torch.inf
+        count = min(_HELPED, int((gain > -torch.inf).sum()))
+        if not count:
+            return _Help(0.0, 1.0)
+        helped = gain.topk(count).indices
+        pair = self.next_state[[without, having]][:, :, helped]
+        return _Help(*_effect_on_next(pair, self.data, config), tuple(helped.tolist()))
+
+    def effect_on_reward(self, without: int, having: int) -> _Help:
+        more = self.reward[without] - self.reward[having]
+        share = float(more.mean()) / _reward_variance(self.data)
+        return _Help(share, clustered_p_value(more, self.data.episodes[_rows(self.data)]))
 
 
 @dataclass(frozen=True)
@@ -227,38 +335,28 @@ class _Effects:
         dimensions: Sequence[int],
         config: ScreeningConfig,
         seed: int,
+        r2: float,
     ) -> "_Effects":
-        absences = absences_of(data, dimensions)
-        rate = config.learning_rate / 3
-        pair = own_pairs(shared, data, absences, config.own_steps, config.batch_size, rate)
-        seen = np.flatnonzero(~data.held_out)
-        sample = np.random.default_rng(seed).choice(seen, min(len(seen), 4 * CHUNK), replace=False)
-        fitted = errors_of(pair, data, np.sort(sample), absences)[0].mean(1)
-        next_errors, reward_errors = errors_of(pair, data, _rows(data), absences)
-        r2, size = _r2(reward_errors[-1], data), data.states.shape[1]
-        gain = 1 - fitted[-1] / fitted[:-1].clamp(min=1e-12)  # (M, S)
-        gain[absences[:-1, 0] > 0] = -torch.inf
-        most_helped = gain.topk(min(_HELPED, size - 1)).indices
-        found = []
+        """`r2` is that of the reward without what measures it."""
+        missing = [*((dimension,) for dimension in dimensions), ()]
+        errors, hard = _Errors.of(shared, data, missing, config, seed), r2 < config.min_reward_r2
+        found, none = [], len(dimensions)
         for row, dimension in enumerate(dimensions):
-            effect = _effect_on_next(next_errors[[row, -1]][:, :, most_helped[row]], data, config)
-            more = reward_errors[row] - reward_errors[-1]
-            of_reward = float(more.mean()) / _reward_variance(data)
-            p_value = clustered_p_value(more, data.episodes[_rows(data)])
+            effect = errors.effect(row, none, config)
+            of_reward = errors.effect_on_reward(row, none)
             found.append(
                 _Effect(
                     dimension=dimension,
-                    effect=effect[0],
-                    helps=tuple(most_helped[row].tolist()),
-                    p_value=effect[1],
-                    reward_effect=of_reward,
-                    reward_p_value=p_value,
-                    helps_next=effect[0] >= config.min_effect and effect[1] < config.level,
-                    helps_reward=r2 < config.min_reward_r2
-                    or (of_reward >= config.min_reward_effect and p_value < config.level),
+                    effect=effect.share,
+                    helps=effect.helps,
+                    p_value=effect.p_value,
+                    reward_effect=of_reward.share,
+                    reward_p_value=of_reward.p_value,
+                    helps_next=effect.counts(config.min_effect, config.level),
+                    helps_reward=hard or of_reward.counts(config.min_reward_effect, config.level),
                 )
             )
-        return cls(found, r2)
+        return cls(found, errors.r2(none))
 
 
 def _effect_on_next(

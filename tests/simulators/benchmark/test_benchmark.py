@@ -162,7 +162,7 @@ def test_every_cell_of_every_table_has_a_configuration(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     budget = replace(TINY, seeds=1, tasks=("synthetic-taobao", "synthetic-catalog"))
-    budget = replace(budget, swept=("synthetic-taobao",))
+    budget = replace(budget, swept=("synthetic-taobao",), distracted=("synthetic-taobao",))
     monkeypatch.setattr(plan, "PURSUED", ("synthetic-catalog",))
     given = Plan(tmp_path, budget)
     every = [*given.main(), *given.additions(), *given.sweeps(), *given.distractor()]

@@ -188,6 +188,9 @@ def test_every_cell_of_every_table_has_a_configuration(
     assert planted.observation_size == 92
     assert [world.rate for world in distractors[0].worlds] == [0.0, 1.0]  # type: ignore[attr-defined]
     assert {cell.evaluation.target_quantile for cell in given.distractor()} == {1.0, 0.99}
+    for table in (given.main, given.additions, given.sweeps, given.distractor):
+        paper = [cell for cell in table() if cell.method == "ucf-paper"]
+        assert {cell.task for cell in paper} == {cell.task for cell in table()}
 
 
 @pytest.mark.usefixtures("no_data")

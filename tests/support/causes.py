@@ -49,11 +49,11 @@ def planted_vectors(
 
 
 def planted_category(out: Path, trajectories: int = 150, length: int = 12) -> EpisodeStore:
-    """Seven dimensions: 0 drives itself and the reward, 1 to 5 are indicators of a category that
-    holds throughout a trajectory and moves the reward, 6 is whether the reward is high."""
+    """Eight dimensions: 0 drives itself and the reward, 1 to 5 are indicators of a category that
+    holds throughout a trajectory and moves the reward, 6 is whether the reward is high, 7 is 0."""
     rng = np.random.default_rng(0)
     shape = (trajectories, length)
-    states, actions = np.zeros((*shape, 7)), rng.uniform(-1, 1, (*shape, 1))
+    states, actions = np.zeros((*shape, 8)), rng.uniform(-1, 1, (*shape, 1))
     category = rng.integers(5, size=trajectories)
     states[np.arange(trajectories), :, 1 + category] = 1.0
     states[:, 0, 0] = rng.normal(size=trajectories)
@@ -63,7 +63,7 @@ def planted_category(out: Path, trajectories: int = 150, length: int = 12) -> Ep
     rewards = states[:, :, 0] + 0.5 * category[:, None] + 0.3 * actions[:, :, 0]
     states[:, :, 6] = rewards > np.median(rewards)
     columns = {
-        schema.OBSERVATION: states.reshape(-1, 7).astype(np.float32),
+        schema.OBSERVATION: states.reshape(-1, 8).astype(np.float32),
         schema.ACTION: actions.reshape(-1, 1).astype(np.float32),
         schema.REWARD: rewards.reshape(-1).astype(np.float32),
     }

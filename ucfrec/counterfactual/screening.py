@@ -174,7 +174,8 @@ def screen(train: EpisodeStore, config: ScreeningConfig, seed: int) -> Screening
     if len(flagged) > 1:
         measures |= measured([dimension for dimension in flagged if dimension not in measures])
         leaks = [dimension for dimension in flagged if measures[dimension]]
-        others = [dimension for dimension in flagged if not measures[dimension]]
+        constant = (data.states == data.states[0]).all(0)
+        others = [d for d in flagged if not measures[d] and not constant[d]]
         together = _help_together(others, leaks, shared, data, config, seed)
         found |= {d: replace(found[d], measures_reward=True) for d in leaks}
         found |= {d: replace(found[d], measures_reward=False, causes=together) for d in others}

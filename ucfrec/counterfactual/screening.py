@@ -142,6 +142,8 @@ def screen(train: EpisodeStore, config: ScreeningConfig, seed: int) -> Screening
     data = StandardSteps.of(train, config.max_transitions, seed)
 
     def measured(dimensions: Sequence[int]) -> dict[int, bool]:
+        if not dimensions:
+            return {}
         found = measured_reward(train, config.measurement, config.max_transitions, seed, dimensions)
         return dict(zip(dimensions, found, strict=True))
 

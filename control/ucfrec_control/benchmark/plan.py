@@ -3,14 +3,14 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from ucfrec.reporting.grid import chosen, run_grid
+from ucfrec.reporting.grid import chosen
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec_control.benchmark.budgets import Budget
 from ucfrec_control.benchmark.cells import SCORE_MEASUREMENT, SCORES, Cell, code_of
-from ucfrec_control.benchmark.estimate import announcement
 from ucfrec_control.benchmark.folders import run_name, stages_of, stores_of
 from ucfrec_control.benchmark.methods import MAIN, TABLES
 from ucfrec_control.benchmark.rates import settings_of
+from ucfrec_control.benchmark.run_cells import run_cells
 from ucfrec_control.data.distractor import zoo_store
 
 
@@ -41,9 +41,8 @@ def benchmark(
             or cells failed.
     """
     selected = chosen(TABLES[table], methods, "method")
-    cells = list(cells_of(data, folder, budget, name, table, selected))
-    said = announcement(workers)
-    return run_grid(cells, SCORE_MEASUREMENT, results, workers, f"benchmark {table}", said)
+    cells = cells_of(data, folder, budget, name, table, selected)
+    return run_cells(cells, SCORE_MEASUREMENT, results, workers, f"benchmark {table}")
 
 
 def cells_of(

@@ -10,16 +10,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ucfrec.reporting.grid import chosen, run_grid
+from ucfrec.reporting.grid import chosen
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.statistics import grouped, summary
 from ucfrec_control.benchmark.budgets import BUDGETS as SCORE_BUDGETS
 from ucfrec_control.benchmark.budgets import MEDIUM, Budget
 from ucfrec_control.benchmark.cells import ROBUSTNESS, ROBUSTNESS_MEASUREMENT, Cell, code_of
-from ucfrec_control.benchmark.estimate import announcement
 from ucfrec_control.benchmark.folders import run_name, stages_of, stores_of
 from ucfrec_control.benchmark.methods import METHODS as LEARNERS
 from ucfrec_control.benchmark.rates import settings_of
+from ucfrec_control.benchmark.run_cells import run_cells
 from ucfrec_control.data.distractor import CLEAN, DISTRACTORS, zoo_store
 
 SCREENED = {"ucf-screened": "copies", "ucf-dropped": "drop"}
@@ -63,9 +63,8 @@ def robustness(
         InputError: a file is missing, a method is unknown, `results` has other content, or cells
             failed.
     """
-    cells = list(robustness_cells(data, folder, budget, name, chosen(METHODS, methods, "method")))
-    said = announcement(workers)
-    return run_grid(cells, ROBUSTNESS_MEASUREMENT, results, workers, "robustness", said)
+    cells = robustness_cells(data, folder, budget, name, chosen(METHODS, methods, "method"))
+    return run_cells(cells, ROBUSTNESS_MEASUREMENT, results, workers, ROBUSTNESS)
 
 
 def robustness_cells(

@@ -3,16 +3,15 @@
 import argparse
 
 from ucfrec.commands.grid_options import results_given
-from ucfrec.reporting.grid import run_grid
 from ucfrec.reporting.rows_file import benchmarking
 from ucfrec_control.benchmark.cells import (
     ROBUSTNESS,
     ROBUSTNESS_MEASUREMENT,
     SCORE_MEASUREMENT,
 )
-from ucfrec_control.benchmark.estimate import announcement
 from ucfrec_control.benchmark.reproduce import PARTS, budget_of, cells_of_part
 from ucfrec_control.benchmark.robustness import BUDGETS as ROBUSTNESS_BUDGETS
+from ucfrec_control.benchmark.run_cells import run_cells
 from ucfrec_control.commands.benchmark import budgets_of, print_scores
 from ucfrec_control.commands.options import (
     budget_given,
@@ -47,8 +46,7 @@ def run(options: argparse.Namespace) -> None:
     cells = list(cells_of_part(part, data_given(options), options.out, budget, options.budget))
     with benchmarking(results):
         how = ROBUSTNESS_MEASUREMENT if robust else SCORE_MEASUREMENT
-        said = announcement(options.workers)
-        rows = run_grid(cells, how, results, options.workers, f"reproduce {options.part}", said)
+        rows = run_cells(cells, how, results, options.workers, f"reproduce {options.part}")
     if robust:
         print_robustness(rows)
     else:

@@ -1,5 +1,6 @@
 """Every table's cells are what their names say, and %BC goes through the benchmark."""
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -120,13 +121,14 @@ def test_the_best_trajectories_are_cloned_and_evaluated(
     monkeypatch.setitem(TABLES, MAIN, rows)
     settings = ("train.steps=50", "train.warmup_steps=5", "train.learning_rate=1e-2")
     settings += ("train.validate_every=25", "policy.dim=16")
-    budget = Budget(("hopper_medium-made",), 1, 2, settings)
+    budget = Budget(("hopper_medium-made",), 2, 2, settings)
     results = tmp_path / "rows.jsonl"
     found = benchmark(tmp_path, tmp_path / "runs", results, budget, "tiny", 1)
-    assert [(row.method, row.checkpoint) for row in found] == [
-        (method, checkpoint) for method in rows for checkpoint in ("last", "best")
-    ]
-    assert "benchmark main: 3 cells, 3 of them left to measure" in capfd.readouterr().err
+    checkpoints = ("last", "best")
+    assert [(row.training_seed, row.method, row.checkpoint) for row in found] == list(
+        product(range(2), rows, checkpoints)
+    )
+    assert "benchmark main: 6 cells, 6 of them left to measure" in capfd.readouterr().err
     seen = np.random.default_rng(0).normal(size=(20, 11)).astype(np.float32)
     chosen = {}
     for method in rows:

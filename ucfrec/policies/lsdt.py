@@ -162,13 +162,18 @@ class _DynamicConvolution(nn.Module):
     def forward(self, hidden: Tensor, valid: Tensor) -> Tensor:
         batch, tokens, dim = hidden.shape
         values = F.glu(self.gated(hidden)).masked_fill(~valid.unsqueeze(-1), 0.0)
-        taps = self.dropout(self.taps(values)).view(batch, tokens, self.groups, 1, self.kernel)
+        # Tokens are the last dimension: 60 numbers side by side, where a group's channels are two.
+        taps = self.dropout(self.taps(values)).transpose(1, 2)
+        taps = taps.reshape(batch, self.groups, self.kernel, tokens)
         # A kernel's weights sum to 1 over tokens of the window only; the own token is the last.
-        visible = F.pad(valid, (self.kernel - 1, 0)).unfold(1, self.kernel, 1).clone()
-        visible[..., -1] = True
-        taps = taps.masked_fill(~visible[:, :, None, None], -torch.inf)
-        # (B, 5 + L, c) -> (B, L, c, 6) -> (B, L, groups, c/groups, 6)
-        local = F.pad(values, (0, 0, self.kernel - 1, 0)).unfold(1, self.kernel, 1)
-        local = local.reshape(batch, tokens, self.groups, dim // self.groups, self.kernel)
-        mixed = (local * taps.softmax(-1)).sum(-1).view(batch, tokens, dim)
+        visible = F.pad(valid, (self.kernel - 1, 0)).unfold(1, tokens, 1).clone()
+        visible[:, -1] = True
+        taps = taps.masked_fill(~visible.unsqueeze(1), -torch.inf).softmax(2)
+        # (B, c, 5 + L) -> (B, groups, c/groups, 5 + L)
+        padded = F.pad(values.transpose(1, 2), (self.kernel - 1, 0))
+        padded = padded.view(batch, self.groups, dim // self.groups, -1)
+        mixed = torch.zeros_like(padded[..., :tokens])
+        for tap in range(self.kernel):
+            mixed = mixed + padded[..., tap : tap + tokens] * taps[:, :, tap, None]
+        mixed = mixed.view(batch, dim, tokens).transpose(1, 2)
         return self.out(mixed + self.bias)  # type: ignore[no-any-return]

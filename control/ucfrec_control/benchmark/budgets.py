@@ -65,7 +65,7 @@ BUDGETS = {
         4,
         20,
         (
-            "train.steps=2000",
+            "train.steps=1000",
             "train.batch_size=16",
             "train.warmup_steps=100",
             "train.validate_every=500",

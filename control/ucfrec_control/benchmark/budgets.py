@@ -111,3 +111,5 @@ SEARCHES = {
     for name, budget in BUDGETS.items()
 }
 """Budgets of the search for learning rates: each task and each kind of data once."""
+RATES = {"small": (3e-3, 1e-2, 3e-2), "full": (1e-4, 3e-4, 1e-3)}
+"""Learning rates that are tried, by the name of the budget."""

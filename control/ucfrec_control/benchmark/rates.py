@@ -16,7 +16,7 @@ from ucfrec.provenance import provenance
 from ucfrec.reporting.grid import Measurement, chosen, run_grid
 from ucfrec.reporting.result_row import ResultRow, RowKey
 from ucfrec.reporting.statistics import grouped
-from ucfrec_control.benchmark.budgets import Budget
+from ucfrec_control.benchmark.budgets import RATES, Budget
 from ucfrec_control.benchmark.cells import Cell, code_of, config, key
 from ucfrec_control.benchmark.estimate import announcement
 from ucfrec_control.benchmark.folders import stores_of
@@ -30,8 +30,6 @@ SUITE: Final = "rates"
 """Suite of the rows."""
 RATE: Final = "learning_rate"
 """Condition of the rows."""
-RATES: Final = {"small": (1e-3, 3e-3, 1e-2), "full": (1e-4, 3e-4, 1e-3)}
-"""Rates that are tried, by the name of the budget."""
 _TIME, _COPIES = "policy.max_timestep", "augment.copies"
 
 

@@ -11,10 +11,9 @@ from ucfrec.errors import InputError
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import read_configurations, read_rows
 from ucfrec_control.benchmark import rates
-from ucfrec_control.benchmark.budgets import BUDGETS, Budget
+from ucfrec_control.benchmark.budgets import BUDGETS, RATES, Budget
 from ucfrec_control.benchmark.methods import METHODS, TABLES
 from ucfrec_control.benchmark.rates import (
-    RATES,
     SEARCHED,
     best_rates,
     chosen_rates,

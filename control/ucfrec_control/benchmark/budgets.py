@@ -59,7 +59,7 @@ ANTMAZE = ("antmaze-umaze-v2", "antmaze-umaze-diverse-v2")
 _ALL = tuple(f"{task}_{kind}-zoo" for task in _TASKS for kind in _KINDS)
 BUDGETS = {
     # Batches, steps and width are reduced; no file, no seed and no method is left out but CQL's.
-    # At half the steps sequence policies are below cloning without a history (benchmarks/LOG.md).
+    # At a quarter of the steps sequence policies are below cloning (benchmarks/LOG.md).
     # The authors' learning rates are for 50 times as many steps: see `rates.toml` instead.
     "small": Budget(
         _ALL,

@@ -13,14 +13,14 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files import atomic_file
 from ucfrec.provenance import provenance
-from ucfrec.reporting.grid import Measurement, chosen, run_grid
+from ucfrec.reporting.grid import Measurement, chosen
 from ucfrec.reporting.result_row import ResultRow, RowKey
 from ucfrec.reporting.statistics import grouped
 from ucfrec_control.benchmark.budgets import RATES, Budget
 from ucfrec_control.benchmark.cells import Cell, code_of, config, key
-from ucfrec_control.benchmark.estimate import announcement
 from ucfrec_control.benchmark.folders import stores_of
 from ucfrec_control.benchmark.methods import METHODS, Methods
+from ucfrec_control.benchmark.run_cells import run_cells
 from ucfrec_control.data.distractor import zoo_store
 from ucfrec_control.data.trajectories import PACKAGES
 from ucfrec_control.learners.rl_baselines import ALGORITHMS
@@ -149,8 +149,8 @@ def search_rates(
             failed.
     """
     selected = chosen(SEARCHED, methods, "method")
-    cells = list(_cells(data, folder, budget, name, selected, steps))
-    return run_grid(cells, _MEASUREMENT, results, workers, SUITE, announcement(workers))
+    cells = _cells(data, folder, budget, name, selected, steps)
+    return run_cells(cells, _MEASUREMENT, results, workers, SUITE)
 
 
 def _cells(

@@ -24,13 +24,15 @@ METHODS: Methods = {
     "ucf-w-time": ("ucf", ("policy.max_timestep=1000",)),
     **PAPER,
     "ucf-wo-count": ("ucf", ("augment.copies=0",)),
-    "ucf-wo-arch": ("dt", ("augment.copies=1",)),
+    "ucf-wo-arch": ("dt", (_NO_TIME, "augment.copies=1")),
 }
 """Learner and settings by the name of the table's row; the last two are Table 3's ablations.
 
 UCF's preset has no embedding of time steps, the presets of DT, DC and LSDT have one; `ucf-w-time`
-and `…-wo-time` are the reverse.
+and `…-wo-time` are the reverse. `ucf-wo-arch` has none, as UCF.
 """
+WITH_TIME = ("dt", "dc", "lsdt", "ucf-w-time")
+"""Methods with embeddings of time steps of which there is one without."""
 
 _FAITHFUL, _NOISE = "csg.kind=faithful", "csg.kind=noise"
 _NO_GATE = "augment.epsilon_r=1e9"

@@ -56,7 +56,7 @@ def cells_of(
         for method in methods:
             learner, method_settings = TABLES[table][method]
             code = code_of(learner)
-            for seed in range(budget.seeds_of(file, learner)):
+            for seed in range(budget.seeds_of(file, method)):
                 yield Cell(
                     suite=SCORES,
                     table=table,

@@ -19,7 +19,7 @@ from ucfrec.reporting.statistics import grouped
 from ucfrec_control.benchmark.budgets import RATES, Budget
 from ucfrec_control.benchmark.cells import Cell, code_of, config, key
 from ucfrec_control.benchmark.folders import stores_of
-from ucfrec_control.benchmark.methods import METHODS, Methods
+from ucfrec_control.benchmark.methods import METHODS, METHODS_WO_TIME, Methods
 from ucfrec_control.benchmark.run_cells import run_cells
 from ucfrec_control.data.distractor import zoo_store
 from ucfrec_control.data.trajectories import PACKAGES
@@ -33,7 +33,7 @@ RATE: Final = "learning_rate"
 _TIME, _COPIES = "policy.max_timestep", "augment.copies"
 
 
-def _searched(methods: Methods) -> dict[str, tuple[str, tuple[str, ...]]]:
+def _differing(methods: Methods) -> Methods:
     """The sequence policies of the main table that differ in learner or embeddings of time."""
     found: dict[tuple[str, tuple[str, ...]], str] = {}
     for name, (learner, settings) in methods.items():
@@ -42,12 +42,24 @@ def _searched(methods: Methods) -> dict[str, tuple[str, tuple[str, ...]]]:
     return {name: (learner, settings) for (learner, settings), name in found.items()}
 
 
+def _one_each(methods: Methods) -> Methods:
+    """One method of each learner: where there are two, that without embeddings of time."""
+    without_time = set(METHODS_WO_TIME.values())
+    return {
+        name: (learner, settings)
+        for name, (learner, settings) in methods.items()
+        if learner not in METHODS_WO_TIME or name in without_time
+    }
+
+
 def _of_time(settings: Sequence[str]) -> tuple[str, ...]:
     return tuple(each for each in settings if each.startswith(_TIME))
 
 
-SEARCHED: Final = _searched(METHODS)
-"""Learner and settings of the methods that have a rate of their own, by name."""
+_DIFFERING: Final = _differing(METHODS)
+"""Learner and settings of the methods that can have a rate of their own, by name."""
+SEARCHED: Final = _one_each(_DIFFERING)
+"""Those of them that are tried; the others take the rate that was chosen for their learner."""
 
 
 @cache
@@ -74,10 +86,10 @@ def read_rates(path: Path) -> dict[str, dict[str, float]]:
         raise InputError(f"{path} cannot be read ({error}); `rates --toml` writes one") from None
     for budget, rates in tables.items():
         for method, rate in rates.items() if isinstance(rates, Mapping) else [("", rates)]:
-            if method not in SEARCHED or not isinstance(rate, float | int) or not 0 < rate < 1:
+            if method not in _DIFFERING or not isinstance(rate, float | int) or not 0 < rate < 1:
                 raise InputError(
                     f"{path}: {method or budget} = {rate!r:.60} is no learning rate of a method; "
-                    f"there are {', '.join(SEARCHED)}"
+                    f"there are {', '.join(_DIFFERING)}"
                 )
     return tables
 
@@ -116,7 +128,9 @@ def settings_of(
     if learner == "ucf" and time == _of_time(METHODS["dt-wo-time"][1]):
         time = ()  # the preset
     rates = chosen_rates(name) if budget.rates is None else budget.rates
-    rate = next((rates.get(m) for m, own in SEARCHED.items() if own == (learner, time)), None)
+    own = [name for name, kind in _DIFFERING.items() if kind == (learner, time)]
+    of_learner = [name for name, (each, _) in SEARCHED.items() if each == learner]
+    rate = next((rates[name] for name in (*own, *of_learner) if name in rates), None)
     searched = () if rate is None else (f"train.{RATE}={rate:g}",)
     return (*budget.settings_of(learner), *searched, *settings)
 
@@ -163,10 +177,10 @@ def _cells(
         store = zoo_store(data, stores_of(folder), file)
         for method in methods:
             learner, own = SEARCHED[method]
-            code = code_of(learner, __name__)
+            code = code_of(learner)
             for rate in RATES[name]:
                 settings = (f"{_COPIES}=0", *shorter, f"train.{RATE}={rate:g}", *own)
-                for seed in range(budget.seeds_of(file, learner)):
+                for seed in range(budget.seeds_of(file, method)):
                     yield Cell(
                         suite=SUITE,
                         table=f"{rate:g}",

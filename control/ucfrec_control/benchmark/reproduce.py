@@ -29,12 +29,12 @@ class Part:
     """Whether it is drawn of its runs, not of its rows."""
 
 
-_ABLATED = ("ucf", "ucf-wo-count", "ucf-wo-arch", "dt", "dc", "lsdt")
+_BASELINES = ("dt", "dt-wo-time", "dc", "dc-wo-time", "lsdt", "lsdt-wo-time")
 _DETERMINISTIC = (CLEAN, "deterministic")
-_JUDGED = ("dt", "dc", "ucf", "ucf-dropped")
+_JUDGED = ("dt-wo-time", "dc-wo-time", "ucf", "ucf-dropped")
 PARTS: Final[Mapping[str, Part]] = {
-    "table-1": Part(MAIN, ("iql", "cql", "dt", "dc", "lsdt", "ucf-paper", "ucf")),
-    "table-3": Part(MAIN, _ABLATED),
+    "table-1": Part(MAIN, ("iql", "cql", *_BASELINES, "ucf-paper", "ucf")),
+    "table-3": Part(MAIN, ("ucf", "ucf-wo-count", "ucf-wo-arch", *_BASELINES)),
     "table-9": Part("gate"),
     "table-10": Part("band"),
     "figure-2": Part("lambda"),

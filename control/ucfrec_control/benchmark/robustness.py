@@ -18,13 +18,14 @@ from ucfrec_control.benchmark.budgets import MEDIUM, Budget
 from ucfrec_control.benchmark.cells import ROBUSTNESS, ROBUSTNESS_MEASUREMENT, Cell, code_of
 from ucfrec_control.benchmark.folders import run_name, stages_of, stores_of
 from ucfrec_control.benchmark.methods import METHODS as LEARNERS
+from ucfrec_control.benchmark.methods import METHODS_WO_TIME
 from ucfrec_control.benchmark.rates import settings_of
 from ucfrec_control.benchmark.run_cells import run_cells
 from ucfrec_control.data.distractor import CLEAN, DISTRACTORS, zoo_store
 
 SCREENED = {"ucf-screened": "copies", "ucf-dropped": "drop"}
 """UCF with copies that intervene on flagged dimensions, and UCF trained without them."""
-METHODS = ("dt", "dc", "lsdt", "ucf-paper", "ucf-wo-count", "ucf-wo-arch", "ucf", *SCREENED)
+METHODS = (*METHODS_WO_TIME.values(), "ucf-paper", "ucf-wo-count", "ucf-wo-arch", *SCREENED)
 """Methods of `ucfrec_control.benchmark.plan`, and `SCREENED`."""
 
 BUDGETS = {

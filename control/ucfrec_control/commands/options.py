@@ -46,7 +46,9 @@ def budget_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--method", action="append", default=[], help="row of the table; repeatable (all)"
     )
-    parser.add_argument("--seeds", type=int, help="number of training seeds, from 0 (the budget's)")
+    parser.add_argument(
+        "--seeds", type=int, help="training seeds of every method, from 0 (the budget's)"
+    )
     evaluation_seed_option(parser)
 
 
@@ -123,6 +125,7 @@ def budget_given(known: Mapping[str, Budget], options: argparse.Namespace) -> Bu
         where_present=() if options.file else budget.where_present,
         seeds=seeds,
         antmaze_seeds=budget.antmaze_seeds if options.seeds is None else seeds,
+        fewer_seeds=budget.fewer_seeds if options.seeds is None else {},
         evaluation_seed=budget.evaluation_seed if evaluation_seed is None else evaluation_seed,
         rates=_rates_given(options),
     )

@@ -89,10 +89,12 @@ def test_a_method_of_two_tables_is_one_configuration(size: str) -> None:
                 assert named.setdefault(method, config) == config
 
 
-def test_seeds_are_fewer_for_cql_and_for_antmaze() -> None:
+def test_seeds_are_fewer_for_some_methods_and_for_antmaze() -> None:
     small, full = BUDGETS["small"], BUDGETS["full"]
     files = ("hopper_medium-zoo", "antmaze-umaze-v2")
+    assert small.fewer_seeds.keys() <= METHODS.keys()
     assert [small.seeds_of(file, "cql") for file in files] == [1, 1]
+    assert [small.seeds_of(files[0], f"dt{time}") for time in ("", "-wo-time")] == [1, 4]
     assert [small.seeds_of(file, "ucf") for file in files] == [4, 4]
     assert [full.seeds_of(file, "cql") for file in files] == [5, 4]
 

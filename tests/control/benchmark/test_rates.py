@@ -12,7 +12,7 @@ from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import read_configurations, read_rows
 from ucfrec_control.benchmark import rates
 from ucfrec_control.benchmark.budgets import BUDGETS, RATES, Budget
-from ucfrec_control.benchmark.methods import METHODS, TABLES
+from ucfrec_control.benchmark.methods import METHODS, TABLES, WITH_TIME
 from ucfrec_control.benchmark.rates import (
     SEARCHED,
     best_rates,
@@ -48,12 +48,11 @@ def test_a_file_with_larger_losses_weighs_no_more() -> None:
     assert best_rates(rows) == {"dt": 0.2, "dc": 0.1}
 
 
-def test_every_learner_and_use_of_time_has_a_rate() -> None:
+def test_every_learner_has_a_rate() -> None:
     assert {name: METHODS[name] for name in SEARCHED} == SEARCHED
     learners = {learner for learner, _ in METHODS.values()} - set(ALGORITHMS)
-    assert {learner for learner, _ in SEARCHED.values()} == learners
-    for learner in ("dt", "dc", "lsdt"):
-        assert f"{learner}-wo-time" in SEARCHED
+    assert sorted(learner for learner, _ in SEARCHED.values()) == sorted(learners)
+    assert not SEARCHED.keys() & set(WITH_TIME)
     assert chosen_rates("small").keys() <= SEARCHED.keys()
     assert set(chosen_rates("small").values()) <= set(RATES["small"])
     assert chosen_rates("unknown") == {}
@@ -69,14 +68,18 @@ def test_every_row_is_trained_at_the_rate_of_its_learner(
         if learner in ALGORITHMS:
             continue
         found = settings_of(BUDGETS["full"], "full", learner, settings)
-        # A table without time calls DT without time by that name too; UCF has none by default.
-        stem = (
-            next(m for m in sorted(SEARCHED, key=len, reverse=True) if name.startswith(m))
-            if (name not in ("ucf-wo-arch",) and not name.startswith(("faithful", "noise")))
-            else ("dt" if name == "ucf-wo-arch" else "ucf")
-        )
-        assert f"train.learning_rate={numbers[stem]:g}" in found, name
+        tried = next(m for m, (each, _) in SEARCHED.items() if each == learner)
+        assert f"train.learning_rate={numbers[tried]:g}" in found, name
         assert found[-len(settings) :] == settings if settings else True
+
+
+def test_a_method_with_a_rate_of_its_own_is_trained_at_it() -> None:
+    budget = replace(BUDGETS["small"], rates={"dt": 0.5, "dt-wo-time": 0.25, "ucf": 0.125})
+    for name, rate in (("dt", 0.5), ("dt-wo-time", 0.25), ("ucf-w-time", 0.125)):
+        assert f"train.learning_rate={rate:g}" in settings_of(budget, "small", *METHODS[name])
+    given = [each for each in budget.settings if each.startswith("train.learning_rate")]
+    found = settings_of(budget, "small", *METHODS["dc"])
+    assert [each for each in found if each.startswith("train.learning_rate")] == given
 
 
 def test_the_search_writes_rows_and_a_choice_once(

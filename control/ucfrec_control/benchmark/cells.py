@@ -34,6 +34,20 @@ SCORES, ROBUSTNESS = "control", "robustness"
 """Suites of the rows."""
 TARGET: Final = "target"
 """Condition of rows of budgets with several target returns."""
+OF_ITEMS: Final = (
+    *("ucfrec.acting.best_items", "ucfrec.acting.fatigue", "ucfrec.acting.learned_sessions"),
+    *("ucfrec.acting.logged_decisions", "ucfrec.acting.many_rules"),
+    *("ucfrec.acting.session_scorer", "ucfrec.counterfactual.action_copies"),
+    *("ucfrec.counterfactual.item_reward_effects", "ucfrec.counterfactual.item_reward_fit"),
+    *("ucfrec.counterfactual.item_reward_mean", "ucfrec.counterfactual.item_reward_model"),
+    *("ucfrec.counterfactual.item_reward_report", "ucfrec.counterfactual.item_reward_rows"),
+    *("ucfrec.counterfactual.session_tastes", "ucfrec.counterfactual.training_users"),
+    *("ucfrec.episodes.exposure", "ucfrec.episodes.item_counts", "ucfrec.episodes.item_table"),
+    *("ucfrec.episodes.main_tags", "ucfrec.episodes.states", "ucfrec.policies.item_sampling"),
+    *("ucfrec.runs.choose_by_ranking", "ucfrec.runs.choose_rule"),
+)
+"""Modules that control imports but does not run, because its actions are vectors: changes to them
+change none of its rows."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +114,8 @@ def code_of(learner: str, *more: str) -> str:
     is_rl = learner in ALGORITHMS
     learner_module = rl if is_rl else policy_class(learner).__module__
     parts = ("ucfrec_control.learners.train", "ucfrec_control.learners.evaluate")
-    return code_version(__name__, *parts, learner_module, *more, exclude=() if is_rl else (rl,))
+    apart = OF_ITEMS if is_rl else (*OF_ITEMS, rl)
+    return code_version(__name__, *parts, learner_module, *more, exclude=apart)
 
 
 def key(cell: Cell) -> RowKey:

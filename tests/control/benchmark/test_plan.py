@@ -1,7 +1,11 @@
 """Every table's cells are what their names say, and %BC goes through the benchmark."""
 
+import sys
+from dataclasses import replace
+from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
+from types import FrameType
 
 import numpy as np
 import pytest
@@ -11,10 +15,17 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.runs.config import Config, resolve_config
 from ucfrec_control.benchmark import robustness
 from ucfrec_control.benchmark.budgets import BUDGETS, SWEEPS, Budget
-from ucfrec_control.benchmark.cells import code_of
+from ucfrec_control.benchmark.cells import (
+    OF_ITEMS,
+    ROBUSTNESS,
+    code_of,
+    key,
+    measure_robustness,
+    measure_scores,
+)
 from ucfrec_control.benchmark.folders import run_name
 from ucfrec_control.benchmark.methods import MAIN, METHODS, PAPER, TABLES
-from ucfrec_control.benchmark.plan import benchmark
+from ucfrec_control.benchmark.plan import benchmark, cells_of
 from ucfrec_control.benchmark.rates import settings_of
 from ucfrec_control.commands.benchmark import budgets_of
 from ucfrec_control.learners.evaluate import load_run
@@ -141,6 +152,43 @@ def test_the_best_trajectories_are_cloned_and_evaluated(
         chosen[method] = actor.act(seen, np.ones(len(seen), dtype=bool))[0].mean()
     # One in five is good: all of the best 10%, four fifths of the best 25%.
     assert chosen["bc"] < -0.2 < 0.2 < chosen["bc-25"] < chosen["bc-10"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("table", [MAIN, ROBUSTNESS])
+def test_no_cell_runs_code_of_items(table: str, tmp_path: Path) -> None:
+    """Rows stay valid when that code changes, so they must not depend on it."""
+    write_hdf5(tmp_path / "hopper_medium-zoo.hdf5", hopper_like((30, 8, 25) * 8))
+    settings = ("train.steps=2", "train.warmup_steps=1", "train.validate_every=2", "crm.epochs=1")
+    small = replace(BUDGETS["small"], files=("hopper_medium-zoo",), seeds=1, episodes=1)
+    budget = replace(small, settings=(*small.settings, *settings, "csg.epochs=1"))
+    given = tmp_path, tmp_path / "runs", budget, "small"
+    if table == MAIN:
+        (cell,) = cells_of(*given, MAIN, ["ucf"])
+    else:
+        (cell,) = robustness.robustness_cells(*given, ["ucf"], ["deterministic"])
+    called: set[str] = set()
+
+    def remember(frame: FrameType, event: str, argument: object) -> None:
+        if frame.f_code.co_name != "<module>":
+            called.add(frame.f_code.co_filename)
+
+    measure = measure_scores if table == MAIN else measure_robustness
+    before = sys.gettrace()
+    sys.settrace(remember)
+    try:
+        measure(cell, key(cell))
+    finally:
+        sys.settrace(before)
+    assert str(source_of("ucfrec.policies.ucf")) in called
+    assert [name for name in OF_ITEMS if str(source_of(name)) in called] == []
+
+
+def source_of(module: str) -> Path:
+    spec = find_spec(module)
+    assert spec is not None
+    assert spec.origin is not None
+    return Path(spec.origin)
 
 
 def test_cells_of_one_learner_run_through_the_same_code() -> None:

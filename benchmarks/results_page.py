@@ -15,10 +15,8 @@ from pathlib import Path
 from textwrap import TextWrapper
 from typing import Any
 
-from counterfactual_copies import ARMS, compared
 from counterfactual_copies import difference_table as copies_table
 
-from ucfrec.reporting.plot_style import OURS, PLAIN, save, styled
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import latest, read_rows
 from ucfrec.reporting.statistics import grouped, summary
@@ -334,49 +332,6 @@ def page(files: Mapping[str, Sequence[ResultRow]], pictures: Sequence[str]) -> s
     return "\n\n".join(parts) + "\n"
 
 
-@styled
-def draw(files: Mapping[str, Sequence[ResultRow]], folder: Path) -> list[Path]:
-    """A picture of each world of Table 2, and one of the copies."""
-    from matplotlib.figure import Figure
-
-    made: list[Path] = []
-    main = of("recommendation", "main")(files)
-    for world, group in grouped(main, lambda row: str(row.world)).items():
-        by_method = list(grouped(group, lambda row: row.method).items())[::-1]
-        found = [summary(row.value for row in rows) for _, rows in by_method]
-        figure = Figure(figsize=(5.2, 4.6))
-        axes = figure.add_subplot()
-        axes.set_title(world)
-        colors = [OURS if name == "ucf" else PLAIN for name, _ in by_method]
-        spreads = [0.0 if each.count < 2 else each.sd for each in found]
-        means = [each.mean for each in found]
-        axes.barh([name for name, _ in by_method], means, xerr=spreads, color=colors, height=0.7)
-        axes.set_xlabel("return of a session (mean ± sd over logs and training seeds)")
-        made += save(figure, folder, f"table-2-{world}")
-    copies = compared(of("counterfactual_copies", "counterfactual-copies")(files))
-    if copies:
-        figure = Figure(figsize=(5.2, 3.2))
-        panels = figure.subplots(1, len({mood for mood, _ in copies}), sharey=True, squeeze=False)
-        for axes, mood in zip(panels[0], sorted({mood for mood, _ in copies}), strict=True):
-            axes.set_title(f"mood {mood:g}")
-            axes.axhline(0.0, color=PLAIN, linewidth=0.8)
-            for arm in [name for name in ARMS if name != "none"]:
-                of_mood = sorted((size, own) for (m, size), own in copies.items() if m == mood)
-                measured = [(size, own[arm].pairs) for size, own in of_mood if arm in own]
-                if not measured:
-                    continue
-                sizes, found = zip(*measured, strict=True)
-                errors = [each.standard_error if each.count > 1 else 0.0 for each in found]
-                means = [each.mean for each in found]
-                axes.errorbar(sizes, means, yerr=errors, marker="o", label=arm)
-            axes.set_xscale("log")
-            axes.set_xlabel("logged sessions")
-        panels[0][0].set_ylabel("return less that of no copies")
-        panels[0][-1].legend()
-        made += save(figure, folder, "copies")
-    return [path for path in made if path.suffix == ".svg"]
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -386,8 +341,15 @@ def main() -> None:
     names = ("recommendation", "counterfactual_copies", "control", "control_robustness")
     files = {name: latest(read_rows(RESULTS / f"{name}.jsonl")) for name in names}
     if not options.check and find_spec("matplotlib") is not None:
+        from results_pictures import draw
+
         PICTURES.mkdir(parents=True, exist_ok=True)
-        draw(files, PICTURES)
+        draw(
+            of("recommendation", "main")(files),
+            of("counterfactual_copies", "counterfactual-copies")(files),
+            of("control", "main")(files),
+            PICTURES,
+        )
         for drawn in PICTURES.glob("*.png"):
             drawn.unlink()
     text = page(files, [path.stem for path in sorted(PICTURES.glob("*.svg"))])

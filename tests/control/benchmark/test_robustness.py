@@ -18,6 +18,7 @@ from ucfrec.runs.config import resolve_config
 from ucfrec_control.benchmark import robustness
 from ucfrec_control.benchmark.budgets import Budget
 from ucfrec_control.benchmark.folders import run_name, stores_of
+from ucfrec_control.benchmark.rates import settings_of
 from ucfrec_control.benchmark.robustness import drops, largest_drops, loss_rises
 from ucfrec_control.benchmark.screening_table import screening_rows
 from ucfrec_control.cli import main
@@ -85,7 +86,8 @@ def test_drops_compare_with_the_same_seed_without_distractor() -> None:
 def begin(tmp_path: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A small table of one file and one distractor, its screened runs begun in `out`."""
     settings = (*TINY, "crm.epochs=1")
-    monkeypatch.setattr(robustness, "BUDGETS", {"small": Budget((FILE,), 1, 2, settings)})
+    budget = Budget((FILE,), 1, 2, settings)
+    monkeypatch.setattr(robustness, "BUDGETS", {"small": budget})
     monkeypatch.setattr("ucfrec_control.commands.robustness.ROBUSTNESS_BUDGETS", robustness.BUDGETS)
     monkeypatch.setattr(robustness, "METHODS", ("dt", *robustness.SCREENED))
     kinds = {kind: robustness.DISTRACTORS[kind] for kind in ("none", "deterministic")}
@@ -102,7 +104,8 @@ def begin(tmp_path: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     distracted = add_distractor(clean, stores_of(out) / f"{FILE}-deterministic")
     tables = preset_of(dataset_of(clean), "ucf").tables
     for kind, store in (("none", clean), ("deterministic", distracted)):
-        config = resolve_config("ucf", None, settings, 0, tables)
+        chosen = settings_of(budget, "small", "ucf", ())
+        config = resolve_config("ucf", None, chosen, 0, tables)
         for method, screening in robustness.SCREENED.items():
             train_control(store, run_of(out, kind, method), config, screening=screening)
 

@@ -285,8 +285,8 @@ SECTIONS = (
         "Control (Tables 1 and 3)",
         "Normalised scores of the last checkpoint after 4,000 steps in batches of 16, a hundredth "
         "of what the authors' settings learn from. Learning rates were chosen on validation loss "
-        "by one search for all learners. **One training seed so far**: without standard errors, "
-        "differences of a column may be luck.",
+        "by one search for all learners. Where no standard error stands there is one seed, and a "
+        "difference may be luck.",
         f"{CONTROL} main",
         of("control", "main"),
         scores,

@@ -154,6 +154,12 @@ def test_the_best_trajectories_are_cloned_and_evaluated(
     assert chosen["bc"] < -0.2 < 0.2 < chosen["bc-25"] < chosen["bc-10"]
 
 
+IMPORTED_BY_THEM_ALONE = (
+    *("ucfrec.acting.sessions", "ucfrec.episodes.group_auc", "ucfrec.processes"),
+)
+"""Modules that `code_version` leaves out together with `OF_ITEMS`."""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("table", [MAIN, ROBUSTNESS])
 def test_no_cell_runs_code_of_items(table: str, tmp_path: Path) -> None:
@@ -181,7 +187,8 @@ def test_no_cell_runs_code_of_items(table: str, tmp_path: Path) -> None:
     finally:
         sys.settrace(before)
     assert str(source_of("ucfrec.policies.ucf")) in called
-    assert [name for name in OF_ITEMS if str(source_of(name)) in called] == []
+    left_out = (*OF_ITEMS, *IMPORTED_BY_THEM_ALONE)
+    assert [name for name in left_out if str(source_of(name)) in called] == []
 
 
 def source_of(module: str) -> Path:

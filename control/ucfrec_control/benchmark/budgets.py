@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from ucfrec_control.benchmark.methods import WITH_TIME
+from ucfrec_control.benchmark.methods import LONGER, WITH_TIME
 from ucfrec_control.worlds.scores import find_task
 
 
@@ -20,6 +20,8 @@ class Budget:
     """Settings over the presets; without any, trainings have the authors' size."""
     memoryless: tuple[str, ...] = ()
     """Further settings of `bc`."""
+    of_methods: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Further settings of single methods, by name."""
     rl_steps: int = 1_000_000
     """Updates of IQL and CQL."""
     rl_batch_size: int = 256
@@ -79,6 +81,7 @@ BUDGETS = {
         ),
         # As many predictions per update as 16 windows of 20 steps; cheap enough for the full width.
         memoryless=("train.batch_size=320", "policy.dim=128"),
+        of_methods=dict.fromkeys(LONGER, ("train.steps=12000",)),
         # They learn from single steps, not from windows of 20, and need more updates: at 5,000 they
         # were below behaviour cloning. A quarter of the authors' batch size, as for the others.
         rl_steps=20_000,
@@ -93,6 +96,7 @@ BUDGETS = {
         5,
         100,
         (),
+        of_methods=dict.fromkeys(LONGER, ("train.steps=300000",)),
         where_present=ANTMAZE,
         antmaze_seeds=4,
         all_targets=True,

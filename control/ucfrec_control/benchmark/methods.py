@@ -48,8 +48,16 @@ _PURSUITS = {
 }
 """Ways to pursue reward instead of imitating. A policy with `max_return` is asked for the largest
 return that it expects in each state."""
-MAIN, PURSUING = "main", "pursuing"
+MAIN, PURSUING, EQUAL_TIME = "main", "pursuing", "equal-time"
 _TABLES: dict[str, Methods] = {
+    # A step of UCF takes a third of the time of one of DT; `Budget.of_methods` has how many.
+    EQUAL_TIME: {
+        "dt-wo-time": METHODS["dt-wo-time"],
+        "ucf": METHODS["ucf"],
+        "ucf-wo-count": METHODS["ucf-wo-count"],
+        "ucf-longer": METHODS["ucf"],
+        "ucf-wo-count-longer": METHODS["ucf-wo-count"],
+    },
     # All but the paper's without embeddings of time steps, as UCF is.
     PURSUING: {
         f"{METHODS_WO_TIME[learner]}{name}": (learner, (_NO_TIME, *settings))
@@ -92,5 +100,7 @@ _TABLES: dict[str, Methods] = {
         },
     },
 }
+LONGER = ("ucf-longer", "ucf-wo-count-longer")
+"""Methods that are trained for as long as DT instead of for as many steps."""
 TABLES = {MAIN: METHODS, **{name: rows | PAPER for name, rows in _TABLES.items()}}
 """Rows of each table, as in `METHODS`."""

@@ -55,6 +55,7 @@ def cells_of(
         store = zoo_store(data, stores_of(folder), file)
         for method in methods:
             learner, method_settings = TABLES[table][method]
+            settings = (*method_settings, *budget.of_methods.get(method, ()))
             code = code_of(learner)
             for seed in range(budget.seeds_of(file, method)):
                 yield Cell(
@@ -64,7 +65,7 @@ def cells_of(
                     file=file,
                     method=method,
                     learner=learner,
-                    settings=settings_of(budget, name, learner, method_settings),
+                    settings=settings_of(budget, name, learner, settings),
                     store=store,
                     run=runs / file / run_name(method, code, seed),
                     seed=seed,

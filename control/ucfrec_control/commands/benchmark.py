@@ -10,7 +10,7 @@ from ucfrec.reporting.rows_file import benchmarking
 from ucfrec.reporting.tables import format_rows
 from ucfrec_control.benchmark.budgets import BUDGETS, SWEEPS, Budget
 from ucfrec_control.benchmark.cells import SCORES
-from ucfrec_control.benchmark.methods import MAIN, PURSUING, TABLES
+from ucfrec_control.benchmark.methods import EQUAL_TIME, MAIN, PURSUING, TABLES
 from ucfrec_control.benchmark.plan import benchmark
 from ucfrec_control.benchmark.rates import chosen_rates
 from ucfrec_control.benchmark.tables import (
@@ -38,7 +38,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--table",
         default=MAIN,
         choices=list(TABLES),
-        help="every learner (main), ways to pursue reward, or a sweep over UCF's settings",
+        help="every learner (main), ways to pursue reward, UCF trained for as long as DT "
+        "(equal-time), or a sweep over UCF's settings",
     )
     budget_options(parser)
     rates_option(parser)
@@ -68,7 +69,7 @@ def run(options: argparse.Namespace) -> None:
 
 def budgets_of(table: str) -> Mapping[str, Budget]:
     """The budgets of a table, by name."""
-    return BUDGETS if table in (MAIN, PURSUING) else SWEEPS
+    return BUDGETS if table in (MAIN, PURSUING, EQUAL_TIME) else SWEEPS
 
 
 def print_scores(

@@ -24,7 +24,7 @@ from ucfrec_control.benchmark.cells import (
     measure_scores,
 )
 from ucfrec_control.benchmark.folders import run_name
-from ucfrec_control.benchmark.methods import MAIN, METHODS, PAPER, TABLES
+from ucfrec_control.benchmark.methods import EQUAL_TIME, MAIN, METHODS, PAPER, TABLES
 from ucfrec_control.benchmark.plan import benchmark, cells_of
 from ucfrec_control.benchmark.rates import settings_of
 from ucfrec_control.commands.benchmark import budgets_of
@@ -41,7 +41,7 @@ def resolved(table: str, budget: Budget, file: str) -> dict[str, Config]:
         method: resolve_config(
             learner,
             None,
-            settings_of(budget, "small", learner, own),
+            settings_of(budget, "small", learner, (*own, *budget.of_methods.get(method, ()))),
             0,
             find_preset(task, kind, learner).tables,
         )
@@ -87,6 +87,10 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
     assert (main["ucf"].augment.copies > 0, main["dt"].augment.copies) == (True, 0)
     assert main["ucf-wo-arch"].policy_name == "dt"
     assert main["ucf-wo-arch"].augment.copies > 0
+    for size in ("small", "full"):
+        timed = resolved(EQUAL_TIME, BUDGETS[size], file)
+        assert timed["ucf-longer"].train.steps == 3 * timed["ucf"].train.steps
+        assert timed["ucf-wo-count-longer"].train.steps == 3 * timed["dt-wo-time"].train.steps
     assert [main[m].policy.best_share for m in ("bc", "bc-10", "bc-25")] == [1.0, 0.1, 0.25]
 
 

@@ -56,6 +56,11 @@ class Budget:
         return (*self.settings, *(self.memoryless if learner == "bc" else ()))
 
 
+def _longer(steps: int) -> dict[str, tuple[str, ...]]:
+    """Settings of the methods that are trained for longer than `steps`."""
+    return {method: (f"train.steps={round(more * steps)}",) for method, more in LONGER.items()}
+
+
 _TASKS, _KINDS = ("halfcheetah", "hopper", "walker2d"), ("medium", "mixed", "medium-expert")
 ANTMAZE = ("antmaze-umaze-v2", "antmaze-umaze-diverse-v2")
 """D4RL's files of the paper's AntMaze columns, under the names of their datasets."""
@@ -81,7 +86,7 @@ BUDGETS = {
         ),
         # As many predictions per update as 16 windows of 20 steps; cheap enough for the full width.
         memoryless=("train.batch_size=320", "policy.dim=128"),
-        of_methods=dict.fromkeys(LONGER, ("train.steps=12000",)),
+        of_methods=_longer(4_000),
         # They learn from single steps, not from windows of 20, and need more updates: at 5,000 they
         # were below behaviour cloning. A quarter of the authors' batch size, as for the others.
         rl_steps=20_000,
@@ -96,7 +101,7 @@ BUDGETS = {
         5,
         100,
         (),
-        of_methods=dict.fromkeys(LONGER, ("train.steps=300000",)),
+        of_methods=_longer(100_000),
         where_present=ANTMAZE,
         antmaze_seeds=4,
         all_targets=True,

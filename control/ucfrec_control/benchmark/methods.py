@@ -50,9 +50,12 @@ _PURSUITS = {
 return that it expects in each state."""
 MAIN, PURSUING, EQUAL_TIME = "main", "pursuing", "equal-time"
 _TABLES: dict[str, Methods] = {
-    # A step of UCF takes a third of the time of one of DT; `Budget.of_methods` has how many.
+    # LSDT takes longer than DT for as many steps, so it has no row of fewer.
     EQUAL_TIME: {
+        **{f"{name}-longer": METHODS[name] for name in ("bc", "bc-10", "bc-25")},
         "dt-wo-time": METHODS["dt-wo-time"],
+        "dc-wo-time-longer": METHODS["dc-wo-time"],
+        "lsdt-wo-time": METHODS["lsdt-wo-time"],
         "ucf": METHODS["ucf"],
         "ucf-wo-count": METHODS["ucf-wo-count"],
         "ucf-longer": METHODS["ucf"],
@@ -100,7 +103,11 @@ _TABLES: dict[str, Methods] = {
         },
     },
 }
-LONGER = ("ucf-longer", "ucf-wo-count-longer")
-"""Methods that are trained for as long as DT instead of for as many steps."""
+LONGER = {
+    **dict.fromkeys(("bc-longer", "bc-10-longer", "bc-25-longer"), 8),
+    "dc-wo-time-longer": 1.25,
+    **dict.fromkeys(("ucf-longer", "ucf-wo-count-longer"), 3),
+}
+"""By method, how many times the budget's steps take about as long as DT (small budget)."""
 TABLES = {MAIN: METHODS, **{name: rows | PAPER for name, rows in _TABLES.items()}}
 """Rows of each table, as in `METHODS`."""

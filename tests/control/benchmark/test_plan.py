@@ -89,8 +89,10 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
     assert main["ucf-wo-arch"].augment.copies > 0
     for size in ("small", "full"):
         timed = resolved(EQUAL_TIME, BUDGETS[size], file)
-        assert timed["ucf-longer"].train.steps == 3 * timed["ucf"].train.steps
-        assert timed["ucf-wo-count-longer"].train.steps == 3 * timed["dt-wo-time"].train.steps
+        steps = {name: config.train.steps for name, config in timed.items()}
+        assert steps["ucf-longer"] == steps["ucf-wo-count-longer"] == 3 * steps["ucf"]
+        assert steps["bc-25-longer"] == 8 * steps["dt-wo-time"] == 8 * steps["lsdt-wo-time"]
+        assert 4 * steps["dc-wo-time-longer"] == 5 * steps["dt-wo-time"]
     assert [main[m].policy.best_share for m in ("bc", "bc-10", "bc-25")] == [1.0, 0.1, 0.25]
 
 

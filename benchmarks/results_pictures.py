@@ -1,6 +1,6 @@
 """Pictures of the page of tables; `results_page.py` draws them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from counterfactual_copies import ARMS, compared
@@ -16,7 +16,7 @@ from ucfrec.reporting.statistics import Summary, grouped, summary
 def draw(
     main: Sequence[ResultRow],
     copies: Sequence[ResultRow],
-    control: Sequence[ResultRow],
+    control: Mapping[str, Sequence[ResultRow]],
     folder: Path,
 ) -> None:
     """Draw each world of Table 2, the copies, and control's scores.
@@ -24,7 +24,7 @@ def draw(
     Args:
         main: rows of the recommendation benchmark's main table.
         copies: rows of the benchmark of counterfactual copies.
-        control: rows of the control benchmark's main table.
+        control: rows of the control benchmark, by the table's name.
         folder: gets a picture each.
     """
     for world, group in grouped(main, lambda row: str(row.world)).items():
@@ -39,7 +39,8 @@ def draw(
         axes.set_xlabel("return of a session (mean ± sd over logs and training seeds)")
         save(figure, folder, f"table-2-{world}")
     _draw_copies(copies, folder)
-    _draw_control(control, folder)
+    for table, rows in control.items():
+        _draw_control(rows, folder, f"control-{table}")
 
 
 def _bars(axes: Axes, found: dict[str, Summary], errors: dict[str, float]) -> None:
@@ -80,7 +81,7 @@ def _draw_copies(rows: Sequence[ResultRow], folder: Path) -> None:
     save(figure, folder, "copies")
 
 
-def _draw_control(rows: Sequence[ResultRow], folder: Path) -> None:
+def _draw_control(rows: Sequence[ResultRow], folder: Path, name: str) -> None:
     """The score of every method on each file, last checkpoints."""
     of_files = grouped([row for row in rows if row.checkpoint == "last"], lambda row: row.task)
     if not of_files:
@@ -90,9 +91,9 @@ def _draw_control(rows: Sequence[ResultRow], folder: Path) -> None:
     panels = figure.subplots(lines, 3, sharey=True, squeeze=False).ravel()
     for axes, task in zip(panels, sorted(of_files), strict=False):
         own = grouped(of_files[task], lambda row: row.method)
-        found = {name: summary(row.value for row in group) for name, group in own.items()}
-        _bars(axes, found, {name: each.standard_error for name, each in found.items()})
+        found = {method: summary(row.value for row in group) for method, group in own.items()}
+        _bars(axes, found, {method: each.standard_error for method, each in found.items()})
         axes.set_title(task.removesuffix("-zoo"))
         axes.tick_params(axis="y", labelsize=6)
     figure.supxlabel("normalised score (mean ± standard error over training seeds)", fontsize=8)
-    save(figure, folder, "control-main")
+    save(figure, folder, name)

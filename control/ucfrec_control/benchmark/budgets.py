@@ -58,7 +58,7 @@ class Budget:
 
 def _longer(steps: int) -> dict[str, tuple[str, ...]]:
     """Settings of the methods that are trained for longer than `steps`."""
-    return {method: (f"train.steps={round(more * steps)}",) for method, more in LONGER.items()}
+    return {method: (f"train.steps={more * steps}",) for method, more in LONGER.items()}
 
 
 _TASKS, _KINDS = ("halfcheetah", "hopper", "walker2d"), ("medium", "mixed", "medium-expert")

@@ -38,8 +38,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--table",
         default=MAIN,
         choices=list(TABLES),
-        help="every learner (main), ways to pursue reward, all trained for as long as DT "
-        "(equal-time), or a sweep over UCF's settings",
+        help="every learner (main), ways to pursue reward, all trained for as long as DT or "
+        "LSDT (equal-time), or a sweep over UCF's settings",
     )
     budget_options(parser)
     rates_option(parser)

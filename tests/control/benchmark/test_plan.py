@@ -90,9 +90,8 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
     for size in ("small", "full"):
         timed = resolved(EQUAL_TIME, BUDGETS[size], file)
         steps = {name: config.train.steps for name, config in timed.items()}
-        assert steps["ucf-longer"] == steps["ucf-wo-count-longer"] == 3 * steps["ucf"]
-        assert steps["bc-25-longer"] == 8 * steps["dt-wo-time"] == 8 * steps["lsdt-wo-time"]
-        assert 4 * steps["dc-wo-time-longer"] == 5 * steps["dt-wo-time"]
+        assert steps["bc-25-x8"] == 8 * steps["dt-wo-time"] == 8 * steps["lsdt-wo-time"]
+        assert 2 * steps["ucf-x3"] == 3 * steps["ucf-wo-count-x2"] == 6 * steps["dc-wo-time"]
     assert [main[m].policy.best_share for m in ("bc", "bc-10", "bc-25")] == [1.0, 0.1, 0.25]
 
 

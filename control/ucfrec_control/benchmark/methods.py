@@ -51,8 +51,8 @@ return that it expects in each state."""
 _UCF = ("ucf", "ucf-wo-count")
 MAIN, PURSUING, EQUAL_TIME = "main", "pursuing", "equal-time"
 _TABLES: dict[str, Methods] = {
-    # Seconds of a training in the small budget are in benchmarks/LOG.md; of LSDT and the rows x3 they
-    # are half as many again as of the others.
+    # In the small budget trainings of x3 take as long as LSDT's, the others as DT's
+    # (benchmarks/LOG.md).
     EQUAL_TIME: {
         **{f"{name}-x8": METHODS[name] for name in ("bc", "bc-10", "bc-25")},
         **{f"{name}-wo-time": METHODS[f"{name}-wo-time"] for name in ("dt", "dc", "lsdt")},

@@ -57,7 +57,7 @@ class Budget:
 
 
 def _longer(steps: int) -> dict[str, tuple[str, ...]]:
-    """Settings of the methods that are trained for longer than `steps`."""
+    """Settings of the methods that have more steps than the budget's `steps`."""
     return {method: (f"train.steps={more * steps}",) for method, more in LONGER.items()}
 
 

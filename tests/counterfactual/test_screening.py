@@ -44,6 +44,16 @@ def test_indicators_of_a_category_are_kept_beside_a_measurement(tmp_path: Path) 
     assert all(not set(each.helps) & {1, 2, 3, 4, 5} for each in report.dimensions)
 
 
+def test_weak_causes_of_a_noisy_reward_are_kept(tmp_path: Path) -> None:
+    """What explains two thirds of a reward does not show what has no part in the last third."""
+    store = planted_category(tmp_path / "store", moves=0.05, noise=0.5)
+    report = screen(store.split("train"), QUICK, seed=0)
+    assert report.flagged == (6,)
+    # Taken as evidence, the same help would do away with the category.
+    trusting = screen(store.split("train"), replace(QUICK, min_reward_r2=0.5), seed=0)
+    assert set(trusting.flagged) >= {1, 2, 3, 4, 5, 6}
+
+
 def test_too_few_trajectories_are_refused(tmp_path: Path) -> None:
     store = planted_vectors(tmp_path / "store", trajectories=8)
     with pytest.raises(InputError, match="screening needs at least 15"):

@@ -48,9 +48,13 @@ def planted_vectors(
     return EpisodeStore.write(out, columns, np.full(trajectories, length), split, source=SOURCE)
 
 
-def planted_category(out: Path, trajectories: int = 150, length: int = 12) -> EpisodeStore:
+def planted_category(
+    out: Path, trajectories: int = 150, length: int = 12, moves: float = 0.5, noise: float = 0.0
+) -> EpisodeStore:
     """Eight dimensions: 0 drives itself and the reward, 1 to 5 are indicators of a category that
-    holds throughout a trajectory and moves the reward, 6 is whether the reward is high, 7 is 0."""
+    holds throughout a trajectory and moves the reward by `moves` from one to the next, 6 is whether
+    the reward is high, 7 is 0. `noise` is the standard deviation of what nothing explains of the
+    reward."""
     rng = np.random.default_rng(0)
     shape = (trajectories, length)
     states, actions = np.zeros((*shape, 8)), rng.uniform(-1, 1, (*shape, 1))
@@ -58,9 +62,10 @@ def planted_category(out: Path, trajectories: int = 150, length: int = 12) -> Ep
     states[np.arange(trajectories), :, 1 + category] = 1.0
     states[:, 0, 0] = rng.normal(size=trajectories)
     for t in range(length - 1):
-        noise = 0.3 * rng.normal(size=trajectories)
-        states[:, t + 1, 0] = 0.8 * states[:, t, 0] + 0.4 * actions[:, t, 0] + noise
-    rewards = states[:, :, 0] + 0.5 * category[:, None] + 0.3 * actions[:, :, 0]
+        drift = 0.3 * rng.normal(size=trajectories)
+        states[:, t + 1, 0] = 0.8 * states[:, t, 0] + 0.4 * actions[:, t, 0] + drift
+    rewards = states[:, :, 0] + moves * category[:, None] + 0.8 * actions[:, :, 0]
+    rewards += noise * np.random.default_rng(1).normal(size=shape)
     states[:, :, 6] = rewards > np.median(rewards)
     columns = {
         schema.OBSERVATION: states.reshape(-1, 8).astype(np.float32),

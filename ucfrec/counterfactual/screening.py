@@ -12,7 +12,7 @@ What helps neither one by one may help together, as the indicators of a category
 from one another. So all that would be flagged but measurements of the reward is tested once more,
 together and without these, and kept if it helps.
 
-Where the reward can hardly be predicted without what measures it, as clicks, no help is no
+Where the reward cannot be predicted well without what measures it, as clicks, no help is no
 evidence, and a measurement of the reward helps most. There a dimension counts as without effect
 only if it is such a measurement (`ucfrec.counterfactual.measured_reward`) and does not help to
 predict the next state. In logs of items the logged observation is screened, and by that test alone.
@@ -80,8 +80,9 @@ class ScreeningConfig:
     """Least share of the reward's variance that counts as help."""
     level: Share = 0.01
     """Level of the tests, over held-out episodes."""
-    min_reward_r2: Share = 0.5
-    """Least R² of the reward at which it counts as evidence that a dimension does not help."""
+    min_reward_r2: Share = 0.9
+    """Least R² of the reward at which it counts as evidence that a dimension does not help: many
+    weak causes fit into a larger share that nothing explains."""
     measurement: MeasurementConfig = field(default_factory=MeasurementConfig)
     """The test whether a dimension measures the reward."""
 
@@ -307,7 +308,7 @@ class _Effect:
     reward_p_value: float
     helps_next: bool
     helps_reward: bool
-    """True too where the reward can hardly be predicted."""
+    """True too where the reward cannot be predicted well."""
 
     @property
     def undecided(self) -> bool:

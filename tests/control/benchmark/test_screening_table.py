@@ -31,7 +31,11 @@ from ucfrec_control.figures.diagnostics import store_of
 from ucfrec_control.learners.train import train_control
 
 QUICKEST = ScreeningConfig(
-    hidden=8, shared_steps=100, own_steps=50, measurement=MeasurementConfig(trees=5)
+    hidden=8,
+    shared_steps=100,
+    own_steps=50,
+    min_reward_r2=0.5,  # predictors this small reach no more
+    measurement=MeasurementConfig(trees=5),
 )
 
 

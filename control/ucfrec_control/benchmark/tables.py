@@ -14,8 +14,9 @@ _BySeed = Mapping[int | None, float]
 
 
 def score_table(rows: Sequence[ResultRow], checkpoint: str) -> list[dict[str, str]]:
-    """One line per method and one column per dataset: normalised score, mean ± standard error over
-    seeds (Table 1 of the paper); then the mean over datasets if the method has rows of all.
+    """One line per method: number of seeds, or the fewest and most where datasets differ; then one
+    column per dataset, normalised score, mean ± standard error over seeds (Table 1 of the paper);
+    then the mean over datasets if the method has rows of all.
 
     As in the paper, the best of a column and what comes within 5% of it are `**bold**`.
 
@@ -37,9 +38,18 @@ def score_table(rows: Sequence[ResultRow], checkpoint: str) -> list[dict[str, st
         for name in (*tasks, MEAN)
     }
     return [
-        {"method": method, **{name: _score(each, best[name]) for name, each in own.items()}}
+        {
+            "method": method,
+            "seeds": _seeds([own[task].count for task in tasks]),
+            **{name: _score(each, best[name]) for name, each in own.items()},
+        }
         for method, own in cells.items()
     ]
+
+
+def _seeds(counts: Sequence[int]) -> str:
+    fewest, most = min(filter(None, counts)), max(counts)
+    return str(most) if fewest == most else f"{fewest}–{most}"
 
 
 def _score(scores: Summary, best: float) -> str:

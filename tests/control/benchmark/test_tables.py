@@ -39,11 +39,14 @@ def test_a_table_of_scores_has_the_spread_over_seeds_and_a_mean_where_nothing_is
     ]
     dt, iql = score_table(rows, "last")
     # Of 10 and 20 the standard error is 5.
-    assert dt == {"method": "dt", "a": "15.0 ± 5", "b": "**45.0 ± 5**", "mean": "**30.0 ± 5**"}
-    assert iql == {"method": "iql", "a": "**30.0**", "b": "–", "mean": "–"}
+    scores_of_dt = {"a": "15.0 ± 5", "b": "**45.0 ± 5**", "mean": "**30.0 ± 5**"}
+    assert dt == {"method": "dt", "seeds": "2", **scores_of_dt}
+    assert iql == {"method": "iql", "seeds": "1", "a": "**30.0**", "b": "–", "mean": "–"}
     best_dt, best_iql = score_table(rows, "best")
     assert best_dt["mean"] == "**31.0 ± 5**"
     assert best_iql == iql
+    more = scored("a", "dt", 2, 18.0, checkpoint="last", metrics={"best_step": 7.0})
+    assert score_table([*rows, more], "last")[0]["seeds"] == "2–3"
 
 
 @pytest.mark.parametrize(("best", "near", "far"), [(100.0, 95.1, 94.9), (-10.0, -10.4, -10.6)])

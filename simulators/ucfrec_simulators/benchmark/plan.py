@@ -99,7 +99,7 @@ GATES: Final = (0.02, 1e6)
 """ε_r in standard deviations of the rewards; the last value disables the gate. The first λ is the
 default, and the line to compare with."""
 DISTRACTOR_METHODS: Final[Mapping[str, Method]] = {
-    **{name: METHODS[name] for name in ("bc", "dt", "ucf-paper", "ucf")},
+    **{name: METHODS[name] for name in ("bc", "dt", *PAPER, "ucf")},
     **SCREENED,
 }
 DISTRACTOR_TARGETS: Final = (1.0, 0.99)

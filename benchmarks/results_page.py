@@ -296,8 +296,8 @@ SECTIONS = (
         "Control: the same training time",
         "The same files, rates and batches, but more steps for what learns faster (x2, x3, x8). "
         "Trainings of UCF x2 and of cloning x8 take about as long as DT's and DC's, trainings of "
-        "UCF x3 as long as LSDT's, half as long again. The paper's UCF has 4,000 steps here too. One "
-        "seed where no standard error stands.",
+        "UCF x3 as long as LSDT's, half as long again. The paper's UCF has 4,000 steps here too. "
+        "One seed where no standard error stands.",
         f"{CONTROL} equal-time",
         of("control", "equal-time"),
         partial(scores, reference="ucf-x2"),

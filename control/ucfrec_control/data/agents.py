@@ -12,6 +12,7 @@ import re
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -111,7 +112,16 @@ def read_agent(file: Path, observations: int, space: Box, noise: float, seed: in
     known = {name for name in tensors if name.startswith((*names, "log_std", "actor.log_std"))}
     if other := sorted(n for n in tensors.keys() - known if n.startswith(("actor.", "features"))):
         raise _refused(file, f"its network has {other[0]}, which is no layer of a perceptron")
+    for name in (f"{name}.{part}" for name in names for part in ("weight", "bias")):
+        if not _is_plain(tensors[name]):
+            raise _refused(file, f"{name} is not of finite numbers stored one by one")
     layers = [tensors[f"{name}.weight"] for name in names]
+    for (name, first), (after, second) in pairwise(zip(names, layers, strict=True)):
+        if first.shape[0] != second.shape[1]:
+            raise _refused(
+                file,
+                f"{name} has {first.shape[0]} outputs, but {after} has {second.shape[1]} inputs",
+            )
     sizes = (layers[0].shape[1], layers[-1].shape[0])
     if sizes != (observations, space.shape[0]):
         raise InputError(
@@ -129,6 +139,8 @@ def read_agent(file: Path, observations: int, space: Box, noise: float, seed: in
     parts.pop()
     if names[-1] == "actor.mu.0" and kind.last:
         bound = kwargs.get("clip_mean", _CLIPPED_MEAN)
+        if not isinstance(bound, int | float) or not bound > 0:
+            raise _refused(file, f"its clip_mean is {bound!r}, not a number above 0")
         parts.append(nn.Hardtanh(-float(bound), float(bound)))
     squashed = kind.squashed or kwargs.get("squash_output") is True
     return Agent(nn.Sequential(*parts, *([nn.Tanh()] if squashed else [])), squashed, space, noise,
@@ -142,7 +154,12 @@ def _contents(file: Path) -> tuple[dict[str, Tensor], Mapping[str, Any]]:
     try:
         with zipfile.ZipFile(file) as archive:
             parts = {name: _unpacked(archive, name) for name in _MOST_BYTES}
-        tensors = torch.load(io.BytesIO(parts["policy.pth"]), "cpu", weights_only=True)
+        network = io.BytesIO(parts["policy.pth"])
+        if zipfile.is_zipfile(network):
+            with zipfile.ZipFile(network) as archive:
+                _require_unpackable("policy.pth", sum(i.file_size for i in archive.infolist()))
+        network.seek(0)
+        tensors = torch.load(network, "cpu", weights_only=True)
         settings = json.loads(parts["data"])
         if not (
             isinstance(settings, dict)
@@ -157,10 +174,13 @@ def _contents(file: Path) -> tuple[dict[str, Tensor], Mapping[str, Any]]:
 
 
 def _unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
-    size = archive.getinfo(name).file_size
+    _require_unpackable(name, archive.getinfo(name).file_size)
+    return archive.read(name)
+
+
+def _require_unpackable(name: str, size: int) -> None:
     if size > _MOST_BYTES[name]:
         raise ValueError(f"{name} has {size:,} bytes, more than {_MOST_BYTES[name]:,}")
-    return archive.read(name)
 
 
 def _kind_of(file: Path, tensors: Mapping[str, Tensor]) -> tuple[_Kind, list[str]]:
@@ -181,7 +201,16 @@ def _is_layer(tensors: Mapping[str, Tensor], name: str) -> bool:
     weight, bias = (tensors.get(f"{name}.{part}") for part in ("weight", "bias"))
     if weight is None or bias is None:
         return False
-    return weight.ndim == 2 and bias.shape == weight.shape[:1] and weight.is_floating_point()
+    return weight.ndim == 2 and bias.shape == weight.shape[:1]
+
+
+def _is_plain(tensor: Tensor) -> bool:
+    """Whether it is of finite numbers that are all in the file: a few bytes can claim any shape."""
+    if tensor.layout != torch.strided or tensor.device.type != "cpu":
+        return False
+    if not (tensor.is_floating_point() and tensor.is_contiguous() and tensor.numel()):
+        return False
+    return bool(tensor.isfinite().all())
 
 
 def _activation(file: Path, kwargs: Mapping[str, Any], kind: _Kind) -> type[nn.Module]:

@@ -21,6 +21,7 @@ from torch import nn
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec_control.cli import main
+from ucfrec_control.data import agents
 from ucfrec_control.data.agents import read_agent
 from ucfrec_control.data.d4rl import read_d4rl
 
@@ -136,6 +137,51 @@ def test_what_cannot_be_told_is_refused_with_the_reason(tmp_path: Path) -> None:
     data["policy_kwargs"] = {"activation_fn": "<class 'somebody.Else'>"}
     bad = rewritten(file, tmp_path / "bad.zip", data=json.dumps(data).encode())
     with pytest.raises(InputError, match="its activation is"):
+        read_agent(bad, OBSERVATIONS, SPACE, 0.0, 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "tensor", "reason"),
+    [
+        ("actor.latent_pi.2.weight", torch.zeros(1).expand(300_000, 300_000), "one by one"),
+        ("actor.latent_pi.2.weight", torch.full((256, 256), torch.nan), "one by one"),
+        ("actor.latent_pi.2.weight", torch.eye(256).to_sparse(), "one by one"),
+        ("actor.latent_pi.2.bias", torch.zeros(256, dtype=torch.complex64), "one by one"),
+        ("actor.latent_pi.2.weight", torch.zeros(256, 255), "256 outputs, .* 255 inputs"),
+    ],
+)
+def test_tensors_that_are_no_network_are_refused(
+    name: str, tensor: torch.Tensor, reason: str, tmp_path: Path
+) -> None:
+    file, _ = saved(tmp_path, "sac-sde")
+    with zipfile.ZipFile(file) as archive:
+        tensors = torch.load(io.BytesIO(archive.read("policy.pth")), weights_only=True)
+    if len(tensor) > 256:
+        tensors["actor.latent_pi.2.bias"] = torch.zeros(1).expand(len(tensor))
+    torch.save({**tensors, name: tensor}, weights := io.BytesIO())
+    bad = rewritten(file, tmp_path / "bad.zip", policy_pth=weights.getvalue())
+    with pytest.raises(InputError, match=reason):
+        read_agent(bad, OBSERVATIONS, SPACE, 0.0, 0)
+
+
+def test_a_network_that_inflates_without_end_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, _ = saved(tmp_path, "sac")
+    monkeypatch.setitem(agents._MOST_BYTES, "policy.pth", 2**20)
+    with zipfile.ZipFile(bomb := io.BytesIO(), "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data/0", bytes(2**20 + 1))
+    bad = rewritten(file, tmp_path / "bad.zip", policy_pth=bomb.getvalue())
+    with pytest.raises(InputError, match=r"policy.pth has .* bytes, more than"):
+        read_agent(bad, OBSERVATIONS, SPACE, 0.0, 0)
+
+
+@pytest.mark.parametrize("bound", ["x", 0.0, -1.0, None, float("nan")])
+def test_a_bound_of_the_mean_that_is_none_is_refused(bound: object, tmp_path: Path) -> None:
+    file, _ = saved(tmp_path, "sac-sde")
+    data = {"policy_kwargs": {"clip_mean": bound}}
+    bad = rewritten(file, tmp_path / "bad.zip", data=json.dumps(data).encode())
+    with pytest.raises(InputError, match="clip_mean"):
         read_agent(bad, OBSERVATIONS, SPACE, 0.0, 0)
 
 

@@ -10,11 +10,13 @@ from tests.support.served import FULL, as_frame, histories, requests_of, respond
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.errors import InputError
+from ucfrec.logs.expressions import Expression
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
-from ucfrec.recommending.requests import Request
+from ucfrec.recommending.requests import HistoryReader, Request, Row
 from ucfrec.recommending.responder import Answer, Responder
+from ucfrec.recommending.row_rewards import RowRewards
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 
@@ -104,6 +106,10 @@ def test_a_wrong_request_does_not_disturb_the_others(trained: TrainedPolicy) -> 
         ({"user_id": 1, "history": [{"item_id": "x", "timestamp": 1.7e12, "reward": 0}]}, r"\(x\)"),
         ({"user_id": 1, "history": [{"item_id": 1, "timestamp": 1.7e12}]}, "0 has no reward;"),
         ({"user_id": 1, "history": [{"item_id": 1, "timestamp": 5, "reward": 0}]}, "before 2000"),
+        (
+            {"user_id": 1, "history": [{"item_id": 1, "timestamp": 1.7e12, "reward": 2e12}]},
+            "within",
+        ),
     ]
     mixed = [wrong[0][0], requests[0], *(each for each, _ in wrong[1:]), requests[1]]
     answers = responder(trained).answers([Request.model_validate(r) for r in mixed])
@@ -120,6 +126,24 @@ def test_a_wrong_request_does_not_disturb_the_others(trained: TrainedPolicy) -> 
             raise error
     skipping = responder(trained, skip_unknown=True).answers([Request.model_validate(wrong[1][0])])
     assert isinstance(skipping[0], Answer)
+
+
+@pytest.mark.parametrize("value", [10**400, -(10**400), float("inf"), float("nan"), 2e12, "1"])
+@pytest.mark.parametrize("reward", ["is_click", "1 * is_click"])
+def test_feedback_that_is_no_reward_is_refused(reward: str, value: object) -> None:
+    rewards = RowRewards(Expression(reward, "run.json"))
+    assert rewards.of_rows([{"is_click": 1}]) == [1.0]
+    with pytest.raises(InputError, match="history"):
+        rewards.of_rows([{"is_click": value}])
+    rewards.close()
+
+
+def test_an_observation_that_is_infinite_in_single_precision_is_refused() -> None:
+    reader = HistoryReader("last", False, 2, RowRewards(Expression("reward", "run.json")))
+    row = {"item_id": 1, "timestamp": 1.7e12, "reward": 0, "observation": [1, -2.5]}
+    assert reader.read([Row(**row)]).observation == [1.0, -2.5]  # type: ignore[typeddict-item]
+    with pytest.raises(InputError, match="numbers beyond"):
+        reader.read([Row(**{**row, "observation": [1, -1e39]})])  # type: ignore[typeddict-item]
 
 
 def test_nothing_of_a_request_is_kept(trained: TrainedPolicy) -> None:

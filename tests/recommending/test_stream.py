@@ -93,6 +93,18 @@ BAD = {
         "history.0.timestamp: ",
     ),
     "a large integer": (b'{"user_id": ' + b"9" * 30 + b"}", "user_id: "),
+    **{
+        f"no float holds the {name}": (
+            b'{"user_id": 1, "history": [{"item_id": 1, "timestamp": 1700000000000, "%s": %s}]}'
+            % (name.encode(), value),
+            f"history.0.{name}",
+        )
+        for name, value in {
+            "timestamp": b"9" * 400,
+            "reward": b"9" * 400,
+            "observation": b"[" + b"9" * 400 + b"]",
+        }.items()
+    },
     "deep": (b'{"user_id": ' + b"[" * 100_000 + b"}", "the request is not JSON"),
 }
 

@@ -23,8 +23,11 @@ from ucfrec.runs.trained_policy import TrainedPolicy, duplicates_of
 from ucfrec.settings import settings_table
 
 Array = npt.NDArray[Any]
-Id = Annotated[StrictInt, Field(ge=-(2**63), lt=2**63)] | Annotated[str, Field(max_length=1000)]
-Number = Annotated[StrictInt | StrictFloat, Field(allow_inf_nan=False)]
+_Integer = Annotated[StrictInt, Field(ge=-(2**63), lt=2**63)]
+"""Of 64 bits: the largest that identifiers have, and small enough to be a float."""
+Id = _Integer | Annotated[str, Field(max_length=1000)]
+Number = Annotated[StrictFloat, Field(allow_inf_nan=False)] | _Integer
+_LARGEST_FLOAT: Final = float(np.finfo(np.float32).max)
 _SHOWN: Final = 60
 """Most characters of a wrong value in a message."""
 
@@ -233,6 +236,10 @@ class HistoryReader:
             raise InputError(
                 f"history.{last}: the observation has {size}; the policy needs "
                 f"{self.observation_size}"
+            )
+        if max(map(abs, given)) > _LARGEST_FLOAT:
+            raise InputError(
+                f"history.{last}: the observation has numbers beyond ±{_LARGEST_FLOAT:.2g}"
             )
         return [float(value) for value in given]
 

@@ -1,6 +1,5 @@
 """Rewards of rows in memory: as given, or by a run's reward expression."""
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -103,10 +102,10 @@ def _checked(values: Sequence[Any], missing: str) -> list[float]:
     for n, value in enumerate(values):
         if value is None:
             raise InputError(f"history.{n} has {missing}; give every row its reward")
-        if not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise InputError(f"history.{n}: the reward is {value!r:.60}; give a finite number")
-        if abs(value) > schema.LARGEST_REWARD:
+        # Integers of JSON have any number of digits, more than a float has: they are only compared.
+        if not isinstance(value, (int, float)) or not abs(value) <= schema.LARGEST_REWARD:
             raise InputError(
-                f"history.{n}: the reward {value:g} is beyond ±{schema.LARGEST_REWARD:g}"
+                f"history.{n}: the reward is {value!r:.60}; give a number within "
+                f"±{schema.LARGEST_REWARD:g}"
             )
     return [float(value) for value in values]

@@ -13,7 +13,7 @@ from ucfrec.runs.run import new_policy, training_views
 from ucfrec_control.benchmark.cells import Cell
 from ucfrec_control.learners.rl_baselines import ALGORITHMS, timed_updates
 from ucfrec_control.learners.train import dataset_of
-from ucfrec_control.worlds.environments import SIDE_BY_SIDE, make_env
+from ucfrec_control.worlds.environments import SIDE_BY_SIDE, make_env, world_of_data
 
 _TIMED: Final = 5
 _WARM: Final = 2
@@ -37,7 +37,7 @@ def estimated_hours(cells: Sequence[Cell], workers: int) -> float:
     torch.set_num_threads(1)
     try:
         for cell in cells:
-            world = dataset_of(EpisodeStore.open(cell.store))["env_id"]
+            world = world_of_data(dataset_of(EpisodeStore.open(cell.store)))
             kind = (world, cell.learner, cell.settings, cell.rl_steps, cell.rl_batch_size)
             if kind not in trained:
                 trained[kind] = _training(cell)

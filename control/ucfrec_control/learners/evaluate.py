@@ -19,7 +19,13 @@ from ucfrec.runs.screened import SCREENING, flagged_columns
 from ucfrec.runs.trained_policy import DROPPED, RUN, TrainedPolicy, learner_of
 from ucfrec_control.learners.presets import find_preset
 from ucfrec_control.learners.rl_baselines import RLPolicy, is_rl
-from ucfrec_control.worlds.environments import SIDE_BY_SIDE, Wrap, make_env, mismatches
+from ucfrec_control.worlds.environments import (
+    SIDE_BY_SIDE,
+    Wrap,
+    make_env,
+    mismatches,
+    world_of_data,
+)
 from ucfrec_control.worlds.scores import find_kind, require_task
 
 Trained = TrainedPolicy | RLPolicy
@@ -108,15 +114,9 @@ def world_of(trained: Trained, env_id: str | None) -> str:
     """`env_id`, or the environment of the data if it is None.
 
     Raises:
-        InputError: the environment of the data is unknown too.
+        InputError: the environment of the data cannot be used; see `world_of_data`.
     """
-    dataset = trained.record["dataset"]
-    world: str | None = env_id or dataset["env_id"]
-    if world is None:
-        raise InputError(
-            f"the data of {dataset['dataset']} does not name its environment; give it with --env"
-        )
-    return world
+    return env_id or world_of_data(trained.record["dataset"])
 
 
 def open_world(

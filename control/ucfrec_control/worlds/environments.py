@@ -73,6 +73,28 @@ def make_env(
         ) from None
 
 
+def world_of_data(dataset: Mapping[str, Any]) -> str:
+    """The environment that a dataset names.
+
+    Args:
+        dataset: the entry `source` of a control store.
+
+    Raises:
+        InputError: it names none, or one with a Python module, which Gymnasium would import: data
+            does not choose what code runs.
+    """
+    name, env_id = dataset["dataset"], dataset["env_id"]
+    if env_id is None:
+        raise InputError(f"the data of {name} does not name its environment; give it with --env")
+    module, separator, _ = str(env_id).partition(":")
+    if separator:
+        raise InputError(
+            f"the data of {name} names the environment {env_id}, for which the Python module "
+            f"{module} would be run; name the environment with --env"
+        )
+    return str(env_id)
+
+
 class AppendedConstants(gymnasium.ObservationWrapper[Any, Any, Any]):
     """Appends constants to every observation (Appendix G.4)."""
 

@@ -1,6 +1,7 @@
 """Control runs end to end: presets, training, normalised scores, distractors, refusals."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -97,6 +98,24 @@ def test_another_environment_version_warns(
     made = {"env_id": "Hopper-v5", "versions": {"mujoco": "2.1.0"}}
     (told,) = mismatches(made, "Hopper-v5")
     assert told.startswith("the data was made with mujoco 2.1.0, ")
+
+
+def test_data_does_not_choose_what_is_imported(
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "theirs.py").write_text("raise SystemExit('their code ran')")
+    monkeypatch.syspath_prepend(tmp_path)
+    run = shutil.copytree(folder / "store-run", tmp_path / "run")
+    record = read_json(run / "run.json")
+    record["dataset"]["env_id"] = "theirs:Hopper-v5"
+    (run / "run.json").write_text(json.dumps(record))
+    assert main(["evaluate", str(run), "--episodes", "1"]) == 2
+    said = capsys.readouterr().err
+    assert "the Python module theirs would be run" in said
+    assert main(["evaluate", str(run), "--episodes", "1", "--env", "Hopper-v5"]) == 0
 
 
 def test_a_distractor_is_the_reward_bit_and_nothing_else_changes(

@@ -3,6 +3,7 @@
 Matplotlib (extra `plots`) is imported only when a figure is drawn.
 """
 
+import re
 from collections.abc import Callable, Iterable
 from functools import wraps
 from itertools import cycle
@@ -23,6 +24,7 @@ FACTUAL, EDITED = "#0072B2", "#D55E00"
 PLAIN, OURS, LIGHT = "#8C8C8C", "#D55E00", "#56B4E9"
 """Colors of other methods, of UCF, and of a third bar."""
 MAP = "cividis"
+_NOT_IN_NAMES: Final = re.compile(r"[^\w,.= -]+")
 # The color-blind-safe palette of Okabe and Ito (2008).
 _PALETTE = (
     *("#0072B2", "#E69F00", "#009E73", "#D55E00"),
@@ -109,10 +111,13 @@ def colors(names: Iterable[str]) -> dict[str, str]:
 
 @styled
 def save(figure: "Figure", folder: Path, name: str) -> list[Path]:
-    """Write `figure` as `name.png` and `name.svg` in `folder`, atomically; returns both paths."""
+    """Write `figure` as `name.png` and `name.svg` in `folder`, atomically; returns both paths.
+
+    Of the name, which may be a dataset's, characters that a path gives a meaning become "-".
+    """
     files = []
     for kind in ("png", "svg"):
-        path = folder / f"{name}.{kind}"
+        path = folder / f"{_NOT_IN_NAMES.sub('-', name)}.{kind}"
         with atomic_file(path) as scratch:
             # A date in the metadata would make the SVG files of equal figures differ.
             metadata = {"Date": None} if kind == "svg" else None

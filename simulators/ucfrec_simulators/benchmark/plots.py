@@ -10,7 +10,6 @@ from ucfrec.reporting.plot_style import LIGHT, OURS, PLAIN, save, styled
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.statistics import grouped, summary
 from ucfrec_simulators.benchmark.tables import DISTRACTOR_RATES, of_checkpoint
-from ucfrec_simulators.folders import folder_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -90,4 +89,4 @@ def _saved(
     axes = figure.add_subplot()
     axes.set_title(name)
     draw(axes, rows)
-    return save(figure, folder, folder_name(name))
+    return save(figure, folder, name)

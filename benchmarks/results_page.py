@@ -87,7 +87,9 @@ def _origin(rows: Sequence[ResultRow], command: str) -> str:
     """What measured the rows, and how long it took."""
     commits = sorted({row.commit[:7] for row in rows if row.commit})
     trained = {
-        (row.task, row.method, row.log_seed, row.training_seed): row.metrics["train_wall_time_s"]
+        (row.method, row.training_seed, row.config_hash, row.data_fingerprint): row.metrics[
+            "train_wall_time_s"
+        ]
         for row in rows
         if "train_wall_time_s" in row.metrics
     }
@@ -204,8 +206,7 @@ def losses_to_distractors(rows: Sequence[ResultRow]) -> str:
         ],
     )
     parts = [
-        "The largest loss over files and distractors, in percent of the clean score, each the mean "
-        "over seeds:",
+        "Each method's largest loss, of means over seeds, in percent of the clean score:",
         largest,
         "Scores, mean ± standard deviation over seeds, and losses in percent:",
         of_lines(over_seeds(drops(rows), shown, SHOWN_DROPS)),

@@ -65,4 +65,7 @@ def print_robustness(rows: Sequence[ResultRow]) -> None:
         print(f"{format_rows(over_seeds(lines, by, values), (*by, *values))}\n")
     print("largest loss of a method over datasets and distractors, % of the clean score")
     print(f"{format_rows(largest_drops(rows), SHOWN_LARGEST)}\n")
-    print(format_rows(screening_rows(rows), SHOWN_SCREENING))
+    # A store is screened once, whatever method and seed it is for.
+    screened = {(line["task"], line["distractor"]): line for line in screening_rows(rows)}
+    shown = [name for name in SHOWN_SCREENING if name != "training_seed"]
+    print(format_rows(list(screened.values()), shown))

@@ -1,5 +1,7 @@
 """Rows of the control tables: learners and their settings, by the name of the row."""
 
+from collections.abc import Iterable
+
 Methods = dict[str, tuple[str, tuple[str, ...]]]
 _NO_TIME = "policy.max_timestep=1"
 _ALGORITHM_5 = ("augment.copies=3", "augment.edits_per_copy=1", "augment.reward_quantile=0.0")
@@ -49,21 +51,30 @@ _PURSUITS = {
 """Ways to pursue reward instead of imitating. A policy with `max_return` is asked for the largest
 return that it expects in each state."""
 _UCF = ("ucf", "ucf-wo-count")
+_BASELINES = ("dt-wo-time", "dc-wo-time", "lsdt-wo-time")
+
+
+def _pursuing(names: Iterable[str], ways: Iterable[str], more: str = "") -> Methods:
+    """Rows of `METHODS` that pursue reward, named by the row, the way and `more`."""
+    return {
+        f"{name}{way}{more}": (METHODS[name][0], (*METHODS[name][1], *_PURSUITS[way]))
+        for name in names
+        for way in ways
+    }
+
+
 MAIN, PURSUING, EQUAL_TIME = "main", "pursuing", "equal-time"
 _TABLES: dict[str, Methods] = {
     # In the small budget trainings of x3 take as long as LSDT's, the others as DT's
     # (benchmarks/LOG.md).
     EQUAL_TIME: {
         **{f"{name}-x8": METHODS[name] for name in ("bc", "bc-10", "bc-25")},
-        **{f"{name}-wo-time": METHODS[f"{name}-wo-time"] for name in ("dt", "dc", "lsdt")},
-        **{f"{name}-{more}": METHODS[name] for more in ("x2", "x3") for name in _UCF},
+        **_pursuing(_BASELINES, ("", "-best-25")),
+        **_pursuing(_UCF, ("", "-best-25"), "-x2"),
+        **_pursuing(_UCF, ("",), "-x3"),
     },
     # All but the paper's without embeddings of time steps, as UCF is.
-    PURSUING: {
-        f"{METHODS_WO_TIME[learner]}{name}": (learner, (_NO_TIME, *settings))
-        for learner in METHODS_WO_TIME
-        for name, settings in _PURSUITS.items()
-    },
+    PURSUING: _pursuing((*_BASELINES, *_UCF), _PURSUITS),
     # Figure 2.
     "lambda": {
         f"ucf-lambda-{weight:g}": ("ucf", (f"policy.lambda_mask={weight}",))
@@ -102,7 +113,8 @@ _TABLES: dict[str, Methods] = {
 }
 LONGER = {
     **{f"{name}-x8": 8 for name in ("bc", "bc-10", "bc-25")},
-    **{f"{name}-x{more}": more for more in (2, 3) for name in _UCF},
+    **{f"{name}{way}-x2": 2 for name in _UCF for way in ("", "-best-25")},
+    **{f"{name}-x3": 3 for name in _UCF},
 }
 """How many times the budget's steps, by method."""
 TABLES = {MAIN: METHODS, **{name: rows | PAPER for name, rows in _TABLES.items()}}

@@ -301,7 +301,8 @@ SECTIONS = (
         "The same files, rates and batches, but more steps for what learns faster (x2, x3, x8). "
         "Trainings of UCF x2 and of cloning x8 take about as long as DT's and DC's, trainings of "
         "UCF x3 as long as LSDT's, half as long again. The paper's UCF has 4,000 steps here too. "
-        "One seed where no standard error stands.",
+        "`best-25` learns from the best quarter of the trajectories. One seed where no "
+        "standard error stands.",
         f"{CONTROL} equal-time",
         of("control", "equal-time"),
         partial(scores, references=("ucf-x2", "ucf-wo-count-x2")),

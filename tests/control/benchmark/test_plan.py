@@ -24,7 +24,14 @@ from ucfrec_control.benchmark.cells import (
     measure_scores,
 )
 from ucfrec_control.benchmark.folders import run_name
-from ucfrec_control.benchmark.methods import EQUAL_TIME, MAIN, METHODS, PAPER, TABLES
+from ucfrec_control.benchmark.methods import (
+    EQUAL_TIME,
+    MAIN,
+    METHODS,
+    PAPER,
+    PURSUING,
+    TABLES,
+)
 from ucfrec_control.benchmark.plan import benchmark, cells_of
 from ucfrec_control.benchmark.rates import settings_of
 from ucfrec_control.commands.benchmark import budgets_of
@@ -92,6 +99,16 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
         steps = {name: config.train.steps for name, config in timed.items()}
         assert steps["bc-25-x8"] == 8 * steps["dt-wo-time"] == 8 * steps["lsdt-wo-time"]
         assert 2 * steps["ucf-x3"] == 3 * steps["ucf-wo-count-x2"] == 6 * steps["dc-wo-time"]
+    pursuing = resolved(PURSUING, BUDGETS["full"], file)
+    for name, config in (pursuing | resolved(EQUAL_TIME, BUDGETS["full"], file)).items():
+        if name in PAPER or name.startswith("bc"):
+            continue
+        policy = config.policy
+        assert policy.max_timestep == 1
+        assert policy.best_share == (0.25 if "-best-25" in name else 1.0)
+        assert policy.advantage_weights == name.endswith(("-weights", "-both"))
+        assert policy.max_return == name.endswith(("-max-return", "-both"))
+        assert (config.augment.copies > 0) == (name.startswith("ucf") and "-wo-count" not in name)
     assert [main[m].policy.best_share for m in ("bc", "bc-10", "bc-25")] == [1.0, 0.1, 0.25]
 
 

@@ -50,9 +50,14 @@ def _bars(axes: Axes, found: dict[str, Summary], errors: dict[str, float]) -> No
         names,
         [found[name].mean for name in names],
         xerr=[errors[name] if found[name].count > 1 else 0.0 for name in names],
-        color=[OURS if name == "ucf" else PLAIN for name in names],
+        color=[OURS if _is_ucf(name) else PLAIN for name in names],
         height=0.7,
     )
+
+
+def _is_ucf(method: str) -> bool:
+    """Whether a method is UCF as it is here, perhaps without copies or with more steps."""
+    return method == "ucf" or method.startswith(("ucf-x", "ucf-wo-count"))
 
 
 def _draw_copies(rows: Sequence[ResultRow], folder: Path) -> None:
@@ -91,7 +96,7 @@ def _draw_control(rows: Sequence[ResultRow], folder: Path, name: str) -> None:
     panels = figure.subplots(lines, 3, sharey=True, squeeze=False).ravel()
     for axes, task in zip(panels, sorted(of_files), strict=False):
         own = grouped(of_files[task], lambda row: row.method)
-        found = {method: summary(row.value for row in group) for method, group in own.items()}
+        found = {method: summary(row.value for row in own[method]) for method in sorted(own)}
         _bars(axes, found, {method: each.standard_error for method, each in found.items()})
         axes.set_title(task.removesuffix("-zoo"))
         axes.tick_params(axis="y", labelsize=6)

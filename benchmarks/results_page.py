@@ -310,8 +310,8 @@ SECTIONS = (
     Section(
         "Control: ways to pursue reward",
         "All without embeddings of time steps, as UCF is: advantage weights, the largest return "
-        "that the policy expects as target, both, and the best quarter of the trajectories. Two of "
-        "the four ways are measured, with one seed: a difference may be luck.",
+        "that the policy expects as target, both, and the best quarter of the trajectories. One "
+        "seed, and of `weights` and `max-return` one file: a difference may be luck.",
         f"{CONTROL} pursuing",
         of("control", "pursuing"),
         scores,

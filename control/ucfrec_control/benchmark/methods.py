@@ -54,8 +54,8 @@ _UCF = ("ucf", "ucf-wo-count")
 _BASELINES = ("dt-wo-time", "dc-wo-time", "lsdt-wo-time")
 
 
-def _pursuing(names: Iterable[str], ways: Iterable[str], more: str = "") -> Methods:
-    """Rows of `METHODS` that pursue reward, named by the row, the way and `more`."""
+def _rows(names: Iterable[str], ways: Iterable[str], more: str = "") -> Methods:
+    """Rows of `METHODS` in each of the ways of `_PURSUITS`, called by row, way and `more`."""
     return {
         f"{name}{way}{more}": (METHODS[name][0], (*METHODS[name][1], *_PURSUITS[way]))
         for name in names
@@ -69,12 +69,12 @@ _TABLES: dict[str, Methods] = {
     # (benchmarks/LOG.md).
     EQUAL_TIME: {
         **{f"{name}-x8": METHODS[name] for name in ("bc", "bc-10", "bc-25")},
-        **_pursuing(_BASELINES, ("", "-best-25")),
-        **_pursuing(_UCF, ("", "-best-25"), "-x2"),
-        **_pursuing(_UCF, ("",), "-x3"),
+        **_rows(_BASELINES, ("", "-best-25")),
+        **_rows(_UCF, ("", "-best-25"), "-x2"),
+        **_rows(_UCF, ("",), "-x3"),
     },
     # All but the paper's without embeddings of time steps, as UCF is.
-    PURSUING: _pursuing((*_BASELINES, *_UCF), _PURSUITS),
+    PURSUING: _rows((*_BASELINES, *_UCF), _PURSUITS),
     # Figure 2.
     "lambda": {
         f"ucf-lambda-{weight:g}": ("ucf", (f"policy.lambda_mask={weight}",))

@@ -24,14 +24,7 @@ from ucfrec_control.benchmark.cells import (
     measure_scores,
 )
 from ucfrec_control.benchmark.folders import run_name
-from ucfrec_control.benchmark.methods import (
-    EQUAL_TIME,
-    MAIN,
-    METHODS,
-    PAPER,
-    PURSUING,
-    TABLES,
-)
+from ucfrec_control.benchmark.methods import EQUAL_TIME, MAIN, METHODS, PAPER, PURSUING, TABLES
 from ucfrec_control.benchmark.plan import benchmark, cells_of
 from ucfrec_control.benchmark.rates import settings_of
 from ucfrec_control.commands.benchmark import budgets_of

@@ -2,16 +2,18 @@
 
     python benchmarks/control_histories.py --data $UCFREC_DATA/control --out runs/control
 
-UCF without copies on the best quarter for twice the steps, as in the equal-time table (runs of
-`ucfrec-control benchmark` in --out are taken, not repeated), with a history of 20 steps and with
-shorter ones at as many predictions per update. Of each the score, and the action loss at every step
-of up to 24 validation episodes: with the logged actions in the history, as in the validation loss,
-and with the policy's own at these states, nearer to how it acts. --show-only prints the table from
-the rows in --results.
+Rows of the equal-time table that learn from the best quarter (runs of `ucfrec-control benchmark` in
+--out are taken, not repeated), with a history of 20 steps and with shorter ones at as many
+predictions per update. Of each the score, and the action loss at every step of up to 24 validation
+episodes: with the logged actions in the history, as in the validation loss, and with the policy's
+own at these states, nearer to how it acts. --show-only prints the tables from the rows in
+--results.
 """
 
 import argparse
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -33,17 +35,17 @@ from ucfrec_control.benchmark.cells import Cell, config, key, measure_scores
 from ucfrec_control.benchmark.folders import run_name
 from ucfrec_control.benchmark.methods import EQUAL_TIME
 from ucfrec_control.benchmark.plan import cells_of
+from ucfrec_control.benchmark.tables import score_table
 
 RESULTS = Path(__file__).parent / "results" / "control_histories.jsonl"
 SUITE = "histories"
-METHOD = "ucf-wo-count-best-25-x2"
-SHORTER = {
-    f"ucf-wo-count-best-25-context-{steps}-x2": (
-        f"policy.context={steps}",
-        f"train.batch_size={320 // steps}",
-    )
-    for steps in (1, 5)
-}
+METHODS = (
+    *("ucf-wo-count-best-25-x2", "lsdt-wo-time-best-25", "dt-wo-time-best-25"),
+    "dc-wo-time-best-25",
+)
+CONTEXTS = (1, 5, 20)
+PREDICTIONS = 320
+"""Per update, as in the small budget: 16 windows of 20 steps."""
 EPISODES = 24
 
 
@@ -84,34 +86,41 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     return [replace(row, metrics={**row.metrics, **found})]
 
 
-def cells(data: Path, out: Path, budget: Budget) -> list[Cell]:
-    """The equal-time cells of `METHOD`, and the same with shorter histories."""
-    measured = cells_of(data, out, budget, "small", EQUAL_TIME, [METHOD])
-    plain = [replace(cell, suite=SUITE) for cell in measured]
-    return plain + [
-        replace(
-            cell,
-            method=name,
-            settings=(*cell.settings, *settings),
-            run=cell.run.with_name(run_name(name, cell.code_version, cell.seed)),
-        )
-        for name, settings in SHORTER.items()
-        for cell in plain
+def cells(
+    data: Path, out: Path, budget: Budget, methods: Sequence[str], contexts: Sequence[int]
+) -> Iterator[Cell]:
+    """Equal-time cells with every length of the history; the last of `CONTEXTS` is the preset's."""
+    for cell in cells_of(data, out, budget, "small", EQUAL_TIME, methods):
+        for steps in contexts:
+            if steps == CONTEXTS[-1]:
+                yield replace(cell, suite=SUITE)
+                continue
+            name = f"{cell.method}-context-{steps}"
+            size = (f"policy.context={steps}", f"train.batch_size={PREDICTIONS // steps}")
+            yield replace(
+                cell,
+                suite=SUITE,
+                method=name,
+                settings=(*cell.settings, *size),
+                run=cell.run.with_name(run_name(name, cell.code_version, cell.seed)),
+            )
+
+
+def tables(rows: list[ResultRow]) -> str:
+    """Scores by method and file; and both losses by file and method, means over training seeds."""
+    lines = score_table(rows, "last")
+    scores = markdown_table(list(lines[0]), [list(line.values()) for line in lines])
+    by_file = grouped(rows, lambda row: (row.task, row.method))
+    means = [
+        [*names, *(f"{mean_of(own, each):.4f}" for each in ("loss", "own_loss"))]
+        for names, own in by_file.items()
     ]
+    names = ["file", "method", "loss, logged actions", "loss, own actions"]
+    return f"{scores}\n\n{markdown_table(names, means)}"
 
 
-def table(rows: list[ResultRow]) -> str:
-    """Scores and both losses by file and method: means over training seeds."""
-    lines = []
-    for (task, method), own in grouped(rows, lambda row: (row.task, row.method)).items():
-        by_seed = sorted(own, key=lambda row: row.training_seed or 0)
-        scores = ", ".join(f"{row.metrics['score']:.1f}" for row in by_seed)
-        score, *both = (
-            np.mean([row.metrics[name] for row in own]) for name in ("score", "loss", "own_loss")
-        )
-        lines.append([task, method, f"{score:.1f}", scores, *(f"{loss:.4f}" for loss in both)])
-    names = ["file", "method", "score", "each seed", "loss, logged history", "own history"]
-    return markdown_table(names, lines)
+def mean_of(rows: Sequence[ResultRow], metric: str) -> float:
+    return sum(row.metrics[metric] for row in rows) / len(rows)
 
 
 def main() -> None:
@@ -122,6 +131,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="folder for stores and runs; resumed")
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--file", action="append", help="repeatable (all nine)")
+    parser.add_argument("--method", action="append", choices=METHODS, help="repeatable (all)")
+    parser.add_argument(
+        "--context", action="append", type=int, choices=CONTEXTS, help="repeatable (all)"
+    )
     parser.add_argument("--seeds", type=int, default=1, help="training seeds, from 0")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--show-only", action="store_true")
@@ -133,9 +146,11 @@ def main() -> None:
         budget = replace(small, files=options.file or small.files, seeds=options.seeds)
         how = Measurement(key, config, measure)
         with benchmarking(options.results):
-            planned = cells(options.data, options.out, budget)
-            run_grid(planned, how, options.results, options.workers, SUITE)
-    print(table(read_rows(options.results)))
+            methods, contexts = options.method or METHODS, options.context or CONTEXTS
+            planned = cells(options.data, options.out, budget, methods, contexts)
+            by_seed = sorted(planned, key=attrgetter("seed"))
+            run_grid(by_seed, how, options.results, options.workers, SUITE)
+    print(tables(read_rows(options.results)))
 
 
 if __name__ == "__main__":

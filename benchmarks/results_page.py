@@ -232,6 +232,14 @@ def of(name: str, table: str, dated: bool = True) -> Callable[..., Sequence[Resu
     return chosen
 
 
+def histories(files: Mapping[str, Sequence[ResultRow]]) -> Sequence[ResultRow]:
+    """What learns from the best quarter with shorter histories, and what that is compared with."""
+    shorter = [r for r in of("control_histories", "equal-time")(files) if "-context-" in r.method]
+    same_time = [r for r in of("control", "equal-time")(files) if "-25" in r.method]
+    cloning = [r for r in of("control", "main")(files) if r.method in ("bc-10", "bc-25")]
+    return [*shorter, *same_time, *cloning] if shorter else []
+
+
 RUN = "ucfrec benchmark recommendation --table"
 CONTROL = "ucfrec-control benchmark $UCFREC_DATA/control --budget small --table"
 SECTIONS = (
@@ -308,6 +316,16 @@ SECTIONS = (
         partial(scores, references=("ucf-x2", "ucf-wo-count-x2")),
     ),
     Section(
+        "Control: what a history is worth",
+        "Trained as above on the best quarter of the trajectories, with histories of 1 and of 5 "
+        "steps (`context`) at as many predictions per update, beside the rows with 20 steps and "
+        "behaviour cloning. Made after the scores with 20 steps on `hopper_medium-expert` were "
+        "seen. One seed where no standard error stands.",
+        "python benchmarks/control_histories.py --data $UCFREC_DATA/control --out runs/control",
+        histories,
+        partial(scores, references=("ucf-wo-count-best-25-x2-context-1",)),
+    ),
+    Section(
         "Control: ways to pursue reward",
         "All without embeddings of time steps, as UCF is: advantage weights, the largest return "
         "that the policy expects as target, both, and the best quarter of the trajectories. One "
@@ -356,7 +374,10 @@ def main() -> None:
     )
     parser.add_argument("--check", action="store_true", help="compare instead of writing")
     options = parser.parse_args()
-    names = ("recommendation", "counterfactual_copies", "control", "control_robustness")
+    names = (
+        *("recommendation", "counterfactual_copies"),
+        *("control", "control_robustness", "control_histories"),
+    )
     files = {name: latest(read_rows(RESULTS / f"{name}.jsonl")) for name in names}
     if not options.check and find_spec("matplotlib") is not None:
         from results_pictures import draw

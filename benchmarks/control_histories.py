@@ -150,7 +150,8 @@ def main() -> None:
             planned = cells(options.data, options.out, budget, methods, contexts)
             by_seed = sorted(planned, key=attrgetter("seed"))
             run_grid(by_seed, how, options.results, options.workers, SUITE)
-    print(tables(read_rows(options.results)))
+    rows = read_rows(options.results)
+    print(tables(rows) if rows else f"{options.results} has no rows")
 
 
 if __name__ == "__main__":

@@ -82,6 +82,7 @@ BUDGETS = {
             "train.cosine=true",
             "policy.dim=64",
             "crm.epochs=3",
+            "crm.learning_rate=4e-3",
             "csg.epochs=5",
         ),
         # As many predictions per update as 16 windows of 20 steps; cheap enough for the full width.
@@ -118,6 +119,8 @@ SWEEPS = {
     "full": replace(_FULL, files=_SWEPT, where_present=(), all_targets=False),
 }
 """Budgets of the sweeps over UCF's settings."""
+WEIGHTS = {"small": SWEEPS["small"], "full": replace(_FULL, all_targets=False)}
+"""Budgets of the sweep over λ: Figure 2 has all of locomotion, and AntMaze."""
 _TRIED = ("halfcheetah_medium-expert-zoo", "hopper_medium-zoo", "walker2d_mixed-zoo")
 SEARCHES = {
     name: replace(budget, files=_TRIED, where_present=(), seeds=1)

@@ -63,7 +63,7 @@ def _rows(names: Iterable[str], ways: Iterable[str], more: str = "") -> Methods:
     }
 
 
-MAIN, PURSUING, EQUAL_TIME = "main", "pursuing", "equal-time"
+MAIN, PURSUING, EQUAL_TIME, LAMBDA = "main", "pursuing", "equal-time", "lambda"
 _TABLES: dict[str, Methods] = {
     # In the small budget trainings of x3 take as long as LSDT's, the others as DT's
     # (benchmarks/LOG.md).
@@ -76,7 +76,7 @@ _TABLES: dict[str, Methods] = {
     # All but the paper's without embeddings of time steps, as UCF is.
     PURSUING: _rows((*_BASELINES, *_UCF), _PURSUITS),
     # Figure 2.
-    "lambda": {
+    LAMBDA: {
         f"ucf-lambda-{weight:g}": ("ucf", (f"policy.lambda_mask={weight}",))
         for weight in (0.0, 0.05, 0.1, 0.25, 0.5, 1.0)
     },

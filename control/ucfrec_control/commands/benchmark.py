@@ -8,9 +8,9 @@ from ucfrec.commands.grid_options import results_given, rows_given
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import benchmarking
 from ucfrec.reporting.tables import format_rows
-from ucfrec_control.benchmark.budgets import BUDGETS, SWEEPS, Budget
+from ucfrec_control.benchmark.budgets import BUDGETS, SWEEPS, WEIGHTS, Budget
 from ucfrec_control.benchmark.cells import SCORES
-from ucfrec_control.benchmark.methods import EQUAL_TIME, MAIN, PURSUING, TABLES
+from ucfrec_control.benchmark.methods import EQUAL_TIME, LAMBDA, MAIN, PURSUING, TABLES
 from ucfrec_control.benchmark.plan import benchmark
 from ucfrec_control.benchmark.rates import chosen_rates
 from ucfrec_control.benchmark.tables import (
@@ -69,6 +69,8 @@ def run(options: argparse.Namespace) -> None:
 
 def budgets_of(table: str) -> Mapping[str, Budget]:
     """The budgets of a table, by name."""
+    if table == LAMBDA:
+        return WEIGHTS
     return BUDGETS if table in (MAIN, PURSUING, EQUAL_TIME) else SWEEPS
 
 

@@ -308,6 +308,7 @@ def _cql(d3rlpy: Any, config: RLConfig) -> Any:
     antmaze = config.task == "antmaze"
     settings: dict[str, Any] = {
         "actor_learning_rate": 3e-5,
+        "temp_learning_rate": 3e-5,
         "conservative_weight": 10.0,
         "alpha_learning_rate": 0.0,
     }
@@ -317,6 +318,8 @@ def _cql(d3rlpy: Any, config: RLConfig) -> Any:
     if antmaze:
         settings = {
             "actor_learning_rate": 1e-4,
+            "temp_learning_rate": 1e-4,
+            "alpha_learning_rate": 3e-4,
             # CORL starts the logarithm of its multiplier at 1.
             "initial_alpha": math.e,
             "conservative_weight": 5.0,

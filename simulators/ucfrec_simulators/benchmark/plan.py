@@ -73,6 +73,7 @@ BUDGETS: Final[Mapping[str, Budget]] = {
             "train.warmup_steps=40",
             "train.validate_every=100",
             "crm.epochs=8",
+            "crm.learning_rate=4e-3",
             "rule.sessions=50",
         ),
         cuts={"dt4rec": ("policy.negatives=1",), "edt4rec": ("policy.cql_steps=400",)},

@@ -83,6 +83,7 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
         paper = [resolved(table, budgets_of(table)["full"], file)[name] for name in PAPER]
         assert [config.policy_name for config in paper] == ["ucf-paper", "ucf-paper"]
         assert [config.augment.edits_per_copy for config in paper] == [0, 1]
+        assert {(c.crm.learning_rate, c.crm.epochs) for c in paper} == {(3e-4, 40)}  # Table 4
     main = resolved(MAIN, BUDGETS["full"], file)
     assert (main["ucf"].augment.copies > 0, main["dt"].augment.copies) == (True, 0)
     assert main["ucf-wo-arch"].policy_name == "dt"

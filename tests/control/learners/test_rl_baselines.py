@@ -118,6 +118,9 @@ def test_cql_has_the_settings_of_corl() -> None:
         assert len(actor) == 3 + 2  # mean and deviation
     learner = learner_of("antmaze", "diverse")
     assert (learner.config.reward_scaler.shift, learner.config.reward_scaler.multiplier) == (-5, 10)
+    assert learner.config.alpha_learning_rate == learner.config.critic_learning_rate
+    for config in (learner.config, learner_of("walker2d", "medium").config):
+        assert config.temp_learning_rate == config.actor_learning_rate
 
 
 def test_steps_of_antmaze_count_no_less_than_the_clip() -> None:

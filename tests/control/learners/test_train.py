@@ -210,6 +210,13 @@ def test_presets_have_the_widths_of_the_paper() -> None:
     assert widths == {key: 256 if key in wide else 128 for key in widths}
     paper = find_preset("antmaze", "diverse", "ucf-paper").tables
     assert (paper["policy"]["context"], paper["crm"]["latent_dim"]) == (50, 32)
+    # Copies are the same whichever policy learns from them.
+    assert find_preset("antmaze", "diverse", "dt").tables["crm"] == paper["crm"]
+    scales = {
+        name: find_preset("antmaze", "", name).tables["policy"]["return_scale"]
+        for name in ("ucf", "dt", "dc", "lsdt")
+    }
+    assert scales == {"ucf": 1.0, "dt": 1.0, "dc": 1.0, "lsdt": 1000.0}
     assert "max_timestep" not in paper["policy"]
 
 

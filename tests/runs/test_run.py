@@ -7,6 +7,7 @@ import resource
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,14 +15,16 @@ import torch
 
 from tests.support import killed_run
 from tests.support.episodes import random_episodes, some_states, write_store
+from ucfrec.checksums import seal
 from ucfrec.commands.cli import main
+from ucfrec.episodes.record import RECORD
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
-from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 
 ROOT = Path(__file__).parents[2]
 
@@ -227,3 +230,35 @@ def test_a_checkpoint_that_cannot_be_written_is_one_clear_error(
     assert not list((tmp_path / "run" / "policy").glob("*safetensors*"))
     train_run(EpisodeStore.open(store), tmp_path / "run", config)
     assert TrainedPolicy.load(tmp_path / "run").name == "dt"
+
+
+def test_a_run_goes_on_with_the_same_item_states_and_not_with_fewer_steps(tmp_path: Path) -> None:
+    """The fingerprint is of the steps; other features of the same log are other states."""
+    episodes = random_episodes([6] * 60)
+    for number, episode in enumerate(episodes):
+        episode.split = int(number % 5 == 0)
+
+    def sealed_store(seed: int) -> EpisodeStore:
+        store = write_store(tmp_path / f"store-{seed}", episodes, some_states(seed=seed))
+        seal(store.path, RECORD, store.meta)
+        return EpisodeStore.open(store.path)
+
+    first, other = sealed_store(0), sealed_store(1)
+    assert first.meta["fingerprint"] == other.meta["fingerprint"]
+
+    def train(store: EpisodeStore, steps: int) -> dict[str, Any]:
+        settings = ["policy.dim=8", "train.batch_size=8", "rule.choose=false"]
+        config = resolve_config("bc", None, [*settings, f"train.steps={steps}"])
+        return train_run(store, tmp_path / "run", config)
+
+    train(first, 4)
+    with pytest.raises(InputError, match="or on other item states"):
+        train(other, 8)
+    with pytest.raises(InputError, match="steps is 4 in the run, 2 now"):
+        train(first, 2)
+    record = train(first, 8)
+    assert record["policy"]["steps"] == 8
+    del record["policy"]
+    seal(tmp_path / "run", RUN, record)
+    with pytest.warns(InputNote, match="has not ended"):
+        TrainedPolicy.load(tmp_path / "run")

@@ -255,7 +255,8 @@ class EffectSearch:
 
     def of_training(self) -> "EffectSearch":
         """A search that is judged on a fifth of the training rows."""
-        held_back = torch.arange(len(self.design.items)) % 5 == 4
+        rows = len(self.design.items)
+        held_back = torch.arange(rows) % 5 == min(4, rows - 1)
         return EffectSearch(self.design.select(~held_back), self.design.select(held_back))
 
     def _take(self, judge: "EffectSearch") -> None:

@@ -5,11 +5,26 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from ucfrec.checksums import FILES
+from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.errors import InputError
 from ucfrec.runs.config import config_from_dict
 
 _LARGEST: Final = 2**48
+
+
+def is_of_store(record: Mapping[str, Any], meta: Mapping[str, Any]) -> bool:
+    """Whether a run was trained on a store: on the same steps, with the same item states.
+
+    Args:
+        record: of the run.
+        meta: of the store.
+    """
+    states = [each.get(FILES, {}).get(ITEM_STATES) for each in (record, meta)]
+    # Runs and stores that an older ucfrec wrote list no files.
+    same_states = None in states or states[0] == states[1]
+    return bool(record["fingerprint"] == meta["fingerprint"]) and same_states
 
 
 def require_run_record(path: Path, record: Mapping[str, Any]) -> None:

@@ -12,6 +12,7 @@ from ucfrec.errors import InputError
 from ucfrec.files import read_json
 from ucfrec.fitting import distributed
 from ucfrec.runs.config import Config, config_from_dict
+from ucfrec.runs.record import is_of_store
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import DROPPED, INPUTS, REWARD_MODEL, RULE, RUN, TrainedPolicy
 
@@ -36,7 +37,7 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> dict[str, Any]:
         InputError: `first` is not a finished run on this store, or `out` is another run.
     """
     trained = TrainedPolicy.load(first)
-    if trained.record["fingerprint"] != store.meta["fingerprint"]:
+    if not is_of_store(trained.record, store.meta):
         raise InputError(
             f"{first} was trained on another store than {store.path}; name the store of the run"
         )

@@ -13,7 +13,7 @@ import torch
 
 from ucfrec import schema
 from ucfrec.acting.decision import Decider, DecisionRule
-from ucfrec.checksums import reopen, seal
+from ucfrec.checksums import FILES, reopen, seal
 from ucfrec.counterfactual.augment import AugmentConfig
 from ucfrec.counterfactual.copies import MODELS, counterfactual_copies, require_rewards_vary
 from ucfrec.counterfactual.generators import CSGConfig
@@ -38,6 +38,7 @@ from ucfrec.runs.choose_by_ranking import RankedChoice, choose_by_ranking
 from ucfrec.runs.choose_rule import Choice, choose_rule
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.policy_fit import fit_policy
+from ucfrec.runs.record import is_of_store
 from ucfrec.runs.reference_losses import reference_losses
 from ucfrec.runs.samples import SAMPLES, sample_recommendations
 from ucfrec.runs.shared_stages import OWN, SharedStages
@@ -257,14 +258,15 @@ def _target_returns(train: EpisodeStore, definition: ReturnToGo) -> FloatArray:
 def _require_same(
     record: Mapping[str, Any], store: EpisodeStore, out: Path, config: Config
 ) -> None:
-    if record["fingerprint"] != store.meta["fingerprint"]:
+    if not is_of_store(record, store.meta):
         raise InputError(
             f"{out} is a run on another store ({record['store']}, fingerprint "
             f"{record['fingerprint'][:12]}), not on {store.path} "
-            f"({store.meta['fingerprint'][:12]}); name another run folder"
+            f"({store.meta['fingerprint'][:12]}), or on other item states than that has; name "
+            "another run folder"
         )
     started = config_from_dict(record["config"])
-    if not config.train.cosine:
+    if not config.train.cosine and config.train.steps > started.train.steps:
         # Without a cosine schedule, a run may be resumed with more steps.
         longer = dataclasses.replace(started.train, steps=config.train.steps)
         started = dataclasses.replace(started, train=longer)
@@ -323,6 +325,7 @@ def _inputs(
     """All that a reward model or copies depend on, but the code."""
     return {
         "data": train.meta["fingerprint"],
+        "item_states": train.meta.get(FILES, {}).get(ITEM_STATES),
         "steps": [train.n_steps, validation.n_steps],
         "state_size": train.state_size,
         "seed": seed,
@@ -379,7 +382,7 @@ def _rule(
     inputs = _inputs(train, validation, config.seed, torch.device("cpu"))
     shared.provide(inputs, fit_item_reward_model.__module__, out, (REWARD_MODEL,), fit)
     model, report = fit()  # read from the folder
-    trained = TrainedPolicy.load(out)
+    trained = TrainedPolicy.load(out, in_training=True)
     targets = {quantile: trained.target_return(quantile) for quantile in config.rule.quantiles}
     decider = Decider(policy, trained.rule, trained.returns, model)
     choice: Choice | RankedChoice
@@ -399,6 +402,5 @@ def _rule(
 def _write_samples(out: Path, validation: EpisodeStore) -> None:
     """Save a few recommendations for the report, by the run's decision rule."""
     if validation.has_items:
-        write_json(
-            out / SAMPLES, sample_recommendations(TrainedPolicy.load(out).decider(), validation)
-        )
+        trained = TrainedPolicy.load(out, in_training=True)
+        write_json(out / SAMPLES, sample_recommendations(trained.decider(), validation))

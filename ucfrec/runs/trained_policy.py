@@ -1,6 +1,7 @@
 """A trained policy, read back from its run folder."""
 
 import os
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,7 +25,7 @@ from ucfrec.episodes.main_tags import MainTags
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
-from ucfrec.errors import InputError, damage_explained
+from ucfrec.errors import InputError, InputNote, damage_explained
 from ucfrec.files import read_json
 from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors
 from ucfrec.fitting.random_state import random_state_kept
@@ -32,7 +33,7 @@ from ucfrec.parquet_files import read_ids
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
 from ucfrec.runs.config import config_from_dict
-from ucfrec.runs.record import require_run_record
+from ucfrec.runs.record import is_of_store, require_run_record
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -75,17 +76,27 @@ class TrainedPolicy:
     """Item counts of the training steps; None if actions are vectors or the run lacks the file."""
 
     @classmethod
-    def load(cls, run: Path, checkpoint: str = "best") -> "TrainedPolicy":
-        """Load a policy from a run folder.
+    def load(
+        cls, run: Path, checkpoint: str = "best", in_training: bool = False
+    ) -> "TrainedPolicy":
+        """Load a policy from a run folder; warns where its training has not ended.
 
         Args:
             run: the folder.
             checkpoint: `best` (lowest validation loss) or `last` weights.
+            in_training: whether the training that has not ended is what asks.
 
         Raises:
             InputError: `run` is not a run folder, or has no checkpoint yet.
         """
         record = read_record(run)
+        if "policy" not in record and not in_training:
+            warnings.warn(
+                f"the training in {run} has not ended: later weights may be better, and its "
+                "decision rule is not chosen yet; train again with the same command",
+                InputNote,
+                stacklevel=2,
+            )
         config = config_from_dict(record["config"])
         path, learner = (
             run / "policy" / f"{checkpoint}.safetensors",
@@ -307,7 +318,7 @@ def store_of(run: Path, record: Mapping[str, Any]) -> EpisodeStore | None:
     for path in places:
         if (path / "meta.json").is_file():
             store = EpisodeStore.open(path)
-            if store.meta["fingerprint"] == record["fingerprint"]:
+            if is_of_store(record, store.meta):
                 return store
     return None
 

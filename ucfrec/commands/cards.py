@@ -47,7 +47,7 @@ def card_of_ranking(
         if values[name] is not None and (interval := row.get(f"{name}_interval")) is not None:
             low, high = interval
             values[name] = f"{row[name]:.4g} [{low:.4g}, {high:.4g}]"
-    of = f"{on}, k {row['k']}, checkpoint {row['checkpoint']}"
+    of = f"{on}, {_rule(row)}, k {row['k']}, checkpoint {row['checkpoint']}"
     add_measurement(run, "ucfrec rank", of, values, said)
 
 

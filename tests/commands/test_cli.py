@@ -281,12 +281,15 @@ def test_a_model_card_lies_beside_every_run_with_what_was_measured(
     world = ["--env", "synthetic-catalog", "--episodes", "20"]
     assert main(["evaluate", run, *world]) == 0
     assert main(["ope", run, logs, "--temperature", "1"]) == 0
-    assert main(["rank", run, logs, "--k", "5"]) == 0
+    for rule in ([], ["--temperature", "3", "--target-return", "2"]):
+        assert main(["rank", run, logs, "--k", "5", *rule]) == 0
     found = card.read_text()
     assert "### ucfrec evaluate: synthetic-catalog, target " in found
     assert re.search(r"### ucfrec ope: DR on sessions\.parquet, target .*temperature 1", found)
     assert "- Do not rely on this estimate: " in found
-    assert "### ucfrec rank: sessions.parquet, k 5, checkpoint best" in found
+    own = TrainedPolicy.load(Path(run)).rule
+    for rule in (own, replace(own, temperature=3.0, target=2.0)):
+        assert f"### ucfrec rank: sessions.parquet, {rule}, k 5, checkpoint best" in found
     assert re.search(r"\| hit_rate_liked \| [\d.]+ \[[\d.]+, [\d.]+\] \|", found)
     assert str(tmp_path) not in found
 

@@ -86,6 +86,12 @@ def test_the_dominant_tags_cover_at_most_their_share() -> None:
     assert dominance(np.array([0, 1, 2, 3]), incidence, dominant) == 0.5
 
 
+def test_a_tag_of_more_than_the_share_is_dominant_alone() -> None:
+    incidence, positives = np.eye(3, dtype=bool), np.array([5, 90, 5])
+    assert dominant_tags(incidence, positives).tolist() == [False, True, False]
+    assert not dominant_tags(incidence, np.zeros(3, dtype=np.int64)).any()
+
+
 def test_a_rollout_is_recorded_in_order() -> None:
     env, recommended, steps = SyntheticCatalog(7), Recommended(), list[Step]()
 

@@ -97,6 +97,20 @@ def test_users_are_passed_on_and_must_be_numbers() -> None:
         world("Names").reset(seed=0)
 
 
+def test_the_user_that_reset_gives_is_that_of_the_whole_session() -> None:
+    env, steps = world("Visitors"), list[Step]()
+    rollout(env, Uniform(env, 0), 7, 0, steps.append)
+    of = set[tuple[int, int]]()
+    for step in steps:
+        assert step.user_ids is not None
+        of |= set(zip(step.episodes.tolist(), step.user_ids.tolist(), strict=True))
+    # Each of the three copies plays its first, second and third visitor.
+    assert of == {(episode, 1000 + episode // 3) for episode in range(7)}
+    env = world("Some-visitors")
+    with pytest.raises(InputError, match="only some sessions or steps have info"):
+        rollout(env, Uniform(env, 0), 4, 0)
+
+
 @pytest.mark.parametrize(
     ("name", "observe", "said"),
     [

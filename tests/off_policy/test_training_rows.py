@@ -1,5 +1,6 @@
 """Rows that a run was trained on are noticed where it is judged by them."""
 
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +9,8 @@ import pandas as pd
 import pytest
 
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.checksums import CARD
+from ucfrec.commands.cli import main
 from ucfrec.logs import LogMapping
 from ucfrec.off_policy.evaluate import evaluate_off_policy
 from ucfrec.off_policy.score import logged_sessions
@@ -43,6 +46,26 @@ def test_judging_by_the_training_log_is_refused(folder: Path, trained: TrainedPo
     assert not judged.verdict.reliable
     assert "90% of the rows were seen in training" in judged.verdict.reasons[0]
     assert judged.rows[0]["seen_in_training"] == pytest.approx(0.9, abs=0.01)
+
+
+def test_a_refit_has_seen_the_test_split_too(
+    folder: Path, trained: TrainedPolicy, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store, log, again = folder / "store", folder / "train.parquet", tmp_path / "refit"
+    assert main(["train", str(store), "--out", str(again), "--refit", str(folder / "run")]) == 0
+    held_out = pd.read_parquet(log).sort_values("timestamp").tail(50)
+    held_out.to_parquet(tmp_path / "held-out.parquet")
+    files = [tmp_path / "held-out.parquet"]
+    with logged_sessions(folder / "run", trained, files, LogMapping()) as logged:
+        assert share_seen(trained, logged.store) == 0
+        assert share_seen(TrainedPolicy.load(again), logged.store) == 1
+    capsys.readouterr()
+    assert main(["rank", str(folder / "run"), str(again)]) == 2
+    assert f"{again} is a refit" in capsys.readouterr().err
+    assert main(["rank", str(folder / "run"), str(again), str(files[0])]) == 0
+    said = re.findall("warning: (.*): (.*) of the rows were seen", capsys.readouterr().out)
+    assert said == [(str(again), "100%")]
+    assert "100% of the rows were seen in training" in (again / CARD).read_text()
 
 
 def test_without_the_training_store_nothing_is_known(

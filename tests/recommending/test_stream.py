@@ -155,6 +155,25 @@ def test_interactions_are_added_to_what_the_stream_has_had(trained: TrainedPolic
     pd.testing.assert_frame_equal(as_frame(forgot[3:4]), as_frame(alone), rtol=1e-5)
 
 
+def test_a_history_replaces_what_the_stream_has_had(trained: TrainedPolicy) -> None:
+    whole, _ = requests_of(histories(users=2))
+    rows, user = whole["history"], whole["user_id"]
+    parts = [
+        {"user_id": user, "interactions": rows},
+        {"user_id": user, "history": rows[:3]},
+        {"user_id": user, "interactions": rows[3:5]},
+        {"user_id": user, "history": []},
+        {"user_id": user},
+    ]
+    found = streamed(trained, lines(parts))
+    told = (rows, rows[:3], rows[:5], [], [])
+    expected = streamed(trained, lines([{"user_id": user, "history": each} for each in told]))
+    pd.testing.assert_frame_equal(as_frame(found), as_frame(expected), rtol=1e-5)
+    # The same of a user of whom nothing was remembered.
+    fresh = streamed(trained, lines(parts[1:3]))
+    pd.testing.assert_frame_equal(as_frame(fresh), as_frame(expected[1:3]), rtol=1e-5)
+
+
 def test_a_stream_takes_no_logs(
     trained: TrainedPolicy, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -175,6 +175,37 @@ def test_a_defect_is_told_without_its_details(
     assert "MemoryError" in capsys.readouterr().err
 
 
+def test_a_client_that_hangs_up_is_no_defect(
+    trained: TrainedPolicy, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arriving = iter(
+        [
+            {"type": "http.request", "body": b'{"user_id": ', "more_body": True},
+            {"type": "http.disconnect"},
+        ]
+    )
+
+    async def receive() -> dict[str, Any]:
+        return next(arriving)
+
+    async def send(_: Any) -> None:
+        pass
+
+    async def ask() -> str:
+        app = application(responder(trained), ServerLimits())
+        path = {"path": "/recommendations", "raw_path": b"", "query_string": b"", "headers": []}
+        async with app.router.lifespan_context(app):
+            await app({"type": "http", "method": "POST", **path}, receive, send)
+            transport = httpx.ASGITransport(app=app)
+            async with httpx.AsyncClient(transport=transport, base_url="http://test") as http:
+                return str((await http.get("/metrics")).text)
+
+    metrics = asyncio.run(ask())
+    assert 'ucfrec_requests_total{status="499"} 1.0' in metrics
+    assert 'status="500"' not in metrics
+    assert capsys.readouterr().err == ""
+
+
 def test_the_pages_describe_the_requests_and_load_nothing_from_elsewhere(
     trained: TrainedPolicy,
 ) -> None:

@@ -70,6 +70,16 @@ def test_limits_follow_the_record(tmp_path: Path) -> None:
     assert "Its decision rule is not chosen yet." in text_of(tmp_path / "run")
 
 
+def test_a_refit_knows_all_rows_of_its_store(tmp_path: Path) -> None:
+    refitted = {"steps": 300, "best_validation": float("nan")}
+    write_card(run(tmp_path / "run", policy=refitted, refit_of={}))
+    card = text_of(tmp_path / "run")
+    assert "2019-11-24 00:00 to 2019-12-01 00:00" in card
+    assert "nothing of what happened after 2019-12-01 00:00 UTC" in card
+    assert "It was trained on all rows of its store: only later logs can judge it." in card
+    assert "is not below that of showing items" not in card
+
+
 def test_the_newest_of_each_measurement_is_kept(tmp_path: Path) -> None:
     folder = run(tmp_path / "run")
     add_measurement(folder, "ucfrec ope", "DR on a", {"R_cum": 1.0, "lift": None}, ["Do not."])

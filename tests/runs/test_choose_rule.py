@@ -360,6 +360,7 @@ def test_a_refit_learns_from_all_rows_and_chooses_nothing_anew(
     again = TrainedPolicy.load(tmp_path / "refit")
     assert record["train_steps"] == store.n_steps > trained.record["train_steps"]
     assert record["policy"]["steps"] == max(1, trained.record["policy"]["best_step"])
+    assert "policy        trained on all rows, up to step" in describe_run(record)
     assert again.rule == trained.rule
     assert again.reward_model is not None
     assert trained.reward_model is not None

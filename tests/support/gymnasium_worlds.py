@@ -1,5 +1,6 @@
 """Small Gymnasium environments, registered under names that start with `ucfrec-test/`."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -14,7 +15,9 @@ class Echo(gymnasium.Env[Any, Any]):
     """Five steps; the reward of item a is a, that of a vector its sum.
 
     A session's secret number is observed as `secret`, and the step as the category `step`; with
-    `whole` the category alone is the observation. `notes` adds an entry of no fixed size.
+    `whole` the category alone is the observation. `notes` adds an entry of no fixed size. `users`
+    is the `user_id` of every `info`; `visitors` are the users of one session after the other, told
+    by `reset` alone, None for a session without.
     """
 
     def __init__(
@@ -23,6 +26,7 @@ class Echo(gymnasium.Env[Any, Any]):
         whole: bool = False,
         users: Any = None,
         notes: bool = False,
+        visitors: Sequence[int | None] = (),
     ) -> None:
         self.action_space, self._whole, self._users = actions, whole, users
         entries: dict[str, spaces.Space[Any]] = {
@@ -34,6 +38,7 @@ class Echo(gymnasium.Env[Any, Any]):
         self.observation_space = entries["step"] if whole else spaces.Dict(entries)
         self.vectors = np.arange(2.0 * ITEMS).reshape(ITEMS, 2)
         self.played: list[Any] = []
+        self._visitors = iter(visitors)
 
     def _observation(self) -> Any:
         if self._whole:
@@ -49,7 +54,8 @@ class Echo(gymnasium.Env[Any, Any]):
     ) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         self._step, self._secret = 0, self.np_random.random()
-        return self._observation(), self._info()
+        user = next(self._visitors, None)
+        return self._observation(), self._info() | ({} if user is None else {"user_id": user})
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         assert self.action_space.contains(action), action
@@ -72,5 +78,8 @@ for _name, _space in ACTIONS.items():
 _items = ACTIONS["Discrete"]
 gymnasium.register("ucfrec-test/Whole-v0", Echo, kwargs={"actions": _items, "whole": True})
 gymnasium.register("ucfrec-test/Users-v0", Echo, kwargs={"actions": _items, "users": 77})
+for _name, _visitors in {"Visitors": range(1000, 1009), "Some-visitors": (1000, None)}.items():
+    _arguments = {"actions": _items, "visitors": _visitors}
+    gymnasium.register(f"ucfrec-test/{_name}-v0", Echo, kwargs=_arguments)
 gymnasium.register("ucfrec-test/Names-v0", Echo, kwargs={"actions": _items, "users": "Ann"})
 gymnasium.register("ucfrec-test/Notes-v0", Echo, kwargs={"actions": _items, "notes": True})

@@ -1,6 +1,6 @@
 """What the commands add to the model cards of the runs that they measure."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,8 +35,10 @@ def card_of_estimates(run: Path, logs: Iterable[str], report: "OffPolicyReport")
     add_measurement(run, "ucfrec ope", of, values, said)
 
 
-def card_of_ranking(run: Path, row: Mapping[str, Any], measures: Iterable[str], on: str) -> None:
-    """Add a row of `ucfrec rank` to the card of its run."""
+def card_of_ranking(
+    run: Path, row: Mapping[str, Any], measures: Iterable[str], on: str, said: Sequence[str] = ()
+) -> None:
+    """Add a row of `ucfrec rank` on the logs `on`, and its warnings, to the card of its run."""
     from ucfrec.reporting.model_card import add_measurement
 
     values: dict[str, object] = {}
@@ -45,8 +47,8 @@ def card_of_ranking(run: Path, row: Mapping[str, Any], measures: Iterable[str], 
         if values[name] is not None and (interval := row.get(f"{name}_interval")) is not None:
             low, high = interval
             values[name] = f"{row[name]:.4g} [{low:.4g}, {high:.4g}]"
-    of = f"{on}, k {row['k']}, checkpoint {row['checkpoint']}"
-    add_measurement(run, "ucfrec rank", of, values)
+    of = f"{on}, {_rule(row)}, k {row['k']}, checkpoint {row['checkpoint']}"
+    add_measurement(run, "ucfrec rank", of, values, said)
 
 
 def _rule(row: Mapping[str, Any]) -> str:

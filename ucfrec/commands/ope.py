@@ -119,7 +119,8 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.reporting.tables import text_table
     from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 
-    runs = [Path(path) for path in options.logs if (Path(path) / RUN).is_file()]
+    named = dict.fromkeys(map(Path, options.logs))
+    runs = [path for path in named if (path / RUN).is_file()]
     options.logs = [path for path in options.logs if Path(path) not in runs]
     if not runs or not options.logs:
         raise InputError("name a run folder of `ucfrec train` first, then the logs")
@@ -129,8 +130,8 @@ def run(options: argparse.Namespace) -> None:
         for rule in _rules(options, TrainedPolicy.load(run, options.checkpoint))
     ]
     reports = {}
-    named = names_of([one.parts for one in candidates])
-    for name, candidate in zip(named, candidates, strict=True):
+    names = names_of([one.parts for one in candidates])
+    for name, candidate in zip(names, candidates, strict=True):
         if len(candidates) > 1:
             print(f"\n{name}:")
         reports[name] = _judged(options, candidate)

@@ -40,13 +40,14 @@ def run(options: argparse.Namespace) -> None:
 
     Raises:
         InputError: a run or log cannot be used, the runs have different stores, or there is no
-            test split to rank.
+            test split to rank that none of the runs was trained on.
     """
     from ucfrec.evaluation.ranking import MEASURES
     from ucfrec.evaluation.ranking_table import require_one_catalogue, training_store
     from ucfrec.files import write_json
     from ucfrec.logs.summary import format_report
     from ucfrec.off_policy.score import logged_sessions
+    from ucfrec.off_policy.training_rows import seen_too_often, share_seen
     from ucfrec.provenance import without_folders
     from ucfrec.reporting.tables import format_rows
     from ucfrec.runs.trained_policy import RUN, TrainedPolicy
@@ -64,25 +65,36 @@ def run(options: argparse.Namespace) -> None:
         files, mapping = logs_given(options)
         with logged_sessions(runs[0], trained[0], files, mapping) as logged:
             print(format_report(logged.report), end="\n\n")
+            warnings = [seen_too_often(share_seen(policy, logged.store)) for policy in trained]
             rows = _rows(options, trained, train, logged.store, logged.users)
     else:
-        test = _test_split(trained[0], train)
+        test, warnings = _test_split(trained, train), [[] for _ in trained]
         rows = _rows(options, trained, train, test, test.episode_values("user"))
     print(format_rows(rows, ("policy", *_SHOWN, "coverage")))
     print("\n" + "\n".join(f"{name:<16}{MEASURES[name]}" for name in _SHOWN))
     print(f"k is {rows[0]['k']}; --json has 95% intervals and paired differences by user")
     on = ", ".join(map(without_folders, options.logs)) or "the test split"
-    for policy, row in zip(trained, rows, strict=False):
-        card_of_ranking(policy.folder, row, _SHOWN, on)
+    for policy, row, said in zip(trained, rows, warnings, strict=False):
+        for warning in said:
+            print(f"warning: {policy.folder}: {warning}")
+        card_of_ranking(policy.folder, row, _SHOWN, on, said)
     if options.json is not None:
         write_json(options.json, rows)
 
 
-def _test_split(trained: "TrainedPolicy", store: "EpisodeStore | None") -> "EpisodeStore":
+def _test_split(trained: "list[TrainedPolicy]", store: "EpisodeStore | None") -> "EpisodeStore":
+    from ucfrec.runs.trained_policy import REFIT_OF
+
+    for policy in trained:
+        if REFIT_OF in policy.record:
+            raise InputError(
+                f"{policy.folder} is a refit, trained on the test split too; name later logs to "
+                "rank"
+            )
     if store is None:
         raise InputError(
-            f"{trained.folder}: its store {trained.record['store']} is gone or has changed; move "
-            "the run together with its store, or name the logs to rank"
+            f"{trained[0].folder}: its store {trained[0].record['store']} is gone or has changed; "
+            "move the run together with its store, or name the logs to rank"
         )
     test = store.split("test")
     if not test.n_episodes:

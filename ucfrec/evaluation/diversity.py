@@ -89,6 +89,8 @@ def novelty(items: IntArray, popularity: npt.NDArray[np.floating]) -> float:
 def dominant_tags(incidence: BoolArray, positives: IntArray, share: float = 0.8) -> BoolArray:
     """Dominant tags (n_tags,): the most frequent ones that together cover at most `share`.
 
+    The most frequent one is always dominant, if it counts at all.
+
     Args:
         incidence: (n_items, n_tags).
         positives: (n_items,) numbers of positive interactions in the training log; each counts
@@ -98,9 +100,11 @@ def dominant_tags(incidence: BoolArray, positives: IntArray, share: float = 0.8)
     counts = positives @ incidence.astype(np.int64)
     order = np.argsort(-counts, kind="stable")
     covered = np.cumsum(counts[order]) / max(counts.sum(), 1)
+    frequent = covered <= share
+    frequent[:1] = True
     dominant = np.zeros(len(counts), dtype=np.bool_)
-    dominant[order[covered <= share]] = True
-    return dominant
+    dominant[order[frequent]] = True
+    return dominant & (counts > 0)
 
 
 def dominance(items: IntArray, incidence: BoolArray, dominant: BoolArray) -> float:

@@ -12,7 +12,7 @@ import pyarrow as pa
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from ucfrec.acting.rollout import USER_IDS, FloatArray
+from ucfrec.acting.rollout import USER_IDS, BoolArray, FloatArray
 from ucfrec.acting.uniform import Uniform
 from ucfrec.errors import InputError
 from ucfrec.evaluation.gymnasium_items import item_table
@@ -21,6 +21,7 @@ from ucfrec.plugins import Simulator
 REWARD: Final = "reward"
 """Column of the environment's rewards in logs."""
 
+_Floats = npt.NDArray[np.float64]
 Items = Callable[[gymnasium.Env[Any, Any], int], pa.Table]
 """Reads the item table from an environment and its number of items."""
 
@@ -56,8 +57,9 @@ class GymnasiumWorld(SyncVectorEnv):
     are recommended and nothing is chosen from a dict, or the observation has no fixed size; states
     then come from the items shown.
 
-    Of `info`, the world passes on `user_id`, a whole number. `reset(seed=s)` seeds copy i with a
-    number drawn from (s, i), so that two seeds share no sessions.
+    Of `info`, the world passes on `user_id`, a whole number. One that `reset` gives is that of the
+    whole session, but for steps that give another. `reset(seed=s)` seeds copy i with a number drawn
+    from (s, i), so that two seeds share no sessions.
 
     Args:
         env_id: identifier as `gymnasium.make` takes it; `module:ID` imports `module` first.
@@ -66,7 +68,8 @@ class GymnasiumWorld(SyncVectorEnv):
 
     Raises:
         InputError: the environment cannot be made, its actions are neither items nor vectors, or
-            its observation does not have the entries `observe`.
+            its observation does not have the entries `observe`. Later, if only some sessions give
+            a `user_id` when they are reset.
     """
 
     def __init__(self, env_id: str, num_envs: int, observe: Sequence[str] = ()) -> None:
@@ -85,7 +88,27 @@ class GymnasiumWorld(SyncVectorEnv):
         if isinstance(seed, int):
             drawn = [np.random.SeedSequence([seed, i]) for i in range(self.num_envs)]
             seed = [int(each.generate_state(1)[0]) for each in drawn]
-        return super().reset(seed=seed, options=options)
+        observations, info = super().reset(seed=seed, options=options)
+        self._gives_users = USER_IDS in info
+        self._require_all_users(info)
+        return observations, info
+
+    def step(
+        self, actions: Any
+    ) -> tuple[FloatArray, _Floats, BoolArray, BoolArray, dict[str, Any]]:
+        """Play one item or vector in each session, (N,) or (N, A); see `VectorEnv.step`."""
+        played = super().step(actions)
+        self._require_all_users(played[-1])
+        return played
+
+    def _require_all_users(self, info: dict[str, Any]) -> None:
+        # Gymnasium fills the entries of sessions that give none with 0, which may be somebody.
+        given = info.get(f"_{USER_IDS}", np.zeros(self.num_envs, dtype=bool))
+        if (given != self._gives_users).any():
+            raise InputError(
+                f"only some sessions or steps have info[{USER_IDS!r}]; the environment's reset "
+                "must give it in every session, or in none"
+            )
 
 
 class GymnasiumCatalog(GymnasiumWorld):
@@ -135,13 +158,16 @@ class _Session(gymnasium.Wrapper[FloatArray, Any, Any, Any]):
     ) -> tuple[FloatArray, dict[str, Any]]:
         """Start a session; returns the observation (O,) and info."""
         observation, info = self.env.reset(seed=seed, options=options)
-        return self._vector(observation), _user(info)
+        self._user = _user(info)
+        return self._vector(observation), self._user
 
     def step(self, action: Any) -> tuple[FloatArray, SupportsFloat, bool, bool, dict[str, Any]]:
         """Play one item or vector (A,)."""
         played = self.env.step(self._to_action(action))
         observation, reward, terminated, truncated, info = played
-        return self._vector(observation), reward, terminated, truncated, _user(info)
+        # Many environments give it once, at the start of the session.
+        self._user = _user(info) or self._user
+        return self._vector(observation), reward, terminated, truncated, self._user
 
     def _vector(self, observation: Any) -> FloatArray:
         if not self._observed:

@@ -2,13 +2,17 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from ucfrec.errors import InputError
 from ucfrec.off_policy.evaluate import OffPolicyReport
 from ucfrec.off_policy.selection import Selection, select
+
+_FEWEST_DIGITS: Final = 6
+_MOST_DIGITS: Final = 17
+"""As many tell any two floats apart."""
 
 
 @dataclass(frozen=True)
@@ -88,16 +92,29 @@ def _require_same_sessions(reports: Mapping[str, OffPolicyReport]) -> None:
 def names_of(candidates: Sequence[Mapping[str, object]]) -> list[str]:
     """Names that say what differs among the candidates, e.g. "target return 5, greedy".
 
+    Candidates that differ have different names: numbers have the digits that tell them apart.
+
     Args:
         candidates: of each, what it is made of, e.g. run, target return and rule.
     """
     differing = [
         key for key in candidates[0] if len({str(one[key]) for one in candidates}) > 1
     ] or list(candidates[0])[:1]
-    return [", ".join(_part(key, one[key]) for key in differing) for one in candidates]
+    columns = [_parts(key, [one[key] for one in candidates]) for key in differing]
+    return [", ".join(parts) for parts in zip(*columns, strict=True)]
 
 
-def _part(key: str, value: object) -> str:
+def _parts(key: str, values: Sequence[object]) -> list[str]:
+    """What the names say of one part of all candidates."""
+    parts: list[str] = []
+    for digits in range(_FEWEST_DIGITS, _MOST_DIGITS + 1):
+        parts = [_part(key, value, digits) for value in values]
+        if len(set(parts)) == len(set(values)):
+            break
+    return parts
+
+
+def _part(key: str, value: object, digits: int) -> str:
     if value is None:
         return f"largest {key} expected"
-    return f"{key} {value:g}" if isinstance(value, float) else str(value)
+    return f"{key} {value:.{digits}g}" if isinstance(value, float) else str(value)

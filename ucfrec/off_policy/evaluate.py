@@ -24,7 +24,7 @@ from ucfrec.off_policy.on_disk import array_on_disk
 from ucfrec.off_policy.options import EstimateOptions
 from ucfrec.off_policy.pages import as_pages, pages_of
 from ucfrec.off_policy.score import LoggedSessions, ScoredSteps, scored_steps
-from ucfrec.off_policy.training_rows import MOST_SEEN, share_seen
+from ucfrec.off_policy.training_rows import seen_too_often, share_seen
 from ucfrec.off_policy.verdict import FAR_OFF, Verdict, cautions, influences, judge
 from ucfrec.provenance import provenance
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -108,7 +108,7 @@ def evaluate_off_policy(
         seed,
         diagnosis=diagnosis,
         wanted_lift=options.wanted_lift,
-        forbidden=[*_seen_too_often(seen), *_too_many_items(trained, judged)],
+        forbidden=[*seen_too_often(seen), *_too_many_items(trained, judged)],
         declared=_declared(judged),
     )
     said = [*verdict.reasons, *cautions(diagnosis, found), *_of_the_logs(seen, logged), *of_groups]
@@ -210,15 +210,6 @@ def _of_the_models(judged: JudgedSteps) -> list[str]:
     return [
         "fitted Q evaluation ran away (its values grew beyond what so many rewards can be) and was "
         "stopped: FQE says nothing here"
-    ]
-
-
-def _seen_too_often(seen: float | None) -> list[str]:
-    if seen is None or seen <= MOST_SEEN:
-        return []
-    return [
-        f"{seen:.0%} of the rows were seen in training: on these a policy looks "
-        "better than it is; give later logs"
     ]
 
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.runs.trained_policy import TrainedPolicy, store_of
+from ucfrec.runs.trained_policy import REFIT_OF, TrainedPolicy, store_of
 
 MOST_SEEN: Final = 0.05
 """Largest share of rows seen in training with which an estimate is accepted. It is above 0 because
@@ -23,7 +23,7 @@ KeyArray = npt.NDArray[np.uint64]
 def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
     """Compute the share of logged rows that are in the run's training or validation data.
 
-    Rows are the same if their user, item and time are.
+    Rows are the same if their user, item and time are. A refit was trained on its test split too.
 
     Args:
         trained: the policy, with the record of its run.
@@ -45,11 +45,21 @@ def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
     keys, rows = np.unique(np.concatenate(list(_keys(logged))), return_counts=True)
     seen = np.zeros(len(keys), dtype=bool)
     # The training data may be far larger than the logs.
-    for name in ("train", "validation"):
+    for name in schema.SPLITS if REFIT_OF in record else ("train", "validation"):
         for learnt in _keys(store.split(name)):
             places = np.minimum(np.searchsorted(keys, learnt), len(keys) - 1)
             seen[places[keys[places] == learnt]] = True
     return float(rows[seen].sum() / rows.sum())
+
+
+def seen_too_often(seen: float | None) -> list[str]:
+    """What to say of a share of rows seen in training (`share_seen`); nothing if it is small."""
+    if seen is None or seen <= MOST_SEEN:
+        return []
+    return [
+        f"{seen:.0%} of the rows were seen in training: on these a policy looks "
+        "better than it is; give later logs"
+    ]
 
 
 def _keys(store: EpisodeStore) -> Iterator[KeyArray]:

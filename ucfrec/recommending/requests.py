@@ -28,6 +28,8 @@ _Integer = Annotated[StrictInt, Field(ge=-(2**63), lt=2**63)]
 Id = _Integer | Annotated[str, Field(max_length=1000)]
 Number = Annotated[StrictFloat, Field(allow_inf_nan=False)] | _Integer
 _LARGEST_FLOAT: Final = float(np.finfo(np.float32).max)
+_MOST_FAULTS: Final = 1000
+"""Beyond so many, it would take too long to look at each."""
 _SHOWN: Final = 60
 """Most characters of a wrong value in a message."""
 
@@ -57,29 +59,40 @@ class Row(TypedDict):
         Annotated[Number, Field(description="Without it, the run's reward of the feedback.")]
     ]
     session_id: NotRequired[Id]
-    observation: NotRequired[Annotated[list[Number], Field(max_length=100_000)]]
+    observation: NotRequired[Annotated[list[Number], Field(max_length=100_000, fail_fast=True)]]
 
 
 class Request(BaseModel):
-    """A user, what they were shown, and what is asked for."""
+    """A user, what they were shown, and what is asked for.
+
+    Lists are read up to their first fault: a message about every element would take seconds.
+    """
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
     user_id: Id
     """Identifier in the training logs, or any other."""
     history: Annotated[
-        list[Row], Field(description="The user's interactions, in any order; empty for a new user.")
+        list[Row],
+        Field(
+            description="The user's interactions, in any order; empty for a new user.",
+            fail_fast=True,
+        ),
     ] = []
     k: Annotated[int, Field(ge=1, description="Number of items.")] | None = None
     candidates: (
-        Annotated[list[Id], Field(min_length=1, description="The only items to recommend.")] | None
+        Annotated[
+            list[Id],
+            Field(min_length=1, description="The only items to recommend.", fail_fast=True),
+        ]
+        | None
     ) = None
 
 
 class StreamRequest(Request):
     """A request of a stream, which remembers its users."""
 
-    interactions: list[Row] = []
+    interactions: Annotated[list[Row], Field(fail_fast=True)] = []
     """Rows that are added to the history or, without one, to what the stream has had of the
     user."""
 
@@ -117,6 +130,10 @@ def parsed(kind: type[Request], text: bytes, limits: Limits) -> Any:
     try:
         request = kind.model_validate_json(text)
     except ValidationError as error:
+        if (faults := error.error_count()) > _MOST_FAULTS:
+            raise InputError(
+                f"the request has {faults:,} faults; most are entries that requests do not have"
+            ) from None
         raise InputError(fault_of(error.errors(include_url=False))) from None
     require_within(request, limits)
     return request

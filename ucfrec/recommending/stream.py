@@ -133,11 +133,10 @@ class _Remembered:
         ).model_copy(update={"history": rows})
 
     def keep(self, request: StreamRequest, rows: list[Row]) -> None:
-        """Remember the rows of a user who has `interactions`, or was remembered."""
-        if request.interactions or request.user_id in self._rows:
-            self._count += len(rows) - len(self._rows.get(request.user_id, ()))
+        """Remember all rows of a user, if there are any."""
+        self._count += len(rows) - len(self._rows.pop(request.user_id, ()))
+        if rows:
             self._rows[request.user_id] = rows
-            self._rows.move_to_end(request.user_id)
         while self._count > self._most:
             self._count -= len(self._rows.popitem(last=False)[1])
 

@@ -15,6 +15,7 @@ from fastapi_offline import FastAPIOffline
 from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import Field
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from ucfrec import __version__
 from ucfrec.errors import InputError
@@ -53,6 +54,9 @@ _FAULTS: Final = {
     503: "Too many requests wait; try again later.",
     504: "No answer in time.",
 }
+
+_HUNG_UP: Final = 499
+"""For the metrics, as nobody receives it; nginx calls it so."""
 
 
 @settings_table("")
@@ -147,6 +151,8 @@ async def _answered(
     except TimeoutError:
         status = 504 if arrived else 408
         return status, {"error": f"not done within {limits.timeout:g} s; try again later"}
+    except ClientDisconnect:
+        return _HUNG_UP, {"error": "the client closed the connection"}
     except Exception:
         traceback.print_exc(file=sys.stderr)
         return 500, {"error": "the server has a defect or no memory; its log says more"}

@@ -17,7 +17,7 @@ from ucfrec.files import atomic_file, read_json, write_json
 from ucfrec.locks import claim
 from ucfrec.provenance import config_hash
 from ucfrec.reporting.tables import markdown_table, shown
-from ucfrec.runs.trained_policy import RULE, learner_of, read_record
+from ucfrec.runs.trained_policy import REFIT_OF, RULE, learner_of, read_record
 
 
 def write_card(run: Path) -> Path:
@@ -93,7 +93,7 @@ def _about(record: Mapping[str, Any]) -> str:
 
 def _data(record: Mapping[str, Any]) -> str:
     source = record.get("data") or {}
-    window = _window(source)
+    window = _window(record)
     files = [PurePath(file).name for file in source.get("files", [])]
     rows = {
         "files": ", ".join(files) or None,
@@ -111,12 +111,14 @@ def _data(record: Mapping[str, Any]) -> str:
     return _listed(rows)
 
 
-def _window(source: Mapping[str, Any]) -> tuple[int, int] | None:
+def _window(record: Mapping[str, Any]) -> tuple[int, int] | None:
     """Times (ms) of the first training row, and from which on rows are no longer trained on."""
+    source = record.get("data") or {}
     times = source.get("time_range_ms")
     if times is None:
         return None
-    begins = source.get("split_times_ms") or times[1:]
+    splits = () if REFIT_OF in record else source.get("split_times_ms")
+    begins = splits or times[1:]
     return int(times[0]), min(int(begins[0]), int(times[1]))
 
 
@@ -137,9 +139,11 @@ def _rule(run: Path) -> str:
 def _limits(record: Mapping[str, Any]) -> list[str]:
     source, items = record.get("data") or {}, record["sizes"]["items"]
     limits = []
+    if REFIT_OF in record:
+        limits.append("It was trained on all rows of its store: only later logs can judge it.")
     if items:
         limits.append(f"It knows {items:,} items and never shows another one.")
-    window = _window(source)
+    window = _window(record)
     if window is not None:
         limits.append(
             f"It knows nothing of what happened after {_day(window[1])} UTC; tastes and items "

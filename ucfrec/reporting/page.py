@@ -1,6 +1,7 @@
 """The HTML report on runs: conclusions from their results, and how they were trained."""
 
 import json
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -146,9 +147,10 @@ def _warnings_of(run: _Run) -> list[str]:
         bound_is_useful = run.copies["bound"] < model["reward_std"]
         if not (bound_is_useful and run.copies["moves"]["edits"]):
             warnings.append(run.copies["verdict"])
-    best = run.record.get("policy", {}).get("best_validation")
+    # A refit has no validation rows, and its loss is not a number.
+    best = run.record.get("policy", {}).get("best_validation", math.nan)
     popularity = run.references.get("popularity")
-    if best is not None and popularity is not None and not best < popularity:
+    if math.isfinite(best) and popularity is not None and best >= popularity:
         warnings.append(
             f"the best validation loss, {best:.4g}, is not below {popularity:.4g}, the loss of "
             "showing items by popularity: the policy learned nothing about users"

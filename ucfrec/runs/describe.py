@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.runs.trained_policy import REFIT_OF
 
 
 def describe_run(record: Mapping[str, Any]) -> str:
@@ -34,10 +35,10 @@ def describe_run(record: Mapping[str, Any]) -> str:
         )
         lines += [f"warning       {warning}" for warning in report["warnings"]]
     policy = record["policy"]
-    lines.append(
-        f"policy        best validation loss {policy['best_validation']:.4g} at step "
-        f"{policy['best_step']} of {policy['steps']}, {policy['seconds']:.0f} s"
-    )
+    found = f"best validation loss {policy['best_validation']:.4g} at step {policy['best_step']}"
+    if REFIT_OF in record:
+        found = f"trained on all rows, up to step {policy['best_step']}"
+    lines.append(f"policy        {found} of {policy['steps']}, {policy['seconds']:.0f} s")
     if "rule" in record:
         lines.append(_describe_rule(record["rule"], record["reward_model"]))
     return "\n".join(lines)

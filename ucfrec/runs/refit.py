@@ -14,7 +14,15 @@ from ucfrec.fitting import distributed
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.record import is_of_store
 from ucfrec.runs.run import train_run
-from ucfrec.runs.trained_policy import DROPPED, INPUTS, REWARD_MODEL, RULE, RUN, TrainedPolicy
+from ucfrec.runs.trained_policy import (
+    DROPPED,
+    INPUTS,
+    REFIT_OF,
+    REWARD_MODEL,
+    RULE,
+    RUN,
+    TrainedPolicy,
+)
 
 
 def refit(store: EpisodeStore, first: Path, out: Path) -> dict[str, Any]:
@@ -43,9 +51,7 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> dict[str, Any]:
         )
     if "policy" not in trained.record:
         raise InputError(f"{first} is not finished; train it to its end first")
-    about: dict[str, Any] = {
-        "refit_of": trained.record["config"] | {"rule": trained.rule.as_dict()}
-    }
+    about: dict[str, Any] = {REFIT_OF: trained.record["config"] | {"rule": trained.rule.as_dict()}}
     if trained.dropped:
         store = store.without_observation_dimensions(trained.dropped)
         about[DROPPED] = list(trained.dropped)

@@ -46,6 +46,8 @@ RULE = "decision_rule.json"
 REWARD_MODEL = "reward_model"
 DROPPED = "dropped_observations"
 """Entry of a record: columns of the logged observation that the policy does not see."""
+REFIT_OF = "refit_of"
+"""Entry of the record of a run that was trained on all splits (`ucfrec.runs.refit`)."""
 INPUTS = (ITEM_STATES, ITEMS, USERS, COUNTS, RETURNS)
 """Files of a run that training does not change."""
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from ucfrec_control.benchmark.methods import LONGER, WITH_TIME
 from ucfrec_control.worlds.scores import find_task
@@ -22,10 +23,8 @@ class Budget:
     """Further settings of `bc`."""
     of_methods: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Further settings of single methods, by name."""
-    rl_steps: int = 1_000_000
-    """Updates of IQL and CQL."""
-    rl_batch_size: int = 256
-    """Transitions per update of IQL and CQL."""
+    rl: Mapping[str, Any] = field(default_factory=lambda: {"steps": 1_000_000})
+    """Settings of IQL and CQL, as of `rl_config`."""
     evaluation_seed: int = 1000
     """Seed of the reported episodes; the same for all training seeds and methods."""
     where_present: tuple[str, ...] = ()
@@ -90,8 +89,7 @@ BUDGETS = {
         of_methods=_longer(4_000),
         # They learn from single steps, not from windows of 20, and need more updates: at 5,000 they
         # were below behaviour cloning. A quarter of the authors' batch size, as for the others.
-        rl_steps=20_000,
-        rl_batch_size=64,
+        rl={"steps": 20_000, "batch_size": 64},
         # CQL's updates take the longest. Embeddings of time make every learner predict held-out
         # actions worse (benchmarks/LOG.md): one seed says what they cost.
         fewer_seeds=dict.fromkeys(("cql", *WITH_TIME), 1),

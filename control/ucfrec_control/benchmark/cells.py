@@ -1,7 +1,7 @@
 """One cell of the control tables: a training and its result rows."""
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -70,9 +70,8 @@ class Cell:
     episodes: int
     evaluation_seed: int
     code_version: str
-    rl_steps: int = 0
-    rl_batch_size: int = 0
-    """Updates, and transitions per update, of IQL and CQL."""
+    rl: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of IQL and CQL, as of `rl_config`."""
     distractor: str | None = None
     """A key of `DISTRACTORS`; None outside the robustness suite."""
     screening: str | None = None
@@ -92,7 +91,7 @@ class Cell:
     def rl_config(self) -> RLConfig:
         """The configuration of an IQL or CQL training."""
         dataset = dataset_of(EpisodeStore.open(self.store))
-        return rl_config(dataset, self.learner, self.rl_steps, self.rl_batch_size)
+        return rl_config(dataset, self.learner, **self.rl)
 
     @property
     def targets(self) -> Sequence[float]:

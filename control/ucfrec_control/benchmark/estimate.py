@@ -38,7 +38,7 @@ def estimated_hours(cells: Sequence[Cell], workers: int) -> float:
     try:
         for cell in cells:
             world = world_of_data(dataset_of(EpisodeStore.open(cell.store)))
-            kind = (world, cell.learner, cell.settings, cell.rl_steps, cell.rl_batch_size)
+            kind = (world, cell.learner, cell.settings, *cell.rl.items())
             if kind not in trained:
                 trained[kind] = _training(cell)
             if not cell.episodes:
@@ -73,7 +73,7 @@ def _training(cell: Cell) -> float:
     """Seconds of all updates of a cell's training."""
     store = EpisodeStore.open(cell.store)
     if cell.learner in ALGORITHMS:
-        return cell.rl_steps * timed_updates(store, cell.rl_config, _TIMED)
+        return cell.rl_config.steps * timed_updates(store, cell.rl_config, _TIMED)
     config, (train, _) = cell.config, training_views(store)
     policy, generator = new_policy(train, config), np.random.default_rng(0)
     optimizer = torch.optim.AdamW(policy.parameters())

@@ -9,7 +9,7 @@ from ucfrec_control.benchmark.budgets import Budget
 from ucfrec_control.benchmark.cells import SCORE_MEASUREMENT, SCORES, Cell, code_of
 from ucfrec_control.benchmark.folders import run_name, stages_of, stores_of
 from ucfrec_control.benchmark.methods import MAIN, TABLES
-from ucfrec_control.benchmark.rates import settings_of
+from ucfrec_control.benchmark.rates import rl_settings_of, settings_of
 from ucfrec_control.benchmark.run_cells import run_cells
 from ucfrec_control.data.distractor import zoo_store
 
@@ -72,8 +72,7 @@ def cells_of(
                     episodes=budget.episodes,
                     evaluation_seed=budget.evaluation_seed,
                     code_version=code,
-                    rl_steps=budget.rl_steps,
-                    rl_batch_size=budget.rl_batch_size,
+                    rl=rl_settings_of(budget, name, learner),
                     all_targets=budget.all_targets,
                     shared=stages_of(folder),
                 )

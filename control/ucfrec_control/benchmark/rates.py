@@ -23,7 +23,7 @@ from ucfrec_control.benchmark.methods import METHODS, METHODS_WO_TIME, Methods
 from ucfrec_control.benchmark.run_cells import run_cells
 from ucfrec_control.data.distractor import zoo_store
 from ucfrec_control.data.trajectories import PACKAGES
-from ucfrec_control.learners.rl_baselines import ALGORITHMS
+from ucfrec_control.learners.rl_baselines import ALGORITHMS, action_loss, train_rl
 from ucfrec_control.learners.train import train_control
 
 SUITE: Final = "rates"
@@ -34,11 +34,10 @@ _TIME, _COPIES = "policy.max_timestep", "augment.copies"
 
 
 def _differing(methods: Methods) -> Methods:
-    """The sequence policies of the main table that differ in learner or embeddings of time."""
+    """The methods of the main table that differ in learner or embeddings of time."""
     found: dict[tuple[str, tuple[str, ...]], str] = {}
     for name, (learner, settings) in methods.items():
-        if learner not in ALGORITHMS:
-            found.setdefault((learner, _of_time(settings)), name)
+        found.setdefault((learner, _of_time(settings)), name)
     return {name: (learner, settings) for (learner, settings), name in found.items()}
 
 
@@ -116,7 +115,8 @@ def format_rates(table: tuple[str, Mapping[str, float]]) -> str:
 def settings_of(
     budget: Budget, name: str, learner: str, settings: Sequence[str]
 ) -> tuple[str, ...]:
-    """Settings of a training over its presets: the budget's, the chosen rate, the method's own.
+    """Settings of a training over its presets: the budget's, the chosen rate, the method's own;
+    none of IQL and CQL (`rl_settings_of`).
 
     Args:
         budget: size of the benchmark.
@@ -124,15 +124,33 @@ def settings_of(
         learner: as `Cell.learner`.
         settings: of the method.
     """
+    if learner in ALGORITHMS:
+        return ()
     time = _of_time(settings)
     if learner == "ucf" and time == _of_time(METHODS["dt-wo-time"][1]):
         time = ()  # the preset
-    rates = chosen_rates(name) if budget.rates is None else budget.rates
+    rates = _rates_of(budget, name)
     own = [name for name, kind in _DIFFERING.items() if kind == (learner, time)]
     of_learner = [name for name, (each, _) in SEARCHED.items() if each == learner]
     rate = next((rates[name] for name in (*own, *of_learner) if name in rates), None)
     searched = () if rate is None else (f"train.{RATE}={rate:g}",)
     return (*budget.settings_of(learner), *searched, *settings)
+
+
+def rl_settings_of(budget: Budget, name: str, learner: str) -> dict[str, Any]:
+    """Settings of a training of IQL or CQL: the budget's and the chosen rate; none of others.
+
+    Args:
+        budget, name, learner: as of `settings_of`.
+    """
+    if learner not in ALGORITHMS:
+        return {}
+    rate = _rates_of(budget, name).get(learner)
+    return {**budget.rl, **({} if rate is None else {RATE: rate})}
+
+
+def _rates_of(budget: Budget, name: str) -> Mapping[str, float]:
+    return chosen_rates(name) if budget.rates is None else budget.rates
 
 
 def search_rates(
@@ -171,6 +189,7 @@ def _cells(
     data: Path, folder: Path, budget: Budget, name: str, methods: Sequence[str], steps: int | None
 ) -> Iterator[Cell]:
     shorter = () if steps is None else (f"train.steps={steps}", f"train.validate_every={steps}")
+    rl_shorter = {} if steps is None else {"steps": steps}
     # Shorter trainings are runs of their own.
     part = "" if steps is None else f"{steps}-"
     for file in budget.files_in(data):
@@ -178,8 +197,9 @@ def _cells(
         for method in methods:
             learner, own = SEARCHED[method]
             code = code_of(learner)
+            rl = learner in ALGORITHMS
             for rate in RATES[name]:
-                settings = (f"{_COPIES}=0", *shorter, f"train.{RATE}={rate:g}", *own)
+                searched = (f"{_COPIES}=0", *shorter, f"train.{RATE}={rate:g}", *own)
                 for seed in range(budget.seeds_of(file, method)):
                     yield Cell(
                         suite=SUITE,
@@ -188,19 +208,25 @@ def _cells(
                         file=file,
                         method=method,
                         learner=learner,
-                        settings=(*budget.settings_of(learner), *settings),
+                        settings=() if rl else (*budget.settings_of(learner), *searched),
                         store=store,
                         run=folder / SUITE / name / file / f"{method}-{rate:g}-{part}{code}-{seed}",
                         seed=seed,
                         episodes=0,
                         evaluation_seed=budget.evaluation_seed,
                         code_version=code,
+                        rl={**budget.rl, **rl_shorter, RATE: rate} if rl else {},
                     )
 
 
 def _measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
-    record = train_control(EpisodeStore.open(cell.store), cell.run, cell.config)
-    loss, rate = record["policy"]["best_validation"], cell.config.train.learning_rate
+    store = EpisodeStore.open(cell.store)
+    if cell.learner in ALGORITHMS:
+        record, rate = train_rl(store, cell.run, cell.rl_config, cell.seed), cell.rl[RATE]
+        loss = action_loss(cell.run, store)
+    else:
+        record = train_control(store, cell.run, cell.config)
+        loss, rate = record["policy"]["best_validation"], cell.config.train.learning_rate
     row = ResultRow(
         **vars(row_key) | {"conditions": {**row_key.conditions, RATE: rate}},
         metric="validation_loss",

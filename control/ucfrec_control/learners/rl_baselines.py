@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from ucfrec import schema
@@ -54,6 +55,8 @@ class RLConfig:
     """Kind of dataset (`ucfrec_control.worlds.scores.find_kind`); selects CORL's settings."""
     batch_size: BatchSize = 256
     """Transitions of an update."""
+    learning_rate: Annotated[float, Field(gt=0, lt=1)] = 3e-4
+    """Of the critics; CORL's by default. All other rates keep CORL's proportion to it."""
 
 
 class RLPolicy:
@@ -93,13 +96,28 @@ def is_rl(record: Mapping[str, Any]) -> bool:
     return record["config"]["policy_name"] in ALGORITHMS
 
 
-def rl_config(
-    dataset: Mapping[str, Any], algorithm: Any, steps: int, batch_size: int = 256
-) -> RLConfig:
-    """The settings for the data that `ucfrec_control.learners.train.dataset_of` describes."""
+def rl_config(dataset: Mapping[str, Any], algorithm: Any, **settings: Any) -> RLConfig:
+    """The settings for the data that `ucfrec_control.learners.train.dataset_of` describes.
+
+    Args:
+        dataset: description of the data.
+        algorithm: one of `ALGORITHMS`.
+        settings: the other fields of `RLConfig`.
+    """
     task = find_task(dataset["env_id"], dataset["dataset"])
     kind = find_kind(dataset["dataset"])
-    return RLConfig(algorithm, steps, task.name if task else "", kind, batch_size)
+    return RLConfig(algorithm=algorithm, task=task.name if task else "", kind=kind, **settings)
+
+
+def action_loss(run: Path, store: EpisodeStore) -> float:
+    """Mean squared error of the actor's mean actions at all validation steps of `store`, whose
+    training `run` is."""
+    validation = store.split("validation")
+    steps = validation.all_steps()
+    policy = RLPolicy(run)
+    live = np.ones(len(steps[0]), dtype=bool)
+    taken, _ = policy.act(validation.step_values(schema.OBSERVATION, *steps), live)
+    return float(np.mean((taken - validation.step_values(schema.ACTION, *steps)) ** 2))
 
 
 def plain_config(config: RLConfig, seed: int) -> dict[str, Any]:
@@ -299,6 +317,8 @@ def _iql(d3rlpy: Any, config: RLConfig) -> Any:
         actor_encoder_factory=layers,
         critic_encoder_factory=layers,
         value_encoder_factory=layers,
+        actor_learning_rate=config.learning_rate,
+        critic_learning_rate=config.learning_rate,
         **settings,
     )
 
@@ -306,9 +326,10 @@ def _iql(d3rlpy: Any, config: RLConfig) -> Any:
 def _cql(d3rlpy: Any, config: RLConfig) -> Any:
     layers = [d3rlpy.models.VectorEncoderFactory([256] * count) for count in (3, 5)]
     antmaze = config.task == "antmaze"
+    rate = config.learning_rate
     settings: dict[str, Any] = {
-        "actor_learning_rate": 3e-5,
-        "temp_learning_rate": 3e-5,
+        "actor_learning_rate": rate / 10,
+        "temp_learning_rate": rate / 10,
         "conservative_weight": 10.0,
         "alpha_learning_rate": 0.0,
     }
@@ -317,9 +338,9 @@ def _cql(d3rlpy: Any, config: RLConfig) -> Any:
         settings |= {"reward_scaler": scaler}
     if antmaze:
         settings = {
-            "actor_learning_rate": 1e-4,
-            "temp_learning_rate": 1e-4,
-            "alpha_learning_rate": 3e-4,
+            "actor_learning_rate": rate / 3,
+            "temp_learning_rate": rate / 3,
+            "alpha_learning_rate": rate,
             # CORL starts the logarithm of its multiplier at 1.
             "initial_alpha": math.e,
             "conservative_weight": 5.0,
@@ -329,7 +350,7 @@ def _cql(d3rlpy: Any, config: RLConfig) -> Any:
         }
     return d3rlpy.algos.CQLConfig(
         batch_size=config.batch_size,
-        critic_learning_rate=3e-4,
+        critic_learning_rate=rate,
         n_action_samples=10,
         actor_encoder_factory=layers[0],
         critic_encoder_factory=layers[antmaze],

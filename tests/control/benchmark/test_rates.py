@@ -18,6 +18,7 @@ from ucfrec_control.benchmark.rates import (
     best_rates,
     chosen_rates,
     read_rates,
+    rl_settings_of,
     settings_of,
     write_rates,
 )
@@ -50,7 +51,7 @@ def test_a_file_with_larger_losses_weighs_no_more() -> None:
 
 def test_every_learner_has_a_rate() -> None:
     assert {name: METHODS[name] for name in SEARCHED} == SEARCHED
-    learners = {learner for learner, _ in METHODS.values()} - set(ALGORITHMS)
+    learners = {learner for learner, _ in METHODS.values()}
     assert sorted(learner for learner, _ in SEARCHED.values()) == sorted(learners)
     assert not SEARCHED.keys() & set(WITH_TIME)
     assert chosen_rates("small").keys() <= SEARCHED.keys()
@@ -65,10 +66,13 @@ def test_every_row_is_trained_at_the_rate_of_its_learner(
     numbers = {name: float(number) for number, name in enumerate(SEARCHED, start=1)}
     monkeypatch.setattr(rates, "chosen_rates", lambda budget: numbers)
     for name, (learner, settings) in TABLES[table].items():
-        if learner in ALGORITHMS:
-            continue
         found = settings_of(BUDGETS["full"], "full", learner, settings)
+        rl = rl_settings_of(BUDGETS["full"], "full", learner)
         tried = next(m for m, (each, _) in SEARCHED.items() if each == learner)
+        if learner in ALGORITHMS:
+            assert (found, rl["learning_rate"]) == ((), numbers[tried])
+            continue
+        assert not rl
         assert f"train.learning_rate={numbers[tried]:g}" in found, name
         assert found[-len(settings) :] == settings if settings else True
 

@@ -37,7 +37,7 @@ def test_the_estimate_grows_with_steps_and_shrinks_with_workers(tmp_path: Path) 
     hours = {}
     for steps in (1_000, 1_000_000):
         settings = (*TINY, f"train.steps={steps}")
-        budget = Budget(("hopper_medium-made",), 2, 1, settings, rl_steps=steps)
+        budget = Budget(("hopper_medium-made",), 2, 1, settings, rl={"steps": steps})
         for method in ("dt", "iql"):
             cells = list(cells_of(tmp_path, tmp_path / "out", budget, "tiny", MAIN, (method,)))
             hours[method, steps] = estimated_hours(cells, 1)

@@ -5,6 +5,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -15,9 +16,10 @@ from ucfrec.files import read_json
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.reporting.rows_file import read_rows
-from ucfrec_control.benchmark.budgets import Budget
+from ucfrec_control.benchmark.budgets import RATES, Budget
 from ucfrec_control.benchmark.methods import TABLES
 from ucfrec_control.benchmark.plan import benchmark
+from ucfrec_control.benchmark.rates import best_rates, search_rates
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.learners import rl_baselines
@@ -95,9 +97,9 @@ def test_equal_seeds_train_equal_actors_that_are_judged_as_others_are(
     assert "keep their last checkpoint only" in capsys.readouterr().err
 
 
-def learner_of(task: str, kind: str, algorithm: str = "cql") -> Any:
+def learner_of(task: str, kind: str, algorithm: str = "cql", **settings: float) -> Any:
     with random_state_kept():
-        learner = rl_baselines._learner(RLConfig(algorithm, 10, task, kind))
+        learner = rl_baselines._learner(RLConfig(algorithm, 10, task, kind, **settings))
         learner.create_impl((29,), 8)
     return learner
 
@@ -121,6 +123,21 @@ def test_cql_has_the_settings_of_corl() -> None:
     assert learner.config.alpha_learning_rate == learner.config.critic_learning_rate
     for config in (learner.config, learner_of("walker2d", "medium").config):
         assert config.temp_learning_rate == config.actor_learning_rate
+
+
+@pytest.mark.parametrize("algorithm", ["iql", "cql"])
+@pytest.mark.parametrize("task", ["hopper", "antmaze"])
+def test_all_rates_keep_their_proportion(algorithm: str, task: str) -> None:
+    usual, ten = (
+        {
+            name: rate
+            for name, rate in vars(learner_of(task, "medium", algorithm, **settings).config).items()
+            if name.endswith("learning_rate")
+        }
+        for settings in ({}, {"learning_rate": 3e-3})
+    )
+    assert usual["critic_learning_rate"] == 3e-4
+    assert ten == pytest.approx({name: 10 * rate for name, rate in usual.items()})
 
 
 def test_steps_of_antmaze_count_no_less_than_the_clip() -> None:
@@ -171,7 +188,7 @@ def test_the_benchmark_finds_its_rl_rows_again(
 ) -> None:
     write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
     monkeypatch.setitem(TABLES, "main", {"iql": ("iql", ())})
-    budget = Budget(("hopper_medium-made",), 1, 2, (), rl_steps=2)
+    budget = Budget(("hopper_medium-made",), 1, 2, (), rl={"steps": 2})
     results = tmp_path / "rows.jsonl"
     (row,) = benchmark(tmp_path, tmp_path / "runs", results, budget, "tiny", 1)
     assert (row.table, row.method, row.checkpoint) == ("main", "iql", "last")
@@ -183,3 +200,18 @@ def test_the_benchmark_finds_its_rl_rows_again(
     assert "1 cells, 0 of them left" in printed.err
     # Neither here nor in the workers does d3rlpy tell of its trainings.
     assert "[info" not in re.sub(r"\x1b\[[\d;]*m", "", printed.out)
+
+
+def test_rates_of_rl_are_searched_on_held_out_actions(tmp_path: Path) -> None:
+    columns = hopper_like((30, 8, 25) * 8)
+    columns["actions"] = np.tanh(columns["observations"][:, :3])
+    write_hdf5(tmp_path / "hopper_medium-made.hdf5", columns)
+    budget = Budget(("hopper_medium-made",), 1, 1, (), rl={"steps": 99, "batch_size": 64})
+    rows = search_rates(
+        tmp_path, tmp_path / "runs", tmp_path / "rows.jsonl", budget, "full", 1, ("iql",), 60
+    )
+    assert [row.conditions["learning_rate"] for row in rows] == list(RATES["full"])
+    assert {row.metrics["steps"] for row in rows} == {60}
+    of_no_action = np.mean(columns["actions"] ** 2)
+    assert rows[-1].value < 0.8 * rows[0].value < 0.8 * of_no_action
+    assert best_rates(rows) == {"iql": RATES["full"][-1]}

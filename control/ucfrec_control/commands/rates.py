@@ -1,10 +1,11 @@
-"""`ucfrec-control rates`: learning rates of sequence policies, by validation loss; resumes."""
+"""`ucfrec-control rates`: learning rates of all learners, by validation loss; resumes."""
 
 import argparse
 from pathlib import Path
 
 from ucfrec.commands.grid_options import results_given, rows_given
 from ucfrec.reporting.rows_file import benchmarking
+from ucfrec.reporting.statistics import grouped
 from ucfrec.reporting.tables import format_rows
 from ucfrec_control.benchmark.budgets import SEARCHES
 from ucfrec_control.benchmark.rates import (
@@ -40,9 +41,13 @@ def run(options: argparse.Namespace) -> None:
     if options.show_only:
         rows = rows_given(options, SUITE)
         rows = [row for row in rows if row.conditions["budget"] == options.budget]
-        # Beside shorter trainings, which rehearse the search, only the longest count.
-        most = max((row.metrics["steps"] for row in rows), default=0.0)
-        rows = [row for row in rows if row.metrics["steps"] == most]
+        # Beside shorter trainings, which rehearse the search, only a method's longest count.
+        rows = [
+            row
+            for own in grouped(rows, lambda row: row.method).values()
+            for row in own
+            if row.metrics["steps"] == max(each.metrics["steps"] for each in own)
+        ]
     else:
         with benchmarking(results_given(options)):
             rows = search_rates(

@@ -23,6 +23,7 @@ _CSV_FAULT = re.compile(r"CSV Error on Line: (\d+).*?\n\s*file = ([^\n]+)", re.D
 _CSV_COLUMN = re.compile(r'converting column "([^"]+)"\. ([^\n]+)')
 _INTEGER = re.compile(r"U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?")
 _REAL = re.compile(r"FLOAT|DOUBLE|DECIMAL.*")
+_NARROW = re.compile(r"(U?(?:TINY|SMALL)INT|U?INTEGER)((?:\[\d*\])*)")
 _NUMBERS = re.compile(r"(U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?|FLOAT|DOUBLE|DECIMAL\(.*\))\[\d*\]")
 
 MAX_FLOAT = 3.4028235e38
@@ -34,12 +35,12 @@ class Table:
 
     files: tuple[Path, ...]
     types: tuple[tuple[str, str], ...]
-    """(name, DuckDB type) of each column."""
+    """(name, DuckDB type) of each column in the files."""
 
     @property
     def columns(self) -> dict[str, str]:
-        """Column name to DuckDB type."""
-        return dict(self.types)
+        """Column name to DuckDB type, as `sql` gives it."""
+        return {name: _computed_as(kind) for name, kind in self.types}
 
     @property
     def columnar(self) -> bool:
@@ -48,12 +49,33 @@ class Table:
 
     @property
     def sql(self) -> str:
+        """SQL of the rows; integers of fewer than 64 bits have 64, unsigned ones of 64 bits 128."""
+        wider = ", ".join(
+            f"CAST({quoted(name)} AS {_computed_as(kind)}) AS {quoted(name)}"
+            for name, kind in self.types
+            if _computed_as(kind) != kind
+        )
+        return f"(SELECT * REPLACE ({wider}) FROM {self.source})" if wider else self.source
+
+    @property
+    def source(self) -> str:
         """SQL call of the DuckDB table function that reads the files."""
         files = ", ".join(text(glob_pattern(file)) for file in self.files)
         if self.columnar:
             return f"read_parquet([{files}])"
         types = ", ".join(f"{text(name)}: {text(kind)}" for name, kind in self.types)
         return f"read_csv([{files}], header = true, types = {{{types}}})"
+
+
+def _computed_as(kind: str) -> str:
+    """The DuckDB type that expressions compute with, given that of a column.
+
+    DuckDB multiplies two columns of 8 bits in 8 bits, and takes unsigned numbers from each other
+    without a sign: where that overflows, a reward would be undefined.
+    """
+    if kind == "UBIGINT":
+        return "HUGEINT"
+    return _NARROW.sub(r"BIGINT\2", kind) if _NARROW.fullmatch(kind) else kind
 
 
 def glob_pattern(file: Path) -> str:
@@ -120,7 +142,7 @@ def _columns(connection: duckdb.DuckDBPyConnection, file: Path) -> tuple[tuple[s
         raise InputError(f"{file} is empty (0 bytes); remove it from the input or fetch it again")
     if file.suffix == ".gz":
         require_plausible_size(file)
-    source = Table((file,), ()).sql.replace(", types = {}", "")
+    source = Table((file,), ()).source.replace(", types = {}", "")
     try:
         types = connection.sql(f"DESCRIBE SELECT * FROM {source}").fetchall()
         if file.suffix == ".parquet":
@@ -160,7 +182,9 @@ def bind(
     if _NAME.fullmatch(given):
         raise InputError(_missing(table, what, given))
     sql = f"({given}\n)"
-    like = ", ".join(f"CAST(NULL AS {kind}) AS {quoted(name)}" for name, kind in table.types)
+    like = ", ".join(
+        f"CAST(NULL AS {kind}) AS {quoted(name)}" for name, kind in table.columns.items()
+    )
     try:
         # DuckDB would read some names that are not columns as the current user or time.
         used = columns_of(connection, given)

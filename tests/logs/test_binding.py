@@ -5,10 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
+from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs.histories import frame_histories, read_histories
-from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.mapping import FeatureTable, LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare
 
 START = 1_700_000_000_000
 
@@ -58,3 +62,83 @@ def test_narrow_seconds_are_times(tmp_path: Path) -> None:
     mapping = LogMapping({"timestamp": "seconds * 1000"})
     (batch,) = read_histories([tmp_path / "log.parquet"], mapping, "reward", last=2)
     assert batch["timestamps"][0].as_py() == [START, START]
+
+
+@pytest.mark.parametrize(
+    ("reward", "wanted"),
+    [
+        ("x", [0.25, 1.0]),
+        ("x > 0.5", [0.0, 1.0]),
+        ("NOT x > 0.5", [1.0, 0.0]),
+        ("x BETWEEN 0.5 AND 100", [0.0, 1.0]),
+        ("if(x > 0.5, 2, 1)", [1.0, 2.0, 1.0, 1.0]),
+        ("coalesce(x, 7)", [0.25, 1.0, 7.0, 7.0]),
+        ("if(isnan(x), 7, x)", [0.25, 1.0, 7.0, 7.0]),
+        ("clicks + x", [0.25, 2.0]),
+        # Extremes and number of missing values in the file tell nothing of NaN.
+        ("y > 0.5", [1.0, 1.0, 1.0]),
+        ("y < 5", [1.0, 1.0, 1.0]),
+        ("if(y < 5, 1, 2)", [1.0, 1.0, 2.0, 1.0]),
+        ("coalesce(y, 7)", [0.75, 1.0, 7.0, 2.0]),
+        ("if(isnan(y), 7, y)", [0.75, 1.0, 7.0, 2.0]),
+        ("clicks / views > 0.1", [1.0, 0.0, 1.0]),
+        ("coalesce(clicks / views, 7)", [7.0, 0.5, 0.0, 1.5]),
+        ("ln(views)", [0.6931472, 0.0, 0.6931472]),
+        ("ln(views) > 0.5", [1.0, 0.0, 1.0]),
+        ("ln(views) + ln(views)", [1.3862944, 0.0, 1.3862944]),
+        ("least(ln(views), 5)", [0.6931472, 0.0, 0.6931472]),
+        ("greatest(sqrt(clicks - 1), 0)", [0.0, 1.4142135]),
+    ],
+)
+def test_what_is_undefined_is_above_no_threshold(
+    reward: str, wanted: list[float], tmp_path: Path
+) -> None:
+    columns = {
+        "x": pa.array([0.25, 1.0, float("nan"), None]),
+        "y": pa.array([0.75, 1.0, float("nan"), 2.0], pa.float32()),
+        "clicks": pa.array([0, 1, 0, 3]),
+        "views": pa.array([0, 2, 1, 2]),
+        "user_id": pa.array([1] * 4),
+        "item_id": pa.array([2] * 4),
+        "timestamp": pa.array(START + np.arange(4)),
+    }
+    pq.write_table(pa.table(columns), tmp_path / "log.parquet")
+    (batch,) = read_histories([tmp_path / "log.parquet"], LogMapping(), reward, last=4)
+    assert batch["rewards"][0].as_py() == pytest.approx(wanted)
+
+
+def test_only_true_and_one_are_random_choices(tmp_path: Path) -> None:
+    given = [1.0, 0.0, float("nan"), None, float("inf"), -1.0, 2.0, 1.0]
+    n = len(given)
+    columns = {
+        "user_id": pa.array([1] * n),
+        "item_id": pa.array(range(n)),
+        "timestamp": pa.array(START + np.arange(n)),
+        "reward": pa.array(range(n)),
+        "propensity": pa.array([0.5] * n),
+        "is_random": pa.array(given),
+    }
+    pq.write_table(pa.table(columns), tmp_path / "log.parquet")
+    for mapping, wanted in (
+        (LogMapping(), [1, 0, 0, 0, 0, 0, 0, 1]),
+        (LogMapping({"is_random": "ln(is_random) = 0"}), [1, 0, 0, 0, 0, 0, 0, 1]),
+        (LogMapping({"is_random": "1 / is_random > 0.5"}), [1, 0, 0, 0, 0, 0, 0, 1]),
+    ):
+        out = tmp_path / f"store{len(list(tmp_path.iterdir()))}"
+        prepare([tmp_path / "log.parquet"], mapping, out, PrepareOptions(embedding_size=2))
+        store = EpisodeStore.open(out)
+        assert store.step_values("is_random", *store.all_steps()).tolist() == wanted
+
+
+def test_undefined_numbers_of_features_are_missing(tmp_path: Path) -> None:
+    frame = pd.DataFrame({"user_id": [1, 2, 3, 4], "item_id": [0, 1, 2, 3], "reward": [0, 1, 2, 3]})
+    frame.assign(timestamp=START + frame.index).to_parquet(tmp_path / "log.parquet")
+    pd.DataFrame({"item_id": [0, 1, 2, 3], "price": [-1, 0, 1, 9]}).to_parquet(
+        tmp_path / "items.parquet"
+    )
+    table = FeatureTable((tmp_path / "items.parquet",), "item_id", ("ln(price)",))
+    mapping = LogMapping(item_features=(table,))
+    options = PrepareOptions(split=(1.0, 0.0, 0.0), embedding_size=2)
+    prepare([tmp_path / "log.parquet"], mapping, tmp_path / "store", options)
+    states = EpisodeStore.open(tmp_path / "store").item_states
+    assert bool(states.embeddings.isfinite().all())

@@ -49,13 +49,12 @@ class Table:
 
     @property
     def sql(self) -> str:
-        """SQL of the rows; integers of fewer than 64 bits have 64, unsigned ones of 64 bits 128."""
-        wider = ", ".join(
-            f"CAST({quoted(name)} AS {_computed_as(kind)}) AS {quoted(name)}"
-            for name, kind in self.types
-            if _computed_as(kind) != kind
+        """SQL of the rows: NaN is missing, integers of fewer than 64 bits have 64."""
+        read = {name: _read(quoted(name), kind) for name, kind in self.types}
+        changed = ", ".join(
+            f"{sql} AS {quoted(name)}" for name, sql in read.items() if sql != quoted(name)
         )
-        return f"(SELECT * REPLACE ({wider}) FROM {self.source})" if wider else self.source
+        return f"(SELECT * REPLACE ({changed}) FROM {self.source})" if changed else self.source
 
     @property
     def source(self) -> str:
@@ -76,6 +75,16 @@ def _computed_as(kind: str) -> str:
     if kind == "UBIGINT":
         return "HUGEINT"
     return _NARROW.sub(r"BIGINT\2", kind) if _NARROW.fullmatch(kind) else kind
+
+
+def _read(column: str, kind: str) -> str:
+    """SQL of a quoted column of a DuckDB type, as expressions compute with it."""
+    if kind in ("FLOAT", "DOUBLE"):
+        # To DuckDB, NaN is greater than every number: `score > 0.5` would hold. It would leave out
+        # `isnan` here, because the extremes that a Parquet file states tell of no NaN.
+        return f"CASE WHEN isfinite({column}) OR isinf({column}) THEN {column} END"
+    wider = _computed_as(kind)
+    return column if wider == kind else f"CAST({column} AS {wider})"
 
 
 def glob_pattern(file: Path) -> str:

@@ -78,7 +78,8 @@ def load_features(
 def _comparable(sql: str, kind: str) -> str | None:
     """SQL that casts a feature to DOUBLE, VARCHAR, VARCHAR[] or FLOAT[]; None if no cast does."""
     if is_number(kind):
-        return f"CAST({sql} AS DOUBLE)"
+        # Undefined numbers, such as the logarithm of 0, are missing.
+        return f"TRY(CAST({sql} AS DOUBLE))"
     if time := as_timestamp(sql, kind):
         return f"epoch({time}) / 86400"
     if kind in ("VARCHAR", "BOOLEAN", "UUID") or kind.startswith("ENUM"):

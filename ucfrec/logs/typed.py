@@ -267,11 +267,11 @@ def _typed(table: Table, name: str, given: str, sql: str, kind: str) -> tuple[st
     elif name == schema.PROPENSITY:
         if is_number(kind):
             valid = f"{sql} > 0 AND {sql} <= {MAX_FLOAT}"
-            return f"CAST(CASE WHEN {valid} THEN {sql} END AS FLOAT)", "FLOAT"
+            return f"TRY(CAST(CASE WHEN {valid} THEN {sql} END AS FLOAT))", "FLOAT"
         wanted = "use a number above 0"
     else:
         if is_number(kind) or kind == "BOOLEAN":
-            return f"coalesce(CAST({sql} AS BOOLEAN), false)", "BOOLEAN"
+            return f"coalesce(TRY(CAST({sql} AS DOUBLE)) = 1, false)", "BOOLEAN"
         wanted = "use a boolean or 0 and 1"
     raise wrong_type(table, name, given, kind, wanted)
 

@@ -1,6 +1,7 @@
 """From log files to episodes: nothing lost unseen, nothing leaked, nothing half-written."""
 
 import errno
+import json
 import subprocess
 import sys
 import time
@@ -619,6 +620,39 @@ def test_a_mapping_is_read_from_toml(tmp_path: Path) -> None:
     (tmp_path / "bad.toml").write_text("rewards = 'x'\n")
     with pytest.raises(InputError, match=r"bad.toml: .*rewards"):
         read_mapping(tmp_path / "bad.toml")
+
+
+@pytest.mark.parametrize("given", ["gpa", "Gap", "", "visit", 3, ["gap"]])
+def test_sessions_of_a_mapping_are_formed_in_a_known_way(tmp_path: Path, given: Any) -> None:
+    """An unknown one had made one session of each user."""
+    (tmp_path / "mapping.toml").write_text(f"session_by = {json.dumps(given)}\n")
+    for make in (
+        lambda: LogMapping(session_by=given),
+        lambda: read_mapping(tmp_path / "mapping.toml"),
+    ):
+        with pytest.raises(InputError, match=r"session_by is .*; use session_id, gap, user"):
+            make()
+
+
+def test_sessions_by_a_column_that_no_file_has_are_refused(tmp_path: Path) -> None:
+    path = write(make_log(), tmp_path / "log.parquet")
+    with pytest.raises(InputError, match=r"no column 'session_id'"):
+        validate([path], LogMapping(session_by="session_id"))
+    path = write(make_log().assign(session_id=0.5), tmp_path / "log.parquet")
+    with pytest.raises(
+        InputError, match=r"session_id \(session_id\) is DOUBLE; use integers or text"
+    ):
+        validate([path], LogMapping(session_by="session_id"))
+
+
+@pytest.mark.parametrize("name", ["files", "columns"])
+def test_one_name_in_place_of_a_list_is_refused(tmp_path: Path, name: str) -> None:
+    """Its letters had been taken for names."""
+    table = {"files": '["items.csv"]', "columns": '["price"]', name: '"price"'}
+    lines = "\n".join(f"{field} = {value}" for field, value in table.items())
+    (tmp_path / "m.toml").write_text(f'[[item_features]]\nkey = "item_id"\n{lines}\n')
+    with pytest.raises(InputError, match=rf"m.toml: {name} of features is 'price'; write a list"):
+        read_mapping(tmp_path / "m.toml")
 
 
 @pytest.mark.parametrize(

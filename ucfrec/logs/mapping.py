@@ -19,6 +19,8 @@ OPTIONAL_COLUMNS: Final = (
     schema.SESSION_ID,
     schema.IS_RANDOM,
 )
+SESSIONS: Final = (schema.SESSION_ID, "gap", "user")
+"""Ways in which rows form sessions."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,9 @@ class FeatureTable:
     The type of a column decides how it is encoded: numbers are standardised, dates count as days,
     text and booleans are categories, lists of text or integers are tags, lists of floats are
     vectors. A cast turns a number into a category: `music_type::VARCHAR`.
+
+    Raises:
+        InputError: `files` or `columns` is one name instead of several.
     """
 
     files: tuple[str | Path, ...]
@@ -39,12 +44,22 @@ class FeatureTable:
     """Of rows with the same key, keep the one with the lowest value of this column or expression,
     e.g. the first day of daily features. Empty: a repeated key is an error."""
 
+    def __post_init__(self) -> None:
+        for name, given in (("files", self.files), ("columns", self.columns)):
+            if isinstance(given, str | Path):
+                raise InputError(
+                    f"{name} of features is {str(given)!r}; write a list: [{str(given)!r}]"
+                )
+
 
 @dataclass(frozen=True)
 class LogMapping:
     """Which columns of the files are the log columns, the reward and the features.
 
     Example: `LogMapping({"item_id": "video_id", "timestamp": "time_s * 1000"}, reward="is_click")`.
+
+    Raises:
+        InputError: `columns` names no log column, or `session_by` is none of `SESSIONS`.
     """
 
     columns: Mapping[str, str] = field(default_factory=dict)
@@ -64,6 +79,11 @@ class LogMapping:
         for name in self.columns:
             if name not in known:
                 raise InputError(f"{name!r} is no log column; use one of {', '.join(known)}")
+        if self.session_by not in (None, *SESSIONS):
+            raise InputError(
+                f"session_by is {self.session_by!r}; use {', '.join(SESSIONS)}, and map a column "
+                f"of sessions as {schema.SESSION_ID}"
+            )
 
     def over(self, defaults: "LogMapping") -> "LogMapping":
         """This mapping, with its empty fields filled from `defaults`."""

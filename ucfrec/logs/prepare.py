@@ -37,10 +37,10 @@ from ucfrec.logs.ids import (
     write_episode_users,
     write_ids,
 )
-from ucfrec.logs.mapping import LogMapping, log_files
+from ucfrec.logs.mapping import SESSIONS, LogMapping, log_files
 from ucfrec.logs.measures import Measures, binned_rewards, measure, sampled_rewards
 from ucfrec.logs.order import count_unsorted
-from ucfrec.logs.sessions import SESSIONS, Cut, Episodes, by_sessions, episodes, split_bounds
+from ucfrec.logs.sessions import Cut, Episodes, by_sessions, episodes, split_bounds
 from ucfrec.logs.sorted_rows import SortedRows, check_sorted, sorted_batches
 from ucfrec.logs.spool import Spool
 from ucfrec.logs.steps import StepNumbers, write_steps

@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import Final
 
 from ucfrec import schema
-from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, log_files
+from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, log_files, table_name
 
 
 def _resolve(paths: Sequence[str | Path], given: LogMapping) -> tuple[tuple[Path, ...], LogMapping]:
-    """Files called `items.*` and `users.*` are feature tables, all others logs."""
+    """Files and folders called `items.*` and `users.*` are feature tables, all others logs."""
     files = log_files(paths)
-    kinds = [file.name.partition(".")[0] for file in files]
+    kinds = [table_name(file).partition(".")[0] for file in files]
     items = tuple(f for f, kind in zip(files, kinds, strict=True) if kind == "items")
     users = tuple(f for f, kind in zip(files, kinds, strict=True) if kind == "users")
     defaults = LogMapping(

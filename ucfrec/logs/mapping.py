@@ -1,7 +1,7 @@
 """Column mappings of logs, written as data, and the datasets that supply them."""
 
 import glob
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
@@ -167,6 +167,9 @@ def read_mapping(path: Path) -> LogMapping:
 def log_files(paths: Sequence[str | Path]) -> tuple[Path, ...]:
     """List the log files among files, folders and globs, each once.
 
+    In a folder, and among the matches of a glob, a folder called like a table (`log.parquet`) is
+    one: its files are its parts.
+
     Returns:
         Files in the order of `paths`; those of one folder or glob by name.
 
@@ -184,16 +187,33 @@ def log_files(paths: Sequence[str | Path]) -> tuple[Path, ...]:
     return tuple(files)
 
 
+def table_name(file: Path) -> str:
+    """Name of the table that a file is, or is a part of: Spark writes folders `items.parquet/`."""
+    folder = file.parent.name
+    return folder if folder.endswith(SUFFIXES) else file.name
+
+
 def _matches(path: Path) -> list[Path]:
     if path.is_dir():
-        return sorted(p for p in path.iterdir() if is_table(p) and not p.name.startswith("."))
+        return _tables(path.iterdir())
     if path.is_file():
         if not is_table(path):
             raise InputError(f"{path} is not a {' or '.join(SUFFIXES)} file; convert it first")
         return [path]
     if not glob.has_magic(str(path)):
         raise InputError(f"{path} does not exist; check the path")
-    return sorted(p for p in map(Path, glob.glob(str(path), recursive=True)) if is_table(p))
+    return _tables(map(Path, glob.glob(str(path), recursive=True)))
+
+
+def _tables(paths: Iterable[Path]) -> list[Path]:
+    """Tables among paths, by name; of a folder that is called like one, the tables in it."""
+    found: list[Path] = []
+    for path in sorted(p for p in paths if not p.name.startswith(".")):
+        if path.name.endswith(SUFFIXES) and path.is_dir():
+            found += sorted(p for p in path.iterdir() if is_table(p) and p.name[0] != ".")
+        elif is_table(path):
+            found.append(path)
+    return found
 
 
 def is_table(path: Path) -> bool:

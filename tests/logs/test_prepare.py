@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from safetensors import SafetensorError
 from ucfrec import progress, schema
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.writer import StoreWriter
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.logs.histories import read_histories
 from ucfrec.logs.mapping import FeatureTable, LogMapping, columns_given, log_files, read_mapping
 from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, validate
@@ -586,6 +587,22 @@ def test_files_of_different_make_are_read_together(tmp_path: Path) -> None:
     assert whole["rows_read"] == apart["rows_read"]
     stores = [EpisodeStore.open(tmp_path / name).meta for name in "ab"]
     assert stores[0]["fingerprint"] == stores[1]["fingerprint"]
+
+
+def test_an_optional_column_of_some_files_is_left_out_with_a_note(tmp_path: Path) -> None:
+    log = make_log().drop(columns="propensity")
+    paths = [write(log.iloc[n::3], tmp_path / f"{n}.parquet") for n in range(3)]
+    write(log.iloc[1::3].assign(SESSION_ID=1, is_random=1), paths[1])
+    with pytest.warns(InputNote) as told:
+        report = validate(paths, LogMapping())
+    assert report["session_by"] == "gap"
+    notes = [str(note.message) for note in told if note.category is InputNote]
+    assert [note.partition(" is ")[0] for note in notes] == ["session_id", "is_random"]
+    assert f"only 1 of 3 files have it ({paths[1]})" in notes[0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", InputNote)
+        validate(paths, LogMapping({"session_id": "", "is_random": ""}))
+        validate([paths[1]], LogMapping())
 
 
 def test_generic_takes_features_from_files_called_items_and_users(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from ucfrec.logs.binding import explained, open_tables
 from ucfrec.logs.clean import DUPLICATES, require_rows
 from ucfrec.logs.distributions import RewardPasses, distributions
 from ucfrec.logs.engine import engine
-from ucfrec.logs.feature_tables import load_features
+from ucfrec.logs.feature_tables import load_features, require_known_ids
 from ucfrec.logs.ids import (
     EPISODE_USERS,
     ID_TABLES,
@@ -37,7 +37,7 @@ from ucfrec.logs.ids import (
     write_episode_users,
     write_ids,
 )
-from ucfrec.logs.mapping import SESSIONS, LogMapping, log_files
+from ucfrec.logs.mapping import SESSIONS, FeatureTable, LogMapping, log_files
 from ucfrec.logs.measures import Measures, binned_rewards, measure, sampled_rewards
 from ucfrec.logs.order import count_unsorted
 from ucfrec.logs.sessions import Cut, Episodes, by_sessions, episodes, split_bounds
@@ -282,6 +282,7 @@ def _prepared(
                 stage.update()
                 features = _features(log, mapping, like)
                 number_ids(log, measures, features, like)
+                _require_known_ids(log, mapping, features)
                 report = _report(rows, spool, cut, measures)
                 report = {"reward": reward, **report, "duplicates": options.duplicates}
                 stage.update()
@@ -317,12 +318,21 @@ def _features(log: TypedLog, mapping: LogMapping, like: Path | None) -> Features
         return {}
     return {
         name: load_features(log.connection, tables, name, log.id_type(name))
-        for name, tables in (
-            (schema.USER_ID, mapping.user_features),
-            (schema.ITEM_ID, mapping.item_features),
-        )
+        for name, tables in _feature_tables(mapping).items()
         if name in log.columns
     }
+
+
+def _feature_tables(mapping: LogMapping) -> dict[str, tuple[FeatureTable, ...]]:
+    return {schema.USER_ID: mapping.user_features, schema.ITEM_ID: mapping.item_features}
+
+
+def _require_known_ids(log: TypedLog, mapping: LogMapping, features: Features) -> None:
+    """Check that feature tables tell of users and items of the log; after `number_ids`."""
+    kept = {name: f"kept_{table}" for name, table, _ in ID_TABLES}
+    for name, names in features.items():
+        tables = _feature_tables(mapping)[name]
+        require_known_ids(log.connection, tables, names, name, kept[name])
 
 
 def _other_inputs(mapping: LogMapping, like: Path | None) -> Iterator[Path]:

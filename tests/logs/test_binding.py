@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
 from ucfrec.logs.histories import frame_histories, read_histories
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
@@ -142,3 +143,44 @@ def test_undefined_numbers_of_features_are_missing(tmp_path: Path) -> None:
     prepare([tmp_path / "log.parquet"], mapping, tmp_path / "store", options)
     states = EpisodeStore.open(tmp_path / "store").item_states
     assert bool(states.embeddings.isfinite().all())
+
+
+def csv_of(folder: Path, column: str, first: str, later: str) -> Path:
+    """A CSV log whose `column` is `first`, in more rows than types are told from, then `later`."""
+    rows = 25_000
+    lines = [f"{column},user_id,item_id,timestamp"]
+    values = [first] * (rows - 1) + [later]
+    lines += [f"{value},{n % 7},{n % 5},{START + n}" for n, value in enumerate(values)]
+    (folder / "log.csv").write_text("\n".join(lines) + "\n")
+    return folder / "log.csv"
+
+
+@pytest.mark.parametrize(
+    ("first", "later", "reward", "wanted"),
+    [
+        ("1", "0.25", "x", 0.25),
+        ("1", "25e-2", "x", 0.25),
+        ("1", "2.0", "x", 2.0),
+        ("2024-01-01", "2024-01-01 12:30:00", "hour(x::TIMESTAMP)", 12.0),
+        ("2024-01-01 00:00:00", "2024-01-01 12:30:00+02:00", "hour(x::TIMESTAMP)", 10.0),
+    ],
+)
+def test_later_rows_of_csv_are_not_cut_to_the_type_of_the_first(
+    tmp_path: Path, first: str, later: str, reward: str, wanted: float
+) -> None:
+    path = csv_of(tmp_path, "x", first, later)
+    users = pa.Table.from_batches(list(read_histories([path], LogMapping(), reward, last=1)))
+    latest = max(users.to_pylist(), key=lambda user: int(user["timestamps"][0]))
+    assert latest["rewards"] == [wanted]
+
+
+@pytest.mark.parametrize("later", ["u7", "99999999999999999999", "9" * 100_000])
+def test_later_rows_of_csv_of_another_kind_are_named(tmp_path: Path, later: str) -> None:
+    path = csv_of(tmp_path, "visit", "1", later)
+    mapping = LogMapping({"session_id": "visit"})
+    with pytest.raises(InputError, match=r"log.csv, line 25001: column visit: .*Parquet") as caught:
+        list(read_histories([path], mapping, "1", last=1, session_by="session_id"))
+    assert len(str(caught.value)) < 700
+    path = csv_of(tmp_path, "visit", "1", "1.5")
+    with pytest.raises(InputError, match=r"session_id \(visit\) is DOUBLE"):
+        list(read_histories([path], mapping, "1", last=1, session_by="session_id"))

@@ -25,6 +25,14 @@ _INTEGER = re.compile(r"U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?")
 _REAL = re.compile(r"FLOAT|DOUBLE|DECIMAL.*")
 _NARROW = re.compile(r"(U?(?:TINY|SMALL)INT|U?INTEGER)((?:\[\d*\])*)")
 _NUMBERS = re.compile(r"(U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?|FLOAT|DOUBLE|DECIMAL\(.*\))\[\d*\]")
+_EXACT = {
+    "BIGINT": "DOUBLE",
+    "DATE": "TIMESTAMP",
+    "TIMESTAMP": "TIMESTAMP WITH TIME ZONE",
+}
+"""DuckDB type of a CSV column to the type that keeps what a cast to it would cut off."""
+_MAX_FAULT = 300
+"""Most characters of a message of DuckDB, which may quote values of any length."""
 
 MAX_FLOAT = 3.4028235e38
 
@@ -165,7 +173,34 @@ def _columns(connection: duckdb.DuckDBPyConnection, file: Path) -> tuple[tuple[s
         ) from None
     if not first_row:
         raise InputError(f"{file} is empty (0 rows); remove it from the input or fetch it again")
-    return tuple((str(name), str(kind)) for name, kind, *_ in types)
+    columns = tuple((str(name), str(kind)) for name, kind, *_ in types)
+    return columns if file.suffix == ".parquet" else _of_all_rows(connection, file, columns)
+
+
+def _of_all_rows(
+    connection: duckdb.DuckDBPyConnection, file: Path, types: tuple[tuple[str, str], ...]
+) -> tuple[tuple[str, str], ...]:
+    """Types of the columns of a CSV file, given those that DuckDB told from its first rows.
+
+    In later rows it would round 0.25 to a whole number, and cut the hour off a date, without an
+    error. For values of another kind there is one, when they are read.
+    """
+    exact = {name: _EXACT[kind] for name, kind in types if kind in _EXACT}
+    if not exact:
+        return types
+    as_text = Table((file,), tuple((n, "VARCHAR" if n in exact else kind) for n, kind in types))
+    source = f"{as_text.source[:-1]}, ignore_errors = true)"
+    lossy = ", ".join(
+        f"bool_or(TRY_CAST({quoted(name)} AS {exact[name]}) <> TRY_CAST({quoted(name)} AS {kind}))"
+        for name, kind in types
+        if name in exact
+    )
+    try:
+        (row,) = connection.sql(f"SELECT {lossy} FROM {source}").fetchall()
+    except duckdb.Error:
+        return types  # reading the rows tells what is wrong with the file
+    wider = {name for name, lost in zip(exact, row, strict=True) if lost}
+    return tuple((name, exact[name] if name in wider else kind) for name, kind in types)
 
 
 def bind(
@@ -260,7 +295,10 @@ def explained(
         if fault := _CSV_FAULT.search(message):
             column = _CSV_COLUMN.search(message)
             detail = f"column {column[1]}: {column[2]}" if column else _first_line(error)
-            raise InputError(f"{fault[2]}, line {fault[1]}: {detail}; correct the line") from None
+            raise InputError(
+                f"{fault[2]}, line {fault[1]}: {detail:.{_MAX_FAULT}}; correct the line, or write "
+                "the log as Parquet, where a column states its type"
+            ) from None
         for file, fault_line in _unreadable(connection, tables):
             raise InputError(
                 f"{file} cannot be read, it may be damaged ({fault_line}); fetch it again"
@@ -299,4 +337,4 @@ def _unreadable(
 
 
 def _first_line(error: Exception) -> str:
-    return str(error).splitlines()[0]
+    return f"{str(error).splitlines()[0]:.{_MAX_FAULT}}"

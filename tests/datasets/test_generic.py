@@ -5,7 +5,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from ucfrec.logs.mapping import FeatureTable, LogMapping, log_files
+from ucfrec.errors import InputError
+from ucfrec.logs.mapping import FeatureTable, LogMapping, log_files, read_mapping
 from ucfrec.logs.prepare import validate
 from ucfrec_datasets import generic
 
@@ -44,3 +45,24 @@ def test_folders_called_like_tables_are_tables(tmp_path: Path, given: str) -> No
     assert mapping.item_features == (FeatureTable((items,), "item_id"),)
     assert validate(files, mapping)["rows_read"] == 40
     assert log_files([tmp_path / "items.parquet"]) == (items,)
+
+
+def test_feature_tables_of_the_mapping_are_no_log(tmp_path: Path) -> None:
+    make_log().to_parquet(tmp_path / "log.parquet")
+    ITEMS.to_parquet(tmp_path / "videos.parquet")
+    (tmp_path / "m.toml").write_text(
+        f'[[item_features]]\nfiles = ["../{tmp_path.name}/videos.parquet"]\nkey = "item_id"\n'
+        '[[user_features]]\nfiles = ["log.parquet"]\nkey = "user_id"\nfirst_by = "timestamp"\n'
+        'columns = ["item_id"]\n'
+    )
+    mapping = read_mapping(tmp_path / "m.toml")
+    files, resolved = generic.DATASET.resolve([tmp_path], mapping)
+    assert files == (tmp_path / "log.parquet",)
+    assert resolved == mapping
+    assert validate(files, resolved)["rows_read"] == 40
+
+
+def test_a_log_called_like_features_is_told_of(tmp_path: Path) -> None:
+    make_log().to_parquet(tmp_path / "users.parquet")
+    with pytest.raises(InputError, match=r"users.parquet: every file is called .* rename it"):
+        generic.DATASET.resolve([tmp_path], LogMapping())

@@ -47,6 +47,7 @@ def test_ids_of_another_type_are_found(
         ([1, 2, 12], [21, 22, 23, 24], r"item_id of the log, which are 1, 2, 12, …, and key is 21"),
         ([1, 2, 12], ["i1", "i2", "i12"], r"key is never such an id; let the key be"),
         ([1, 2, 12], [1.4, 2.4, 11.6], r"key is never such an id"),
+        ([2**53, 2**53 + 2], [2.0**53, 2.0**53 + 2], r"key is never such an id"),
         (["a1", "a2", "a12"], [1, 2, 12], r"which are 'a1', 'a12', 'a2', …, and key is '1', '12'"),
         (["1", "2", "12"], ["01", "02", "012"], r"key is '01', '012', '02', …"),
     ],

@@ -662,6 +662,78 @@ def test_sessions_by_a_column_that_no_file_has_are_refused(tmp_path: Path) -> No
         validate([path], LogMapping(session_by="session_id"))
 
 
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"gap_minutes": np.inf},
+        {"gap_minutes": np.nan},
+        {"gap_minutes": -1.0},
+        {"min_steps": np.nan},
+        {"embedding_size": np.nan},
+        {"split": (0.0, np.inf)},
+        {"split": (-np.inf, 0.0)},
+        {"split": (np.nan, np.nan)},
+    ],
+)
+def test_numbers_that_are_none_are_refused(given: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=rf"{next(iter(given))}.* (above 0|infinite|two times)"):
+        PrepareOptions(**given)
+
+
+def test_a_huge_gap_never_ends_a_session(tmp_path: Path) -> None:
+    path = write(make_log(users=4), tmp_path / "log.parquet")
+    assert validate([path], LogMapping(), PrepareOptions(gap_minutes=1e300))["sessions"] == 4
+
+
+@pytest.mark.parametrize("folder", ["logs [1]", "a*b?", "it's {x,y}", "~", "$HOME"])
+def test_globs_of_a_mapping_are_relative_to_a_folder_of_any_name(
+    tmp_path: Path, folder: str
+) -> None:
+    here = tmp_path / folder
+    here.mkdir()
+    write(make_log(), here / "log [1].parquet")
+    write(pd.DataFrame({"item_id": range(12), "price": range(12)}), here / "videos [1].csv")
+    for files in ("videos*.csv", "videos [1].csv"):
+        lines = f'[[item_features]]\nfiles = ["{files}"]\nkey = "item_id"\n'
+        (here / "mapping.toml").write_text(lines)
+        mapping = read_mapping(here / "mapping.toml")
+        assert validate([here / "log [1].parquet"], mapping)["rows_read"] == 660
+
+
+def test_a_single_path_is_one_log(tmp_path: Path) -> None:
+    path = write(make_log(), tmp_path / "log.parquet")
+    assert log_files(str(path)) == (path,)
+
+
+def test_a_path_that_no_pattern_matches_is_refused(tmp_path: Path) -> None:
+    path = write(make_log(), tmp_path / "a\\[b].parquet")
+    with pytest.raises(InputError, match=r"backslash and .*; rename it"):
+        validate([path], LogMapping())
+
+
+def test_ids_of_any_size_stay_apart(tmp_path: Path) -> None:
+    for first, kind in ((2**64 - 12, "uint64"), (-(2**63), "int64"), (2**53, "int64")):
+        ids = [first + n for n in range(12)]
+        log = make_log()
+        log["item_id"] = np.array(ids, dtype=kind)[log["item_id"]]
+        features = pd.DataFrame({"item_id": np.array(ids, dtype=kind), "price": range(12)})
+        table = FeatureTable((write(features, tmp_path / "items.csv"),), "item_id")
+        out = tmp_path / str(first)
+        for name in ("log.parquet", "log.csv"):
+            path = write(log, tmp_path / name)
+            prepare([path], LogMapping(item_features=(table,)), out / name[4:], SMALL)
+            found = pq.read_table(out / name[4:] / "items.parquet")["item_id"].to_pylist()
+            assert sorted(map(int, found)) == ids
+
+
+def test_reals_are_no_ids_and_the_remedy_tells_of_rounding(tmp_path: Path) -> None:
+    log = make_log()
+    log["item_id"] = log["item_id"] + 2.0**53
+    path = write(log, tmp_path / "log.parquet")
+    with pytest.raises(InputError, match=r"is DOUBLE; .*at most 15 digits: others would be round"):
+        validate([path], LogMapping())
+
+
 @pytest.mark.parametrize("name", ["files", "columns"])
 def test_one_name_in_place_of_a_list_is_refused(tmp_path: Path, name: str) -> None:
     """Its letters had been taken for names."""

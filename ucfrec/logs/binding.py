@@ -157,6 +157,10 @@ def open_tables(connection: duckdb.DuckDBPyConnection, files: Sequence[Path]) ->
 def _columns(connection: duckdb.DuckDBPyConnection, file: Path) -> tuple[tuple[str, str], ...]:
     if file.stat().st_size == 0:
         raise InputError(f"{file} is empty (0 bytes); remove it from the input or fetch it again")
+    if "\\" in str(file) and _MAGIC.search(str(file)):
+        raise InputError(
+            f"{file} cannot be read: its path has a backslash and [, * or ?; rename it"
+        )
     if file.suffix == ".gz":
         require_plausible_size(file)
     source = Table((file,), ()).source.replace(", types = {}", "")

@@ -1,6 +1,7 @@
 """Read the features of items and users into DuckDB tables."""
 
 from collections.abc import Sequence
+from typing import Final
 
 import duckdb
 
@@ -15,6 +16,9 @@ from ucfrec.logs.binding import (
     wrong_type,
 )
 from ucfrec.logs.mapping import FeatureTable, log_files
+
+_WHOLE: Final = {"FLOAT": 2**24, "DOUBLE": 2**53}
+"""DuckDB type of reals to the bound below which it holds every whole number."""
 
 
 def load_features(
@@ -114,8 +118,10 @@ def _listed(rows: Sequence[tuple[object, ...]]) -> str:
 def _as_id(key: str, key_type: str, id_type: str) -> str:
     """SQL that casts a key to an id type, NULL where no cast does."""
     if is_number(key_type) and not is_integer(key_type):
-        # 12.0 is the text '12' and no other; a cast of 12.4 would round it to another id.
-        key = f"CASE WHEN {key} = trunc({key}) THEN TRY_CAST({key} AS HUGEINT) END"
+        # 12.0 is the text '12' and no other; a cast of 12.4 would round it to another id, as the
+        # file did with whole numbers that its type does not hold.
+        exact = f"AND abs({key}) < {_WHOLE[key_type]}" if key_type in _WHOLE else ""
+        key = f"CASE WHEN {key} = trunc({key}) {exact} THEN TRY_CAST({key} AS HUGEINT) END"
     return f"TRY_CAST({key} AS {id_type})"
 
 

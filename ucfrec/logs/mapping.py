@@ -152,7 +152,7 @@ def read_mapping(path: Path) -> LogMapping:
             given[kind] = tuple(
                 replace(
                     table,
-                    files=tuple(path.parent / file for file in table.files),
+                    files=tuple(_beside(path, file) for file in table.files),
                     key=Expression(table.key, str(path)),
                     columns=tuple(Expression(column, str(path)) for column in table.columns),
                     first_by=Expression(table.first_by, str(path)),
@@ -164,11 +164,23 @@ def read_mapping(path: Path) -> LogMapping:
         raise InputError(f"{path}: {error}") from None
 
 
+def _beside(mapping: Path, file: str | Path) -> Path:
+    """A file or glob that a mapping file names, relative to its folder."""
+    named = mapping.parent / file
+    if named.exists() or not glob.has_magic(str(file)):
+        return named
+    # The folder is no pattern, even if it is called "logs [1]".
+    return Path(glob.escape(str(mapping.parent))) / file
+
+
 def log_files(paths: Sequence[str | Path]) -> tuple[Path, ...]:
     """List the log files among files, folders and globs, each once.
 
     In a folder, and among the matches of a glob, a folder called like a table (`log.parquet`) is
     one: its files are its parts.
+
+    Args:
+        paths: of files, folders and globs; or a single one.
 
     Returns:
         Files in the order of `paths`; those of one folder or glob by name.
@@ -177,7 +189,8 @@ def log_files(paths: Sequence[str | Path]) -> tuple[Path, ...]:
         InputError: a path is missing, matches no log file, or is a file of another kind.
     """
     files: dict[Path, None] = {}
-    for path in paths:
+    # A text is a sequence of texts, too: its characters.
+    for path in [paths] if isinstance(paths, str) else paths:
         matches = _matches(Path(path))
         if not matches:
             raise InputError(f"{path} matches no {' or '.join(SUFFIXES)} file; check the path")

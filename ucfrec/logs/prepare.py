@@ -5,6 +5,7 @@ rows in batches: faults and duplicates (`sorted_rows`), sessions (`sessions`), c
 and the store (`steps`).
 """
 
+import math
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -98,9 +99,12 @@ class PrepareOptions:
             raise InputError(f"session_by is {self.session_by!r}; use {', '.join(SESSIONS)}")
         if self.duplicates not in DUPLICATES:
             raise InputError(f"duplicates is {self.duplicates!r}; use {', '.join(DUPLICATES)}")
-        if not self.gap_minutes > 0 or self.min_steps < 1 or self.embedding_size < 1:
+        if not (self.gap_minutes > 0 and self.min_steps >= 1 and self.embedding_size >= 1):
             raise InputError("gap_minutes, min_steps and embedding_size must be above 0")
-        times = len(self.split) == 2 and self.split[0] <= self.split[1]
+        if self.gap_minutes == math.inf:
+            raise InputError("gap_minutes is infinite; use session_by='user' for sessions of users")
+        finite = all(math.isfinite(bound) for bound in self.split)
+        times = finite and len(self.split) == 2 and self.split[0] <= self.split[1]
         shares = len(self.split) == 3 and min(self.split) >= 0 and self.split[0] > 0
         if not times and not (shares and abs(sum(self.split) - 1) < 1e-9):
             raise InputError(

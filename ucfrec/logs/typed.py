@@ -281,7 +281,9 @@ def _typed(table: Table, name: str, given: str, sql: str, kind: str) -> tuple[st
     if name in (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID):
         if is_integer(kind) or kind in ("VARCHAR", "UUID"):
             return sql, kind
-        wanted = f"use integers or text, e.g. --column {name}='{given}::BIGINT'"
+        wanted = f"use integers or text, e.g. --column {name}='({given})::BIGINT'"
+        if is_number(kind):
+            wanted += ", if all are whole numbers of at most 15 digits: others would be rounded"
     elif name == schema.TIMESTAMP:
         if is_number(kind):
             return f"TRY_CAST(round({sql}) AS BIGINT)", "BIGINT"

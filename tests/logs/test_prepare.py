@@ -1,9 +1,11 @@
 """From log files to episodes: nothing lost unseen, nothing leaked, nothing half-written."""
 
 import errno
+import json
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,7 +23,7 @@ from safetensors import SafetensorError
 from ucfrec import progress, schema
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.writer import StoreWriter
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.logs.histories import read_histories
 from ucfrec.logs.mapping import FeatureTable, LogMapping, columns_given, log_files, read_mapping
 from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, validate
@@ -587,6 +589,22 @@ def test_files_of_different_make_are_read_together(tmp_path: Path) -> None:
     assert stores[0]["fingerprint"] == stores[1]["fingerprint"]
 
 
+def test_an_optional_column_of_some_files_is_left_out_with_a_note(tmp_path: Path) -> None:
+    log = make_log().drop(columns="propensity")
+    paths = [write(log.iloc[n::3], tmp_path / f"{n}.parquet") for n in range(3)]
+    write(log.iloc[1::3].assign(SESSION_ID=1, is_random=1), paths[1])
+    with pytest.warns(InputNote) as told:
+        report = validate(paths, LogMapping())
+    assert report["session_by"] == "gap"
+    notes = [str(note.message) for note in told if note.category is InputNote]
+    assert [note.partition(" is ")[0] for note in notes] == ["session_id", "is_random"]
+    assert f"only 1 of 3 files have it ({paths[1]})" in notes[0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", InputNote)
+        validate(paths, LogMapping({"session_id": "", "is_random": ""}))
+        validate([paths[1]], LogMapping())
+
+
 def test_generic_takes_features_from_files_called_items_and_users(tmp_path: Path) -> None:
     write(make_log(), tmp_path / "log.parquet")
     write(pd.DataFrame({"item_id": range(20), "price": range(20)}), tmp_path / "items.csv")
@@ -619,6 +637,111 @@ def test_a_mapping_is_read_from_toml(tmp_path: Path) -> None:
     (tmp_path / "bad.toml").write_text("rewards = 'x'\n")
     with pytest.raises(InputError, match=r"bad.toml: .*rewards"):
         read_mapping(tmp_path / "bad.toml")
+
+
+@pytest.mark.parametrize("given", ["gpa", "Gap", "", "visit", 3, ["gap"]])
+def test_sessions_of_a_mapping_are_formed_in_a_known_way(tmp_path: Path, given: Any) -> None:
+    """An unknown one had made one session of each user."""
+    (tmp_path / "mapping.toml").write_text(f"session_by = {json.dumps(given)}\n")
+    for make in (
+        lambda: LogMapping(session_by=given),
+        lambda: read_mapping(tmp_path / "mapping.toml"),
+    ):
+        with pytest.raises(InputError, match=r"session_by is .*; use session_id, gap, user"):
+            make()
+
+
+def test_sessions_by_a_column_that_no_file_has_are_refused(tmp_path: Path) -> None:
+    path = write(make_log(), tmp_path / "log.parquet")
+    with pytest.raises(InputError, match=r"no column 'session_id'"):
+        validate([path], LogMapping(session_by="session_id"))
+    path = write(make_log().assign(session_id=0.5), tmp_path / "log.parquet")
+    with pytest.raises(
+        InputError, match=r"session_id \(session_id\) is DOUBLE; use integers or text"
+    ):
+        validate([path], LogMapping(session_by="session_id"))
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"gap_minutes": np.inf},
+        {"gap_minutes": np.nan},
+        {"gap_minutes": -1.0},
+        {"min_steps": np.nan},
+        {"embedding_size": np.nan},
+        {"split": (0.0, np.inf)},
+        {"split": (-np.inf, 0.0)},
+        {"split": (np.nan, np.nan)},
+    ],
+)
+def test_numbers_that_are_none_are_refused(given: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=rf"{next(iter(given))}.* (above 0|infinite|two times)"):
+        PrepareOptions(**given)
+
+
+def test_a_huge_gap_never_ends_a_session(tmp_path: Path) -> None:
+    path = write(make_log(users=4), tmp_path / "log.parquet")
+    assert validate([path], LogMapping(), PrepareOptions(gap_minutes=1e300))["sessions"] == 4
+
+
+@pytest.mark.parametrize("folder", ["logs [1]", "a*b?", "it's {x,y}", "~", "$HOME"])
+def test_globs_of_a_mapping_are_relative_to_a_folder_of_any_name(
+    tmp_path: Path, folder: str
+) -> None:
+    here = tmp_path / folder
+    here.mkdir()
+    write(make_log(), here / "log [1].parquet")
+    write(pd.DataFrame({"item_id": range(12), "price": range(12)}), here / "videos [1].csv")
+    for files in ("videos*.csv", "videos [1].csv"):
+        lines = f'[[item_features]]\nfiles = ["{files}"]\nkey = "item_id"\n'
+        (here / "mapping.toml").write_text(lines)
+        mapping = read_mapping(here / "mapping.toml")
+        assert validate([here / "log [1].parquet"], mapping)["rows_read"] == 660
+
+
+def test_a_single_path_is_one_log(tmp_path: Path) -> None:
+    path = write(make_log(), tmp_path / "log.parquet")
+    assert log_files(str(path)) == (path,)
+
+
+def test_a_path_that_no_pattern_matches_is_refused(tmp_path: Path) -> None:
+    path = write(make_log(), tmp_path / "a\\[b].parquet")
+    with pytest.raises(InputError, match=r"backslash and .*; rename it"):
+        validate([path], LogMapping())
+
+
+def test_ids_of_any_size_stay_apart(tmp_path: Path) -> None:
+    for first, kind in ((2**64 - 12, "uint64"), (-(2**63), "int64"), (2**53, "int64")):
+        ids = [first + n for n in range(12)]
+        log = make_log()
+        log["item_id"] = np.array(ids, dtype=kind)[log["item_id"]]
+        features = pd.DataFrame({"item_id": np.array(ids, dtype=kind), "price": range(12)})
+        table = FeatureTable((write(features, tmp_path / "items.csv"),), "item_id")
+        out = tmp_path / str(first)
+        for name in ("log.parquet", "log.csv"):
+            path = write(log, tmp_path / name)
+            prepare([path], LogMapping(item_features=(table,)), out / name[4:], SMALL)
+            found = pq.read_table(out / name[4:] / "items.parquet")["item_id"].to_pylist()
+            assert sorted(map(int, found)) == ids
+
+
+def test_reals_are_no_ids_and_the_remedy_tells_of_rounding(tmp_path: Path) -> None:
+    log = make_log()
+    log["item_id"] = log["item_id"] + 2.0**53
+    path = write(log, tmp_path / "log.parquet")
+    with pytest.raises(InputError, match=r"is DOUBLE; .*at most 15 digits: others would be round"):
+        validate([path], LogMapping())
+
+
+@pytest.mark.parametrize("name", ["files", "columns"])
+def test_one_name_in_place_of_a_list_is_refused(tmp_path: Path, name: str) -> None:
+    """Its letters had been taken for names."""
+    table = {"files": '["items.csv"]', "columns": '["price"]', name: '"price"'}
+    lines = "\n".join(f"{field} = {value}" for field, value in table.items())
+    (tmp_path / "m.toml").write_text(f'[[item_features]]\nkey = "item_id"\n{lines}\n')
+    with pytest.raises(InputError, match=rf"m.toml: {name} of features is 'price'; write a list"):
+        read_mapping(tmp_path / "m.toml")
 
 
 @pytest.mark.parametrize(

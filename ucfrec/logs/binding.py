@@ -23,7 +23,16 @@ _CSV_FAULT = re.compile(r"CSV Error on Line: (\d+).*?\n\s*file = ([^\n]+)", re.D
 _CSV_COLUMN = re.compile(r'converting column "([^"]+)"\. ([^\n]+)')
 _INTEGER = re.compile(r"U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?")
 _REAL = re.compile(r"FLOAT|DOUBLE|DECIMAL.*")
+_NARROW = re.compile(r"(U?(?:TINY|SMALL)INT|U?INTEGER)((?:\[\d*\])*)")
 _NUMBERS = re.compile(r"(U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?|FLOAT|DOUBLE|DECIMAL\(.*\))\[\d*\]")
+_EXACT = {
+    "BIGINT": "DOUBLE",
+    "DATE": "TIMESTAMP",
+    "TIMESTAMP": "TIMESTAMP WITH TIME ZONE",
+}
+"""DuckDB type of a CSV column to the type that keeps what a cast to it would cut off."""
+_MAX_FAULT = 300
+"""Most characters of a message of DuckDB, which may quote values of any length."""
 
 MAX_FLOAT = 3.4028235e38
 
@@ -34,12 +43,12 @@ class Table:
 
     files: tuple[Path, ...]
     types: tuple[tuple[str, str], ...]
-    """(name, DuckDB type) of each column."""
+    """(name, DuckDB type) of each column in the files."""
 
     @property
     def columns(self) -> dict[str, str]:
-        """Column name to DuckDB type."""
-        return dict(self.types)
+        """Column name to DuckDB type, as `sql` gives it."""
+        return {name: _computed_as(kind) for name, kind in self.types}
 
     @property
     def columnar(self) -> bool:
@@ -48,12 +57,42 @@ class Table:
 
     @property
     def sql(self) -> str:
+        """SQL of the rows: NaN is missing, integers of fewer than 64 bits have 64."""
+        read = {name: _read(quoted(name), kind) for name, kind in self.types}
+        changed = ", ".join(
+            f"{sql} AS {quoted(name)}" for name, sql in read.items() if sql != quoted(name)
+        )
+        return f"(SELECT * REPLACE ({changed}) FROM {self.source})" if changed else self.source
+
+    @property
+    def source(self) -> str:
         """SQL call of the DuckDB table function that reads the files."""
         files = ", ".join(text(glob_pattern(file)) for file in self.files)
         if self.columnar:
             return f"read_parquet([{files}])"
         types = ", ".join(f"{text(name)}: {text(kind)}" for name, kind in self.types)
         return f"read_csv([{files}], header = true, types = {{{types}}})"
+
+
+def _computed_as(kind: str) -> str:
+    """The DuckDB type that expressions compute with, given that of a column.
+
+    DuckDB multiplies two columns of 8 bits in 8 bits, and takes unsigned numbers from each other
+    without a sign: where that overflows, a reward would be undefined.
+    """
+    if kind == "UBIGINT":
+        return "HUGEINT"
+    return _NARROW.sub(r"BIGINT\2", kind) if _NARROW.fullmatch(kind) else kind
+
+
+def _read(column: str, kind: str) -> str:
+    """SQL of a quoted column of a DuckDB type, as expressions compute with it."""
+    if kind in ("FLOAT", "DOUBLE"):
+        # To DuckDB, NaN is greater than every number: `score > 0.5` would hold. It would leave out
+        # `isnan` here, because the extremes that a Parquet file states tell of no NaN.
+        return f"CASE WHEN isfinite({column}) OR isinf({column}) THEN {column} END"
+    wider = _computed_as(kind)
+    return column if wider == kind else f"CAST({column} AS {wider})"
 
 
 def glob_pattern(file: Path) -> str:
@@ -118,9 +157,13 @@ def open_tables(connection: duckdb.DuckDBPyConnection, files: Sequence[Path]) ->
 def _columns(connection: duckdb.DuckDBPyConnection, file: Path) -> tuple[tuple[str, str], ...]:
     if file.stat().st_size == 0:
         raise InputError(f"{file} is empty (0 bytes); remove it from the input or fetch it again")
+    if "\\" in str(file) and _MAGIC.search(str(file)):
+        raise InputError(
+            f"{file} cannot be read: its path has a backslash and [, * or ?; rename it"
+        )
     if file.suffix == ".gz":
         require_plausible_size(file)
-    source = Table((file,), ()).sql.replace(", types = {}", "")
+    source = Table((file,), ()).source.replace(", types = {}", "")
     try:
         types = connection.sql(f"DESCRIBE SELECT * FROM {source}").fetchall()
         if file.suffix == ".parquet":
@@ -134,7 +177,34 @@ def _columns(connection: duckdb.DuckDBPyConnection, file: Path) -> tuple[tuple[s
         ) from None
     if not first_row:
         raise InputError(f"{file} is empty (0 rows); remove it from the input or fetch it again")
-    return tuple((str(name), str(kind)) for name, kind, *_ in types)
+    columns = tuple((str(name), str(kind)) for name, kind, *_ in types)
+    return columns if file.suffix == ".parquet" else _of_all_rows(connection, file, columns)
+
+
+def _of_all_rows(
+    connection: duckdb.DuckDBPyConnection, file: Path, types: tuple[tuple[str, str], ...]
+) -> tuple[tuple[str, str], ...]:
+    """Types of the columns of a CSV file, given those that DuckDB told from its first rows.
+
+    In later rows it would round 0.25 to a whole number, and cut the hour off a date, without an
+    error. For values of another kind there is one, when they are read.
+    """
+    exact = {name: _EXACT[kind] for name, kind in types if kind in _EXACT}
+    if not exact:
+        return types
+    as_text = Table((file,), tuple((n, "VARCHAR" if n in exact else kind) for n, kind in types))
+    source = f"{as_text.source[:-1]}, ignore_errors = true)"
+    lossy = ", ".join(
+        f"bool_or(TRY_CAST({quoted(name)} AS {exact[name]}) <> TRY_CAST({quoted(name)} AS {kind}))"
+        for name, kind in types
+        if name in exact
+    )
+    try:
+        (row,) = connection.sql(f"SELECT {lossy} FROM {source}").fetchall()
+    except duckdb.Error:
+        return types  # reading the rows tells what is wrong with the file
+    wider = {name for name, lost in zip(exact, row, strict=True) if lost}
+    return tuple((name, exact[name] if name in wider else kind) for name, kind in types)
 
 
 def bind(
@@ -160,7 +230,9 @@ def bind(
     if _NAME.fullmatch(given):
         raise InputError(_missing(table, what, given))
     sql = f"({given}\n)"
-    like = ", ".join(f"CAST(NULL AS {kind}) AS {quoted(name)}" for name, kind in table.types)
+    like = ", ".join(
+        f"CAST(NULL AS {kind}) AS {quoted(name)}" for name, kind in table.columns.items()
+    )
     try:
         # DuckDB would read some names that are not columns as the current user or time.
         used = columns_of(connection, given)
@@ -227,7 +299,10 @@ def explained(
         if fault := _CSV_FAULT.search(message):
             column = _CSV_COLUMN.search(message)
             detail = f"column {column[1]}: {column[2]}" if column else _first_line(error)
-            raise InputError(f"{fault[2]}, line {fault[1]}: {detail}; correct the line") from None
+            raise InputError(
+                f"{fault[2]}, line {fault[1]}: {detail:.{_MAX_FAULT}}; correct the line, or write "
+                "the log as Parquet, where a column states its type"
+            ) from None
         for file, fault_line in _unreadable(connection, tables):
             raise InputError(
                 f"{file} cannot be read, it may be damaged ({fault_line}); fetch it again"
@@ -266,4 +341,4 @@ def _unreadable(
 
 
 def _first_line(error: Exception) -> str:
-    return str(error).splitlines()[0]
+    return f"{str(error).splitlines()[0]:.{_MAX_FAULT}}"

@@ -151,7 +151,12 @@ def as_arrow(numbers: npt.NDArray[np.int64]) -> "pa.Array":
 def _set_semantics(connection: duckdb.DuckDBPyConnection) -> None:
     """Make expressions mean the same in every connection and on every machine."""
     connection.execute("SET enable_progress_bar = false")
+    # A division by zero is NULL, and so is every comparison with it; infinity would be above every
+    # threshold. The logarithm of a negative number is an error, for TRY, instead of NaN.
     connection.execute("SET error_on_division_by_zero = false")
+    connection.execute("SET ieee_floating_point_ops = false")
+    # What an expression computes twice DuckDB would compute once, but outside of its TRY.
+    connection.execute("SET disabled_optimizers = 'common_subexpressions'")
     # Casts from TIMESTAMPTZ to TIMESTAMP use this zone.
     connection.execute("SET TimeZone = 'UTC'")
     # DuckDB's least(x, 5) is 5 if x is NULL, NaN or infinite: a video of unknown length would
@@ -162,6 +167,8 @@ def _set_semantics(connection: duckdb.DuckDBPyConnection) -> None:
             f"isfinite(b::DOUBLE) THEN CASE WHEN a {sign} b THEN a ELSE b END END, "
             f"(a, b, c) AS {name}({name}(a, b), c)"
         )
+    # Tables read NaN as missing (`ucfrec.logs.binding.Table`).
+    connection.execute("CREATE TEMP MACRO isnan(a) AS coalesce(system.main.isnan(a), true)")
 
 
 def _close(connection: duckdb.DuckDBPyConnection, inputs: Iterable[Path], work: str | None) -> None:

@@ -41,7 +41,7 @@ class FrameTable(Table):
         return True
 
     @property
-    def sql(self) -> str:
+    def source(self) -> str:
         return quoted(str(self.files[0]))
 
 

@@ -1,7 +1,7 @@
 """Column mappings of logs, written as data, and the datasets that supply them."""
 
 import glob
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
@@ -19,6 +19,8 @@ OPTIONAL_COLUMNS: Final = (
     schema.SESSION_ID,
     schema.IS_RANDOM,
 )
+SESSIONS: Final = (schema.SESSION_ID, "gap", "user")
+"""Ways in which rows form sessions."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,9 @@ class FeatureTable:
     The type of a column decides how it is encoded: numbers are standardised, dates count as days,
     text and booleans are categories, lists of text or integers are tags, lists of floats are
     vectors. A cast turns a number into a category: `music_type::VARCHAR`.
+
+    Raises:
+        InputError: `files` or `columns` is one name instead of several.
     """
 
     files: tuple[str | Path, ...]
@@ -39,12 +44,22 @@ class FeatureTable:
     """Of rows with the same key, keep the one with the lowest value of this column or expression,
     e.g. the first day of daily features. Empty: a repeated key is an error."""
 
+    def __post_init__(self) -> None:
+        for name, given in (("files", self.files), ("columns", self.columns)):
+            if isinstance(given, str | Path):
+                raise InputError(
+                    f"{name} of features is {str(given)!r}; write a list: [{str(given)!r}]"
+                )
+
 
 @dataclass(frozen=True)
 class LogMapping:
     """Which columns of the files are the log columns, the reward and the features.
 
     Example: `LogMapping({"item_id": "video_id", "timestamp": "time_s * 1000"}, reward="is_click")`.
+
+    Raises:
+        InputError: `columns` names no log column, or `session_by` is none of `SESSIONS`.
     """
 
     columns: Mapping[str, str] = field(default_factory=dict)
@@ -64,6 +79,11 @@ class LogMapping:
         for name in self.columns:
             if name not in known:
                 raise InputError(f"{name!r} is no log column; use one of {', '.join(known)}")
+        if self.session_by not in (None, *SESSIONS):
+            raise InputError(
+                f"session_by is {self.session_by!r}; use {', '.join(SESSIONS)}, and map a column "
+                f"of sessions as {schema.SESSION_ID}"
+            )
 
     def over(self, defaults: "LogMapping") -> "LogMapping":
         """This mapping, with its empty fields filled from `defaults`."""
@@ -132,7 +152,7 @@ def read_mapping(path: Path) -> LogMapping:
             given[kind] = tuple(
                 replace(
                     table,
-                    files=tuple(path.parent / file for file in table.files),
+                    files=tuple(_beside(path, file) for file in table.files),
                     key=Expression(table.key, str(path)),
                     columns=tuple(Expression(column, str(path)) for column in table.columns),
                     first_by=Expression(table.first_by, str(path)),
@@ -144,8 +164,23 @@ def read_mapping(path: Path) -> LogMapping:
         raise InputError(f"{path}: {error}") from None
 
 
+def _beside(mapping: Path, file: str | Path) -> Path:
+    """A file or glob that a mapping file names, relative to its folder."""
+    named = mapping.parent / file
+    if named.exists() or not glob.has_magic(str(file)):
+        return named
+    # The folder is no pattern, even if it is called "logs [1]".
+    return Path(glob.escape(str(mapping.parent))) / file
+
+
 def log_files(paths: Sequence[str | Path]) -> tuple[Path, ...]:
     """List the log files among files, folders and globs, each once.
+
+    In a folder, and among the matches of a glob, a folder called like a table (`log.parquet`) is
+    one: its files are its parts.
+
+    Args:
+        paths: of files, folders and globs; or a single one.
 
     Returns:
         Files in the order of `paths`; those of one folder or glob by name.
@@ -154,7 +189,8 @@ def log_files(paths: Sequence[str | Path]) -> tuple[Path, ...]:
         InputError: a path is missing, matches no log file, or is a file of another kind.
     """
     files: dict[Path, None] = {}
-    for path in paths:
+    # A text is a sequence of texts, too: its characters.
+    for path in [paths] if isinstance(paths, str) else paths:
         matches = _matches(Path(path))
         if not matches:
             raise InputError(f"{path} matches no {' or '.join(SUFFIXES)} file; check the path")
@@ -164,16 +200,33 @@ def log_files(paths: Sequence[str | Path]) -> tuple[Path, ...]:
     return tuple(files)
 
 
+def table_name(file: Path) -> str:
+    """Name of the table that a file is, or is a part of: Spark writes folders `items.parquet/`."""
+    folder = file.parent.name
+    return folder if folder.endswith(SUFFIXES) else file.name
+
+
 def _matches(path: Path) -> list[Path]:
     if path.is_dir():
-        return sorted(p for p in path.iterdir() if is_table(p) and not p.name.startswith("."))
+        return _tables(path.iterdir())
     if path.is_file():
         if not is_table(path):
             raise InputError(f"{path} is not a {' or '.join(SUFFIXES)} file; convert it first")
         return [path]
     if not glob.has_magic(str(path)):
         raise InputError(f"{path} does not exist; check the path")
-    return sorted(p for p in map(Path, glob.glob(str(path), recursive=True)) if is_table(p))
+    return _tables(map(Path, glob.glob(str(path), recursive=True)))
+
+
+def _tables(paths: Iterable[Path]) -> list[Path]:
+    """Tables among paths, by name; of a folder that is called like one, the tables in it."""
+    found: list[Path] = []
+    for path in sorted(p for p in paths if not p.name.startswith(".")):
+        if path.name.endswith(SUFFIXES) and path.is_dir():
+            found += sorted(p for p in path.iterdir() if is_table(p) and p.name[0] != ".")
+        elif is_table(path):
+            found.append(path)
+    return found
 
 
 def is_table(path: Path) -> bool:

@@ -5,6 +5,7 @@ rows in batches: faults and duplicates (`sorted_rows`), sessions (`sessions`), c
 and the store (`steps`).
 """
 
+import math
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -26,7 +27,7 @@ from ucfrec.logs.binding import explained, open_tables
 from ucfrec.logs.clean import DUPLICATES, require_rows
 from ucfrec.logs.distributions import RewardPasses, distributions
 from ucfrec.logs.engine import engine
-from ucfrec.logs.feature_tables import load_features
+from ucfrec.logs.feature_tables import load_features, require_known_ids
 from ucfrec.logs.ids import (
     EPISODE_USERS,
     ID_TABLES,
@@ -37,10 +38,10 @@ from ucfrec.logs.ids import (
     write_episode_users,
     write_ids,
 )
-from ucfrec.logs.mapping import LogMapping, log_files
+from ucfrec.logs.mapping import SESSIONS, FeatureTable, LogMapping, log_files
 from ucfrec.logs.measures import Measures, binned_rewards, measure, sampled_rewards
 from ucfrec.logs.order import count_unsorted
-from ucfrec.logs.sessions import SESSIONS, Cut, Episodes, by_sessions, episodes, split_bounds
+from ucfrec.logs.sessions import Cut, Episodes, by_sessions, episodes, split_bounds
 from ucfrec.logs.sorted_rows import SortedRows, check_sorted, sorted_batches
 from ucfrec.logs.spool import Spool
 from ucfrec.logs.steps import StepNumbers, write_steps
@@ -98,9 +99,12 @@ class PrepareOptions:
             raise InputError(f"session_by is {self.session_by!r}; use {', '.join(SESSIONS)}")
         if self.duplicates not in DUPLICATES:
             raise InputError(f"duplicates is {self.duplicates!r}; use {', '.join(DUPLICATES)}")
-        if not self.gap_minutes > 0 or self.min_steps < 1 or self.embedding_size < 1:
+        if not (self.gap_minutes > 0 and self.min_steps >= 1 and self.embedding_size >= 1):
             raise InputError("gap_minutes, min_steps and embedding_size must be above 0")
-        times = len(self.split) == 2 and self.split[0] <= self.split[1]
+        if self.gap_minutes == math.inf:
+            raise InputError("gap_minutes is infinite; use session_by='user' for sessions of users")
+        finite = all(math.isfinite(bound) for bound in self.split)
+        times = finite and len(self.split) == 2 and self.split[0] <= self.split[1]
         shares = len(self.split) == 3 and min(self.split) >= 0 and self.split[0] > 0
         if not times and not (shares and abs(sum(self.split) - 1) < 1e-9):
             raise InputError(
@@ -282,6 +286,7 @@ def _prepared(
                 stage.update()
                 features = _features(log, mapping, like)
                 number_ids(log, measures, features, like)
+                _require_known_ids(log, mapping, features)
                 report = _report(rows, spool, cut, measures)
                 report = {"reward": reward, **report, "duplicates": options.duplicates}
                 stage.update()
@@ -317,12 +322,21 @@ def _features(log: TypedLog, mapping: LogMapping, like: Path | None) -> Features
         return {}
     return {
         name: load_features(log.connection, tables, name, log.id_type(name))
-        for name, tables in (
-            (schema.USER_ID, mapping.user_features),
-            (schema.ITEM_ID, mapping.item_features),
-        )
+        for name, tables in _feature_tables(mapping).items()
         if name in log.columns
     }
+
+
+def _feature_tables(mapping: LogMapping) -> dict[str, tuple[FeatureTable, ...]]:
+    return {schema.USER_ID: mapping.user_features, schema.ITEM_ID: mapping.item_features}
+
+
+def _require_known_ids(log: TypedLog, mapping: LogMapping, features: Features) -> None:
+    """Check that feature tables tell of users and items of the log; after `number_ids`."""
+    kept = {name: f"kept_{table}" for name, table, _ in ID_TABLES}
+    for name, names in features.items():
+        tables = _feature_tables(mapping)[name]
+        require_known_ids(log.connection, tables, names, name, kept[name])
 
 
 def _other_inputs(mapping: LogMapping, like: Path | None) -> Iterator[Path]:

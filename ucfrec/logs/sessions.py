@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,16 +17,13 @@ Array = npt.NDArray[Any]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 
-SESSIONS: Final = (schema.SESSION_ID, "gap", "user")
-"""Ways in which rows form sessions."""
-
 
 @dataclass(frozen=True)
 class Cut:
     """How rows form episodes."""
 
     session_by: str
-    """One of `SESSIONS`."""
+    """One of `ucfrec.logs.mapping.SESSIONS`."""
     gap_ms: int
     """With "gap": a longer pause (ms) ends the session."""
     min_steps: int

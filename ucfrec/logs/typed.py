@@ -1,5 +1,6 @@
 """A log as one relation of typed rows: its files, its columns, its reward."""
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Any, Final
 import duckdb
 
 from ucfrec import schema
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.logs.binding import (
     MAX_FLOAT,
     Table,
@@ -97,10 +98,13 @@ def typed_columns(
 ) -> TypedColumns:
     """Resolve the columns and the reward of a log; the arguments are those of `typed_log`.
 
+    Optional columns that only some of the files have are left out, with an `InputNote`.
+
     Raises:
         InputError: a column is missing or of an unsupported type, or an expression cannot be used.
     """
     columns = _present(tables, mapping, session_by)
+    _note_partial(tables, {*columns, *mapping.columns})
     selects = [_select(connection, table, mapping, columns, reward) for table in tables]
     for name in (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID):
         _unify_ids(selects, name)
@@ -224,6 +228,30 @@ def _present(
     return (schema.USER_ID, key, schema.TIMESTAMP, *optional)
 
 
+def _note_partial(tables: Sequence[Table], settled: set[str]) -> None:
+    """Warn of optional columns that some files have and others do not.
+
+    Args:
+        tables: of the log.
+        settled: columns that every file has, and those that the mapping names.
+    """
+    have = {name: _files_with(tables, name) for name in OPTIONAL_COLUMNS if name not in settled}
+    every = sum(len(table.files) for table in tables)
+    for name, files in have.items():
+        if files:
+            warnings.warn(
+                f"{name} is left out: only {len(files)} of {every} files have it ({files[0]}); add "
+                f"it to the others, or drop it with --column {name}=",
+                InputNote,
+                stacklevel=4,
+            )
+
+
+def _files_with(tables: Sequence[Table], name: str) -> list[Path]:
+    named = (t for t in tables if name in {column.casefold() for column in t.columns})
+    return [file for table in named for file in table.files]
+
+
 Select = dict[str, tuple[str, str]]
 """Log column to its (SQL, DuckDB type)."""
 
@@ -253,7 +281,9 @@ def _typed(table: Table, name: str, given: str, sql: str, kind: str) -> tuple[st
     if name in (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID):
         if is_integer(kind) or kind in ("VARCHAR", "UUID"):
             return sql, kind
-        wanted = f"use integers or text, e.g. --column {name}='{given}::BIGINT'"
+        wanted = f"use integers or text, e.g. --column {name}='({given})::BIGINT'"
+        if is_number(kind):
+            wanted += ", if all are whole numbers of at most 15 digits: others would be rounded"
     elif name == schema.TIMESTAMP:
         if is_number(kind):
             return f"TRY_CAST(round({sql}) AS BIGINT)", "BIGINT"
@@ -267,11 +297,11 @@ def _typed(table: Table, name: str, given: str, sql: str, kind: str) -> tuple[st
     elif name == schema.PROPENSITY:
         if is_number(kind):
             valid = f"{sql} > 0 AND {sql} <= {MAX_FLOAT}"
-            return f"CAST(CASE WHEN {valid} THEN {sql} END AS FLOAT)", "FLOAT"
+            return f"TRY(CAST(CASE WHEN {valid} THEN {sql} END AS FLOAT))", "FLOAT"
         wanted = "use a number above 0"
     else:
         if is_number(kind) or kind == "BOOLEAN":
-            return f"coalesce(CAST({sql} AS BOOLEAN), false)", "BOOLEAN"
+            return f"coalesce(TRY(CAST({sql} AS DOUBLE)) = 1, false)", "BOOLEAN"
         wanted = "use a boolean or 0 and 1"
     raise wrong_type(table, name, given, kind, wanted)
 

@@ -1,0 +1,60 @@
+"""Ids of feature tables: those of the log in another type are found, others are refused."""
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from ucfrec.errors import InputError
+from ucfrec.logs.mapping import FeatureTable, LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare, validate
+
+START = 1_700_000_000_000
+OPTIONS = PrepareOptions(split=(1.0, 0.0, 0.0), embedding_size=2)
+
+
+def mapping_of(folder: Path, ids: list[object], keys: list[object]) -> LogMapping:
+    """Write a log of items `ids` and features of items `keys`."""
+    log = pd.DataFrame({"item_id": ids, "user_id": [n % 2 for n in range(len(ids))]})
+    log = log.assign(timestamp=START + log.index, reward=log.index)
+    log.to_parquet(folder / "log.parquet")
+    features = pd.DataFrame({"key": keys, "price": range(len(keys))})
+    features.to_parquet(folder / "features.parquet")
+    table = FeatureTable((folder / "features.parquet",), "key", ("price",))
+    return LogMapping(item_features=(table,))
+
+
+@pytest.mark.parametrize(
+    ("ids", "keys"),
+    [
+        ([1, 2, 12], ["1", "2", "12"]),
+        ([1, 2, 12], [1.0, 2.0, 12.0]),
+        (["1", "2", "12"], [1, 2, 12]),
+        (["1", "2", "12"], [1.0, 2.0, 12.0]),
+    ],
+)
+def test_ids_of_another_type_are_found(
+    tmp_path: Path, ids: list[object], keys: list[object]
+) -> None:
+    mapping = mapping_of(tmp_path, ids, keys)
+    prepare([tmp_path / "log.parquet"], mapping, tmp_path / "store", OPTIONS)
+    assert len(pd.read_parquet(tmp_path / "store" / "items.parquet")) == 3
+
+
+@pytest.mark.parametrize(
+    ("ids", "keys", "message"),
+    [
+        ([1, 2, 12], [21, 22, 23, 24], r"item_id of the log, which are 1, 2, 12, …, and key is 21"),
+        ([1, 2, 12], ["i1", "i2", "i12"], r"key is never such an id; let the key be"),
+        ([1, 2, 12], [1.4, 2.4, 11.6], r"key is never such an id"),
+        ([2**53, 2**53 + 2], [2.0**53, 2.0**53 + 2], r"key is never such an id"),
+        (["a1", "a2", "a12"], [1, 2, 12], r"which are 'a1', 'a12', 'a2', …, and key is '1', '12'"),
+        (["1", "2", "12"], ["01", "02", "012"], r"key is '01', '012', '02', …"),
+    ],
+)
+def test_features_of_nothing_in_the_log_are_refused(
+    tmp_path: Path, ids: list[object], keys: list[object], message: str
+) -> None:
+    mapping = mapping_of(tmp_path, ids, keys)
+    with pytest.raises(InputError, match=rf"features\.parquet: no row belongs to .*{message}"):
+        validate([tmp_path / "log.parquet"], mapping, OPTIONS)

@@ -94,12 +94,13 @@ def read_rates(path: Path) -> dict[str, dict[str, float]]:
 
 
 def write_rates(path: Path, budget: str, rates: Mapping[str, float]) -> None:
-    """Write rates to a file; its tables of other budgets stay.
+    """Write rates to a file; its rates of other budgets and methods stay.
 
     Raises:
         InputError: the file exists and is not of such tables.
     """
-    tables = (read_rates(path) if path.exists() else {}) | {budget: dict(rates)}
+    tables = read_rates(path) if path.exists() else {}
+    tables[budget] = {**tables.get(budget, {}), **rates}
     with atomic_file(path) as scratch:
         scratch.write_text("\n".join(map(format_rates, tables.items())), encoding="utf-8")
 

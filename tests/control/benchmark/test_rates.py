@@ -124,12 +124,16 @@ def test_the_search_writes_rows_and_a_choice_once(
     }
 
 
-def test_a_file_of_rates_keeps_its_other_budgets_and_is_checked(tmp_path: Path) -> None:
+def test_a_file_of_rates_keeps_its_other_rates_and_is_checked(tmp_path: Path) -> None:
     file = tmp_path / "rates.toml"
     write_rates(file, "full", {"dt": 1e-4})
     write_rates(file, "small", {"dt": 1e-2, "ucf": 3e-3})
-    write_rates(file, "full", {"dc": 1e-3})
-    assert read_rates(file) == {"full": {"dc": 0.001}, "small": {"dt": 0.01, "ucf": 0.003}}
+    write_rates(file, "full", {"dt": 2e-4, "iql": 1e-3})
+    write_rates(file, "full", {"dt": 3e-4})
+    assert read_rates(file) == {
+        "full": {"dt": 3e-4, "iql": 1e-3},
+        "small": {"dt": 0.01, "ucf": 0.003},
+    }
     for text, says in (
         ("[small]\nnone = 0.1\n", "none = 0.1 is no learning rate of a method"),
         ("[small]\ndt = 7\n", "dt = 7 is no"),

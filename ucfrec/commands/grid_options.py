@@ -42,11 +42,22 @@ def grid_options(parser: argparse.ArgumentParser, out: str, workers: int) -> Non
     )
 
 
+def seed_given(text: str) -> int:
+    """The value of an option for a seed.
+
+    Raises:
+        ArgumentTypeError: `text` is no whole number from 0 to 2**32 − 1.
+    """
+    if not text.isdecimal() or len(text) > 10 or int(text) >= 2**32:
+        raise argparse.ArgumentTypeError(f"{text:.40} is no whole number from 0 to {2**32 - 1}")
+    return int(text)
+
+
 def evaluation_seed_option(parser: argparse.ArgumentParser) -> None:
     """Add --evaluation-seed."""
     parser.add_argument(
         "--evaluation-seed",
-        type=int,
+        type=seed_given,
         metavar="SEED",
         help="seed of the evaluated episodes, the same for every training seed (default: set by "
         "--budget)",

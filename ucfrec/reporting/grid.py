@@ -78,8 +78,11 @@ def run_grid(
         The rows of all cells, in the order of `cells`.
 
     Raises:
-        InputError: a line of `results` is no result row, or at least one cell failed.
+        InputError: `workers` is below 1, a line of `results` is no result row, or at least one cell
+            failed.
     """
+    if workers < 1:
+        raise InputError(f"--workers is {workers}; at least one is needed")
     tasks: dict[str, _Task[Cell]] = {}
     for cell in cells:
         config = _plain(how.config(cell))

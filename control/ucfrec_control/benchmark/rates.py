@@ -11,7 +11,7 @@ import numpy as np
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files import atomic_file
+from ucfrec.files import atomic_file, read_toml
 from ucfrec.provenance import provenance
 from ucfrec.reporting.grid import Measurement, chosen
 from ucfrec.reporting.result_row import ResultRow, RowKey
@@ -79,10 +79,11 @@ def read_rates(path: Path) -> dict[str, dict[str, float]]:
     Raises:
         InputError: the file is missing, or not of such tables.
     """
-    try:
-        tables: dict[str, dict[str, float]] = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{path} cannot be read ({error}); `rates --toml` writes one") from None
+    tables: dict[str, dict[str, float]] = read_toml(path)
+    if unknown := [budget for budget in tables if budget not in RATES]:
+        raise InputError(
+            f"{path}: no budget is called {unknown[0]:.60}; there are {', '.join(RATES)}"
+        )
     for budget, rates in tables.items():
         for method, rate in rates.items() if isinstance(rates, Mapping) else [("", rates)]:
             if method not in _DIFFERING or not isinstance(rate, float | int) or not 0 < rate < 1:

@@ -52,6 +52,8 @@ def read_scores(path: Path) -> list[ResultRow]:
         InputError: the file is missing or has other content.
     """
     if path.suffix != ".json":
+        if not path.exists():
+            raise InputError(f"{path} does not exist; check the path")
         return read_rows(path)
     rows = read_json(path)
     if not isinstance(rows, list):
@@ -76,7 +78,7 @@ def _evaluated(evaluation: object, where: str) -> ResultRow:
             data_fingerprint=evaluation["fingerprint"],
         )
         row = score_row(evaluation, key).to_json()
-    except (AssertionError, AttributeError, KeyError, TypeError, ValueError):
+    except (AssertionError, AttributeError, KeyError, TypeError, ValueError, OverflowError):
         raise InputError(
             f"{where}, is not a row of `ucfrec-control evaluate --json`; evaluate the run again"
         ) from None

@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from ucfrec.commands.grid_options import seed_given
 from ucfrec.errors import InputError
 from ucfrec.reporting.tables import format_rows
 from ucfrec_control.data.collect import SHOWN as COLLECTED
@@ -24,7 +25,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--size", type=int, default=1_000_000, help="steps of medium and of expert (1000000)"
     )
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=seed_given, default=0)
     parser.add_argument(
         "--agent",
         type=Path,

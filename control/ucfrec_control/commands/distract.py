@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from ucfrec.commands.grid_options import seed_given
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec_control.data.distractor import add_distractor
 
@@ -13,7 +14,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="STORE")
     parser.add_argument("--flip", type=float, default=0.0, help="probability that it is wrong (0)")
     parser.add_argument("--early", action="store_true", help="indicate the next step's reward")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=seed_given, default=0)
 
 
 def run(options: argparse.Namespace) -> None:

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from ucfrec.commands.grid_options import seed_given
 from ucfrec.errors import InputError
 from ucfrec.files import write_json
 from ucfrec.provenance import provenance
@@ -20,7 +21,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
     parser.add_argument("--env", help="environment to play (that of the data)")
     parser.add_argument("--episodes", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=seed_given, default=0)
     parser.add_argument(
         "--target",
         type=target_given,

@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 from pathlib import Path
 
+from ucfrec.commands.grid_options import seed_given
 from ucfrec.counterfactual.screening import describe_screening
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files import write_json
@@ -15,7 +16,7 @@ from ucfrec_control.data.trajectories import PACKAGES
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `screen`."""
     parser.add_argument("store", type=Path, metavar="STORE")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=seed_given, default=0)
     parser.add_argument("--json", type=Path, help="write the report here")
 
 

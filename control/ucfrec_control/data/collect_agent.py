@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from gymnasium.spaces import Box
 
 from ucfrec.errors import InputError
@@ -36,9 +37,10 @@ def collect_agent(
 
     Raises:
         InputError: the agent cannot be read as data or does not fit the environment, which cannot
-            be made; `noise` is negative or `size` below 1; or `out` is complete already.
+            be made; `noise` is negative or not finite, or `size` below 1; or `out` is complete
+            already.
     """
-    if noise < 0 or size < 1:
+    if not 0 <= noise < np.inf or size < 1:
         raise InputError(f"--noise {noise:g} and --size {size}: give at least 0, and at least 1")
     with claimed(out, "filled"):
         remove_leftovers_within(out)

@@ -22,6 +22,38 @@ PACKAGES = ("gymnasium", "mujoco", "gymnasium-robotics", "minari", "h5py")
 """Packages, besides those of the core, whose versions affect numerical results."""
 
 
+def require_source(source: object, where: Path) -> None:
+    """Check what a store or a run says of its data: it may be somebody else's.
+
+    Args:
+        source: as `Trajectories.source`, which a store's and a run's JSON files repeat.
+        where: file or folder that holds it, for the message.
+
+    Raises:
+        InputError: an entry is missing or has another type.
+    """
+    found: Mapping[str, Any] = source if isinstance(source, Mapping) else {}
+    for name, kind in (("dataset", str), ("env_id", str | None), ("versions", Mapping)):
+        if name not in found or not isinstance(found[name], kind):
+            raise _bad_source(where, name, found.get(name))
+    for name, value in found["versions"].items():
+        if not isinstance(value, str):
+            raise _bad_source(where, f"version of {name}", value)
+    if not isinstance(settings := found.get("env_settings", {}), Mapping):
+        raise _bad_source(where, "env_settings", settings)
+    added = found.get("distractors", [])
+    for each in added if isinstance(added, list) else [added]:
+        if not isinstance(each, Mapping) or type(each.get("dimension")) is not int:
+            raise _bad_source(where, "distractors", added)
+
+
+def _bad_source(where: Path, name: str, value: object) -> InputError:
+    return InputError(
+        f"{where} does not describe control data: its {name} is {value!r:.60}; restore it, or "
+        "prepare the data again"
+    )
+
+
 @dataclass(frozen=True)
 class Trajectories:
     """Complete trajectories, concatenated along the first axis.

@@ -9,7 +9,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, damage_explained
 from ucfrec.files import read_json
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.provenance import config_hash
@@ -21,6 +21,7 @@ from ucfrec_control.benchmark.cells import ROBUSTNESS, SCORES
 from ucfrec_control.benchmark.robustness import drops, loss_rises
 from ucfrec_control.benchmark.score_rows import EVALUATE, read_scores
 from ucfrec_control.benchmark.tables import of_best_target
+from ucfrec_control.data.trajectories import require_source
 from ucfrec_control.figures import diagnostics, plots
 from ucfrec_control.learners.evaluate import method_of
 
@@ -90,7 +91,7 @@ def make_figures(
         The files written, and a line for each figure that lacks its data.
 
     Raises:
-        InputError: a file of `results` holds something else.
+        InputError: a folder or file is missing, or holds something else.
     """
     found = _distinguished([run for folder in runs for run in _runs(folder)])
     rows = [row for path in results for row in read_scores(path)]
@@ -124,21 +125,30 @@ def _drawn(plans: Sequence[_Plan], out: Path) -> tuple[list[Path], list[str]]:
 
 
 def _runs(folder: Path) -> Iterator[_Run]:
+    if not folder.is_dir():
+        raise InputError(f"{folder} is no folder of runs; check the path")
     for file in sorted(folder.rglob(RUN)):
         record, path = read_json(file), file.parent
-        if "dataset" not in record:
+        if not isinstance(record, Mapping) or "dataset" not in record:
             continue
-        below, dataset, config = path.relative_to(folder), record["dataset"], record["config"]
-        distracted = " with a distractor" if dataset.get("distractors") else ""
-        yield _Run(
-            path=path,
-            name="-".join(below.parts) or path.resolve().name,
-            group="-".join(below.parent.parts) or dataset["dataset"],
-            method=method_of(record),
-            policy=config["policy_name"],
-            settings=config_hash({**config, "seed": None, "data": record["fingerprint"]}),
-            about=f"{dataset['dataset']}{distracted}",
-        )
+        require_source(record["dataset"], file)
+        with damage_explained(file, "restore it, or train again"):
+            found = _run_of(record, path, path.relative_to(folder))
+        yield found
+
+
+def _run_of(record: Mapping[str, Any], path: Path, below: Path) -> _Run:
+    dataset, config = record["dataset"], record["config"]
+    distracted = " with a distractor" if dataset.get("distractors") else ""
+    return _Run(
+        path=path,
+        name="-".join(below.parts) or path.resolve().name,
+        group="-".join(below.parent.parts) or dataset["dataset"],
+        method=method_of(record),
+        policy=config["policy_name"],
+        settings=config_hash({**config, "seed": None, "data": record["fingerprint"]}),
+        about=f"{dataset['dataset']}{distracted}",
+    )
 
 
 def _distinguished(runs: Sequence[_Run]) -> list[_Run]:

@@ -10,13 +10,14 @@ from gymnasium.vector import VectorEnv
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import rollout
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, damage_explained
 from ucfrec.evaluation.metrics import bootstrap_interval
 from ucfrec.files import read_json
 from ucfrec.provenance import config_hash, without_folders
 from ucfrec.reporting.statistics import summary
 from ucfrec.runs.screened import SCREENING, flagged_columns
 from ucfrec.runs.trained_policy import DROPPED, RUN, TrainedPolicy, learner_of
+from ucfrec_control.data.trajectories import require_source
 from ucfrec_control.learners.presets import find_preset
 from ucfrec_control.learners.rl_baselines import RLPolicy, is_rl
 from ucfrec_control.worlds.environments import (
@@ -90,16 +91,23 @@ def _kept(run: Path, checkpoints: Sequence[str]) -> Sequence[str]:
 
 
 def _is_rl_run(run: Path) -> bool:
-    return (run / RUN).exists() and is_rl(read_json(run / RUN))
+    if not (run / RUN).exists():
+        return False
+    record = read_json(run / RUN)
+    with damage_explained(run / RUN, "restore it, or train again"):
+        return is_rl(record)
 
 
 def load_run(run: Path, checkpoint: str) -> Trained:
     """The policy of a run on a control store.
 
     Raises:
-        InputError: `run` is not on a control store, or has no such checkpoint.
+        InputError: `run` is not on a control store, is damaged or not finished, or has no such
+            checkpoint.
     """
     rl = _is_rl_run(run)
+    if (run / RUN).exists() and "policy" not in read_json(run / RUN):
+        raise InputError(f"the training in {run} has not ended; train with the same command first")
     if rl and checkpoint != "last":
         raise InputError(
             f"{run} is of IQL or CQL, which keep their last checkpoint only; give --checkpoint last"
@@ -107,6 +115,10 @@ def load_run(run: Path, checkpoint: str) -> Trained:
     trained = RLPolicy(run) if rl else TrainedPolicy.load(run, checkpoint)
     if trained.record.get("dataset") is None:
         raise InputError(f"{run} is not a run of `ucfrec-control train`; evaluate it with `ucfrec`")
+    require_source(trained.record["dataset"], run / RUN)
+    training = trained.record["policy"]
+    if not isinstance(training, Mapping) or not {"steps", "best_step"} <= training.keys():
+        raise InputError(f"{run / RUN} is damaged: its policy is {training!r:.60}; train again")
     return trained
 
 
@@ -228,6 +240,6 @@ def _row(
         "fingerprint": record["fingerprint"],
         "dataset_versions": dataset["versions"],
         "warnings": mismatches(dataset, env_id),
-        "train_wall_time_s": record["wall_time_s"],
+        "train_wall_time_s": record.get("wall_time_s"),
         "wall_time_s": seconds,
     }

@@ -19,7 +19,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import BoolArray, FloatArray, IntArray
 from ucfrec.checksums import seal
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, damage_explained
 from ucfrec.files import atomic_file, atomic_folder, read_json, write_json
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
 from ucfrec.fitting.metrics_log import MetricsLog
@@ -69,11 +69,15 @@ class RLPolicy:
         self.record: dict[str, Any] = read_json(run / RUN)
         self.name: str = self.record["config"]["policy_name"]
         tensors, _ = load_tensors(run / _ACTOR)
-        self._mean, self._std = (tensors.pop(f"state.{name}").numpy() for name in ("mean", "std"))
-        sizes = self.record["sizes"]
-        with random_state_kept():
-            self._learner = _learner(RLConfig(**self.record["config"]["policy"]))
-            self._learner.create_impl((sizes["state"],), sizes["action"])
+        with damage_explained(run, "train it again"):
+            mean, std = (tensors.pop(f"state.{name}") for name in ("mean", "std"))
+            sizes = self.record["sizes"]
+            if not mean.shape == std.shape == (sizes["state"],):
+                raise ValueError(f"statistics of {tuple(mean.shape)} states")
+            self._mean, self._std = mean.numpy(), std.numpy()
+            with random_state_kept():
+                self._learner = _learner(RLConfig(**self.record["config"]["policy"]))
+                self._learner.create_impl((sizes["state"],), sizes["action"])
         load_weights(run / _ACTOR, self._learner.impl.modules.policy, tensors)
 
     def actor(self, episodes: int, rule: DecisionRule | None) -> "RLPolicy":

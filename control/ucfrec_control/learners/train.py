@@ -10,7 +10,7 @@ from ucfrec.provenance import versions
 from ucfrec.runs.config import Config
 from ucfrec.runs.screened import train_screened
 from ucfrec.runs.shared_stages import OWN, SharedStages
-from ucfrec_control.data.trajectories import PACKAGES
+from ucfrec_control.data.trajectories import PACKAGES, require_source
 from ucfrec_control.learners.presets import Preset, find_preset
 from ucfrec_control.worlds.scores import find_kind, find_task
 
@@ -26,6 +26,7 @@ def dataset_of(store: EpisodeStore) -> Mapping[str, Any]:
         raise InputError(
             f"{store.path} is not a control store; write one with `ucfrec-control prepare`"
         )
+    require_source(source, store.path)
     return source
 
 

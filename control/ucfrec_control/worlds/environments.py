@@ -65,8 +65,9 @@ def make_env(
                 wrappers=wrappers,
                 **settings,
             )
-    except (gymnasium.error.Error, ImportError, TypeError) as error:
-        reason = str(error).splitlines()[0]
+    except (gymnasium.error.Error, ImportError, TypeError, ValueError, OSError) as error:
+        # The settings that data states may be anything; MuJoCo raises ValueError over its files.
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(
             f"the environment {env_id} cannot be made ({reason}); install ucfrec[control], or name "
             "another with --env"

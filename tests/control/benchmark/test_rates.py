@@ -138,10 +138,26 @@ def test_a_file_of_rates_keeps_its_other_rates_and_is_checked(tmp_path: Path) ->
         ("[small]\nnone = 0.1\n", "none = 0.1 is no learning rate of a method"),
         ("[small]\ndt = 7\n", "dt = 7 is no"),
         ("small = 1\n", "small = 1 is no"),
-        ("[", "cannot be read"),
+        ("[", "is not TOML"),
     ):
         file.write_text(text)
         with pytest.raises(InputError, match=says):
             read_rates(file)
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="does not exist"):
         read_rates(tmp_path / "missing.toml")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a = " + "[" * 100_000,
+        "[small]\nucf = " + "1" * 5000,
+        "['a b']\nucf = 0.1",
+        "[small]\nucf = nan",
+    ],
+)
+def test_a_strangers_rates_are_refused(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "rates.toml"
+    file.write_text(text)
+    with pytest.raises(InputError, match=r"rates\.toml"):
+        read_rates(file)

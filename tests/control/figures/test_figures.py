@@ -17,6 +17,7 @@ from ucfrec.files import read_json
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.reporting.rows_file import append_rows
 from ucfrec_control.benchmark.robustness import drops
+from ucfrec_control.benchmark.score_rows import read_scores
 from ucfrec_control.cli import main
 from ucfrec_control.figures import diagnostics, plots
 from ucfrec_control.figures.figures import HIGHS, LOWS, NEEDS, make_figures
@@ -292,3 +293,20 @@ def test_runs_with_other_settings_are_no_seeds_of_one_another(runs: Path, tmp_pa
     drawn = (tmp_path / "figures" / "training-gate-hopper.svg").read_text()
     assert all(f">{kind}<" in drawn for kind in KINDS)
     assert "iql" not in drawn
+
+
+@pytest.mark.parametrize("given", [["--results", "no.jsonl"], ["--runs", "no"]])
+def test_what_does_not_exist_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], given: list[str]
+) -> None:
+    option, name = given
+    assert main(["figures", option, str(tmp_path / name), "--out", str(tmp_path / "out")]) == 2
+    assert "check the path" in capsys.readouterr().err
+
+
+def test_a_number_beyond_all_floats_is_refused(tmp_path: Path) -> None:
+    row = {"dataset": "a", "method": "dt", "config": {"policy_name": "dt"}, "seed": 0}
+    row |= {"evaluation_seed": 0, "config_hash": "a", "fingerprint": "a", "score": 10**400}
+    (tmp_path / "rows.json").write_text(json.dumps([row]))
+    with pytest.raises(InputError, match="row 1, is not a row"):
+        read_scores(tmp_path / "rows.json")

@@ -66,7 +66,7 @@ def test_a_training_that_was_interrupted_ends_as_one_left_alone(
         interrupted.setattr(rl_baselines, "progress", lambda *_, **__: nullcontext(_Stops()))
         with pytest.raises(KeyboardInterrupt):
             train_rl(store, tmp_path / "interrupted", config, 0)
-    with pytest.raises(InputError, match="does not exist"):
+    with pytest.raises(InputError, match="has not ended"):
         evaluate_run(tmp_path / "interrupted", episodes=2, seed=0)
     assert torch.load(tmp_path / "interrupted" / "checkpoint.pt", weights_only=True)["step"] == 4
     train_rl(store, tmp_path / "interrupted", config, 0)

@@ -401,3 +401,58 @@ def test_what_no_benchmark_can_be_of_is_refused(
     assert main([*given, *(str(rows) if o == "{rows}" else o for o in options)]) == 2
     printed = capsys.readouterr().err.strip().splitlines()
     assert says in printed[-1]
+
+
+def changed(run: Path, to: Path, entry: tuple[str, ...], value: object) -> Path:
+    """A copy of a run with another value of an entry of its record; None takes it out."""
+    shutil.copytree(run, to)
+    record = read_json(run / "run.json")
+    inner = record
+    for name in entry[:-1]:
+        inner = inner[name]
+    inner[entry[-1]] = value
+    if value is None:
+        del inner[entry[-1]]
+    (to / "run.json").write_text(json.dumps(record))
+    return to
+
+
+def test_a_run_that_has_not_ended_is_not_evaluated(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = changed(folder / "store-run", tmp_path / "run", ("policy",), None)
+    assert main(["evaluate", str(run), "--episodes", "1"]) == 2
+    assert f"the training in {run} has not ended" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("entry", "value"),
+    [
+        (("config",), "text"),
+        (("config",), None),
+        (("dataset",), "text"),
+        (("dataset",), {}),
+        (("dataset", "dataset"), 5),
+        (("dataset", "env_id"), 5),
+        (("dataset", "versions"), "text"),
+        (("dataset", "versions"), {"mujoco": 3}),
+        (("dataset", "distractors"), 5),
+        (("dataset", "distractors"), [1]),
+        (("dataset", "env_settings"), [1]),
+        (("dataset", "env_settings"), {"xml_file": "/etc/passwd"}),
+        (("policy",), {}),
+    ],
+)
+def test_a_strangers_run_is_refused_on_one_line(
+    folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    entry: tuple[str, ...],
+    value: object,
+) -> None:
+    run = changed(folder / "store-run", tmp_path / "run", entry, value)
+    assert main(["evaluate", str(run), "--episodes", "1"]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert line.startswith("ucfrec-control evaluate: ")
+    if "xml_file" not in str(value) and entry != ("policy",):
+        assert main(["figures", "--runs", str(run), "--out", str(tmp_path / "figures")]) == 2

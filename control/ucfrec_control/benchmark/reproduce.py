@@ -1,12 +1,13 @@
 """What the paper's control tables and figures are made of."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+from ucfrec.reporting.result_row import ResultRow
 from ucfrec_control.benchmark.budgets import Budget
-from ucfrec_control.benchmark.cells import ROBUSTNESS, Cell
+from ucfrec_control.benchmark.cells import ROBUSTNESS, SCORES, Cell
 from ucfrec_control.benchmark.methods import MAIN, TABLES
 from ucfrec_control.benchmark.plan import cells_of
 from ucfrec_control.benchmark.robustness import robustness_cells
@@ -71,3 +72,25 @@ def cells_of_part(
         return robustness_cells(data, folder, budget, name, part.methods, part.distractors)
     methods = part.methods or tuple(TABLES[part.table])
     return cells_of(data, folder, budget, name, part.table, methods)
+
+
+def rows_of_part(part: Part, rows: Sequence[ResultRow], name: str) -> list[ResultRow]:
+    """The rows of a part.
+
+    Args:
+        part: of `PARTS`.
+        rows: of any tables.
+        name: of the budget.
+    """
+    return [row for row in rows if row.conditions.get("budget") == name and _is_of(part, row)]
+
+
+def _is_of(part: Part, row: ResultRow) -> bool:
+    if (part.methods and row.method not in part.methods) or (
+        part.files and row.task not in part.files
+    ):
+        return False
+    if part.table == ROBUSTNESS:
+        distractor = row.conditions.get("distractor")
+        return row.suite == ROBUSTNESS and (not part.distractors or distractor in part.distractors)
+    return (row.suite, row.table) == (SCORES, part.table)

@@ -3,13 +3,15 @@
 import argparse
 
 from ucfrec.commands.grid_options import results_given
-from ucfrec.reporting.rows_file import benchmarking
+from ucfrec.errors import InputError
+from ucfrec.reporting.rows_file import benchmarking, latest, read_rows
 from ucfrec_control.benchmark.cells import (
     ROBUSTNESS,
     ROBUSTNESS_MEASUREMENT,
     SCORE_MEASUREMENT,
+    Cell,
 )
-from ucfrec_control.benchmark.reproduce import PARTS, budget_of, cells_of_part
+from ucfrec_control.benchmark.reproduce import PARTS, budget_of, cells_of_part, rows_of_part
 from ucfrec_control.benchmark.robustness import BUDGETS as ROBUSTNESS_BUDGETS
 from ucfrec_control.benchmark.run_cells import run_cells
 from ucfrec_control.commands.benchmark import budgets_of, print_scores
@@ -40,13 +42,24 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec_control.figures.figures import make_figures, make_row_figures
 
     part, results = PARTS[options.part], results_given(options)
+    if options.show_only and part.of_runs:
+        raise InputError(f"{options.part} is drawn from its runs; leave --show-only out")
     robust = part.table == ROBUSTNESS
     known = ROBUSTNESS_BUDGETS if robust else budgets_of(part.table)
     budget = budget_of(part, budget_given(known, options))
-    cells = list(cells_of_part(part, data_given(options), options.out, budget, options.budget))
-    with benchmarking(results):
-        how = ROBUSTNESS_MEASUREMENT if robust else SCORE_MEASUREMENT
-        rows = run_cells(cells, how, results, options.workers, f"reproduce {options.part}")
+    cells: list[Cell] = []
+    if options.show_only:
+        rows = rows_of_part(part, latest(read_rows(results)), options.budget)
+        if not rows:
+            raise InputError(
+                f"{results} has no rows of {options.part} with budget {options.budget}; name a "
+                "file that has them with --results"
+            )
+    else:
+        cells += cells_of_part(part, data_given(options), options.out, budget, options.budget)
+        with benchmarking(results):
+            how = ROBUSTNESS_MEASUREMENT if robust else SCORE_MEASUREMENT
+            rows = run_cells(cells, how, results, options.workers, f"reproduce {options.part}")
     if robust:
         print_robustness(rows)
     else:

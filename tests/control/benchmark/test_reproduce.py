@@ -6,7 +6,7 @@ import pytest
 
 from tests.support.control_files import hopper_like, write_hdf5
 from tests.support.result_rows import result_row
-from ucfrec.reporting.rows_file import read_rows
+from ucfrec.reporting.rows_file import append_rows, read_rows
 from ucfrec_control.benchmark.budgets import BUDGETS, Budget
 from ucfrec_control.benchmark.cells import ROBUSTNESS, SCORES
 from ucfrec_control.benchmark.estimate import estimated_hours
@@ -89,3 +89,38 @@ def test_every_other_part_is_drawn_of_its_rows(tmp_path: Path) -> None:
         wanted = "robustness-scores-small-d.png" if robust else f"scores-small-{part.table}.png"
         assert wanted in made
     assert (tmp_path / "lambda-small.png").exists()
+
+
+def test_show_only_draws_the_rows_at_hand_and_measures_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = [
+        result_row(
+            score,
+            suite=SCORES,
+            table=table,
+            metric="score",
+            task="hopper_medium-zoo",
+            method=method,
+            training_seed=0,
+            checkpoint="last",
+            conditions={"budget": budget},
+        )
+        for table, method, budget, score in (
+            (MAIN, "ucf", "small", 41.5),
+            (MAIN, "bc", "small", 42.5),
+            (MAIN, "ucf", "full", 43.5),
+            ("lambda", "ucf", "small", 44.5),
+        )
+    ]
+    results = tmp_path / "rows.jsonl"
+    append_rows(results, rows)
+    asked = ["--show-only", "--results", str(results), "--out", str(tmp_path / "out")]
+    assert main(["reproduce", "table-1", *asked]) == 0
+    printed = capsys.readouterr().out
+    assert [score in printed for score in ("41.5", "42.5", "43.5", "44.5")] == [True] + [False] * 3
+    assert read_rows(results) == rows
+    assert main(["reproduce", "table-9", *asked]) == 2
+    assert "no rows of table-9" in capsys.readouterr().err
+    assert main(["reproduce", "figure-5", *asked]) == 2
+    assert "drawn from its runs" in capsys.readouterr().err

@@ -85,21 +85,26 @@ def read_rates(path: Path) -> dict[str, dict[str, float]]:
             f"{path}: no budget is called {unknown[0]:.60}; there are {', '.join(RATES)}"
         )
     for budget, rates in tables.items():
-        for method, rate in rates.items() if isinstance(rates, Mapping) else [("", rates)]:
-            if method not in _DIFFERING or not isinstance(rate, float | int) or not 0 < rate < 1:
-                raise InputError(
-                    f"{path}: {method or budget} = {rate!r:.60} is no learning rate of a method; "
-                    f"there are {', '.join(_DIFFERING)}"
-                )
+        _require_rates(path, rates if isinstance(rates, Mapping) else {budget: rates})
     return tables
+
+
+def _require_rates(path: Path, rates: Mapping[str, object]) -> None:
+    for method, rate in rates.items():
+        if method not in _DIFFERING or not isinstance(rate, float | int) or not 0 < rate < 1:
+            raise InputError(
+                f"{path}: {method!r:.60} = {rate!r:.60} is no learning rate of a method; there "
+                f"are {', '.join(_DIFFERING)}"
+            )
 
 
 def write_rates(path: Path, budget: str, rates: Mapping[str, float]) -> None:
     """Write rates to a file; its rates of other budgets and methods stay.
 
     Raises:
-        InputError: the file exists and is not of such tables.
+        InputError: the file exists and is not of such tables, or a rate is of no method.
     """
+    _require_rates(path, rates)
     tables = read_rates(path) if path.exists() else {}
     tables[budget] = {**tables.get(budget, {}), **rates}
     with atomic_file(path) as scratch:

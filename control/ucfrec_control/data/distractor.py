@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -67,12 +68,17 @@ def zoo_store(data: Path, stores: Path, file: str, distractor: str = CLEAN) -> P
         Folder of the store.
 
     Raises:
-        InputError: the HDF5 file is missing or invalid, or the distractor cannot be added.
+        InputError: the HDF5 file is missing, invalid or not that of the store, or the distractor
+            cannot be added.
         KeyError: `distractor` is not a key of `DISTRACTORS`.
     """
-    clean = stores / file
+    clean, path = stores / file, data / f"{file}.hdf5"
     if not clean.exists():
-        read_d4rl(data / f"{file}.hdf5").write_store(clean)
+        read_d4rl(path).write_store(clean)
+    elif path.exists() and not _is_of(clean, path):
+        raise InputError(
+            f"{clean} was made from other data than {path}, of the same name; name another --out"
+        )
     arguments = DISTRACTORS[distractor]
     if arguments is None:
         return clean
@@ -80,3 +86,15 @@ def zoo_store(data: Path, stores: Path, file: str, distractor: str = CLEAN) -> P
     if not distracted.exists():
         add_distractor(EpisodeStore.open(clean), distracted, **arguments)
     return distracted
+
+
+def _is_of(folder: Path, path: Path) -> bool:
+    """Whether the store in `folder` holds the data of the HDF5 file at `path`."""
+    store = EpisodeStore.open(folder)
+    unchanged = path.stat().st_mtime <= folder.stat().st_mtime
+    if unchanged and store.meta["source"]["where"] == str(path):
+        return True
+    with TemporaryDirectory() as scratch:
+        made = read_d4rl(path).write_store(Path(scratch) / folder.name)
+    same: bool = made.meta["fingerprint"] == store.meta["fingerprint"]
+    return same

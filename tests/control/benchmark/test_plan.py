@@ -12,6 +12,7 @@ import pytest
 
 from tests.support.control_files import hopper_like, write_hdf5
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.errors import InputError
 from ucfrec.runs.config import Config, resolve_config
 from ucfrec_control.benchmark import robustness
 from ucfrec_control.benchmark.budgets import BUDGETS, SWEEPS, Budget
@@ -28,6 +29,7 @@ from ucfrec_control.benchmark.methods import EQUAL_TIME, MAIN, METHODS, PAPER, P
 from ucfrec_control.benchmark.plan import benchmark, cells_of
 from ucfrec_control.benchmark.rates import settings_of
 from ucfrec_control.commands.benchmark import budgets_of
+from ucfrec_control.data.distractor import zoo_store
 from ucfrec_control.learners.evaluate import load_run
 from ucfrec_control.learners.presets import find_preset
 from ucfrec_control.learners.rl_baselines import ALGORITHMS
@@ -218,3 +220,19 @@ def test_cells_of_one_learner_run_through_the_same_code() -> None:
     codes = {learner: code_of(learner) for learner in ("ucf", "dt", "iql", "cql")}
     assert codes["ucf"] != codes["dt"]
     assert codes["iql"] == codes["cql"] != codes["dt"]
+
+
+def test_a_store_of_other_data_of_the_same_name_is_refused(tmp_path: Path) -> None:
+    stores = tmp_path / "stores"
+    for folder, seed in (("first", 0), ("moved", 0), ("other", 1)):
+        (tmp_path / folder).mkdir()
+        write_hdf5(tmp_path / folder / "hopper_medium-made.hdf5", hopper_like((30, 8) * 8, seed))
+    made = zoo_store(tmp_path / "first", stores, "hopper_medium-made")
+    assert zoo_store(tmp_path / "moved", stores, "hopper_medium-made") == made
+    with pytest.raises(InputError, match="made from other data"):
+        zoo_store(tmp_path / "other", stores, "hopper_medium-made")
+    # Rows may be made again where the store is left of the data.
+    assert zoo_store(tmp_path / "gone", stores, "hopper_medium-made") == made
+    write_hdf5(tmp_path / "first" / "hopper_medium-made.hdf5", hopper_like((30, 8) * 8, 1))
+    with pytest.raises(InputError, match="made from other data"):
+        zoo_store(tmp_path / "first", stores, "hopper_medium-made")

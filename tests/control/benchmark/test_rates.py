@@ -135,9 +135,9 @@ def test_a_file_of_rates_keeps_its_other_rates_and_is_checked(tmp_path: Path) ->
         "small": {"dt": 0.01, "ucf": 0.003},
     }
     for text, says in (
-        ("[small]\nnone = 0.1\n", "none = 0.1 is no learning rate of a method"),
-        ("[small]\ndt = 7\n", "dt = 7 is no"),
-        ("small = 1\n", "small = 1 is no"),
+        ("[small]\nnone = 0.1\n", "'none' = 0.1 is no learning rate of a method"),
+        ("[small]\ndt = 7\n", "'dt' = 7 is no"),
+        ("small = 1\n", "'small' = 1 is no"),
         ("[", "is not TOML"),
     ):
         file.write_text(text)
@@ -145,6 +145,10 @@ def test_a_file_of_rates_keeps_its_other_rates_and_is_checked(tmp_path: Path) ->
             read_rates(file)
     with pytest.raises(InputError, match="does not exist"):
         read_rates(tmp_path / "missing.toml")
+    # A stranger's rows may name methods of any text.
+    with pytest.raises(InputError, match="is no learning rate of a method"):
+        write_rates(tmp_path / "new.toml", "small", {"dt\n[full]\nx": 0.1})
+    assert not (tmp_path / "new.toml").exists()
 
 
 @pytest.mark.parametrize(

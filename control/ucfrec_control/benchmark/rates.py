@@ -184,8 +184,8 @@ def search_rates(
         steps: updates of a training; None for the budget's.
 
     Raises:
-        InputError: a file is missing, a method is unknown, `results` has other content, or cells
-            failed.
+        InputError: a file is missing or has no validation trajectories, a method is unknown,
+            `results` has other content, or cells failed.
     """
     selected = chosen(SEARCHED, methods, "method")
     cells = _cells(data, folder, budget, name, selected, steps)
@@ -201,6 +201,11 @@ def _cells(
     part = "" if steps is None else f"{steps}-"
     for file in budget.files_in(data):
         store = zoo_store(data, stores_of(folder), file)
+        if not EpisodeStore.open(store).split("validation").n_episodes:
+            raise InputError(
+                f"{file} has too few trajectories for validation, by which rates are chosen; name "
+                "a larger file with --file"
+            )
         for method in methods:
             learner, own = SEARCHED[method]
             code = code_of(learner)

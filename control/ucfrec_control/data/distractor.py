@@ -92,7 +92,7 @@ def _is_of(folder: Path, path: Path) -> bool:
     """Whether the store in `folder` holds the data of the HDF5 file at `path`."""
     store = EpisodeStore.open(folder)
     unchanged = path.stat().st_mtime <= folder.stat().st_mtime
-    if unchanged and store.meta["source"]["where"] == str(path):
+    if unchanged and store.meta["source"].get("where") == str(path):
         return True
     with TemporaryDirectory() as scratch:
         made = read_d4rl(path).write_store(Path(scratch) / folder.name)

@@ -165,3 +165,13 @@ def test_a_strangers_rates_are_refused(tmp_path: Path, text: str) -> None:
     file.write_text(text)
     with pytest.raises(InputError, match=r"rates\.toml"):
         read_rates(file)
+
+
+def test_a_file_without_validation_trajectories_is_refused_before_a_training(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8)))
+    asked = ["rates", "--data", str(tmp_path), "--out", str(tmp_path / "out")]
+    assert main([*asked, "--file", "hopper_medium-made"]) == 2
+    assert "too few trajectories for validation" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "rates").exists()

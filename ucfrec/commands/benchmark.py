@@ -7,6 +7,7 @@ from ucfrec.commands.grid_options import (
     evaluation_seed_option,
     grid_options,
     results_given,
+    rows_explained,
     rows_given,
 )
 from ucfrec.commands.options import env_options, world_given
@@ -75,7 +76,8 @@ def run(options: argparse.Namespace) -> None:
     suite: Benchmark = load_plugin("benchmarks", options.suite)
     tables, results = chosen(suite.tables, options.table, "table"), results_given(options)
     if options.show_only:
-        print(suite.show(tables, rows_given(options, options.suite, tables)))
+        with rows_explained(options):
+            print(suite.show(tables, rows_given(options, options.suite, tables)))
         return
     request = BenchmarkRequest(
         budget=options.budget,

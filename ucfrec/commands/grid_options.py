@@ -2,9 +2,10 @@
 
 import argparse
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, damage_explained
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import latest, read_rows
 
@@ -68,6 +69,12 @@ def results_given(options: argparse.Namespace) -> Path:
     """Path of the file of result rows: --results, or `results.jsonl` in --out."""
     given: Path = options.results or options.out / "results.jsonl"
     return given
+
+
+def rows_explained(options: argparse.Namespace) -> AbstractContextManager[None]:
+    """For the block that prints rows of --results: an `InputError` says what they lack."""
+    remedy = "measure its rows again, or name another file with --results"
+    return damage_explained(results_given(options), remedy)
 
 
 def rows_given(

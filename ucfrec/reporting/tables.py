@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from ucfrec.errors import one_line
 from ucfrec.reporting.statistics import Summary, summary
 
 NONE = "–"
@@ -28,7 +29,7 @@ class Table:
 
 def text_table(head: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
     """An aligned table for a terminal; the first two columns are left-aligned, others right."""
-    table = [list(head), *([_text(cell) for cell in line] for line in lines)]
+    table = [[_text(cell) for cell in line] for line in (head, *lines)]
     widths = [max(len(line[i]) for line in table) for i in range(len(head))]
     written = []
     for line in table:
@@ -40,7 +41,7 @@ def text_table(head: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
 
 def markdown_table(head: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
     """A table in GitHub Markdown."""
-    body = [head, ["---"] * len(head), *([_text(cell) for cell in line] for line in lines)]
+    body = [[_text(cell) for cell in line] for line in (head, ["---"] * len(head), *lines)]
     return "\n".join("| " + " | ".join(line) + " |" for line in body)
 
 
@@ -89,4 +90,4 @@ def _cell(row: Mapping[str, Any], name: str) -> str:
 def _text(value: object) -> str:
     if value is None:
         return NONE
-    return number(value) if isinstance(value, float) else str(value)
+    return number(value) if isinstance(value, float) else one_line(str(value))

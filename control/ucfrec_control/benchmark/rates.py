@@ -153,7 +153,7 @@ def rl_settings_of(budget: Budget, name: str, learner: str) -> dict[str, Any]:
     if learner not in ALGORITHMS:
         return {}
     rate = _rates_of(budget, name).get(learner)
-    return {**budget.rl, **({} if rate is None else {RATE: rate})}
+    return {**budget.rl[learner], **({} if rate is None else {RATE: rate})}
 
 
 def _rates_of(budget: Budget, name: str) -> Mapping[str, float]:
@@ -227,7 +227,7 @@ def _cells(
                         episodes=0,
                         evaluation_seed=budget.evaluation_seed,
                         code_version=code,
-                        rl={**budget.rl, **rl_shorter, RATE: rate} if rl else {},
+                        rl={**budget.rl[learner], **rl_shorter, RATE: rate} if rl else {},
                     )
 
 

@@ -157,7 +157,7 @@ def loss_rises(rows: Sequence[ResultRow]) -> list[Mapping[str, Any]]:
     return [
         {**row.as_line(), "rise": 100 * (row.metrics["loss_at_zero"] / row.metrics["loss"] - 1)}
         for row in rows
-        if row.conditions["distractor"] != CLEAN and "loss" in row.metrics
+        if row.conditions["distractor"] != CLEAN and row.metrics.get("loss")
     ]
 
 

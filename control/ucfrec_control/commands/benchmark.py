@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ucfrec.commands.grid_options import results_given, rows_given
+from ucfrec.commands.grid_options import results_given, rows_explained, rows_given
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import benchmarking
 from ucfrec.reporting.tables import format_rows
@@ -63,7 +63,8 @@ def run(options: argparse.Namespace) -> None:
                 options.table,
                 options.method,
             )
-    print_scores(rows, options.table, budget.rates)
+    with rows_explained(options):
+        print_scores(rows, options.table, budget.rates)
     print(f"\nrows: {results_given(options)}")
 
 
@@ -116,7 +117,7 @@ def _print_tables(rows: Sequence[ResultRow], table: str) -> None:
     shown = (*values, "acceptance")
     print("\nlast checkpoint, mean ± standard deviation over seeds")
     print(format_rows(over_seeds([row.as_line() for row in last], by, shown), (*by, *shown)))
-    reference = UCF if table == MAIN else last[0].method
+    reference = UCF if table == MAIN or not last else last[0].method
     for name in values:
         if lines := difference_table(last, reference, name):
             print(f"\n{name} less that of {reference} of the same seed, mean ± standard error")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ucfrec.commands.grid_options import evaluation_seed_option, grid_options
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, one_line
 from ucfrec_control.benchmark.budgets import Budget
 from ucfrec_control.benchmark.rates import read_rates
 from ucfrec_control.data.d4rl import read_d4rl
@@ -101,9 +101,10 @@ def describe_source(trajectories: Trajectories) -> str:
     task = find_task(source["env_id"], source["dataset"])
     score = f", normalised {task.score(returns.mean()):.2f}" if task else ""
     dropped = [f"{count} {what.replace('_', ' ')}" for what, count in source["dropped"].items()]
+    name, env_id = one_line(source["dataset"]), one_line(source["env_id"] or "unknown")
     return (
-        f"{source['dataset']}: {len(returns)} trajectories, {len(trajectories.rewards)} steps, "
-        f"environment {source['env_id'] or 'unknown'}\n"
+        f"{name}: {len(returns)} trajectories, {len(trajectories.rewards)} steps, environment "
+        f"{env_id}\n"
         f"mean return {returns.mean():.3f}{score}; dropped: {', '.join(dropped)}"
     )
 

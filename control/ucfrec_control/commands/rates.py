@@ -1,9 +1,11 @@
 """`ucfrec-control rates`: learning rates of all learners, by validation loss; resumes."""
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
-from ucfrec.commands.grid_options import results_given, rows_given
+from ucfrec.commands.grid_options import results_given, rows_explained, rows_given
+from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import benchmarking
 from ucfrec.reporting.statistics import grouped
 from ucfrec.reporting.tables import format_rows
@@ -39,15 +41,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec-control rates`."""
     if options.show_only:
-        rows = rows_given(options, SUITE)
-        rows = [row for row in rows if row.conditions["budget"] == options.budget]
-        # Beside shorter trainings, which rehearse the search, only a method's longest count.
-        rows = [
-            row
-            for own in grouped(rows, lambda row: row.method).values()
-            for row in own
-            if row.metrics["steps"] == max(each.metrics["steps"] for each in own)
-        ]
+        with rows_explained(options):
+            rows = _longest(rows_given(options, SUITE), options.budget)
     else:
         with benchmarking(results_given(options)):
             rows = search_rates(
@@ -61,8 +56,21 @@ def run(options: argparse.Namespace) -> None:
                 options.steps,
             )
     by, values = ("task", "method", RATE), ("validation_loss",)
-    print(format_rows(over_seeds([row.as_line() for row in rows], by, values), (*by, *values)))
-    found = best_rates(rows)
+    with rows_explained(options):
+        print(format_rows(over_seeds([row.as_line() for row in rows], by, values), (*by, *values)))
+        found = best_rates(rows)
     print(f"\n{format_rates((options.budget, found))}\nrows: {results_given(options)}")
     if options.toml is not None:
         write_rates(options.toml, options.budget, found)
+
+
+def _longest(rows: Sequence[ResultRow], budget: str) -> list[ResultRow]:
+    """The rows of a budget; beside shorter trainings, which rehearse the search, only a method's
+    longest count."""
+    of_budget = [row for row in rows if row.conditions["budget"] == budget]
+    return [
+        row
+        for own in grouped(of_budget, lambda row: row.method).values()
+        for row in own
+        if row.metrics["steps"] == max(each.metrics["steps"] for each in own)
+    ]

@@ -2,7 +2,7 @@
 
 import argparse
 
-from ucfrec.commands.grid_options import results_given
+from ucfrec.commands.grid_options import results_given, rows_explained
 from ucfrec.errors import InputError
 from ucfrec.reporting.rows_file import benchmarking, latest, read_rows
 from ucfrec_control.benchmark.cells import (
@@ -60,14 +60,15 @@ def run(options: argparse.Namespace) -> None:
         with benchmarking(results):
             how = ROBUSTNESS_MEASUREMENT if robust else SCORE_MEASUREMENT
             rows = run_cells(cells, how, results, options.workers, f"reproduce {options.part}")
-    if robust:
-        print_robustness(rows)
-    else:
-        print_scores(rows, part.table, budget.rates)
     pictures = options.out / options.part
-    if part.of_runs:
-        made, _ = make_figures([cell.run for cell in cells], [], pictures)
-    else:
-        made = make_row_figures(rows, pictures)
+    with rows_explained(options):
+        if robust:
+            print_robustness(rows)
+        else:
+            print_scores(rows, part.table, budget.rates)
+        if part.of_runs:
+            made, _ = make_figures([cell.run for cell in cells], [], pictures)
+        else:
+            made = make_row_figures(rows, pictures)
     print("\n".join(["", *map(str, made)]))
     print(f"\nrows: {results}")

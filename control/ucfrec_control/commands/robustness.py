@@ -3,7 +3,7 @@
 import argparse
 from collections.abc import Sequence
 
-from ucfrec.commands.grid_options import results_given, rows_given
+from ucfrec.commands.grid_options import results_given, rows_explained, rows_given
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import benchmarking
 from ucfrec.reporting.tables import format_rows
@@ -54,7 +54,8 @@ def run(options: argparse.Namespace) -> None:
                 options.workers,
                 options.method,
             )
-    print_robustness(rows)
+    with rows_explained(options):
+        print_robustness(rows)
     print(f"\nrows: {results_given(options)}")
 
 

@@ -2,7 +2,7 @@
 
 import argparse
 
-from ucfrec.commands.grid_options import results_given, rows_given
+from ucfrec.commands.grid_options import results_given, rows_explained, rows_given
 from ucfrec.reporting.rows_file import benchmarking
 from ucfrec.reporting.tables import format_rows
 from ucfrec_control.benchmark.budgets import BUDGETS
@@ -28,4 +28,6 @@ def run(options: argparse.Namespace) -> None:
             rows = screening_table(
                 data_given(options), stores, files, results_given(options), options.workers
             )
-    print(f"{format_rows(screening_rows(rows), SHOWN_SCREENING)}\n\nrows: {results_given(options)}")
+    with rows_explained(options):
+        print(format_rows(screening_rows(rows), SHOWN_SCREENING))
+    print(f"\nrows: {results_given(options)}")

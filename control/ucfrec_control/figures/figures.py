@@ -45,6 +45,7 @@ NEEDS = {
     "robustness-losses": "such rows with a distractor",
 }
 """What every kind of figure is made of."""
+_REMEDY = "measure it again"
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,9 @@ def make_figures(
     """
     found = _distinguished([run for folder in runs for run in _runs(folder)])
     rows = [row for path in results for row in read_scores(path)]
-    plans = [*_of_runs(found), *_of_rows(rows)]
+    plans = list(_of_runs(found))
+    with damage_explained(Path(", ".join(map(str, results))), _REMEDY):
+        plans += _of_rows(rows)
     missing = [f"{k}: needs {w}" for k, w in NEEDS.items() if k not in {p.kind for p in plans}]
     made, failed = _drawn(plans, out)
     return made, [*missing, *failed]
@@ -118,7 +121,9 @@ def _drawn(plans: Sequence[_Plan], out: Path) -> tuple[list[Path], list[str]]:
     for plan in plans:
         name = f"{plan.kind}-{plan.about}"
         try:
-            made += save(plan.draw(), out, name)
+            # One figure that cannot be drawn does not keep the others from it.
+            with damage_explained(Path(name), _REMEDY):
+                made += save(plan.draw(), out, name)
         except InputError as error:
             missing.append(f"{name}: {error}")
     return made, missing

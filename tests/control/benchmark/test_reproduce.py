@@ -1,5 +1,6 @@
 """Every table and figure of the paper has its cells, and one command makes it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -37,7 +38,7 @@ def test_the_estimate_grows_with_steps_and_shrinks_with_workers(tmp_path: Path) 
     hours = {}
     for steps in (1_000, 1_000_000):
         settings = (*TINY, f"train.steps={steps}")
-        budget = Budget(("hopper_medium-made",), 2, 1, settings, rl={"steps": steps})
+        budget = Budget(("hopper_medium-made",), 2, 1, settings, rl={"iql": {"steps": steps}})
         for method in ("dt", "iql"):
             cells = list(cells_of(tmp_path, tmp_path / "out", budget, "tiny", MAIN, (method,)))
             hours[method, steps] = estimated_hours(cells, 1)
@@ -124,3 +125,43 @@ def test_show_only_draws_the_rows_at_hand_and_measures_nothing(
     assert "no rows of table-9" in capsys.readouterr().err
     assert main(["reproduce", "figure-5", *asked]) == 2
     assert "drawn from its runs" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("command", "suite", "conditions", "lacking"),
+    [
+        ("benchmark", SCORES, {}, "budget"),
+        ("rates", "rates", {}, "budget"),
+        ("rates", "rates", {"budget": "small"}, "steps"),
+        ("robustness", ROBUSTNESS, {"budget": "small"}, "distractor"),
+    ],
+)
+def test_rows_that_lack_what_is_shown_are_one_clear_error(
+    command: str,
+    suite: str,
+    conditions: dict[str, str],
+    lacking: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    results = tmp_path / "rows.jsonl"
+    fields = {"suite": suite, "metric": "score", "checkpoint": "last", "conditions": conditions}
+    append_rows(results, [result_row(1.0, **fields)])
+    assert main([command, "--show-only", "--results", str(results)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{results} is damaged (KeyError: '{lacking}'); measure its rows again" in line
+    if suite != "rates":
+        assert main(["figures", "--results", str(results), "--out", str(tmp_path / "out")]) == 2
+        assert f"{results} is damaged" in capsys.readouterr().err
+
+
+def test_names_of_foreign_rows_do_not_steer_the_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results, name = tmp_path / "rows.jsonl", "d\x1b[2J\nforged"
+    row = result_row(1.0, suite=SCORES, table=MAIN, metric="score", task=name, checkpoint="last")
+    append_rows(results, [replace(row, conditions={"budget": "small"})])
+    assert main(["benchmark", "--show-only", "--results", str(results)]) == 0
+    printed = capsys.readouterr().out
+    assert "\x1b" not in printed
+    assert "d\\x1b[2J forged" in printed

@@ -188,7 +188,7 @@ def test_the_benchmark_finds_its_rl_rows_again(
 ) -> None:
     write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
     monkeypatch.setitem(TABLES, "main", {"iql": ("iql", ())})
-    budget = Budget(("hopper_medium-made",), 1, 2, (), rl={"steps": 2})
+    budget = Budget(("hopper_medium-made",), 1, 2, (), rl={"iql": {"steps": 2}})
     results = tmp_path / "rows.jsonl"
     (row,) = benchmark(tmp_path, tmp_path / "runs", results, budget, "tiny", 1)
     assert (row.table, row.method, row.checkpoint) == ("main", "iql", "last")
@@ -206,7 +206,8 @@ def test_rates_of_rl_are_searched_on_held_out_actions(tmp_path: Path) -> None:
     columns = hopper_like((30, 8, 25) * 8)
     columns["actions"] = np.tanh(columns["observations"][:, :3])
     write_hdf5(tmp_path / "hopper_medium-made.hdf5", columns)
-    budget = Budget(("hopper_medium-made",), 1, 1, (), rl={"steps": 99, "batch_size": 64})
+    settings = {"steps": 99, "batch_size": 64}
+    budget = Budget(("hopper_medium-made",), 1, 1, (), rl={"iql": settings})
     rows = search_rates(
         tmp_path, tmp_path / "runs", tmp_path / "rows.jsonl", budget, "full", 1, ("iql",), 60
     )

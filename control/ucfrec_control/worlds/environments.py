@@ -17,6 +17,8 @@ from ucfrec_control.worlds.antmaze import GoalObservations, antmaze_settings, is
 
 SIDE_BY_SIDE = 50
 """Largest number of episodes played at once; the policy chooses all their actions together."""
+_MOST_FRAMES = 1000
+"""Largest number of simulated frames a step, which data of others states; MuJoCo's worlds: 5."""
 
 Wrap = Callable[[gymnasium.Env[Any, Any]], gymnasium.Wrapper[Any, Any, Any, Any]]
 
@@ -48,6 +50,12 @@ def make_env(
         InputError: the environment is not registered or cannot be made.
     """
     settings, wrappers = dict(settings or {}), list(wrappers)
+    skip = settings.get("frame_skip", 1)
+    if type(skip) is not int or not 0 < skip <= _MOST_FRAMES:
+        raise InputError(
+            f"the environment {env_id} cannot be made with frame_skip {skip!r:.40}; it is a whole "
+            f"number from 1 to {_MOST_FRAMES}"
+        )
     if is_antmaze(env_id):
         settings |= antmaze_settings(env_id)
         wrappers = [GoalObservations, *wrappers]

@@ -440,6 +440,8 @@ def test_a_run_that_has_not_ended_is_not_evaluated(
         (("dataset", "distractors"), [1]),
         (("dataset", "env_settings"), [1]),
         (("dataset", "env_settings"), {"xml_file": "/etc/passwd"}),
+        (("dataset", "env_settings"), {"frame_skip": 10**9}),
+        (("dataset", "env_settings"), {"frame_skip": 0}),
         (("policy",), {}),
     ],
 )
@@ -454,5 +456,6 @@ def test_a_strangers_run_is_refused_on_one_line(
     assert main(["evaluate", str(run), "--episodes", "1"]) == 2
     [line] = capsys.readouterr().err.splitlines()
     assert line.startswith("ucfrec-control evaluate: ")
-    if "xml_file" not in str(value) and entry != ("policy",):
+    of_evaluation = entry == ("policy",) or any(w in str(value) for w in ("xml_file", "frame_skip"))
+    if not of_evaluation:
         assert main(["figures", "--runs", str(run), "--out", str(tmp_path / "figures")]) == 2

@@ -299,7 +299,8 @@ SECTIONS = (
         "Normalised scores of the last checkpoint after 4,000 steps in batches of 16, a hundredth "
         "of what the authors' settings learn from (IQL: 50,000 in batches of 64, CQL: 10,000). "
         "Learning rates were chosen on validation loss by one search for all learners (IQL's with "
-        "20,000 steps, CQL's with 2,500). Where no standard error stands there is one seed, and a difference may be luck.",
+        "20,000 steps, CQL's with 2,500). Where no standard error stands there is one seed, and a "
+        "difference may be luck.",
         f"{CONTROL} main",
         of("control", "main"),
         scores,

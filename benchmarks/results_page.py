@@ -330,7 +330,7 @@ SECTIONS = (
         "Control: ways to pursue reward",
         "All without embeddings of time steps, as UCF is: advantage weights, the largest return "
         "that the policy expects as target, both, and the best quarter of the trajectories. One "
-        "seed, and of `weights` and `max-return` one file: a difference may be luck.",
+        "seed, and of `weights` one file, of DC with `max-return` five: a difference may be luck.",
         f"{CONTROL} pursuing",
         of("control", "pursuing"),
         scores,

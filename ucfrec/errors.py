@@ -28,11 +28,11 @@ class InputNote(UserWarning):
 
 
 @contextmanager
-def damage_explained(path: Path, remedy: str) -> Iterator[None]:
+def damage_explained(path: Path | str, remedy: str) -> Iterator[None]:
     """Turn errors over the content of a file, which the block uses, into one `InputError`.
 
     Args:
-        path: of the file.
+        path: of the file, or words for what is used.
         remedy: what to do about it.
 
     Raises:

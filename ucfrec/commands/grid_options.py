@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from ucfrec.errors import InputError, damage_explained
@@ -72,7 +72,10 @@ def results_given(options: argparse.Namespace) -> Path:
 
 
 def rows_explained(options: argparse.Namespace) -> AbstractContextManager[None]:
-    """For the block that prints rows of --results: an `InputError` says what they lack."""
+    """For the block that prints rows of --results: with --show-only, an `InputError` says what they
+    lack. Rows that were just measured lack nothing: there an error is ours, and keeps its trace."""
+    if not options.show_only:
+        return nullcontext()
     remedy = "measure its rows again, or name another file with --results"
     return damage_explained(results_given(options), remedy)
 

@@ -97,7 +97,7 @@ def make_figures(
     found = _distinguished([run for folder in runs for run in _runs(folder)])
     rows = [row for path in results for row in read_scores(path)]
     plans = list(_of_runs(found))
-    with damage_explained(Path(", ".join(map(str, results))), _REMEDY):
+    with damage_explained(", ".join(map(str, results)), _REMEDY):
         plans += _of_rows(rows)
     missing = [f"{k}: needs {w}" for k, w in NEEDS.items() if k not in {p.kind for p in plans}]
     made, failed = _drawn(plans, out)
@@ -122,7 +122,7 @@ def _drawn(plans: Sequence[_Plan], out: Path) -> tuple[list[Path], list[str]]:
         name = f"{plan.kind}-{plan.about}"
         try:
             # One figure that cannot be drawn does not keep the others from it.
-            with damage_explained(Path(name), _REMEDY):
+            with damage_explained("what it is drawn from", _REMEDY):
                 made += save(plan.draw(), out, name)
         except InputError as error:
             missing.append(f"{name}: {error}")

@@ -165,3 +165,16 @@ def test_names_of_foreign_rows_do_not_steer_the_terminal(
     printed = capsys.readouterr().out
     assert "\x1b" not in printed
     assert "d\\x1b[2J forged" in printed
+
+
+def test_a_figure_that_cannot_be_drawn_keeps_no_other_from_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results, out = tmp_path / "rows.jsonl", tmp_path / "out"
+    row = result_row(1.0, suite=SCORES, table="lambda", metric="score", method="ucf")
+    for weight in (0.5, "half"):
+        conditions = {"budget": "small", "lambda_mask": weight}
+        append_rows(results, [replace(row, checkpoint="last", conditions=conditions)])
+    assert main(["figures", "--results", str(results), "--out", str(out)]) == 0
+    assert "lambda-small: what it is drawn from is damaged" in capsys.readouterr().err
+    assert (out / "scores-small-lambda.png").exists()

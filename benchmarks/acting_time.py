@@ -31,12 +31,12 @@ import torch
 
 from ucfrec import Recommender, schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.learned_sessions import LearnedSessions
 from ucfrec.acting.logged_decisions import session_scores
 from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.rollout import rollout
+from ucfrec.choosing.by_simulation import RuleSearch
+from ucfrec.choosing.config import RuleConfig
 from ucfrec.code_version import code_version
-from ucfrec.counterfactual.item_reward_model import ItemRewardModel
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.policies.registry import policy_class
@@ -49,11 +49,11 @@ from ucfrec.recommending.stream import answer_stream
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows
 from ucfrec.reporting.tables import markdown_table
-from ucfrec.runs.choose_rule import RuleSearch
 from ucfrec.runs.config import config_from_dict
-from ucfrec.runs.rule_config import RuleConfig
 from ucfrec.runs.run import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.user_model.reward import ItemRewardModel
+from ucfrec.user_model.simulator import LearnedSessions
 
 RESULTS = Path("runs/acting_time/results.jsonl")
 HISTORY, SESSIONS, PAGES, LOG_USERS = 20, 4096, 300, 5000

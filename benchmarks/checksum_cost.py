@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ucfrec.checksums import sealed_record
 from ucfrec.code_version import code_version
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.locks import scratch_folder
+from ucfrec.files.checksums import sealed_record
+from ucfrec.files.locks import scratch_folder
 from ucfrec.provenance import provenance
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows
@@ -111,7 +111,9 @@ def main() -> None:
         method="XXH3, two threads",
         policy="none",
         conditions={"steps": options.steps, "rounds": options.rounds},
-        code_version=code_version(Path(__file__), "ucfrec.checksums", "ucfrec.episodes.store"),
+        code_version=code_version(
+            Path(__file__), "ucfrec.files.checksums", "ucfrec.episodes.store"
+        ),
         metric="verify_to_read",
         metrics=metrics,
         wall_time_s=time.perf_counter() - began,

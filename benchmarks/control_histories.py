@@ -20,8 +20,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ucfrec.arrays import IntArray
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import IntArray, Windows
+from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.reporting.grid import Measurement, run_grid
 from ucfrec.reporting.result_row import ResultRow, RowKey

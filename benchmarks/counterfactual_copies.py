@@ -27,8 +27,8 @@ from ucfrec.code_version import code_version
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.evaluate import evaluate_policy
 from ucfrec.evaluation.simulated_store import simulated_store
+from ucfrec.evaluation.simulator import Simulator
 from ucfrec.evaluation.world import World
-from ucfrec.plugins import Simulator
 from ucfrec.reporting.evaluation_rows import evaluation_row
 from ucfrec.reporting.grid import Measurement, chosen, run_grid
 from ucfrec.reporting.result_row import ResultRow, RowKey

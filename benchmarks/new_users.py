@@ -24,10 +24,6 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from ucfrec.code_version import code_version
-from ucfrec.counterfactual.item_reward_effects import EFFECTS
-from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model
-from ucfrec.counterfactual.item_reward_model import ItemRewardModel
-from ucfrec.counterfactual.item_reward_rows import RewardRows
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.prepare import prepare
@@ -37,6 +33,10 @@ from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows, read_rows
 from ucfrec.reporting.tables import markdown_table
 from ucfrec.schema import USER
+from ucfrec.user_model.reward import ItemRewardModel
+from ucfrec.user_model.reward_effects import EFFECTS
+from ucfrec.user_model.reward_fit import fit_item_reward_model
+from ucfrec.user_model.reward_rows import RewardRows
 from ucfrec_simulators.folders import data_folder
 
 ITEMS: Final = ("item", "user", "content", "affinity")

@@ -20,7 +20,7 @@ from ucfrec.code_version import code_version
 from ucfrec.commands.cli import main as ucfrec
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.ranking import MEASURES
-from ucfrec.files import read_json
+from ucfrec.files.atomic import read_json
 from ucfrec.logs.mapping import log_files
 from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import config_hash, provenance

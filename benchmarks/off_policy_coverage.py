@@ -37,8 +37,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.code_version import code_version
 from ucfrec.off_policy.estimators import Estimate, estimate
 from ucfrec.off_policy.fqe import cross_fitted
@@ -48,9 +48,6 @@ from ucfrec.progress import progress
 from ucfrec.provenance import provenance
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 SHOWN = ("logged", "IPS", "SNIPS", "PDIS", "SNPDIS", "DR", "SNDR", "lift")
 LOW, HIGH = 0.90, 0.98
@@ -77,7 +74,7 @@ class World:
     model_knows: bool = True
     """Whether the model sees context and action, or only if the action's number is odd."""
 
-    def tables(self, seed: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def tables(self, seed: int) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
         """Behavior, target and mean reward (X, A), and the next context's (X, A, X)."""
         rng = np.random.default_rng([seed, 1])
         shape = (self.contexts, self.actions)
@@ -155,12 +152,12 @@ WORLDS = {
 }
 
 
-def softmax(logits: FloatArray) -> FloatArray:
+def softmax(logits: Float64Array) -> Float64Array:
     exponents = np.exp(logits - logits.max(axis=1, keepdims=True))
     return np.asarray(exponents / exponents.sum(axis=1, keepdims=True))
 
 
-def drawn(probabilities: FloatArray, rng: np.random.Generator) -> IntArray:
+def drawn(probabilities: Float64Array, rng: np.random.Generator) -> IntArray:
     """(n,) a column drawn from each row (n, K)."""
     beyond = rng.random((len(probabilities), 1)) > probabilities.cumsum(axis=1)
     return np.asarray(np.minimum(beyond.sum(axis=1), probabilities.shape[1] - 1))

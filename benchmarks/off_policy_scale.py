@@ -21,10 +21,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.code_version import code_version
 from ucfrec.errors import InputError
 from ucfrec.progress import progress
@@ -40,18 +40,16 @@ TRAINED_ON = 0.1
 START_MS, SESSION_MS, STEP_MS = 1_704_067_200_000, 100, 1_000
 SESSIONS_AT_ONCE = 20_000
 
-FloatArray = npt.NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class Catalogue:
     """What users click, and what the logging policy shows, by group of users."""
 
-    clicks: FloatArray
+    clicks: Float64Array
     """(GROUPS, n_items) probability of a click."""
-    shown: FloatArray
+    shown: Float64Array
     """(GROUPS, n_items) propensity."""
-    items: FloatArray
+    items: Float64Array
     """(n_items, FEATURES)."""
 
     @classmethod
@@ -87,7 +85,7 @@ class Catalogue:
         assert writer is not None
         writer.close()
 
-    def _sessions(self, numbers: npt.NDArray[np.int64], rng: np.random.Generator) -> pa.Table:
+    def _sessions(self, numbers: IntArray, rng: np.random.Generator) -> pa.Table:
         user = numbers // USER_SESSIONS
         group = np.repeat(user % GROUPS, SESSION_ROWS)
         item = np.empty(len(group), dtype=np.int64)

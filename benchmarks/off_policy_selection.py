@@ -49,12 +49,12 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import numpy.typing as npt
 from gymnasium.vector import VectorEnv
 from scipy.stats import spearmanr
 
-from ucfrec.acting.rollout import Actor, BoolArray, FloatArray, IntArray, Step, rollout
+from ucfrec.acting.rollout import Actor, Step, rollout
 from ucfrec.acting.uniform import Memoryless
+from ucfrec.arrays import BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.code_version import code_version
 from ucfrec.off_policy.estimators import session_terms
 from ucfrec.off_policy.logged_steps import LoggedSteps
@@ -72,13 +72,12 @@ from ucfrec_simulators.taobao.synthetic import SyntheticTaobao
 PARALLEL = 256
 ESTIMATORS = ("SNPDIS", "PDIS", "SNIPS")
 RESULTS = Path("runs/off_policy/results.jsonl")
-DoubleArray = npt.NDArray[np.float64]
 
 
 class Watched(Actor, Protocol):
     """A logging policy that notes what each candidate would have thought of its choices."""
 
-    thought: DoubleArray
+    thought: Float64Array
     """(N, 4) of the last step: each candidate's probability, or density, of the action drawn; 0 in
     rows that are not live."""
 
@@ -105,7 +104,7 @@ class GuessedTastes(SoftmaxGuess):
         super().__init__(world, seed, *Catalogue.LOGGING)
         self._others, self.thought = others, np.empty((0, len(others)))
 
-    def act(self, observations: FloatArray, live: BoolArray) -> tuple[IntArray, FloatArray]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[IntArray, Float32Array]:
         chosen, propensity = super().act(observations, live)
         items, rows = chosen[live], np.arange(live.sum())
         self.thought = np.zeros((len(chosen), len(self._others)))
@@ -150,7 +149,7 @@ class NoisyBlend(Memoryless):
         self._generator = np.random.default_rng([seed, 7])
         self.thought = np.empty((0, len(of.candidates)))
 
-    def act(self, observations: FloatArray, live: BoolArray) -> tuple[FloatArray, FloatArray]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Float32Array, Float32Array]:
         best = self._world.optimal_actions(observations)
         chosen, density = truncated_normal(mean(best, self._of.LOGGING), NOISE, self._generator)
         self.thought = np.zeros((len(chosen), len(self._of.candidates)))
@@ -165,7 +164,7 @@ NOISE, UNTUNED = 0.3, default_action()
 action that they blend with the best."""
 
 
-def mean(best: FloatArray, quality: float) -> FloatArray:
+def mean(best: Float32Array, quality: float) -> Float32Array:
     """Blend of the best actions (N, A), share `quality`, and an untuned one."""
     return quality * best + (1 - quality) * UNTUNED
 
@@ -205,10 +204,10 @@ WORLDS: Mapping[str, World] = {
 }
 
 
-def logs(world: World, sessions: int, seed: int) -> tuple[LoggedSteps, DoubleArray]:
+def logs(world: World, sessions: int, seed: int) -> tuple[LoggedSteps, Float64Array]:
     """Logged steps, and each candidate's probabilities or densities (N, 4) of what was logged."""
     env, actor = world.playing(seed)
-    parts: list[DoubleArray] = []
+    parts: list[Float64Array] = []
 
     def keep(step: Step) -> None:
         assert step.propensities is not None

@@ -240,7 +240,7 @@ def main() -> None:
     if options.method:
         RUN[options.method](options.log, options.out, options.memory_limit)
         return
-    from ucfrec.locks import scratch_folder
+    from ucfrec.files.locks import scratch_folder
     from ucfrec.reporting.tables import markdown_table
 
     lines = []

@@ -27,8 +27,9 @@ import pyarrow.parquet as pq
 from scipy.stats import spearmanr
 
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.choosing.by_simulation import RuleSearch
+from ucfrec.choosing.config import RuleConfig
 from ucfrec.code_version import code_version
-from ucfrec.counterfactual.training_users import TrainingUsers, fit_training_users
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.evaluate import evaluate_policy
 from ucfrec.evaluation.simulated_store import simulated_store
@@ -37,12 +38,11 @@ from ucfrec.provenance import config_hash, provenance
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows, read_rows
 from ucfrec.reporting.tables import markdown_table
-from ucfrec.runs.choose_rule import RuleSearch
 from ucfrec.runs.config import resolve_config
-from ucfrec.runs.rule_config import RuleConfig
 from ucfrec.runs.run import train_run, training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.schema import PROPENSITY
+from ucfrec.user_model.training_users import TrainingUsers, fit_training_users
 from ucfrec_simulators.benchmark.plan import BUDGETS
 
 WORLD, SESSIONS, EPISODES, SEED = World("sardine-boredinf"), 500, 300, 3_000_000

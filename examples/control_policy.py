@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
+
+from ucfrec.arrays import Float32Array
 
 ENV, EPISODES = "Hopper-v5", 150
 TARGETS = (50.0, 150.0, 250.0)
@@ -73,7 +74,7 @@ def train(file: Path, folder: Path) -> Path:
     from ucfrec_control.learners.train import dataset_of, preset_of, train_control
 
     store = read_d4rl(file).write_store(folder / "store")
-    returns: npt.NDArray[np.float32] = store.returns
+    returns: Float32Array = store.returns
     print(f"{store.n_episodes} trajectories, returns {returns.min():.0f} to {returns.max():.0f}")
     preset = preset_of(dataset_of(store), "ucf")
     config = resolve_config("ucf", None, SETTINGS, presets=preset.tables)

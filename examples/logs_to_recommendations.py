@@ -10,10 +10,10 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
 from ucfrec import EpisodeStore, Recommender
+from ucfrec.arrays import Float64Array
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.logs.summary import format_report
@@ -35,7 +35,7 @@ COLUMNS = {"user_id": "uid", "item_id": "video", "timestamp": "time_s * 1000"}
 # units are not ours on purpose: times are seconds, and what counts is how long a video was watched.
 
 
-def make_logs(folder: Path) -> npt.NDArray[np.float64]:
+def make_logs(folder: Path) -> Float64Array:
     """Write `views.parquet` and `videos.csv`.
 
     Returns:
@@ -104,7 +104,7 @@ def train(store: EpisodeStore, folder: Path) -> Recommender:
 # done then.
 
 
-def true_value(frame: pd.DataFrame, appeal: npt.NDArray[np.float64]) -> float:
+def true_value(frame: pd.DataFrame, appeal: Float64Array) -> float:
     """Mean share that the users of `frame` would watch of its videos."""
     users = frame["user_id"].str[1:].astype(int)
     videos = frame["item_id"].str[1:].astype(int)

@@ -6,7 +6,7 @@ A package adds a simulator to the command line by declaring, in the entry-point 
 from `ucfrec.policies.base.SequencePolicy`) in `ucfrec.policies`.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -15,9 +15,6 @@ from typing import TYPE_CHECKING, Any, Final
 from ucfrec.errors import InputError
 
 if TYPE_CHECKING:
-    from gymnasium.vector import VectorEnv
-
-    from ucfrec.acting.rollout import Actor
     from ucfrec.evaluation.world import World
     from ucfrec.reporting.result_row import ResultRow
 
@@ -28,27 +25,6 @@ _ONE_OF: Final = {
     "simulators": "simulator",
 }
 """Singular of each group, for messages."""
-
-
-@dataclass(frozen=True)
-class Simulator:
-    """A simulated environment in which sessions are played."""
-
-    summary: str
-    """One line for `--help`."""
-    make: "Callable[[int, Path | None], VectorEnv[Any, Any, Any]]"
-    """Makes a vector environment with `AutoresetMode.SAME_STEP` from (number of parallel sessions,
-    folder of weights or None)."""
-    behaviors: "Mapping[str, Callable[[VectorEnv[Any, Any, Any], int], Actor]]"
-    """Built-in behavior policies by name, each made from (environment, seed): `random`, `mixture`
-    and, if it is known, `optimal`."""
-    feedback: str
-    """Name of the reward column in the logs that `ucfrec collect` writes."""
-
-    @property
-    def logging_behavior(self) -> str:
-        """The behavior policy of logs that nobody chose another for."""
-        return "mixture" if "mixture" in self.behaviors else "random"
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ import pyarrow.parquet as pq
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files import atomic_folder
-from ucfrec.locks import scratch_folder
+from ucfrec.files.atomic import atomic_folder
+from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.clean import REASONS
 from ucfrec.logs.histories import log_table
 from ucfrec.logs.mapping import LogMapping

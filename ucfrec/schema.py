@@ -46,3 +46,8 @@ SPLITS: Final = ("train", "validation", "test")
 
 STORE_VERSION: Final = 1
 """Version of the store format; increased whenever an older ucfrec would misread a new store."""
+
+USER_IDS: Final = "user_id"
+"""Key of `info`: (N,) int64, user of each environment's next step, numbered as in the logs."""
+FORBIDDEN: Final = "forbidden"
+"""Key of `info`: (N, L) int64, items not allowed at the next step; rows are padded with −1."""

@@ -1,32 +1,31 @@
 """Built-in behavior policies shared by the worlds; each is an `ucfrec.acting.rollout.Actor`."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import ndtr, ndtri
 
-from ucfrec.acting.rollout import Actor, BoolArray, FloatArray, IntArray
+from ucfrec.acting.rollout import Actor
 from ucfrec.acting.uniform import Memoryless
+from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 
-Actions = npt.NDArray[Any]
+Actions = Array
 
 
 class Constant(Memoryless):
     """The same action vector (A,) at every step."""
 
-    def __init__(self, action: FloatArray) -> None:
+    def __init__(self, action: Float32Array) -> None:
         self._action = action
 
-    def act(self, observations: FloatArray, live: BoolArray) -> tuple[Actions, None]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Actions, None]:
         """Repeat the action, (N, A)."""
         return np.tile(self._action, (len(observations), 1)), None
 
 
 def truncated_normal(
-    mean: FloatArray, scale: float, generator: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
+    mean: Float32Array, scale: float, generator: np.random.Generator
+) -> tuple[Float32Array, Float32Array]:
     """Draw from a normal around `mean` that is truncated to the box [−1, 1]^A, not clipped to it.
 
     Clipping would put probability mass on the faces of the box, where no density exists. The
@@ -49,8 +48,8 @@ def truncated_normal(
 
 
 def truncated_normal_density(
-    mean: FloatArray, scale: float, actions: FloatArray
-) -> npt.NDArray[np.float64]:
+    mean: Float32Array, scale: float, actions: Float32Array
+) -> Float64Array:
     """Densities (N,) of actions (N, A) under the distribution of `truncated_normal`."""
     center = mean.astype(np.float64)
     inside = ndtr((1 - center) / scale) - ndtr((-1 - center) / scale)
@@ -62,10 +61,10 @@ def truncated_normal_density(
 class Rule(Memoryless):
     """A deterministic map from observations (N, O) to action vectors (N, A)."""
 
-    def __init__(self, rule: Callable[[FloatArray], FloatArray]) -> None:
+    def __init__(self, rule: Callable[[Float32Array], Float32Array]) -> None:
         self._rule = rule
 
-    def act(self, observations: FloatArray, live: BoolArray) -> tuple[Actions, None]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Actions, None]:
         """Apply the rule, (N, A)."""
         return self._rule(observations), None
 
@@ -78,14 +77,14 @@ class Blend(Memoryless):
     """
 
     def __init__(
-        self, target: Actor, default: FloatArray, quality: float, noise: float, seed: int
+        self, target: Actor, default: Float32Array, quality: float, noise: float, seed: int
     ) -> None:
         self._target, self._default = target, default
         self._quality, self._noise = quality, noise
         # The quality is part of the seed so that components of one mixture draw independently.
         self._generator = np.random.default_rng([seed, 2, round(1000 * quality)])
 
-    def act(self, observations: FloatArray, live: BoolArray) -> tuple[Actions, None]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Actions, None]:
         """Blended actions with exploration noise, (N, A)."""
         target, _ = self._target.act(observations, live)
         explored = self._noise * self._generator.standard_normal(target.shape)
@@ -119,7 +118,9 @@ class SessionMixture:
         for actor in self._actors:
             actor.begin(rows)
 
-    def act(self, observations: FloatArray, live: BoolArray) -> tuple[Actions, FloatArray | None]:
+    def act(
+        self, observations: Float32Array, live: BoolArray
+    ) -> tuple[Actions, Float32Array | None]:
         """Actions (N, A) or (N,) of the sessions' actors; propensities (N,) if all report them."""
         choices = [actor.act(observations, live) for actor in self._actors]
         rows = np.arange(len(observations))
@@ -129,7 +130,7 @@ class SessionMixture:
             return actions, None
         return actions, np.stack(known)[self.component, rows]
 
-    def observe(self, actions: Actions, rewards: FloatArray) -> None:
+    def observe(self, actions: Actions, rewards: Float32Array) -> None:
         """Pass the played actions and rewards (N,) to every actor."""
         for actor in self._actors:
             actor.observe(actions, rewards)

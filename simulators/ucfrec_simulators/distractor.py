@@ -15,14 +15,14 @@ from gymnasium import spaces
 from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from ucfrec.acting.rollout import Actor, BoolArray, FloatArray, Informed
+from ucfrec.acting.rollout import Actor, Informed
+from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.episodes.distractor import logged_observations, reward_bit, with_observations
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.evaluation.simulator import Simulator
 from ucfrec.evaluation.world import World
-from ucfrec.plugins import Simulator
 from ucfrec_simulators.kuai import kuairand
-from ucfrec_simulators.session_env import AnyArray
 from ucfrec_simulators.taobao import synthetic as synthetic_taobao
 
 OFF: Final = 0.0
@@ -52,7 +52,7 @@ def plant_distractor(
     return with_observations(store, out, planted, {"distractor": record})
 
 
-class DistractorEnv(VectorWrapper[FloatArray, AnyArray, AnyArray]):
+class DistractorEnv(VectorWrapper[Float32Array, Array, Array]):
     """A world whose observation starts with a distractor that has no effect.
 
     In each step the distractor is 1 with probability `rate`, independently of everything else:
@@ -68,7 +68,7 @@ class DistractorEnv(VectorWrapper[FloatArray, AnyArray, AnyArray]):
         InputError: `rate` is not in [0, 1].
     """
 
-    def __init__(self, env: VectorEnv[FloatArray, AnyArray, AnyArray], rate: float) -> None:
+    def __init__(self, env: VectorEnv[Float32Array, Array, Array], rate: float) -> None:
         if not 0 <= rate <= 1:
             raise InputError(f"the distractor's rate is {rate}; it must lie in [0, 1]")
         super().__init__(env)
@@ -86,7 +86,7 @@ class DistractorEnv(VectorWrapper[FloatArray, AnyArray, AnyArray]):
         *,
         seed: int | None = None,
         options: dict[str, Any] | None = None,
-    ) -> tuple[FloatArray, dict[str, Any]]:
+    ) -> tuple[Float32Array, dict[str, Any]]:
         """Start all sessions; `seed` seeds the world and, independently, the distractors."""
         observations, info = super().reset(seed=seed, options=options)
         if seed is not None:
@@ -94,8 +94,8 @@ class DistractorEnv(VectorWrapper[FloatArray, AnyArray, AnyArray]):
         return self._with_distractors(observations), info
 
     def step(
-        self, actions: AnyArray
-    ) -> tuple[FloatArray, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
+        self, actions: Array
+    ) -> tuple[Float32Array, Float32Array, BoolArray, BoolArray, dict[str, Any]]:
         """Play one action in each session, as the wrapped world does."""
         observations, rewards, terminated, truncated, info = self.env.step(actions)
         if "final_obs" in info:
@@ -105,7 +105,7 @@ class DistractorEnv(VectorWrapper[FloatArray, AnyArray, AnyArray]):
                 info["final_obs"][row] = final
         return self._with_distractors(observations), rewards, terminated, truncated, info
 
-    def _with_distractors(self, observations: FloatArray) -> FloatArray:
+    def _with_distractors(self, observations: Float32Array) -> Float32Array:
         distractors = self._distractors.random(len(observations)) < self._rate
         return np.column_stack([distractors, observations]).astype(np.float32)
 
@@ -117,7 +117,7 @@ class WithoutDistractor:
         self._actor = actor
         self.begin, self.observe = actor.begin, actor.observe
 
-    def act(self, observations: FloatArray, live: BoolArray) -> tuple[AnyArray, FloatArray | None]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, Float32Array | None]:
         """Act on observations (N, 1 + O) with the distractor removed."""
         return self._actor.act(observations[:, 1:], live)
 

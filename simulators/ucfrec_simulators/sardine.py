@@ -18,11 +18,11 @@ import numpy as np
 import pyarrow as pa
 from gymnasium.vector import VectorEnv
 
-from ucfrec.acting.rollout import BoolArray, FloatArray, IntArray
 from ucfrec.acting.uniform import Actions, Uniform
+from ucfrec.arrays import BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.evaluation.gymnasium_world import GymnasiumCatalog
-from ucfrec.plugins import Simulator
+from ucfrec.evaluation.simulator import Simulator
 from ucfrec.schema import ITEM_ID
 
 PACKAGE: Final = "sardine"
@@ -50,7 +50,7 @@ class SardineWorld(GymnasiumCatalog):
                 "'ucfrec[sardine]'"
             ) from None
         super().__init__(f"{PACKAGE}/SingleItem-{variant}-v0", num_envs, _items)
-        self.vectors: FloatArray = _sardine(self.envs[0]).item_embedd
+        self.vectors: Float32Array = _sardine(self.envs[0]).item_embedd
         """(n_items, 10) weight of each topic in each item."""
 
     def favourites(self) -> IntArray:
@@ -106,7 +106,7 @@ class GreedyOracle:
         """Draw ε of the sessions that start."""
         self._epsilon[rows] = self._generator.choice(self._choices, size=len(rows))
 
-    def act(self, observations: FloatArray, live: BoolArray) -> tuple[IntArray, FloatArray]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[IntArray, Float32Array]:
         """Draw items (N,); returns them and their propensities (N,)."""
         n_items, count = len(self._world.vectors), len(self._epsilon)
         greedy, uniform = self._world.favourites(), self._generator.integers(n_items, size=count)
@@ -114,7 +114,7 @@ class GreedyOracle:
         propensities = self._epsilon / n_items + (1 - self._epsilon) * (chosen == greedy)
         return chosen, propensities.astype(np.float32)
 
-    def observe(self, actions: Actions, rewards: FloatArray) -> None:
+    def observe(self, actions: Actions, rewards: Float32Array) -> None:
         """Do nothing: tastes are read from the world."""
 
 

@@ -11,14 +11,12 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from ucfrec.acting.rollout import BoolArray, FloatArray, IntArray
+from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
-
-AnyArray = npt.NDArray[Any]
 
 
 def draw_categories(
-    probabilities: npt.NDArray[np.floating[Any]], uniforms: npt.NDArray[np.float64]
+    probabilities: npt.NDArray[np.floating[Any]], uniforms: Float64Array
 ) -> IntArray:
     """Sample one category per row by inverting the cumulative distribution.
 
@@ -34,7 +32,7 @@ def draw_categories(
     return chosen
 
 
-class SessionsEnv(VectorEnv[FloatArray, AnyArray, AnyArray], ABC):
+class SessionsEnv(VectorEnv[Float32Array, Array, Array], ABC):
     """N sessions played at once with `AutoresetMode.SAME_STEP`.
 
     A step that ends a session returns the first observation of the next session, and the last one
@@ -67,20 +65,20 @@ class SessionsEnv(VectorEnv[FloatArray, AnyArray, AnyArray], ABC):
         """Start new sessions in `rows`."""
 
     @abstractmethod
-    def _play(self, actions: AnyArray) -> tuple[FloatArray, BoolArray, BoolArray]:
+    def _play(self, actions: Array) -> tuple[Float32Array, BoolArray, BoolArray]:
         """Advance every session one step; returns rewards, terminated and truncated, each (N,)."""
 
     @abstractmethod
-    def _observe(self) -> FloatArray:
+    def _observe(self) -> Float32Array:
         """Observations (N, O) in a new array."""
 
     @abstractmethod
-    def _describe(self) -> dict[str, AnyArray]:
+    def _describe(self) -> dict[str, Array]:
         """Entries of `info`: new arrays with one row per session."""
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[FloatArray, dict[str, Any]]:
+    ) -> tuple[Float32Array, dict[str, Any]]:
         """Start all sessions; returns observations (N, O) and info."""
         super().reset(seed=seed, options=options)
         self._begin(np.arange(self.num_envs))
@@ -88,8 +86,8 @@ class SessionsEnv(VectorEnv[FloatArray, AnyArray, AnyArray], ABC):
         return self._observe(), self._info(np.ones(self.num_envs, dtype=np.bool_))
 
     def step(
-        self, actions: AnyArray
-    ) -> tuple[FloatArray, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
+        self, actions: Array
+    ) -> tuple[Float32Array, Float32Array, BoolArray, BoolArray, dict[str, Any]]:
         """Play one action in each session.
 
         Args:
@@ -122,11 +120,11 @@ class SessionsEnv(VectorEnv[FloatArray, AnyArray, AnyArray], ABC):
         all_rows = np.ones(self.num_envs, dtype=np.bool_)
         return self._observe(), rewards, terminated, truncated, self._info(all_rows) | final
 
-    def _info(self, rows: BoolArray) -> dict[str, AnyArray]:
+    def _info(self, rows: BoolArray) -> dict[str, Array]:
         described = self._describe()
         return described | {f"_{key}": rows.copy() for key in described}
 
-    def _checked(self, actions: AnyArray) -> AnyArray:
+    def _checked(self, actions: Array) -> Array:
         space = self.action_space
         actions = np.asarray(actions)
         if actions.shape != space.shape:
@@ -146,14 +144,14 @@ class SessionsEnv(VectorEnv[FloatArray, AnyArray, AnyArray], ABC):
         return actions.astype(np.float32, copy=False)
 
 
-class SingleSession(gymnasium.Env[FloatArray, AnyArray]):
+class SingleSession(gymnasium.Env[Float32Array, Array]):
     """A plain Gymnasium environment of a world with one session.
 
     Raises:
         InputError: the world has more than one session.
     """
 
-    def __init__(self, world: VectorEnv[FloatArray, AnyArray, AnyArray]) -> None:
+    def __init__(self, world: VectorEnv[Float32Array, Array, Array]) -> None:
         if world.num_envs != 1:
             raise InputError(f"SingleSession needs a world of one session, got {world.num_envs}")
         self._world = world
@@ -162,21 +160,19 @@ class SingleSession(gymnasium.Env[FloatArray, AnyArray]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[FloatArray, dict[str, Any]]:
+    ) -> tuple[Float32Array, dict[str, Any]]:
         """Start a session; returns the observation (O,) and info."""
         super().reset(seed=seed, options=options)
         observations, infos = self._world.reset(seed=seed, options=options)
         return observations[0], _first(infos)
 
-    def step(
-        self, action: AnyArray
-    ) -> tuple[FloatArray, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: Array) -> tuple[Float32Array, SupportsFloat, bool, bool, dict[str, Any]]:
         """Play one action; returns observation (O,), reward, terminated, truncated and info."""
         observations, rewards, terminated, truncated, infos = self._world.step(
             np.asarray(action)[None]
         )
         ended = bool(terminated[0] | truncated[0])
-        observation = cast(FloatArray, infos["final_obs"][0]) if ended else observations[0]
+        observation = cast(Float32Array, infos["final_obs"][0]) if ended else observations[0]
         info = _first(infos["final_info"] if ended else infos)
         return observation, float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info
 

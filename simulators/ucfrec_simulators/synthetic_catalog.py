@@ -5,17 +5,17 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
-from ucfrec.acting.rollout import Actor, BoolArray, FloatArray, IntArray
+from ucfrec.acting.rollout import Actor
 from ucfrec.acting.uniform import Memoryless, Uniform
+from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.plugins import Simulator
+from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators.behaviors import SessionMixture
-from ucfrec_simulators.session_env import AnyArray, SessionsEnv, draw_categories
+from ucfrec_simulators.session_env import SessionsEnv, draw_categories
 
 CLUSTERS: Final = 8
 FACTORS: Final = 4
@@ -86,7 +86,7 @@ class SyntheticCatalog(SessionsEnv):
         self.mood = mood
         shifts = (-mood, mood) if mood else (0.0,)
         self._by_mood = np.stack([1 / (1 + np.exp(-(self.logits + shift))) for shift in shifts])
-        self.click_probabilities: npt.NDArray[np.float64] = self._by_mood.mean(axis=0)
+        self.click_probabilities: Float64Array = self._by_mood.mean(axis=0)
         """(n_users, n_items) probabilities of a click, over all moods."""
         features = np.concatenate([tastes, factors], axis=1)
         self._features = (features + world.normal(0, 0.5, features.shape)).astype(np.float32)
@@ -111,7 +111,7 @@ class SyntheticCatalog(SessionsEnv):
         columns = {f"tag_{tag}": pa.array(column) for tag, column in enumerate(hot.T)}
         return pa.table({"item_id": pa.array(np.arange(len(self.tags))), **columns})
 
-    def favourites(self, probabilities: npt.NDArray[np.float64]) -> IntArray:
+    def favourites(self, probabilities: Float64Array) -> IntArray:
         """The best item of each of the `boredom_window` best tags, the best first.
 
         Args:
@@ -130,7 +130,7 @@ class SyntheticCatalog(SessionsEnv):
         order = np.argsort(-np.take_along_axis(probabilities, by_tag, 1), axis=1, kind="stable")
         return np.take_along_axis(by_tag, order[:, : self.boredom_window], axis=1)
 
-    def optimal_returns(self) -> npt.NDArray[np.float64]:
+    def optimal_returns(self) -> Float64Array:
         """(n_users,) expected return of `Rotation` for each user, which is the largest possible."""
         best = np.take_along_axis(
             self.click_probabilities, self.favourites(self.click_probabilities), axis=1
@@ -145,7 +145,7 @@ class SyntheticCatalog(SessionsEnv):
         if self.mood:
             self.good_mood[rows] = self.np_random.integers(2, size=len(rows))
 
-    def _play(self, actions: AnyArray) -> tuple[FloatArray, BoolArray, BoolArray]:
+    def _play(self, actions: Array) -> tuple[Float32Array, BoolArray, BoolArray]:
         tags = self.tags[actions]
         chances = self._by_mood[self.good_mood, self.users, actions]
         clicks = self.np_random.random(self.num_envs) < chances
@@ -154,10 +154,10 @@ class SyntheticCatalog(SessionsEnv):
         self.turns += 1
         return clicks.astype(np.float32), bored, (self.turns >= self.max_turn) & ~bored
 
-    def _observe(self) -> FloatArray:
+    def _observe(self) -> Float32Array:
         return self._features[self.users]
 
-    def _describe(self) -> dict[str, AnyArray]:
+    def _describe(self) -> dict[str, Array]:
         return {"user_id": self.users.copy()}
 
 
@@ -179,7 +179,9 @@ class Rotation(Memoryless):
     def __init__(self, world: SyntheticCatalog, favourites: IntArray) -> None:
         self._world, self._favourites = world, favourites
 
-    def act(self, observations: FloatArray, live: BoolArray) -> tuple[IntArray, FloatArray | None]:
+    def act(
+        self, observations: Float32Array, live: BoolArray
+    ) -> tuple[IntArray, Float32Array | None]:
         """The next favourite (N,) of each session's user; propensities (N,) are 1."""
         world = self._world
         last = world.turns == world.max_turn - 1
@@ -219,7 +221,7 @@ class SoftmaxGuess(Memoryless):
         errors = np.random.default_rng([0, 5, round(1000 * error)])
         self._guess = world.logits + error * errors.standard_normal(world.logits.shape)
 
-    def probabilities(self, live: BoolArray | None = None) -> npt.NDArray[np.float64]:
+    def probabilities(self, live: BoolArray | None = None) -> Float64Array:
         """(N, n_items) probability of each item in each session's next step.
 
         Args:
@@ -236,7 +238,7 @@ class SoftmaxGuess(Memoryless):
         greedy = weights / weights.sum(axis=1, keepdims=True)
         return np.asarray((1 - self._epsilon) * greedy + self._epsilon / scores.shape[1])
 
-    def act(self, observations: FloatArray, live: BoolArray) -> tuple[IntArray, FloatArray]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[IntArray, Float32Array]:
         """Draw items (N,); returns them and their propensities (N,)."""
         probabilities = self.probabilities()
         chosen = draw_categories(probabilities, self._generator.random(len(probabilities)))

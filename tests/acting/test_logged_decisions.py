@@ -15,8 +15,6 @@ from tests.support.tagged import ITEMS, tagged_log, tagged_store
 from ucfrec import EpisodeStore, Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.logged_decisions import LoggedDecisions, seen_before, session_scores
-from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model
-from ucfrec.counterfactual.session_tastes import MEMORY
 from ucfrec.evaluation.ranking import Steps
 from ucfrec.evaluation.ranking_baselines import PolicyRanker
 from ucfrec.logs import LogMapping
@@ -25,6 +23,8 @@ from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
 from ucfrec.runs.run import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.user_model.posterior import MEMORY
+from ucfrec.user_model.reward_fit import fit_item_reward_model
 
 SETTINGS = {
     "train.steps": 30, "train.learning_rate": 3e-3, "policy.dim": 16, "policy.context": 6,

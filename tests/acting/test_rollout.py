@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from ucfrec.acting.rollout import BoolArray, Episodes, FloatArray, IntArray, Step, rollout
+from ucfrec.acting.rollout import Episodes, Step, rollout
+from ucfrec.arrays import BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.evaluation.metrics import bootstrap_interval, session_metrics
 
 
-class Countdown(gym.Env[FloatArray, int]):
+class Countdown(gym.Env[Float32Array, int]):
     """Episode e of environment i lasts as long as its seeded draw; the reward is the step."""
 
     observation_space = gym.spaces.Box(0, 1000, (2,), np.float32)
@@ -20,18 +21,18 @@ class Countdown(gym.Env[FloatArray, int]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[FloatArray, dict[str, Any]]:
+    ) -> tuple[Float32Array, dict[str, Any]]:
         super().reset(seed=seed)
         self.length = int(self.np_random.integers(1, 9))
         self.step_number = 0
         return self._observation(), {}
 
-    def step(self, action: int) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: int) -> tuple[Float32Array, float, bool, bool, dict[str, Any]]:
         self.step_number += 1
         done = self.step_number >= self.length
         return self._observation(), float(self.step_number), done, False, {}
 
-    def _observation(self) -> FloatArray:
+    def _observation(self) -> Float32Array:
         return np.array([self.length, self.step_number], dtype=np.float32)
 
 
@@ -44,11 +45,11 @@ class Recorder:
     def begin(self, rows: IntArray) -> None:
         self.steps[rows] = 0
 
-    def act(self, observations: FloatArray, live: BoolArray) -> tuple[IntArray, None]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[IntArray, None]:
         np.testing.assert_array_equal(observations[:, 1], self.steps)
         return np.zeros(len(observations), dtype=np.int64), None
 
-    def observe(self, actions: IntArray, rewards: FloatArray) -> None:
+    def observe(self, actions: IntArray, rewards: Float32Array) -> None:
         self.steps += 1
 
 

@@ -6,9 +6,9 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 
-from ucfrec.acting.rollout import FORBIDDEN
 from ucfrec.acting.uniform import Uniform
 from ucfrec.errors import InputError
+from ucfrec.schema import FORBIDDEN
 
 
 class Bare(gymnasium.Env[np.ndarray, np.ndarray]):

@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.episodes import random_episodes, write_store
 from ucfrec.commands.cli import main
-from ucfrec.files import read_json, write_json
+from ucfrec.files.atomic import read_json, write_json
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 

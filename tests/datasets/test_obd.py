@@ -4,12 +4,12 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 import pytest
 
 from tests.support.real_data import data_folder
 from ucfrec import schema
+from ucfrec.arrays import Float64Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.metrics import bootstrap_interval
@@ -135,7 +135,7 @@ def real(policy: str) -> tuple[Path, pd.DataFrame]:
     return path, pd.read_parquet(path)
 
 
-def shares(log: pd.DataFrame) -> npt.NDArray[np.float64]:
+def shares(log: pd.DataFrame) -> Float64Array:
     """(position, item) how often each item was shown there."""
     counts = np.zeros((POSITIONS, 80))
     np.add.at(counts, (log.position - 1, log.item_id), 1)

@@ -34,7 +34,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay, Transitions, Windows
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError, InputNote
-from ucfrec.files import atomic_folder, read_json, write_json
+from ucfrec.files.atomic import atomic_folder, read_json, write_json
 
 LENGTHS = [3, 1, 7, 2, 5, 9, 1, 4]
 SHARDS = (2**24, 6, 1)

@@ -12,7 +12,7 @@ from ucfrec.acting.rollout import Episodes
 from ucfrec.errors import InputError
 from ucfrec.evaluation import collect as module
 from ucfrec.evaluation.collect import collect
-from ucfrec.plugins import Simulator
+from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators import synthetic_catalog
 from ucfrec_simulators.taobao import synthetic as synthetic_taobao
 

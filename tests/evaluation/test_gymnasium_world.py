@@ -10,13 +10,14 @@ import pytest
 from gymnasium import spaces
 
 from tests.support.gymnasium_worlds import ITEMS, LENGTH
-from ucfrec.acting.rollout import USER_IDS, Step, rollout
+from ucfrec.acting.rollout import Step, rollout
 from ucfrec.acting.uniform import Uniform
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import world_items
 from ucfrec.evaluation.gymnasium_world import GymnasiumWorld
 from ucfrec.evaluation.world import World
+from ucfrec.schema import USER_IDS
 
 MODULE = "tests.support.gymnasium_worlds"
 

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 import pytest
 
 from ucfrec import schema
+from ucfrec.arrays import Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs import measures
 from ucfrec.logs.mapping import FeatureTable, LogMapping
@@ -18,9 +18,7 @@ from ucfrec.logs.prepare import PrepareOptions, prepare
 START = 1_700_000_000_000
 
 
-def prepared(
-    tmp_path: Path, rewards: npt.NDArray[Any], mapping: LogMapping | None = None
-) -> EpisodeStore:
+def prepared(tmp_path: Path, rewards: Array, mapping: LogMapping | None = None) -> EpisodeStore:
     """A store of sessions of several lengths, with items of several popularities."""
     generator = np.random.default_rng(0)
     rows = len(rewards)
@@ -38,7 +36,7 @@ def prepared(
     return EpisodeStore.open(tmp_path / "store")
 
 
-def counted(values: npt.NDArray[Any], found: dict[str, Any]) -> None:
+def counted(values: Array, found: dict[str, Any]) -> None:
     """Check bins and quantiles against the values themselves."""
     edges = found["edges"]
     expected = [((values >= a) & (values < b)).sum() for a, b in itertools.pairwise(edges)]

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from ucfrec.errors import InputError
-from ucfrec.locks import SCRATCH
+from ucfrec.files.locks import SCRATCH
 from ucfrec.logs import LogMapping, PrepareOptions, prepare, validate
 from ucfrec.logs.binding import Table, glob_pattern, open_tables, text
 from ucfrec.logs.engine import engine

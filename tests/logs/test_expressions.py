@@ -18,7 +18,7 @@ from tests.support.attacks import ATTACKS, attack
 from ucfrec import UCF, EpisodeStore
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
-from ucfrec.files import read_json
+from ucfrec.files.atomic import read_json
 from ucfrec.logs import FeatureTable, LogMapping, PrepareOptions, prepare, read_histories, validate
 from ucfrec.logs.binding import Table, bind, open_tables
 from ucfrec.logs.engine import engine

@@ -4,9 +4,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
+from ucfrec.arrays import Float32Array, Float64Array, IntArray
 from ucfrec.off_policy import LoggedSteps, estimate
 from ucfrec.off_policy.behavior_model import BehaviorModel, fit_behavior
 
@@ -14,7 +14,7 @@ GROUP_OF = np.array([0, 0, 0, 1, 1, 2, 2, 2, 2])
 STEPS = 6000
 
 
-def behavior() -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float64]]:
+def behavior() -> tuple[Float32Array, Float64Array]:
     """States (N, 3), and the probability (N, 9) of every item: groups by the state, items of a
     group alike but for the first, which is shown twice as often."""
     rng = np.random.default_rng(0)
@@ -26,14 +26,12 @@ def behavior() -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float64]]:
     return states, groups[:, GROUP_OF] * share
 
 
-def logged() -> tuple[
-    npt.NDArray[np.float32], npt.NDArray[np.float64], npt.NDArray[np.int64], BehaviorModel
-]:
+def logged() -> tuple[Float32Array, Float64Array, IntArray, BehaviorModel]:
     states, probabilities = behavior()
     rng = np.random.default_rng(1)
     item = (rng.random((STEPS, 1)) > probabilities.cumsum(axis=1)).sum(axis=1).clip(0, 8)
 
-    def chunks() -> Iterator[npt.NDArray[np.float32]]:
+    def chunks() -> Iterator[Float32Array]:
         yield from np.array_split(states, 7)
 
     session = np.arange(STEPS)

@@ -5,22 +5,20 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.support.logged_steps import random_steps, reference
+from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.off_policy.estimators import LOGGED, estimate, session_terms
 from ucfrec.off_policy.fqe import cross_fitted
 from ucfrec.off_policy.logged_steps import LoggedSteps, Modelled
 from ucfrec.off_policy.shrinkage import DR_KINDS, IPS_KINDS
 
-FloatArray = npt.NDArray[np.float64]
 
-
-def values_of(model: Modelled) -> tuple[FloatArray, FloatArray, FloatArray]:
+def values_of(model: Modelled) -> tuple[Float64Array, Float64Array, Float64Array]:
     return model.reward, model.q, model.v
 
 
@@ -154,11 +152,11 @@ def test_effective_sessions_are_between_one_and_all(lengths: list[int], seed: in
 class World:
     """Two states, two actions; a session ends after an action, or goes on in the other state."""
 
-    behavior: FloatArray
+    behavior: Float64Array
     """(state, action)."""
-    target: FloatArray
-    pays: FloatArray
-    ends: FloatArray
+    target: Float64Array
+    pays: Float64Array
+    ends: Float64Array
     """(state, action) probability that the session ends."""
 
     def sessions(self, longest: int) -> Iterator[tuple[float, list[tuple[int, int]]]]:
@@ -170,7 +168,7 @@ class World:
                 likely *= float(np.prod([1 - self.ends[at] for at in path[:-1]]))
                 yield likely * (1.0 if length == longest else float(self.ends[path[-1]])), path
 
-    def q(self, longest: int) -> list[FloatArray]:
+    def q(self, longest: int) -> list[Float64Array]:
         """By steps left (0 to `longest`), (state, action) returns under the target."""
         table = [np.zeros((2, 2))]
         for _ in range(longest):
@@ -178,7 +176,7 @@ class World:
             table.append(self.pays + (1 - self.ends) * v[::-1, None])
         return table
 
-    def logged(self, sessions: int, seed: int) -> tuple[LoggedSteps, npt.NDArray[np.int64]]:
+    def logged(self, sessions: int, seed: int) -> tuple[LoggedSteps, IntArray]:
         """Logged sessions without limit, and the (state, action) of each step as 2 s + a."""
         rng, rows = np.random.default_rng(seed), []
         live, state = np.arange(sessions), 0
@@ -365,7 +363,7 @@ def test_long_sessions_overflow_nothing() -> None:
         ({"cluster_target": np.full(10, 0.5)}, "both cluster_propensity and cluster_target"),
     ],
 )
-def test_wrong_arrays_are_input_errors(change: dict[str, FloatArray], says: str) -> None:
+def test_wrong_arrays_are_input_errors(change: dict[str, Float64Array], says: str) -> None:
     with pytest.raises(InputError, match=says):
         replace(random_steps([2] * 5), **change)
 

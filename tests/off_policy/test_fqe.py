@@ -3,12 +3,10 @@
 from collections.abc import Iterator
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
+from ucfrec.arrays import Float32Array
 from ucfrec.off_policy.fqe import Fitted, cross_fitted, fit_models
-
-Float32Array = npt.NDArray[np.float32]
 
 
 def chain(sessions: int = 300, length: int = 4, seed: int = 0) -> tuple[Float32Array, ...]:

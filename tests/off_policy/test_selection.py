@@ -1,24 +1,23 @@
 """Choosing where the truth is known: bands, probabilities, luck, rank correlation and regret."""
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy.stats import spearmanr
 
+from ucfrec.arrays import Float64Array
 from ucfrec.errors import InputError
 from ucfrec.off_policy import LoggedSteps
 from ucfrec.off_policy.estimators import session_terms
 from ucfrec.off_policy.selection import Selection, select
 from ucfrec.off_policy.verdict import influences
 
-FloatArray = npt.NDArray[np.float64]
 ITEMS = 8
 PAYS = np.linspace(0.1, 0.5, ITEMS)
 LIKING = {"worst": -0.3, "plain": 0.0, "better": 0.15, "best": 0.45}
 """How strongly each of four policies prefers items that pay more."""
 
 
-def policy(liking: float) -> FloatArray:
+def policy(liking: float) -> Float64Array:
     weights = np.exp(liking * np.arange(ITEMS))
     return np.asarray(weights / weights.sum())
 
@@ -59,7 +58,7 @@ def test_the_best_of_four_policies_is_chosen() -> None:
     assert within >= 36
 
 
-def equal(seed: int, candidates: int, sessions: int = 400) -> FloatArray:
+def equal(seed: int, candidates: int, sessions: int = 400) -> Float64Array:
     return np.asarray(np.random.default_rng(seed).exponential(size=(sessions, candidates)))
 
 
@@ -126,6 +125,6 @@ def test_candidates_alike_share_first_place() -> None:
         (["a"], np.full((5, 1), np.nan), "not finite at 5 places"),
     ],
 )
-def test_wrong_arrays_are_input_errors(names: list[str], terms: FloatArray, says: str) -> None:
+def test_wrong_arrays_are_input_errors(names: list[str], terms: Float64Array, says: str) -> None:
     with pytest.raises(InputError, match=says):
         select(names, terms, 0)

@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.checksums import CARD
 from ucfrec.commands.cli import main
+from ucfrec.files.checksums import CARD
 from ucfrec.logs import LogMapping
 from ucfrec.off_policy.evaluate import evaluate_off_policy
 from ucfrec.off_policy.score import logged_sessions

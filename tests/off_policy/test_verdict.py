@@ -4,9 +4,9 @@ import re
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
+from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.off_policy import LoggedSteps, diagnose, estimate, judge
 from ucfrec.off_policy.fqe import cross_fitted
 from ucfrec.off_policy.verdict import cautions
@@ -17,8 +17,8 @@ PAYS = np.linspace(0.1, 0.5, ITEMS)
 
 
 def logs(
-    sessions: int, seed: int = 0, length: int = 1, behavior: npt.NDArray[np.float64] | None = None
-) -> tuple[LoggedSteps, npt.NDArray[np.int64]]:
+    sessions: int, seed: int = 0, length: int = 1, behavior: Float64Array | None = None
+) -> tuple[LoggedSteps, IntArray]:
     """Sessions of a behavior policy (uniform unless given) judged for one that likes later items;
     its value is `value(length)`. Returns the items shown too."""
     rng = np.random.default_rng(seed)

@@ -15,12 +15,12 @@ import torch
 
 from tests.support import killed_run
 from tests.support.episodes import random_episodes, some_states, write_store
-from ucfrec.checksums import seal
 from ucfrec.commands.cli import main
 from ucfrec.episodes.record import RECORD
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay
 from ucfrec.errors import InputError, InputNote
+from ucfrec.files.checksums import seal
 from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run

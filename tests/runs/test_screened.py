@@ -13,7 +13,7 @@ from ucfrec.counterfactual.screening import DimensionReport, ScreeningReport
 from ucfrec.episodes.distractor import logged_observations, with_observations
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files import read_json
+from ucfrec.files.atomic import read_json
 from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.runs import screened
 from ucfrec.runs.config import resolve_config

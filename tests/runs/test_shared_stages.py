@@ -7,7 +7,7 @@ import torch
 
 from tests.support.episodes import random_episodes, some_states, write_store
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.files import read_json
+from ucfrec.files.atomic import read_json
 from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run

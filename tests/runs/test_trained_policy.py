@@ -12,7 +12,7 @@ from tests.recommending.test_recommend import SMALL, random_log
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files import read_json, write_json
+from ucfrec.files.atomic import read_json, write_json
 from ucfrec.fitting.checkpoint import load_module, load_tensors, save_tensors
 from ucfrec.logs import LogMapping, PrepareOptions, prepare
 from ucfrec.policies.registry import BUILT_IN, policy_class

@@ -13,7 +13,8 @@ from tests.simulators.kuai.test_kuairand import QUICK, planted_store
 from tests.support.causes import QUICK as QUICK_SCREENING
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.rollout import IntArray, rollout
+from ucfrec.acting.rollout import rollout
+from ucfrec.arrays import IntArray
 from ucfrec.commands.cli import main
 from ucfrec.episodes.distractor import reward_bit
 from ucfrec.episodes.store import EpisodeStore

@@ -8,7 +8,7 @@ from gymnasium.utils.env_checker import check_env
 
 from ucfrec.acting.rollout import Episodes, Step, rollout
 from ucfrec.errors import InputError
-from ucfrec.plugins import Simulator
+from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators import synthetic_catalog
 from ucfrec_simulators.session_env import SessionsEnv, SingleSession
 from ucfrec_simulators.synthetic_catalog import SoftmaxGuess, SyntheticCatalog, mixture

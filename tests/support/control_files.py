@@ -1,13 +1,13 @@
 """Control datasets made up for tests, and files of them in D4RL's layout."""
 
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
-import numpy.typing as npt
 
-Columns = dict[str, npt.NDArray[Any]]
+from ucfrec.arrays import Array
+
+Columns = dict[str, Array]
 
 
 def hopper_like(lengths: tuple[int, ...] = (4, 1, 6, 3), seed: int = 0) -> Columns:

@@ -8,19 +8,17 @@ independent computation.
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from ucfrec import schema
+from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.episodes.windows import Overlay
 
 N_ITEMS, DIM, N_USERS = 11, 4, 5
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass
@@ -28,10 +26,10 @@ class Logged:
     """One episode as it was logged."""
 
     rewards: list[float]
-    observations: FloatArray
+    observations: Float64Array
     """(T, O)."""
     items: list[int] = field(default_factory=list)
-    actions: FloatArray | None = None
+    actions: Float64Array | None = None
     """(T, A), of episodes without items."""
     user: int = 0
     split: int = 0
@@ -76,10 +74,10 @@ def some_states(
     )
 
 
-def step_columns(episodes: list[Logged]) -> dict[str, npt.NDArray[Any]]:
+def step_columns(episodes: list[Logged]) -> dict[str, Array]:
     """Every step column there is."""
     n = sum(map(len, episodes))
-    steps: dict[str, npt.NDArray[Any]] = {
+    steps: dict[str, Array] = {
         schema.REWARD: np.concatenate([e.rewards for e in episodes]),
         schema.TIMESTAMP: np.arange(n) * 7 + 2**40,
         schema.PROPENSITY: np.linspace(0.1, 1.0, n),
@@ -94,7 +92,7 @@ def step_columns(episodes: list[Logged]) -> dict[str, npt.NDArray[Any]]:
     return steps
 
 
-def episode_columns(episodes: list[Logged]) -> dict[str, npt.NDArray[Any]]:
+def episode_columns(episodes: list[Logged]) -> dict[str, Array]:
     """Every episode column there is."""
     return {
         schema.USER: np.array([e.user for e in episodes]),
@@ -103,7 +101,7 @@ def episode_columns(episodes: list[Logged]) -> dict[str, npt.NDArray[Any]]:
     }
 
 
-def lengths_of(episodes: list[Logged]) -> npt.NDArray[np.int64]:
+def lengths_of(episodes: list[Logged]) -> IntArray:
     return np.array([len(e) for e in episodes], dtype=np.int64)
 
 
@@ -123,7 +121,7 @@ def write_store(
     return store
 
 
-def state_before(episode: Logged, step: int, states: ItemStates | None) -> FloatArray:
+def state_before(episode: Logged, step: int, states: ItemStates | None) -> Float64Array:
     """s_t in float64, straight from the documentation of `ItemStates`."""
     observation = episode.observations[step]
     if states is None:
@@ -134,7 +132,7 @@ def state_before(episode: Logged, step: int, states: ItemStates | None) -> Float
         share = (reward - states.reward_low) / (states.reward_high - states.reward_low)
         return min(max(share, 0.0), 1.0)
 
-    def weighted_mean(weights: list[float], vectors: list[FloatArray]) -> FloatArray:
+    def weighted_mean(weights: list[float], vectors: list[Float64Array]) -> Float64Array:
         total = sum(weights)
         if total == 0:
             return np.zeros(embeddings.shape[1])
@@ -162,7 +160,7 @@ def state_before(episode: Logged, step: int, states: ItemStates | None) -> Float
 
 def random_overlay(
     store: EpisodeStore, copies: int, seed: int, share: float = 0.4
-) -> tuple[Overlay, dict[tuple[int, int], npt.NDArray[np.float32]]]:
+) -> tuple[Overlay, dict[tuple[int, int], Float32Array]]:
     """Copies of random base episodes of the view, and the edits by (copy, step)."""
     rng = np.random.default_rng(seed)
     positions = rng.integers(len(store.episode_ids), size=copies)

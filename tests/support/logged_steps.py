@@ -1,11 +1,10 @@
 """Random logged steps, and the reference inputs of the Open Bandit Pipeline and SCOPE-RL."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ucfrec.arrays import Array
 from ucfrec.off_policy.logged_steps import LoggedSteps, Modelled, cluster_probabilities
 
 REFERENCE = Path(__file__).parents[1] / "off_policy" / "fixtures" / "reference.npz"
@@ -26,7 +25,7 @@ def random_steps(
     )
 
 
-def reference(name: str) -> tuple[LoggedSteps, dict[str, npt.NDArray[Any]]]:
+def reference(name: str) -> tuple[LoggedSteps, dict[str, Array]]:
     """The inputs "bandit" or "sequence" as logged steps, and what the references make of them."""
     with np.load(REFERENCE) as files:
         given = {key: files[key] for key in files.files}

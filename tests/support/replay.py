@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.rollout import USER_IDS
 from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.schema import USER_IDS
 
 
 class Told(DecisionRule):

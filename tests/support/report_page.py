@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
-from ucfrec.files import read_json
+from ucfrec.files.atomic import read_json
 from ucfrec.reporting.page import write_report
 
 VOID = {"meta", "br", "img", "link", "input", "hr"}

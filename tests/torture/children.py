@@ -176,7 +176,7 @@ def run_fresh(*arguments: object, number: int, moment: float) -> End:
 
 def leftovers(*folders: Path) -> list[str]:
     """Locks and scratch in the folders."""
-    from ucfrec.locks import is_lock_or_scratch
+    from ucfrec.files.locks import is_lock_or_scratch
 
     return [
         str(path)

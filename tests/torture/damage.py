@@ -85,9 +85,9 @@ def _replace(path: Path, content: bytes) -> None:
 def read_store(path: Path) -> list[Any]:
     """All that ucfrec reads of a store."""
     from ucfrec import schema
-    from ucfrec.checksums import sealed_record
     from ucfrec.episodes.store import EpisodeStore
-    from ucfrec.parquet_files import read_ids
+    from ucfrec.files.checksums import sealed_record
+    from ucfrec.files.parquet import read_ids
 
     store = EpisodeStore.open(path)
     columns = [store.step_values(name, *store.all_steps()) for name in store.meta["columns"]]

@@ -252,10 +252,10 @@ def _targets(inputs: Inputs) -> dict[str, tuple[Path, str, Reader]]:
     """Name of a reader to (file or folder, the file in it that is changed, the reader)."""
     from tests.torture.damage import read_run, read_store
     from ucfrec.episodes.windows import Overlay
+    from ucfrec.files.parquet import read_ids
     from ucfrec.fitting.checkpoint import load_tensors
     from ucfrec.fitting.metrics_log import read_metrics
     from ucfrec.logs.mapping import read_mapping
-    from ucfrec.parquet_files import read_ids
     from ucfrec.reporting.evaluation_rows import read_evaluations
     from ucfrec.reporting.rows_file import read_configurations, read_rows
     from ucfrec.runs.config import resolve_config
@@ -363,7 +363,7 @@ def _unsealed_run(inputs: Inputs) -> Path:
 
 
 def _without(source: Path, record: str) -> Path:
-    from ucfrec.files import read_json, write_json
+    from ucfrec.files.atomic import read_json, write_json
 
     copy = source.with_name(f"{source.name}-unsealed")
     if not copy.exists():

@@ -19,7 +19,7 @@ from ucfrec.policies.base import SequencePolicy
 from ucfrec.provenance import config_hash
 
 if TYPE_CHECKING:
-    from ucfrec.counterfactual.item_reward_model import ItemRewardModel
+    from ucfrec.user_model.reward import ItemRewardModel
 
 
 _RANGES: Final = {

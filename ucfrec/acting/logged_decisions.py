@@ -3,17 +3,15 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import Decider
+from ucfrec.arrays import IntArray
 from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
-
-IntArray = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)

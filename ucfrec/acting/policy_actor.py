@@ -4,17 +4,17 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from ucfrec.acting.decision import Decider
-from ucfrec.acting.rollout import FORBIDDEN, USER_IDS, BoolArray, FloatArray, IntArray
+from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.states import ItemStates, SessionStates
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.policies.heads import ItemHead
+from ucfrec.schema import FORBIDDEN, USER_IDS
 
 
 class PolicyActor:
@@ -31,7 +31,7 @@ class PolicyActor:
         observation_size: int,
         item_states: ItemStates | None = None,
         item_ids: IntArray | None = None,
-        user_ids: npt.NDArray[Any] | None = None,
+        user_ids: Array | None = None,
         seed: int = 0,
         dropped: Sequence[int] = (),
     ) -> None:
@@ -111,9 +111,7 @@ class PolicyActor:
         self._forbidden = None if forbidden is None else self._in_store(forbidden)
 
     @torch.no_grad()
-    def act(
-        self, observations: FloatArray, live: BoolArray
-    ) -> tuple[npt.NDArray[Any], FloatArray | None]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, Float32Array | None]:
         """Choose the actions of the live rows; other rows play the first item that is allowed.
 
         Args:
@@ -141,7 +139,7 @@ class PolicyActor:
         self._actions[torch.from_numpy(~live), -1] = 0.0
         return self._actions[:, -1].numpy(), None
 
-    def _items(self, rows: Tensor) -> tuple[npt.NDArray[Any], FloatArray]:
+    def _items(self, rows: Tensor) -> tuple[Array, Float32Array]:
         """The environment's items (N,) and their probabilities (N,); live are the `rows`."""
         forbidden = self._left_out()
         chances = torch.ones(len(self._mask))
@@ -169,7 +167,7 @@ class PolicyActor:
         scores = self._decider.scores(windows, collected, *given)
         return self._decider.rule.choose(scores, self._generator)
 
-    def observe(self, actions: npt.NDArray[Any], rewards: FloatArray) -> None:
+    def observe(self, actions: Array, rewards: Float32Array) -> None:
         """Subtract the rewards (N,) from the returns-to-go and advance by one step.
 
         `actions`, (N, A) or (N,), is not used: `act` has recorded them.

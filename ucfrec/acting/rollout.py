@@ -2,25 +2,17 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
-import numpy.typing as npt
 
+from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.progress import progress
+from ucfrec.schema import FORBIDDEN, USER_IDS
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
-
-BoolArray = npt.NDArray[np.bool_]
-IntArray = npt.NDArray[np.int64]
-FloatArray = npt.NDArray[np.float32]
-
-USER_IDS: Final = "user_id"
-"""Key of `info`: (N,) int64, user of each environment's next step, numbered as in the logs."""
-FORBIDDEN: Final = "forbidden"
-"""Key of `info`: (N, L) int64, items not allowed at the next step; rows are padded with −1."""
 
 
 class Actor(Protocol):
@@ -29,9 +21,7 @@ class Actor(Protocol):
     def begin(self, rows: IntArray) -> None:
         """Start a new episode in each of `rows`, (M,) environment indices from 0 to N − 1."""
 
-    def act(
-        self, observations: FloatArray, live: BoolArray
-    ) -> tuple[npt.NDArray[Any], FloatArray | None]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, Float32Array | None]:
         """Choose one action per environment.
 
         Args:
@@ -44,7 +34,7 @@ class Actor(Protocol):
             exceed 1. Propensities are None if they are unknown or undefined.
         """
 
-    def observe(self, actions: npt.NDArray[Any], rewards: FloatArray) -> None:
+    def observe(self, actions: Array, rewards: Float32Array) -> None:
         """Record the actions just played, (N, A) or (N,), and their rewards (N,)."""
 
 
@@ -64,15 +54,15 @@ class Step:
     """(M,) environment indices, 0 to N − 1."""
     episodes: IntArray
     """(M,) episode indices, 0 to episodes − 1."""
-    observations: FloatArray
+    observations: Float32Array
     """(M, O) observations before the actions."""
-    actions: npt.NDArray[Any]
+    actions: Array
     """(M, A) vectors or (M,) items."""
-    rewards: FloatArray
+    rewards: Float32Array
     """(M,)."""
-    next_observations: FloatArray
+    next_observations: Float32Array
     """(M, O) observations after the actions; the final observation where the episode ended."""
-    propensities: FloatArray | None
+    propensities: Float32Array | None
     """(M,) see `Actor.act`."""
     terminated: BoolArray
     """(M,)."""
@@ -93,7 +83,7 @@ class Step:
 class Episodes:
     """Outcome of every episode."""
 
-    returns: npt.NDArray[np.float64]
+    returns: Float64Array
     """(episodes,) sums of rewards, in reward units."""
     lengths: IntArray
     """(episodes,) numbers of steps."""
@@ -158,11 +148,11 @@ def rollout(
 def _play_step(
     env: "VectorEnv[Any, Any, Any]",
     actor: Actor,
-    observations: FloatArray,
+    observations: Float32Array,
     info: Mapping[str, Any],
     episode: IntArray,
     live: BoolArray,
-) -> tuple[Step, FloatArray, dict[str, Any]]:
+) -> tuple[Step, Float32Array, dict[str, Any]]:
     """One step of all N environments, and the observations and `info` of the next one.
 
     `episode` (N,) is the index of each environment's episode.
@@ -209,7 +199,7 @@ def _require_informed(
         )
 
 
-def _before_reset(next_observations: FloatArray, info: Mapping[str, Any]) -> FloatArray:
+def _before_reset(next_observations: Float32Array, info: Mapping[str, Any]) -> Float32Array:
     """Observations (N, O) after a step; of episodes that ended, the final one, not the reset's."""
     if "final_obs" not in info:
         return next_observations

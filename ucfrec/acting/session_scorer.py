@@ -5,19 +5,19 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ucfrec.acting.decision import Decider
 from ucfrec.acting.sessions import Sessions
-from ucfrec.counterfactual.item_reward_model import ItemRewardModel
+from ucfrec.arrays import Float32Array
 from ucfrec.episodes.exposure import Exposed, Likeness, Shown
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
+from ucfrec.user_model.reward import ItemRewardModel
 
 
 class Query(NamedTuple):
@@ -92,14 +92,14 @@ class SessionScorer:
         windows = sessions.windows(self._states, context or self.context)
         return self._product.query(self._decider.asked(windows, sessions.collected), sessions)
 
-    def vectors(self) -> npt.NDArray[np.float32]:
+    def vectors(self) -> Float32Array:
         """(n_items, d + 1) vectors of all items, whose products with `asked` are most of the
         scores."""
         assert self._product is not None
         return self._product.vectors()
 
     @torch.inference_mode()
-    def asked(self, query: Query) -> npt.NDArray[np.float32]:
+    def asked(self, query: Query) -> Float32Array:
         """(B, d + 1) what multiplies `vectors`."""
         assert self._product is not None
         return self._product.asked(query)
@@ -221,13 +221,13 @@ class _Product:
         repeated = query.repeated[rows, lags]
         return scores.index_put_((rows, query.items[rows, lags]), repeated, accumulate=True)
 
-    def vectors(self) -> npt.NDArray[np.float32]:
+    def vectors(self) -> Float32Array:
         """(n_items, d + 1) what `asked` is multiplied with; the last column is the bias."""
         vectors = np.empty((len(self._bias), len(self._matrix) + 1), dtype=np.float32)
         vectors[:, :-1], vectors[:, -1] = self._matrix.numpy().T, self._bias.numpy()
         return vectors
 
-    def asked(self, query: Query) -> npt.NDArray[np.float32]:
+    def asked(self, query: Query) -> Float32Array:
         """(B, d + 1) what multiplies the vectors of all items."""
         return F.pad(self._asked(query)[0], (0, 1), value=1.0).numpy()
 

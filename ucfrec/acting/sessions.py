@@ -4,11 +4,11 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from ucfrec.arrays import Float32Array, IntArray
 from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Windows
@@ -35,10 +35,10 @@ class Sessions:
     @classmethod
     def of_rows(
         cls,
-        owner: npt.NDArray[np.int64],
-        items: npt.NDArray[np.int64],
-        rewards: npt.NDArray[np.float32],
-        users: npt.NDArray[np.int64],
+        owner: IntArray,
+        items: IntArray,
+        rewards: Float32Array,
+        users: IntArray,
         length: int,
         observations: Tensor | None = None,
     ) -> "Sessions":

@@ -4,14 +4,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
-from ucfrec.acting.rollout import FORBIDDEN, BoolArray, FloatArray, IntArray
+from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
+from ucfrec.schema import FORBIDDEN
 
-Actions = npt.NDArray[Any]
+Actions = Array
 
 
 class Memoryless:
@@ -20,7 +20,7 @@ class Memoryless:
     def begin(self, rows: IntArray) -> None:
         """Do nothing: there is no state to reset."""
 
-    def observe(self, actions: Actions, rewards: FloatArray) -> None:
+    def observe(self, actions: Actions, rewards: Float32Array) -> None:
         """Do nothing: there is no state to update."""
 
 
@@ -45,7 +45,9 @@ class Uniform(Memoryless):
         """Read the (N, L) forbidden items of each session from `info`, if the world masks items."""
         self._forbidden = info.get(FORBIDDEN)
 
-    def act(self, observations: FloatArray, live: BoolArray) -> tuple[Actions, FloatArray | None]:
+    def act(
+        self, observations: Float32Array, live: BoolArray
+    ) -> tuple[Actions, Float32Array | None]:
         """Draw actions: (N, A) without propensities, or items (N,) with propensities (N,)."""
         count = len(observations)
         if isinstance(self._space, spaces.Discrete):
@@ -59,7 +61,7 @@ class Uniform(Memoryless):
         drawn = self._generator.uniform(low, high, size=(count, *low.shape))
         return drawn.astype(np.float32), None
 
-    def _allowed_items(self, forbidden: IntArray, n_items: int) -> tuple[IntArray, FloatArray]:
+    def _allowed_items(self, forbidden: IntArray, n_items: int) -> tuple[IntArray, Float32Array]:
         """Draw uniformly among the allowed items; `forbidden` (N, L) is padded with −1.
 
         A rank among the allowed items is drawn, then raised by one per forbidden item up to it.

@@ -16,8 +16,8 @@ from typing import Any, Final, Protocol, cast
 
 from ucfrec import __version__
 from ucfrec.errors import InputError, InputNote, explain_os_error, one_line
+from ucfrec.files.remote import local_paths
 from ucfrec.processes import Interrupted, interruptions_raised
-from ucfrec.remote import local_paths
 
 
 @dataclass(frozen=True)

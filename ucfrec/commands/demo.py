@@ -57,7 +57,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec demo` and print its result table."""
-    from ucfrec.locks import claimed, remove_leftovers
+    from ucfrec.files.locks import claimed, remove_leftovers
     from ucfrec.reporting.tables import format_rows
 
     with claimed(options.out, "filled"):
@@ -78,7 +78,7 @@ def demo(out: Path, seed: int, config: DemoConfig) -> list[dict[str, Any]]:
     from ucfrec.evaluation.evaluate import evaluate_behavior
     from ucfrec.evaluation.simulated_store import simulated_store
     from ucfrec.evaluation.world import World
-    from ucfrec.files import write_json
+    from ucfrec.files.atomic import write_json
     from ucfrec.reporting.page import write_report
 
     for world in WORLDS:

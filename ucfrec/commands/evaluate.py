@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> None:
         InputError: neither a run nor a built-in policy is named, or one of them cannot be used.
     """
     from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
-    from ucfrec.files import write_json
+    from ucfrec.files.atomic import write_json
     from ucfrec.provenance import without_folders
     from ucfrec.reporting.tables import format_rows
     from ucfrec.runs.trained_policy import TrainedPolicy

@@ -7,7 +7,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ucfrec.files import atomic_file
+from ucfrec.files.atomic import atomic_file
 
 
 def write_frames(out: Path, frames: Iterable[pd.DataFrame]) -> int:

@@ -254,7 +254,7 @@ def _write(
     if options.json is None:
         return
     from ucfrec.code_version import code_version
-    from ucfrec.files import write_json
+    from ucfrec.files.atomic import write_json
     from ucfrec.provenance import config_hash
     from ucfrec.reporting.estimate_rows import estimate_row
     from ucfrec.runs.trained_policy import read_record

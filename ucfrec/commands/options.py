@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ucfrec.remote import Input, uri_or_path
+from ucfrec.files.remote import Input, uri_or_path
 
 if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from ucfrec.commands.options import log_options, logs_given
 from ucfrec.errors import InputError
-from ucfrec.remote import Output, origin, uri_or_path
+from ucfrec.files.remote import Output, origin, uri_or_path
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> None:
     """
     from ucfrec.evaluation.ranking import MEASURES
     from ucfrec.evaluation.ranking_table import require_one_catalogue, training_store
-    from ucfrec.files import write_json
+    from ucfrec.files.atomic import write_json
     from ucfrec.logs.summary import format_report
     from ucfrec.off_policy.score import logged_sessions
     from ucfrec.off_policy.training_rows import seen_too_often, share_seen

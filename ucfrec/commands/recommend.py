@@ -18,8 +18,8 @@ from ucfrec.commands.options import (
     rule_options,
 )
 from ucfrec.errors import InputError
+from ucfrec.files.remote import Output, origin, uri_or_path
 from ucfrec.progress import Progress, progress
-from ucfrec.remote import Output, origin, uri_or_path
 
 if TYPE_CHECKING:
     from ucfrec.recommending.histories import Histories

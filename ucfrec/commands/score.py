@@ -10,7 +10,7 @@ from ucfrec.commands.options import (
     rule_given,
     rule_options,
 )
-from ucfrec.remote import Output, origin, uri_or_path
+from ucfrec.files.remote import Output, origin, uri_or_path
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

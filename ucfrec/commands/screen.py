@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from ucfrec.remote import Input, uri_or_path
+from ucfrec.files.remote import Input, uri_or_path
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -27,7 +27,7 @@ def run(options: argparse.Namespace) -> None:
 
     from ucfrec.counterfactual.screening import describe_screening
     from ucfrec.episodes.store import EpisodeStore
-    from ucfrec.files import write_json
+    from ucfrec.files.atomic import write_json
     from ucfrec.provenance import provenance
     from ucfrec.runs.screened import screen_store
 

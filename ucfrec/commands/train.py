@@ -5,8 +5,8 @@ import warnings
 from pathlib import Path
 
 from ucfrec.errors import InputError, InputNote
+from ucfrec.files.remote import Input, uri_or_path
 from ucfrec.policies.registry import policy_names
-from ucfrec.remote import Input, uri_or_path
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

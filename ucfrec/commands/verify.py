@@ -34,8 +34,8 @@ def run(options: argparse.Namespace) -> None:
 
 def _verified(path: Path) -> int:
     """Print what `path` is and its faults; returns their number."""
-    from ucfrec.checksums import sealed_record
     from ucfrec.errors import one_line
+    from ucfrec.files.checksums import sealed_record
 
     if path.is_file():
         from ucfrec.reporting.rows_file import read_rows

@@ -5,15 +5,15 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from ucfrec import schema
+from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.counterfactual.clusters import ActionSupport, StateClusters
 from ucfrec.counterfactual.reward_model import CausalRewardModel
 from ucfrec.counterfactual.transitions import Read
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Array, FloatArray, IntArray, Overlay
+from ucfrec.episodes.windows import Overlay
 
 _CHUNK = 4096
 _STREAM = 1
@@ -129,7 +129,7 @@ class OtherActions:
         return _Asked(episodes[rows], steps[rows], actions, reward, *own)
 
     def _copies(
-        self, episodes: IntArray, steps: IntArray, actions: Array, rewards: FloatArray
+        self, episodes: IntArray, steps: IntArray, actions: Array, rewards: Float32Array
     ) -> Overlay:
         sources, size = self.view.episode_ids[episodes], self.view.state_size
         return Overlay.of_actions(sources, steps, actions, rewards, size)
@@ -141,10 +141,10 @@ class _Asked(NamedTuple):
     episode: IntArray
     step: IntArray
     action: Array
-    reward: npt.NDArray[np.float64]
-    logged: npt.NDArray[np.float64]
+    reward: Float64Array
+    logged: Float64Array
     """What the logged action earned."""
-    reproduced: npt.NDArray[np.bool_]
+    reproduced: BoolArray
     """Whether the reward model says the same of the logged action."""
 
 

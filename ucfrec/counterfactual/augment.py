@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from pydantic import Field
 from torch import Tensor
 
 from ucfrec import schema
+from ucfrec.arrays import BoolArray, Float32Array, IntArray
 from ucfrec.counterfactual.action_copies import ActionReport
 from ucfrec.counterfactual.edit_statistics import MoveReport, MoveStatistics
 from ucfrec.counterfactual.generators import Generator
@@ -23,7 +23,7 @@ from ucfrec.counterfactual.reward_model import CausalRewardModel
 from ucfrec.counterfactual.reward_model_fit import CRMReport, fit_warning
 from ucfrec.counterfactual.transitions import Read
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import FloatArray, IntArray, Overlay, Transitions
+from ucfrec.episodes.windows import Overlay, Transitions
 from ucfrec.settings import Count, Quantile, settings_table
 
 _CHUNK = 8192
@@ -159,7 +159,7 @@ class _Edits(NamedTuple):
     episode: IntArray
     copy: IntArray
     step: IntArray
-    state: FloatArray
+    state: Float32Array
 
 
 class _Editor:
@@ -195,9 +195,7 @@ class _Editor:
         return _Edits(episodes[kept], np.full(int(kept.sum()), copy), steps[kept], state)
 
     @torch.no_grad()
-    def _chunk(
-        self, episodes: IntArray, steps: IntArray
-    ) -> tuple[npt.NDArray[np.bool_], FloatArray]:
+    def _chunk(self, episodes: IntArray, steps: IntArray) -> tuple[BoolArray, Float32Array]:
         factual = self._read(self._view, episodes, steps).to(self._crm.device)
         z = self._crm.abduct(factual.states, factual.actions, factual.rewards)
         proposed = self._generator.propose(factual.states, factual.actions, z, self._random)

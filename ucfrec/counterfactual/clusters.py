@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ucfrec.episodes.windows import Array, IntArray
+from ucfrec.arrays import Array, IntArray
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,6 @@ from ucfrec.counterfactual.augment import (
 )
 from ucfrec.counterfactual.clusters import ActionSupport
 from ucfrec.counterfactual.generators import CSGConfig, make_generator, state_clusters
-from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model
-from ucfrec.counterfactual.item_reward_mean import EffectsMean, EffectTransitions
 from ucfrec.counterfactual.reward_model import CRMConfig
 from ucfrec.counterfactual.reward_model_fit import fit_crm
 from ucfrec.counterfactual.transitions import Read, sample_steps, sample_transitions
@@ -26,6 +24,8 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay
 from ucfrec.errors import InputError
 from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.user_model.reward_fit import fit_item_reward_model
+from ucfrec.user_model.reward_mean import EffectsMean, EffectTransitions
 
 MODELS: Final = ("item-reward", "crm", "csg")
 """Folders of the checkpoints of `counterfactual_copies`; which of them there are depends on the

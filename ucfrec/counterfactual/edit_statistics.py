@@ -4,9 +4,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
+
+from ucfrec.arrays import Float64Array
 
 _QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 _BINS = 20
@@ -72,7 +73,7 @@ class MoveStatistics:
         )
 
 
-def _quantiles(values: npt.NDArray[np.float64]) -> dict[str, float]:
+def _quantiles(values: Float64Array) -> dict[str, float]:
     return {f"{level:g}": float(np.quantile(values, level)) for level in _QUANTILES}
 
 

@@ -18,14 +18,13 @@ from dataclasses import dataclass
 from typing import Annotated, Final
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from pydantic import Field
 from scipy import stats
 from torch import Tensor
 
+from ucfrec.arrays import BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import IntArray
 from ucfrec.errors import InputError
 from ucfrec.progress import progress
 from ucfrec.settings import Count, LearningRate, Share, settings_table
@@ -34,8 +33,6 @@ CLIP: Final = 10.0
 """Standardised values beyond this many standard deviations are clipped."""
 _HELD_OUT_EVERY = 5
 _PATIENCE = 8
-
-FloatArray = npt.NDArray[np.float32]
 
 
 @settings_table("measurement")
@@ -106,14 +103,14 @@ def measured_reward(
 class _Steps:
     """Standardised steps that have a successor."""
 
-    columns: FloatArray
+    columns: Float32Array
     """(N, O) logged observations."""
-    rest: FloatArray
+    rest: Float32Array
     """(N, R) the rest of the state, the action and the next one."""
-    rewards: FloatArray
+    rewards: Float32Array
     """(N, 2) of the step and of the next one."""
     episodes: IntArray
-    held_out: npt.NDArray[np.bool_]
+    held_out: BoolArray
     """(N,)."""
 
     @classmethod
@@ -140,12 +137,12 @@ def _measures(
     alone = np.square(values[held_out] - values[~held_out].mean(dtype=np.float64))
     variance = max(float(alone.mean()), 1e-12)
 
-    def saved(inputs: FloatArray) -> npt.NDArray[np.float64]:
+    def saved(inputs: Float32Array) -> Float64Array:
         """Share (B,) of the variance that the inputs tell of held-out steps."""
         predicted = _predicted(inputs, values, held_out, config, seed)
         return np.asarray((alone - np.square(values[held_out] - predicted)) / variance)
 
-    def told(shares: npt.NDArray[np.float64]) -> bool:
+    def told(shares: Float64Array) -> bool:
         p_value = clustered_p_value(torch.from_numpy(shares), data.episodes[held_out])
         return bool(shares.mean() >= config.min_told) and p_value < config.level
 
@@ -163,12 +160,12 @@ def _measures(
 
 
 def _predicted(
-    inputs: FloatArray,
-    values: FloatArray,
-    held_out: npt.NDArray[np.bool_],
+    inputs: Float32Array,
+    values: Float32Array,
+    held_out: BoolArray,
     config: MeasurementConfig,
     seed: int,
-) -> npt.NDArray[np.float64]:
+) -> Float64Array:
     """`values` (N,) of the held-out rows, predicted by what was fitted to the others."""
     from sklearn.ensemble import HistGradientBoostingRegressor  # takes a second to import
 
@@ -199,7 +196,7 @@ def steps_with_successor(view: EpisodeStore, most: int, seed: int) -> tuple[IntA
     return episodes[inner], steps[inner]
 
 
-def held_out_of(train: EpisodeStore, episodes: IntArray) -> npt.NDArray[np.bool_]:
+def held_out_of(train: EpisodeStore, episodes: IntArray) -> BoolArray:
     """Which steps are held out: those of every fifth episode.
 
     Args:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ucfrec.arrays import IntArray
 from ucfrec.counterfactual.measured_reward import (
     CLIP,
     held_out_of,
@@ -16,7 +17,6 @@ from ucfrec.counterfactual.measured_reward import (
     steps_with_successor,
 )
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import IntArray
 from ucfrec.progress import progress
 
 CHUNK: Final = 1024

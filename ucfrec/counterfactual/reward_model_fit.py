@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ucfrec.counterfactual.item_reward_mean import EffectsMean
+from ucfrec.arrays import Float32Array
 from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, kl_to_prior
 from ucfrec.episodes.windows import Transitions
 from ucfrec.errors import InputError
 from ucfrec.fitting.loop import LoopConfig, fit
 from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.user_model.reward_mean import EffectsMean
 
 _ACTIVE_NATS = 0.01
 _LEAK = 0.1
@@ -326,5 +326,5 @@ def _rows(generator: np.random.Generator, most: int, rows: int, device: torch.de
 
 
 def _noise(generator: np.random.Generator, rows: int, size: int) -> Tensor:
-    values: npt.NDArray[np.float32] = generator.standard_normal((rows, size), dtype=np.float32)
+    values: Float32Array = generator.standard_normal((rows, size), dtype=np.float32)
     return torch.from_numpy(values)

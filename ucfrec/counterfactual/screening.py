@@ -30,6 +30,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from ucfrec.arrays import IntArray
 from ucfrec.counterfactual.measured_reward import (
     MeasurementConfig,
     clustered_p_value,
@@ -45,7 +46,6 @@ from ucfrec.counterfactual.missing_dimensions import (
     shared_pair,
 )
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import IntArray
 from ucfrec.errors import InputError
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.settings import BatchSize, Count, LearningRate, Share, Width, settings_table

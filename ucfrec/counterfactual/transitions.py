@@ -4,8 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ucfrec.arrays import IntArray
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import IntArray, Transitions
+from ucfrec.episodes.windows import Transitions
 
 Read = Callable[[EpisodeStore, IntArray, IntArray], Transitions]
 """Reads the transitions of (view, episodes, steps)."""

@@ -4,16 +4,13 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
 from ucfrec import schema
-from ucfrec.checksums import Sealed
+from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.record import REMEDY
 from ucfrec.errors import InputError, one_line
-from ucfrec.remote import fetch
-
-Array = npt.NDArray[Any]
-IntArray = npt.NDArray[np.int64]
+from ucfrec.files.checksums import Sealed
+from ucfrec.files.remote import fetch
 
 _DTYPES: Final = {
     schema.OFFSETS: "<i8",

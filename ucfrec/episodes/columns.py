@@ -7,21 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.checksums import Sealed
+from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.column_files import StepColumn, load_column
 from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.record import REMEDY, read_store_record
 from ucfrec.episodes.returns import ReturnToGo, returns_to_go
 from ucfrec.episodes.states import ItemStates
 from ucfrec.errors import InputError, InputNote
-
-Array = npt.NDArray[Any]
-IntArray = npt.NDArray[np.int64]
+from ucfrec.files.checksums import Sealed
 
 _IN_MEMORY = Path("<memory>")
 

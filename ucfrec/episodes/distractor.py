@@ -8,19 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ucfrec import schema
-from ucfrec.checksums import FILES, seal
+from ucfrec.arrays import Float32Array
 from ucfrec.episodes.record import RECORD
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files import atomic_folder
+from ucfrec.files.atomic import atomic_folder
+from ucfrec.files.checksums import FILES, seal
 
 
 def reward_bit(
     store: EpisodeStore, flip: float = 0.0, seed: int = 0, early: bool = False
-) -> npt.NDArray[np.float32]:
+) -> Float32Array:
     """The distractor d_t = I{r_t is high} ⊕ Bernoulli(flip) of every step (paper appendix G.4).
 
     A reward is high if it exceeds the median of all rewards; if the median equals the largest
@@ -60,7 +60,7 @@ def reward_bit(
 def with_observations(
     store: EpisodeStore,
     out: Path,
-    observations: npt.NDArray[np.float32],
+    observations: Float32Array,
     source: Mapping[str, Any],
 ) -> EpisodeStore:
     """Write a copy of `store` with other observations, atomically.
@@ -99,7 +99,7 @@ def with_observations(
     return EpisodeStore.open(out)
 
 
-def logged_observations(store: EpisodeStore) -> npt.NDArray[np.float32]:
+def logged_observations(store: EpisodeStore) -> Float32Array:
     """The observations (n_steps, O) in the order of `all_steps`; O is 0 if none were logged."""
     if not store.observation_size:
         return np.zeros((store.n_steps, 0), dtype=np.float32)

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from ucfrec.arrays import Float32Array, Float64Array
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Windows
 
@@ -279,9 +279,7 @@ class ExposureTerm(nn.Module):
         return added + (repeated * (exposed.items == items)).sum(1)
 
 
-def quantiles(
-    values: npt.NDArray[np.float32], levels: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
+def quantiles(values: Float32Array, levels: Float64Array) -> Float64Array:
     """`np.quantile` of the values in float64, without a copy of all of them in float64.
 
     Args:

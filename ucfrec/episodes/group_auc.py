@@ -1,16 +1,13 @@
 """Group AUC: how well scores rank each user's liked steps above the user's other steps."""
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from ucfrec.arrays import Array, BoolArray, Float64Array
 
 
 def group_auc(
-    scores: FloatArray, liked: npt.NDArray[np.bool_], owner: npt.NDArray[Any], n_users: int
-) -> tuple[FloatArray, FloatArray]:
+    scores: Float64Array, liked: BoolArray, owner: Array, n_users: int
+) -> tuple[Float64Array, Float64Array]:
     """Per user: AUC times impressions, and impressions (Zhu et al., KDD 2017).
 
     Both are 0 for users whose steps are all liked or all not liked. The group AUC is the ratio of
@@ -41,7 +38,7 @@ def group_auc(
     return auc * weight, weight
 
 
-def ratio_with_error(above: FloatArray, below: FloatArray) -> tuple[float, float]:
+def ratio_with_error(above: Float64Array, below: Float64Array) -> tuple[float, float]:
     """Σ above / Σ below over users (U,), and its standard error by linearisation; NaN for 0 / 0."""
     total = below.sum()
     if total == 0:

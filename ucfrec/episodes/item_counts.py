@@ -4,11 +4,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from ucfrec import schema
+from ucfrec.arrays import BoolArray, IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
@@ -18,9 +18,7 @@ LIKED = 0.6
 threshold on the normalised watch ratio in the published dominance metric; a click is liked."""
 
 
-def liked_steps(
-    store: EpisodeStore, episodes: npt.NDArray[np.int64], steps: npt.NDArray[np.int64]
-) -> npt.NDArray[np.bool_]:
+def liked_steps(store: EpisodeStore, episodes: IntArray, steps: IntArray) -> BoolArray:
     """Whether each step was liked: its reward, scaled as in item states, is at least `LIKED`.
 
     Args:

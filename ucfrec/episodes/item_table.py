@@ -3,16 +3,16 @@
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xxhash
 from safetensors import SafetensorError
 from safetensors.numpy import save_file
 
+from ucfrec.arrays import Array, Float32Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.files import atomic_file
+from ucfrec.files.atomic import atomic_file
 
 ITEM_STATES: Final = "item_states.safetensors"
 """Name of the file in a store or a run."""
@@ -28,11 +28,11 @@ DECAY: Final = 0.8
 
 def write_item_table(
     path: Path,
-    embeddings: npt.NDArray[np.float32],
-    user_features: npt.NDArray[np.float32],
+    embeddings: Float32Array,
+    user_features: Float32Array,
     reward_low: float,
     reward_high: float,
-    tags: npt.NDArray[np.int64] | None,
+    tags: IntArray | None,
 ) -> None:
     """Write the file that `ucfrec.episodes.states.ItemStates.save` would, atomically.
 
@@ -49,7 +49,7 @@ def write_item_table(
     """
     numbers = {"window": WINDOW, "decay": DECAY}
     numbers |= {"reward_low": reward_low, "reward_high": reward_high}
-    arrays: dict[str, npt.NDArray[Any]] = {"embeddings": embeddings, "user_features": user_features}
+    arrays: dict[str, Array] = {"embeddings": embeddings, "user_features": user_features}
     if tags is not None and tags.shape[1]:
         arrays["tags"] = tags
     plain = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
@@ -67,7 +67,7 @@ def write_item_table(
             ) from None
 
 
-def _checksum(arrays: Mapping[str, npt.NDArray[Any]], about: str) -> str:
+def _checksum(arrays: Mapping[str, Array], about: str) -> str:
     """The checksum that `ucfrec.fitting.checkpoint.load_tensors` verifies."""
     digest = xxhash.xxh3_64(about.encode())
     for name in sorted(arrays):

@@ -7,11 +7,11 @@ from typing import Any, Final
 import numpy as np
 
 from ucfrec import schema
-from ucfrec.checksums import Sealed, sealed_record
 from ucfrec.errors import InputError
+from ucfrec.files.checksums import Sealed, sealed_record
 
 RECORD: Final = "meta.json"
-"""Name of the file; `ucfrec.checksums.seal` writes it with the checksums of the other files."""
+"""Name of the file; `ucfrec.files.checksums.seal` adds the checksums of the other files."""
 REMEDY: Final = "prepare it again"
 """What to do about a damaged store."""
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
+from ucfrec.arrays import Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
 
 if TYPE_CHECKING:
@@ -51,16 +52,14 @@ class ReturnToGo:
         """
         return self.definition == "session"
 
-    def weights(self, ahead: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+    def weights(self, ahead: IntArray) -> Float64Array:
         """How much of a reward that comes so many steps later counts, of the shape of `ahead`."""
         if self.definition == "discounted":
             return np.asarray(self.discount**ahead, dtype=np.float64)
         reach = self.horizon if self.definition == "horizon" else np.inf
         return np.asarray(ahead < reach, dtype=np.float64)
 
-    def of_logs(
-        self, rewards: npt.NDArray[np.floating], offsets: npt.NDArray[np.int64]
-    ) -> npt.NDArray[np.float32]:
+    def of_logs(self, rewards: npt.NDArray[np.floating], offsets: IntArray) -> Float32Array:
         """Returns-to-go of logged episodes.
 
         Example: rewards [1, 0, 2, 5] with offsets [0, 3, 4] give [3, 2, 2, 5] for `session`.
@@ -132,16 +131,14 @@ class ReturnToGo:
         return torch.cat([returns, last], dim=1).float()
 
 
-def returns_to_go(
-    rewards: npt.NDArray[np.floating], offsets: npt.NDArray[np.int64]
-) -> npt.NDArray[np.float32]:
+def returns_to_go(rewards: npt.NDArray[np.floating], offsets: IntArray) -> Float32Array:
     """Returns-to-go of the whole rest of each session; see `ReturnToGo.of_logs`."""
     return ReturnToGo().of_logs(rewards, offsets)
 
 
 def returns_in_parts(
-    rewards: npt.NDArray[np.floating], offsets: npt.NDArray[np.int64], steps: int
-) -> Iterator[npt.NDArray[np.float32]]:
+    rewards: npt.NDArray[np.floating], offsets: IntArray, steps: int
+) -> Iterator[Float32Array]:
     """The same numbers as `returns_to_go`, in parts of about `steps` steps, to save memory."""
     begin, before = 0, 0.0
     while begin < len(offsets) - 1:
@@ -154,9 +151,7 @@ def returns_in_parts(
         begin, before = end, float(sums[-1])
 
 
-def _rest(
-    before: npt.NDArray[np.float64], offsets: npt.NDArray[np.int64]
-) -> npt.NDArray[np.float32]:
+def _rest(before: Float64Array, offsets: IntArray) -> Float32Array:
     """Rest of each episode, from the sums (N + 1,) of all rewards before each step."""
     lengths = np.diff(offsets)
     starts, ends = np.repeat(offsets[:-1], lengths), np.repeat(offsets[1:], lengths)
@@ -165,8 +160,8 @@ def _rest(
 
 
 def _discounted(
-    rewards: npt.NDArray[np.floating], offsets: npt.NDArray[np.int64], discount: float
-) -> npt.NDArray[np.float32]:
+    rewards: npt.NDArray[np.floating], offsets: IntArray, discount: float
+) -> Float32Array:
     """Discounted suffix sums, for all episodes at once, one step from their ends at a time."""
     lengths = np.diff(offsets)
     order = np.argsort(-lengths, kind="stable")

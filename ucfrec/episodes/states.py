@@ -8,17 +8,14 @@ import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from ucfrec.arrays import IntArray
 from ucfrec.episodes.item_table import DECAY, DISTINCT_TAGS, TAGS_PER_ITEM, WINDOW
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
-
-IntArray = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from ucfrec import schema
+from ucfrec.arrays import Array, Float32Array, IntArray
 from ucfrec.episodes.columns import Columns
 from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.returns import ReturnToGo
@@ -22,9 +22,6 @@ from ucfrec.errors import InputError
 
 __all__ = ["ITEM_STATES", "EpisodeStore"]
 
-Array = npt.NDArray[Any]
-IntArray = npt.NDArray[np.int64]
-FloatArray = npt.NDArray[np.float32]
 
 _STATISTICS_STEPS = 1_000_000
 
@@ -150,7 +147,7 @@ class EpisodeStore(EpisodeView):
         return EpisodeStore(self._columns, self._selected)
 
     def with_returns_to_go(
-        self, values: FloatArray, definition: ReturnToGo | None = None
+        self, values: Float32Array, definition: ReturnToGo | None = None
     ) -> "EpisodeStore":
         """A view of the same episodes with other returns-to-go; the files are not changed.
 

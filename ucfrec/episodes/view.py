@@ -6,18 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from torch import Tensor
 
 from ucfrec import schema
+from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.episodes.columns import Columns
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Overlay
 from ucfrec.errors import InputError
-
-Array = npt.NDArray[Any]
-IntArray = npt.NDArray[np.int64]
-FloatArray = npt.NDArray[np.float32]
 
 _OF_ACTIONS = (schema.ITEM, schema.ACTION, schema.REWARD, schema.RETURN_TO_GO)
 """Step columns in which an action copy differs from its source."""
@@ -154,7 +150,7 @@ class EpisodeView:
         return self._columns.episode_column(name)[self._sources]
 
     @property
-    def terminated(self) -> npt.NDArray[np.bool_]:
+    def terminated(self) -> BoolArray:
         """(E + C + N,) whether each session is known to have ended with its last step."""
         known = np.ones(self.n_episodes, dtype=bool)
         if self._columns.has_episode_column(schema.TERMINATED):
@@ -163,7 +159,7 @@ class EpisodeView:
         return known
 
     @cached_property
-    def returns(self) -> FloatArray:
+    def returns(self) -> Float32Array:
         """(E + C + N,) undiscounted return of each episode, in reward units."""
         episodes = np.arange(self.n_episodes)
         return self.step_values(schema.RETURN_TO_GO, episodes, np.zeros_like(episodes))
@@ -214,14 +210,14 @@ class EpisodeView:
         values[here] = own[copies[here]]
 
     @cached_property
-    def _reward_changes(self) -> npt.NDArray[np.float64]:
+    def _reward_changes(self) -> Float64Array:
         """(N,) reward of each action copy less that of its source, in reward units."""
         assert self.overlay is not None
         index = self._columns.starts[self.overlay.action_source] + self.overlay.action_step
         logged = self._columns.step_values(schema.REWARD, index)
         return self.overlay.action_reward.astype(np.float64) - logged
 
-    def rewards_before(self, episodes: IntArray, steps: IntArray) -> npt.NDArray[np.float64]:
+    def rewards_before(self, episodes: IntArray, steps: IntArray) -> Float64Array:
         """(B,) sum of the rewards of the session before each step, in reward units.
 
         Args:

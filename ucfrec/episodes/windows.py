@@ -3,19 +3,14 @@
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from ucfrec.arrays import Array, Float32Array, IntArray
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
-
-IntArray = npt.NDArray[np.int64]
-FloatArray = npt.NDArray[np.float32]
-Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -106,7 +101,7 @@ def _no_integers() -> IntArray:
     return np.zeros(0, dtype=np.int64)
 
 
-def _no_floats() -> FloatArray:
+def _no_floats() -> Float32Array:
     return np.zeros(0, dtype=np.float32)
 
 
@@ -128,7 +123,7 @@ class Overlay:
     """(M,) number of the copy, 0 to C − 1, that each edit belongs to."""
     edit_step: IntArray
     """(M,) step of the episode that each edit changes; (copy, step) is strictly increasing."""
-    edit_state: FloatArray
+    edit_state: Float32Array
     """(M, S) counterfactual states."""
     action_source: IntArray = field(default_factory=_no_integers)
     """(N,) number in the store of the episode that an action copy is of."""
@@ -136,7 +131,7 @@ class Overlay:
     """(N,) step of the episode with the other action, the last of the copy."""
     action: Array = field(default_factory=_no_integers)
     """(N,) int64 items or (N, A) float32 vectors: the other actions."""
-    action_reward: FloatArray = field(default_factory=_no_floats)
+    action_reward: Float32Array = field(default_factory=_no_floats)
     """(N,) what they earned, in reward units."""
 
     def __post_init__(self) -> None:
@@ -161,7 +156,7 @@ class Overlay:
 
     @classmethod
     def of_actions(
-        cls, source: IntArray, step: IntArray, action: Array, reward: FloatArray, state_size: int
+        cls, source: IntArray, step: IntArray, action: Array, reward: Float32Array, state_size: int
     ) -> "Overlay":
         """An overlay of action copies only, of a store whose states have `state_size` numbers."""
         nothing = np.zeros(0, dtype=np.int64)

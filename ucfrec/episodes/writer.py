@@ -6,25 +6,23 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ucfrec import schema
-from ucfrec.checksums import seal
+from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.episodes.record import RECORD
 from ucfrec.episodes.returns import returns_in_parts
 from ucfrec.errors import InputError
-from ucfrec.files import atomic_folder
+from ucfrec.files.atomic import atomic_folder
+from ucfrec.files.checksums import seal
 
-Array = npt.NDArray[Any]
-BoolArray = npt.NDArray[np.bool_]
 _PART_STEPS = 2**20
 
 
 class StoreWriter:
     """Writes steps, appended in order, as shards of .npy columns.
 
-    `folder` should be a scratch folder of `ucfrec.files.atomic_folder`, so that a store appears
-    complete or not at all.
+    `folder` should be a scratch folder of `ucfrec.files.atomic.atomic_folder`, so that a store
+    appears complete or not at all.
 
     Example: three steps, two episodes::
 
@@ -45,7 +43,7 @@ class StoreWriter:
         self._hashes: dict[str, Any] = {}
         self._shapes: dict[str, list[int]] = {}
         self._files: dict[str, _NpyFile] = {}
-        self._offsets: list[npt.NDArray[np.int64]] = []
+        self._offsets: list[IntArray] = []
         self._episode_values: dict[str, list[Array]] = {}
         self._split_counts = np.zeros((len(schema.SPLITS), 2), dtype=np.int64)
         self._shards = self._steps_in_shard = self._n_steps = self._n_episodes = 0
@@ -53,7 +51,7 @@ class StoreWriter:
     def append(
         self,
         steps: Mapping[str, Array],
-        first: npt.NDArray[np.bool_],
+        first: BoolArray,
         episodes: Mapping[str, Array],
     ) -> None:
         """Append M steps.
@@ -93,7 +91,7 @@ class StoreWriter:
     def _append(
         self,
         steps: Mapping[str, Array],
-        first: npt.NDArray[np.bool_],
+        first: BoolArray,
         episodes: Mapping[str, Array],
     ) -> None:
         starts = np.flatnonzero(first)
@@ -191,7 +189,7 @@ class StoreWriter:
 def write_arrays(
     path: Path,
     steps: Mapping[str, Array],
-    lengths: npt.NDArray[np.int64],
+    lengths: IntArray,
     episodes: Mapping[str, Array],
     reward: str,
     source: Mapping[str, Any],
@@ -207,7 +205,7 @@ def write_arrays(
         writer.finish(reward=reward, source=source)
 
 
-def require_steps(path: Path | str, lengths: Array) -> npt.NDArray[np.int64]:
+def require_steps(path: Path | str, lengths: Array) -> IntArray:
     """Check that every episode has at least one step.
 
     Args:

@@ -6,17 +6,17 @@ from pathlib import Path
 from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
 from ucfrec.acting.rollout import Actor, Episodes, Step, rollout
+from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.files import atomic_folder, write_json
+from ucfrec.evaluation.simulator import Simulator
+from ucfrec.files.atomic import atomic_folder, write_json
 from ucfrec.fitting.random_state import random_state_kept
-from ucfrec.plugins import Simulator
 from ucfrec.schema import ACTION, ITEM_ID, OBSERVATION, PROPENSITY, SESSION_ID, TIMESTAMP, USER_ID
 
 EPOCH_MS: Final = 1_704_067_200_000
@@ -37,7 +37,7 @@ class Catalog(Protocol):
         """One row per item in the order of the action indices, with a column `item_id`."""
 
 
-def world_items(env: VectorEnv[Any, Any, Any]) -> npt.NDArray[np.int64]:
+def world_items(env: VectorEnv[Any, Any, Any]) -> IntArray:
     """Identifiers (n_items,) of a world's items in logs: those of its catalogue, or indices."""
     world = env.unwrapped
     if isinstance(world, Catalog):
@@ -105,7 +105,7 @@ class _SessionLog:
         self._steps: list[Step] = []
         self._rows = 0
         self._played = np.zeros(env.num_envs, dtype=np.int64)
-        self._numbers: list[npt.NDArray[np.int64]] = []
+        self._numbers: list[IntArray] = []
         self._writer: pq.ParquetWriter | None = None
 
     def record(self, step: Step) -> None:
@@ -158,7 +158,7 @@ class _SessionLog:
         return columns
 
 
-def _lists(rows: npt.NDArray[Any]) -> pa.Array:
+def _lists(rows: Array) -> pa.Array:
     """`rows` (M, D) as a column of type list<float>."""
     offsets = np.arange(len(rows) + 1, dtype=np.int32) * np.int32(rows.shape[1])
     return pa.ListArray.from_arrays(offsets, rows.astype(np.float32).ravel())

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from ucfrec.acting.rollout import BoolArray, IntArray, Step
+from ucfrec.acting.rollout import Step
+from ucfrec.arrays import BoolArray, IntArray
 
 Similarity = Callable[[IntArray, IntArray], npt.NDArray[np.floating]]
 """Similarity (M,) of two aligned arrays of items (M,), at most 1; equal items have 1."""

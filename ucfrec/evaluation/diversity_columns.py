@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 from gymnasium.vector import VectorEnv
 
-from ucfrec.acting.rollout import BoolArray, IntArray
+from ucfrec.arrays import BoolArray, IntArray
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.evaluation.collect import Catalog, world_items
 from ucfrec.evaluation.diversity import (

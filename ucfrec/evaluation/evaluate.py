@@ -10,7 +10,8 @@ from gymnasium import spaces
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.rollout import Actor, IntArray, rollout
+from ucfrec.acting.rollout import Actor, rollout
+from ucfrec.arrays import IntArray
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import world_items

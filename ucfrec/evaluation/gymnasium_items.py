@@ -5,10 +5,10 @@ from typing import Any, Final
 
 import gymnasium
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from ucfrec.arrays import Array
 from ucfrec.errors import InputError
 from ucfrec.schema import ITEM_ID
 
@@ -57,7 +57,7 @@ def item_table(source: str, env: gymnasium.Env[Any, Any], n_items: int) -> pa.Ta
         ) from None
 
 
-def _table(values: npt.NDArray[Any], source: str, n_items: int) -> pa.Table:
+def _table(values: Array, source: str, n_items: int) -> pa.Table:
     """The item table of an array (n_items,) or (n_items, D)."""
     numbers = values.dtype.kind in "biuf"
     if not numbers or values.ndim not in (1, 2) or len(values) != n_items:

@@ -7,21 +7,21 @@ from typing import Any, Final, SupportsFloat
 
 import gymnasium
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from ucfrec.acting.rollout import USER_IDS, BoolArray, FloatArray
 from ucfrec.acting.uniform import Uniform
+from ucfrec.arrays import BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.evaluation.gymnasium_items import item_table
-from ucfrec.plugins import Simulator
+from ucfrec.evaluation.simulator import Simulator
+from ucfrec.schema import USER_IDS
 
 REWARD: Final = "reward"
 """Column of the environment's rewards in logs."""
 
-_Floats = npt.NDArray[np.float64]
+_Floats = Float64Array
 Items = Callable[[gymnasium.Env[Any, Any], int], pa.Table]
 """Reads the item table from an environment and its number of items."""
 
@@ -83,7 +83,7 @@ class GymnasiumWorld(SyncVectorEnv):
         *,
         seed: int | list[int | None] | None = None,
         options: dict[str, Any] | None = None,
-    ) -> tuple[FloatArray, dict[str, Any]]:
+    ) -> tuple[Float32Array, dict[str, Any]]:
         """Start all sessions; returns observations (N, O) and info."""
         if isinstance(seed, int):
             drawn = [np.random.SeedSequence([seed, i]) for i in range(self.num_envs)]
@@ -95,7 +95,7 @@ class GymnasiumWorld(SyncVectorEnv):
 
     def step(
         self, actions: Any
-    ) -> tuple[FloatArray, _Floats, BoolArray, BoolArray, dict[str, Any]]:
+    ) -> tuple[Float32Array, _Floats, BoolArray, BoolArray, dict[str, Any]]:
         """Play one item or vector in each session, (N,) or (N, A); see `VectorEnv.step`."""
         played = super().step(actions)
         self._require_all_users(played[-1])
@@ -136,7 +136,7 @@ class GymnasiumCatalog(GymnasiumWorld):
         return self._table
 
 
-class _Session(gymnasium.Wrapper[FloatArray, Any, Any, Any]):
+class _Session(gymnasium.Wrapper[Float32Array, Any, Any, Any]):
     """One environment as `GymnasiumWorld` describes it."""
 
     def __init__(self, env_id: str, observe: tuple[str, ...]) -> None:
@@ -155,13 +155,13 @@ class _Session(gymnasium.Wrapper[FloatArray, Any, Any, Any]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[FloatArray, dict[str, Any]]:
+    ) -> tuple[Float32Array, dict[str, Any]]:
         """Start a session; returns the observation (O,) and info."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._user = _user(info)
         return self._vector(observation), self._user
 
-    def step(self, action: Any) -> tuple[FloatArray, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Float32Array, SupportsFloat, bool, bool, dict[str, Any]]:
         """Play one item or vector (A,)."""
         played = self.env.step(self._to_action(action))
         observation, reward, terminated, truncated, info = played
@@ -169,7 +169,7 @@ class _Session(gymnasium.Wrapper[FloatArray, Any, Any, Any]):
         self._user = _user(info) or self._user
         return self._vector(observation), reward, terminated, truncated, self._user
 
-    def _vector(self, observation: Any) -> FloatArray:
+    def _vector(self, observation: Any) -> Float32Array:
         if not self._observed:
             return np.zeros(0, dtype=np.float32)
         parts: list[Any] = [
@@ -221,7 +221,7 @@ def _observed(
     return chosen if sized else ()
 
 
-def _user(info: dict[str, Any]) -> dict[str, npt.NDArray[np.int64]]:
+def _user(info: dict[str, Any]) -> dict[str, IntArray]:
     """What is passed on of `info`."""
     if USER_IDS not in info:
         return {}

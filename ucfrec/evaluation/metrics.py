@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from ucfrec.acting.rollout import Episodes
+from ucfrec.arrays import Float64Array
 
 _RESAMPLES = 2000
 
@@ -44,17 +44,15 @@ def session_metrics(played: Episodes, seed: int) -> SessionMetrics:
     )
 
 
-def bootstrap_interval(
-    values: npt.NDArray[np.float64], seed: int, level: float = 0.95
-) -> tuple[float, float]:
+def bootstrap_interval(values: Float64Array, seed: int, level: float = 0.95) -> tuple[float, float]:
     """Percentile bootstrap interval (low, high) of the mean of `values` (N,), 2,000 resamples."""
     ((low, high),) = ratio_intervals(values[:, None], np.ones((len(values), 1)), seed, level)
     return float(low), float(high)
 
 
 def ratio_intervals(
-    above: npt.NDArray[np.float64], below: npt.NDArray[np.float64], seed: int, level: float = 0.95
-) -> npt.NDArray[np.float64]:
+    above: Float64Array, below: Float64Array, seed: int, level: float = 0.95
+) -> Float64Array:
     """Percentile bootstrap intervals (C, 2) of the column ratios Σ above / Σ below.
 
     Rows are resampled; resamples whose denominator is 0 are left out.
@@ -69,9 +67,7 @@ def ratio_intervals(
     return np.asarray(np.nanquantile(ratios, [(1 - level) / 2, (1 + level) / 2], axis=0).T)
 
 
-def resampled_ratios(
-    above: npt.NDArray[np.float64], below: npt.NDArray[np.float64], seed: int
-) -> npt.NDArray[np.float64]:
+def resampled_ratios(above: Float64Array, below: Float64Array, seed: int) -> Float64Array:
     """Ratios Σ above / Σ below (2000, C) of rows (N, C) drawn with replacement.
 
     Ratios whose denominator is 0 are NaN.

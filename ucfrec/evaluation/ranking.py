@@ -8,15 +8,15 @@ as in item states, is at least `ucfrec.episodes.item_counts.LIKED`.
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from scipy.stats import rankdata
 from torch import Tensor
 
 from ucfrec import schema
+from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
 from ucfrec.episodes.group_auc import group_auc
 from ucfrec.episodes.item_counts import liked_steps
 from ucfrec.episodes.store import EpisodeStore
@@ -25,9 +25,6 @@ from ucfrec.evaluation.metrics import resampled_ratios
 
 _SCORES_AT_ONCE = 2**24
 _STEPS_AT_ONCE = 1024
-
-IntArray = npt.NDArray[np.int64]
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -65,9 +62,9 @@ class Ranker(Protocol):
 class Ranked:
     """One ranker's results at N evaluated steps."""
 
-    ranks: FloatArray
+    ranks: Float64Array
     """(N,) rank of the shown item, from 1; tied items share their mean rank."""
-    scores: FloatArray
+    scores: Float64Array
     """(N,) score of the shown item at its user's first evaluated step: what was known before any of
     the user's evaluated steps. Scores at the steps themselves would depend on the very rewards that
     they are compared by."""
@@ -85,7 +82,7 @@ def evaluated_steps(store: EpisodeStore, at_once: int) -> Iterator[Steps]:
 
 
 @torch.no_grad()
-def rank_steps(ranker: Ranker, store: EpisodeStore, k: int, users: npt.NDArray[Any]) -> Ranked:
+def rank_steps(ranker: Ranker, store: EpisodeStore, k: int, users: Array) -> Ranked:
     """Rank every step of `store`.
 
     Args:
@@ -108,9 +105,7 @@ def rank_steps(ranker: Ranker, store: EpisodeStore, k: int, users: npt.NDArray[A
     return Ranked(ranks, _first_scores(ranker, store, users, at_once), top)
 
 
-def _first_scores(
-    ranker: Ranker, store: EpisodeStore, users: npt.NDArray[Any], at_once: int
-) -> FloatArray:
+def _first_scores(ranker: Ranker, store: EpisodeStore, users: Array, at_once: int) -> Float64Array:
     """(N,) score of each step's item at the first step of its user."""
     _, first, owner = np.unique(users, return_index=True, return_inverse=True)
     episodes, steps = store.all_steps()
@@ -129,14 +124,14 @@ def _first_scores(
     return found
 
 
-def _ranked(scores: Tensor, shown: Tensor, k: int) -> tuple[FloatArray, IntArray]:
+def _ranked(scores: Tensor, shown: Tensor, k: int) -> tuple[Float64Array, IntArray]:
     of_shown = scores.gather(1, shown.unsqueeze(1))
     above, equal = (scores > of_shown).sum(1), (scores == of_shown).sum(1)
     ranks = 1 + above.double() + (equal - 1).double() / 2
     return ranks.numpy(), scores.topk(k, dim=1).indices.numpy()
 
 
-def _ranked_alike(scores: Tensor, shown: Tensor, k: int) -> tuple[FloatArray, IntArray]:
+def _ranked_alike(scores: Tensor, shown: Tensor, k: int) -> tuple[Float64Array, IntArray]:
     """`_ranked` for scores (n_items,) that all steps share, which are sorted only once."""
     ranks = rankdata(-scores.double().numpy(), method="average")
     top = np.broadcast_to(scores.topk(k).indices.numpy(), (len(shown), k))
@@ -147,16 +142,16 @@ def _ranked_alike(scores: Tensor, shown: Tensor, k: int) -> tuple[FloatArray, In
 class Period:
     """The N evaluated steps: the items shown and whether they were liked."""
 
-    users: npt.NDArray[Any]
+    users: Array
     """(N,) identifier of each step's user."""
     items: IntArray
     """(N,) items shown."""
-    liked: npt.NDArray[np.bool_]
+    liked: BoolArray
     """(N,) true at liked steps."""
     n_items: int
 
     @classmethod
-    def of(cls, store: EpisodeStore, users: npt.NDArray[Any]) -> "Period":
+    def of(cls, store: EpisodeStore, users: Array) -> "Period":
         """The steps of `store`; `users` (E,) are the user identifiers of its E episodes."""
         episodes, steps = store.all_steps()
         items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
@@ -164,7 +159,7 @@ class Period:
         return cls(users[episodes], items, liked_steps(store, episodes, steps), n_items)
 
     @property
-    def item_rates(self) -> FloatArray:
+    def item_rates(self) -> Float64Array:
         """Share of each item's impressions in the period that were liked, (n_items,).
 
         NaN for items that were never shown.
@@ -193,7 +188,7 @@ MEASURES: Mapping[str, str] = {
 resampled."""
 
 
-def measure(period: Period, ranked: Ranked, k: int) -> dict[str, tuple[FloatArray, FloatArray]]:
+def measure(period: Period, ranked: Ranked, k: int) -> dict[str, tuple[Float64Array, Float64Array]]:
     """Every measure as numerators and denominators per user.
 
     Args:
@@ -209,7 +204,7 @@ def measure(period: Period, ranked: Ranked, k: int) -> dict[str, tuple[FloatArra
     hit = ranked.ranks <= k
     gain = hit / np.log2(1 + ranked.ranks)
 
-    def by_user(values: npt.NDArray[Any]) -> FloatArray:
+    def by_user(values: Array) -> Float64Array:
         return np.bincount(owner, values, minlength=len(users)).astype(np.float64)
 
     every, liked = np.ones(len(owner)), period.liked.astype(np.float64)
@@ -229,7 +224,7 @@ def measure(period: Period, ranked: Ranked, k: int) -> dict[str, tuple[FloatArra
 
 def _recall(
     period: Period, ranked: Ranked, owner: IntArray, n_users: int
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[Float64Array, Float64Array]:
     """Per user: the share of liked items recommended at the first step, and 1; 0 and 0 if none."""
     pairs = np.unique(np.stack([owner, period.items])[:, period.liked], axis=1)
     # Steps are sorted by time within a user, so the first row of a user is the first step.
@@ -295,11 +290,11 @@ def compare(
     ]
 
 
-def _flat(values: FloatArray) -> FloatArray:
+def _flat(values: Float64Array) -> Float64Array:
     return values.reshape(len(values), -1)
 
 
-def _ends(drawn: FloatArray) -> FloatArray:
+def _ends(drawn: Float64Array) -> Float64Array:
     """Ends (2, rankers, measures) of the 95% intervals; NaN if all resampled ratios are NaN."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)

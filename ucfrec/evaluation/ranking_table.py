@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ucfrec.arrays import Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.ranking import MEASURES, Period, compare, rank_steps, rankers_named
@@ -40,7 +40,7 @@ def ranking_rows(
     trained: TrainedPolicy,
     train: EpisodeStore | None,
     later: EpisodeStore,
-    users: npt.NDArray[Any],
+    users: Array,
     k: int,
     seed: int,
 ) -> list[dict[str, Any]]:

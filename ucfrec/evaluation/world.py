@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Final
 
 from ucfrec.errors import InputError
-from ucfrec.plugins import Simulator, load_plugin
+from ucfrec.evaluation.simulator import Simulator
+from ucfrec.plugins import load_plugin
 
 GYMNASIUM: Final = "gymnasium:"
 """Start of the names of worlds that are Gymnasium environments."""

@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.files import atomic_file
+from ucfrec.files.atomic import atomic_file
 
 REMEDY: Final = "restore it or train again"
 """What to do about a damaged file."""

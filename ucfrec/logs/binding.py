@@ -12,10 +12,10 @@ import duckdb
 from safetensors import SafetensorError
 
 from ucfrec.errors import InputError
+from ucfrec.files.parquet import require_plausible_rows
+from ucfrec.files.remote import fetch
 from ucfrec.logs.compressed import require_plausible_size
 from ucfrec.logs.expressions import NotScalarError, columns_of, refused
-from ucfrec.parquet_files import require_plausible_rows
-from ucfrec.remote import fetch
 
 _MAGIC = re.compile(r"[\[*?]")
 _NAME = re.compile(r"[^\W\d]\w*")

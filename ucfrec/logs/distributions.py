@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
+from ucfrec.arrays import Array, IntArray
 from ucfrec.logs.measures import FEW_VALUES, Measures
 
 QUANTILES: Final = (0.0, 0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 1.0)
@@ -14,14 +14,13 @@ QUANTILES: Final = (0.0, 0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 1.0)
 Distribution = dict[str, Any]
 """`counts` (N), either `values` (N) or bin `edges` (N + 1; a bin includes its left edge but not its
 right one), and `quantiles` by share, e.g. `{"0.5": 3}`."""
-IntArray = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class RewardPasses:
     """Passes over the steps that only rewards of many values need."""
 
-    sampled: Callable[[], npt.NDArray[Any]]
+    sampled: Callable[[], Array]
     """See `ucfrec.logs.measures.sampled_rewards`."""
     binned: Callable[[float, float, int], IntArray]
     """See `ucfrec.logs.measures.binned_rewards`."""
@@ -84,7 +83,7 @@ def _rewards(measures: Measures, passes: RewardPasses) -> Distribution:
     }
 
 
-def _quantiles(values: npt.NDArray[Any], counts: IntArray) -> dict[str, Any]:
+def _quantiles(values: Array, counts: IntArray) -> dict[str, Any]:
     """Quantiles, each one of the ascending values, of which there are `counts`."""
     cumulative = np.cumsum(counts)
     ranks = np.ceil(np.array(QUANTILES) * cumulative[-1]).clip(min=1)

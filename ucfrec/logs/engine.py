@@ -5,14 +5,14 @@ import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import duckdb
 import numpy as np
-import numpy.typing as npt
 
+from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.locks import scratch_folder
+from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.binding import glob_pattern, text
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ def engine_in_memory() -> Iterator[duckdb.DuckDBPyConnection]:
         connection.close()
 
 
-def as_numpy(column: "pa.Array") -> npt.NDArray[Any]:
+def as_numpy(column: "pa.Array") -> Array:
     """A column of numbers or truth values without missing ones, copied only if it must be.
 
     `pyarrow.Array.to_numpy` would import pandas, which takes longer than reading a small log.
@@ -140,7 +140,7 @@ def as_numpy(column: "pa.Array") -> npt.NDArray[Any]:
     return np.from_dlpack(column)
 
 
-def as_arrow(numbers: npt.NDArray[np.int64]) -> "pa.Array":
+def as_arrow(numbers: IntArray) -> "pa.Array":
     """Whole numbers as a column; `pyarrow.array` would import pandas."""
     import pyarrow as pa
 

@@ -1,13 +1,13 @@
 """Encode the features of items and users as sparse matrices."""
 
 from collections.abc import Sequence
-from typing import Any, Final, TypeAlias
+from typing import Final, TypeAlias
 
 import duckdb
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
+from ucfrec.arrays import Array
 from ucfrec.episodes.item_table import DISTINCT_TAGS, TAGS_PER_ITEM
 from ucfrec.errors import InputError
 
@@ -16,7 +16,6 @@ CATEGORIES: Final = 200
 CLIP: Final = 5.0
 """Standardised numbers are clipped to ± this many standard deviations."""
 
-Array = npt.NDArray[Any]
 Features: TypeAlias = sparse.csr_matrix
 
 

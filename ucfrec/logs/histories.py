@@ -5,15 +5,15 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import gettempdir
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from ucfrec import schema
+from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.locks import scratch_folder
+from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.binding import Table, explained, open_tables, quoted
 from ucfrec.logs.clean import REASONS, check_rows, drop_counts, require_rows
 from ucfrec.logs.engine import BATCH_ROWS, as_arrow, engine, engine_in_memory
@@ -25,8 +25,6 @@ from ucfrec.logs.typed import TypedLog, typed_log
 if TYPE_CHECKING:
     import pandas as pd
 
-Array = npt.NDArray[Any]
-IntArray = npt.NDArray[np.int64]
 
 HISTORIES: Final = "histories"
 """Name of a data frame in messages and in the engine."""

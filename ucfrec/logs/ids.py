@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ucfrec import schema
+from ucfrec.arrays import IntArray
 from ucfrec.logs.binding import glob_pattern, text
 from ucfrec.logs.engine import BATCH_ROWS, as_arrow, as_numpy
 from ucfrec.logs.measures import Measures
@@ -26,7 +26,6 @@ ID_TABLES: Final = (
     (schema.ITEM_ID, "items", ITEMS_FILE),
 )
 """Id column, its DuckDB table of ids and numbers, and the file of that table in the store."""
-IntArray = npt.NDArray[np.int64]
 
 
 def number_ids(

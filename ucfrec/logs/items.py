@@ -3,22 +3,19 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
 from ucfrec import schema
+from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
 from ucfrec.episodes.item_table import ITEM_STATES, write_item_table
 from ucfrec.episodes.record import read_store_record
 from ucfrec.errors import InputError
 from ucfrec.logs.moments import Moments
 from ucfrec.logs.spectral import SparseRows, right_singular_vectors
 from ucfrec.processes import require_blas_memory
-
-IntArray = npt.NDArray[np.int64]
-FloatArray = npt.NDArray[np.float32]
 
 PRIOR_COUNT: Final = 3.0
 """Number of times shown at which co-occurrence and features have equal weight for an item."""
@@ -42,7 +39,7 @@ class TrainingSteps:
     """(M,) number of the user."""
     items: IntArray
     """(M,) number of the item."""
-    rewards: npt.NDArray[np.float64]
+    rewards: Float64Array
     """(M,)."""
 
 
@@ -175,7 +172,7 @@ class Exposure:
         self._rows = SparseRows(path, len(self.trained))
         self._by_item = np.zeros(len(self.trained))
 
-    def add(self, users: IntArray, items: IntArray, weights: npt.NDArray[np.float64]) -> None:
+    def add(self, users: IntArray, items: IntArray, weights: Float64Array) -> None:
         """Add steps.
 
         Args:
@@ -194,7 +191,7 @@ class Exposure:
         block.data /= np.repeat(by_user, np.diff(block.indptr))
         self._rows.append(block)
 
-    def cooccurrence(self, size: int) -> npt.NDArray[np.float64]:
+    def cooccurrence(self, size: int) -> Float64Array:
         """(trained items, ≤ size) unit rows from the SVD of the matrix."""
         by_item = np.sqrt(self._by_item)
         rank = min(size + 1, *self._rows.shape)
@@ -213,7 +210,7 @@ class Exposure:
 
 def item_embeddings(
     exposure: Exposure, features: sparse.csr_matrix | None = None, size: int = 32
-) -> FloatArray:
+) -> Float32Array:
     """Embed items by co-occurrence in users' histories and by their features.
 
     The co-occurrence part is the truncated SVD of the user × item matrix of exposure and liking,
@@ -248,9 +245,9 @@ def item_embeddings(
 def _predicted(
     features: sparse.csr_matrix,
     trained: IntArray,
-    cooccurrence: npt.NDArray[np.float64],
+    cooccurrence: Float64Array,
     counts: IntArray,
-) -> npt.NDArray[np.float64]:
+) -> Float64Array:
     """(n_items, size) co-occurrence part predicted from features, by ridge regression."""
     axes = _axes(features[trained], CONTENT_RANK)
     known = np.asarray(features[trained] @ axes, dtype=np.float64)
@@ -261,16 +258,16 @@ def _predicted(
     return np.asarray(features @ (axes @ slopes), dtype=np.float64)
 
 
-def _reduced(features: sparse.csr_matrix, known: IntArray, size: int) -> FloatArray:
+def _reduced(features: sparse.csr_matrix, known: IntArray, size: int) -> Float32Array:
     """(n, ≤ size) features on the singular axes of the rows `known`, centred on their mean."""
-    rows: npt.NDArray[Any] = np.asarray(features @ _axes(features[known], max(size, 1)))
+    rows: Array = np.asarray(features @ _axes(features[known], max(size, 1)))
     rows -= rows[known].mean(axis=0)
     # A row without any feature is at the mean.
     rows[np.diff(features.indptr) == 0] = 0
     return np.asarray(rows, dtype=np.float32)
 
 
-def _axes(known: sparse.csr_matrix, size: int) -> npt.NDArray[Any]:
+def _axes(known: sparse.csr_matrix, size: int) -> Array:
     """(F, D ≤ `size`) right singular vectors of the rows; the identity if F ≤ `size`."""
     if known.shape[1] <= size:
         return np.eye(known.shape[1])
@@ -281,6 +278,6 @@ def _axes(known: sparse.csr_matrix, size: int) -> npt.NDArray[Any]:
     return np.asarray(directions.T)
 
 
-def _unit_rows(rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def _unit_rows(rows: Array) -> Array:
     norms = np.linalg.norm(rows, axis=1, keepdims=True)
     return rows / np.where(norms > 0, norms, 1)

@@ -8,7 +8,7 @@ from typing import Final
 
 from ucfrec import schema
 from ucfrec.errors import InputError
-from ucfrec.files import read_toml
+from ucfrec.files.atomic import read_toml
 from ucfrec.logs.expressions import Expression
 
 SUFFIXES: Final = (".parquet", ".csv", ".csv.gz")

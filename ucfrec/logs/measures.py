@@ -2,19 +2,17 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from ucfrec import schema
+from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.logs.moments import Moments
 from ucfrec.logs.sessions import Cut, Episodes, episodes
 from ucfrec.logs.spool import BLOCK, Spool
-
-Array = npt.NDArray[Any]
-IntArray = npt.NDArray[np.int64]
 
 FEW_VALUES: Final = 20
 """Rewards with at most this many distinct values are counted by value, others in as many bins."""

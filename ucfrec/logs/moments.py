@@ -1,9 +1,8 @@
 """Means and covariances of numbers that come in batches."""
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
+
+from ucfrec.arrays import Array, Float64Array
 
 
 class Moments:
@@ -22,7 +21,7 @@ class Moments:
         self.mean = np.zeros(size)
         self._deviations = np.zeros((size, size))
 
-    def add(self, *values: npt.NDArray[Any]) -> None:
+    def add(self, *values: Array) -> None:
         """Add M vectors.
 
         Args:
@@ -41,6 +40,6 @@ class Moments:
         self.count = total
 
     @property
-    def covariance(self) -> npt.NDArray[np.float64]:
+    def covariance(self) -> Float64Array:
         """(size, size) covariance of all vectors so far, not corrected for their number."""
         return self._deviations / max(self.count, 1)

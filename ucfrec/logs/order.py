@@ -1,14 +1,12 @@
 """Order statistics of rows on disk, in bounded memory: exact quantiles, and rows out of order."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from ucfrec.arrays import Array
 from ucfrec.logs.spool import BLOCK, Spool
-
-Array = npt.NDArray[Any]
 
 _BINS: Final = 2**16
 _NEVER: Final = np.iinfo(np.int64).max

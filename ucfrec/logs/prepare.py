@@ -17,12 +17,12 @@ from tempfile import gettempdir
 from typing import Any, Final
 
 from ucfrec import schema
-from ucfrec.checksums import seal
 from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.record import RECORD
 from ucfrec.errors import InputError
-from ucfrec.files import atomic_folder
-from ucfrec.locks import scratch_folder
+from ucfrec.files.atomic import atomic_folder
+from ucfrec.files.checksums import seal
+from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.binding import explained, open_tables
 from ucfrec.logs.clean import DUPLICATES, require_rows
 from ucfrec.logs.distributions import RewardPasses, distributions

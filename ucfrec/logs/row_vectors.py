@@ -10,15 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from ucfrec import schema
+from ucfrec.arrays import Float32Array, IntArray
 from ucfrec.logs.engine import as_numpy
 from ucfrec.logs.typed import ROWS, TypedLog
-
-Float32Array = npt.NDArray[np.float32]
-IntArray = npt.NDArray[np.int64]
 
 
 class RowVectors:

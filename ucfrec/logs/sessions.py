@@ -3,19 +3,15 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ucfrec import schema
+from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.logs.order import ranked
 from ucfrec.logs.sorted_rows import SortedRows
 from ucfrec.logs.spool import Spool
-
-Array = npt.NDArray[Any]
-BoolArray = npt.NDArray[np.bool_]
-IntArray = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -7,22 +7,19 @@ duplicates and writes the others to a spool with numbers in place of ids.
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from ucfrec import schema
+from ucfrec.arrays import Array, BoolArray
 from ucfrec.logs.binding import MAX_FLOAT
 from ucfrec.logs.clean import REASONS, faults, require_rewards_in_range
 from ucfrec.logs.engine import as_numpy
 from ucfrec.logs.row_vectors import RowVectors
 from ucfrec.logs.spool import Spool
 from ucfrec.logs.typed import ROWS, TypedLog
-
-Array = npt.NDArray[Any]
-BoolArray = npt.NDArray[np.bool_]
 
 CODES: Final = {schema.USER_ID: "user_codes", schema.ITEM_ID: "item_codes"}
 """Id column to the table of its ids and their codes, numbers in the order of the ids."""

@@ -2,14 +2,12 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import IO, Final
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
-Array = npt.NDArray[Any]
-FloatArray = npt.NDArray[np.float64]
+from ucfrec.arrays import Float64Array
 
 _OVERSAMPLES: Final = 10
 _SMALL: Final = 1e-10
@@ -52,8 +50,8 @@ class SparseRows:
 
 
 def right_singular_vectors(
-    matrix: SparseRows, by_column: FloatArray, rank: int, seed: int = 0
-) -> tuple[FloatArray, FloatArray]:
+    matrix: SparseRows, by_column: Float64Array, rank: int, seed: int = 0
+) -> tuple[Float64Array, Float64Array]:
     """Largest singular values and right singular vectors of a matrix whose columns are divided.
 
     The randomised subspace iteration of Halko, Martinsson and Tropp (2011), with the sizes, numbers
@@ -99,7 +97,7 @@ def right_singular_vectors(
     return values, directions * np.where(signs == 0, 1, signs)[:, None]
 
 
-def _orthonormal(basis: FloatArray) -> FloatArray:
+def _orthonormal(basis: Float64Array) -> Float64Array:
     """A basis of the same space that is orthonormal up to rounding errors."""
     try:
         # Several times faster than a QR decomposition, and exact enough between iterations.
@@ -109,12 +107,12 @@ def _orthonormal(basis: FloatArray) -> FloatArray:
     return np.asarray(basis @ np.linalg.inv(triangle).T)
 
 
-def _inverse(values: FloatArray) -> FloatArray:
+def _inverse(values: Float64Array) -> Float64Array:
     """1 / x, and 0 for 0."""
     return np.divide(1, values, out=np.zeros_like(values), where=values > 0)
 
 
-def _largest(symmetric: FloatArray, rank: int) -> tuple[FloatArray, FloatArray]:
+def _largest(symmetric: Float64Array, rank: int) -> tuple[Float64Array, Float64Array]:
     """Square roots of the largest eigenvalues, descending, 0 for rounding errors; eigenvectors."""
     values, vectors = np.linalg.eigh(symmetric)
     values, vectors = values[::-1][:rank], vectors[:, ::-1][:, :rank]
@@ -127,8 +125,11 @@ def _largest(symmetric: FloatArray, rank: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _there_and_back(
-    matrix: SparseRows, by_column: FloatArray, basis: FloatArray, gram: FloatArray | None = None
-) -> FloatArray:
+    matrix: SparseRows,
+    by_column: Float64Array,
+    basis: Float64Array,
+    gram: Float64Array | None = None,
+) -> Float64Array:
     """AᵀA V for the matrix A with divided columns and a basis V; adds (A V)ᵀ(A V) to `gram`."""
     scaled = (basis / by_column[:, None]).astype(np.float32)
     back = np.zeros(basis.shape)

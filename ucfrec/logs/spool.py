@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[Any]
+from ucfrec.arrays import Array
 
 BLOCK: Final = 2**19
 """Most rows of a spool that are in memory at a time."""

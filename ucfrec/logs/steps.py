@@ -3,12 +3,11 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ucfrec import schema
+from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.logs.ids import numbers
 from ucfrec.logs.measures import Measures
@@ -16,8 +15,6 @@ from ucfrec.logs.sessions import Episodes
 from ucfrec.logs.spool import Spool
 from ucfrec.logs.typed import TypedLog
 from ucfrec.progress import Progress
-
-IntArray = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -73,7 +70,7 @@ def write_steps(
     for found in episodes:
         if not len(found.lengths):
             continue
-        steps: dict[str, npt.NDArray[Any]] = {n: found.column(spool, n) for n in names}
+        steps: dict[str, Array] = {n: found.column(spool, n) for n in names}
         if schema.ITEM in steps:
             steps[schema.ITEM] = numbered.items[steps[schema.ITEM]]
         new = np.append(found.users[0] != last_user, found.users[1:] != found.users[:-1])

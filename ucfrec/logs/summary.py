@@ -9,12 +9,12 @@ import numpy as np
 
 from ucfrec import schema
 from ucfrec.errors import InputError, one_line
+from ucfrec.files.remote import origin
 from ucfrec.logs.clean import DUPLICATES, REASONS
 from ucfrec.logs.distributions import Distribution
 from ucfrec.logs.measures import Measures
 from ucfrec.logs.sessions import Cut
 from ucfrec.logs.sorted_rows import SortedRows
-from ucfrec.remote import origin
 
 CONFLICT: Final = "duplicates with a different reward from the kept row"
 """Describes `conflicting_duplicates` of the report."""

@@ -11,15 +11,12 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-import numpy.typing as npt
 
+from ucfrec.arrays import Float32Array, Float64Array, IntArray
 from ucfrec.off_policy.on_disk import array_on_disk
 from ucfrec.processes import require_blas_memory
 from ucfrec.progress import progress
 
-FloatArray = npt.NDArray[np.float64]
-Float32Array = npt.NDArray[np.float32]
-IntArray = npt.NDArray[np.int64]
 States = Callable[[], Iterator[Float32Array]]
 """Reads the states (N, S) from the first step on, some thousand at once."""
 
@@ -36,9 +33,9 @@ _TEMPERATURES = (0.7, 1.0, 1.4, 2.0, 3.0)
 class BehaviorModel:
     """Estimated probabilities of what was logged, and how good they are."""
 
-    group: FloatArray
+    group: Float64Array
     """(N,) of the logged item's group."""
-    item: FloatArray
+    item: Float64Array
     """(N,) of the logged item."""
     log_loss: float
     """Held-out mean −ln p of the logged group."""
@@ -117,7 +114,7 @@ def fit_behavior(
 class _Groups:
     """Probabilities of groups given a state."""
 
-    def __init__(self, states: Float32Array, group: IntArray, shares: FloatArray) -> None:
+    def __init__(self, states: Float32Array, group: IntArray, shares: Float64Array) -> None:
         # Importing scikit-learn takes a second, which no other estimate must cost.
         from sklearn.linear_model import LogisticRegression
 
@@ -131,7 +128,7 @@ class _Groups:
             self._model = LogisticRegression(C=0.1, max_iter=100, tol=1e-3)
             self._model.fit(self._scaled(states), group)
 
-    def __call__(self, states: Float32Array, temperature: float, share: float) -> FloatArray:
+    def __call__(self, states: Float32Array, temperature: float, share: float) -> Float64Array:
         """(B, K), with so much of the shares of groups mixed in."""
         if self._model is None or not len(states):
             return np.tile(self.shares, (len(states), 1))
@@ -189,7 +186,7 @@ def _calibrated(
     return choices[int(np.argmin(losses))]
 
 
-def _within(item: IntArray, group: IntArray, folds: IntArray) -> FloatArray:
+def _within(item: IntArray, group: IntArray, folds: IntArray) -> Float64Array:
     """(N,) share of the item among its group's steps in the other folds, one step added to each
     item."""
     items, found = int(item.max()) + 1, np.ones(len(item))
@@ -204,7 +201,7 @@ def _within(item: IntArray, group: IntArray, folds: IntArray) -> FloatArray:
     return found
 
 
-def _count_calibration(table: FloatArray, probabilities: FloatArray, group: IntArray) -> None:
+def _count_calibration(table: Float64Array, probabilities: Float64Array, group: IntArray) -> None:
     """Add to table (2, K, 10), by group and tenth of the probability: what is expected, and what
     occurs."""
     tenth = np.minimum((probabilities * 10).astype(np.int64), 9)
@@ -213,5 +210,5 @@ def _count_calibration(table: FloatArray, probabilities: FloatArray, group: IntA
     np.add.at(table[1], (group, tenth[rows, group]), 1.0)
 
 
-def _calibration_error(table: FloatArray) -> float:
+def _calibration_error(table: Float64Array) -> float:
     return float(np.abs(table[0] - table[1]).sum() / max(table[1].sum(), 1.0))

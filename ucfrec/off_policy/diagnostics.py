@@ -11,15 +11,11 @@ from statistics import NormalDist
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.off_policy.estimators import effective_number, step_totals
 from ucfrec.off_policy.intervals import cluster_means
 from ucfrec.off_policy.logged_steps import LoggedSteps
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 ENOUGH_TO_TEST: Final = 30
 """Users below which a mean weight is not tested."""
@@ -157,7 +153,7 @@ def weight_tests(steps: LoggedSteps, segment: IntArray | None = None) -> tuple[W
     )
 
 
-def _group_weights(steps: LoggedSteps, ratios: FloatArray) -> list[tuple[str, float, float]]:
+def _group_weights(steps: LoggedSteps, ratios: Float64Array) -> list[tuple[str, float, float]]:
     """Name, mean weight and its error of each item group that the evaluated policy shows."""
     if steps.groups is None:
         return []
@@ -200,7 +196,7 @@ def implied_items(steps: LoggedSteps, listed: BoolArray, items: int) -> WeightTe
     return WeightTest(ITEMS_TO_CHOOSE_FROM, float(mean), float(error), passed)
 
 
-def pareto_tail(weights: FloatArray) -> float | None:
+def pareto_tail(weights: Float64Array) -> float | None:
     """Shape k of a generalised Pareto distribution fitted to the largest weights.
 
     From 0.5 on the variance is infinite; from 0.7 on a mean, and its interval, is unreliable
@@ -258,7 +254,7 @@ def _users(steps: LoggedSteps) -> IntArray:
     return np.asarray(np.unique(steps.user, return_inverse=True)[1])
 
 
-def _summed(users: IntArray, values: FloatArray) -> FloatArray:
+def _summed(users: IntArray, values: Float64Array) -> Float64Array:
     """(U,) sums of values (S,) by user."""
     return np.bincount(users, values).astype(np.float64)
 

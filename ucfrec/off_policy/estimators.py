@@ -28,14 +28,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ucfrec.arrays import Float64Array
 from ucfrec.off_policy.intervals import Interval, cluster_intervals
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.pages import independent_terms
 from ucfrec.off_policy.shrinkage import shrunk
-
-FloatArray = npt.NDArray[np.float64]
 
 LOGGED = "logged"
 WEIGHTED = ("IPS", "SNIPS", "PDIS", "SNPDIS", "DR", "SNDR", "MIPS")
@@ -67,10 +65,10 @@ class Estimate:
 class Terms:
     """An estimate as the ratio Σ above / Σ below of sums over sessions."""
 
-    above: FloatArray
+    above: Float64Array
     """(S,)."""
-    below: FloatArray
-    weights: FloatArray
+    below: Float64Array
+    weights: Float64Array
     """(S,) what each session counts."""
     parameter: float | None = None
     biased: bool = False
@@ -163,7 +161,7 @@ def _summary(terms: Terms, interval: Interval | None) -> Estimate:
     )
 
 
-def effective_number(weights: FloatArray) -> float:
+def effective_number(weights: Float64Array) -> float:
     """(Σw)² / Σw²: as many equal weights estimate a mean as well (Kish 1965)."""
     top = weights.max()
     if top == 0:
@@ -172,14 +170,16 @@ def effective_number(weights: FloatArray) -> float:
     return float(shares.sum() ** 2 / (shares**2).sum())
 
 
-def step_totals(steps: LoggedSteps, weights: FloatArray) -> FloatArray:
+def step_totals(steps: LoggedSteps, weights: Float64Array) -> Float64Array:
     """(T,) Σ_i w_it by step up to the longest session's, ended sessions with their last weight."""
     alive = np.bincount(steps.step, weights)
     ended = np.bincount(steps.lengths, weights[steps.last], len(alive) + 1)
     return np.asarray(alive + np.cumsum(ended)[:-1])
 
 
-def _normalised_by_step(steps: LoggedSteps, left: FloatArray, v: FloatArray | None) -> FloatArray:
+def _normalised_by_step(
+    steps: LoggedSteps, left: Float64Array, v: Float64Array | None
+) -> Float64Array:
     """(S,) estimate plus influence of each session; their mean is the estimate.
 
     The estimate is Σ_t γ^t [Σ_i w_it left_it / W_t + Σ_i w_i,t−1 v_it / W_t−1] with W_t = Σ_i w_it

@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.arrays import Array, Float64Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.off_policy.behavior_model import BehaviorModel, fit_behavior
 from ucfrec.off_policy.columns import as_row, diagnosis_columns, verdict_columns
@@ -31,9 +31,6 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 
 DEFAULTS = EstimateOptions()
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-
 
 @dataclass(frozen=True)
 class OffPolicyReport:
@@ -46,11 +43,11 @@ class OffPolicyReport:
     verdict: Verdict
     models: ModelReport
     """How good the models of DM, FQE and DR are."""
-    returns: FloatArray
+    returns: Float64Array
     """(S,) of the logged sessions, or pages, with all their propensities; empty if none has."""
     user: IntArray | None
     """(S,) whose they are; None where each is somebody else's."""
-    terms: FloatArray | None
+    terms: Float64Array | None
     """(S,) whose mean is the estimate that the verdict is of; None where nothing can be weighed."""
 
 
@@ -163,7 +160,7 @@ def _of_the_sessions(
     }
 
 
-def _terms(known: LoggedSteps, verdict: Verdict) -> FloatArray | None:
+def _terms(known: LoggedSteps, verdict: Verdict) -> Float64Array | None:
     terms = {} if verdict.estimator is None else session_terms(known)
     return influences(terms[verdict.estimator]) if verdict.estimator in terms else None
 
@@ -339,9 +336,7 @@ def _item_groups(trained: TrainedPolicy, options: EstimateOptions, seed: int) ->
     return group_items(embeddings, wanted, seed)
 
 
-def step_features(
-    trained: TrainedPolicy, batch: ScoredSteps
-) -> tuple[npt.NDArray[Any], Tensor, StepInputs]:
+def step_features(trained: TrainedPolicy, batch: ScoredSteps) -> tuple[Array, Tensor, StepInputs]:
     """Compute the policy's probability and the models' inputs for B logged steps.
 
     An item that the run does not know (−1) has probability 0 and an embedding of zeros.

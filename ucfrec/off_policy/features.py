@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from ucfrec.arrays import Float32Array
 from ucfrec.off_policy.score import ScoredSteps
-
-Float32Array = npt.NDArray[np.float32]
 
 _PRODUCTS = 256
 _LOWEST_SCORE = -20.0

@@ -11,16 +11,13 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
 
+from ucfrec.arrays import BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.off_policy.logged_steps import Modelled
 from ucfrec.progress import progress
 
-FloatArray = npt.NDArray[np.float64]
-Float32Array = npt.NDArray[np.float32]
-IntArray = npt.NDArray[np.int64]
 Chunks = Callable[[], Iterator[tuple[Float32Array, Float32Array]]]
 """Reads the N steps from the start, some at once, in order: features (B, P) of state and logged
 action, the first of them 1, and (B, P) their mean over the evaluated policy's actions in the same
@@ -73,7 +70,7 @@ class Fitted:
 def cross_fitted(
     features: Float32Array,
     at_policy: Float32Array,
-    reward: FloatArray,
+    reward: Float64Array,
     session: IntArray,
     seed: int,
     user: IntArray | None = None,
@@ -96,7 +93,7 @@ def cross_fitted(
 
 def fit_models(
     chunks: Chunks,
-    reward: FloatArray,
+    reward: Float64Array,
     session: IntArray,
     seed: int,
     user: IntArray | None = None,
@@ -138,8 +135,8 @@ def fit_models(
 class _Fit:
     """Weights (P,) of the reward model and of Q."""
 
-    reward: FloatArray
-    q: FloatArray
+    reward: Float64Array
+    q: Float64Array
     iterations: int
     settled: bool
 
@@ -148,16 +145,16 @@ class _Fit:
 class _Sums:
     """Sums over the steps of each of F folds."""
 
-    gram: FloatArray
+    gram: Float64Array
     """(F, P, P) Σ φ φᵀ."""
-    follows: FloatArray
+    follows: Float64Array
     """(F, P, P) Σ φ φ̄'ᵀ over steps that another follows, φ̄' the mean features of that one."""
-    earned: FloatArray
+    earned: Float64Array
     """(F, P) Σ φ r."""
     rows: IntArray
     """(F,)."""
 
-    def fit(self, fold: int, reward: FloatArray, horizon: int, discount: float) -> _Fit:
+    def fit(self, fold: int, reward: Float64Array, horizon: int, discount: float) -> _Fit:
         """The models that know all folds but one.
 
         Args:
@@ -188,9 +185,9 @@ class _Sums:
 
 def _sums(
     chunks: Chunks,
-    reward: FloatArray,
+    reward: Float64Array,
     folds: IntArray,
-    last: npt.NDArray[np.bool_],
+    last: BoolArray,
     done: Callable[[int], object],
 ) -> _Sums:
     begin, sums = 0, None
@@ -221,7 +218,7 @@ def _sums(
 
 def _predicted(
     chunks: Chunks, fits: list[_Fit], folds: IntArray, done: Callable[[int], object]
-) -> tuple[Modelled, FloatArray]:
+) -> tuple[Modelled, Float64Array]:
     """What the models say of every step, and the modelled reward (N,) of the logged action."""
     reward_weights = np.stack([fit.reward for fit in fits], axis=1)
     q_weights = np.stack([fit.q for fit in fits], axis=1)
@@ -244,9 +241,9 @@ def _predicted(
 
 def _report(
     modelled: Modelled,
-    at_logged: FloatArray,
-    reward: FloatArray,
-    last: npt.NDArray[np.bool_],
+    at_logged: Float64Array,
+    reward: Float64Array,
+    last: BoolArray,
     discount: float,
     fits: list[_Fit],
 ) -> ModelReport:
@@ -263,11 +260,11 @@ def _report(
     )
 
 
-def _penalty(gram: FloatArray, rows: int) -> FloatArray:
+def _penalty(gram: Float64Array, rows: int) -> Float64Array:
     """(P,) penalty: features count by their root mean square, and the prior gives all P of them
     together the variance of the noise; the constant goes free."""
     mean_square = np.diag(gram) / rows
     # A feature that is always 0 has no weight to find.
-    penalty: FloatArray = len(gram) * np.where(mean_square > 0, mean_square, 1.0)
+    penalty: Float64Array = len(gram) * np.where(mean_square > 0, mean_square, 1.0)
     penalty[0] = 0.0
     return penalty

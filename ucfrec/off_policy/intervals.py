@@ -6,9 +6,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
+from ucfrec.arrays import BoolArray, Float64Array, IntArray
 
 RESAMPLES = 2000
 MOST_CLUSTERS = 10_000
@@ -32,8 +30,8 @@ class Interval:
 
 
 def cluster_intervals(
-    above: FloatArray,
-    below: FloatArray,
+    above: Float64Array,
+    below: Float64Array,
     cluster: IntArray | None,
     seed: int,
     level: float = 0.95,
@@ -81,13 +79,13 @@ def cluster_intervals(
 class Resampled:
     """K ratios, and B resamples of them; the same clusters are drawn for all K."""
 
-    value: FloatArray
+    value: Float64Array
     """(K,)."""
-    error: FloatArray
+    error: Float64Array
     """(K,) standard errors over clusters."""
-    shift: FloatArray
+    shift: Float64Array
     """(B, K) of each resample: its ratio less `value`."""
-    errors: FloatArray
+    errors: Float64Array
     """(B, K) its own standard error."""
     spreads: BoolArray
     """(K,) whether clusters differ at all."""
@@ -99,7 +97,7 @@ class Resampled:
 
 
 def resample(
-    above: FloatArray, below: FloatArray, cluster: IntArray | None, seed: int
+    above: Float64Array, below: Float64Array, cluster: IntArray | None, seed: int
 ) -> Resampled:
     """Draw clusters with replacement, each with all its sessions.
 
@@ -129,8 +127,8 @@ def resample(
 
 
 def cluster_means(
-    values: FloatArray, cluster: IntArray | None, weights: FloatArray | None = None
-) -> tuple[FloatArray, FloatArray]:
+    values: Float64Array, cluster: IntArray | None, weights: Float64Array | None = None
+) -> tuple[Float64Array, Float64Array]:
     """Means (K,) of the columns of values (S, K) and their standard errors over clusters.
 
     Args:
@@ -157,13 +155,15 @@ def _numbered(cluster: IntArray | None, sessions: int) -> tuple[IntArray, int]:
     return names, int(names.max()) + 1
 
 
-def _by_cluster(values: FloatArray, names: IntArray, clusters: int) -> FloatArray:
+def _by_cluster(values: Float64Array, names: IntArray, clusters: int) -> Float64Array:
     """(C, K) sums of the rows of values (S, K)."""
     columns = [np.bincount(names, column, clusters) for column in values.T]
     return np.stack(columns, axis=1)
 
 
-def _resampled(moments: FloatArray, correction: float, seed: int) -> tuple[FloatArray, FloatArray]:
+def _resampled(
+    moments: Float64Array, correction: float, seed: int
+) -> tuple[Float64Array, Float64Array]:
     """Deviation from the estimate (B, K) in each resample, and the resample's standard error.
 
     Args:

@@ -1,10 +1,8 @@
 """Groups of items alike, by their embeddings: for marginalised weights and tests by group."""
 
 import numpy as np
-import numpy.typing as npt
 
-IntArray = npt.NDArray[np.int64]
-Float32Array = npt.NDArray[np.float32]
+from ucfrec.arrays import Float32Array, IntArray
 
 _MOST_GROUPS = 32
 

@@ -9,14 +9,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ucfrec.arrays import BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
-
-FloatArray = npt.NDArray[np.float64]
-Float32Array = npt.NDArray[np.float32]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 _LARGEST = 1e100
 """Weights stop here: beyond, an estimate means nothing, and their squares stay finite."""
@@ -26,11 +21,11 @@ _LARGEST = 1e100
 class Modelled:
     """What models fitted on other sessions say of N logged steps, under the evaluated policy."""
 
-    reward: FloatArray
+    reward: Float64Array
     """(N,) mean reward of the step."""
-    q: FloatArray
+    q: Float64Array
     """(N,) discounted return from the logged action on."""
-    v: FloatArray
+    v: Float64Array
     """(N,) Σ_a π(a | s) q(s, a): the mean of `q` over the evaluated policy's actions."""
 
 
@@ -55,11 +50,11 @@ class LoggedSteps:
 
     session: IntArray
     """(N,) number of each step's session: 0 to S − 1, never falling, none left out."""
-    reward: FloatArray
+    reward: Float64Array
     """(N,) in any unit; estimates are in the same unit."""
-    propensity: FloatArray
+    propensity: Float64Array
     """(N,) the behavior policy's probability of the logged action, in (0, 1]; NaN where unknown."""
-    target: FloatArray
+    target: Float64Array
     """(N,) the evaluated policy's probability of it, in [0, 1]; 0 where it cannot choose it."""
     model: Modelled | None = None
     user: IntArray | None = None
@@ -67,10 +62,10 @@ class LoggedSteps:
     session is somebody else's."""
     discount: float = 1.0
     """γ in (0, 1]: a reward at step t (from 0) counts γ^t."""
-    cluster_propensity: FloatArray | None = None
+    cluster_propensity: Float64Array | None = None
     """(N,) the behavior policy's probability of the logged action's cluster, for MIPS; see
     `cluster_probabilities`."""
-    cluster_target: FloatArray | None = None
+    cluster_target: Float64Array | None = None
     """(N,) the evaluated policy's probability of it."""
     groups: ItemGroups | None = None
     densities: bool = False
@@ -131,27 +126,27 @@ class LoggedSteps:
         return np.arange(len(self.session)) - self.first[self.session]
 
     @cached_property
-    def discounts(self) -> FloatArray:
+    def discounts(self) -> Float64Array:
         """(N,) γ^t."""
         return np.asarray(self.discount**self.step, dtype=np.float64)
 
     @cached_property
-    def returns(self) -> FloatArray:
+    def returns(self) -> Float64Array:
         """(S,) discounted return of each session as logged."""
         return self.per_session(self.discounts * self.reward)
 
     @cached_property
-    def weights(self) -> FloatArray:
+    def weights(self) -> Float64Array:
         """(N,) w_it; NaN from a step without propensity on."""
         return self._products(self.target / self.propensity)
 
     @cached_property
-    def session_weights(self) -> FloatArray:
+    def session_weights(self) -> Float64Array:
         """(S,) w of each session's last step: the product of all its ratios."""
         return self.weights[self.last]
 
     @cached_property
-    def cluster_weights(self) -> FloatArray | None:
+    def cluster_weights(self) -> Float64Array | None:
         """(N,) products of ratios of the logged actions' clusters; None without them."""
         if self.cluster_propensity is None or self.cluster_target is None:
             return None
@@ -162,11 +157,11 @@ class LoggedSteps:
         """How many steps have none."""
         return int(np.isnan(self.propensity).sum())
 
-    def per_session(self, values: FloatArray) -> FloatArray:
+    def per_session(self, values: Float64Array) -> Float64Array:
         """(S,) sums of values (N,)."""
         return np.asarray(np.add.reduceat(values, self.first))
 
-    def before(self, upto: FloatArray) -> FloatArray:
+    def before(self, upto: Float64Array) -> Float64Array:
         """(N,) w_i,t−1 of products (N,): 1 at the first step."""
         earlier = np.roll(upto, 1)
         earlier[self.first] = 1.0
@@ -218,7 +213,7 @@ class LoggedSteps:
             parts["groups"] = ItemGroups(self.groups.number[rows], self.groups.target[rows])
         return parts
 
-    def _products(self, upto: FloatArray) -> FloatArray:
+    def _products(self, upto: Float64Array) -> Float64Array:
         """(N,) products of ratios (N,) from the session's first step to each."""
         # One pass a place in the session: sums of logarithms would lose digits over many sessions.
         longest_first = np.argsort(-self.lengths, kind="stable")
@@ -230,8 +225,8 @@ class LoggedSteps:
 
 
 def cluster_probabilities(
-    probabilities: FloatArray, cluster: IntArray, action: IntArray
-) -> FloatArray:
+    probabilities: Float64Array, cluster: IntArray, action: IntArray
+) -> Float64Array:
     """A policy's probability of the cluster of each logged action, for MIPS.
 
     In a large catalogue hardly any single item is shown often by both policies, but items alike
@@ -251,13 +246,13 @@ def cluster_probabilities(
     return np.asarray(np.minimum((probabilities * same).sum(axis=1), 1.0), dtype=np.float64)
 
 
-def _require_shape(name: str, values: FloatArray, n: int) -> None:
+def _require_shape(name: str, values: Float64Array, n: int) -> None:
     if values.shape != (n,):
         raise InputError(f"{name} has shape {values.shape}, {n} steps are ({n},)")
 
 
 def _require_probabilities(
-    propensity: FloatArray, target: FloatArray, n: int, most: float = 1.0
+    propensity: Float64Array, target: Float64Array, n: int, most: float = 1.0
 ) -> None:
     """Args:
     most: what they may not exceed; infinity for densities.

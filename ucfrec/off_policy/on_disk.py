@@ -4,9 +4,8 @@ import os
 import tempfile
 
 import numpy as np
-import numpy.typing as npt
 
-Float32Array = npt.NDArray[np.float32]
+from ucfrec.arrays import Float32Array
 
 
 def array_on_disk(shape: tuple[int, int]) -> Float32Array:

@@ -16,13 +16,10 @@ Each model contains the one above it: a weaker assumption, and heavier weights.
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.off_policy.logged_steps import LoggedSteps
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 ENOUGH_TO_NORMALISE = 1e-12
 PAGE_MS = 10
@@ -77,7 +74,7 @@ def pages_of(user: IntArray, time: IntArray) -> IntArray:
     return page
 
 
-def independent_terms(steps: LoggedSteps) -> dict[str, tuple[FloatArray, FloatArray]]:
+def independent_terms(steps: LoggedSteps) -> dict[str, tuple[Float64Array, Float64Array]]:
     """Of each estimator under the independent model: the terms (S,) whose mean is the estimate, and
     what each page counts (S,), its mean ratio. Propensities of all steps are known."""
     ratios = steps.target / steps.propensity

@@ -8,7 +8,6 @@ from tempfile import gettempdir
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 import pyarrow.parquet as pq
 from torch import Tensor
@@ -16,10 +15,11 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.logged_decisions import session_decisions
+from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
-from ucfrec.locks import scratch_folder
+from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.engine import BATCH_ROWS
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.ids import EPISODE_USERS
@@ -32,15 +32,13 @@ SESSION, PROBABILITY, RANK, GREEDY = "session", "probability", "rank", "greedy_i
 _STEPS_AT_ONCE = 1024
 _LOGITS_AT_ONCE = 2**24
 
-IntArray = npt.NDArray[np.int64]
-
 
 @dataclass(frozen=True)
 class LoggedSessions:
     """Logs with items, users, reward and sessions defined as in a policy's training logs."""
 
     store: EpisodeStore
-    users: npt.NDArray[Any]
+    users: Array
     """(E,): identifier of each session's user."""
     report: dict[str, Any]
     """Counts of what was read and dropped, for `ucfrec.logs.summary.format_report`."""

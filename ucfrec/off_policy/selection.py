@@ -16,13 +16,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.off_policy.intervals import Resampled, resample
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 LEVEL = 0.95
 
@@ -76,7 +73,7 @@ class Selection:
 
 
 def select(
-    names: Sequence[str], terms: FloatArray, seed: int, user: IntArray | None = None
+    names: Sequence[str], terms: Float64Array, seed: int, user: IntArray | None = None
 ) -> Selection:
     """Rank candidates by estimates on the same sessions.
 
@@ -118,7 +115,7 @@ def select(
     return Selection(standings, corrected, _regret(terms, first, seed, user))
 
 
-def _regret(terms: FloatArray, first: int, seed: int, user: IntArray | None) -> float:
+def _regret(terms: Float64Array, first: int, seed: int, user: IntArray | None) -> float:
     """Upper end of how much better than the first any other may be."""
     others = np.delete(terms, first, axis=1) - terms[:, [first]]
     if not others.shape[1]:

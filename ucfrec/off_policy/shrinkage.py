@@ -23,32 +23,31 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from ucfrec.arrays import Float64Array
 from ucfrec.off_policy.logged_steps import LoggedSteps
 
-FloatArray = npt.NDArray[np.float64]
-Shrink = Callable[[FloatArray, float], FloatArray]
+Shrink = Callable[[Float64Array, float], Float64Array]
 
 
-def clip(weights: FloatArray, most: float) -> FloatArray:
+def clip(weights: Float64Array, most: float) -> Float64Array:
     """min(w, λ)."""
     return np.minimum(weights, most)
 
 
-def switch(weights: FloatArray, most: float) -> FloatArray:
+def switch(weights: Float64Array, most: float) -> Float64Array:
     """w where w ≤ λ, else 0."""
     return np.where(weights <= most, weights, 0.0)
 
 
-def optimistic(weights: FloatArray, strength: float) -> FloatArray:
+def optimistic(weights: Float64Array, strength: float) -> Float64Array:
     """λ w / (w² + λ): w where λ is infinite, 0 where it is 0."""
     if math.isinf(strength):
         return weights
     return np.asarray(strength * weights / np.maximum(weights**2 + strength, 1e-300))
 
 
-def sub_gaussian(weights: FloatArray, strength: float) -> FloatArray:
+def sub_gaussian(weights: Float64Array, strength: float) -> Float64Array:
     """w / (1 − λ + λ w): w where λ is 0, 1 where it is 1."""
     return np.asarray(weights / np.maximum(1 - strength + strength * weights, 1e-300))
 
@@ -72,7 +71,7 @@ DR_KINDS: Final = {
 }
 
 
-def shrunk(steps: LoggedSteps) -> dict[str, tuple[float, FloatArray, FloatArray]]:
+def shrunk(steps: LoggedSteps) -> dict[str, tuple[float, Float64Array, Float64Array]]:
     """Of each estimator: the tuned parameter, the terms (S,) whose mean is the estimate, and the
     shrunk weights (S,). Propensities of all steps are known."""
     weights, nothing = steps.session_weights, np.zeros(len(steps.first))
@@ -86,8 +85,8 @@ def shrunk(steps: LoggedSteps) -> dict[str, tuple[float, FloatArray, FloatArray]
 
 
 def _tuned(
-    kind: Shrinkage, weights: FloatArray, left: FloatArray, value: FloatArray
-) -> tuple[float, FloatArray, FloatArray]:
+    kind: Shrinkage, weights: Float64Array, left: Float64Array, value: Float64Array
+) -> tuple[float, Float64Array, Float64Array]:
     parameter = tune(kind.shrink, kind.candidates, weights, left, value)
     kept = kind.shrink(weights, parameter)
     return parameter, value + kept * left, kept
@@ -96,9 +95,9 @@ def _tuned(
 def tune(
     shrink: Shrink,
     candidates: Sequence[float],
-    weights: FloatArray,
-    left: FloatArray,
-    value: FloatArray,
+    weights: Float64Array,
+    left: Float64Array,
+    value: Float64Array,
 ) -> float:
     """The candidate of least estimated mean squared error, the first of equals.
 
@@ -115,7 +114,7 @@ def tune(
 
 
 def mean_squared_error(
-    weights: FloatArray, kept: FloatArray, left: FloatArray, value: FloatArray
+    weights: Float64Array, kept: Float64Array, left: Float64Array, value: Float64Array
 ) -> float:
     """Estimated mean squared error of E_n[value + kept · left] (Su et al. 2020, section 5)."""
     bias = float(((weights - kept) * left).mean())

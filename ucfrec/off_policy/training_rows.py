@@ -1,12 +1,13 @@
 """Finds out whether a policy is evaluated on rows that it was trained on."""
 
 from collections.abc import Iterator
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from ucfrec import schema
+from ucfrec.arrays import Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.runs.trained_policy import REFIT_OF, TrainedPolicy, store_of
@@ -66,7 +67,7 @@ def _keys(store: EpisodeStore) -> Iterator[KeyArray]:
     """Hash the (user, item, time) of each step to one number; some at a time, in order."""
     if not store.n_episodes:
         return
-    users: npt.NDArray[Any] = store.episode_values(schema.USER)
+    users: Array = store.episode_values(schema.USER)
     for begin in range(0, store.n_steps, _ROWS_AT_ONCE):
         episodes, steps = store.locate(np.arange(begin, min(begin + _ROWS_AT_ONCE, store.n_steps)))
         keys = np.zeros(len(steps), dtype=np.uint64)

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ucfrec import schema
+from ucfrec.arrays import Float32Array, Float64Array, IntArray
 from ucfrec.counterfactual.reward_model import mlp
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Transitions
@@ -18,7 +19,6 @@ from ucfrec.fitting.loop import LoopConfig, fit
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.settings import BatchSize, Count, LearningRate, Weight, Width, settings_table
 
-FloatArray = npt.NDArray[np.float32]
 _CHUNK = 4096
 _LOGGED = 100_000
 """Largest number of logged actions that candidates are drawn from."""
@@ -166,9 +166,9 @@ def relabelled(store: EpisodeStore, config: CQLConfig, folder: Path, seed: int) 
 
 def optimistic_returns(
     rewards: npt.NDArray[np.floating],
-    values: npt.NDArray[np.float64],
-    lengths: npt.NDArray[np.int64],
-) -> FloatArray:
+    values: Float64Array,
+    lengths: IntArray,
+) -> Float32Array:
     """R_t = r_t + max(R_{t+1}, V_{t+1}) within each episode, R = V = 0 after its end.
 
     With C_t the sum of rewards before t, R_t + C_t is the maximum of V_k + C_k over k > t (V = 0

@@ -11,15 +11,15 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ucfrec import schema
-from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model
-from ucfrec.counterfactual.item_reward_model import ItemRewardModel
 from ucfrec.counterfactual.reward_model import mlp
-from ucfrec.counterfactual.session_tastes import MEMORY
 from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import PolicyConfig, SequencePolicy
 from ucfrec.policies.heads import VectorHead
+from ucfrec.user_model.posterior import MEMORY
+from ucfrec.user_model.reward import ItemRewardModel
+from ucfrec.user_model.reward_fit import fit_item_reward_model
 
 _CANDIDATES: Final = 512
 """Number of logged action vectors to choose from."""

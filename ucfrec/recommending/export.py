@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
 from ucfrec import __version__
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.arrays import Array
 from ucfrec.errors import InputError
-from ucfrec.files import atomic_folder, write_json
+from ucfrec.files.atomic import atomic_folder, write_json
 from ucfrec.recommending.export_graph import INPUTS, OUTPUTS, RuleGraph
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -97,7 +97,7 @@ def random_sessions(
     items = np.where(places, rng.integers(n, size=places.shape), -1)
     rewards = rng.choice([states.reward_low, states.reward_high], size=places.shape)
     rewards = np.where(places, rewards, 0.0).astype(np.float32)
-    values: dict[str, npt.NDArray[Any]] = {
+    values: dict[str, Array] = {
         "items": items,
         "rewards": rewards,
         "steps": steps,

@@ -15,12 +15,12 @@ from torch.nn import functional as F
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.sessions import Sessions
-from ucfrec.counterfactual.item_reward_model import ItemRewardModel
 from ucfrec.episodes.exposure import GAIN, ExposureTerm, Likeness, Shown
 from ucfrec.errors import InputError
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
 from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.user_model.reward import ItemRewardModel
 
 INPUTS: Final = ("items", "rewards", "steps", "collected", "users", "excluded", "observations")
 OUTPUTS: Final = ("scores", "top_items", "top_scores")

@@ -4,14 +4,14 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 import pyarrow as pa
 
 from ucfrec import schema
+from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.logs.clean import EARLIEST_MS
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.histories import frame_histories, read_histories
@@ -24,10 +24,6 @@ _MOST_PLAIN_ROWS = 1_000_000
 LONGEST_HISTORY = 1000
 """Most recent rows of a user that are read; older ones only count as seen."""
 
-Array = npt.NDArray[Any]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
-
 
 @dataclass(frozen=True)
 class Histories:
@@ -39,7 +35,7 @@ class Histories:
     """(N,) user index of each row, 0 to U − 1; sorted."""
     item_ids: Array
     """(N,) identifiers in the logs."""
-    rewards: npt.NDArray[np.float32]
+    rewards: Float32Array
     """(N,) in reward units."""
     timestamps: IntArray
     """(N,) milliseconds."""
@@ -49,7 +45,7 @@ class Histories:
     """(M,) user index of each entry of `seen_ids`; sorted."""
     seen_ids: Array
     """(M,) identifiers of all items that a user has seen, also before the N rows."""
-    observations: npt.NDArray[np.float32] | None
+    observations: Float32Array | None
     """(U, O) last logged observation; None if the logs have none."""
 
     @classmethod

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 import torch
 from torch import Tensor
@@ -15,6 +14,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.item_index import ItemIndex
 from ucfrec.acting.session_scorer import SessionScorer
 from ucfrec.acting.sessions import Sessions
+from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.recommending.histories import Histories
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -24,9 +24,6 @@ _USERS_AT_ONCE = 128
 """Most users of a forward pass; scores of more leave the processor's cache."""
 _SCORES = 2**24
 """Most scores of a forward pass of several users, users × items: 64 MiB."""
-
-Array = npt.NDArray[Any]
-IntArray = npt.NDArray[np.int64]
 
 
 def recommend(

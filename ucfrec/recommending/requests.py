@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Final, NamedTuple, NotRequired
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, ValidationError
 
 # Of typing's TypedDict, pydantic cannot read the configuration before Python 3.12.
 from typing_extensions import TypedDict
 
 from ucfrec import schema
+from ucfrec.arrays import Array, Float32Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.logs.clean import DAY_MS, EARLIEST_MS
 from ucfrec.recommending.histories import LONGEST_HISTORY
@@ -22,7 +22,6 @@ from ucfrec.recommending.row_rewards import RowRewards
 from ucfrec.runs.trained_policy import TrainedPolicy, duplicates_of
 from ucfrec.settings import settings_table
 
-Array = npt.NDArray[Any]
 _Integer = Annotated[StrictInt, Field(ge=-(2**63), lt=2**63)]
 """Of 64 bits: the largest that identifiers have, and small enough to be a float."""
 Id = _Integer | Annotated[str, Field(max_length=1000)]
@@ -102,9 +101,9 @@ class UserHistory(NamedTuple):
 
     item_ids: Array
     """(n,) integers or text."""
-    rewards: npt.NDArray[np.float32]
+    rewards: Float32Array
     """(n,) in reward units."""
-    timestamps: npt.NDArray[np.int64]
+    timestamps: IntArray
     """(n,) milliseconds."""
     session_ids: list[Any] | None
     """(n,); None if sessions are not split by them."""

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.recommending.histories import Histories
 from ucfrec.recommending.recommend import best_of, sessions_of, uniforms, users_at_once
@@ -19,9 +19,6 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 TORCH: Final = "torch"
 ONNXRUNTIME: Final = "onnxruntime"
 ENGINES: Final = (TORCH, ONNXRUNTIME)
-
-Array = npt.NDArray[Any]
-IntArray = npt.NDArray[np.int64]
 
 
 class Answer(NamedTuple):

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ucfrec.errors import InputError
-from ucfrec.files import read_json
+from ucfrec.files.atomic import read_json
 from ucfrec.reporting.estimate_rows import SUITE, as_estimate
 from ucfrec.reporting.result_row import ResultRow, RowKey, row_from_json
 from ucfrec.reporting.rows_file import read_lines

@@ -12,9 +12,9 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.checksums import CARD, MEASURED
-from ucfrec.files import atomic_file, read_json, write_json
-from ucfrec.locks import claim
+from ucfrec.files.atomic import atomic_file, read_json, write_json
+from ucfrec.files.checksums import CARD, MEASURED
+from ucfrec.files.locks import claim
 from ucfrec.provenance import config_hash
 from ucfrec.reporting.tables import markdown_table, shown
 from ucfrec.runs.trained_policy import REFIT_OF, RULE, learner_of, read_record

@@ -15,7 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from ucfrec import __version__
 from ucfrec.counterfactual.reward_model_fit import fit_warning
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.files import atomic_file, read_json
+from ucfrec.files.atomic import atomic_file, read_json
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.reporting import charts
 from ucfrec.reporting.copies import copies_table, moves_chart

@@ -10,7 +10,7 @@ from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, ParamSpec, TypeVar
 
-from ucfrec.files import atomic_file
+from ucfrec.files.atomic import atomic_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

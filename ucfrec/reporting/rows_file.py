@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 from ucfrec.errors import InputError
-from ucfrec.files import atomic_file
-from ucfrec.locks import claim, claimed, remove_leftovers
+from ucfrec.files.atomic import atomic_file
+from ucfrec.files.locks import claim, claimed, remove_leftovers
 from ucfrec.provenance import config_hash
 from ucfrec.reporting.result_row import ResultRow, RowKey, row_from_json
 

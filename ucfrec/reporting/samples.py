@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.files import read_json
+from ucfrec.files.atomic import read_json
 from ucfrec.reporting.tables import Table, shown
 from ucfrec.runs.samples import SAMPLES
 from ucfrec.runs.trained_policy import ITEMS

@@ -9,15 +9,15 @@ from typing import Annotated, Any, Final, NamedTuple
 import numpy as np
 from pydantic import Field
 
+from ucfrec.choosing.config import RuleConfig
 from ucfrec.counterfactual.augment import AugmentConfig
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
 from ucfrec.errors import InputError
-from ucfrec.files import read_toml
+from ucfrec.files.atomic import read_toml
 from ucfrec.fitting.loop import LoopConfig
 from ucfrec.policies.base import PolicyConfig
 from ucfrec.policies.registry import policy_class
-from ucfrec.runs.rule_config import RuleConfig
 from ucfrec.settings import SettingError, nearest, settings_table
 
 TABLES: Final = ("policy", "train", "crm", "csg", "augment", "rule")

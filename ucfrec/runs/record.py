@@ -5,10 +5,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from ucfrec.checksums import FILES
 from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.errors import InputError
+from ucfrec.files.checksums import FILES
 from ucfrec.runs.config import config_from_dict
 
 _LARGEST: Final = 2**48

@@ -5,11 +5,10 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from ucfrec.checksums import reopen, seal
-from ucfrec.counterfactual.item_reward_fit import refit_item_reward_model
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files import read_json
+from ucfrec.files.atomic import read_json
+from ucfrec.files.checksums import reopen, seal
 from ucfrec.fitting import distributed
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.record import is_of_store
@@ -23,6 +22,7 @@ from ucfrec.runs.trained_policy import (
     RUN,
     TrainedPolicy,
 )
+from ucfrec.user_model.reward_fit import refit_item_reward_model
 
 
 def refit(store: EpisodeStore, first: Path, out: Path) -> dict[str, Any]:

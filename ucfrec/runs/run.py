@@ -13,29 +13,28 @@ import torch
 
 from ucfrec import schema
 from ucfrec.acting.decision import Decider, DecisionRule
-from ucfrec.checksums import FILES, reopen, seal
+from ucfrec.arrays import Float32Array
+from ucfrec.choosing.by_ranking import RankedChoice, choose_by_ranking
+from ucfrec.choosing.by_simulation import Choice, choose_rule
 from ucfrec.counterfactual.augment import AugmentConfig
 from ucfrec.counterfactual.copies import MODELS, counterfactual_copies, require_rewards_vary
 from ucfrec.counterfactual.generators import CSGConfig
-from ucfrec.counterfactual.item_reward_fit import fit_item_reward_model, reward_model_sizes
 from ucfrec.counterfactual.reward_model import CRMConfig
-from ucfrec.counterfactual.training_users import TRAINING_USERS, fit_training_users
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
-from ucfrec.episodes.windows import FloatArray, Overlay
+from ucfrec.episodes.windows import Overlay
 from ucfrec.errors import InputError
-from ucfrec.files import atomic_folder, read_json, write_json
+from ucfrec.files.atomic import atomic_folder, read_json, write_json
+from ucfrec.files.checksums import FILES, reopen, seal
+from ucfrec.files.locks import claimed, remove_leftovers, remove_leftovers_within
 from ucfrec.fitting import distributed
 from ucfrec.fitting.checkpoint import save_tensors
 from ucfrec.fitting.random_state import random_state_kept
-from ucfrec.locks import claimed, remove_leftovers, remove_leftovers_within
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
 from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import command_line, versions
-from ucfrec.runs.choose_by_ranking import RankedChoice, choose_by_ranking
-from ucfrec.runs.choose_rule import Choice, choose_rule
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.policy_fit import fit_policy
 from ucfrec.runs.record import is_of_store
@@ -55,6 +54,8 @@ from ucfrec.runs.trained_policy import (
     TrainedPolicy,
     store_from,
 )
+from ucfrec.user_model.reward_fit import fit_item_reward_model, reward_model_sizes
+from ucfrec.user_model.training_users import TRAINING_USERS, fit_training_users
 
 _MOST_RETURNS = 1_000_001
 _QUANTILES = (0.5, 0.75, 0.9, 0.95, 0.99, 1.0)
@@ -243,7 +244,7 @@ def _returns(store: EpisodeStore, config: Config) -> ReturnToGo:
     return config.policy.returns(store.meta["source"].get("session_by"))
 
 
-def _target_returns(train: EpisodeStore, definition: ReturnToGo) -> FloatArray:
+def _target_returns(train: EpisodeStore, definition: ReturnToGo) -> Float32Array:
     """Sorted returns-to-go of sessions, or of steps if targets are set anew at every step.
 
     Of more than a million, evenly spaced order statistics are kept, the lowest and highest too.

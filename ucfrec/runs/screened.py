@@ -10,7 +10,7 @@ from ucfrec.counterfactual.interventions import interventions
 from ucfrec.counterfactual.screening import ScreeningConfig, ScreeningReport, screen
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files import read_json, write_json
+from ucfrec.files.atomic import read_json, write_json
 from ucfrec.runs.config import Config
 from ucfrec.runs.run import train_run, training_views
 from ucfrec.runs.shared_stages import OWN, SharedStages

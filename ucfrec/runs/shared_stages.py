@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from ucfrec.code_version import code_version
-from ucfrec.files import atomic_file, atomic_folder
-from ucfrec.locks import claim
+from ucfrec.files.atomic import atomic_file, atomic_folder
+from ucfrec.files.locks import claim
 from ucfrec.provenance import config_hash
 
 

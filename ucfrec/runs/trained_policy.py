@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -17,8 +16,7 @@ from ucfrec import schema
 from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.session_scorer import SessionScorer
-from ucfrec.checksums import sealed_record
-from ucfrec.counterfactual.item_reward_model import FITTED, ItemRewardModel
+from ucfrec.arrays import Array, Float32Array, IntArray
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.main_tags import MainTags
@@ -26,14 +24,16 @@ from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError, InputNote, damage_explained
-from ucfrec.files import read_json
+from ucfrec.files.atomic import read_json
+from ucfrec.files.checksums import sealed_record
+from ucfrec.files.parquet import read_ids
 from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors
 from ucfrec.fitting.random_state import random_state_kept
-from ucfrec.parquet_files import read_ids
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
 from ucfrec.runs.config import config_from_dict
 from ucfrec.runs.record import is_of_store, require_run_record
+from ucfrec.user_model.reward import FITTED, ItemRewardModel
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -63,11 +63,11 @@ class TrainedPolicy:
     """Content of `run.json`."""
     item_states: ItemStates | None
     """Builds states from items; None if the logged observation is the state."""
-    item_ids: npt.NDArray[Any] | None
+    item_ids: Array | None
     """(n_items,) item identifiers in the logs; None if actions are vectors."""
-    user_ids: npt.NDArray[Any]
+    user_ids: Array
     """(n_users,) user identifiers in the logs; empty if the store has none."""
-    training_returns: npt.NDArray[np.float32]
+    training_returns: Float32Array
     """(M,) returns-to-go that targets are set for, sorted, in reward units: those of sessions, or
     of steps if a target is set anew at every step (`ReturnToGo.per_session`)."""
     rule: DecisionRule
@@ -258,7 +258,7 @@ class TrainedPolicy:
         self,
         episodes: int,
         rule: DecisionRule | None = None,
-        item_numbers: npt.NDArray[np.int64] | None = None,
+        item_numbers: IntArray | None = None,
         seed: int = 0,
     ) -> PolicyActor:
         """An actor for `episodes` parallel environments.
@@ -392,7 +392,7 @@ def _reward_model(path: Path, sizes: Mapping[str, int]) -> ItemRewardModel | Non
     return load_module(path, lambda: ItemRewardModel(sizes), load_tensors(path)[0]).eval()
 
 
-def _returns(path: Path) -> npt.NDArray[np.float32]:
+def _returns(path: Path) -> Float32Array:
     with damage_explained(path, REMEDY):
         returns = load_tensors(path)[0]["returns"]
         if returns.dim() != 1 or returns.dtype != torch.float32 or not len(returns):
@@ -402,7 +402,7 @@ def _returns(path: Path) -> npt.NDArray[np.float32]:
         return np.asarray(returns.numpy())
 
 
-def _ids(path: Path, column: str) -> npt.NDArray[Any]:
+def _ids(path: Path, column: str) -> Array:
     if not path.exists():
         return np.empty(0, dtype=np.int64)
     return read_ids(path, column)

@@ -35,16 +35,16 @@ SCORES, ROBUSTNESS = "control", "robustness"
 TARGET: Final = "target"
 """Condition of rows of budgets with several target returns."""
 OF_ITEMS: Final = (
-    *("ucfrec.acting.best_items", "ucfrec.acting.fatigue", "ucfrec.acting.learned_sessions"),
-    *("ucfrec.acting.logged_decisions", "ucfrec.acting.many_rules"),
+    *("ucfrec.acting.best_items", "ucfrec.user_model.fatigue", "ucfrec.user_model.simulator"),
+    *("ucfrec.acting.logged_decisions", "ucfrec.choosing.many_rules"),
     *("ucfrec.acting.session_scorer", "ucfrec.counterfactual.action_copies"),
-    *("ucfrec.counterfactual.item_reward_effects", "ucfrec.counterfactual.item_reward_fit"),
-    *("ucfrec.counterfactual.item_reward_mean", "ucfrec.counterfactual.item_reward_model"),
-    *("ucfrec.counterfactual.item_reward_report", "ucfrec.counterfactual.item_reward_rows"),
-    *("ucfrec.counterfactual.session_tastes", "ucfrec.counterfactual.training_users"),
+    *("ucfrec.user_model.reward_effects", "ucfrec.user_model.reward_fit"),
+    *("ucfrec.user_model.reward_mean", "ucfrec.user_model.reward"),
+    *("ucfrec.user_model.reward_report", "ucfrec.user_model.reward_rows"),
+    *("ucfrec.user_model.posterior", "ucfrec.user_model.training_users"),
     *("ucfrec.episodes.exposure", "ucfrec.episodes.item_counts", "ucfrec.episodes.item_table"),
     *("ucfrec.episodes.main_tags", "ucfrec.episodes.states", "ucfrec.policies.item_sampling"),
-    *("ucfrec.runs.choose_by_ranking", "ucfrec.runs.choose_rule"),
+    *("ucfrec.choosing.by_ranking", "ucfrec.choosing.by_simulation"),
 )
 """Modules that control imports but does not run, because its actions are vectors: changes to them
 change none of its rows."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files import atomic_file, read_toml
+from ucfrec.files.atomic import atomic_file, read_toml
 from ucfrec.provenance import provenance
 from ucfrec.reporting.grid import Measurement, chosen
 from ucfrec.reporting.result_row import ResultRow, RowKey

@@ -7,7 +7,7 @@ from typing import Any
 
 from ucfrec.commands.grid_options import seed_given
 from ucfrec.errors import InputError
-from ucfrec.files import write_json
+from ucfrec.files.atomic import write_json
 from ucfrec.provenance import provenance
 from ucfrec.reporting.tables import format_rows
 from ucfrec_control.commands.options import shown_score, target_given

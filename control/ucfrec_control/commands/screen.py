@@ -7,7 +7,7 @@ from pathlib import Path
 from ucfrec.commands.grid_options import seed_given
 from ucfrec.counterfactual.screening import describe_screening
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.files import write_json
+from ucfrec.files.atomic import write_json
 from ucfrec.provenance import provenance
 from ucfrec.runs.screened import screen_store
 from ucfrec_control.data.trajectories import PACKAGES

@@ -17,12 +17,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from gymnasium.spaces import Box
 from torch import Tensor, nn
 
-from ucfrec.acting.rollout import BoolArray, FloatArray, IntArray
+from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
 
 _MOST_BYTES: Final = {"policy.pth": 2**30, "data": 2**26}
@@ -76,9 +75,7 @@ class Agent:
     def begin(self, rows: IntArray) -> None:
         """Do nothing: the agent has no memory."""
 
-    def act(
-        self, observations: FloatArray, live: BoolArray
-    ) -> tuple[npt.NDArray[np.float32], None]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Float32Array, None]:
         """Actions (N, A) within the action space, and None."""
         with torch.no_grad():
             out = self._network(torch.as_tensor(observations, dtype=torch.float32))
@@ -88,7 +85,7 @@ class Agent:
         noise = self._noise * half * self._generator.normal(size=mean.shape)
         return np.clip(mean + noise, self._low, self._high).astype(np.float32), None
 
-    def observe(self, actions: npt.NDArray[Any], rewards: FloatArray) -> None:
+    def observe(self, actions: Array, rewards: Float32Array) -> None:
         """Do nothing: the agent has no memory."""
 
 

@@ -8,15 +8,15 @@ from typing import Annotated, Any, Final
 
 import gymnasium
 import numpy as np
-import numpy.typing as npt
 from gymnasium.vector import VectorEnv
 from pydantic import Field
 
-from ucfrec.acting.rollout import Actor, BoolArray, FloatArray, IntArray, Step, rollout
+from ucfrec.acting.rollout import Actor, Step, rollout
+from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.files import read_json, write_json
+from ucfrec.files.atomic import read_json, write_json
+from ucfrec.files.locks import claimed, remove_leftovers_within
 from ucfrec.fitting.random_state import random_state_kept
-from ucfrec.locks import claimed, remove_leftovers_within
 from ucfrec.progress import progress
 from ucfrec.provenance import provenance
 from ucfrec.settings import Count, require, settings_table
@@ -222,11 +222,11 @@ class _Uniform:
     def begin(self, rows: IntArray) -> None:
         """Do nothing: the actor has no state."""
 
-    def act(self, observations: FloatArray, live: BoolArray) -> tuple[npt.NDArray[Any], None]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, None]:
         """Return (N, A) random actions, and None."""
         return self._space.sample(), None
 
-    def observe(self, actions: npt.NDArray[Any], rewards: FloatArray) -> None:
+    def observe(self, actions: Array, rewards: Float32Array) -> None:
         """Do nothing: the actor has no state."""
 
 
@@ -299,7 +299,7 @@ def roll_out(
 def _by_episode(steps: list[Step], env_id: str) -> Trajectories:
     """Reorder the steps of episodes that ran in parallel so that each episode is contiguous."""
 
-    def column(name: str) -> npt.NDArray[Any]:
+    def column(name: str) -> Array:
         return np.concatenate([getattr(step, name) for step in steps])
 
     order = np.argsort(column("episodes"), kind="stable")

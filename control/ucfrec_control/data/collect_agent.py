@@ -7,8 +7,8 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from ucfrec.errors import InputError
-from ucfrec.files import write_json
-from ucfrec.locks import claimed, remove_leftovers_within
+from ucfrec.files.atomic import write_json
+from ucfrec.files.locks import claimed, remove_leftovers_within
 from ucfrec.provenance import provenance
 from ucfrec_control.data.agents import read_agent
 from ucfrec_control.data.collect import roll_out

@@ -6,16 +6,15 @@ data folder have the same layout.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
-import numpy.typing as npt
 
+from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.files import atomic_file, read_json
+from ucfrec.files.atomic import atomic_file, read_json
 from ucfrec_control.data.hdf5 import opened, read_numbers
-from ucfrec_control.data.trajectories import BoolArray, FloatArray, IntArray, Trajectories
+from ucfrec_control.data.trajectories import Trajectories
 from ucfrec_control.worlds.scores import check_sizes, dataset_name, find_task
 
 _REQUIRED = ("observations", "actions", "rewards", "terminals")
@@ -115,7 +114,7 @@ def write_d4rl(
             file[f"metadata/{name}"] = value
 
 
-def _next_observations(trajectories: Trajectories, ends: IntArray) -> FloatArray | None:
+def _next_observations(trajectories: Trajectories, ends: IntArray) -> Float32Array | None:
     if trajectories.final_observations is None:
         return None
     next_observations = np.roll(trajectories.observations, -1, axis=0)
@@ -123,11 +122,11 @@ def _next_observations(trajectories: Trajectories, ends: IntArray) -> FloatArray
     return next_observations
 
 
-def _sizes(steps: Mapping[str, npt.NDArray[Any]]) -> tuple[int, ...]:
+def _sizes(steps: Mapping[str, Array]) -> tuple[int, ...]:
     return (*steps["observations"].shape[1:], *steps["actions"].shape[1:])
 
 
-def _require_aligned(steps: Mapping[str, npt.NDArray[Any]], path: Path) -> None:
+def _require_aligned(steps: Mapping[str, Array], path: Path) -> None:
     n = len(steps["rewards"]) if steps["rewards"].ndim else 0
     for name, values in steps.items():
         two = name not in ("rewards", "terminals", "timeouts")
@@ -142,7 +141,7 @@ def _require_aligned(steps: Mapping[str, npt.NDArray[Any]], path: Path) -> None:
             )
 
 
-def _flags(values: npt.NDArray[Any], name: str, path: Path) -> BoolArray:
+def _flags(values: Array, name: str, path: Path) -> BoolArray:
     """Bools; some AntMaze files store them as floats."""
     strange = int(np.count_nonzero((values != 0) & (values != 1)))
     if strange:
@@ -150,7 +149,7 @@ def _flags(values: npt.NDArray[Any], name: str, path: Path) -> BoolArray:
     return values.astype(bool)
 
 
-def _timeouts(steps: Mapping[str, npt.NDArray[Any]], path: Path) -> BoolArray:
+def _timeouts(steps: Mapping[str, Array], path: Path) -> BoolArray:
     if "timeouts" in steps:
         return _flags(steps["timeouts"], "timeouts", path)
     if "next_observations" not in steps:
@@ -163,8 +162,8 @@ def _timeouts(steps: Mapping[str, npt.NDArray[Any]], path: Path) -> BoolArray:
 
 
 def _final_observations(
-    steps: Mapping[str, npt.NDArray[Any]], ends: IntArray, path: Path
-) -> FloatArray | None:
+    steps: Mapping[str, Array], ends: IntArray, path: Path
+) -> Float32Array | None:
     if "next_observations" in steps:
         return steps["next_observations"][ends]
     if _FINAL not in steps:

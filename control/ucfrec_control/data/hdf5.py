@@ -7,8 +7,8 @@ from typing import Any, Final
 
 import h5py
 import numpy as np
-import numpy.typing as npt
 
+from ucfrec.arrays import Array
 from ucfrec.errors import InputError, one_line
 
 _DEFLATE: Final = 1032
@@ -42,7 +42,7 @@ def opened(path: Path) -> Iterator[Any]:
         ) from None
 
 
-def read_numbers(file: Any, path: Path, name: str) -> npt.NDArray[Any]:
+def read_numbers(file: Any, path: Path, name: str) -> Array:
     """A data set of numbers in memory, of at most two dimensions; floats become float32.
 
     Args:

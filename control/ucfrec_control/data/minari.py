@@ -13,13 +13,13 @@ from typing import Any
 import gymnasium
 import minari
 import numpy as np
-import numpy.typing as npt
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 from minari.namespace import NAMESPACE_METADATA_FILENAME
 
+from ucfrec.arrays import Array, Float32Array
 from ucfrec.errors import InputError
-from ucfrec.files import atomic_file, atomic_folder
+from ucfrec.files.atomic import atomic_file, atomic_folder
 from ucfrec_control.data.hdf5 import require_inside
 from ucfrec_control.data.trajectories import Trajectories
 from ucfrec_control.worlds.antmaze import antmaze_settings, is_antmaze
@@ -246,7 +246,7 @@ def _box(size: int) -> gymnasium.spaces.Box:
     return gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
 
 
-def _vectors(values: Any, source: str) -> npt.NDArray[Any]:
+def _vectors(values: Any, source: str) -> Array:
     if isinstance(values, Mapping) and {"achieved_goal", "observation"} <= values.keys():
         values = np.concatenate([values["achieved_goal"], values["observation"]], axis=1)
     if not isinstance(values, np.ndarray) or values.ndim != 2:
@@ -254,7 +254,7 @@ def _vectors(values: Any, source: str) -> npt.NDArray[Any]:
     return values
 
 
-def _joined(parts: list[npt.NDArray[Any]]) -> npt.NDArray[np.float32]:
+def _joined(parts: list[Array]) -> Float32Array:
     return np.concatenate(parts or [np.zeros((0, 0))]).astype(np.float32)
 
 

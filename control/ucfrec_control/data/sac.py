@@ -11,12 +11,11 @@ from typing import Annotated, Any, Final
 
 import gymnasium
 import numpy as np
-import numpy.typing as npt
 import torch
 from gymnasium.vector import VectorEnv
 from pydantic import Field
 
-from ucfrec.acting.rollout import BoolArray, FloatArray, IntArray
+from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, save_tensors
 from ucfrec.progress import Progress
@@ -100,7 +99,7 @@ class SacLearner:
             bar.update()
         self.episode += 1
 
-    def _explore(self, observations: FloatArray, generator: np.random.Generator) -> FloatArray:
+    def _explore(self, observations: Float32Array, generator: np.random.Generator) -> Float32Array:
         """Return an action of shape (1, A), scaled to [−1, 1]."""
         if self.steps < self._config.learning_starts:
             shape = (1, *(self._env.single_action_space.shape or ()))
@@ -108,7 +107,7 @@ class SacLearner:
         drawn, _ = self._model.predict(observations, deterministic=False)
         return np.asarray(self._model.policy.scale_action(drawn), dtype=np.float32)
 
-    def replay(self, steps: int) -> dict[str, npt.NDArray[Any]]:
+    def replay(self, steps: int) -> dict[str, Array]:
         """Return the first steps played, with D4RL's column names.
 
         Args:
@@ -199,7 +198,7 @@ class SacLearner:
     def begin(self, rows: IntArray) -> None:
         """Do nothing: the policy depends only on the current observation."""
 
-    def act(self, observations: FloatArray, live: BoolArray) -> tuple[FloatArray, None]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Float32Array, None]:
         """Sample actions from the policy, as in training.
 
         Args:
@@ -211,7 +210,7 @@ class SacLearner:
         """
         return self._model.predict(observations.astype(np.float32), deterministic=False)[0], None
 
-    def observe(self, actions: npt.NDArray[Any], rewards: FloatArray) -> None:
+    def observe(self, actions: Array, rewards: Float32Array) -> None:
         """Do nothing: the learner does not learn from `rollout`."""
 
 
@@ -230,7 +229,7 @@ def seed_all(*key: int) -> int:
     return seed
 
 
-class _Spaces(gymnasium.Env[FloatArray, FloatArray]):
+class _Spaces(gymnasium.Env[Float32Array, Float32Array]):
     """Environment with spaces only, for Stable-Baselines3; the episodes run in another one."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:

@@ -6,15 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ucfrec import schema
+from ucfrec.arrays import BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-
-FloatArray = npt.NDArray[np.float32]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 VALIDATION_EVERY = 20
 """One trajectory in this many belongs to the validation split."""
@@ -65,17 +61,17 @@ class Trajectories:
         InputError: there is no trajectory, array shapes disagree, or a value is not finite.
     """
 
-    observations: FloatArray
+    observations: Float32Array
     """(N, S) observation before each action."""
-    actions: FloatArray
+    actions: Float32Array
     """(N, A) action of each step, in the units of the environment."""
-    rewards: FloatArray
+    rewards: Float32Array
     """(N,) reward of each step."""
     lengths: IntArray
     """(E,) number of steps of each trajectory; the sum is N."""
     terminated: BoolArray
     """(E,) whether the trajectory ended by failure or success rather than by the step limit."""
-    final_observations: FloatArray | None
+    final_observations: Float32Array | None
     """(E, S) observation after the last action; None if the source does not contain it."""
     source: Mapping[str, Any]
     """Provenance: `where` the data was read from, name of the `dataset`, `env_id` (None if
@@ -101,7 +97,7 @@ class Trajectories:
                 raise InputError(f"{where}: {non_finite} numbers of its {name} are not finite")
 
     @property
-    def returns(self) -> npt.NDArray[np.float64]:
+    def returns(self) -> Float64Array:
         """(E,) undiscounted return, the sum of rewards, of each trajectory."""
         starts = np.cumsum(self.lengths) - self.lengths
         return np.add.reduceat(self.rewards.astype(np.float64), starts)

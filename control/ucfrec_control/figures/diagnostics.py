@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
+from ucfrec.arrays import Float64Array
 from ucfrec.counterfactual.augment import accept
 from ucfrec.counterfactual.generators import (
     CounterfactualStateGenerator,
@@ -21,7 +21,7 @@ from ucfrec.counterfactual.transitions import sample_transitions
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay, Transitions
 from ucfrec.errors import InputError
-from ucfrec.files import read_json
+from ucfrec.files.atomic import read_json
 from ucfrec.fitting.checkpoint import load_tensors, load_weights
 from ucfrec.policies.ucf import UCFPolicy
 from ucfrec.runs.config import Config, config_from_dict
@@ -29,8 +29,6 @@ from ucfrec.runs.run import training_views
 from ucfrec.runs.screened import without_columns
 from ucfrec.runs.trained_policy import DROPPED, RUN, TrainedPolicy
 from ucfrec.runs.trained_policy import store_of as trained_store
-
-FloatArray = npt.NDArray[np.float64]
 
 _REPORT = "augmentation.json"
 _PROPOSALS = 4096
@@ -61,7 +59,7 @@ def has_copies(run: Path) -> bool:
     return (run / _REPORT).exists() and read_json(run / _REPORT)["proposals"] > 0
 
 
-def edited_states(run: Path, seed: int = 0) -> tuple[FloatArray, FloatArray]:
+def edited_states(run: Path, seed: int = 0) -> tuple[Float64Array, Float64Array]:
     """Factual states and their edits, (M, S) each, aligned and in standard deviations from the
     training mean; at most 3,000 drawn from a run's counterfactual copies.
 
@@ -138,7 +136,7 @@ class Editing:
         return float((passed & (length >= band[0] - _ROUNDING)).float().mean())
 
 
-def acceptance_grid(run: Path, lows: Sequence[float], highs: Sequence[float]) -> FloatArray:
+def acceptance_grid(run: Path, lows: Sequence[float], highs: Sequence[float]) -> Float64Array:
     """(lows, highs) acceptance under every band; NaN where ρ_low is not below ρ_high.
 
     Raises:
@@ -161,7 +159,7 @@ def move_histogram(run: Path) -> tuple[list[float], list[int], tuple[float, floa
     return moves["histogram_edges"], moves["histogram_counts"], (low, high)
 
 
-def attention(run: Path, seed: int = 0) -> FloatArray:
+def attention(run: Path, seed: int = 0) -> Float64Array:
     """(K, 3, K) attention of a UCF run from s_t to R, s and a of every step.
 
     The mean over heads and over full windows of validation episodes; a row sums to one.

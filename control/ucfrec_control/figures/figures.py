@@ -10,7 +10,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.files import read_json
+from ucfrec.files.atomic import read_json
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.provenance import config_hash
 from ucfrec.reporting.plot_style import label, save

@@ -5,13 +5,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from ucfrec.arrays import Float64Array
 from ucfrec.reporting.plot_style import (
     COLUMN,
     EDITED,
@@ -25,7 +25,6 @@ from ucfrec.reporting.plot_style import (
 )
 from ucfrec.reporting.statistics import summary
 
-FloatArray = npt.NDArray[np.float64]
 Row = Mapping[str, Any]
 _PANELS = 3
 """Most datasets side by side."""
@@ -56,7 +55,7 @@ def move_histogram(
 def acceptance_heatmap(
     lows: Sequence[float],
     highs: Sequence[float],
-    acceptance: FloatArray,
+    acceptance: Float64Array,
     band: tuple[float, float],
     title: str = "",
 ) -> Figure:
@@ -90,7 +89,7 @@ def acceptance_heatmap(
 
 
 @styled
-def state_overlay(factual: FloatArray, edited: FloatArray, title: str = "") -> Figure:
+def state_overlay(factual: Float64Array, edited: Float64Array, title: str = "") -> Figure:
     """Factual and edited states in the factual ones' first two principal components (Figures 5, 6).
 
     Args:
@@ -266,7 +265,7 @@ def training_curves(
 
 
 @styled
-def attention_map(weights: FloatArray, title: str = "") -> Figure:
+def attention_map(weights: Float64Array, title: str = "") -> Figure:
     """How much the state token of every step of a window attends to every earlier token.
 
     Args:

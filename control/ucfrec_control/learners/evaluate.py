@@ -12,7 +12,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import rollout
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.evaluation.metrics import bootstrap_interval
-from ucfrec.files import read_json
+from ucfrec.files.atomic import read_json
 from ucfrec.provenance import config_hash, without_folders
 from ucfrec.reporting.statistics import summary
 from ucfrec.runs.screened import SCREENING, flagged_columns

@@ -9,22 +9,21 @@ from time import perf_counter
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from pydantic import Field
 from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.rollout import BoolArray, FloatArray, IntArray
-from ucfrec.checksums import seal
+from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.files import atomic_file, atomic_folder, read_json, write_json
+from ucfrec.files.atomic import atomic_file, atomic_folder, read_json, write_json
+from ucfrec.files.checksums import seal
+from ucfrec.files.locks import claimed, remove_leftovers_within
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
 from ucfrec.fitting.metrics_log import MetricsLog
 from ucfrec.fitting.random_state import random_state_kept
-from ucfrec.locks import claimed, remove_leftovers_within
 from ucfrec.progress import progress
 from ucfrec.provenance import command_line, versions
 from ucfrec.runs.trained_policy import RUN
@@ -87,11 +86,11 @@ class RLPolicy:
     def begin(self, rows: IntArray) -> None:
         """See `ucfrec.acting.rollout.Actor`."""
 
-    def act(self, observations: FloatArray, live: BoolArray) -> tuple[npt.NDArray[Any], None]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, None]:
         """The policy's mean actions (N, A)."""
         return self._learner.predict(_normalised(observations, self._mean, self._std)), None
 
-    def observe(self, actions: npt.NDArray[Any], rewards: FloatArray) -> None:
+    def observe(self, actions: Array, rewards: Float32Array) -> None:
         """See `ucfrec.acting.rollout.Actor`."""
 
 
@@ -263,9 +262,7 @@ def _parts(learner: Any) -> Mapping[str, Any]:
     return parts
 
 
-def _dataset(
-    d3rlpy: Any, train: EpisodeStore, mean: npt.NDArray[Any], std: npt.NDArray[Any]
-) -> Any:
+def _dataset(d3rlpy: Any, train: EpisodeStore, mean: Array, std: Array) -> Any:
     episodes, steps = train.all_steps()
     last = steps == train.lengths[episodes] - 1
     terminated = train.episode_values(schema.TERMINATED).astype(bool)[episodes]
@@ -362,10 +359,8 @@ def _cql(d3rlpy: Any, config: RLConfig) -> Any:
     )
 
 
-def _normalised(
-    states: npt.NDArray[Any], mean: npt.NDArray[Any], std: npt.NDArray[Any]
-) -> FloatArray:
-    normalised: FloatArray = ((states - mean) / std).astype(np.float32)
+def _normalised(states: Array, mean: Array, std: Array) -> Float32Array:
+    normalised: Float32Array = ((states - mean) / std).astype(np.float32)
     return normalised
 
 

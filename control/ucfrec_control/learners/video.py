@@ -16,7 +16,7 @@ from matplotlib.image import imsave
 
 from ucfrec.acting.rollout import rollout
 from ucfrec.errors import InputError
-from ucfrec.files import atomic_file, atomic_folder
+from ucfrec.files.atomic import atomic_file, atomic_folder
 from ucfrec_control.learners.evaluate import load_run, open_world, rules_of, world_of
 
 Frame = npt.NDArray[np.uint8]

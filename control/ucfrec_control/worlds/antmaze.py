@@ -8,9 +8,9 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import numpy.typing as npt
 from gymnasium.spaces import Box, Dict
 
+from ucfrec.arrays import Float32Array
 from ucfrec.errors import InputError
 from ucfrec_control.worlds.scores import D4RL_ANTMAZE, find_task
 
@@ -78,7 +78,7 @@ class GoalObservations(gymnasium.ObservationWrapper[Any, Any, Any]):
         # gymnasium-robotics has finished with this temporary file but does not delete it.
         Path(getattr(env.unwrapped, "tmp_xml_file_path", "")).unlink(missing_ok=True)
 
-    def observation(self, observation: Mapping[str, Any]) -> npt.NDArray[np.float32]:
+    def observation(self, observation: Mapping[str, Any]) -> Float32Array:
         """Flatten one observation.
 
         Args:

@@ -15,13 +15,11 @@ from typing import Any
 
 import gymnasium.envs.mujoco
 import numpy as np
-import numpy.typing as npt
 from gymnasium_robotics.envs.maze import maps
 from gymnasium_robotics.envs.maze.ant_maze_v5 import AntMazeEnv
 
-from ucfrec.locks import scratch_folder
-
-FloatArray = npt.NDArray[np.float64]
+from ucfrec.arrays import Float64Array
+from ucfrec.files.locks import scratch_folder
 
 _ANT = Path(gymnasium.envs.mujoco.__file__).parent / "assets" / "ant.xml"
 _START = (1, 1)
@@ -61,14 +59,14 @@ class D4RLAntMaze(AntMazeEnv):
         self.metadata = {**AntMazeEnv.metadata, "render_fps": round(1 / self.ant_env.dt)}
         self.origin = self._center(_START)
 
-    def _center(self, cell: tuple[int, int]) -> FloatArray:
+    def _center(self, cell: tuple[int, int]) -> Float64Array:
         row, column = cell
-        center: FloatArray = self.maze.cell_rowcol_to_xy(
+        center: Float64Array = self.maze.cell_rowcol_to_xy(
             np.array([self.maze.map_length - 1 - row, column])
         )
         return center
 
-    def generate_target_goal(self) -> FloatArray:
+    def generate_target_goal(self) -> Float64Array:
         """Draw the goal near the center of its cell.
 
         Returns:
@@ -77,18 +75,20 @@ class D4RLAntMaze(AntMazeEnv):
         """
         quarter = self.maze.maze_size_scaling / 4
         offset = self.np_random.uniform(0, quarter, 2) + self.np_random.uniform(0, quarter / 2, 2)
-        goal: FloatArray = self._center(self._goal_cell) + offset
+        goal: Float64Array = self._center(self._goal_cell) + offset
         return goal
 
-    def generate_reset_pos(self) -> FloatArray:
+    def generate_reset_pos(self) -> Float64Array:
         """Return the start position (2,), without noise; the ant adds its own when it is reset."""
         return self.origin.copy()
 
-    def add_xy_position_noise(self, xy_pos: FloatArray) -> FloatArray:
+    def add_xy_position_noise(self, xy_pos: Float64Array) -> Float64Array:
         """Return the position (2,) unchanged, because D4RL adds no noise here."""
         return xy_pos
 
-    def compute_reward(self, achieved_goal: FloatArray, desired_goal: FloatArray, info: Any) -> Any:
+    def compute_reward(
+        self, achieved_goal: Float64Array, desired_goal: Float64Array, info: Any
+    ) -> Any:
         """Compute the sparse reward.
 
         Args:
@@ -103,7 +103,7 @@ class D4RLAntMaze(AntMazeEnv):
         return (distance <= _GOAL_RADIUS).astype(np.float64)
 
     def compute_terminated(
-        self, achieved_goal: FloatArray, desired_goal: FloatArray, info: Any
+        self, achieved_goal: Float64Array, desired_goal: Float64Array, info: Any
     ) -> bool:
         """Return whether the ant at `achieved_goal` (2,) has reached `desired_goal` (2,)."""
         return bool(self.compute_reward(achieved_goal, desired_goal, info))

@@ -8,10 +8,10 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import numpy.typing as npt
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 
+from ucfrec.arrays import Array
 from ucfrec.errors import InputError
 from ucfrec_control.worlds.antmaze import GoalObservations, antmaze_settings, is_antmaze, is_rebuilt
 
@@ -115,7 +115,7 @@ class AppendedConstants(gymnasium.ObservationWrapper[Any, Any, Any]):
         low, high = (np.append(bound, constants) for bound in (space.low, space.high))
         self.observation_space = Box(low, high, dtype=np.float64)
 
-    def observation(self, observation: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def observation(self, observation: Array) -> Array:
         """Return the observation (O,) with the constants at its end, (O + number of constants,)."""
         return np.append(observation, self._constants)
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ucfrec.arrays import Float64Array
 from ucfrec.errors import InputError
 
 
@@ -30,7 +31,7 @@ class Task:
     """Gymnasium environments that stand for those of D4RL's own datasets, in the oldest version
     available. A key is text that the dataset's name contains (`""` matches every name)."""
 
-    def score(self, returns: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    def score(self, returns: npt.ArrayLike) -> Float64Array:
         """Convert returns to D4RL's normalised scores.
 
         Args:

@@ -9,7 +9,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.world import World
-from ucfrec.locks import claim
+from ucfrec.files.locks import claim
 from ucfrec.reporting.evaluation_rows import evaluation_row
 from ucfrec.reporting.grid import Measurement
 from ucfrec.reporting.result_row import ResultRow, RowKey

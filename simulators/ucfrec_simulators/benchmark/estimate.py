@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-from ucfrec.files import read_json
+from ucfrec.files.atomic import read_json
 from ucfrec.runs.screened import SCREENING
 from ucfrec.runs.trained_policy import RUN
 from ucfrec_simulators.benchmark.cells import Cell

@@ -6,8 +6,9 @@ from typing import Any, Final
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from ucfrec.acting.rollout import Actor, BoolArray, FloatArray, IntArray
+from ucfrec.acting.rollout import Actor
 from ucfrec.acting.uniform import Memoryless, Uniform
+from ucfrec.arrays import BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec_simulators.kuai.environment import ExitRule, KuaiEnv
 
@@ -25,7 +26,7 @@ class RandomMask(Memoryless):
     def __init__(self, world: KuaiEnv, seed: int) -> None:
         self._world, self._generator = world, np.random.default_rng([seed, 1])
 
-    def act(self, observations: FloatArray, live: BoolArray) -> tuple[IntArray, None]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[IntArray, None]:
         """An item of each session, (N,)."""
         repeated = self._world.boring(MASK)
         drawn = self._generator.random(repeated.shape) - repeated
@@ -47,7 +48,7 @@ class Oracle(Memoryless):
     def __init__(self, world: KuaiEnv) -> None:
         self._world = world
 
-    def act(self, observations: FloatArray, live: BoolArray) -> tuple[IntArray, None]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[IntArray, None]:
         """The best item of each session, (N,)."""
         world, items = self._world, np.arange(len(self._world.item_ids))
         users = np.broadcast_to(world.users[:, None], (world.num_envs, len(items)))

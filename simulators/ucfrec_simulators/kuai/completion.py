@@ -4,10 +4,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
@@ -16,10 +15,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ucfrec import schema
-from ucfrec.acting.rollout import FloatArray, IntArray
+from ucfrec.arrays import Array, Float32Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files import atomic_folder, write_json
+from ucfrec.files.atomic import atomic_folder, write_json
 from ucfrec.fitting.loop import LoopConfig, fit
 from ucfrec.fitting.random_state import random_state_kept
 
@@ -92,7 +91,7 @@ class CompletionModel(nn.Module):
         return match + user[:, -1] + item[:, -1] + self.bias  # type: ignore[no-any-return]
 
     @torch.no_grad()
-    def factors(self) -> tuple[FloatArray, FloatArray]:
+    def factors(self) -> tuple[Float32Array, Float32Array]:
         """Vectors (n, factors + 2) of users and of items; their inner products are the log-odds."""
         user = self.user_vectors.weight + self.user_features @ self.of_user
         item = self.item_vectors.weight + self.item_features @ self.of_item
@@ -105,7 +104,7 @@ class CompletionModel(nn.Module):
 class Completed:
     """The completed table, computed on access and indexed like an array (see `Rewards`)."""
 
-    def __init__(self, users: FloatArray, items: FloatArray) -> None:
+    def __init__(self, users: Float32Array, items: Float32Array) -> None:
         """
         Args:
             users: (n_users, D).
@@ -114,7 +113,7 @@ class Completed:
         self._users, self._items = users, items
         self.shape = (len(users), len(items))
 
-    def __getitem__(self, pairs: tuple[IntArray, IntArray]) -> npt.NDArray[Any]:
+    def __getitem__(self, pairs: tuple[IntArray, IntArray]) -> Array:
         """Click probabilities (...) of aligned users (...) and items (...)."""
         users, items = pairs
         logits = np.einsum("...d,...d->...", self._users[users], self._items[items])
@@ -241,5 +240,5 @@ def _write(
         pq.write_table(pa.table(columns), folder / name)
 
 
-def _lists(rows: FloatArray) -> pa.Array:
+def _lists(rows: Float32Array) -> pa.Array:
     return pa.FixedSizeListArray.from_arrays(rows.ravel(), rows.shape[1])

@@ -5,16 +5,16 @@ Source: `BaseEnv`, `KuaiEnv` and `KuaiRandEnv` of EasyRL4Rec, and their versions
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Final, Protocol
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 from gymnasium import spaces
 
-from ucfrec.acting.rollout import FORBIDDEN, USER_IDS, BoolArray, FloatArray, IntArray
+from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec_simulators.session_env import AnyArray, SessionsEnv
+from ucfrec.schema import FORBIDDEN, USER_IDS
+from ucfrec_simulators.session_env import SessionsEnv
 
 UNTAGGED: Final = -1
 """The tag of all items without one; it counts for the exit rule like any other."""
@@ -80,7 +80,7 @@ class Rewards(Protocol):
     def shape(self) -> tuple[int, ...]:
         """(n_users, n_items)."""
 
-    def __getitem__(self, pairs: tuple[IntArray, IntArray]) -> npt.NDArray[Any]:
+    def __getitem__(self, pairs: tuple[IntArray, IntArray]) -> Array:
         """Rewards (...) of aligned users (...) and items (...), indexed as a NumPy array."""
 
 
@@ -178,7 +178,7 @@ class KuaiEnv(SessionsEnv):
         tiresome[:, -1] = False
         return tiresome
 
-    def leave_out_masked(self, scores: AnyArray) -> None:
+    def leave_out_masked(self, scores: Array) -> None:
         """Set `scores` (N, n_items) of the items that the regime masks to −∞, in place."""
         if self.regime.masked:
             rows, places = np.nonzero(self._shown != NOT_SHOWN)
@@ -189,7 +189,7 @@ class KuaiEnv(SessionsEnv):
         self.turns[rows] = 0
         self._shown[rows] = NOT_SHOWN
 
-    def _play(self, actions: AnyArray) -> tuple[FloatArray, BoolArray, BoolArray]:
+    def _play(self, actions: Array) -> tuple[Float32Array, BoolArray, BoolArray]:
         rows = np.arange(self.num_envs)
         if self.regime.masked:
             self._require_new(actions)
@@ -204,7 +204,7 @@ class KuaiEnv(SessionsEnv):
         self.turns += 1
         return rewards, bored, np.asarray((self.turns >= self._shown.shape[1]) & ~bored)
 
-    def _require_new(self, actions: AnyArray) -> None:
+    def _require_new(self, actions: Array) -> None:
         repeated = (self._shown == actions[:, None]).any(axis=1)
         if repeated.any():
             raise InputError(
@@ -212,13 +212,13 @@ class KuaiEnv(SessionsEnv):
                 f'{actions[repeated][0]}), which this regime masks; avoid info["{FORBIDDEN}"]'
             )
 
-    def _observe(self) -> FloatArray:
+    def _observe(self) -> Float32Array:
         last = self._shown[np.arange(self.num_envs), np.maximum(self.turns - 1, 0)]
         last = np.where(self.turns == 0, len(self.item_ids), last)
         return np.stack([self.users, last], axis=1).astype(np.float32)
 
-    def _describe(self) -> dict[str, AnyArray]:
-        info: dict[str, AnyArray] = {USER_IDS: self.user_ids[self.users]}
+    def _describe(self) -> dict[str, Array]:
+        info: dict[str, Array] = {USER_IDS: self.user_ids[self.users]}
         return info | {FORBIDDEN: self._shown.copy()} if self.regime.masked else info
 
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ucfrec.acting.rollout import IntArray
+from ucfrec.arrays import IntArray
 from ucfrec_simulators.kuai.environment import ExitRule, KuaiEnv
 
 

@@ -15,10 +15,10 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from ucfrec import schema
-from ucfrec.acting.rollout import FloatArray
+from ucfrec.arrays import Float32Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.plugins import Simulator
+from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators.folders import data_folder
 from ucfrec_simulators.kuai.behaviors import BEHAVIORS
 from ucfrec_simulators.kuai.completion import ITEMS_FILE, USERS_FILE, Completed, complete
@@ -71,7 +71,7 @@ def kuairand(
     )
 
 
-def _matrix(table: "pq.Table") -> FloatArray:
+def _matrix(table: "pq.Table") -> Float32Array:
     vectors = table["vector"].combine_chunks()
     return np.asarray(vectors.flatten()).reshape(len(vectors), -1)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from ucfrec.errors import InputError
-from ucfrec.plugins import Simulator
+from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators.folders import data_folder
 from ucfrec_simulators.kuai.behaviors import BEHAVIORS
 from ucfrec_simulators.kuai.environment import (

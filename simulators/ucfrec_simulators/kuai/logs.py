@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ucfrec.errors import InputError
-from ucfrec.files import atomic_file
+from ucfrec.files.atomic import atomic_file
 from ucfrec.logs.binding import glob_pattern, text
 from ucfrec.logs.engine import engine
 from ucfrec.schema import SESSION_ID

@@ -7,11 +7,10 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
-from ucfrec.acting.rollout import BoolArray, FloatArray, IntArray
 from ucfrec.acting.uniform import Uniform
-from ucfrec.plugins import Simulator
+from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
+from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators.folders import data_folder
-from ucfrec_simulators.session_env import AnyArray
 from ucfrec_simulators.taobao import ddpg
 from ucfrec_simulators.taobao.environment import (
     ACTION_DIM,
@@ -66,14 +65,14 @@ class CirsTaobao(VirtualTaobao):
         super()._begin(rows)
         self._recent[rows] = np.inf
 
-    def _play(self, actions: AnyArray) -> tuple[FloatArray, BoolArray, BoolArray]:
+    def _play(self, actions: Array) -> tuple[Float32Array, BoolArray, BoolArray]:
         clicks, _, _ = super()._play(actions)
         distances = np.linalg.norm(self._recent - actions[:, None], axis=-1)
         bored = np.asarray((distances <= self._threshold).any(axis=1))
         self._recent = np.concatenate([self._recent[:, 1:], actions[:, None]], axis=1)
         return clicks, bored, np.asarray((self._pages >= self._max_turn) & ~bored)
 
-    def _observe(self) -> FloatArray:
+    def _observe(self) -> Float32Array:
         begun = self._pages[:, None] > 0
         users = np.where(begun, 0, self._users)
         actions = np.where(begun, self._recent[:, -1], 0)

@@ -18,8 +18,9 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import nn
 
-from ucfrec.acting.rollout import Actor, BoolArray, FloatArray, IntArray, Step, rollout
+from ucfrec.acting.rollout import Actor, Step, rollout
 from ucfrec.acting.uniform import Memoryless
+from ucfrec.arrays import BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
 from ucfrec.fitting.random_state import random_state_kept
@@ -58,11 +59,13 @@ DEFAULT: Final = DdpgConfig()
 class Noisy(Memoryless):
     """A deterministic policy network with truncated normal exploration noise."""
 
-    def __init__(self, network: nn.Module, high: FloatArray, noise: float, seed: list[int]) -> None:
+    def __init__(
+        self, network: nn.Module, high: Float32Array, noise: float, seed: list[int]
+    ) -> None:
         self._network, self._high, self._noise = network, high, noise
         self._generator = np.random.default_rng(seed)
 
-    def act(self, observations: FloatArray, live: BoolArray) -> tuple[Actions, FloatArray]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Actions, Float32Array]:
         """Draw actions (N, A); returns them and their densities (N,)."""
         mean = _forward(self._network, observations / self._high)
         return truncated_normal(mean, self._noise, self._generator)
@@ -104,7 +107,7 @@ class Learner:
         """Mark that the previous sessions in `rows` have ended."""
         self._ended[rows] = True
 
-    def act(self, observations: FloatArray, live: BoolArray) -> tuple[Actions, FloatArray]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Actions, Float32Array]:
         """Learn from the previous step, whose next observations are `observations`; then act.
 
         Returns:
@@ -116,7 +119,7 @@ class Learner:
         self._ended[:] = False
         if self._steps < self._config.warm_up:
             box = (len(observations), ACTION_DIM)
-            actions: FloatArray = self._generator.uniform(-1, 1, box).astype(np.float32)
+            actions: Float32Array = self._generator.uniform(-1, 1, box).astype(np.float32)
             density = np.full(len(observations), 0.5**ACTION_DIM, dtype=np.float32)
         else:
             mean = _forward(self.network, scaled)
@@ -124,12 +127,12 @@ class Learner:
         self._played = _Played(scaled, np.flatnonzero(live))
         return actions, density
 
-    def observe(self, actions: Actions, rewards: FloatArray) -> None:
+    def observe(self, actions: Actions, rewards: Float32Array) -> None:
         """Keep the step until its next observations are known."""
         assert self._played is not None
         self._played.actions, self._played.rewards = actions, rewards / np.float32(MAX_CLICKS)
 
-    def _learn(self, played: "_Played", next_observations: FloatArray) -> None:
+    def _learn(self, played: "_Played", next_observations: Float32Array) -> None:
         buffer, rows, config = self._model.replay_buffer, played.rows, self._config
         # `ReplayBuffer.add` takes steps of all N sessions; only the M live ones may enter.
         slots = (buffer.pos + np.arange(len(rows))) % buffer.buffer_size
@@ -152,15 +155,15 @@ class Learner:
 class _Played:
     """A step whose next observations are not known yet."""
 
-    observations: FloatArray
+    observations: Float32Array
     """(N, O), scaled."""
     rows: IntArray
     """(M,) live rows."""
     actions: Actions = field(init=False)
-    rewards: FloatArray = field(init=False)
+    rewards: Float32Array = field(init=False)
 
 
-class _Spaces(gymnasium.Env[FloatArray, Actions]):
+class _Spaces(gymnasium.Env[Float32Array, Actions]):
     """The spaces that Stable-Baselines3 needs; the sessions themselves are played by `rollout`."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
@@ -204,13 +207,13 @@ def _network(observation_size: int, hidden: int) -> nn.Sequential:
     )
 
 
-def _forward(network: nn.Module, scaled: FloatArray) -> FloatArray:
+def _forward(network: nn.Module, scaled: Float32Array) -> Float32Array:
     with torch.no_grad():
-        actions: FloatArray = network(torch.from_numpy(scaled)).numpy()
+        actions: Float32Array = network(torch.from_numpy(scaled)).numpy()
     return actions
 
 
-def _high(env: VectorEnv[Any, Any, Any]) -> FloatArray:
+def _high(env: VectorEnv[Any, Any, Any]) -> Float32Array:
     """(O,) upper bounds of the observations, which scale them to [−1, 1]."""
     space = env.single_observation_space
     assert isinstance(space, gymnasium.spaces.Box)

@@ -4,14 +4,13 @@ from abc import abstractmethod
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
-from ucfrec.acting.rollout import BoolArray, FloatArray, IntArray
+from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec_simulators.behaviors import Constant
-from ucfrec_simulators.session_env import AnyArray, SessionsEnv
+from ucfrec_simulators.session_env import SessionsEnv
 
 ATTRIBUTES: Final = (8, 8, 11, 11, 11, 11, 2, 2, 3, 18, 3)
 """Number of values of each of the eleven user attributes; one-hot, they give the 88 user bits."""
@@ -46,13 +45,13 @@ class TaobaoEnv(SessionsEnv):
     @abstractmethod
     def sample_users(
         self, count: int, generator: np.random.Generator
-    ) -> tuple[FloatArray, IntArray]:
+    ) -> tuple[Float32Array, IntArray]:
         """Draw M = `count` users: one-hot bits (M, 88), and pages they turn (M,), at least 1."""
 
     @abstractmethod
     def expected_clicks(
-        self, users: FloatArray, pages: AnyArray, actions: FloatArray
-    ) -> npt.NDArray[np.float64]:
+        self, users: Float32Array, pages: Array, actions: Float32Array
+    ) -> Float64Array:
         """Exact expected clicks on a page.
 
         Args:
@@ -66,7 +65,7 @@ class TaobaoEnv(SessionsEnv):
 
     @abstractmethod
     def _respond(
-        self, users: FloatArray, pages: IntArray, actions: FloatArray
+        self, users: Float32Array, pages: IntArray, actions: Float32Array
     ) -> tuple[IntArray, IntArray]:
         """Sample clicks (N,) and page indices (N,) from the environment's generator."""
 
@@ -74,7 +73,7 @@ class TaobaoEnv(SessionsEnv):
         self._users[rows], self._lengths[rows] = self.sample_users(len(rows), self.np_random)
         self._last[rows] = self._pages[rows] = self._clicks[rows] = 0
 
-    def _play(self, actions: AnyArray) -> tuple[FloatArray, BoolArray, BoolArray]:
+    def _play(self, actions: Array) -> tuple[Float32Array, BoolArray, BoolArray]:
         clicks, indices = self._respond(self._users, self._pages, actions)
         self._last[:, 0], self._last[:, 1] = clicks, indices
         self._clicks += clicks
@@ -82,15 +81,15 @@ class TaobaoEnv(SessionsEnv):
         left = self._pages >= self._lengths
         return clicks.astype(np.float32), left, np.zeros_like(left)
 
-    def _observe(self) -> FloatArray:
+    def _observe(self) -> Float32Array:
         pages = self._pages[:, None].astype(np.float32)
         return np.concatenate([self._users, self._last, pages], axis=1)
 
-    def _describe(self) -> dict[str, AnyArray]:
+    def _describe(self) -> dict[str, Array]:
         return {"CTR": self._clicks / np.maximum(self._pages, 1) / MAX_CLICKS}
 
 
-def split_observations(observations: FloatArray) -> tuple[FloatArray, FloatArray]:
+def split_observations(observations: Float32Array) -> tuple[Float32Array, Float32Array]:
     """Split observations (M, 91) into user bits (M, 88) and pages turned (M,)."""
     return observations[:, :USER_BITS], observations[:, -1]
 
@@ -106,7 +105,7 @@ def taobao(env: VectorEnv[Any, Any, Any]) -> TaobaoEnv:
     return env.unwrapped
 
 
-def default_action() -> FloatArray:
+def default_action() -> Float32Array:
     """An untuned weight vector (27,): one fixed uniform draw from [−1, 1]^27."""
     return np.random.default_rng([0, 11]).uniform(-1, 1, ACTION_DIM).astype(np.float32)
 
@@ -119,7 +118,7 @@ def best_constant(
     candidates: int = 160,
     elite: int = 16,
     rounds: int = 15,
-) -> FloatArray:
+) -> Float32Array:
     """The constant action vector (27,) with the highest expected clicks over all users' pages.
 
     The best result of several cross-entropy searches, since one may end in a local optimum. It uses
@@ -140,7 +139,7 @@ def best_constant(
     owner = np.repeat(np.arange(len(users)), lengths)
     page = np.arange(len(owner)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
 
-    def mean_clicks(actions: FloatArray, count: int) -> FloatArray:  # (M, 27) -> (M,)
+    def mean_clicks(actions: Float32Array, count: int) -> Float32Array:  # (M, 27) -> (M,)
         sample = generator.choice(len(owner), size=count, replace=False)
         clicks = env.expected_clicks(
             np.tile(users[owner[sample]], (len(actions), 1)),

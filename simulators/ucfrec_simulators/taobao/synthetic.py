@@ -4,14 +4,13 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 from gymnasium.vector import VectorEnv
 
-from ucfrec.acting.rollout import FloatArray, IntArray
 from ucfrec.acting.uniform import Uniform
-from ucfrec.plugins import Simulator
+from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
+from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators.behaviors import Blend, Rule, SessionMixture
-from ucfrec_simulators.session_env import AnyArray, draw_categories
+from ucfrec_simulators.session_env import draw_categories
 from ucfrec_simulators.taobao import ddpg
 from ucfrec_simulators.taobao.environment import (
     ACTION_DIM,
@@ -61,7 +60,7 @@ class SyntheticTaobao(TaobaoEnv):
 
     def sample_users(
         self, count: int, generator: np.random.Generator
-    ) -> tuple[FloatArray, IntArray]:
+    ) -> tuple[Float32Array, IntArray]:
         """Draw M = `count` users: one-hot bits (M, 88), and pages they turn (M,), at least 1."""
         uniforms = generator.random((count, len(ATTRIBUTES)))
         users = np.concatenate(
@@ -76,31 +75,31 @@ class SyntheticTaobao(TaobaoEnv):
         logarithm = 1.5 + users @ self._patience + generator.normal(0, 1.0, count)
         return users, np.clip(np.ceil(np.exp(logarithm)), 1, LONGEST_SESSION).astype(np.int64)
 
-    def best_actions(self, users: FloatArray, pages: AnyArray) -> FloatArray:
+    def best_actions(self, users: Float32Array, pages: Array) -> Float32Array:
         """Best actions a* (M, 27) of users (M, 88) after pages (M,) turned."""
         share = np.asarray(pages, dtype=np.float64) / (np.asarray(pages) + 4.0)
         taste = self._common + users @ self._tastes + share[:, None] * self._drift
         return (0.9 * np.tanh(taste)).astype(np.float32)
 
-    def optimal_actions(self, observations: FloatArray) -> FloatArray:
+    def optimal_actions(self, observations: Float32Array) -> Float32Array:
         """Best actions a* (M, 27) for observations (M, 91)."""
         return self.best_actions(*split_observations(observations))
 
     def expected_clicks(
-        self, users: FloatArray, pages: AnyArray, actions: FloatArray
-    ) -> npt.NDArray[np.float64]:
+        self, users: Float32Array, pages: Array, actions: Float32Array
+    ) -> Float64Array:
         """Exact expected clicks (M,): users (M, 88), pages turned (M,), actions (M, 27)."""
         return MAX_CLICKS * self._click_probability(users, pages, actions)
 
     def _respond(
-        self, users: FloatArray, pages: IntArray, actions: FloatArray
+        self, users: Float32Array, pages: IntArray, actions: Float32Array
     ) -> tuple[IntArray, IntArray]:
         clicks = self.np_random.binomial(MAX_CLICKS, self._click_probability(users, pages, actions))
         return clicks, self.np_random.integers(PAGE_INDICES, size=len(users))
 
     def _click_probability(
-        self, users: FloatArray, pages: AnyArray, actions: FloatArray
-    ) -> npt.NDArray[np.float64]:
+        self, users: Float32Array, pages: Array, actions: Float32Array
+    ) -> Float64Array:
         difference = actions.astype(np.float64) - self.best_actions(users, pages)
         distance = np.square(difference).mean(axis=1)
         return np.asarray(BEST_CLICK_PROBABILITY / (1 + distance / TOLERANCE) ** 2)

@@ -5,18 +5,17 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from gymnasium.vector import VectorEnv
 from torch import nn
 
-from ucfrec.acting.rollout import FloatArray, IntArray
 from ucfrec.acting.uniform import Uniform
+from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.plugins import Simulator
+from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators.behaviors import Blend, SessionMixture
 from ucfrec_simulators.folders import data_folder
-from ucfrec_simulators.session_env import AnyArray, draw_categories
+from ucfrec_simulators.session_env import draw_categories
 from ucfrec_simulators.taobao import ddpg
 from ucfrec_simulators.taobao.environment import (
     ACTION_DIM,
@@ -75,7 +74,7 @@ class VirtualTaobao(TaobaoEnv):
 
     def sample_users(
         self, count: int, generator: np.random.Generator
-    ) -> tuple[FloatArray, IntArray]:
+    ) -> tuple[Float32Array, IntArray]:
         """Draw M = `count` users: one-hot bits (M, 88), and pages they turn (M,), at least 1."""
         noise = torch.from_numpy(generator.random((count, NOISE_DIM), dtype=np.float32))
         uniforms = generator.random((count, len(ATTRIBUTES)))
@@ -93,18 +92,18 @@ class VirtualTaobao(TaobaoEnv):
         return users, np.maximum(draw_categories(lengths, generator.random(count)), 1)
 
     def expected_clicks(
-        self, users: FloatArray, pages: AnyArray, actions: FloatArray
-    ) -> npt.NDArray[np.float64]:
+        self, users: Float32Array, pages: Array, actions: Float32Array
+    ) -> Float64Array:
         """Exact expected clicks (M,): users (M, 88), pages turned (M,), actions (M, 27)."""
         with torch.inference_mode():
             clicks = self._logits(users, pages, actions)[:, :CLICK_LEVELS].softmax(1).numpy()
-        expected: npt.NDArray[np.float64] = clicks.astype(np.float64) @ np.arange(
+        expected: Float64Array = clicks.astype(np.float64) @ np.arange(
             CLICK_LEVELS, dtype=np.float64
         )
         return expected
 
     def _respond(
-        self, users: FloatArray, pages: IntArray, actions: FloatArray
+        self, users: Float32Array, pages: IntArray, actions: Float32Array
     ) -> tuple[IntArray, IntArray]:
         with torch.inference_mode():
             logits = self._logits(users, pages, actions)
@@ -112,7 +111,7 @@ class VirtualTaobao(TaobaoEnv):
         uniforms = self.np_random.random((len(users), 2))
         return draw_categories(clicks, uniforms[:, 0]), draw_categories(indices, uniforms[:, 1])
 
-    def _logits(self, users: FloatArray, pages: AnyArray, actions: FloatArray) -> torch.Tensor:
+    def _logits(self, users: Float32Array, pages: Array, actions: Float32Array) -> torch.Tensor:
         """Logits (M, 21) of clicks and page indices."""
         page = np.asarray(pages, dtype=np.float32)[:, None]
         inputs = np.concatenate([users, page, actions], axis=1, dtype=np.float32)
@@ -120,10 +119,10 @@ class VirtualTaobao(TaobaoEnv):
         return logits
 
 
-def _weights(logits: torch.Tensor) -> FloatArray:
+def _weights(logits: torch.Tensor) -> Float32Array:
     """Numbers (M, K) proportional to the probabilities; a softmax of few columns takes six times
     as long, and drawing needs no normalisation."""
-    weights: FloatArray = (logits - logits.amax(1, keepdim=True)).exp().numpy()
+    weights: Float32Array = (logits - logits.amax(1, keepdim=True)).exp().numpy()
     return weights
 
 

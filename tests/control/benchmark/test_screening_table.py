@@ -14,7 +14,7 @@ from ucfrec.counterfactual.screening import ScreeningConfig, screen
 from ucfrec.episodes.distractor import with_observations
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files import read_json
+from ucfrec.files.atomic import read_json
 from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.reporting.rows_file import read_rows
 from ucfrec.reporting.tables import NONE

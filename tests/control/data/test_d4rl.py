@@ -21,7 +21,7 @@ from tests.support.real_data import data_folder
 from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.locks import is_lock_or_scratch
+from ucfrec.files.locks import is_lock_or_scratch
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl, write_d4rl
 from ucfrec_control.data.minari import is_minari, read_minari, write_minari

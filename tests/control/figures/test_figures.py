@@ -13,7 +13,7 @@ from tests.support.result_rows import result_row
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay
 from ucfrec.errors import InputError
-from ucfrec.files import read_json
+from ucfrec.files.atomic import read_json
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.reporting.rows_file import append_rows
 from ucfrec_control.benchmark.robustness import drops

@@ -12,7 +12,7 @@ import torch
 from tests.support.control_files import hopper_like, write_hdf5
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files import read_json
+from ucfrec.files.atomic import read_json
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.reporting.rows_file import read_rows

@@ -15,7 +15,7 @@ from ucfrec import schema
 from ucfrec.acting.rollout import rollout
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files import read_json
+from ucfrec.files.atomic import read_json
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.policies.registry import BUILT_IN
 from ucfrec.runs.config import resolve_config

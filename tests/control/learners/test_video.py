@@ -11,7 +11,7 @@ from matplotlib.image import imread
 
 from tests.support.control_files import hopper_like, write_hdf5
 from ucfrec.errors import InputError
-from ucfrec.files import read_json
+from ucfrec.files.atomic import read_json
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.learners.evaluate import evaluate_run

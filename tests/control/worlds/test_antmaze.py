@@ -9,13 +9,13 @@ from pathlib import Path
 import gymnasium
 import minari
 import numpy as np
-import numpy.typing as npt
 import pytest
 import torch
 from minari.data_collector import EpisodeBuffer
 
 from tests.support.control_files import hopper_like, write_hdf5
 from ucfrec.acting.rollout import rollout
+from ucfrec.arrays import Float32Array, Float64Array
 from ucfrec.errors import InputError
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
@@ -42,7 +42,7 @@ D4RL_MAZES = {
 }
 
 
-def simulated(env: gymnasium.vector.SyncVectorEnv) -> npt.NDArray[np.float64]:
+def simulated(env: gymnasium.vector.SyncVectorEnv) -> Float64Array:
     """What D4RL shows of every environment: qpos, then qvel of the ant."""
     seen = []
     for one in env.envs:
@@ -52,7 +52,7 @@ def simulated(env: gymnasium.vector.SyncVectorEnv) -> npt.NDArray[np.float64]:
     return np.array(seen)
 
 
-def ant_columns(lengths: tuple[int, ...]) -> dict[str, npt.NDArray[np.float32]]:
+def ant_columns(lengths: tuple[int, ...]) -> dict[str, Float32Array]:
     """A D4RL AntMaze file's: floats throughout, no successors."""
     columns = hopper_like(lengths)
     rng, n = np.random.default_rng(0), sum(lengths)
@@ -136,7 +136,7 @@ class Teleported:
     def begin(self, rows: object) -> None:
         pass
 
-    def act(self, observations: object, live: object) -> tuple[npt.NDArray[np.float32], None]:
+    def act(self, observations: object, live: object) -> tuple[Float32Array, None]:
         self._steps += 1
         if self._steps == 3:
             for one in self._env.envs[::2]:

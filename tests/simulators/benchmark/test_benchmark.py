@@ -17,7 +17,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.evaluate import evaluate_behavior
 from ucfrec.evaluation.world import World
-from ucfrec.files import read_json
+from ucfrec.files.atomic import read_json
 from ucfrec.plugins import Benchmark, BenchmarkRequest, load_plugin
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows, read_configurations, read_rows

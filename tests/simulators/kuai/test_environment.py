@@ -18,15 +18,16 @@ from hypothesis import strategies as st
 from tests.support.kuai_reference import OneUser, Plain
 from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
-from ucfrec.acting.rollout import FORBIDDEN, Step, rollout
+from ucfrec.acting.rollout import Step, rollout
 from ucfrec.acting.uniform import Uniform
 from ucfrec.episodes.states import ItemStates
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import collect
 from ucfrec.evaluation.evaluate import _item_numbers
+from ucfrec.evaluation.simulator import Simulator
 from ucfrec.evaluation.world import World
-from ucfrec.plugins import Simulator
 from ucfrec.policies.dt import DTConfig, DTPolicy
+from ucfrec.schema import FORBIDDEN
 from ucfrec_simulators.behaviors import Constant
 from ucfrec_simulators.kuai.behaviors import MASK, oracle, random_mask
 from ucfrec_simulators.kuai.environment import EXITS, REGIMES, ExitRule, KuaiEnv

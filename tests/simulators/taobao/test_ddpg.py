@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from ucfrec.acting.rollout import FloatArray, Step, rollout
+from ucfrec.acting.rollout import Step, rollout
+from ucfrec.arrays import Float32Array
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import collect
 from ucfrec_simulators.behaviors import truncated_normal
@@ -41,7 +42,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache"
 
 
-def reference_density(actions: FloatArray, mean: FloatArray, scale: float) -> np.ndarray:
+def reference_density(actions: Float32Array, mean: Float32Array, scale: float) -> np.ndarray:
     low, high = (-1 - mean) / scale, (1 - mean) / scale
     return stats.truncnorm.pdf(actions, low, high, loc=mean, scale=scale).prod(axis=-1)
 
@@ -111,7 +112,7 @@ class Slope(SyntheticTaobao):
 def test_it_learns() -> None:
     need_sb3()
     config = DdpgConfig(warm_up=3000, updates=1 / 16, batch_size=128, hidden=64)
-    rewards: list[FloatArray] = []
+    rewards: list[Float32Array] = []
     env = Slope(128)
     rollout(env, ddpg.training(env, 0, config), 1500, 0, lambda s: rewards.append(s.rewards))
     clicks = np.concatenate(rewards)

@@ -12,7 +12,8 @@ from gymnasium.vector import AutoresetMode
 from torch.nn import functional as F
 
 from tests.support.real_data import data_folder
-from ucfrec.acting.rollout import Episodes, FloatArray, rollout
+from ucfrec.acting.rollout import Episodes, rollout
+from ucfrec.arrays import Float32Array
 from ucfrec.errors import InputError
 from ucfrec_simulators.session_env import SingleSession
 from ucfrec_simulators.taobao import environment
@@ -31,11 +32,11 @@ def folder() -> Path:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def searches(folder: Path) -> Iterator[dict[int, FloatArray]]:
+def searches(folder: Path) -> Iterator[dict[int, Float32Array]]:
     """The best constants that were searched for in these networks, by seed; none is twice."""
-    found: dict[int, FloatArray] = {}
+    found: dict[int, Float32Array] = {}
 
-    def search(env: TaobaoEnv, seed: int) -> FloatArray:
+    def search(env: TaobaoEnv, seed: int) -> Float32Array:
         if seed not in found:
             found[seed] = best_constant(env, seed)
         return found[seed]
@@ -184,7 +185,7 @@ def test_the_mixture_is_mediocre_and_varied(folder: Path) -> None:
 
 
 def test_same_seed_same_numbers_and_another_differs(
-    folder: Path, searches: dict[int, FloatArray]
+    folder: Path, searches: dict[int, Float32Array]
 ) -> None:
     first, other = (played(folder, "mixture", 80, seed) for seed in (4, 5))
     searches.clear()

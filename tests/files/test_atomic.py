@@ -1,0 +1,163 @@
+"""Outputs appear whole or not at all."""
+
+import json
+import math
+import os
+import signal
+import stat
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ucfrec.errors import InputError
+from ucfrec.files.atomic import atomic_file, atomic_folder, read_json, write_json
+from ucfrec.fitting.checkpoint import save_tensors
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_folder_appears_when_its_block_ends(tmp_path: Path) -> None:
+    target = tmp_path / "made" / "on the way" / "out"
+    with atomic_folder(target) as scratch:
+        (scratch / "inner").mkdir()
+        (scratch / "inner" / "a").write_text("1")
+        assert not target.exists()
+        # Beside its target, so that the last step is a rename on one file system.
+        assert scratch.parent == target.parent
+    assert (target / "inner" / "a").read_text() == "1"
+    assert names(target.parent) == ["out"]
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit])
+def test_a_folder_whose_block_raises_never_was(tmp_path: Path, error: type[BaseException]) -> None:
+    def write() -> None:
+        with atomic_folder(tmp_path / "out") as scratch:
+            (scratch / "a").write_text("1")
+            raise error
+
+    with pytest.raises(error):
+        write()
+    assert names(tmp_path) == []
+
+
+def test_a_folder_that_exists_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine").write_text("1")
+    with pytest.raises(InputError, match="out exists already"), atomic_folder(tmp_path / "out"):
+        raise AssertionError("the block must not run")
+    assert names(tmp_path) == ["out"]
+    assert (tmp_path / "out" / "mine").read_text() == "1"
+
+
+def test_what_a_killed_process_left_does_not_mix_in(tmp_path: Path) -> None:
+    """Process numbers come around again."""
+    with atomic_folder(tmp_path / "out") as scratch:
+        left = scratch
+    (tmp_path / "out").rename(left)
+    (left / "stale").write_text("from a run that was killed")
+    with atomic_folder(tmp_path / "out") as scratch:
+        assert scratch == left
+        (scratch / "new").write_text("1")
+    assert names(tmp_path / "out") == ["new"]
+
+
+def test_a_file_is_replaced_when_its_block_ends(tmp_path: Path) -> None:
+    target = tmp_path / "folder" / "a.txt"
+    for text in ("old", "new"):
+        with atomic_file(target) as scratch:
+            scratch.write_text(text)
+            assert not target.exists() or target.read_text() == "old"
+        assert target.read_text() == text
+    assert names(target.parent) == ["a.txt"]
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_a_file_whose_block_raises_stays_as_it_was(
+    tmp_path: Path, error: type[BaseException]
+) -> None:
+    target = tmp_path / "a.txt"
+    target.write_text("old")
+
+    def write() -> None:
+        with atomic_file(target) as scratch:
+            scratch.write_text("half of the n")
+            raise error
+
+    with pytest.raises(error):
+        write()
+    assert target.read_text() == "old"
+    assert names(tmp_path) == ["a.txt"]
+
+
+def test_a_file_rewritten_by_a_process_that_is_killed_is_always_whole(tmp_path: Path) -> None:
+    target = tmp_path / "a.json"
+    write_json(target, {"numbers": list(range(2000))})
+    for attempt in range(12):
+        child = os.fork()
+        if child == 0:
+            try:
+                while True:
+                    write_json(target, {"numbers": list(range(2000))})
+            finally:
+                os._exit(1)
+        time.sleep(0.003 + 0.001 * attempt)
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        assert read_json(target) == {"numbers": list(range(2000))}
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+    max_leaves=10,
+)
+
+
+@given(st.dictionaries(st.text(), json_values) | st.lists(json_values))
+def test_json_comes_back(tmp_path_factory: pytest.TempPathFactory, value: object) -> None:
+    path = tmp_path_factory.getbasetemp() / "value.json"
+    write_json(path, value)  # type: ignore[arg-type]
+    assert read_json(path) == value
+
+
+def test_numbers_that_are_not_finite_come_back(tmp_path: Path) -> None:
+    write_json(tmp_path / "a.json", {"nan": math.nan, "inf": math.inf})
+    read = read_json(tmp_path / "a.json")
+    assert math.isnan(read["nan"])
+    assert read["inf"] == math.inf
+
+
+def test_a_value_that_is_not_json_leaves_the_old_file(tmp_path: Path) -> None:
+    write_json(tmp_path / "a.json", {"a": 1})
+    with pytest.raises(TypeError):
+        write_json(tmp_path / "a.json", {"a": object()})
+    assert json.loads((tmp_path / "a.json").read_text()) == {"a": 1}
+    assert names(tmp_path) == ["a.json"]
+
+
+def test_reading_what_is_not_there_or_not_json(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"a\.json does not exist"):
+        read_json(tmp_path / "a.json")
+    for content in (b"{", b"", b"\xff\xfe\x00"):
+        (tmp_path / "a.json").write_bytes(content)
+        with pytest.raises(InputError, match=r"a\.json is not (JSON|UTF-8)") as caught:
+            read_json(tmp_path / "a.json")
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("mask", [0o022, 0o027])
+def test_whoever_may_read_a_record_may_read_its_tensors(tmp_path: Path, mask: int) -> None:
+    before = os.umask(mask)
+    try:
+        write_json(tmp_path / "record.json", {})
+        save_tensors(tmp_path / "weights.safetensors", {"w": torch.ones(2)}, {})
+    finally:
+        os.umask(before)
+    modes = {stat.S_IMODE(path.stat().st_mode) for path in tmp_path.iterdir()}
+    assert modes == {0o666 & ~mask}

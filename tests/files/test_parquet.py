@@ -1,0 +1,59 @@
+"""Parquet files that claim too much, or hold something else than ids."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from ucfrec.errors import InputError
+from ucfrec.files.parquet import read_ids, require_plausible_rows
+from ucfrec.logs import LogMapping, PrepareOptions, prepare
+
+
+def test_ids_come_back(tmp_path: Path) -> None:
+    for ids in ([3, 1, 2], ["b", "a"], []):
+        frame = pd.DataFrame({"item_id": pd.Series(ids, dtype=None if ids else "int64")})
+        frame.to_parquet(tmp_path / "ids.parquet")
+        assert read_ids(tmp_path / "ids.parquet", "item_id").tolist() == ids
+
+
+@pytest.mark.parametrize(
+    "column", [pa.array([1, None]), pa.array([[1], [2]]), pa.array([b"a", b"b"]), pa.array([0.5])]
+)
+def test_what_are_no_ids_is_named(tmp_path: Path, column: pa.Array) -> None:
+    pq.write_table(pa.table({"item_id": column}), tmp_path / "ids.parquet")
+    with pytest.raises(InputError, match=r"ids\.parquet: item_id is .* not ids"):
+        read_ids(tmp_path / "ids.parquet", "item_id")
+
+
+def test_damage_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "ids.parquet"
+    with pytest.raises(InputError, match="does not exist"):
+        read_ids(path, "item_id")
+    pq.write_table(pa.table({"item_id": pa.array(range(1000))}), path)
+    with pytest.raises(InputError, match="no column 'user_id'"):
+        read_ids(path, "user_id")
+    content = path.read_bytes()
+    for cut in (0, 3, 100, len(content) - 5):
+        path.write_bytes(content[:cut])
+        with pytest.raises(InputError, match="is damaged") as caught:
+            read_ids(path, "item_id")
+        assert "\n" not in str(caught.value)
+
+
+def test_a_small_file_of_very_many_equal_rows_is_refused_at_once(tmp_path: Path) -> None:
+    path, rows = tmp_path / "log.parquet", 2_000_000
+    columns = {"user_id": 1, "item_id": 2, "timestamp": 1_700_000_000_000, "reward": 1}
+    block = pa.table({name: np.full(rows, value) for name, value in columns.items()})
+    with pq.ParquetWriter(path, block.schema, compression="zstd") as writer:
+        writer.write_table(block, row_group_size=rows)
+    assert path.stat().st_size < 100_000
+    with pytest.raises(InputError, match=r"claims 2,000,000 rows in [\d,]+ bytes, so nearly all"):
+        prepare([path], LogMapping(), tmp_path / "store", PrepareOptions())
+    with pytest.raises(InputError, match="so nearly all"):
+        read_ids(path, "item_id")
+    require_plausible_rows(path, 1_000_000)
+    assert [each.name for each in tmp_path.iterdir()] == ["log.parquet"]

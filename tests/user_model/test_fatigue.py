@@ -1,0 +1,87 @@
+"""Fatigue is found where users tire, and only there; later steps tell nothing of earlier ones."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.support.episodes import N_ITEMS, Logged, some_states, write_store
+from ucfrec.arrays import BoolArray, IntArray
+from ucfrec.episodes.main_tags import MainTags
+from ucfrec.user_model.fatigue import Fatigue, LoggedRuns, fit_fatigue
+
+LAGS = 10
+
+
+def sessions(factor: float, seed: int, count: int = 150, length: int = 40) -> LoggedRuns:
+    """Sessions of two tags whose users tire for 4 steps after 3 likes of one tag on end."""
+    rng, runs, liked = np.random.default_rng(seed), [], []
+    for _ in range(count):
+        tags, likes = np.zeros(0, dtype=int), np.zeros(0, dtype=bool)
+        taste = rng.uniform(0.4, 0.9)
+        for _step in range(length):
+            back = [on_end(tags[: len(tags) - n], likes[: len(tags) - n]) for n in range(LAGS)]
+            runs.append(back)
+            tired = any(each >= 3 for each in back[:4])
+            likes = np.append(likes, rng.random() < taste * (factor if tired else 1.0))
+            tags = np.append(tags, rng.random() < 0.3)
+        liked.append(likes)
+    numbers = np.repeat(np.arange(count), length)
+    return LoggedRuns(torch.tensor(runs), np.concatenate(liked), numbers)
+
+
+def on_end(tags: IntArray, likes: BoolArray) -> int:
+    """Steps on end, up to the last, with its tag and liked; as `MainTags.runs` counts them."""
+    length = 0
+    while length < len(tags) and likes[-1 - length] and tags[-1 - length] == tags[-1]:
+        length += 1
+    return length
+
+
+def test_fatigue_is_found_with_its_length_steps_and_factor() -> None:
+    found = fit_fatigue(sessions(0.1, seed=0), sessions(0.1, seed=1))
+    assert found is not None
+    assert (found.length, found.steps) == (3, 4)
+    assert found.factor == pytest.approx(0.1, abs=0.03)
+
+
+def test_users_who_do_not_tire_are_not_said_to() -> None:
+    assert fit_fatigue(sessions(1.0, seed=0), sessions(1.0, seed=1)) is None
+    assert fit_fatigue(sessions(0.8, seed=0), sessions(0.8, seed=1)) is None
+
+
+def test_held_out_sessions_must_show_it_too() -> None:
+    tires, not_at_all, few = sessions(0.1, 0), sessions(1.0, 1), sessions(0.1, 1, count=1)
+    assert fit_fatigue(tires, not_at_all) is None
+    assert fit_fatigue(tires, few) is None
+
+
+def test_users_are_tired_for_so_many_steps_after_a_run() -> None:
+    runs = torch.tensor([[3, 2, 1, 0], [0, 3, 2, 1], [0, 0, 3, 2], [2, 1, 0, 0]])
+    assert Fatigue(3, 2, 0.0).tired(runs).tolist() == [True, True, False, False]
+
+
+def test_runs_of_a_log_know_nothing_of_the_step_or_later(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    given = rng.integers(N_ITEMS, size=(5, 8))
+    tags = MainTags(torch.arange(N_ITEMS) % 3, 0.0, 1.0)
+
+    def runs(last: float, name: str) -> LoggedRuns:
+        rewards = [1.0] * 5 + [last] * 3
+        logged = [
+            Logged(rewards, np.zeros((8, 0), np.float32), items=items.tolist()) for items in given
+        ]
+        store = write_store(tmp_path / name, logged, some_states(users=1))
+        return LoggedRuns.of(store, tags, LAGS, 10_000)
+
+    liked, not_liked = runs(1.0, "liked"), runs(0.0, "not")
+    steps = np.arange(40) % 8
+    assert torch.equal(liked.runs[steps <= 5], not_liked.runs[steps <= 5])
+    assert not torch.equal(liked.runs, not_liked.runs)
+    assert not_liked.liked.tolist() == (steps < 5).tolist()
+    for session in range(5):
+        for step in range(8):
+            history = given[session, :step] % 3
+            by_hand = on_end(history, np.ones(step, dtype=bool))
+            assert int(liked.runs[8 * session + step, 0]) == by_hand

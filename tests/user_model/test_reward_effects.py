@@ -1,0 +1,131 @@
+"""The penalised fit of effects, against independent solutions."""
+
+import time
+
+import numpy as np
+import pytest
+import torch
+from scipy import sparse
+from sklearn.linear_model import LogisticRegression, Ridge
+from torch import Tensor
+
+from ucfrec.user_model.reward_effects import EFFECTS, Design, fit_effects, minimum
+
+
+def design(rows: int, binary: bool, items: int = 12, users: int = 9) -> Design:
+    """Random rows; rewards depend on items and the state."""
+    rng = np.random.default_rng(0)
+    shown = rng.integers(items, size=rows)
+    x = rng.normal(size=(rows, 5)) @ rng.normal(size=(5, 5))  # correlated
+    vectors = rng.normal(size=(items, 3))
+    predictor = rng.normal(size=items)[shown] + 0.3 * x[:, 0] + x[:, 1] * vectors[shown, 0] * 0.2
+    target = predictor + rng.normal(size=rows)
+    if binary:
+        target = rng.random(rows) < 1 / (1 + np.exp(-predictor))
+    return Design(
+        items=torch.from_numpy(shown),
+        users=torch.from_numpy(rng.integers(users + 1, size=rows)),
+        x=torch.from_numpy(x).float(),
+        exposure=torch.from_numpy(rng.random((rows, 4)) < 0.2).float(),
+        target=torch.from_numpy(target).float(),
+        vectors=torch.from_numpy(vectors).float(),
+        rows=torch.from_numpy(vectors[shown]).float(),
+        tags=torch.arange(items)[:, None].add(torch.tensor([0, 2])).remainder(5),
+        n_tags=4,
+        n_users=users,
+        binary=binary,
+        weights=torch.ones(rows),
+        tastes=torch.from_numpy(rng.normal(size=rows)).float(),
+    )
+
+
+def matrix(given: Design, name: str) -> sparse.csr_matrix:
+    """What every number of an effect multiplies, row by row."""
+    count = len(given.items)
+    if name in ("item", "user"):
+        columns = (given.items if name == "item" else given.users).numpy()
+        shape = (count, len(given.zeros(name)))
+        return sparse.csr_matrix((np.ones(count), (np.arange(count), columns)), shape=shape)
+    if name == "content":
+        tags = torch.stack([(given.tags == tag).sum(1) for tag in range(given.n_tags)], 1)
+        return sparse.csr_matrix(torch.cat([tags[given.items].float(), given.rows], 1).numpy())
+    if name == "affinity":
+        of_users = torch.nn.functional.one_hot(given.users, given.n_users + 1).float()
+        return sparse.csr_matrix(_products(of_users, given.rows).numpy())
+    if name == "interaction":
+        return sparse.csr_matrix(_products(given.x, given.rows).numpy())
+    columns = {"exposure": given.exposure, "state": given.x, "tastes": given.tastes.unsqueeze(1)}
+    return sparse.csr_matrix(columns[name].numpy())
+
+
+def _products(left: Tensor, right: Tensor) -> Tensor:
+    return torch.einsum("ma,mb->mab", left, right).flatten(1)
+
+
+@pytest.mark.parametrize("binary", [True, False])
+@pytest.mark.parametrize("name", EFFECTS)
+def test_an_effect_is_that_of_a_penalised_regression(name: str, binary: bool) -> None:
+    given = design(600, binary)
+    found = fit_effects(given, {}, {name: 0.7})
+    penalty = given.penalty(name, 0.7)
+    inputs, target = matrix(given, name), given.target.numpy()
+    assert penalty * 0.7**2 == pytest.approx(inputs.multiply(inputs).sum() / 600, rel=1e-4)
+    if binary:
+        reference = LogisticRegression(C=1 / penalty, tol=1e-8, max_iter=10_000)
+    else:
+        reference = Ridge(alpha=penalty, tol=1e-8, solver="lsqr" if name == "item" else "auto")
+    reference.fit(inputs, target)
+    expected = inputs @ reference.coef_.ravel() + reference.intercept_
+    np.testing.assert_allclose(given.predictor(found).numpy(), expected, atol=0.02)
+
+
+def test_effects_are_fitted_jointly_and_a_start_changes_nothing() -> None:
+    given = design(800, binary=True)
+    spreads = dict.fromkeys(EFFECTS, 0.5)
+    alone = fit_effects(given, {}, spreads)
+    inputs = sparse.hstack(
+        [matrix(given, name) * given.penalty(name, 0.5) ** -0.5 for name in EFFECTS]
+    )
+    reference = LogisticRegression(C=1.0, tol=1e-8, max_iter=10_000)
+    reference.fit(inputs.tocsr(), given.target.numpy())
+    expected = inputs @ reference.coef_.ravel() + reference.intercept_
+    np.testing.assert_allclose(given.predictor(alone).numpy(), expected, atol=0.05)
+    start = {name: torch.randn(given.zeros(name).shape) for name in EFFECTS}
+    other = fit_effects(given, start, spreads)
+    np.testing.assert_allclose(
+        given.predictor(other).numpy(), given.predictor(alone).numpy(), atol=0.05
+    )
+
+
+def test_squares_are_those_of_the_inputs() -> None:
+    given = design(200, binary=True)
+    for name in EFFECTS:
+        inputs = matrix(given, name)
+        expected = np.asarray(inputs.multiply(inputs).sum(0)).ravel()
+        actual = given.squares(name).flatten()
+        np.testing.assert_allclose(actual.numpy(), expected, rtol=1e-4)
+
+
+def test_the_minimum_of_a_quadratic_function_is_found() -> None:
+    random = torch.Generator().manual_seed(0)
+    root = torch.eye(30) + 0.1 * torch.randn(30, 30, generator=random)
+    at = torch.randn(30, generator=random)
+
+    def height(z: torch.Tensor) -> torch.Tensor:
+        return 0.5 * (root @ (z - at)).square().sum() + 1.0
+
+    found = minimum(height, torch.zeros(30))
+    assert float(height(found)) == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.mark.slow
+def test_time_grows_no_faster_than_rows() -> None:
+    """A hundred times the rows take well below two hundred times the time."""
+    seconds = []
+    spreads = dict.fromkeys(EFFECTS, 0.3)
+    for rows in (5_000, 500_000):
+        given = design(rows, binary=True, items=rows // 50, users=rows // 10)
+        start = time.process_time()
+        fit_effects(given, {}, spreads)
+        seconds.append(time.process_time() - start)
+    assert seconds[1] < 200 * max(seconds[0], 0.05)

@@ -1,0 +1,271 @@
+"""Fitting the reward model of items: what it recovers, what it reads, and what it reports."""
+
+import copy
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+
+from ucfrec.arrays import Float64Array, IntArray
+from ucfrec.choosing.by_simulation import calibrate
+from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.user_model.posterior import MEMORY
+from ucfrec.user_model.reward import LAGS
+from ucfrec.user_model.reward_fit import (
+    fit_item_reward_model,
+    refit_item_reward_model,
+)
+from ucfrec.user_model.reward_rows import RewardRows
+
+ITEMS, USERS, LENGTH, DIM, TAGS = 40, 150, 20, 4, 6
+
+
+class Log(NamedTuple):
+    """A log of one session a user, and what was planted."""
+
+    items: IntArray
+    users: IntArray
+    predictor: Float64Array
+    of_item: Float64Array
+
+
+def sigmoid(values: Float64Array) -> Float64Array:
+    return 1 / (1 + np.exp(-values))
+
+
+def log(seed: int, boredom: float = 0.0, taste: float = 0.0, users: int = USERS) -> Log:
+    """Items shown at random; users and items differ, and may tire of, or like, some tags."""
+    rng, world = np.random.default_rng(seed), np.random.default_rng(99)
+    of_item, tags = world.normal(0, 1, ITEMS), np.arange(ITEMS) % TAGS
+    of_user = rng.normal(0, 1, users)
+    items = rng.integers(ITEMS, size=(users, LENGTH))
+    liked = rng.integers(TAGS, size=users)
+    predictor = of_item[items] + of_user[:, None] + taste * (tags[items] == liked[:, None])
+    repeats = tags[items][:, 1:] == tags[items][:, :-1]
+    predictor[:, 1:] -= boredom * repeats
+    return Log(items.ravel(), np.repeat(np.arange(users), LENGTH), predictor.ravel(), of_item)
+
+
+def store_of(log: Log, rewards: Float64Array, validation: float = 0.25) -> EpisodeStore:
+    """The log as a store; the last users are held out for validation, one more for the test."""
+    users = len(log.items) // LENGTH
+    split = np.where(np.arange(users) < users * (1 - validation), 0, 1)
+    split[-1] = 2
+    return EpisodeStore.from_arrays(
+        {"item": log.items, "reward": rewards},
+        np.full(users, LENGTH),
+        {"user": np.arange(users), "split": split},
+        item_states(users),
+    )
+
+
+def item_states(users: int) -> ItemStates:
+    """Items of one tag each, with random embeddings; users without features."""
+    tags = torch.from_numpy(np.arange(ITEMS)[:, None] % TAGS)
+    embeddings = torch.from_numpy(np.random.default_rng(5).normal(size=(ITEMS, DIM))).float()
+    return ItemStates(embeddings, torch.zeros(users, 0), 0.0, 1.0, tags=tags)
+
+
+def clicks(log: Log, seed: int = 0) -> Float64Array:
+    chosen = np.random.default_rng(seed).random(len(log.items)) < sigmoid(log.predictor)
+    return chosen.astype(np.float64)
+
+
+def views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
+    return store.split("train"), store.split("validation")
+
+
+def test_planted_item_effects_are_recovered_and_calibrated(tmp_path: Path) -> None:
+    planted = log(0, users=400)
+    model, report = fit_item_reward_model(
+        *views(store_of(planted, clicks(planted))), tmp_path, seed=0
+    )
+    assert np.corrcoef(model.item.numpy(), planted.of_item)[0, 1] > 0.95
+    slope = np.polyfit(planted.of_item, model.item.numpy(), 1)[0]
+    assert 0.8 < slope < 1.2
+    assert {"item", "user"} <= report.kept.keys()
+    assert report.loss < report.item_loss + 1e-9 < report.base_loss
+    assert report.calibration.error < 0.05
+    assert sum(report.calibration.count) == report.validation_rows == 99 * LENGTH
+    assert abs(report.gauc - report.item_rate_gauc) < 3 * report.gauc_gain_error + 0.01
+    assert report.gauc > 0.6
+
+
+def test_boredom_and_state_are_learned(tmp_path: Path) -> None:
+    planted = log(1, boredom=3.0, users=300)
+    model, report = fit_item_reward_model(
+        *views(store_of(planted, clicks(planted))), tmp_path, seed=0
+    )
+    assert "exposure" in report.kept
+    assert model.exposure[1, 0] < -1
+    assert model.exposure[1, 1:].abs().max() < 0.5
+    assert report.gauc_gain > 2 * report.gauc_gain_error
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_item_effects_are_adjusted_for_who_saw_them(known: bool, tmp_path: Path) -> None:
+    """All items are alike, but users who click more see the second half of the catalogue more.
+
+    Held-out sessions are later ones of the same users, or of users who were never seen.
+    """
+    rng = np.random.default_rng(3)
+    sessions = np.arange(400)
+    users = sessions // 2 if known else sessions
+    eager = (rng.random(400) < 0.5)[users]
+    half = rng.random((400, LENGTH)) < np.where(eager, 0.8, 0.2)[:, None]
+    items = rng.integers(ITEMS // 2, size=half.shape) + half * (ITEMS // 2)
+    predictor = np.where(eager, 1.0, -1.0)[:, None].repeat(LENGTH, 1)
+    confounded = Log(items.ravel(), users, predictor.ravel(), np.zeros(ITEMS))
+    rewards = clicks(confounded)
+    split = sessions % 2 if known else (sessions >= 300).astype(np.int64)
+    columns = {"item": confounded.items, "reward": rewards}
+    store = EpisodeStore.from_arrays(
+        columns, np.full(400, LENGTH), {"user": users, "split": split}, item_states(400)
+    )
+    model, _ = fit_item_reward_model(*views(store), tmp_path, seed=0)
+    shown = np.bincount(confounded.items, minlength=ITEMS)
+    rates = np.bincount(confounded.items, rewards, minlength=ITEMS) / shown
+    crude = np.log(rates / (1 - rates))
+
+    def gap(of_items: Float64Array) -> float:
+        return float(of_items[ITEMS // 2 :].mean() - of_items[: ITEMS // 2].mean())
+
+    assert gap(crude) > 0.9
+    assert abs(gap(model.item.numpy().astype(np.float64))) < 0.3 * gap(crude)
+
+
+def test_for_new_users_the_session_tells_what_users_effects_tell_of_training_rows(
+    tmp_path: Path,
+) -> None:
+    planted = log(3, taste=4.0, users=300)
+    columns = {"item": planted.items, "reward": clicks(planted)}
+    split, states = (np.arange(300) >= 200).astype(np.int64), item_states(300)
+    states = replace(states, embeddings=torch.eye(TAGS)[states.tags[:, 0]])
+    per_session = {"user": np.arange(300), "split": split}
+    store = EpisodeStore.from_arrays(columns, np.full(300, LENGTH), per_session, states)
+    model, report = fit_item_reward_model(*views(store), tmp_path / "a", seed=0)
+    assert report.new_users
+    assert "affinity" in report.kept
+    assert not model.user.any()
+    assert not model.affinity.any()
+    assert "tastes" in report.kept
+    assert model.reach == MEMORY
+    rows = RewardRows.of(store.split("validation"), model.reach, 10**6, 0)
+    slope, intercept = calibrate(model, rows)
+    assert 0.85 < slope < 1.15
+    assert abs(intercept) < 0.3
+    # After ten steps, the session tells what its user likes, which the log never says.
+    late = (torch.arange(len(rows)) % LENGTH >= 10).numpy()
+    true = planted.predictor[split[planted.users] == 1][late]
+    scores = model.score(rows.states, rows.shown, None, rows.items).numpy()[late]
+    alone = copy.deepcopy(model)
+    alone.tastes.weigh(0.0)
+    without = alone.score(rows.states, rows.shown, None, rows.items).numpy()[late]
+    assert np.corrcoef(scores, true)[0, 1] > np.corrcoef(without, true)[0, 1] + 0.1
+    scores = model.score(rows.states, rows.shown, None, rows.items)
+    assert torch.equal(scores, model.score(rows.states, rows.shown, rows.users, rows.items))
+    again = refit_item_reward_model(tmp_path / "a", store.split("train"), tmp_path / "b", seed=0)
+    for name, value in model.state_dict().items():
+        assert torch.allclose(value, again.state_dict()[name], atol=0.05), name
+
+
+def test_rewards_of_many_values_are_fitted_in_their_units(tmp_path: Path) -> None:
+    planted = log(4, users=300)
+    noise = np.random.default_rng(0).normal(0, 1, len(planted.items))
+    rewards = 50 + 7 * (planted.predictor + noise)
+    store = store_of(planted, rewards)
+    model, report = fit_item_reward_model(*views(store), tmp_path, seed=0)
+    assert not report.binary
+    rows = RewardRows.of(store.split("validation"), LAGS, 10**6, 0)
+    scores = model.score(rows.states, rows.shown, rows.users, rows.items)
+    errors = (model.expected(scores) - rows.rewards).numpy()
+    assert 1 - errors.var() / rows.rewards.numpy().var() == pytest.approx(report.r2, abs=0.02)
+    assert report.r2 > 0.25
+    slope = np.polyfit(planted.of_item, model.item.numpy() * float(model.reward_std), 1)[0]
+    assert slope == pytest.approx(7, rel=0.15)
+
+
+def test_what_does_not_predict_is_left_out(tmp_path: Path) -> None:
+    planted = log(5)
+    rewards = (np.random.default_rng(1).random(len(planted.items)) < 0.3).astype(np.float64)
+    model, report = fit_item_reward_model(*views(store_of(planted, rewards)), tmp_path, seed=0)
+    assert len(report.kept) <= 2
+    assert report.loss > report.base_loss - 0.01
+    for tried in report.effects:
+        assert tried.kept == (tried.gain > tried.gain_error)
+        if not tried.kept and tried.effect in ("user", "affinity", "state", "interaction"):
+            assert not model.get_buffer(tried.effect).any()
+
+
+def test_scores_do_not_depend_on_the_step_or_on_later_ones(tmp_path: Path) -> None:
+    planted = log(6, boredom=1.0)
+    rewards = clicks(planted)
+    model, _ = fit_item_reward_model(*views(store_of(planted, rewards)), tmp_path, seed=0)
+    step = 7
+    later = np.arange(len(planted.items)) % LENGTH >= step
+    changed = planted._replace(items=np.where(later, (planted.items + 11) % ITEMS, planted.items))
+    scores = []
+    for given, paid in ((planted, rewards), (changed, np.where(later, 1 - rewards, rewards))):
+        store = store_of(given, paid)
+        episodes = np.arange(store.n_episodes)
+        rows = RewardRows.at(store, episodes, np.full(len(episodes), step), LAGS)
+        scores.append(model.scores(rows.states, rows.shown, rows.users))
+    assert torch.equal(scores[0], scores[1])
+
+
+def test_test_rows_have_no_effect_and_statistics_come_from_training_rows(tmp_path: Path) -> None:
+    planted = log(7)
+    rewards = clicks(planted)
+    first, _ = fit_item_reward_model(*views(store_of(planted, rewards)), tmp_path / "a", seed=0)
+    other = rewards.copy()
+    other[-LENGTH:] = 1 - other[-LENGTH:]
+    items = planted.items.copy()
+    items[-LENGTH:] = 0
+    same, _ = fit_item_reward_model(
+        *views(store_of(planted._replace(items=items), other)), tmp_path / "b", seed=0
+    )
+    for name, value in first.state_dict().items():
+        assert torch.equal(value, same.state_dict()[name]), name
+    held_out = slice(int(USERS * 0.75) * LENGTH + LENGTH, None)
+    other = rewards.copy()
+    other[held_out] = 1 - other[held_out]
+    chosen, _ = fit_item_reward_model(*views(store_of(planted, other)), tmp_path / "c", seed=0)
+    statistics = ("state_mean", "state_std", "reward_mean", "reward_std", "vectors")
+    for name in statistics:
+        assert torch.equal(first.get_buffer(name), chosen.get_buffer(name)), name
+
+
+def test_a_fit_repeats_and_is_read_again(tmp_path: Path) -> None:
+    planted = log(8, users=60)
+    store = store_of(planted, clicks(planted))
+    first, report = fit_item_reward_model(*views(store), tmp_path / "a", seed=0, max_rows=600)
+    again, _ = fit_item_reward_model(*views(store), tmp_path / "b", seed=0, max_rows=600)
+    kept, kept_report = fit_item_reward_model(*views(store), tmp_path / "a", seed=0, max_rows=600)
+    assert report.train_rows == 600
+    assert kept_report == report
+    for name, value in first.state_dict().items():
+        assert torch.equal(value, again.state_dict()[name]), name
+        assert torch.equal(value, kept.state_dict()[name]), name
+
+
+@pytest.mark.parametrize(
+    ("rewards", "validation", "message"),
+    [
+        (lambda made: np.full(len(made.items), 2.0), 0.25, "all 900 training rewards equal 2"),
+        (clicks, 0.0, "no held-out steps"),
+    ],
+)
+def test_what_cannot_be_fitted_is_an_input_error(
+    rewards: Callable[[Log], Float64Array], validation: float, message: str, tmp_path: Path
+) -> None:
+    planted = log(9, users=60)
+    store = store_of(planted, rewards(planted), validation)
+    with pytest.raises(InputError, match=message):
+        fit_item_reward_model(*views(store), tmp_path / "run", seed=0)
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,1 @@
+"""The choice of the decision rule: candidates, their evaluation, the rule that is kept."""

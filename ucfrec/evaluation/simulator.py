@@ -1,0 +1,32 @@
+"""What a plugin of the entry-point group `ucfrec.simulators` is."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gymnasium.vector import VectorEnv
+
+    from ucfrec.acting.rollout import Actor
+
+
+@dataclass(frozen=True)
+class Simulator:
+    """A simulated environment in which sessions are played."""
+
+    summary: str
+    """One line for `--help`."""
+    make: "Callable[[int, Path | None], VectorEnv[Any, Any, Any]]"
+    """Makes a vector environment with `AutoresetMode.SAME_STEP` from (number of parallel sessions,
+    folder of weights or None)."""
+    behaviors: "Mapping[str, Callable[[VectorEnv[Any, Any, Any], int], Actor]]"
+    """Built-in behavior policies by name, each made from (environment, seed): `random`, `mixture`
+    and, if it is known, `optimal`."""
+    feedback: str
+    """Name of the reward column in the logs that `ucfrec collect` writes."""
+
+    @property
+    def logging_behavior(self) -> str:
+        """The behavior policy of logs that nobody chose another for."""
+        return "mixture" if "mixture" in self.behaviors else "random"

@@ -1,0 +1,202 @@
+"""Checksums of the files of a store or a run, recorded in its `meta.json` or `run.json`.
+
+XXH3 (64 bits) runs at the speed of memory, where CRC-32 of zlib has a quarter of it: see
+`benchmarks/checksum_cost.py`. It finds accidents, not forgers: who can change a file can change its
+checksum.
+"""
+
+import os
+from collections.abc import Container, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import xxhash
+
+from ucfrec.errors import InputError, explain_os_error
+from ucfrec.files.atomic import CHECKSUM, read_json, write_sealed_json
+from ucfrec.files.locks import is_lock_or_scratch
+from ucfrec.files.remote import fetch
+
+FILES: Final = "files"
+"""Entry of a record with size and checksum of the files beside it: {path: [bytes, hexadecimal]}."""
+CARD, MEASURED = "MODEL_CARD.md", "measured.json"
+"""Files of a run that later measurements change; they are never listed."""
+_BLOCK: Final = 2**19
+_THREADS: Final = 2
+
+
+def seal(folder: Path, record: str, value: Mapping[str, Any]) -> dict[str, Any]:
+    """Write the record of a folder with the checksums of the other files in it.
+
+    A file that `value` lists keeps its entry, so that damage since then is not signed off.
+
+    Args:
+        folder: all its files are complete.
+        record: name of the record in the folder, e.g. `meta.json`.
+        value: its content.
+
+    Returns:
+        The content with the list of files.
+    """
+    known = value.get(FILES, {})
+    listed = {
+        name: known.get(name) or [(folder / name).stat().st_size, file_checksum(folder / name)]
+        for name in sorted(_names(folder))
+        if name != record
+    }
+    return _write(folder / record, value, listed)
+
+
+def reopen(folder: Path, record: str, value: Mapping[str, Any], kept: Container[str]) -> None:
+    """Write the record of a folder before files of it change.
+
+    Args:
+        folder: sealed by `seal`, or by nothing if an older ucfrec made it.
+        record: name of the record in the folder.
+        value: its content.
+        kept: files that will not change; the others are no longer listed.
+    """
+    listed = {name: entry for name, entry in value.get(FILES, {}).items() if name in kept}
+    if FILES in value and listed != value[FILES]:
+        _write(folder / record, value, listed)
+
+
+def _write(path: Path, value: Mapping[str, Any], listed: Mapping[str, Any]) -> dict[str, Any]:
+    sealed = {**{k: v for k, v in value.items() if k != CHECKSUM}, FILES: listed}
+    write_sealed_json(path, sealed)
+    return sealed
+
+
+def file_checksum(path: Path) -> str:
+    """XXH3 (64 bits, hexadecimal) of the content of a file."""
+    digest, block = xxhash.xxh3_64(), bytearray(_BLOCK)
+    view = memoryview(block)
+    with path.open("rb", buffering=0) as file:
+        while size := file.readinto(block):
+            digest.update(view[:size])
+    return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class Sealed:
+    """The files of a folder and what its record says about them."""
+
+    folder: Path
+    remedy: str
+    """What to do about a damaged file, for messages."""
+    files: Mapping[str, tuple[int, str]]
+    """Path in the folder to size in bytes and checksum."""
+
+    @classmethod
+    def of(cls, folder: Path, record: Mapping[str, Any], remedy: str) -> "Sealed | None":
+        """The checksums that `seal` recorded; None if an older ucfrec wrote the record.
+
+        Raises:
+            InputError: the list of files is damaged.
+        """
+        if FILES not in record:
+            return None
+        listed = record[FILES]
+        if not isinstance(listed, dict) or not all(map(_is_entry, listed.items())):
+            raise InputError(f"{folder}: its list of files is damaged; {remedy}")
+        return cls(folder, remedy, {name: (size, text) for name, (size, text) in listed.items()})
+
+    def require_sizes(self) -> None:
+        """Check that every file is there with its size; no file is read.
+
+        Raises:
+            InputError: the first file that is missing, or has another size.
+        """
+        for name, (size, _) in self.files.items():
+            if fault := _size_fault(self.folder / name, size):
+                raise self._error(name, fault)
+
+    def require(self, name: str) -> None:
+        """Read a file and check its size and checksum; a file that is not listed passes.
+
+        Raises:
+            InputError: the file is missing or has another content.
+        """
+        if name in self.files and (fault := self._fault(name)):
+            raise self._error(name, fault)
+
+    def require_small(self, largest: int = 2**26) -> None:
+        """Check the sizes of all files, and the content of those of at most `largest` bytes.
+
+        Raises:
+            InputError: the first file that is missing or has another content.
+        """
+        self.require_sizes()
+        for name, (size, _) in self.files.items():
+            if size <= largest:
+                self.require(name)
+
+    def faults(self) -> Iterator[tuple[str, str]]:
+        """Read every file, several at a time; yields (path in the folder, what is wrong with it).
+
+        Reading and hashing release Python's lock, so with two processors the hashing costs no time.
+        """
+        from concurrent.futures import ThreadPoolExecutor  # only to verify everything
+
+        with ThreadPoolExecutor(_THREADS) as threads:
+            for name, fault in zip(self.files, threads.map(self._fault, self.files), strict=True):
+                if fault:
+                    yield name, fault
+
+    def strangers(self) -> list[str]:
+        """Files of the folder that are not listed, without locks and scratch."""
+        return sorted(set(_names(self.folder)) - self.files.keys())
+
+    def _fault(self, name: str) -> str:
+        size, stated = self.files[name]
+        path = self.folder / name
+        fetch(path)
+        try:
+            return _size_fault(path, size) or (
+                "" if file_checksum(path) == stated else "has another content than was written"
+            )
+        except OSError as error:
+            return f"cannot be read ({explain_os_error(error)})"
+
+    def _error(self, name: str, fault: str) -> InputError:
+        return InputError(f"{self.folder / name} {fault}; restore the file, or {self.remedy}")
+
+
+def sealed_record(folder: Path, record: str, remedy: str) -> tuple[dict[str, Any], Sealed | None]:
+    """Read the record of a folder and its checksums; only the record is verified.
+
+    Raises:
+        InputError: the record is missing or damaged.
+    """
+    value = read_json(folder / record)
+    if not isinstance(value, dict):
+        raise InputError(f"{folder / record} is damaged: it is no JSON object; {remedy}")
+    return value, Sealed.of(folder, value, remedy)
+
+
+def _is_entry(entry: tuple[str, object]) -> bool:
+    name, value = entry
+    inside = not Path(name).is_absolute() and ".." not in Path(name).parts
+    if not inside or not isinstance(value, list) or len(value) != 2:
+        return False
+    return type(value[0]) is int and isinstance(value[1], str)
+
+
+def _size_fault(path: Path, size: int) -> str:
+    try:
+        found = path.stat().st_size
+    except (OSError, ValueError) as error:
+        if isinstance(error, FileNotFoundError):
+            return "is missing"
+        return f"cannot be read ({error})"
+    if found == size:
+        return "" if path.is_file() else "is no regular file"
+    return f"is {'truncated' if found < size else 'grown'}: {found:,} of {size:,} bytes"
+
+
+def _names(folder: Path) -> Iterator[str]:
+    for where, _, files in os.walk(folder):
+        for name in files:
+            if not is_lock_or_scratch(name) and name not in (CARD, MEASURED):
+                yield (Path(where) / name).relative_to(folder).as_posix()

@@ -1,0 +1,70 @@
+"""Parquet files of strangers: how many rows a small file may claim, and columns of ids."""
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from ucfrec.arrays import Array
+from ucfrec.errors import InputError, explain_os_error, one_line
+
+_FEW_ROWS: Final = 1_000_000
+_ROWS_PER_BYTE: Final = 10
+_NO_THREAD: Final = "Failed to launch worker thread"
+"""How Arrow says that there is no memory for the stack of a thread."""
+
+
+def require_plausible_rows(path: Path, rows: int) -> None:
+    """Check that a Parquet file does not unfold into very many equal rows.
+
+    A log has at least a user, an item and a time a row, which take some bytes however well they are
+    compressed; ten rows a byte can only be repetitions, of which duplicates are dropped anyway.
+
+    Args:
+        path: of the file.
+        rows: that it claims to hold.
+
+    Raises:
+        InputError: it claims over a million rows, and over ten for each of its bytes.
+    """
+    size = path.stat().st_size
+    if rows > max(_FEW_ROWS, _ROWS_PER_BYTE * size):
+        raise InputError(
+            f"{path} claims {rows:,} rows in {size:,} bytes, so nearly all of them must be equal; "
+            "remove the repetitions"
+        )
+
+
+def read_ids(path: Path, column: str) -> Array:
+    """The ids in a column of a Parquet file, (n,) int64 or text.
+
+    Raises:
+        InputError: the file is missing or damaged, or the column is missing, has missing values, or
+            holds neither integers nor text.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        with pq.ParquetFile(path) as file:
+            require_plausible_rows(path, file.metadata.num_rows)
+            ids = file.read([column]).column(column)
+    except InputError:
+        raise
+    except FileNotFoundError as error:
+        raise InputError(explain_os_error(error)) from None
+    except (pa.ArrowException, OSError, KeyError, ValueError, OverflowError) as error:
+        if _NO_THREAD in str(error):
+            raise MemoryError(one_line(str(error))) from None
+        raise InputError(
+            f"{path} is damaged or has no column {column!r} ({one_line(str(error)):.200}); restore "
+            "it, or make the store or run again"
+        ) from None
+    integers = pa.types.is_integer(ids.type)
+    texts = pa.types.is_string(ids.type) or pa.types.is_large_string(ids.type)
+    if ids.null_count or not (integers or texts):
+        raise InputError(
+            f"{path}: {column} is {ids.type} with {ids.null_count} missing values, not ids; "
+            "restore it, or make the store or run again"
+        )
+    return np.asarray(ids, dtype=np.int64 if integers else None)

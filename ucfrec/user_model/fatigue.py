@@ -1,0 +1,95 @@
+"""Fatigue: how much less users reward anything once they liked one tag many times on end."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from torch import Tensor
+
+from ucfrec.arrays import BoolArray, IntArray
+from ucfrec.episodes.exposure import Shown
+from ucfrec.episodes.main_tags import MainTags
+from ucfrec.episodes.store import EpisodeStore
+
+LONGEST: Final = 8
+"""Largest length of a run, and largest number of steps that it tires, that are tried."""
+_MOST: Final = 0.5
+"""Largest factor that counts as fatigue."""
+_EXPECTED: Final = 20.0
+"""Fewest rewards to be expected of users who did not tire, from which a factor is told."""
+
+
+@dataclass(frozen=True)
+class Fatigue:
+    """After `length` liked items of one main tag on end, the chance of a reward is multiplied by
+    `factor` for `steps` steps."""
+
+    length: int
+    steps: int
+    factor: float
+
+    def tired(self, runs: Tensor) -> Tensor:
+        """Whether users are tired, (M,) bool, from `MainTags.runs` (M, N) before a step."""
+        return (runs[:, : self.steps] >= self.length).any(1)
+
+
+@dataclass(frozen=True)
+class LoggedRuns:
+    """Logged steps, the runs before each, and whether the step was liked."""
+
+    runs: Tensor
+    """(M, N) of `MainTags.runs`; nothing of the step itself or of later ones."""
+    liked: BoolArray
+    """(M,)."""
+    sessions: IntArray
+    """(M,) number of the session."""
+
+    @classmethod
+    def of(cls, store: EpisodeStore, tags: MainTags, lags: int, most: int) -> "LoggedRuns":
+        """Steps of a view of a store of items: the first sessions of it, about `most` steps."""
+        ends = np.cumsum(store.lengths)
+        view = store.select(np.arange(int(np.searchsorted(ends, most)) + 1)[: len(ends)])
+        episodes, steps = view.all_steps()
+        windows = view.windows(episodes, steps, lags + 1)
+        runs = tags.runs(Shown.before_last(windows))
+        return cls(runs, tags.liked(windows.rewards[:, -1]).numpy(), np.asarray(episodes))
+
+
+def fit_fatigue(training: LoggedRuns, held_out: LoggedRuns) -> Fatigue | None:
+    """The fatigue that training rows tell most clearly; None if there is none.
+
+    The factor is the share of likes at which the log's policies arrived with tired users, relative
+    to the share in the rest of the same sessions. This is cautious: policies that knew of the
+    fatigue, and showed what nobody likes, look as if the users would have liked nothing. Fatigue
+    must at least halve the likes, in held-out rows too.
+    """
+    found, clearest = None, 0.0
+    for length, steps in _candidates(training.runs.shape[1]):
+        seen, expected = _likes(training, length, steps)
+        if expected < _EXPECTED or seen > _MOST * expected:
+            continue
+        # Twice the logarithm of the likelihood ratio of two Poisson rates.
+        clearness = 2 * (seen * np.log(max(seen, 1e-9) / expected) + expected - seen)
+        if clearness > clearest:
+            found, clearest = Fatigue(length, steps, seen / expected), clearness
+    if found is None:
+        return None
+    seen, expected = _likes(held_out, found.length, found.steps)
+    return found if expected >= _EXPECTED and seen <= _MOST * expected else None
+
+
+def _likes(rows: LoggedRuns, length: int, steps: int) -> tuple[float, float]:
+    """Likes of tired users, and as many as they gave elsewhere in the same sessions."""
+    tired = Fatigue(length, steps, 0.0).tired(rows.runs).numpy()
+    count = int(rows.sessions.max(initial=-1)) + 1
+    others = np.bincount(rows.sessions[~tired], minlength=count)
+    liked = np.bincount(rows.sessions[~tired & rows.liked], minlength=count)
+    share = liked / np.maximum(others, 1)
+    return float(rows.liked[tired].sum()), float(share[rows.sessions[tired]].sum())
+
+
+def _candidates(remembered: int) -> Iterator[tuple[int, int]]:
+    for length in range(2, min(LONGEST, remembered) + 1):
+        for steps in range(1, min(LONGEST, remembered - length + 1) + 1):
+            yield length, steps

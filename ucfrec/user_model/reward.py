@@ -1,0 +1,193 @@
+"""Expected reward of every item of a catalogue: additive effects of items, users and the state."""
+
+from collections.abc import Callable, Mapping
+from typing import Final
+
+import torch
+from torch import Tensor, nn
+
+from ucfrec.episodes.exposure import Likeness, Shown
+from ucfrec.user_model.posterior import MEMORY, SessionTastes
+
+FITTED: Final = "item_reward.safetensors"
+"""File of a fitted model in its folder."""
+LAGS: Final = 10
+"""Items shown before a step whose repetition and likeness enter its expected reward."""
+CLIP: Final = 5.0
+"""Standardised states beyond this many standard deviations are clipped."""
+
+
+class ItemRewardModel(nn.Module):
+    """A generalised additive model of the reward of showing item i to user u in state s.
+
+    The linear predictor is
+
+        η = item_i + user_u + state · x + (affinity_u + interactionᵀ x) · e_i + exposure_i,
+
+    x being the standardised state, e_i the centred embedding of the item, and exposure_i what
+    repeating an item, or showing one like it, n steps after the last time adds (`Likeness`). For
+    new users, user_u and affinity_u are what the session tells of them (`SessionTastes`).
+    Item effects include those of tags and embeddings, which items without training rows have too.
+    For rewards of two values the model is logistic: η is the log-odds of the higher one. Otherwise
+    η is the standardised reward.
+
+    `ucfrec.user_model.reward_fit` fits the model; effects that it leaves out are 0.
+    """
+
+    binary: Tensor
+    reward_low: Tensor
+    reward_high: Tensor
+    reward_mean: Tensor
+    reward_std: Tensor
+    state_mean: Tensor
+    state_std: Tensor
+    vectors: Tensor
+    item: Tensor
+    user: Tensor
+    affinity: Tensor
+    state: Tensor
+    interaction: Tensor
+    exposure: Tensor
+
+    def __init__(self, sizes: Mapping[str, int]) -> None:
+        """Args:
+        sizes: `state` S; `action` D, the size of an item's embedding; `items`; `users` (0 or
+            missing: no effects of users); and `tags`, most tags of one item (0 or missing: items
+            are alike by their embeddings).
+        """
+        super().__init__()
+        state, dim, items = sizes["state"], sizes["action"], sizes["items"]
+        users = sizes.get("users", 0)
+        self.lags = LAGS
+        for name in ("reward_low", "reward_mean"):
+            self.register_buffer(name, torch.zeros(()))
+        for name in ("reward_high", "reward_std"):
+            self.register_buffer(name, torch.ones(()))
+        self.register_buffer("binary", torch.zeros((), dtype=torch.bool))
+        self.register_buffer("state_mean", torch.zeros(state))
+        self.register_buffer("state_std", torch.ones(state))
+        self.register_buffer("vectors", torch.zeros(items, dim))
+        self.register_buffer("item", torch.zeros(items))
+        # The last row is that of unknown users.
+        self.register_buffer("user", torch.zeros(users + 1))
+        self.register_buffer("affinity", torch.zeros(users + 1, dim))
+        self.register_buffer("state", torch.zeros(state))
+        self.register_buffer("interaction", torch.zeros(state, dim))
+        self.register_buffer("exposure", torch.zeros(4, LAGS))
+        self.likeness = Likeness(items, dim, sizes.get("tags", 0))
+        self.tastes = SessionTastes(items, dim)
+
+    @property
+    def reach(self) -> int:
+        """Items shown before a step that its expected reward depends on."""
+        return max(self.lags, MEMORY) if self.tastes.known else self.lags
+
+    def scores(self, states: Tensor, shown: Shown, users: Tensor | None = None) -> Tensor:
+        """Linear predictors of all items, (B, n_items).
+
+        Args:
+            states: (B, S) before the step.
+            shown: what the sessions showed before the step; more than `reach` items have no effect.
+            users: (B,) int64 numbers in the training store, −1 for an unknown user; None if all
+                users are unknown.
+
+        Returns:
+            Log-odds of the higher reward if rewards have two values; otherwise rewards in standard
+            deviations from their mean.
+        """
+        items, repeated, alike = self.exposures(shown)
+        added = self.likeness.to_all(self.likeness.profile(items, alike))
+        rows, lags = torch.nonzero(items >= 0, as_tuple=True)
+        added = added.index_put((rows, items[rows, lags]), repeated[rows, lags], accumulate=True)
+        tastes = self.tastes_after(shown)
+        added = added + self.query(states, users, tastes) @ self.vectors.T
+        return self.item + self.level(states, users, tastes).unsqueeze(1) + added
+
+    def score(self, states: Tensor, shown: Shown, users: Tensor | None, items: Tensor) -> Tensor:
+        """Linear predictors (B,) of one item each, int64 (B,); see `scores`."""
+        level = self.standardised(states) @ self.state
+        added = ((self.standardised(states) @ self.interaction) * self.vectors[items]).sum(1)
+        scores: Tensor = self.fixed_part(shown, users, items) + level + added
+        return scores
+
+    def fixed_part(self, shown: Shown, users: Tensor | None, items: Tensor) -> Tensor:
+        """The part of `score` that does not depend on the state, (B,)."""
+        before, repeated, alike = self.exposures(shown)
+        each, known = items.unsqueeze(1), self._known(users, items)
+        exposure = self.likeness.to_items(self.likeness.profile(before, alike), each)
+        exposure = exposure + ((before == each) * repeated).sum(1)
+        tastes = self.tastes_after(shown)
+        affinity = ((self.affinity[known] + tastes[:, 1:]) * self.vectors[items]).sum(1)
+        part: Tensor = self.item[items] + self.user[known] + tastes[:, 0] + affinity + exposure
+        return part
+
+    def level(self, states: Tensor, users: Tensor | None, tastes: Tensor) -> Tensor:
+        """The part (B,) of the scores that all items share, in states (B, S) of users (B,) with
+        `tastes_after` (B, D + 1)."""
+        of_user = self.user[self._known(users, states)] + tastes[:, 0]
+        return of_user + self.standardised(states) @ self.state
+
+    def tastes_after(self, shown: Shown) -> Tensor:
+        """What sessions told of their users' level and affinity, (B, D + 1)."""
+        if not self.tastes.known:
+            return torch.zeros(len(shown.items), self.vectors.shape[1] + 1, device=self.item.device)
+        items, rewards = shown.latest(MEMORY)
+        tastes: Tensor = self.tastes(items, self.vectors, self.target(rewards))
+        return tastes
+
+    def expected(self, scores: Tensor) -> Tensor:
+        """Expected rewards, in reward units, of linear predictors of any shape."""
+        if bool(self.binary):
+            return self.reward_low + (self.reward_high - self.reward_low) * torch.sigmoid(scores)
+        return self.reward_mean + self.reward_std * scores
+
+    @torch.no_grad()
+    def set_effects(
+        self, effects: Mapping[str, Tensor], of_content: Callable[[Tensor], Tensor]
+    ) -> None:
+        """Set the fitted effects; those that are missing become 0.
+
+        Args:
+            effects: by the names of `ucfrec.user_model.reward_effects.EFFECTS`.
+            of_content: effects (n_items,) of the items' tags and embeddings, from those of content.
+        """
+        for name in ("user", "affinity", "state", "interaction", "exposure"):
+            buffer = self.get_buffer(name)
+            buffer.copy_(effects.get(name, torch.zeros(buffer.shape)).view(buffer.shape))
+        self.item.copy_(effects["mean"] + effects.get("item", torch.zeros(())))
+        if "content" in effects:
+            self.item.add_(of_content(effects["content"]))
+        self.tastes.weigh(effects.get("tastes", 0.0))
+
+    def target(self, rewards: Tensor) -> Tensor:
+        """What η predicts: whether rewards (...) are the higher one, or standardised rewards."""
+        standardised = ((rewards - self.reward_mean) / self.reward_std).clamp(-CLIP, CLIP)
+        return torch.where(self.binary, (rewards == self.reward_high).float(), standardised)
+
+    def standardised(self, states: Tensor) -> Tensor:
+        """States (..., S) in standard deviations from their training mean, clipped."""
+        return ((states - self.state_mean) / self.state_std).clamp(-CLIP, CLIP)
+
+    def _known(self, users: Tensor | None, like: Tensor) -> Tensor:
+        """Rows (B,) of the users in the effects of users, B being the length of `like`."""
+        last = len(self.user) - 1
+        if users is None:
+            return torch.full((len(like),), last, device=like.device)
+        return torch.where((users >= 0) & (users < last), users, last)
+
+    def query(self, states: Tensor, users: Tensor | None, tastes: Tensor) -> Tensor:
+        """What multiplies the vector of every item, (B, D); the arguments are those of `level`."""
+        interaction = self.standardised(states) @ self.interaction
+        return self.affinity[self._known(users, states)] + tastes[:, 1:] + interaction
+
+    def liked(self, rewards: Tensor) -> Tensor:
+        """Rewards (...) on a scale from 0 to 1."""
+        return ((rewards - self.reward_low) / (self.reward_high - self.reward_low)).clamp(0, 1)
+
+    def exposures(self, shown: Shown) -> tuple[Tensor, Tensor, Tensor]:
+        """Items (B, lags) shown before, and the weights (B, lags) of repetition and likeness."""
+        missing = max(0, self.lags - shown.items.shape[1])
+        items = nn.functional.pad(shown.items[:, : self.lags], (0, missing), value=-1)
+        liked = self.liked(nn.functional.pad(shown.rewards[:, : self.lags], (0, missing)))
+        repeated, alike, repeated_liked, alike_liked = self.exposure
+        return items, repeated + repeated_liked * liked, alike + alike_liked * liked

@@ -1,0 +1,429 @@
+"""Fitting the reward model of items, effect by effect, on training rows."""
+
+import dataclasses
+import time
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ucfrec.episodes.exposure import Shown
+from ucfrec.episodes.item_counts import LIKED
+from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
+from ucfrec.progress import Progress, progress
+from ucfrec.user_model.posterior import MEMORY, root_of_tastes
+from ucfrec.user_model.reward import FITTED, ItemRewardModel
+from ucfrec.user_model.reward_effects import EFFECTS, Design, Effects, fit_effects
+from ucfrec.user_model.reward_report import (
+    Calibration,
+    EffectTried,
+    ItemRewardReport,
+    calibration,
+    gauc_against,
+    item_rates,
+    scores_of,
+)
+from ucfrec.user_model.reward_rows import RewardRows
+
+_SPREADS: Final = tuple(0.05 * 2 ** (k / 2) for k in range(13))
+_FIRST: Final = 6
+"""Index of the spread that is tried first, 0.4."""
+_CHEAP: Final = ("item", "user", "content")
+"""Effects whose spreads are searched finely, and adjusted to each other."""
+_STRIDES: Final = {**dict.fromkeys(_CHEAP, (2, 1)), "tastes": ()}
+"""Steps of the search of a spread, (2,) for others; one number alone needs no search."""
+_KNOWN: Final = 0.1
+"""Least share of held-out rows of known users that can judge the effects in `LASTING`."""
+_SCALES: Final = (0.25, 0.5, 1.0, 2.0, 4.0)
+"""Standard deviations of tastes that are tried, relative to the noise of single steps."""
+LASTING: Final = ("item", "user", "content", "affinity")
+"""Effects that are told apart by users who were shown several items."""
+_MAX_ROWS: Final = 500_000
+_CONSTANT: Final = 1e-6
+_ROWS: Final = 512
+"""Rows whose tastes are found at once; more leave the processor's cache."""
+
+
+def reward_model_sizes(store: EpisodeStore) -> dict[str, int]:
+    """Sizes of the reward model of a store of items, as `ItemRewardModel` takes them."""
+    states = store.item_states
+    items, dim = states.embeddings.shape
+    return {
+        "state": store.state_size,
+        "action": dim,
+        "items": items,
+        "users": len(states.user_features),
+        "tags": states.tags.shape[1],
+    }
+
+
+def fit_item_reward_model(
+    train: EpisodeStore,
+    validation: EpisodeStore,
+    folder: Path,
+    seed: int,
+    max_rows: int = _MAX_ROWS,
+    effects: Collection[str] = EFFECTS,
+) -> tuple[ItemRewardModel, ItemRewardReport]:
+    """Fit the model to training rows, or read it from `folder` if it was fitted before.
+
+    Effects are added one after the other, all fitted jointly. Validation rows choose the strength
+    of each effect's penalty, and whether the effect is kept: if it lowers their mean loss by more
+    than the standard error of the decrease.
+
+    Where hardly any validation row is of a user with training rows, the model is for new users. A
+    fifth of the training rows then chooses for the effects in `LASTING`: with unknown users,
+    effects of items that contain those of the users who saw them predict best. What a user's
+    effects tell of training rows, the history of the session must tell of a new user. So the
+    effects of users are dropped once those of items are known, but for how much users differ, which
+    is what `SessionTastes` start from, and the other effects are fitted without them.
+
+    Args:
+        train: view of a store of items.
+        validation: held-out view of the same store.
+        folder: receives the fitted model.
+        seed: of the rows drawn from a store with more than `max_rows`.
+        max_rows: most rows of each view that are used.
+        effects: those that are tried.
+
+    Returns:
+        The model, in evaluation mode, and its quality on the validation rows.
+
+    Raises:
+        InputError: a view has no steps, or all training rewards are equal.
+    """
+    model = ItemRewardModel(reward_model_sizes(train))
+    if (folder / FITTED).exists():
+        tensors, about = load_tensors(folder / FITTED)
+        load_weights(folder / FITTED, model, tensors)
+        return model.eval(), _report_from(about)
+    start = time.process_time()
+    rows = RewardRows.of(train, model.lags, max_rows, seed)
+    held_out = RewardRows.of(validation, model.lags, max_rows, seed)
+    set_statistics(model, rows, held_out, train.item_states)
+    search = EffectSearch(Design.of(model, rows), Design.of(model, held_out))
+    if search.of_new_users:
+        rows = RewardRows.of(train, MEMORY, max_rows, seed)
+        held_out = RewardRows.of(validation, MEMORY, max_rows, seed)
+        search.shown = ShownBefore(model, rows.shown, held_out.shown)
+    with progress(len(EFFECTS), "item rewards", "effects") as bar:
+        search.add_all(bar, effects)
+    model.set_effects(search.effects, search.design.of_content)
+    report = _report(model, search, rows, held_out, train.item_states, start)
+    folder.mkdir(parents=True, exist_ok=True)
+    save_tensors(folder / FITTED, model.state_dict(), dataclasses.asdict(report))
+    return model.eval(), report
+
+
+def refit_item_reward_model(
+    first: Path, store: EpisodeStore, folder: Path, seed: int, max_rows: int = _MAX_ROWS
+) -> ItemRewardModel:
+    """Fit the effects of the model in the folder `first`, as strong as there, to other rows.
+
+    Args:
+        first: folder of `fit_item_reward_model`.
+        store: view of the episodes to fit to.
+        folder: receives the fitted model.
+        seed: of the rows drawn from a view with more than `max_rows`.
+        max_rows: most rows that are used.
+    """
+    tensors, about = load_tensors(first / FITTED)
+    report = _report_from(about)
+    model = ItemRewardModel(reward_model_sizes(store))
+    lags = MEMORY if "tastes" in report.kept else model.lags
+    rows = RewardRows.of(store, lags, max_rows, seed)
+    set_statistics(model, rows, rows, store.item_states)
+    design = Design.of(model, rows)
+    effects, spreads, fixed = design.mean_effect(), dict(report.kept), Effects()
+    if report.new_users:
+        lasting: dict[str, float] = {}
+        for name in LASTING:
+            if name in spreads:
+                lasting[name] = spreads.pop(name)
+        fixed = _of_items(fit_effects(design, effects, lasting))
+        design = design.of_unknown_users()
+        if "tastes" in spreads:
+            alone = fit_effects(design, effects, {}, fixed)
+            set_usual(model, design, alone)
+            model.tastes.root.copy_(tensors["tastes.root"])
+            design = replace(design, tastes=added_by_tastes(model, rows.shown, rows.items))
+    model.set_effects(fit_effects(design, effects, spreads, fixed), design.of_content)
+    folder.mkdir(parents=True, exist_ok=True)
+    save_tensors(folder / FITTED, model.state_dict(), dataclasses.asdict(report))
+    return model.eval()
+
+
+def _of_items(effects: Effects) -> Effects:
+    return {name: effects[name] for name in ("item", "content") if name in effects}
+
+
+def set_usual(model: ItemRewardModel, design: Design, effects: Effects) -> None:
+    """Set what items usually earn, for `SessionTastes`, from the effects of mean and items."""
+    everywhere = effects["mean"] + effects.get("item", torch.zeros(()))
+    if "content" in effects:
+        everywhere = everywhere + design.of_content(effects["content"])
+    model.tastes.usual.copy_(torch.sigmoid(everywhere) if design.binary else everywhere)
+
+
+def added_by_tastes(model: ItemRewardModel, shown: Shown, items: Tensor) -> Tensor:
+    """What `SessionTastes` of weight 1, after what was shown in M sessions, add to the scores (M,)
+    of items (M,)."""
+    model.tastes.weigh(1.0)
+    added = []
+    for start in range(0, len(items), _ROWS):
+        part = slice(start, start + _ROWS)
+        tastes = model.tastes_after(shown.at(part))
+        added.append(tastes[:, 0] + (tastes[:, 1:] * model.vectors[items[part]]).sum(1))
+    return torch.cat(added)
+
+
+class ShownBefore(NamedTuple):
+    """What the sessions of rows showed before them, where users are new."""
+
+    model: ItemRewardModel
+    """Its `tastes` are set while effects are searched."""
+    training: Shown
+    held_out: Shown
+
+
+class EffectSearch:
+    """The effects found so far, and their loss on held-out rows."""
+
+    shown: ShownBefore | None = None
+    """Where users are new; needed to learn tastes within the session."""
+
+    def __init__(self, design: Design, held_out: Design) -> None:
+        self.design, self.held_out = design, held_out
+        self.effects = design.mean_effect()
+        self.kept: dict[str, int] = {}
+        self.new_users = False
+        self._fixed: Effects = {}
+        self._root: Tensor | None = None
+        self.losses = self._losses(self.effects)
+        self.base_loss = self.item_loss = float(self.losses.mean())
+        self.tried: list[EffectTried] = []
+
+    def add(self, name: str) -> None:
+        """Add the effect `name` with the best spread, if it lowers the held-out loss."""
+        if name == "tastes" and self._root is not None:
+            self._scale_tastes(self._root)
+        nobody = bool((self.design.users == self.design.n_users).all())
+        if not self.design.squares(name).any() or (nobody and name in ("user", "affinity")):
+            return
+        at, (effects, losses) = self._best(name, _FIRST, _STRIDES.get(name, (2,)))
+        decrease = self.losses - losses
+        gain = float(decrease.mean())
+        error = float(decrease.std(correction=0)) / len(decrease) ** 0.5
+        self.tried.append(EffectTried(name, _SPREADS[at], gain, error, gain > error))
+        if name == "item":
+            self.item_loss = float(losses.mean())
+        if gain > error:
+            self.effects, self.losses, self.kept[name] = effects, losses, at
+
+    def add_all(self, bar: Progress, effects: Collection[str]) -> None:
+        """Add every one of `effects` that lowers the held-out loss."""
+        judge = self.of_training() if self.of_new_users else self
+        for name in EFFECTS:
+            if judge is not self and name not in LASTING:
+                self._take(judge)
+                self._forget_users()
+                judge = self
+            if name in effects:
+                judge.add(name)
+            if name == _CHEAP[-1]:
+                judge.adjust()
+            bar.update()
+
+    @property
+    def of_new_users(self) -> bool:
+        """Whether hardly any held-out row is of a user with training rows."""
+        seen = self._seen()
+        return bool(seen.any()) and float(seen[self.held_out.users].float().mean()) < _KNOWN
+
+    def _seen(self) -> Tensor:
+        """(n_users + 1,) bool: users with training rows."""
+        seen = torch.bincount(self.design.users, minlength=self.design.n_users + 1) > 0
+        seen[-1] = False
+        return seen
+
+    def of_training(self) -> "EffectSearch":
+        """A search that is judged on a fifth of the training rows."""
+        rows = len(self.design.items)
+        held_back = torch.arange(rows) % 5 == min(4, rows - 1)
+        return EffectSearch(self.design.select(~held_back), self.design.select(held_back))
+
+    def _take(self, judge: "EffectSearch") -> None:
+        """Fit the effects that `judge` keeps, with its spreads, to all training rows."""
+        self.tried, at = list(judge.tried), judge.kept
+        if "item" in at:
+            _, (_, losses) = self._best("item", at["item"], ())
+            self.item_loss = float(losses.mean())
+        for name in at:
+            self.kept[name] = at[name]
+        if at:
+            last = [*at][-1]
+            _, (self.effects, self.losses) = self._best(last, at[last], ())
+
+    def _forget_users(self) -> None:
+        """Fit further effects as for new users, with the effects of items as they are."""
+        if self.shown is not None and "affinity" in self.effects:
+            seen = self._seen()
+            level = self.effects.get("user", torch.zeros(len(seen)))[seen]
+            tastes = torch.cat([level.unsqueeze(1), self.effects["affinity"][seen]], 1)
+            self._root = root_of_tastes(tastes, self.design.rows)
+        self.new_users, self._fixed = True, _of_items(self.effects)
+        self.design = self.design.of_unknown_users()
+        self.effects = fit_effects(self.design, self.design.mean_effect(), {}, self._fixed)
+        self.losses = self._losses(self.effects)
+
+    def _scale_tastes(self, root: Tensor) -> None:
+        """Choose how much users differ, relative to noise, by the held-out loss."""
+        assert self.shown is not None
+        model, *shown = self.shown
+        set_usual(model, self.design, self.effects)
+
+        def tell(scale: float) -> None:
+            model.tastes.root.copy_(scale * root)
+            self.design, self.held_out = (
+                replace(design, tastes=added_by_tastes(model, before, design.items))
+                for design, before in zip((self.design, self.held_out), shown, strict=True)
+            )
+
+        def loss(scale: float) -> float:
+            tell(scale)
+            return float(self._best("tastes", _FIRST, ())[1][1].mean())
+
+        tell(min(_SCALES, key=loss))
+
+    def adjust(self) -> None:
+        """Choose the spreads of the effects found so far again, each given the others."""
+        for name in [*self.kept]:
+            self.kept[name], (self.effects, self.losses) = self._best(name, self.kept[name], (1,))
+
+    def report(self) -> tuple[EffectTried, ...]:
+        """The effects tried, with the final spreads of those that were kept."""
+        return tuple(
+            dataclasses.replace(tried, spread=_SPREADS[self.kept[tried.effect]])
+            if tried.kept
+            else tried
+            for tried in self.tried
+        )
+
+    def _best(
+        self, name: str, at: int, strides: tuple[int, ...]
+    ) -> tuple[int, tuple[Effects, Tensor]]:
+        """Index of the best spread of the effect `name` near `at`, the fit, and its losses."""
+        found: dict[int, tuple[Effects, Tensor]] = {}
+
+        def loss(index: int) -> float:
+            if not 0 <= index < len(_SPREADS):
+                return float("inf")
+            if index not in found:
+                spreads = {each: _SPREADS[number] for each, number in self.kept.items()}
+                if self.new_users:
+                    spreads = {each: spreads[each] for each in spreads if each not in LASTING}
+                spreads[name] = _SPREADS[index]
+                effects = fit_effects(self.design, self.effects, spreads, self._fixed)
+                found[index] = effects, self._losses(effects)
+            return float(found[index][1].mean())
+
+        for stride in strides:
+            for step in (stride, -stride):
+                start = at
+                while loss(at + step) < loss(at):
+                    at += step
+                if at != start:
+                    break
+        loss(at)
+        return at, found[at]
+
+    def _losses(self, effects: Effects) -> Tensor:
+        return self.held_out.loss(self.held_out.predictor(effects)).double()
+
+
+def set_statistics(
+    model: ItemRewardModel, rows: RewardRows, held_out: RewardRows, states: ItemStates
+) -> None:
+    """Set the normalisation of states, rewards and embeddings from the training rows."""
+    for name, part in (("training", rows), ("held-out", held_out)):
+        if len(part) == 0:
+            raise InputError(f"the reward model has no {name} steps; check the store's split")
+    values = torch.unique(rows.rewards)
+    if len(values) == 1:
+        raise InputError(
+            f"all {len(rows)} training rewards equal {float(values[0]):g}: there is nothing to "
+            "model; check the reward expression"
+        )
+    binary = len(values) == 2
+    model.binary.fill_(binary)
+    model.reward_low.fill_(values[0] if binary else states.reward_low)
+    model.reward_high.fill_(values[1] if binary else states.reward_high)
+    rewards, before = rows.rewards.double(), rows.states.double()
+    model.reward_mean.copy_(rewards.mean())
+    model.reward_std.copy_(rewards.std(correction=0))
+    model.state_mean.copy_(before.mean(0))
+    spread = before.std(0, correction=0)
+    constant = spread <= _CONSTANT * before.mean(0).abs().clamp(min=1.0)
+    model.state_std.copy_(torch.where(constant, torch.inf, spread))
+    shown = states.embeddings[rows.items].double()
+    centred = states.embeddings.double() - shown.mean(0)
+    length = centred[rows.items].square().sum(1).mean().sqrt()
+    model.vectors.copy_(centred / length.clamp(min=_CONSTANT))
+    model.likeness.start_from(states)
+
+
+def _report(
+    model: ItemRewardModel,
+    search: EffectSearch,
+    rows: RewardRows,
+    held_out: RewardRows,
+    states: ItemStates,
+    start: float,
+) -> ItemRewardReport:
+    scores, levels = scores_of(model, held_out)
+    predicted = model.expected(scores).double().numpy()
+    observed = held_out.rewards.double().numpy()
+    threshold = states.reward_low + LIKED * (states.reward_high - states.reward_low)
+    rates = item_rates(rows, rows.rewards >= threshold, len(model.item))
+    ranking = gauc_against(
+        scores - levels, rates[held_out.items], held_out.rewards >= threshold, held_out.users
+    )
+    variance = float(observed.var()) or float("nan")
+    return ItemRewardReport(
+        train_rows=len(rows),
+        validation_rows=len(held_out),
+        binary=bool(model.binary),
+        effects=search.report(),
+        new_users=search.new_users,
+        base_loss=search.base_loss,
+        item_loss=search.item_loss,
+        loss=float(search.losses.mean()),
+        r2=1 - float(np.square(predicted - observed).mean()) / variance,
+        calibration=calibration(predicted, observed),
+        seconds=time.process_time() - start,
+        **ranking,
+    )
+
+
+def _report_from(values: Mapping[str, Any]) -> ItemRewardReport:
+    """The report as it was before `dataclasses.asdict` and JSON."""
+    curve = values["calibration"]
+    return ItemRewardReport(
+        **{
+            **values,
+            "effects": tuple(EffectTried(**tried) for tried in values["effects"]),
+            "calibration": Calibration(
+                predicted=tuple(curve["predicted"]),
+                observed=tuple(curve["observed"]),
+                count=tuple(curve["count"]),
+                error=curve["error"],
+            ),
+        }
+    )

@@ -1,0 +1,154 @@
+"""The users of a training log, as the users whose sessions a decision rule is tried in.
+
+For new users, policy and reward model learn tastes from the session. In sessions whose rewards are
+drawn from that reward model, a policy is paid for its own guesses: an item that pays once, by luck,
+counts as liked and goes on paying. Here tastes are there before a session begins: those of training
+users, and nothing that acts knows them.
+
+Logs of policies that knew more of their users than the log tells make what they showed look better
+than it is for anybody else. Where the log has all propensities p, rows are therefore weighted by
+1 / (p · items), cut off at 10, as if all items had been shown alike (inverse propensity weighting).
+So that a few rows of large weight do not pass for much knowledge of a user's tastes, the weights of
+each user's rows are scaled to add up to their effective number (Pfeffermann et al., 1998,
+"Weighting for unequal selection probabilities in multilevel models").
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ucfrec import schema
+from ucfrec.arrays import IntArray
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import damage_explained
+from ucfrec.fitting.checkpoint import REMEDY, load_tensors, load_weights, save_tensors
+from ucfrec.progress import progress
+from ucfrec.user_model.reward import ItemRewardModel
+from ucfrec.user_model.reward_effects import EFFECTS, Design, fit_effects
+from ucfrec.user_model.reward_fit import (
+    EffectSearch,
+    reward_model_sizes,
+    set_statistics,
+)
+from ucfrec.user_model.reward_report import EffectTried, fit_line
+from ucfrec.user_model.reward_rows import RewardRows
+
+TRAINING_USERS: Final = "training_users.safetensors"
+"""File of the fitted users in a run folder."""
+_MAX_STEPS: Final = 100_000
+_LARGEST_WEIGHT: Final = 10.0
+"""Larger weights are cut off, so that no single row decides."""
+
+
+@dataclass(frozen=True)
+class TrainingUsers:
+    """Training users, and how their tastes were found."""
+
+    model: ItemRewardModel
+    """Rewards of items for them."""
+    calibration: tuple[float, float]
+    """Slope and intercept of its scores on training rows that were held back."""
+    effects: tuple[EffectTried, ...]
+    """The effects that were tried, judged on these rows."""
+    steps: int
+    """Logged steps that the effects are fitted to."""
+    effective_steps: float
+    """As many steps of equal weight tell as much; `steps` without propensities."""
+    weighted: bool
+    """Whether rows were weighted by propensities."""
+
+    def report(self) -> dict[str, Any]:
+        """All but the model, as a JSON object."""
+        fields = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
+        del fields["model"]
+        return {**fields, "effects": [dataclasses.asdict(tried) for tried in self.effects]}
+
+
+def fit_training_users(train: EpisodeStore, path: Path, seed: int) -> TrainingUsers:
+    """Fit the effects of training users, or read them from the file `path`.
+
+    Effects are chosen as in `ucfrec.user_model.reward_fit`, on a fifth of the rows.
+
+    Args:
+        train: view of a store of items whose episodes name their users.
+        path: receives the fitted effects.
+        seed: of the sessions drawn by `sessions_of`.
+
+    Raises:
+        InputError: all training rewards are equal, or the file is damaged.
+    """
+    model = ItemRewardModel(reward_model_sizes(train))
+    if path.exists():
+        tensors, about = load_tensors(path)
+        load_weights(path, model, tensors)
+        with damage_explained(path, REMEDY):
+            return _read(model.eval(), about)
+    sessions = sessions_of(train, seed)
+    episodes, steps = sessions.all_steps()
+    rows = RewardRows.at(sessions, episodes, steps, model.lags)
+    set_statistics(model, rows, rows, train.item_states)
+    # What the session tells of tastes is known already: states are features and observations.
+    of_session = train.item_states.size - train.item_states.user_features.shape[1]
+    model.state_std[:of_session] = torch.inf
+    weights = propensity_weights(sessions, episodes, steps, len(model.item))
+    design = Design.of(model, rows, weights)
+    judge = EffectSearch(design, design).of_training()
+    with progress(len(EFFECTS), "training users", "effects") as bar:
+        for name in EFFECTS:
+            judge.add(name)
+            bar.update()
+    tried = judge.report()
+    spreads = {each.effect: each.spread for each in tried if each.kept}
+    model.set_effects(fit_effects(design, design.mean_effect(), spreads), design.of_content)
+    held_back = judge.held_out
+    scores = held_back.predictor(judge.effects)
+    fitted = TrainingUsers(
+        model=model.eval(),
+        calibration=fit_line(scores, held_back.target, held_back.binary, held_back.weights),
+        effects=tried,
+        steps=len(rows),
+        effective_steps=design.count,
+        weighted=weights is not None,
+    )
+    save_tensors(path, model.state_dict(), fitted.report())
+    return fitted
+
+
+def sessions_of(train: EpisodeStore, seed: int) -> EpisodeStore:
+    """The training sessions, in an order drawn by `seed`; of many, the first 100,000 steps."""
+    order = np.random.default_rng([seed, 5]).permutation(train.n_episodes)
+    last = int(np.searchsorted(np.cumsum(train.lengths[order]), _MAX_STEPS))
+    return train.select(order[: last + 1])
+
+
+def propensity_weights(
+    view: EpisodeStore, episodes: IntArray, steps: IntArray, items: int
+) -> Tensor | None:
+    """What logged steps (M,) count for, as if all of `items` had been shown alike.
+
+    Of each user in proportion to 1 / (p · items), cut off at 10. Their sum is the number of the
+    user's steps of equal weight that tell as much, (Σ w)² / Σ w² (Kish). None if the log does not
+    have every p.
+    """
+    if schema.PROPENSITY not in view.meta["columns"]:
+        return None
+    propensities = view.step_values(schema.PROPENSITY, episodes, steps).astype(np.float64)
+    if not (propensities > 0).all():
+        return None
+    shares = np.minimum(1 / (propensities * items), _LARGEST_WEIGHT)
+    users = np.unique(view.episode_values(schema.USER), return_inverse=True)[1][episodes]
+    sums, squares = (np.bincount(users, weights=each) for each in (shares, np.square(shares)))
+    return torch.from_numpy(shares * (sums / squares)[users]).float()
+
+
+def _read(model: ItemRewardModel, about: Mapping[str, Any]) -> TrainingUsers:
+    slope, intercept = about["calibration"]
+    tried = tuple(EffectTried(**each) for each in about["effects"])
+    values = {**about, "calibration": (slope, intercept), "effects": tried}
+    return TrainingUsers(model=model, **values)

@@ -8,7 +8,7 @@ policy and reward model one after the other. With `--items 1000000` also for a c
 copies of the run's items. `one user's frame`: `Recommender.recommend`, beside reading the frame by
 SQL. `all users`: `ucfrec recommend` without its start, beside the way of before. `choose the rule`:
 decision rules played side by side, and one after the other. `VirtualTaobao`: pages of 4,096
-sessions, beside the authors' world (--original, their repository) page by page.
+sessions, beside the authors' environment (--original, their repository) page by page.
 
 One thread. Appends the rows to runs/acting_time/results.jsonl, or to --results, and prints a table.
 """
@@ -53,7 +53,7 @@ from ucfrec.runs.config import config_from_dict
 from ucfrec.runs.run import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.user_model.reward import ItemRewardModel
-from ucfrec.user_model.simulator import LearnedSessions
+from ucfrec.user_model.simulator import UserSimulator
 
 RESULTS = Path("runs/acting_time/results.jsonl")
 HISTORY, SESSIONS, PAGES, LOG_USERS = 20, 4096, 300, 5000
@@ -204,9 +204,9 @@ def rule_ways(trained: TrainedPolicy, store: EpisodeStore, sessions: int) -> tup
     decider, config = trained.decider(DecisionRule(target)), RuleConfig(sessions=sessions)
     search = RuleSearch(decider, *views, config, seed=0)
     rules = [
-        DecisionRule(target, floor=floor, tilt=tilt, temperature=temperature)
+        DecisionRule(target, floor=floor, reward_weight=reward_weight, temperature=temperature)
         for floor in (None, target)
-        for tilt in (0.0, 4.0)
+        for reward_weight in (0.0, 4.0)
         for temperature in (0.0, 0.5)
     ]
     _, validation = views
@@ -214,7 +214,9 @@ def rule_ways(trained: TrainedPolicy, store: EpisodeStore, sessions: int) -> tup
     assert model is not None
     users = np.arange(len(states.user_features))
     longest = int(views[0].lengths.max())
-    world = LearnedSessions(*(validation, model, search.calibration, search.end, sessions, longest))
+    environment = UserSimulator(
+        *(validation, model, search.calibration, search.end, sessions, longest)
+    )
 
     def one_by_one() -> list[float]:
         returns = []
@@ -224,7 +226,7 @@ def rule_ways(trained: TrainedPolicy, store: EpisodeStore, sessions: int) -> tup
                 *(states, None, users),
                 seed=0,
             )
-            played = rollout(world, actor, sessions, 0)  # type: ignore[arg-type]
+            played = rollout(environment, actor, sessions, 0)  # type: ignore[arg-type]
             returns.append(float(played.returns.mean()))
         return returns
 
@@ -232,7 +234,7 @@ def rule_ways(trained: TrainedPolicy, store: EpisodeStore, sessions: int) -> tup
 
 
 def taobao_ways(original: Path) -> tuple[Way, Way, tuple[int, int]]:
-    """Turn pages of many sessions at once, and of one session of the authors' world."""
+    """Turn pages of many sessions at once, and of one session of the authors' environment."""
     import gymnasium
 
     from ucfrec_simulators.taobao.virtual import VirtualTaobao

@@ -154,8 +154,8 @@ def data(out: Path) -> tuple[Path, Path]:
     logs, store, run = out / "logs", out / "store", out / "run"
     ucfrec = ("-m", "ucfrec")
     if not logs.exists():
-        world = ("--env", "synthetic-catalog", "--sessions", "4000")
-        python(*ucfrec, "collect", *world, "--out", str(logs))
+        environment = ("--env", "synthetic-catalog", "--sessions", "4000")
+        python(*ucfrec, "collect", *environment, "--out", str(logs))
     if not store.exists():
         log = str(logs / "sessions.parquet")
         python(*ucfrec, "prepare", log, "--out", str(store), "--reward", "is_click")

@@ -1,12 +1,14 @@
-"""What counterfactual copies are worth: state copies, action copies, both and tilt, against none.
+"""What counterfactual copies are worth: state copies, action copies, both and reward weight,
+against none.
 
     python benchmarks/counterfactual_copies.py --out runs/copies
 
 Trains UCF on logs of the synthetic catalogue, of several sizes, without and with a hidden mood of
 each session that moves both what the log shows and what is clicked (a confounder, planted in
 `ucfrec_simulators.synthetic_catalog`). Every arm of a log and a training seed is evaluated in the
-same episodes of the world of its log: the evaluation seed is fixed. Policies act by argmax at the
-largest training return; only `none+tilt` chooses, on its log, a weight of the reward model.
+same episodes of the environment of its log: the evaluation seed is fixed. Policies act by argmax
+at the largest training return; only `none+reward_weight` chooses, on its log, a weight of the
+reward model.
 
 Appends the rows to results.jsonl in --out, or to --results; a measured row is not measured again.
 Prints each arm's return less that of `none`, paired by log and training seed: the mean, its
@@ -25,10 +27,10 @@ import numpy as np
 
 from ucfrec.code_version import code_version
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_policy
 from ucfrec.evaluation.simulated_store import simulated_store
 from ucfrec.evaluation.simulator import Simulator
-from ucfrec.evaluation.world import World
 from ucfrec.reporting.evaluation_rows import evaluation_row
 from ucfrec.reporting.grid import Measurement, chosen, run_grid
 from ucfrec.reporting.result_row import ResultRow, RowKey
@@ -50,13 +52,13 @@ ARMS: Final = {
     "state": ("augment.copies=1",),
     "action": ("augment.copies=0", "augment.actions=2"),
     "both": ("augment.copies=1", "augment.actions=2"),
-    "none+tilt": ("augment.copies=0", *TILT),
+    "none+reward weight": ("augment.copies=0", *TILT),
 }
 """Settings of each arm beside `SIZE`."""
 
 
 @dataclass(frozen=True)
-class Catalogue(World):
+class Catalogue(Environment):
     """The synthetic catalogue, with or without moods."""
 
     mood: float = field(default=0.0, kw_only=True)
@@ -81,8 +83,8 @@ class Cell:
     episodes: int
 
     @property
-    def world(self) -> Catalogue:
-        """The world of the log and of the evaluation."""
+    def environment(self) -> Catalogue:
+        """The environment of the log and of the evaluation."""
         return Catalogue("synthetic-catalog", mood=self.mood)
 
     @property
@@ -122,7 +124,7 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     run = cell.folder / f"{cell.arm}-{cell.training_seed}-{cell.steps}-{row_key.code_version}"
     record = train_run(EpisodeStore.open(cell.folder / "store"), run, cell.config)
     trained = TrainedPolicy.load(run)
-    found = evaluate_policy(cell.world, trained, cell.arm, cell.episodes, EVALUATION_SEED)
+    found = evaluate_policy(cell.environment, trained, cell.arm, cell.episodes, EVALUATION_SEED)
     found |= {
         "train_wall_time_s": record["wall_time_s"],
         "validation_loss": record["policy"]["best_validation"],
@@ -288,7 +290,7 @@ def main() -> None:
         )
     ]
     for cell in {cell.folder: cell for cell in cells}.values():
-        simulated_store(cell.world, cell.folder, cell.sessions, cell.log_seed)
+        simulated_store(cell.environment, cell.folder, cell.sessions, cell.log_seed)
     results = options.results or options.out / "results.jsonl"
     measurement = Measurement(key, config, measure)
     said = announcement(options.workers)

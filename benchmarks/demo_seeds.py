@@ -13,7 +13,7 @@ from typing import Any
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.code_version import code_version, plugin_module
-from ucfrec.commands.demo import BEHAVIORS, LEARNERS, WORLDS, DemoConfig, demo
+from ucfrec.commands.demo import BEHAVIORS, ENVIRONMENTS, LEARNERS, DemoConfig, demo
 from ucfrec.policies.registry import policy_class
 from ucfrec.reporting.evaluation_rows import evaluation_row
 from ucfrec.reporting.result_row import ResultRow, RowKey
@@ -29,7 +29,7 @@ def row_of(evaluation: Mapping[str, Any], seed: int, code: str) -> ResultRow:
     key = RowKey(
         suite="demo",
         table="demo",
-        task=evaluation["world"],
+        task=evaluation["environment"],
         method=name,
         policy=LEARNERS[name][0] if trained else BEHAVIORS[name],
         training_seed=seed if trained else None,
@@ -57,7 +57,7 @@ def main() -> None:
     options = parser.parse_args()
     results = options.results or options.out / "results.jsonl"
     learners = {policy_class(learner).__module__ for learner, *_ in LEARNERS.values()}
-    simulators = [plugin_module("simulators", world) for world in WORLDS]
+    simulators = [plugin_module("simulators", environment) for environment in ENVIRONMENTS]
     code = code_version("ucfrec.commands.demo", *sorted(learners), *simulators)
     rows = []
     for seed in options.seeds:
@@ -71,12 +71,14 @@ def main() -> None:
                 config = read_record(run)["config"] if row.config_hash else None
                 append_rows(results, [row], config)
     lines = []
-    for world in WORLDS:
+    for environment in ENVIRONMENTS:
         for policy in ("random", "logging", *LEARNERS, "optimal"):
-            returns = [row.value for row in rows if (row.task, row.method) == (world, policy)]
+            returns = [row.value for row in rows if (row.task, row.method) == (environment, policy)]
             values = ", ".join(f"{value:.2f}" for value in returns)
-            lines.append((world, policy, mean_and_sd(returns), values))
-    print(markdown_table(("world", "policy", "R_cum, mean ± sd over seeds", "each seed"), lines))
+            lines.append((environment, policy, mean_and_sd(returns), values))
+    print(
+        markdown_table(("environment", "policy", "R_cum, mean ± sd over seeds", "each seed"), lines)
+    )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""Time per user-step: 4,096 users in one `kuairand` world against one user in a Python loop.
+"""Time per user-step: 4,096 users in one `kuairand` environment against one user in a Python loop.
 
-    python -m benchmarks.kuai_speed --world FOLDER
+    python -m benchmarks.kuai_speed --environment FOLDER
 
 Both use the same rewards, tags and exit rule. The single user runs under Gymnasium's
-`SyncVectorEnv`, so that both are vector environments. They are timed in turn. FOLDER is the `world`
-that `ucfrec benchmark recommendation` makes in its task folder. Appends a row to
+`SyncVectorEnv`, so that both are vector environments. They are timed in turn. FOLDER is the
+`environment` that `ucfrec benchmark recommendation` makes in its task folder. Appends a row to
 runs/kuai_speed/results.jsonl, or to --results.
 """
 
@@ -39,13 +39,15 @@ def seconds_a_step(env: Any, steps: int, generator: np.random.Generator, n_items
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--world", type=Path, required=True, help="folder of the kuairand world")
+    parser.add_argument(
+        "--environment", type=Path, required=True, help="folder of the kuairand environment"
+    )
     parser.add_argument("--rounds", type=int, default=9, help="timed rounds (default: 9)")
     parser.add_argument(
         "--results", type=Path, default=RESULTS, help=f"file of result rows (default: {RESULTS})"
     )
     options = parser.parse_args()
-    many = kuairand(USERS, options.world)
+    many = kuairand(USERS, options.environment)
     one = SyncVectorEnv(
         [lambda: OneUser(many.rewards, many.tags, many.exit_rule)],
         autoreset_mode=AutoresetMode.SAME_STEP,
@@ -58,7 +60,10 @@ def main() -> None:
         if turn:  # the first turn warms up
             ratios.append(slow[-1] / fast[-1])
     low, middle, high = np.quantile(ratios, [0.1, 0.5, 0.9])
-    print(f"{USERS} users in one world: 1/{middle:.0f} [1/{low:.0f}, 1/{high:.0f}] per user-step")
+    print(
+        f"{USERS} users in one environment: 1/{middle:.0f} [1/{low:.0f}, 1/{high:.0f}] per "
+        "user-step"
+    )
     row = ResultRow(
         suite="kuai-speed",
         table="kuai-speed",

@@ -5,7 +5,7 @@
 The users of KuaiRand-Pure, whose files are in $UCFREC_DATA/kuairand, are drawn into five parts:
 three to fit the reward model of items to, one that chooses its effects, one that judges them and
 that nothing else has seen. The model is fitted with and without tastes learned within the session
-(`SessionTastes`), and for items alone, in three draws. The log loss on the judged users' clicks
+(`UserPosterior`), and for items alone, in three draws. The log loss on the judged users' clicks
 tells of both how much and what users like; the AUC, over all users, of how much more the shown item
 scores than the mean of all items, tells what. (GAUC would compare a user's clicks with the steps
 that they themselves changed.) Appends rows to results.jsonl in --out, or to --results.

@@ -1,7 +1,7 @@
 """How often the best of four policies is chosen from logs, where the truth is known.
 
     python benchmarks/off_policy_selection.py                        # 200 replications of each
-    python benchmarks/off_policy_selection.py --worlds synthetic-taobao --replications 20
+    python benchmarks/off_policy_selection.py --environments synthetic-taobao --replications 20
 
 In the synthetic catalogue, logs of one softmax policy over guessed tastes judge four others that
 are sharper or flatter and show more or less variety; their values are those of 20,000 sessions
@@ -82,14 +82,14 @@ class Watched(Actor, Protocol):
     rows that are not live."""
 
 
-class World(Protocol):
+class Environment(Protocol):
     """Where logs come from, and what the candidates are worth there."""
 
     candidates: tuple[str, ...]
     densities: bool
 
     def playing(self, seed: int) -> tuple[VectorEnv[Any, Any, Any], Watched]:
-        """The world, and the logging policy in it."""
+        """The environment, and the logging policy in it."""
         ...
 
     def values(self) -> dict[str, float]:
@@ -100,8 +100,10 @@ class World(Protocol):
 class GuessedTastes(SoftmaxGuess):
     """Logs of the catalogue."""
 
-    def __init__(self, world: SyntheticCatalog, seed: int, others: list[SoftmaxGuess]) -> None:
-        super().__init__(world, seed, *Catalogue.LOGGING)
+    def __init__(
+        self, environment: SyntheticCatalog, seed: int, others: list[SoftmaxGuess]
+    ) -> None:
+        super().__init__(environment, seed, *Catalogue.LOGGING)
         self._others, self.thought = others, np.empty((0, len(others)))
 
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[IntArray, Float32Array]:
@@ -128,15 +130,17 @@ class Catalogue:
     densities = False
 
     def playing(self, seed: int) -> tuple[SyntheticCatalog, GuessedTastes]:
-        world = SyntheticCatalog(PARALLEL)
-        others = [SoftmaxGuess(world, seed, *knobs) for knobs in self.CANDIDATES.values()]
-        return world, GuessedTastes(world, seed, others)
+        environment = SyntheticCatalog(PARALLEL)
+        others = [SoftmaxGuess(environment, seed, *knobs) for knobs in self.CANDIDATES.values()]
+        return environment, GuessedTastes(environment, seed, others)
 
     def values(self) -> dict[str, float]:
         found = {}
         for name, knobs in self.CANDIDATES.items():
-            world = SyntheticCatalog(PARALLEL)
-            played = rollout(world, SoftmaxGuess(world, 1, *knobs), self.PLAYED, seed=10**6)
+            environment = SyntheticCatalog(PARALLEL)
+            played = rollout(
+                environment, SoftmaxGuess(environment, 1, *knobs), self.PLAYED, seed=10**6
+            )
             found[name] = float(played.returns.mean())
         return found
 
@@ -144,13 +148,13 @@ class Catalogue:
 class NoisyBlend(Memoryless):
     """Logs of SyntheticTaobao."""
 
-    def __init__(self, of: "Taobao", world: SyntheticTaobao, seed: int) -> None:
-        self._of, self._world = of, world
+    def __init__(self, of: "Taobao", environment: SyntheticTaobao, seed: int) -> None:
+        self._of, self._environment = of, environment
         self._generator = np.random.default_rng([seed, 7])
         self.thought = np.empty((0, len(of.candidates)))
 
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[Float32Array, Float32Array]:
-        best = self._world.optimal_actions(observations)
+        best = self._environment.optimal_actions(observations)
         chosen, density = truncated_normal(mean(best, self._of.LOGGING), NOISE, self._generator)
         self.thought = np.zeros((len(chosen), len(self._of.candidates)))
         for number, quality in enumerate(self._of.qualities.values()):
@@ -180,33 +184,33 @@ class Taobao:
         self.candidates = tuple(self.qualities)
 
     def playing(self, seed: int) -> tuple[SyntheticTaobao, NoisyBlend]:
-        world = SyntheticTaobao(PARALLEL)
-        return world, NoisyBlend(self, world, seed)
+        environment = SyntheticTaobao(PARALLEL)
+        return environment, NoisyBlend(self, environment, seed)
 
     def values(self) -> dict[str, float]:
-        world = SyntheticTaobao(1)
-        users, lengths = world.sample_users(self.USERS, np.random.default_rng(10**6))
+        environment = SyntheticTaobao(1)
+        users, lengths = environment.sample_users(self.USERS, np.random.default_rng(10**6))
         owner = np.repeat(np.arange(self.USERS), lengths)
         page = np.arange(len(owner)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
-        best, found = world.best_actions(users[owner], page), {}
+        best, found = environment.best_actions(users[owner], page), {}
         for name, quality in self.qualities.items():
             # The same draws for all: what they differ by has hardly an error.
             drawn, _ = truncated_normal(mean(best, quality), NOISE, np.random.default_rng(10**6))
-            clicks = world.expected_clicks(users[owner], page, drawn)
+            clicks = environment.expected_clicks(users[owner], page, drawn)
             found[name] = float(clicks.sum() / self.USERS)
         return found
 
 
-WORLDS: Mapping[str, World] = {
+ENVIRONMENTS: Mapping[str, Environment] = {
     "synthetic-catalog": Catalogue(),
     "synthetic-taobao": Taobao((-0.01, 0.005, 0.01, 0.015)),
     "synthetic-taobao, far apart": Taobao((-0.1, 0.1, 0.2, 0.3)),
 }
 
 
-def logs(world: World, sessions: int, seed: int) -> tuple[LoggedSteps, Float64Array]:
+def logs(environment: Environment, sessions: int, seed: int) -> tuple[LoggedSteps, Float64Array]:
     """Logged steps, and each candidate's probabilities or densities (N, 4) of what was logged."""
-    env, actor = world.playing(seed)
+    env, actor = environment.playing(seed)
     parts: list[Float64Array] = []
 
     def keep(step: Step) -> None:
@@ -227,7 +231,7 @@ def logs(world: World, sessions: int, seed: int) -> tuple[LoggedSteps, Float64Ar
         propensity=table[:, 2],
         target=np.zeros(len(table)),
         user=table[first, 3].astype(np.int64),
-        densities=world.densities,
+        densities=environment.densities,
     )
     return steps, table[:, 4:]
 
@@ -241,17 +245,17 @@ class Replication:
     """Whether the verdict of each candidate stands."""
 
 
-def replication(world: World, sessions: int, seed: int) -> dict[str, Replication]:
+def replication(environment: Environment, sessions: int, seed: int) -> dict[str, Replication]:
     """Of each estimator."""
-    steps, targets = logs(world, sessions, seed)
-    most = np.inf if world.densities else 1.0
+    steps, targets = logs(environment, sessions, seed)
+    most = np.inf if environment.densities else 1.0
     judged = [replace(steps, target=target) for target in targets.T.clip(0, most)]
     stands = tuple(judge(one, seed).reliable for one in judged)
     terms = [session_terms(one) for one in judged]
     return {
         name: Replication(
             select(
-                world.candidates,
+                environment.candidates,
                 np.stack([influences(one[name]) for one in terms], axis=1),
                 seed,
                 steps.user,
@@ -303,21 +307,23 @@ def line(name: str, numbers: Mapping[str, float]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--worlds", nargs="+", choices=list(WORLDS), default=list(WORLDS))
+    parser.add_argument(
+        "--environments", nargs="+", choices=list(ENVIRONMENTS), default=list(ENVIRONMENTS)
+    )
     parser.add_argument("--replications", type=int, default=200)
     parser.add_argument("--sessions", type=int, default=3000)
     parser.add_argument(
         "--results", type=Path, default=RESULTS, help=f"file of result rows (default: {RESULTS})"
     )
     options = parser.parse_args()
-    for name in options.worlds:
-        began, world = time.perf_counter(), WORLDS[name]
-        values = world.values()
+    for name in options.environments:
+        began, environment = time.perf_counter(), ENVIRONMENTS[name]
+        values = environment.values()
         print(f"{name}: " + ", ".join(f"{one} {value:.3f}" for one, value in values.items()))
         found: dict[str, list[Replication]] = {one: [] for one in ESTIMATORS}
         with progress(options.replications, name, "replications") as bar:
             for seed in range(options.replications):
-                made = replication(world, options.sessions, 100_000 + 1000 * seed)
+                made = replication(environment, options.sessions, 100_000 + 1000 * seed)
                 for estimator, one in made.items():
                     found[estimator].append(one)
                 bar.update()

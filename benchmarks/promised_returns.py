@@ -1,18 +1,19 @@
-"""What models of the users promise of decision rules, and what comes in the world.
+"""What models of the users promise of decision rules, and what comes in the environment.
 
     python benchmarks/promised_returns.py --out runs/promised           # ten minutes on one core
     python benchmarks/promised_returns.py --out runs/promised --log 1   # nothing was decided on it
 
 In SARDINE's BoredInf, whose users are new in every session: UCF and BC are trained on 500 sessions
 of its oracles at the sizes of the benchmark's small budget. The rule of each is played at every
-tilt and temperature in three models of the users, each fitted to the log alone, and in the world:
+reward weight and temperature in three models of the users, each fitted to the log alone, and in
+the environment:
 
 - reward model: rewards are drawn from the run's reward model, which learns tastes from the session;
 - training users: users have the tastes of training users;
 - weighted: the same, fitted with the log's propensities, as `train` does.
 
 The table says what each promises; then how far promises are off in the mean, and Spearman's rank
-correlation with the world, over the rules of a policy.
+correlation with the environment, over the rules of a policy.
 """
 
 import argparse
@@ -31,9 +32,9 @@ from ucfrec.choosing.by_simulation import RuleSearch
 from ucfrec.choosing.config import RuleConfig
 from ucfrec.code_version import code_version
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_policy
 from ucfrec.evaluation.simulated_store import simulated_store
-from ucfrec.evaluation.world import World
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows, read_rows
@@ -45,10 +46,10 @@ from ucfrec.schema import PROPENSITY
 from ucfrec.user_model.training_users import TrainingUsers, fit_training_users
 from ucfrec_simulators.benchmark.plan import BUDGETS
 
-WORLD, SESSIONS, EPISODES, SEED = World("sardine-boredinf"), 500, 300, 3_000_000
+ENVIRONMENT, SESSIONS, EPISODES, SEED = Environment("sardine-boredinf"), 500, 300, 3_000_000
 POLICIES = {"ucf": ("policy.context=11",), "bc": ()}
 RULES = tuple(product((1.0, 0.5), (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)))
-"""Temperatures and tilts."""
+"""Temperatures and reward weights."""
 MODELS = ("reward model", "training users", "weighted")
 
 
@@ -65,20 +66,20 @@ def without_propensities(logs: Path, folder: Path, log: int) -> Path:
         table = pq.read_table(file)
         kept = [name for name in table.column_names if name != PROPENSITY]
         pq.write_table(table.select(kept), target)
-    return simulated_store(WORLD, folder, SESSIONS, log)
+    return simulated_store(ENVIRONMENT, folder, SESSIONS, log)
 
 
 def measured(
     name: str, out: Path, log: int, seed: int
 ) -> tuple[list[ResultRow], Mapping[str, Any]]:
     """Rows of the rules of one policy, and the configuration of its training."""
-    path = simulated_store(WORLD, out / "told", SESSIONS, log)
+    path = simulated_store(ENVIRONMENT, out / "told", SESSIONS, log)
     bare = without_propensities(out / "told" / "logs", out / "untold", log)
     store = EpisodeStore.open(path)
     config = resolve_config(name, None, (*BUDGETS["small"].settings, *POLICIES[name]), seed)
     train_run(store, out / f"{name}-{seed}", config)
     trained = TrainedPolicy.load(out / f"{name}-{seed}")
-    rules = [replace(trained.rule, temperature=t, tilt=b) for t, b in RULES]
+    rules = [replace(trained.rule, temperature=t, reward_weight=b) for t, b in RULES]
     train, validation = training_views(store)
     given = trained.decider(DecisionRule(trained.rule.target)), train, validation, RuleConfig(), 0
     users = {
@@ -104,17 +105,21 @@ def row(
     store: EpisodeStore,
 ) -> ResultRow:
     """The row of a rule: what was promised of it, and what it earns."""
-    played = evaluate_policy(WORLD, trained, name, EPISODES, SEED, rule)
+    played = evaluate_policy(ENVIRONMENT, trained, name, EPISODES, SEED, rule)
     return ResultRow(
         suite="promised-returns",
         table="promised-returns",
-        task=WORLD.name,
+        task=ENVIRONMENT.name,
         method=name,
         policy=name,
         training_seed=seed,
         log_seed=log,
         evaluation_seed=SEED,
-        conditions={"temperature": rule.temperature, "tilt": rule.tilt, "episodes": EPISODES},
+        conditions={
+            "temperature": rule.temperature,
+            "reward_weight": rule.reward_weight,
+            "episodes": EPISODES,
+        },
         config_hash=config_hash(trained.record["config"]),
         code_version=code_version(RuleSearch.__module__, fit_training_users.__module__),
         data_fingerprint=store.meta["fingerprint"],
@@ -134,7 +139,7 @@ def tables(rows: Sequence[ResultRow]) -> str:
         own = [row for row in rows if row.method == name]
         for each in own:
             promised = [f"{each.metrics[model]:.1f}" for model in MODELS]
-            rule = (each.conditions["temperature"], each.conditions["tilt"])
+            rule = (each.conditions["temperature"], each.conditions["reward_weight"])
             lines.append((name, *rule, *promised, f"{each.value:.1f}"))
         earned = np.array([each.value for each in own])
         for model in MODELS:
@@ -143,7 +148,7 @@ def tables(rows: Sequence[ResultRow]) -> str:
             agreement.append(
                 (name, model, f"{np.abs(promises - earned).mean():.1f}", f"{rank:.2f}")
             )
-    head = ("policy", "temperature", "tilt", *MODELS, "world")
+    head = ("policy", "temperature", "reward_weight", *MODELS, "environment")
     told = markdown_table(("policy", "model", "off by, mean", "rank correlation"), agreement)
     return f"{markdown_table(head, lines)}\n\n{told}"
 

@@ -38,7 +38,7 @@ PUBLISHED = """\
 | CDT4Rec | 7.33 ± 1.98 | 0.651 | 30.49 ± 10.19 | 1.006 | 79.21 ± 22.38 | 5.649 |
 | EDT4Rec | 7.58 ± 1.84 | 0.650 | 31.07 ± 10.98 | 1.040 | 79.67 ± 21.67 | 5.674 |
 | UCF | 7.62 ± 1.79 | 0.655 | 31.87 ± 10.55 | 1.058 | 80.42 ± 21.15 | 5.696 |"""
-WORLDS = (
+ENVIRONMENTS = (
     "**VirtualTaobao** cannot tell good methods apart: one constant action earns 10 clicks of 10 "
     "on every page.",
     "**KuaiRand FB and NX_0** (N = 10) tell whether a policy stops repeating tags, and then how "
@@ -54,7 +54,7 @@ WORLDS = (
     "tell](numbers.md#what-they-cannot-tell).",
 )
 BUILT_IN = ("oracle", "optimal", "best-constant")
-"""Policies that know a world; never the best of a column."""
+"""Policies that know an environment; never the best of a column."""
 
 
 def fill(text: str, subsequent_indent: str = "") -> str:
@@ -104,32 +104,35 @@ def _origin(rows: Sequence[ResultRow], command: str) -> str:
 def pivot(
     rows: Sequence[ResultRow], cell: Callable[[str, str, Sequence[ResultRow]], str], methods: Any
 ) -> str:
-    """One line a method and one column a world; `cell` is given (world, method, their rows)."""
-    worlds = list(dict.fromkeys(str(row.world) for row in rows))
-    of = grouped(rows, lambda row: (str(row.world), row.method))
+    """One line a method and one column an environment; `cell` is given (environment, method, their
+    rows)."""
+    environments = list(dict.fromkeys(str(row.environment) for row in rows))
+    of = grouped(rows, lambda row: (str(row.environment), row.method))
     named = {row.method: None for row in rows}
     order = [*(n for n in named if n not in methods), *(n for n in methods if n in named)]
     lines = [
-        (name, *(cell(w, name, of[w, name]) if (w, name) in of else NONE for w in worlds))
+        (name, *(cell(w, name, of[w, name]) if (w, name) in of else NONE for w in environments))
         for name in order
     ]
-    return markdown_table(("method", *worlds), lines)
+    return markdown_table(("method", *environments), lines)
 
 
 def returns_and_differences(rows: Sequence[ResultRow]) -> str:
     """Returns, then average rewards, then what each method earns less than UCF."""
     best: dict[str, float] = {}
-    for (world, method), group in grouped(rows, lambda row: (str(row.world), row.method)).items():
+    for (environment, method), group in grouped(
+        rows, lambda row: (str(row.environment), row.method)
+    ).items():
         mean = summary(row.value for row in group).mean
         if method not in BUILT_IN:
-            best[world] = max(best.get(world, mean), mean)
+            best[environment] = max(best.get(environment, mean), mean)
 
-    def earned(world: str, method: str, group: Sequence[ResultRow]) -> str:
+    def earned(environment: str, method: str, group: Sequence[ResultRow]) -> str:
         said = mean_and_sd(row.value for row in group)
-        is_best = summary(row.value for row in group).mean == best.get(world)
+        is_best = summary(row.value for row in group).mean == best.get(environment)
         return f"**{said}**" if is_best and method not in BUILT_IN else said
 
-    def average(world: str, method: str, group: Sequence[ResultRow]) -> str:
+    def average(environment: str, method: str, group: Sequence[ResultRow]) -> str:
         return mean_and_sd(row.metrics["R_avg_episode"] for row in group)
 
     differences = difference_to_ours(rows)
@@ -142,7 +145,7 @@ def returns_and_differences(rows: Sequence[ResultRow]) -> str:
             "R_cum less that of `ucf` of the same log and seed, ± standard error over the pairs, "
             "in brackets over the means of logs:"
         ),
-        pivot(rows, lambda world, method, _: differences[world, method], METHODS),
+        pivot(rows, lambda environment, method, _: differences[environment, method], METHODS),
     ]
     return "\n\n".join(parts)
 
@@ -151,10 +154,10 @@ def additions(rows: Sequence[ResultRow]) -> str:
     """What UCF earns with and without each addition, as differences."""
     differences = difference_to_ours(rows)
 
-    def cell(world: str, method: str, group: Sequence[ResultRow]) -> str:
+    def cell(environment: str, method: str, group: Sequence[ResultRow]) -> str:
         if method == "ucf":
             return mean_and_sd(row.value for row in group)
-        return differences[world, method]
+        return differences[environment, method]
 
     return pivot(rows, cell, {"ucf": None, **ADDITIONS, **PAPER})
 
@@ -162,7 +165,7 @@ def additions(rows: Sequence[ResultRow]) -> str:
 def promises(rows: Sequence[ResultRow]) -> str:
     """What was promised of the chosen rules, and what came; then how far off it was."""
 
-    def cell(world: str, method: str, group: Sequence[ResultRow]) -> str:
+    def cell(environment: str, method: str, group: Sequence[ResultRow]) -> str:
         said = summary(row.metrics["promised"] for row in group).mean
         return f"{said:.3g} → {summary(row.value for row in group).mean:.3g}"
 
@@ -170,11 +173,11 @@ def promises(rows: Sequence[ResultRow]) -> str:
         return f"{summary(abs(row.metrics['promised'] - row.value) for row in own).mean:.2g}"
 
     lines = []
-    for world, own in grouped(rows, lambda row: str(row.world)).items():
+    for environment, own in grouped(rows, lambda row: str(row.environment)).items():
         logs = grouped(own, lambda row: str(row.log_seed)).items()
         of_logs = ", ".join(f"log {name} {off(group)}" for name, group in logs)
-        lines.append((world, len(own), off(own), of_logs))
-    told = markdown_table(("world", "rows", "off by, mean", "by log"), lines)
+        lines.append((environment, len(own), off(own), of_logs))
+    told = markdown_table(("environment", "rows", "off by, mean", "by log"), lines)
     return f"{pivot(rows, cell, METHODS)}\n\n{told}"
 
 
@@ -246,10 +249,10 @@ SECTIONS = (
     Section(
         "Recommendation (Table 2)",
         "A learner's name stands for it as its authors have it, `+` for it with what UCF has as "
-        "well: exposure features, and a decision rule with a tilt by the reward model, chosen on "
-        "the log. `ucf-plain` is UCF without them, `ucf-paper` the paper's. `…-mask` leaves out "
-        "the tags of the last ten items. Bold is the highest of a column among what knows no "
-        "world.",
+        "well: exposure features, and a decision rule with a reward weight by the reward model, "
+        "chosen on the log. `ucf-plain` is UCF without them, `ucf-paper` the paper's. `…-mask` "
+        "leaves out the tags of the last ten items. Bold is the highest of a column among what "
+        "knows no environment.",
         f"{RUN} main",
         of("recommendation", "main"),
         returns_and_differences,
@@ -265,8 +268,8 @@ SECTIONS = (
     Section(
         "What was promised, and what came",
         "The return that the model of the users, fitted to the log alone, gave the rule that was "
-        "chosen, and the return in the world: means over logs and training seeds. Rows measured "
-        "before they said so are missing.",
+        "chosen, and the return in the environment: means over logs and training seeds. Rows "
+        "measured before they said so are missing.",
         f"{RUN} main",
         promised,
         promises,
@@ -355,14 +358,16 @@ def page(files: Mapping[str, Sequence[ResultRow]], pictures: Sequence[str]) -> s
         "goes on where it was interrupted."
     )
     paper = fill(
-        "**Its numbers, of its worlds**: they do not compare with ours. "
+        "**Its numbers, of its environments**: they do not compare with ours. "
         "The best public match for a return of 7 to 8 in KuaiRand is repeats allowed with N = 10; "
-        "DORL's published 11.85 over 27.6 steps is NX_0 at N = 4, the worlds `kuairand-n4-nx0` "
-        "here. KuaiRec's files were not at hand."
+        "DORL's published 11.85 over 27.6 steps is NX_0 at N = 4, the environments "
+        "`kuairand-n4-nx0` here. KuaiRec's files were not at hand."
     )
     shown = "\n".join(f"![{name}](assets/tables/{name}.svg)" for name in pictures)
-    worlds = "\n".join(fill(f"- {world}", subsequent_indent="  ") for world in WORLDS)
-    parts = ["# Tables", head, "## What each world can and cannot tell", worlds]
+    environments = "\n".join(
+        fill(f"- {environment}", subsequent_indent="  ") for environment in ENVIRONMENTS
+    )
+    parts = ["# Tables", head, "## What each environment can and cannot tell", environments]
     parts += [section.text(files) for section in SECTIONS if section.rows(files)]
     parts += ["## The paper's Table 2", paper, PUBLISHED]
     parts += ["## Pictures", shown] if pictures else []

@@ -19,7 +19,7 @@ def draw(
     control: Mapping[str, Sequence[ResultRow]],
     folder: Path,
 ) -> None:
-    """Draw each world of Table 2, the copies, and control's scores.
+    """Draw each environment of Table 2, the copies, and control's scores.
 
     Args:
         main: rows of the recommendation benchmark's main table.
@@ -27,17 +27,17 @@ def draw(
         control: rows of the control benchmark, by the table's name.
         folder: gets a picture each.
     """
-    for world, group in grouped(main, lambda row: str(row.world)).items():
+    for environment, group in grouped(main, lambda row: str(row.environment)).items():
         figure = Figure(figsize=(5.2, 4.6))
         axes = figure.add_subplot()
-        axes.set_title(world)
+        axes.set_title(environment)
         found = {
             name: summary(row.value for row in rows)
             for name, rows in grouped(group, lambda row: row.method).items()
         }
         _bars(axes, found, {name: each.sd for name, each in found.items()})
         axes.set_xlabel("return of a session (mean ± sd over logs and training seeds)")
-        save(figure, folder, f"table-2-{world}")
+        save(figure, folder, f"table-2-{environment}")
     _draw_copies(copies, folder)
     for table, rows in control.items():
         _draw_control(rows, folder, f"control-{table}")

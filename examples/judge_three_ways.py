@@ -3,8 +3,9 @@
 Run it with `python examples/judge_three_ways.py [FOLDER]`; it takes about a minute on two cores.
 
 The three ways answer different questions and can disagree. Here all three are possible, because the
-logs come from a simulated world, `synthetic-catalog`: the first way gives the truth in that world,
-and the others can be held against it. With real logs only the second and the third remain.
+logs come from a simulated environment, `synthetic-catalog`: the first way gives the truth in that
+environment, and the others can be held against it. With real logs only the second and the third
+remain.
 """
 
 import sys
@@ -17,7 +18,7 @@ import pandas as pd
 from ucfrec import EpisodeStore
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.evaluation.collect import collect
-from ucfrec.evaluation.evaluate import World, evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.evaluate import Environment, evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.simulated_store import simulated_store
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.off_policy.evaluate import evaluate_off_policy
@@ -27,7 +28,7 @@ from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 
-WORLD = World("synthetic-catalog")
+ENVIRONMENT = Environment("synthetic-catalog")
 SMALL = ["train.steps=600", "train.learning_rate=3e-3", "train.cosine=true"]
 SMALL += ["train.warmup_steps=50", "policy.dim=32"]
 LEARNERS = {"ucf": [*SMALL, "policy.context=10", "crm.epochs=2"], "bc": SMALL}
@@ -39,7 +40,7 @@ def train(folder: Path) -> dict[str, Path]:
 
     Behaviour cloning (`bc`) imitates the logs. UCF is told, in every step, what return is wanted.
     """
-    store = EpisodeStore.open(simulated_store(WORLD, folder, sessions=2500, seed=0))
+    store = EpisodeStore.open(simulated_store(ENVIRONMENT, folder, sessions=2500, seed=0))
     runs = {}
     for learner, settings in LEARNERS.items():
         runs[learner] = folder / learner
@@ -55,12 +56,12 @@ def train(folder: Path) -> dict[str, Path]:
 
 def by_playing(runs: dict[str, Path]) -> list[dict[str, object]]:
     """One result row a policy: `R_cum` is the mean return of an episode."""
-    rows = [evaluate_behavior(WORLD, name, EPISODES, SEED) for name in ("random", "mixture")]
+    rows = [evaluate_behavior(ENVIRONMENT, name, EPISODES, SEED) for name in ("random", "mixture")]
     for name, run in runs.items():
         trained = TrainedPolicy.load(run)
         # By the run's own rule, which was chosen on its log.
-        rows.append(evaluate_policy(WORLD, trained, name, EPISODES, SEED, trained.rule))
-    rows.append(evaluate_behavior(WORLD, "optimal", EPISODES, SEED))
+        rows.append(evaluate_policy(ENVIRONMENT, trained, name, EPISODES, SEED, trained.rule))
+    rows.append(evaluate_behavior(ENVIRONMENT, "optimal", EPISODES, SEED))
     return rows
 
 
@@ -132,10 +133,10 @@ def main(folder: Path) -> tuple[list[dict[str, object]], pd.DataFrame, pd.DataFr
     played = by_playing(runs)
     print(f"1. played in the simulator\n{format_rows(played)}\n")
 
-    simulator = WORLD.simulator()
+    simulator = ENVIRONMENT.simulator()
     env = simulator.make(256, None)
     actor = simulator.behaviors["mixture"](env, SEED)
-    about = {"env_name": WORLD.name, "behavior": "mixture"}
+    about = {"env_name": ENVIRONMENT.name, "behavior": "mixture"}
     collect(simulator, env, actor, 800, SEED, folder / "fresh", **about)
 
     print("2. estimated from new logs")

@@ -48,7 +48,7 @@ TESTED_HERE = {
     "tests/test_readme.py",
     "tests/test_start.py",
     "tests/simulators/benchmark/test_benchmark.py",
-    "tests/simulators/test_synthetic_worlds.py",
+    "tests/simulators/test_synthetic_environments.py",
 }
 """Tests of several modules of the room that they lie in, or of the project as a whole."""
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 from ucfrec.errors import InputError
 
 if TYPE_CHECKING:
-    from ucfrec.evaluation.world import World
+    from ucfrec.evaluation.environment import Environment
     from ucfrec.reporting.result_row import ResultRow
 
 _ONE_OF: Final = {
@@ -61,8 +61,8 @@ class BenchmarkRequest:
     """Number of logs of each task; None for the budget's."""
     evaluation_seed: int | None = None
     """Seed of the evaluation episodes; None stands for the budget's."""
-    world: "World | None" = None
-    """A world that is measured instead of the suite's tasks; None for these."""
+    environment: "Environment | None" = None
+    """An environment that is measured instead of the suite's tasks; None for these."""
     tasks: Sequence[str] = ()
     """Names of the only tasks to measure; empty for all."""
     methods: Sequence[str] = ()

@@ -1,4 +1,5 @@
-"""Built-in behavior policies shared by the worlds; each is an `ucfrec.acting.rollout.Actor`."""
+"""Built-in behavior policies shared by the environments; each is an
+`ucfrec.acting.rollout.Actor`."""
 
 from collections.abc import Callable, Sequence
 

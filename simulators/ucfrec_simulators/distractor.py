@@ -1,7 +1,8 @@
 """A distractor in the observations: correlated with the reward in the logs, without any effect.
 
-It is the first number of the observation, in stores and in worlds: a policy reads as many numbers
-of a world's observation as its logs had, and KuaiRand's logs have none but the distractor.
+It is the first number of the observation, in stores and in environments: a policy reads as many
+numbers of an environment's observation as its logs had, and KuaiRand's logs have none but the
+distractor.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,8 +21,8 @@ from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.episodes.distractor import logged_observations, reward_bit, with_observations
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.simulator import Simulator
-from ucfrec.evaluation.world import World
 from ucfrec_simulators.kuai import kuairand
 from ucfrec_simulators.taobao import synthetic as synthetic_taobao
 
@@ -53,7 +54,7 @@ def plant_distractor(
 
 
 class DistractorEnv(VectorWrapper[Float32Array, Array, Array]):
-    """A world whose observation starts with a distractor that has no effect.
+    """An environment whose observation starts with a distractor that has no effect.
 
     In each step the distractor is 1 with probability `rate`, independently of everything else:
     do(d ~ Bernoulli(rate)), from a separate random generator. With rate 0 it is always off, with 1
@@ -61,7 +62,7 @@ class DistractorEnv(VectorWrapper[Float32Array, Array, Array]):
     misled by the distractor from one that fails when it never occurs.
 
     Args:
-        env: the world, with observations (N, O); those of this one are (N, 1 + O).
+        env: the environment, with observations (N, O); those of this one are (N, 1 + O).
         rate: probability that the distractor is on.
 
     Raises:
@@ -87,7 +88,7 @@ class DistractorEnv(VectorWrapper[Float32Array, Array, Array]):
         seed: int | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Float32Array, dict[str, Any]]:
-        """Start all sessions; `seed` seeds the world and, independently, the distractors."""
+        """Start all sessions; `seed` seeds the environment and, independently, the distractors."""
         observations, info = super().reset(seed=seed, options=options)
         if seed is not None:
             self._distractors = np.random.default_rng([seed, 31])
@@ -96,7 +97,7 @@ class DistractorEnv(VectorWrapper[Float32Array, Array, Array]):
     def step(
         self, actions: Array
     ) -> tuple[Float32Array, Float32Array, BoolArray, BoolArray, dict[str, Any]]:
-        """Play one action in each session, as the wrapped world does."""
+        """Play one action in each session, as the wrapped environment does."""
         observations, rewards, terminated, truncated, info = self.env.step(actions)
         if "final_obs" in info:
             rows = np.flatnonzero(info["_final_obs"])
@@ -111,7 +112,8 @@ class DistractorEnv(VectorWrapper[Float32Array, Array, Array]):
 
 
 class WithoutDistractor:
-    """A behavior policy of the wrapped world; it reads observations without the distractor."""
+    """A behavior policy of the wrapped environment; it reads observations without the
+    distractor."""
 
     def __init__(self, actor: Actor) -> None:
         self._actor = actor
@@ -122,7 +124,7 @@ class WithoutDistractor:
         return self._actor.act(observations[:, 1:], live)
 
     def inform(self, info: Mapping[str, Any]) -> None:
-        """Pass the world's `info` to the policy, if it reads it."""
+        """Pass the environment's `info` to the policy, if it reads it."""
         if isinstance(self._actor, Informed):
             self._actor.inform(info)
 
@@ -137,7 +139,7 @@ def _without_distractor(
 
 
 def with_distractor(simulator: Simulator, rate: float) -> Simulator:
-    """The simulator with a distractor that is on with probability `rate` in its world."""
+    """The simulator with a distractor that is on with probability `rate` in its environment."""
     state = {OFF: "off", ON: "always on"}.get(rate, f"drawn with probability {rate:g}")
     return replace(
         simulator,
@@ -151,8 +153,8 @@ def with_distractor(simulator: Simulator, rate: float) -> Simulator:
 
 
 @dataclass(frozen=True)
-class DistractorWorld(World):
-    """A named world with a distractor added, for `ucfrec.evaluation.evaluate`."""
+class DistractorEnvironment(Environment):
+    """A named environment with a distractor added, for `ucfrec.evaluation.evaluate`."""
 
     rate: float = OFF
     """Probability that the distractor is on in a step."""

@@ -1,4 +1,4 @@
-"""The default folder of the worlds' files, and names of folders."""
+"""The default folder of the environments' files, and names of folders."""
 
 import os
 import re
@@ -11,5 +11,6 @@ def data_folder(name: str) -> Path:
 
 
 def folder_name(name: str) -> str:
-    """The name of a task or world without characters that a path gives a meaning, such as "/"."""
+    """The name of a task or environment without characters that a path gives a meaning, such as
+    "/"."""
     return re.sub(r"[^\w,.= -]+", "-", name)

@@ -1,4 +1,4 @@
-"""SARDINE's worlds of single items: tastes that only feedback tells, and boredom.
+"""SARDINE's environments of single items: tastes that only feedback tells, and boredom.
 
 SARDINE is the simulator of Deffayet et al. (2024), the package `sardine-rec` (extra `sardine`),
 which is played as published. A session has 100 steps. One of 1,000 items is shown in each and
@@ -21,7 +21,7 @@ from gymnasium.vector import VectorEnv
 from ucfrec.acting.uniform import Actions, Uniform
 from ucfrec.arrays import BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.evaluation.gymnasium_world import GymnasiumCatalog
+from ucfrec.evaluation.gymnasium_environment import GymnasiumCatalog
 from ucfrec.evaluation.simulator import Simulator
 from ucfrec.schema import ITEM_ID
 
@@ -30,11 +30,11 @@ EPSILONS: Final = (0.2, 0.5, 0.8, 1.0)
 """Shares of uniform items in the sessions of `mixture`, all equally likely."""
 
 
-class SardineWorld(GymnasiumCatalog):
+class SardineEnvironment(GymnasiumCatalog):
     """N sessions of a SARDINE environment of single items.
 
     Args:
-        variant: the part of the identifier that names the world, `Static` or `BoredInf`.
+        variant: the part of the identifier that names the environment, `Static` or `BoredInf`.
         num_envs: N.
 
     Raises:
@@ -85,20 +85,20 @@ class GreedyOracle:
     because the draw of ε does not depend on what happens in the session.
 
     Args:
-        env: the world that it acts in.
+        env: the environment that it acts in.
         seed: seed of its draws.
         epsilons: values of ε, all equally likely.
 
     Raises:
-        InputError: `env` is not a `SardineWorld`.
+        InputError: `env` is not a `SardineEnvironment`.
     """
 
     def __init__(
         self, env: VectorEnv[Any, Any, Any], seed: int, epsilons: Sequence[float] = (0.0,)
     ) -> None:
-        if not isinstance(env.unwrapped, SardineWorld):
+        if not isinstance(env.unwrapped, SardineEnvironment):
             raise InputError(f"this behavior policy serves SARDINE, not {type(env).__name__}")
-        self._world, self._choices = env.unwrapped, np.asarray(epsilons)
+        self._environment, self._choices = env.unwrapped, np.asarray(epsilons)
         self._generator = np.random.default_rng([seed, 6])
         self._epsilon = np.zeros(env.num_envs)
 
@@ -108,19 +108,22 @@ class GreedyOracle:
 
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[IntArray, Float32Array]:
         """Draw items (N,); returns them and their propensities (N,)."""
-        n_items, count = len(self._world.vectors), len(self._epsilon)
-        greedy, uniform = self._world.favourites(), self._generator.integers(n_items, size=count)
+        n_items, count = len(self._environment.vectors), len(self._epsilon)
+        greedy, uniform = (
+            self._environment.favourites(),
+            self._generator.integers(n_items, size=count),
+        )
         chosen = np.where(self._generator.random(count) < self._epsilon, uniform, greedy)
         propensities = self._epsilon / n_items + (1 - self._epsilon) * (chosen == greedy)
         return chosen, propensities.astype(np.float32)
 
     def observe(self, actions: Actions, rewards: Float32Array) -> None:
-        """Do nothing: tastes are read from the world."""
+        """Do nothing: tastes are read from the environment."""
 
 
 def _simulator(variant: str, summary: str) -> Simulator:
-    def make(num_envs: int, folder: Path | None) -> SardineWorld:
-        return SardineWorld(variant, num_envs)
+    def make(num_envs: int, folder: Path | None) -> SardineEnvironment:
+        return SardineEnvironment(variant, num_envs)
 
     return Simulator(
         summary=f"SARDINE: 1,000 items, 100 steps, clicks; {summary} (extra: sardine)",

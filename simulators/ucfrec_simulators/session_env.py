@@ -1,4 +1,5 @@
-"""Base classes of the worlds: parallel sessions, each replaced in the step in which it ends."""
+"""Base classes of the environments: parallel sessions, each replaced in the step in which it
+ends."""
 
 from abc import ABC, abstractmethod
 from typing import Any, SupportsFloat, cast
@@ -145,30 +146,32 @@ class SessionsEnv(VectorEnv[Float32Array, Array, Array], ABC):
 
 
 class SingleSession(gymnasium.Env[Float32Array, Array]):
-    """A plain Gymnasium environment of a world with one session.
+    """A plain Gymnasium environment of an environment with one session.
 
     Raises:
-        InputError: the world has more than one session.
+        InputError: the environment has more than one session.
     """
 
-    def __init__(self, world: VectorEnv[Float32Array, Array, Array]) -> None:
-        if world.num_envs != 1:
-            raise InputError(f"SingleSession needs a world of one session, got {world.num_envs}")
-        self._world = world
-        self.observation_space = world.single_observation_space
-        self.action_space = world.single_action_space
+    def __init__(self, environment: VectorEnv[Float32Array, Array, Array]) -> None:
+        if environment.num_envs != 1:
+            raise InputError(
+                f"SingleSession needs an environment of one session, got {environment.num_envs}"
+            )
+        self._environment = environment
+        self.observation_space = environment.single_observation_space
+        self.action_space = environment.single_action_space
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Float32Array, dict[str, Any]]:
         """Start a session; returns the observation (O,) and info."""
         super().reset(seed=seed, options=options)
-        observations, infos = self._world.reset(seed=seed, options=options)
+        observations, infos = self._environment.reset(seed=seed, options=options)
         return observations[0], _first(infos)
 
     def step(self, action: Array) -> tuple[Float32Array, SupportsFloat, bool, bool, dict[str, Any]]:
         """Play one action; returns observation (O,), reward, terminated, truncated and info."""
-        observations, rewards, terminated, truncated, infos = self._world.step(
+        observations, rewards, terminated, truncated, infos = self._environment.step(
             np.asarray(action)[None]
         )
         ended = bool(terminated[0] | truncated[0])

@@ -44,10 +44,10 @@ class SyntheticCatalog(SessionsEnv):
 
     Args:
         num_envs: number of parallel sessions, N.
-        n_items, n_tags, n_users: sizes of the world.
+        n_items, n_tags, n_users: sizes of the environment.
         boredom_window: items among which a tag may occur only once.
         max_turn: largest number of steps of a session.
-        world_seed: seed of users and items; independent of the seed of `reset`.
+        environment_seed: seed of users and items; independent of the seed of `reset`.
         mood: shift of the log-odds by the hidden mood of a session; 0 for no moods.
 
     Raises:
@@ -62,7 +62,7 @@ class SyntheticCatalog(SessionsEnv):
         n_users: int = 2000,
         boredom_window: int = 4,
         max_turn: int = 20,
-        world_seed: int = 0,
+        environment_seed: int = 0,
         mood: float = 0.0,
     ) -> None:
         if not boredom_window <= n_tags <= n_items:
@@ -72,15 +72,15 @@ class SyntheticCatalog(SessionsEnv):
             )
         if not mood >= 0:
             raise InputError(f"mood is {mood}; give 0 or more")
-        world = np.random.default_rng([world_seed, 31])
-        self.tags: IntArray = world.permutation(np.arange(n_items) % n_tags)
+        environment = np.random.default_rng([environment_seed, 31])
+        self.tags: IntArray = environment.permutation(np.arange(n_items) % n_tags)
         """(n_items,) tag of each item."""
-        centres = world.normal(0, 1, (CLUSTERS, n_tags))
-        individual = world.normal(0, 0.6, (n_users, n_tags))
-        tastes = centres[world.integers(CLUSTERS, size=n_users)] + individual
-        factors = world.normal(0, 1, (n_users, FACTORS))
-        match = factors @ world.normal(0, 1, (FACTORS, n_items)) / np.sqrt(FACTORS)
-        quality = world.normal(0, 0.5, n_items)
+        centres = environment.normal(0, 1, (CLUSTERS, n_tags))
+        individual = environment.normal(0, 0.6, (n_users, n_tags))
+        tastes = centres[environment.integers(CLUSTERS, size=n_users)] + individual
+        factors = environment.normal(0, 1, (n_users, FACTORS))
+        match = factors @ environment.normal(0, 1, (FACTORS, n_items)) / np.sqrt(FACTORS)
+        quality = environment.normal(0, 0.5, n_items)
         self.logits = -2.5 + tastes[:, self.tags] + 0.7 * match + quality
         """(n_users, n_items) log-odds of a click in no mood."""
         self.mood = mood
@@ -89,7 +89,7 @@ class SyntheticCatalog(SessionsEnv):
         self.click_probabilities: Float64Array = self._by_mood.mean(axis=0)
         """(n_users, n_items) probabilities of a click, over all moods."""
         features = np.concatenate([tastes, factors], axis=1)
-        self._features = (features + world.normal(0, 0.5, features.shape)).astype(np.float32)
+        self._features = (features + environment.normal(0, 0.5, features.shape)).astype(np.float32)
         self.boredom_window, self.max_turn = boredom_window, max_turn
         self.users: IntArray = np.zeros(num_envs, dtype=np.int64)
         """(N,) user of each session."""
@@ -176,28 +176,28 @@ class Rotation(Memoryless):
     step may end the session and earns m₁.
     """
 
-    def __init__(self, world: SyntheticCatalog, favourites: IntArray) -> None:
-        self._world, self._favourites = world, favourites
+    def __init__(self, environment: SyntheticCatalog, favourites: IntArray) -> None:
+        self._environment, self._favourites = environment, favourites
 
     def act(
         self, observations: Float32Array, live: BoolArray
     ) -> tuple[IntArray, Float32Array | None]:
         """The next favourite (N,) of each session's user; propensities (N,) are 1."""
-        world = self._world
-        last = world.turns == world.max_turn - 1
-        rank = np.where(last, 0, world.turns % world.boredom_window)
-        chosen = self._favourites[world.users, rank]
+        environment = self._environment
+        last = environment.turns == environment.max_turn - 1
+        rank = np.where(last, 0, environment.turns % environment.boredom_window)
+        chosen = self._favourites[environment.users, rank]
         return chosen, np.ones(len(chosen), dtype=np.float32)
 
 
 class SoftmaxGuess(Memoryless):
     """Softmax policy over erroneous log-odds with uniform exploration; its propensities are exact.
 
-    In a world with moods, it adds `mood` to the log-odds of items of even tags, or, in sessions of
-    a bad mood, of odd tags; its propensities are those given the mood.
+    In an environment with moods, it adds `mood` to the log-odds of items of even tags, or, in
+    sessions of a bad mood, of odd tags; its propensities are those given the mood.
 
     Args:
-        world: the world that it acts in.
+        environment: the environment that it acts in.
         seed: seed of its draws.
         error: standard deviation of the fixed error of each (user, item) log-odds.
         temperature: temperature of the softmax.
@@ -207,19 +207,19 @@ class SoftmaxGuess(Memoryless):
 
     def __init__(
         self,
-        world: SyntheticCatalog,
+        environment: SyntheticCatalog,
         seed: int,
         error: float,
         temperature: float,
         epsilon: float,
         variety: float,
     ) -> None:
-        self._world = world
+        self._environment = environment
         self._temperature, self._epsilon, self._variety = temperature, epsilon, variety
         self._generator = np.random.default_rng([seed, 4, round(1000 * error)])
         # The error does not depend on the seed, so the seed does not change the policy's quality.
         errors = np.random.default_rng([0, 5, round(1000 * error)])
-        self._guess = world.logits + error * errors.standard_normal(world.logits.shape)
+        self._guess = environment.logits + error * errors.standard_normal(environment.logits.shape)
 
     def probabilities(self, live: BoolArray | None = None) -> Float64Array:
         """(N, n_items) probability of each item in each session's next step.
@@ -227,12 +227,12 @@ class SoftmaxGuess(Memoryless):
         Args:
             live: (N,) marks the sessions to tell of; None for all.
         """
-        world, rows = self._world, slice(None) if live is None else live
-        shown = (world.recent_tags[rows, :, None] == world.tags).any(axis=1)
-        scores = self._guess[world.users[rows]] - self._variety * shown
-        if world.mood:
-            favoured = (world.tags % 2 == 0) == (world.good_mood[rows] == 1)[:, None]
-            scores = scores + world.mood * favoured
+        environment, rows = self._environment, slice(None) if live is None else live
+        shown = (environment.recent_tags[rows, :, None] == environment.tags).any(axis=1)
+        scores = self._guess[environment.users[rows]] - self._variety * shown
+        if environment.mood:
+            favoured = (environment.tags % 2 == 0) == (environment.good_mood[rows] == 1)[:, None]
+            scores = scores + environment.mood * favoured
         scores = scores / self._temperature
         weights = np.exp(scores - scores.max(axis=1, keepdims=True))
         greedy = weights / weights.sum(axis=1, keepdims=True)
@@ -257,8 +257,8 @@ def optimal(env: VectorEnv[Any, Any, Any], seed: int) -> Rotation:
     Raises:
         InputError: `env` is not a SyntheticCatalog.
     """
-    world = _catalog(env)
-    return Rotation(world, world.favourites(world.click_probabilities))
+    environment = _catalog(env)
+    return Rotation(environment, environment.favourites(environment.click_probabilities))
 
 
 def popular(env: VectorEnv[Any, Any, Any], seed: int) -> Rotation:
@@ -267,9 +267,9 @@ def popular(env: VectorEnv[Any, Any, Any], seed: int) -> Rotation:
     Raises:
         InputError: `env` is not a SyntheticCatalog.
     """
-    world = _catalog(env)
-    favourites = world.favourites(world.click_probabilities.mean(axis=0, keepdims=True))
-    return Rotation(world, np.tile(favourites, (len(world.logits), 1)))
+    environment = _catalog(env)
+    favourites = environment.favourites(environment.click_probabilities.mean(axis=0, keepdims=True))
+    return Rotation(environment, np.tile(favourites, (len(environment.logits), 1)))
 
 
 QUALITIES: Final = (
@@ -288,8 +288,8 @@ def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
     Raises:
         InputError: `env` is not a SyntheticCatalog.
     """
-    world = _catalog(env)
-    guesses: list[Actor] = [SoftmaxGuess(world, seed, *knobs) for *knobs, _ in QUALITIES]
+    environment = _catalog(env)
+    guesses: list[Actor] = [SoftmaxGuess(environment, seed, *knobs) for *knobs, _ in QUALITIES]
     return SessionMixture(
         [Uniform(env, seed), *guesses], [0.2, *(share for *_, share in QUALITIES)], seed
     )

@@ -27,7 +27,7 @@ rules = st.builds(
     DecisionRule,
     target=st.one_of(st.none(), st.floats(-1e6, 1e6)),
     floor=st.one_of(st.none(), st.floats(-1e6, 1e6)),
-    tilt=st.floats(0, 100),
+    reward_weight=st.floats(0, 100),
     temperature=st.floats(0, 100),
     top_k=st.one_of(st.none(), st.integers(1, 99)),
     exclude_seen=st.booleans(),
@@ -49,12 +49,16 @@ def test_a_rule_read_back_from_json_is_the_same_rule(rule: DecisionRule) -> None
 
 def test_the_hash_is_that_of_the_values_alone() -> None:
     assert DecisionRule(5.0).hash == "537dff980f53"
-    for same in (DecisionRule(5), DecisionRule(np.float32(5)), DecisionRule(5.0, tilt=-0.0)):
+    for same in (
+        DecisionRule(5),
+        DecisionRule(np.float32(5)),
+        DecisionRule(5.0, reward_weight=-0.0),
+    ):
         assert (same, same.hash) == (DecisionRule(5.0), DecisionRule(5.0).hash)
     others = [
         DecisionRule(None),
         DecisionRule(5.0, floor=5.0),
-        DecisionRule(5.0, tilt=1.0),
+        DecisionRule(5.0, reward_weight=1.0),
         DecisionRule(5.0, temperature=1.0),
         DecisionRule(5.0, top_k=1),
         DecisionRule(5.0, exclude_seen=True),
@@ -72,12 +76,12 @@ HOSTILE: dict[str, Any] = {
     "nan": {"target": math.nan},
     "infinite": {"target": -math.inf},
     "huge": {"target": 10**400},
-    "no target": {"tilt": 1.0},
+    "no target": {"reward_weight": 1.0},
     "unknown": {"target": 1.0, "__class__": "x"},
     "nan floor": {"target": 1.0, "floor": math.nan},
-    "negative tilt": {"target": 1.0, "tilt": -1.0},
-    "no tilt": {"target": 1.0, "tilt": None},
-    "huge tilt": {"target": 1.0, "tilt": 1e300},
+    "negative reward weight": {"target": 1.0, "reward_weight": -1.0},
+    "no reward weight": {"target": 1.0, "reward_weight": None},
+    "huge reward weight": {"target": 1.0, "reward_weight": 1e300},
     "negative temperature": {"target": 1.0, "temperature": -0.1},
     "no temperature": {"target": 1.0, "temperature": None},
     "no item": {"target": 1.0, "top_k": 0},
@@ -272,13 +276,13 @@ def shown_in(windows: Windows, row: int, last: int) -> list[int]:
     return [int(windows.actions[row, t]) for t in steps]
 
 
-def test_scores_are_the_policys_plus_the_tilt() -> None:
+def test_scores_are_the_policys_plus_the_reward_weight() -> None:
     windows, collected = random_windows(CATALOG), torch.tensor([0.0, 1.0, 2.5]).double()
     users = torch.tensor([2, 0, -1])
-    plain, tilted = decider_of(), decider_of(tilt=0.5)
+    plain, weighted = decider_of(), decider_of(reward_weight=0.5)
     logits = plain.scores(windows, collected)
     torch.testing.assert_close(logits, plain.policy.act(plain.asked(windows, collected)).detach())
-    found = tilted.scores(windows, collected, users=users)
+    found = weighted.scores(windows, collected, users=users)
     for row in range(B):
         shown = shown_in(windows, row, KnownRewards.lags)
         for item in range(ITEMS):
@@ -354,7 +358,7 @@ def test_the_steps_own_action_and_reward_are_not_read(name: str) -> None:
     actions[:, -1], rewards[:, -1] = other(actions[:, -1]), math.nan
     logged = torch.rand(windows.mask.shape)
     changed = replace(windows, actions=actions, rewards=rewards, returns_to_go=logged)
-    decider = decider_of(name, tilt=1.0, tag_window=2, tag_run=1)
+    decider = decider_of(name, reward_weight=1.0, tag_window=2, tag_run=1)
     before, after = (decider.scores(each, collected) for each in (windows, changed))
     assert torch.equal(before, after)
     earlier = windows.actions.clone()
@@ -377,7 +381,7 @@ def test_vectors_are_predicted_at_the_target() -> None:
 def test_a_rule_needs_what_it_uses() -> None:
     policy, states = build("dt", CATALOG), ItemStates(torch.eye(ITEMS), torch.zeros(0, 0), 0, 1)
     with pytest.raises(InputError, match="no reward model of items"):
-        Decider(policy, DecisionRule(1.0, tilt=0.5))
+        Decider(policy, DecisionRule(1.0, reward_weight=0.5))
     for likeness in (None, Likeness.of(states)):
         with pytest.raises(InputError, match="the store has none"):
             Decider(policy, DecisionRule(1.0, tag_window=2), likeness=likeness)

@@ -21,7 +21,7 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 
 pytest.importorskip("faiss")
 
-RULES = [DecisionRule(2.0), FULL, DecisionRule(1.0, tilt=3.0, tag_run=1)]
+RULES = [DecisionRule(2.0), FULL, DecisionRule(1.0, reward_weight=3.0, tag_run=1)]
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def test_what_is_found_has_its_score_and_the_recall_is_told(
 ) -> None:
     for name, value in {"_FEWEST": 1, "_AT_LEAST": 1, "_SAMPLE": 1}.items():
         monkeypatch.setattr(item_index, name, value)
-    rule = DecisionRule(1.0, tilt=3.0)
+    rule = DecisionRule(1.0, reward_weight=3.0)
     asked, scorer = sessions(trained, rule), trained.scorer(rule)
     nothing = (torch.empty(0, dtype=torch.int64),) * 2
     index = ItemIndex(scorer, rule, "ucf")

@@ -39,7 +39,9 @@ RULES = {
     "filters": DecisionRule(3.0, temperature=2.0, top_k=9, exclude_seen=True, tag_window=2),
     "run": DecisionRule(3.0, temperature=1.0, tag_run=2),
     "far": DecisionRule(3.0, temperature=1.0, tag_window=8),  # further than the policy sees
-    "tilted": DecisionRule(3.0, temperature=1.0, tilt=1.0),  # by tastes learned in the session
+    "weighted": DecisionRule(
+        3.0, temperature=1.0, reward_weight=1.0
+    ),  # by tastes learned in the session
 }
 MORE = {"session": {}, "horizon": {"policy.return_to_go": "horizon", "policy.horizon": 2}}
 

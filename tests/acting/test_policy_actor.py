@@ -59,7 +59,7 @@ def written(
 
 
 @pytest.mark.parametrize(
-    ("world", "name"),
+    ("environment", "name"),
     [
         ("synthetic-taobao", "ucf"),
         ("synthetic-taobao", "dt"),
@@ -69,11 +69,13 @@ def written(
         ("synthetic-catalog", "item-knn"),
     ],
 )
-def test_logged_windows_give_the_actions_played(world: str, name: str, tmp_path: Path) -> None:
-    env = load_plugin("simulators", world).make(SIDE_BY_SIDE, None)
+def test_logged_windows_give_the_actions_played(
+    environment: str, name: str, tmp_path: Path
+) -> None:
+    env = load_plugin("simulators", environment).make(SIDE_BY_SIDE, None)
     observed = env.single_observation_space.shape[0]
     states = None
-    if world == "synthetic-catalog":
+    if environment == "synthetic-catalog":
         items = int(env.single_action_space.n)
         embeddings = torch.randn(items, 6, generator=torch.Generator().manual_seed(0))
         states = ItemStates(embeddings, torch.zeros(0, 0), 0.0, 1.0)

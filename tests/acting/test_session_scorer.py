@@ -20,7 +20,7 @@ RULES = {
     "own": None,
     "plain": DecisionRule(2.0),
     "full": FULL,
-    "tilted": DecisionRule(1.0, floor=0.5, tilt=3.0),
+    "weighted": DecisionRule(1.0, floor=0.5, reward_weight=3.0),
 }
 
 
@@ -100,7 +100,7 @@ def test_a_scorer_is_kept_until_rule_or_weights_change(
     sessions = sessions_at(store, *drawn_steps(store, 2))
     first = trained.scorer(RULES["plain"])
     assert trained.scorer(RULES["plain"]) is first
-    assert trained.scorer(RULES["tilted"]) is not first
+    assert trained.scorer(RULES["weighted"]) is not first
     before = trained.scorer(RULES["plain"]).scores(sessions)
     with torch.no_grad():
         trained.policy.head.bias[4] += 1.5  # type: ignore[index,operator]

@@ -1,4 +1,4 @@
-"""The tilt chosen by ranking is judged by what each rule would have shown."""
+"""The reward weight chosen by ranking is judged by what each rule would have shown."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,7 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 SETTINGS = ["train.steps=5", "policy.dim=16", "policy.context=4", "augment.copies=0"]
 
 
-def test_all_tilts_at_once_are_judged_as_each_rule_alone(tmp_path: Path) -> None:
+def test_all_reward_weights_at_once_are_judged_as_each_rule_alone(tmp_path: Path) -> None:
     tagged_log().to_parquet(tmp_path / "log.parquet")
     options = PrepareOptions(reward="reward", session_by="user", embedding_size=6)
     prepare([tmp_path / "log.parquet"], tagged_mapping(tmp_path), tmp_path / "store", options)
@@ -32,9 +32,11 @@ def test_all_tilts_at_once_are_judged_as_each_rule_alone(tmp_path: Path) -> None
     liked = liked_steps(validation, episodes, steps)
     items = validation.step_values("item", episodes, steps)
     candidates = read_json(tmp_path / "run" / "run.json")["rule"]["candidates"]
-    assert len({each["rule"]["tilt"] for each in candidates}) == len(candidates) > 2
+    assert len({each["rule"]["reward_weight"] for each in candidates}) == len(candidates) > 2
     for each in candidates:
-        decider = trained.decider(replace(trained.rule, tilt=each["rule"]["tilt"]))
+        decider = trained.decider(
+            replace(trained.rule, reward_weight=each["rule"]["reward_weight"])
+        )
         scores = session_scores(decider, validation, episodes, steps)
         top = scores.topk(SHOWN).indices.numpy()
         hits = (top == items[:, None]).any(1)[liked].mean()

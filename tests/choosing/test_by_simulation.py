@@ -31,12 +31,12 @@ from ucfrec.runs.run import train_run, training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.user_model.reward_fit import fit_item_reward_model
 from ucfrec.user_model.reward_rows import RewardRows
-from ucfrec.user_model.simulator import LearnedSessions, LoggedEnds, SessionEnd
+from ucfrec.user_model.simulator import LoggedEnds, SessionEnd, UserSimulator
 from ucfrec.user_model.training_users import TRAINING_USERS, fit_training_users
 
 SMALL = ["train.steps=60", "train.learning_rate=3e-3", "train.warmup_steps=5", "policy.dim=16"]
 SETTINGS = [*SMALL, "train.validate_every=20", "policy.context=6", "augment.copies=0"]
-FEW = RuleConfig(sessions=40, tilts=(0.0, 4.0), least_impressions=1, least_items=2.0)
+FEW = RuleConfig(sessions=40, reward_weights=(0.0, 4.0), least_impressions=1, least_items=2.0)
 
 
 @pytest.fixture(scope="module")
@@ -84,17 +84,22 @@ def test_a_run_acts_by_the_rule_that_it_chose_and_says_how(
     assert promised({**chosen, "candidates": []}) is None
 
 
-def test_a_tilt_pays_where_the_reward_model_knows_the_items(
+def test_a_reward_weight_pays_where_the_reward_model_knows_the_items(
     folder: Path, trained: TrainedPolicy
 ) -> None:
     search = search_of(folder, trained)
-    plain, tilted = search.play([DecisionRule(2.0, tilt=tilt, temperature=1.0) for tilt in (0, 4)])
-    assert tilted.value > plain.value + 2 * plain.error
-    assert tilted.items < plain.items
+    plain, weighted = search.play(
+        [
+            DecisionRule(2.0, reward_weight=reward_weight, temperature=1.0)
+            for reward_weight in (0, 4)
+        ]
+    )
+    assert weighted.value > plain.value + 2 * plain.error
+    assert weighted.items < plain.items
 
 
 def test_playing_a_rule_twice_gives_the_same(folder: Path, trained: TrainedPolicy) -> None:
-    rule = DecisionRule(2.0, tilt=1.0, temperature=0.5)
+    rule = DecisionRule(2.0, reward_weight=1.0, temperature=0.5)
     assert search_of(folder, trained).play([rule]) == search_of(folder, trained).play([rule])
 
 
@@ -105,9 +110,9 @@ def test_rules_played_side_by_side_do_what_each_does_alone(
     search = search_of(folder, trained)
     rules = [
         DecisionRule(2.0, temperature=1.0),
-        DecisionRule(1.0, floor=1.0, tilt=2.0, temperature=0.5),
+        DecisionRule(1.0, floor=1.0, reward_weight=2.0, temperature=0.5),
         DecisionRule(3.0, tag_window=3),
-        DecisionRule(3.0, tilt=4.0, tag_window=2, temperature=2.0),
+        DecisionRule(3.0, reward_weight=4.0, tag_window=2, temperature=2.0),
     ]
     together = search.play(rules)
     model, n = trained.reward_model, FEW.sessions
@@ -115,7 +120,7 @@ def test_rules_played_side_by_side_do_what_each_does_alone(
     ends = LoggedEnds.of(train, model.lags, 100_000, 0)
     end = SessionEnd(Likeness.of(validation.item_states), ends)
     longest = int(train.lengths.max())
-    world = LearnedSessions(validation, model, search.calibration, end, n, longest)
+    environment = UserSimulator(validation, model, search.calibration, end, n, longest)
     users = np.arange(len(validation.item_states.user_features))
     for rule, candidate in zip(rules, together, strict=True):
         # A session a row, with sessions that begin anew and rows that are no longer live.
@@ -123,7 +128,7 @@ def test_rules_played_side_by_side_do_what_each_does_alone(
         actor = PolicyActor(
             *(decider, n, validation.observation_size, validation.item_states, None, users), seed=0
         )
-        alone = rollout(world, actor, n, 0)  # type: ignore[arg-type]
+        alone = rollout(environment, actor, n, 0)  # type: ignore[arg-type]
         assert candidate.value == pytest.approx(float(alone.returns.mean()), abs=1e-9)
         assert candidate.length == pytest.approx(float(alone.lengths.mean()), abs=1e-9)
         assert candidate == search.play([rule])[0]
@@ -167,9 +172,9 @@ def test_every_kind_of_candidate_is_played(folder: Path, trained: TrainedPolicy)
     rules = [candidate.rule for candidate in found.candidates]
     assert len(set(rules)) == len(rules)
     assert {rule.temperature for rule in rules} == set(FEW.temperatures)
-    assert {rule.tilt for rule in rules} == set(FEW.tilts)
-    together = {(rule.tag_window, rule.tilt) for rule in rules}
-    assert together == set(product((0, 3, 10), FEW.tilts))
+    assert {rule.reward_weight for rule in rules} == set(FEW.reward_weights)
+    together = {(rule.tag_window, rule.reward_weight) for rule in rules}
+    assert together == set(product((0, 3, 10), FEW.reward_weights))
     assert {rule.floor is None for rule in rules} == {True, False}
 
 
@@ -184,7 +189,7 @@ def test_what_the_log_supports_only_without_recent_tags_is_found(
         FEW,
         least_impressions=int(train.item_counts()[:4].min()),
         temperatures=(0.0, 4.0),
-        tilts=(0.0,),
+        reward_weights=(0.0,),
         tag_windows=(0, 3),
     )
     found = choose_rule(narrow, {0.9: 2.0, 1.0: 2.0}, train, validation, config, 0)
@@ -198,7 +203,7 @@ def test_users_who_tire_are_shown_no_longer_runs(tmp_path: Path, trained: Traine
     model, _ = fit_item_reward_model(train, validation, tmp_path / "model", 0)
     one_tag = torch.where(torch.arange(24) % 4 == 0, 9.0, 0.0)
     decider = replace(with_bias(trained, one_tag), reward_model=model)
-    config = replace(FEW, tag_windows=(0,), temperatures=(1.0,), tilts=(0.0,))
+    config = replace(FEW, tag_windows=(0,), temperatures=(1.0,), reward_weights=(0.0,))
     found = choose_rule(decider, {0.9: 2.0, 1.0: 3.0}, train, validation, config, 0)
     assert found.fatigue is not None
     assert (found.fatigue.length, found.fatigue.steps) == (3, 4)
@@ -216,8 +221,13 @@ def test_the_most_promising_rules_are_played_in_more_sessions(
 ) -> None:
     few = replace(FEW, sessions=10)
     search, more = (search_of(folder, trained, each) for each in (few, replace(few, sessions=40)))
-    tilts = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
-    played = search.play([DecisionRule(2.0, tilt=tilt, temperature=1.0) for tilt in tilts])
+    reward_weights = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
+    played = search.play(
+        [
+            DecisionRule(2.0, reward_weight=reward_weight, temperature=1.0)
+            for reward_weight in reward_weights
+        ]
+    )
     allowed = [each for each in played if search.allowed(each)]
     worst = min(allowed, key=lambda each: each.value)
     again = search.play_finalists(played, worst)
@@ -230,7 +240,7 @@ def test_the_most_promising_rules_are_played_in_more_sessions(
 
 
 def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_path: Path) -> None:
-    one = ("temperatures=[1.0]", "tilts=[0.0, 4.0]", "tag_windows=[0]", "tag_runs=[0]")
+    one = ("temperatures=[1.0]", "reward weights=[0.0, 4.0]", "tag_windows=[0]", "tag_runs=[0]")
     rule = [
         f"rule.{each}" for each in (*one, "sessions=40", "least_items=2", "least_impressions=1")
     ]
@@ -270,8 +280,8 @@ def test_of_rules_that_the_model_cannot_tell_apart_the_widest_draws_are_taken(
     rule = found.rule
     assert rule.tag_run > 0
     same_run = [each for each in found.candidates if each.rule.tag_run == rule.tag_run]
-    drawn = {(each.rule.temperature, each.rule.tilt) for each in same_run}
-    assert drawn == set(product(config.temperatures, config.tilts))
+    drawn = {(each.rule.temperature, each.rule.reward_weight) for each in same_run}
+    assert drawn == set(product(config.temperatures, config.reward_weights))
     top = max(each.value for each in found.candidates)
     level = [each for each in same_run if each.value >= 0.9 * top and each.items >= 2]
     assert len({each.rule.temperature for each in level}) > 1
@@ -306,34 +316,36 @@ def tiring_store(folder: Path) -> EpisodeStore:
     return EpisodeStore.open(folder / "store")
 
 
-def test_tilts_below_the_first_that_overlaps_too_little_are_ranked_too(
+def test_reward_weights_below_the_first_that_overlaps_too_little_are_ranked_too(
     folder: Path, trained: TrainedPolicy
 ) -> None:
     views = training_views(EpisodeStore.open(folder / "store"))
     liked = TrainingCounts.of(views[0]).liked.topk(10).indices
     decider = with_bias(trained, torch.zeros(24).index_fill(0, liked, 50.0))
-    few = RuleConfig(tilts=(0.0, 1000.0))
+    few = RuleConfig(reward_weights=(0.0, 1000.0))
     found = choose_by_ranking(decider, *views, few, 0)
-    tilts = [each.rule.tilt for each in found.candidates]
-    assert tilts[:2] == [0.0, 1000.0]
+    reward_weights = [each.rule.reward_weight for each in found.candidates]
+    assert reward_weights[:2] == [0.0, 1000.0]
     assert found.candidates[1].gain < 0
     assert found.supported
     overlapping = [each for each in found.candidates if each.gain >= 0]
     best = max(overlapping, key=lambda each: each.item_rate)
     assert found.rule == best.rule
-    too_large = min(each.rule.tilt for each in found.candidates if each.gain < 0)
-    assert too_large - max(each.rule.tilt for each in overlapping) == 1000 / 2 ** (len(tilts) - 2)
+    too_large = min(each.rule.reward_weight for each in found.candidates if each.gain < 0)
+    assert too_large - max(each.rule.reward_weight for each in overlapping) == 1000 / 2 ** (
+        len(reward_weights) - 2
+    )
 
 
-def test_a_rule_without_overlap_has_no_tilt_and_says_so(
+def test_a_rule_without_overlap_has_no_reward_weight_and_says_so(
     folder: Path, trained: TrainedPolicy
 ) -> None:
     views = training_views(EpisodeStore.open(folder / "store"))
     liked = TrainingCounts.of(views[0]).liked.topk(10).indices
     decider = with_bias(trained, torch.zeros(24).index_fill(0, liked, -1e4))
-    found = choose_by_ranking(decider, *views, RuleConfig(tilts=(0.0, 1.0)), 0)
+    found = choose_by_ranking(decider, *views, RuleConfig(reward_weights=(0.0, 1.0)), 0)
     assert not found.supported
-    assert found.rule.tilt == 0
+    assert found.rule.reward_weight == 0
     assert "WARNING" in found.as_dict()["warning"]
 
 

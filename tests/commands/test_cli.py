@@ -16,7 +16,7 @@ import pytest
 
 from ucfrec.acting.rollout import rollout
 from ucfrec.commands.cli import UCFREC, build_parser, main
-from ucfrec.evaluation.world import World
+from ucfrec.evaluation.environment import Environment
 from ucfrec.plugins import load_plugin
 from ucfrec.reporting.evaluation_rows import read_evaluations
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -39,13 +39,13 @@ def settings(*more: str) -> list[str]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Logs of both kinds, their stores, and a run on the catalogue."""
     folder = tmp_path_factory.mktemp("cli")
-    for world in ("synthetic-taobao", "synthetic-catalog"):
-        logs, store = folder / f"{world}-logs", folder / f"{world}-store"
-        assert main(["collect", "--env", world, "--sessions", "300", "--out", str(logs)]) == 0
+    for environment in ("synthetic-taobao", "synthetic-catalog"):
+        logs, store = folder / f"{environment}-logs", folder / f"{environment}-store"
+        assert main(["collect", "--env", environment, "--sessions", "300", "--out", str(logs)]) == 0
         sessions = str(logs / "sessions.parquet")
-        feedback = load_plugin("simulators", world).feedback
+        feedback = load_plugin("simulators", environment).feedback
         assert main(["prepare", sessions, "--out", str(store), "--reward", feedback]) == 0
-        run = str(folder / f"{world}-run")
+        run = str(folder / f"{environment}-run")
         assert main(["train", str(store), "--out", run, *settings()]) == 0
     return folder
 
@@ -73,19 +73,19 @@ def test_help_answers_at_once() -> None:
     assert min(seconds() for _ in range(3)) < 0.5
 
 
-@pytest.mark.parametrize("world", ["synthetic-taobao", "synthetic-catalog"])
+@pytest.mark.parametrize("environment", ["synthetic-taobao", "synthetic-catalog"])
 def test_evaluate_writes_the_rows_it_prints(
-    folder: Path, world: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    folder: Path, environment: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "rows.json"
-    run = str(folder / f"{world}-run")
-    arguments = ["evaluate", run, "--env", world, "--episodes", "40", "--seed", "7"]
+    run = str(folder / f"{environment}-run")
+    arguments = ["evaluate", run, "--env", environment, "--episodes", "40", "--seed", "7"]
     arguments += ["--behavior", "random", "--json", str(out)]
     assert main(arguments) == 0
     rows = json.loads(out.read_text())
     assert [row["policy"] for row in rows] == ["ucf", "random"]
     for row in rows:
-        assert row["world"] == world
+        assert row["environment"] == environment
         assert (row["episodes"], row["seed"]) == (40, 7)
         assert row["R_cum_low"] <= row["R_cum"] <= row["R_cum_high"]
         assert row["R_avg_pooled"] * row["length"] == pytest.approx(row["R_cum"])
@@ -250,12 +250,12 @@ def test_ope_tells_from_uniform_logs_what_playing_tells(
     collected = ["--behavior", "random", "--sessions", "3000", "--out", str(tmp_path / "logs")]
     assert main(["collect", "--env", "synthetic-catalog", *collected]) == 0
     out = tmp_path / "rows.json"
-    given = ["--temperature", "1.5", "--tilt", "0", "--json", str(out)]
+    given = ["--temperature", "1.5", "--reward-weight", "0", "--json", str(out)]
     assert main(["ope", run, str(tmp_path / "logs/sessions.parquet"), *given]) == 0
     rows = estimates_in(out)
     trained = TrainedPolicy.load(Path(run))
-    actor = trained.actor(512, replace(trained.rule, temperature=1.5, tilt=0.0))
-    env = World("synthetic-catalog", None).simulator().make(512, None)
+    actor = trained.actor(512, replace(trained.rule, temperature=1.5, reward_weight=0.0))
+    env = Environment("synthetic-catalog", None).simulator().make(512, None)
     returns = rollout(env, actor, 2000, seed=0).returns
     truth, error = returns.mean(), returns.std() / 2000**0.5
     assert abs(truth - rows["logged"]["R_cum"]) > 3 * error
@@ -278,8 +278,8 @@ def test_a_model_card_lies_beside_every_run_with_what_was_measured(
     trained = card.read_text()
     assert "# Model card: ucf" in trained
     assert "| reward | `is_click` |" in trained
-    world = ["--env", "synthetic-catalog", "--episodes", "20"]
-    assert main(["evaluate", run, *world]) == 0
+    environment = ["--env", "synthetic-catalog", "--episodes", "20"]
+    assert main(["evaluate", run, *environment]) == 0
     assert main(["ope", run, logs, "--temperature", "1"]) == 0
     for rule in ([], ["--temperature", "3", "--target-return", "2"]):
         assert main(["rank", run, logs, "--k", "5", *rule]) == 0
@@ -301,7 +301,16 @@ def test_ope_ranks_targets_and_rules_and_says_which_it_cannot_judge(
     collected = ["--behavior", "random", "--sessions", "1500", "--out", str(tmp_path / "logs")]
     assert main(["collect", "--env", "synthetic-catalog", *collected, "--seed", "7"]) == 0
     out, fresh = tmp_path / "rows.json", str(tmp_path / "logs/sessions.parquet")
-    asked = ["--targets", "q0.5,6", "--temperatures", "1,0", "--tilt", "0", "--json", str(out)]
+    asked = [
+        "--targets",
+        "q0.5,6",
+        "--temperatures",
+        "1,0",
+        "--reward-weight",
+        "0",
+        "--json",
+        str(out),
+    ]
     assert main(["ope", run, fresh, *asked]) == 0
     printed = capsys.readouterr().out
     rows = read_evaluations(out)
@@ -430,7 +439,7 @@ def test_what_cannot_be_used_is_refused_in_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_policy_is_not_played_in_a_world_it_does_not_fit(
+def test_a_policy_is_not_played_in_a_environment_it_does_not_fit(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["evaluate", str(folder / "synthetic-catalog-run"), "--env", "synthetic-taobao"]

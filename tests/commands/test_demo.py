@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from ucfrec.commands.demo import BEHAVIORS, LEARNERS, WORLDS, DemoConfig, demo
+from ucfrec.commands.demo import BEHAVIORS, ENVIRONMENTS, LEARNERS, DemoConfig, demo
 
 TINY = DemoConfig(
     sessions=400,
@@ -22,19 +22,21 @@ def test_the_demo_writes_every_row_and_goes_on_where_it_was(tmp_path: Path) -> N
     written = json.loads((tmp_path / "demo" / "results.json").read_text())
     names = {*LEARNERS, *BEHAVIORS}
     assert names == {"logging", "random", "bc", "dt", "ucf-no-augmentation", "ucf", "optimal"}
-    for world in WORLDS:
-        of_world = {row["policy"]: row for row in written if row["world"] == world}
-        assert of_world.keys() == names
-        assert max(of_world.values(), key=lambda row: row["R_cum"])["policy"] == "optimal"
-        for row in of_world.values():
+    for environment in ENVIRONMENTS:
+        of_environment = {
+            row["policy"]: row for row in written if row["environment"] == environment
+        }
+        assert of_environment.keys() == names
+        assert max(of_environment.values(), key=lambda row: row["R_cum"])["policy"] == "optimal"
+        for row in of_environment.values():
             assert row["R_cum_low"] <= row["R_cum"] <= row["R_cum_high"]
             assert row["R_avg_pooled"] == pytest.approx(row["R_cum"] / row["length"])
             assert {"command", "versions", "fingerprint", "config"} <= row.keys()
     page = (tmp_path / "demo" / "report.html").read_text()
-    for world in WORLDS:
-        assert f"R_cum in {world}" in page
-        assert all(f"<summary>{world}/{learner}</summary>" in page for learner in LEARNERS)
-    weights = tmp_path / "demo" / WORLDS[0] / "dt" / "policy" / "best.safetensors"
+    for environment in ENVIRONMENTS:
+        assert f"R_cum in {environment}" in page
+        assert all(f"<summary>{environment}/{learner}</summary>" in page for learner in LEARNERS)
+    weights = tmp_path / "demo" / ENVIRONMENTS[0] / "dt" / "policy" / "best.safetensors"
     written_at = weights.stat().st_mtime_ns
     again = demo(tmp_path / "demo", seed=0, config=TINY)
     assert weights.stat().st_mtime_ns == written_at

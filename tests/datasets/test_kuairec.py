@@ -1,4 +1,4 @@
-"""KuaiRec: files generated in the official schema, dirt included, as logs and as a world."""
+"""KuaiRec: files generated in the official schema, dirt included, as logs and as an environment."""
 
 from pathlib import Path
 
@@ -8,8 +8,8 @@ import pytest
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior
-from ucfrec.evaluation.world import World
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec_datasets.kuairec import DATASET
@@ -120,7 +120,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         DATASET.resolve([folder / "user_features.csv"], LogMapping())
 
 
-def test_the_world_is_the_observed_matrix(tmp_path: Path) -> None:
+def test_the_environment_is_the_observed_matrix(tmp_path: Path) -> None:
     folder = official(tmp_path / "data")
     env = kuairec(1, folder)
     small = pd.read_csv(folder / "small_matrix.csv")
@@ -138,8 +138,10 @@ def test_the_world_is_the_observed_matrix(tmp_path: Path) -> None:
 
 def test_it_is_played_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = official(tmp_path / "data")
-    monkeypatch.setattr(World, "simulator", lambda self: SIMULATOR)
-    rows = {b: evaluate_behavior(World("kuairec", folder), b, 50, 0) for b in ("random", "oracle")}
+    monkeypatch.setattr(Environment, "simulator", lambda self: SIMULATOR)
+    rows = {
+        b: evaluate_behavior(Environment("kuairec", folder), b, 50, 0) for b in ("random", "oracle")
+    }
     assert rows["oracle"]["R_cum"] > 2 * rows["random"]["R_cum"]
     assert SIMULATOR_NX_10.make(3, folder).regime.steps == 10
 

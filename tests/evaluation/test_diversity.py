@@ -24,7 +24,7 @@ from ucfrec_simulators.synthetic_catalog import SyntheticCatalog
 N, TAGS, USERS = 12, 5, 9
 
 
-def world(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def environment(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     lengths = rng.integers(1, 7, size=rng.integers(1, 8))
     episodes = np.repeat(np.arange(len(lengths)), lengths)
@@ -34,7 +34,7 @@ def world(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @given(st.integers(0, 999))
 def test_diversity_is_that_of_a_plain_loop(seed: int) -> None:
-    episodes, items, incidence = world(seed)
+    episodes, items, incidence = environment(seed)
 
     def jaccard(a: int, b: int) -> float:
         one, other = set(np.flatnonzero(incidence[a])), set(np.flatnonzero(incidence[b]))
@@ -50,7 +50,7 @@ def test_diversity_is_that_of_a_plain_loop(seed: int) -> None:
 
 @given(st.integers(0, 999))
 def test_all_are_in_range_and_blind_to_order(seed: int) -> None:
-    episodes, items, incidence = world(seed)
+    episodes, items, incidence = environment(seed)
     order = np.lexsort([np.random.default_rng(seed).random(len(items)), episodes])
     value = diversity(episodes, items, tag_jaccard(incidence))
     assert 0 <= value <= 1

@@ -1,4 +1,4 @@
-"""Variety columns of result rows against plain loops over what a world and a log say."""
+"""Variety columns of result rows against plain loops over what an environment and a log say."""
 
 import itertools
 import math
@@ -16,9 +16,9 @@ from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.diversity import Recommended
 from ucfrec.evaluation.diversity_columns import COLUMNS, variety_columns
+from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.simulated_store import simulated_store
-from ucfrec.evaluation.world import World
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run, training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -64,16 +64,16 @@ def test_columns_are_those_of_plain_loops() -> None:
 
 
 def test_what_is_unknown_is_null() -> None:
-    catalog = evaluate_behavior(World("synthetic-catalog"), "random", 20, 0)
+    catalog = evaluate_behavior(Environment("synthetic-catalog"), "random", 20, 0)
     assert catalog["novelty"] is catalog["majority_category_dominance"] is None
     assert 0 < catalog["diversity"] <= 1
-    taobao = evaluate_behavior(World("synthetic-taobao"), "random", 5, 0)
+    taobao = evaluate_behavior(Environment("synthetic-taobao"), "random", 5, 0)
     assert all(taobao[name] is None for name in COLUMNS)
 
 
 def test_a_run_knows_its_training_log(tmp_path: Path) -> None:
-    world = World("synthetic-catalog")
-    store = EpisodeStore.open(simulated_store(world, tmp_path, 60, 0))
+    environment = Environment("synthetic-catalog")
+    store = EpisodeStore.open(simulated_store(environment, tmp_path, 60, 0))
     settings = ("train.steps=2", "train.validate_every=2", "policy.dim=8")
     train_run(store, tmp_path / "run", resolve_config("popular", None, settings))
     trained = TrainedPolicy.load(tmp_path / "run")
@@ -87,7 +87,7 @@ def test_a_run_knows_its_training_log(tmp_path: Path) -> None:
     assert trained.counts.shown.tolist() == [shown[item] for item in range(200)]
     assert trained.counts.liked.tolist() == [liked[item] for item in range(200)]
     best = DecisionRule(1.0)
-    row = evaluate_policy(world, trained, "popular", 10, 0, best)
+    row = evaluate_policy(environment, trained, "popular", 10, 0, best)
     # The one item that it plays is the one shown most.
     assert row["novelty"] == pytest.approx(-math.log(max(shown.values()) / train.n_episodes))
     assert row["majority_category_dominance"] in (0.0, 1.0)

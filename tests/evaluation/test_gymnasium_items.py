@@ -9,12 +9,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from tests.support.gymnasium_worlds import ITEMS
+from tests.support.gymnasium_environments import ITEMS
 from ucfrec.errors import InputError
+from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.gymnasium_items import item_table
-from ucfrec.evaluation.world import World
 
-ID = "tests.support.gymnasium_worlds:ucfrec-test/Discrete-v0"
+ID = "tests.support.gymnasium_environments:ucfrec-test/Discrete-v0"
 
 
 @pytest.fixture
@@ -69,8 +69,8 @@ def test_unusable_features_are_refused(env: gymnasium.Env[Any, Any], tmp_path: P
     refused(path, "has no whole numbers as item_id")
 
 
-def test_worlds_of_vectors_have_no_items() -> None:
+def test_environments_of_vectors_have_no_items() -> None:
     name = ID.replace("Discrete", "Box")
-    world = World(f"gymnasium:{name}", observe=("secret",), item_features="vectors")
+    environment = Environment(f"gymnasium:{name}", observe=("secret",), item_features="vectors")
     with pytest.raises(InputError, match="takes vectors, not items"):
-        world.simulator().make(1, None)
+        environment.simulator().make(1, None)

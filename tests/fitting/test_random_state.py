@@ -14,9 +14,9 @@ from tests.support import killed_run
 from ucfrec.counterfactual.copies import counterfactual_copies
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.simulated_store import simulated_store
-from ucfrec.evaluation.world import World
 from ucfrec.fitting.loop import LoopConfig, fit
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.registry import BUILT_IN
@@ -115,9 +115,9 @@ def test_a_run_and_reading_it_back(store: EpisodeStore, tmp_path: Path, name: st
         TrainedPolicy.load(tmp_path / "run")
 
 
-@pytest.mark.parametrize("world", ["synthetic-taobao", "synthetic-catalog"])
-def test_collecting_and_evaluating(world: str, tmp_path: Path) -> None:
-    at = World(world)
+@pytest.mark.parametrize("environment", ["synthetic-taobao", "synthetic-catalog"])
+def test_collecting_and_evaluating(environment: str, tmp_path: Path) -> None:
+    at = Environment(environment)
     with unnoticed():
         simulated_store(at, tmp_path, 60, 0)
     config = resolve_config("bc", None, {"train.steps": 2, "policy.dim": 8})

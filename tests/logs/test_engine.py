@@ -107,7 +107,7 @@ def work_of(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("statement", REFUSED)
-def test_the_world_is_shut(
+def test_the_environment_is_shut(
     closed: duckdb.DuckDBPyConnection,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -255,7 +255,7 @@ def test_an_output_folder_needs_no_opening(tmp_path: Path) -> None:
     assert report["steps"] == rows
 
 
-def test_every_connection_is_closed_to_the_world() -> None:
+def test_every_connection_is_closed_to_the_environment() -> None:
     """`duckdb.connect`, and its default connection, are used in one file, and by a peer."""
     root = Path(sys.modules["ucfrec"].__path__[0]).parent
     opens = re.compile(r"duckdb\.(connect|sql|query|execute|read_|from_|default_connection|cursor)")

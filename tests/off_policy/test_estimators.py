@@ -1,4 +1,4 @@
-"""Off-policy estimates against slow loops, enumerated worlds and what is known of them."""
+"""Off-policy estimates against slow loops, enumerated environments and what is known of them."""
 
 import itertools
 from collections.abc import Iterator
@@ -149,7 +149,7 @@ def test_effective_sessions_are_between_one_and_all(lengths: list[int], seed: in
 
 
 @dataclass(frozen=True)
-class World:
+class Environment:
     """Two states, two actions; a session ends after an action, or goes on in the other state."""
 
     behavior: Float64Array
@@ -194,7 +194,7 @@ class World:
         ), at
 
 
-WORLD = World(
+ENVIRONMENT = Environment(
     behavior=np.array([[0.7, 0.3], [0.4, 0.6]]),
     target=np.array([[0.2, 0.8], [0.5, 0.5]]),
     pays=np.array([[1.0, 0.0], [0.5, 2.0]]),
@@ -206,46 +206,46 @@ WORLD = World(
 def test_weighted_estimates_are_unbiased_whatever_the_model(right: bool) -> None:
     """Exactly, over every session that the behavior policy can log."""
     longest = 3
-    table = WORLD.q(longest)
+    table = ENVIRONMENT.q(longest)
     wrong = [np.random.default_rng(i).normal(size=(2, 2)) for i in range(longest + 1)]
     totals = dict.fromkeys(("IPS", "PDIS", "DR", "FQE"), 0.0)
-    for likely, path in WORLD.sessions(longest):
+    for likely, path in ENVIRONMENT.sessions(longest):
         qs = [(table if right else wrong)[longest - t] for t in range(len(path))]
         states = [state for state, _ in path]
         steps = LoggedSteps(
             session=np.zeros(len(path), dtype=np.int64),
-            reward=np.array([WORLD.pays[at] for at in path]),
-            propensity=np.array([WORLD.behavior[at] for at in path]),
-            target=np.array([WORLD.target[at] for at in path]),
+            reward=np.array([ENVIRONMENT.pays[at] for at in path]),
+            propensity=np.array([ENVIRONMENT.behavior[at] for at in path]),
+            target=np.array([ENVIRONMENT.target[at] for at in path]),
             model=Modelled(
                 reward=np.zeros(len(path)),
                 q=np.array([q[at] for q, at in zip(qs, path, strict=True)]),
                 v=np.array(
-                    [(WORLD.target[s] * q[s]).sum() for q, s in zip(qs, states, strict=True)]
+                    [(ENVIRONMENT.target[s] * q[s]).sum() for q, s in zip(qs, states, strict=True)]
                 ),
             ),
         )
         found = estimate(steps, 0)
         for name in totals:
             totals[name] += likely * found[name].value
-    truth = float((WORLD.target[0] * table[longest][0]).sum())
+    truth = float((ENVIRONMENT.target[0] * table[longest][0]).sum())
     for name in ("IPS", "PDIS", "DR"):
         assert totals[name] == pytest.approx(truth, rel=1e-12), name
     assert (abs(totals["FQE"] - truth) < 1e-12) is right
 
 
-def test_fitted_q_evaluation_finds_the_value_of_a_world_of_tables() -> None:
-    steps, at = WORLD.logged(10_000, seed=0)
-    truth = float((WORLD.target[0] * WORLD.q(100)[100][0]).sum())
+def test_fitted_q_evaluation_finds_the_value_of_a_environment_of_tables() -> None:
+    steps, at = ENVIRONMENT.logged(10_000, seed=0)
+    truth = float((ENVIRONMENT.target[0] * ENVIRONMENT.q(100)[100][0]).sum())
     state = at // 2
     features = np.column_stack([np.ones(len(at)), np.eye(4)[at]]).astype(np.float32)
     spread = np.zeros((len(at), 4))
     for action in (0, 1):
-        spread[np.arange(len(at)), 2 * state + action] = WORLD.target[state, action]
+        spread[np.arange(len(at)), 2 * state + action] = ENVIRONMENT.target[state, action]
     at_policy = np.column_stack([np.ones(len(at)), spread]).astype(np.float32)
     model = cross_fitted(features, at_policy, steps.reward, steps.session, seed=0)
     found = estimate(replace(steps, model=model), 0)
-    on_policy = WORLD.behavior[0] @ WORLD.q(100)[100][0]
+    on_policy = ENVIRONMENT.behavior[0] @ ENVIRONMENT.q(100)[100][0]
     assert abs(on_policy - truth) > 0.1
     assert found["FQE"].value == pytest.approx(truth, abs=0.03)
     assert found["DR"].low < truth < found["DR"].high
@@ -272,7 +272,7 @@ def test_no_session_is_judged_by_a_model_that_saw_it() -> None:
 def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
     """Of a policy near the behavior. `WORLD`'s own target has weights with so heavy a tail that 95%
     intervals cover 78 to 90% (200 repetitions of 400 sessions, 60 of 4,000)."""
-    near = replace(WORLD, target=np.full((2, 2), 0.5))
+    near = replace(ENVIRONMENT, target=np.full((2, 2), 0.5))
     truth = float((near.target[0] * near.q(100)[100][0]).sum())
     covered = dict.fromkeys(("IPS", "SNIPS", "PDIS"), 0)
     for seed in range(60):

@@ -48,7 +48,7 @@ def lines(requests: list[dict[str, Any]]) -> bytes:
 def test_a_pipe_equals_the_command_on_files(trained: TrainedPolicy, tmp_path: Path) -> None:
     log = histories()
     log.to_parquet(tmp_path / "log.parquet")
-    arguments = ["recommend", str(trained.folder), "--k", "7", "--tilt", "0.3"]
+    arguments = ["recommend", str(trained.folder), "--k", "7", "--reward-weight", "0.3"]
     assert main([*arguments, str(tmp_path / "log.parquet"), "--out", str(tmp_path / "out")]) == 0
     requests = requests_of(log)
     command = [sys.executable, "-m", "ucfrec.commands.cli", *arguments, "--stream"]

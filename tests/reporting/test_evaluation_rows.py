@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from ucfrec.errors import InputError
+from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior
-from ucfrec.evaluation.world import World
 from ucfrec.reporting.evaluation_rows import as_evaluation, evaluation_row, read_evaluations
 from ucfrec.reporting.result_row import RowKey
 from ucfrec.reporting.rows_file import append_rows
@@ -23,9 +23,11 @@ KEY = RowKey(
 )
 
 
-@pytest.mark.parametrize("world", ["synthetic-catalog", "synthetic-taobao"])
-def test_an_evaluation_keeps_its_numbers_in_a_row_and_back(world: str, tmp_path: Path) -> None:
-    found = evaluate_behavior(World(world), "random", 20, 7)
+@pytest.mark.parametrize("environment", ["synthetic-catalog", "synthetic-taobao"])
+def test_an_evaluation_keeps_its_numbers_in_a_row_and_back(
+    environment: str, tmp_path: Path
+) -> None:
+    found = evaluate_behavior(Environment(environment), "random", 20, 7)
     row = evaluation_row(found, KEY)
     assert (row.value, row.interval) == (
         found["R_cum"],
@@ -42,7 +44,7 @@ def test_an_evaluation_keeps_its_numbers_in_a_row_and_back(world: str, tmp_path:
 
 
 def test_evaluations_are_read_from_lists_and_lines(tmp_path: Path) -> None:
-    row = {"world": "a", "policy": "ucf", "R_cum": 1.0}
+    row = {"environment": "a", "policy": "ucf", "R_cum": 1.0}
     (tmp_path / "a.json").write_text(json.dumps([row]))
     (tmp_path / "b.jsonl").write_text(json.dumps(row) + "\n")
     assert read_evaluations(tmp_path / "a.json") == read_evaluations(tmp_path / "b.jsonl") == [row]

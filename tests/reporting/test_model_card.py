@@ -83,7 +83,9 @@ def test_a_refit_knows_all_rows_of_its_store(tmp_path: Path) -> None:
 def test_the_newest_of_each_measurement_is_kept(tmp_path: Path) -> None:
     folder = run(tmp_path / "run")
     add_measurement(folder, "ucfrec ope", "DR on a", {"R_cum": 1.0, "lift": None}, ["Do not."])
-    add_measurement(folder, "ucfrec evaluate", "world", {"R_cum": "2 [1, 3]", "episodes": 1000})
+    add_measurement(
+        folder, "ucfrec evaluate", "environment", {"R_cum": "2 [1, 3]", "episodes": 1000}
+    )
     add_measurement(folder, "ucfrec ope", "DR on a", {"R_cum": 4.0}, ["It earns more."])
     card = text_of(folder)
     assert card.count("### ucfrec ope: DR on a") == 1

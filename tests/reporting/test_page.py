@@ -191,7 +191,7 @@ def test_long_curves_are_thinned_to_their_end(runs: Path, tmp_path: Path) -> Non
     assert gaps.max() - gaps.min() <= 1  # but for the step that was not finite
 
 
-def test_what_policies_earn_comes_by_world_with_intervals(runs: Path, tmp_path: Path) -> None:
+def test_what_policies_earn_comes_by_environment_with_intervals(runs: Path, tmp_path: Path) -> None:
     rows = [
         row("a", "ucf", 3.25, train_seed=1000, length=7.5, episodes=2000),
         row("a", "ucf", 2.25, train_seed=1001, length=6.5, episodes=2000),
@@ -217,7 +217,7 @@ def test_what_policies_earn_comes_by_world_with_intervals(runs: Path, tmp_path: 
     [
         (None, "does not exist"),
         ("{}", "holds no list of result rows"),
-        ("[1]", "row 1, has no usable world, policy, R_cum"),
+        ("[1]", "row 1, has no usable environment, policy, R_cum"),
         (json.dumps([row("a", "ucf", 1.0), row("a", "ucf", float("nan"))]), "row 2, has no usable"),
     ],
 )

@@ -180,7 +180,7 @@ def test_estimates_from_logs_are_shown_with_their_warnings(folder: Path, tmp_pat
         row("", "ucf", 3.0, estimator="DR", choice="softmax", **about),
     ]
     for one in rows:
-        del one["world"]
+        del one["environment"]
     (tmp_path / "ope.json").write_text(json.dumps([*rows, *rows]))
     page = page_of(tmp_path / "report.html", folder / "ucf", results=(tmp_path / "ope.json",))
     table = page.tables["Estimates for ucf (softmax) of runs/ucf"]

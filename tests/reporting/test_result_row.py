@@ -40,7 +40,7 @@ def test_a_row_is_read_as_it_was_written(row: ResultRow) -> None:
 
 def test_what_a_row_does_not_say_is_not_written() -> None:
     assert result_row().to_json().keys() == {
-        *("suite", "table", "task", "method", "policy", "world", "checkpoint"),
+        *("suite", "table", "task", "method", "policy", "environment", "checkpoint"),
         *("training_seed", "metric", "metrics"),
     }
 

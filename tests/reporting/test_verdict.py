@@ -14,7 +14,7 @@ def earned(policy: str, value: float, wide: float = 0.1, **more: Any) -> dict[st
     return row("a", policy, value, **more) | interval
 
 
-def of_world(*rows: dict[str, Any]) -> str:
+def of_environment(*rows: dict[str, Any]) -> str:
     (said,) = verdict(Results({"a": rows}, ()))
     return said
 
@@ -35,7 +35,7 @@ def test_without_results_nothing_is_said_of_earnings() -> None:
 
 
 def test_the_best_is_named_with_its_interval_and_what_it_lies_above() -> None:
-    said = of_world(
+    said = of_environment(
         earned("random", 1.0), earned("dt", 2.0, train_seed=0), earned("ucf", 3.0, train_seed=0),
         earned("optimal", 9.0), earned("logging", 2.95),
     )  # fmt: skip
@@ -47,14 +47,14 @@ def test_the_best_is_named_with_its_interval_and_what_it_lies_above() -> None:
 
 
 def test_intervals_that_overlap_leave_it_open() -> None:
-    said = of_world(earned("dt", 2.9, train_seed=0), earned("ucf", 3.0, train_seed=0))
+    said = of_environment(earned("dt", 2.9, train_seed=0), earned("ucf", 3.0, train_seed=0))
     assert "overlaps that of dt (2.9): which of them earns more is open" in said
     assert "to compare it with" in said
 
 
 def test_seeds_of_training_are_taken_together() -> None:
     rows = [earned("ucf", value, train_seed=seed) for seed, value in enumerate((3.0, 4.0, 5.0))]
-    said = of_world(*rows, earned("random", 3.5), earned("bad", 1.0))
+    said = of_environment(*rows, earned("random", 3.5), earned("bad", 1.0))
     assert "4 in the mean of 3 trainings (their 95% intervals span 2.9 to 5.1)" in said
     assert "more than bad (1)" in said
     assert "less than random (3.5) is open" in said
@@ -64,13 +64,13 @@ def test_seeds_of_training_are_taken_together() -> None:
 def test_checkpoints_of_one_run_are_no_seeds() -> None:
     rows = [earned("ucf", 3.0, train_seed=0, checkpoint="best"),
             earned("ucf", 2.0, train_seed=0, checkpoint="last")]  # fmt: skip
-    said = of_world(*rows)
+    said = of_environment(*rows)
     assert "ucf, checkpoint best earned most of 2 trained policies: 3 (" in said
     assert "trained once" in said
 
 
 def test_built_in_policies_alone_say_nothing_of_trained_ones() -> None:
-    assert of_world(earned("random", 1.0)) == (
+    assert of_environment(earned("random", 1.0)) == (
         "In a, only built-in policies were evaluated: random (1)."
     )
 

@@ -1,4 +1,4 @@
-"""The distractor: goes with rewards in the logs, causes nothing in the worlds."""
+"""The distractor: goes with rewards in the logs, causes nothing in the environments."""
 
 from pathlib import Path
 from typing import Any
@@ -19,14 +19,14 @@ from ucfrec.commands.cli import main
 from ucfrec.episodes.distractor import reward_bit
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
-from ucfrec.evaluation.world import World
 from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.screened import train_screened
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec_simulators.distractor import DistractorEnv, DistractorWorld, plant_distractor
+from ucfrec_simulators.distractor import DistractorEnv, DistractorEnvironment, plant_distractor
 from ucfrec_simulators.kuai.completion import complete
 from ucfrec_simulators.session_env import SingleSession
 
@@ -35,15 +35,15 @@ TINY = ["train.steps=2", "train.validate_every=2", "policy.dim=16", "policy.cont
 
 @pytest.fixture(scope="module")
 def kuairand_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """KuaiRand-like clicks as a store, `log/store`, and their world, `world`."""
+    """KuaiRand-like clicks as a store, `log/store`, and their environment, `environment`."""
     folder = tmp_path_factory.mktemp("distractor")
-    complete(planted_store(folder / "log"), {}, folder / "world", QUICK)
+    complete(planted_store(folder / "log"), {}, folder / "environment", QUICK)
     return folder
 
 
 @pytest.fixture(scope="module")
 def stores(kuairand_folder: Path) -> dict[str, EpisodeStore]:
-    """One store a world, without a distractor."""
+    """One store an environment, without a distractor."""
     logs, taobao = str(kuairand_folder / "logs"), str(kuairand_folder / "taobao")
     played = ["--env", "synthetic-taobao", "--behavior", "mixture", "--sessions", "300"]
     assert main(["collect", *played, "--out", logs]) == 0
@@ -101,14 +101,14 @@ def test_clicks_that_are_the_rule_are_high_and_equal_rewards_are_refused(tmp_pat
 
 @pytest.mark.parametrize("name", ["synthetic-taobao", "kuairand"])
 def test_the_distractor_causes_nothing(kuairand_folder: Path, name: str) -> None:
-    folder = kuairand_folder / "world"
-    plain = World(name, folder).simulator().make(16, folder)
+    folder = kuairand_folder / "environment"
+    plain = Environment(name, folder).simulator().make(16, folder)
     plain.action_space.seed(3)
     actions = [plain.action_space.sample() for _ in range(40)]
     seen, _ = plain.reset(seed=5)
     steps = [plain.step(action) for action in actions]
     for rate in (0.0, 1.0, 0.4):
-        env = DistractorWorld(name, folder, rate).simulator().make(16, folder)
+        env = DistractorEnvironment(name, folder, rate).simulator().make(16, folder)
         first, _ = env.reset(seed=5)
         np.testing.assert_array_equal(first[:, 1:], seen)
         distractors = [first[:, 0]]
@@ -131,15 +131,17 @@ def test_the_distractor_causes_nothing(kuairand_folder: Path, name: str) -> None
 
 @pytest.mark.parametrize("name", ["synthetic-taobao-distractor", "kuairand-distractor-on"])
 def test_gymnasium_accepts_it(kuairand_folder: Path, name: str) -> None:
-    folder = kuairand_folder / "world"
-    world = World(name, folder).simulator().make(1, folder)
-    check_env(SingleSession(world), skip_render_check=True)
+    folder = kuairand_folder / "environment"
+    environment = Environment(name, folder).simulator().make(1, folder)
+    check_env(SingleSession(environment), skip_render_check=True)
 
 
 def test_behaviors_do_not_look_at_it(kuairand_folder: Path) -> None:
     for name, behavior in (("synthetic-taobao", "optimal"), ("kuairand", "oracle")):
-        worlds = [World(n, kuairand_folder / "world") for n in (name, f"{name}-distractor-on")]
-        plain, distractor = (evaluate_behavior(w, behavior, 40, 0)["R_cum"] for w in worlds)
+        environments = [
+            Environment(n, kuairand_folder / "environment") for n in (name, f"{name}-distractor-on")
+        ]
+        plain, distractor = (evaluate_behavior(w, behavior, 40, 0)["R_cum"] for w in environments)
         assert plain == distractor
 
 
@@ -156,11 +158,13 @@ def test_a_policy_is_shown_the_distractor_where_it_was_trained_on_it(
     same = (states == distractor.unsqueeze(1)).all(0)
     assert same.sum() == 1
     where = int(same.nonzero())
-    folder = kuairand_folder / "world"
+    folder = kuairand_folder / "environment"
     for rate in (0.0, 1.0):
-        world = DistractorWorld(name, folder, rate)
-        assert evaluate_policy(world, trained, "bc", 20, 0, DecisionRule(1.0))["episodes"] == 20
-        env = world.simulator().make(8, folder)
+        environment = DistractorEnvironment(name, folder, rate)
+        assert (
+            evaluate_policy(environment, trained, "bc", 20, 0, DecisionRule(1.0))["episodes"] == 20
+        )
+        env = environment.simulator().make(8, folder)
         ids = np.arange(len(trained.item_ids)) if trained.item_ids is not None else None
         steps_played, states_shown = _play_and_watch(env, trained, ids)
         assert len(states_shown) == steps_played
@@ -198,13 +202,15 @@ def test_screening_finds_the_distractor_among_items_and_drops_it_to_the_last_bit
         for key, value in plain.items():
             assert torch.equal(dropped[key], value), (file, key)
     # What it earns is the same, wherever the distractor is.
-    folder = kuairand_folder / "world"
+    folder = kuairand_folder / "environment"
     earned = [
-        evaluate_policy(world, TrainedPolicy.load(tmp_path / run), "ucf", 20, 0, None)["R_cum"]
-        for world, run in (
-            (World("kuairand", folder), "plain"),
-            (DistractorWorld("kuairand", folder, 0.0), "dropped"),
-            (DistractorWorld("kuairand", folder, 1.0), "dropped"),
+        evaluate_policy(environment, TrainedPolicy.load(tmp_path / run), "ucf", 20, 0, None)[
+            "R_cum"
+        ]
+        for environment, run in (
+            (Environment("kuairand", folder), "plain"),
+            (DistractorEnvironment("kuairand", folder, 0.0), "dropped"),
+            (DistractorEnvironment("kuairand", folder, 1.0), "dropped"),
         )
     ]
     assert len(set(earned)) == 1

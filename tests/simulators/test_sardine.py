@@ -1,4 +1,4 @@
-"""SARDINE's worlds: their oracle is SARDINE's, their logs say how probable each item was."""
+"""SARDINE's environments: their oracle is SARDINE's, their logs say how probable each item was."""
 
 from pathlib import Path
 from typing import Any
@@ -10,9 +10,9 @@ import pytest
 from ucfrec.acting.rollout import Step, rollout
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import collect
-from ucfrec.evaluation.world import World
+from ucfrec.evaluation.environment import Environment
 from ucfrec_simulators import sardine
-from ucfrec_simulators.sardine import BORED_INF, EPSILONS, GreedyOracle, SardineWorld
+from ucfrec_simulators.sardine import BORED_INF, EPSILONS, GreedyOracle, SardineEnvironment
 from ucfrec_simulators.synthetic_catalog import SyntheticCatalog
 
 pytest.importorskip("sardine", reason="needs the extra sardine")
@@ -20,7 +20,7 @@ LIVE = np.ones(8, dtype=np.bool_)
 
 
 def test_the_oracle_shows_what_sardine_s_own_would_show() -> None:
-    env = SardineWorld("BoredInf", 8)
+    env = SardineEnvironment("BoredInf", 8)
     actor = GreedyOracle(env, 0)
     observations, _ = env.reset(seed=0)
     actor.begin(np.arange(8))
@@ -29,23 +29,23 @@ def test_the_oracle_shows_what_sardine_s_own_would_show() -> None:
         own = [each.unwrapped for each in env.envs]
         chosen, propensities = actor.act(observations, LIVE)
         assert (propensities == 1).all()
-        for world, item in zip(own, chosen, strict=True):
-            relevances = relevance(world)
-            best = world.get_st_oracle_slate(np.array([-1]), relevances)
+        for environment, item in zip(own, chosen, strict=True):
+            relevances = relevance(environment)
+            best = environment.get_st_oracle_slate(np.array([-1]), relevances)
             assert relevances[item] == pytest.approx(relevances[best[0]])
             liked += relevances[item] > 0.5
         observations, *_ = env.step(chosen)
     assert liked > 40, "users are not always bored"
 
 
-def relevance(world: Any) -> np.ndarray:
+def relevance(environment: Any) -> np.ndarray:
     """Probability of a click on each item, by SARDINE's formula."""
-    score = world.item_embedd @ world.cur_user_embedd / world.max_score
-    return np.asarray(1 / (1 + np.exp(-(score - world.offset) * world.slope)))
+    score = environment.item_embedd @ environment.cur_user_embedd / environment.max_score
+    return np.asarray(1 / (1 + np.exp(-(score - environment.offset) * environment.slope)))
 
 
 def test_propensities_are_those_of_the_session_s_policy() -> None:
-    env = SardineWorld("Static", 8)
+    env = SardineEnvironment("Static", 8)
     actor = GreedyOracle(env, 3, EPSILONS)
     observations, _ = env.reset(seed=3)
     actor.begin(np.arange(8))
@@ -67,7 +67,7 @@ def test_propensities_are_those_of_the_session_s_policy() -> None:
 
 
 def test_sessions_have_100_steps_and_earn_what_is_known() -> None:
-    env = SardineWorld("BoredInf", 48)
+    env = SardineEnvironment("BoredInf", 48)
     earned = {}
     for name in ("random", "oracle"):
         played = rollout(env, BORED_INF.behaviors[name](env, 0), 48, 0)
@@ -102,7 +102,7 @@ def test_oracles_serve_sardine_only() -> None:
 
 def test_users_of_a_seed_are_always_the_same() -> None:
     def first(seed: int) -> list[Step]:
-        env = SardineWorld("Static", 5)
+        env = SardineEnvironment("Static", 5)
         steps: list[Step] = []
         rollout(env, GreedyOracle(env, seed, EPSILONS), 5, seed, steps.append)
         return steps
@@ -115,4 +115,4 @@ def test_users_of_a_seed_are_always_the_same() -> None:
 def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sardine, "PACKAGE", "sardine_that_is_not_installed")
     with pytest.raises(InputError, match=r"pip install 'ucfrec\[sardine\]'"):
-        World("sardine-static").simulator().make(1, None)
+        Environment("sardine-static").simulator().make(1, None)

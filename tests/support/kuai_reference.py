@@ -1,4 +1,4 @@
-"""A plain reading of the Kuaishou worlds' rules, one user at a time."""
+"""A plain reading of the Kuaishou environments' rules, one user at a time."""
 
 from collections import Counter
 from typing import Any

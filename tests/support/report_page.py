@@ -95,9 +95,9 @@ def rewritten(run: Path, to: Path, **changes: Any) -> Path:
     return to
 
 
-def row(world: str, policy: str, value: float, **more: Any) -> dict[str, Any]:
+def row(environment: str, policy: str, value: float, **more: Any) -> dict[str, Any]:
     interval = {"R_cum": value, "R_cum_low": value - 0.5, "R_cum_high": value + 1.5}
-    return {"world": world, "policy": policy, **interval, **more}
+    return {"environment": environment, "policy": policy, **interval, **more}
 
 
 def number(cell: str) -> float:

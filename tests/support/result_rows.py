@@ -14,7 +14,7 @@ def result_row(value: float = 1.0, **fields: Any) -> ResultRow:
         "suite": "recommendation",
         "table": "main",
         "task": "w",
-        "world": "w",
+        "environment": "w",
         "method": "m",
         "policy": "m",
         "training_seed": 0,

@@ -17,10 +17,15 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 
 SETTINGS = [
     *("train.steps=20", "policy.dim=8", "policy.context=4", "augment.copies=0"),
-    *("policy.max_return=true", "rule.sessions=2", "rule.tilts=[0.5]", "rule.temperatures=[0.0]"),
+    *(
+        "policy.max_return=true",
+        "rule.sessions=2",
+        "rule.reward_weights=[0.5]",
+        "rule.temperatures=[0.0]",
+    ),
     *("rule.quantiles=[1.0]", "rule.tag_windows=[0]"),
 ]
-FULL = DecisionRule(None, floor=0.1, tilt=0.7, exclude_seen=True, tag_window=2)
+FULL = DecisionRule(None, floor=0.1, reward_weight=0.7, exclude_seen=True, tag_window=2)
 """A rule that uses every part of a policy."""
 
 

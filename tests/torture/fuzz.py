@@ -392,8 +392,8 @@ def _texts(inputs: Inputs) -> Path:
     row |= {"metrics": {"r": 1.0}, "interval": [0.5, 1.5], "conditions": {"b": 1}}  # type: ignore[dict-item]
     (folder / "rows.jsonl").write_text(f"{json.dumps(row)}\n" * 3)
     evaluations = folder / "evaluations.json"
-    world = ("--env", "synthetic-catalog", "--episodes", 20, "--json", evaluations)
-    if end := run("evaluate", inputs.run, *world).status:
+    environment = ("--env", "synthetic-catalog", "--episodes", 20, "--json", evaluations)
+    if end := run("evaluate", inputs.run, *environment).status:
         raise SystemExit(f"evaluate ended with {end}")
     (folder / "mapping.toml").write_text(
         'reward = "is_click"\nsession_by = "gap"\n[columns]\nuser_id = "uid"\n'

@@ -14,7 +14,7 @@ from tests.torture.children import run_first
 TINY = (
     *("train.steps=30", "train.validate_every=10", "policy.dim=8", "policy.context=4"),
     *("crm.epochs=1", "crm.hidden=16", "csg.epochs=1", "rule.sessions=10", "rule.quantiles=[1.0]"),
-    *("rule.temperatures=[0.0,1.0]", "rule.tilts=[0.0,1.0]", "rule.tag_windows=[0]"),
+    *("rule.temperatures=[0.0,1.0]", "rule.reward_weights=[0.0,1.0]", "rule.tag_windows=[0]"),
 )
 SETTINGS = [part for setting in TINY for part in ("--set", setting)]
 
@@ -37,9 +37,9 @@ class Inputs:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.logs, self.store, self.run = folder / "logs", folder / "store", folder / "run"
-        world = ("--env", "synthetic-catalog", "--sessions", 60)
+        environment = ("--env", "synthetic-catalog", "--sessions", 60)
         for arguments in (
-            ("collect", *world, "--out", self.logs),
+            ("collect", *environment, "--out", self.logs),
             ("prepare", self.log, "--out", self.store, "--reward", "is_click"),
             ("train", self.store, "--out", self.run, *SETTINGS),
         ):
@@ -52,9 +52,9 @@ class Inputs:
         return self.logs / "sessions.parquet"
 
     def jobs(self) -> list[Job]:
-        world = ("--env", "synthetic-catalog")
+        environment = ("--env", "synthetic-catalog")
         return [
-            Job("collect", lambda out: ["collect", *world, "--sessions", 60, "--out", out]),
+            Job("collect", lambda out: ["collect", *environment, "--sessions", 60, "--out", out]),
             Job(
                 "prepare",
                 lambda out: ["prepare", self.log, "--out", out, "--reward", "is_click"],
@@ -70,7 +70,7 @@ class Inputs:
             Job("ope", lambda out: ["ope", self.run, self.log, "--json", out], ".json", True),
             Job(
                 "evaluate",
-                lambda out: ["evaluate", self.run, *world, "--episodes", 20, "--json", out],
+                lambda out: ["evaluate", self.run, *environment, "--episodes", 20, "--json", out],
                 ".json",
                 waits=True,
             ),

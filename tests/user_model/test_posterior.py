@@ -9,15 +9,15 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import DotProduct
 from torch import Tensor
 
-from ucfrec.user_model.posterior import SessionTastes, _solution, root_of_tastes
+from ucfrec.user_model.posterior import UserPosterior, _solution, root_of_tastes
 
 ITEMS, DIM = 12, 3
 
 
-def planted(seed: int = 0) -> tuple[SessionTastes, Tensor]:
+def planted(seed: int = 0) -> tuple[UserPosterior, Tensor]:
     """Tastes that differ in all directions, and the vectors of the items."""
     random = torch.Generator().manual_seed(seed)
-    tastes = SessionTastes(ITEMS, DIM)
+    tastes = UserPosterior(ITEMS, DIM)
     tastes.root.copy_(torch.randn(DIM + 1, DIM + 1, generator=random).tril())
     tastes.usual.copy_(torch.rand(ITEMS, generator=random))
     tastes.weigh(2.5)

@@ -41,8 +41,8 @@ def sigmoid(values: Float64Array) -> Float64Array:
 
 def log(seed: int, boredom: float = 0.0, taste: float = 0.0, users: int = USERS) -> Log:
     """Items shown at random; users and items differ, and may tire of, or like, some tags."""
-    rng, world = np.random.default_rng(seed), np.random.default_rng(99)
-    of_item, tags = world.normal(0, 1, ITEMS), np.arange(ITEMS) % TAGS
+    rng, environment = np.random.default_rng(seed), np.random.default_rng(99)
+    of_item, tags = environment.normal(0, 1, ITEMS), np.arange(ITEMS) % TAGS
     of_user = rng.normal(0, 1, users)
     items = rng.integers(ITEMS, size=(users, LENGTH))
     liked = rng.integers(TAGS, size=users)

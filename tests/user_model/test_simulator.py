@@ -14,7 +14,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.user_model.fatigue import Fatigue
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_fit import reward_model_sizes
-from ucfrec.user_model.simulator import LearnedSessions, LoggedEnds, SessionEnd
+from ucfrec.user_model.simulator import LoggedEnds, SessionEnd, UserSimulator
 
 ITEMS = 12
 
@@ -43,10 +43,10 @@ def never(store: EpisodeStore) -> SessionEnd:
 
 def test_rewards_are_drawn_with_the_models_calibrated_probabilities(store: EpisodeStore) -> None:
     effects = torch.linspace(-2, 2, len(store.item_states.embeddings))
-    world = LearnedSessions(store, model_of(store, effects), (0.5, 1.0), never(store), 4000, 50)
-    world.reset(seed=3)
+    environment = UserSimulator(store, model_of(store, effects), (0.5, 1.0), never(store), 4000, 50)
+    environment.reset(seed=3)
     for item in (0, 11, 23):
-        _, rewards, terminated, truncated, _ = world.step(np.full(4000, item))
+        _, rewards, terminated, truncated, _ = environment.step(np.full(4000, item))
         expected = torch.sigmoid(0.5 * effects[item] + 1.0)
         assert rewards.mean() == pytest.approx(float(expected), abs=0.03)
         assert set(np.unique(rewards)) <= {0.0, 1.0}
@@ -57,7 +57,7 @@ def test_rewards_are_drawn_with_the_models_calibrated_probabilities(store: Episo
 def test_users_who_liked_one_main_tag_on_end_reward_less_for_a_while(store: EpisodeStore) -> None:
     effects = torch.full((len(store.item_states.embeddings),), 40.0)
     given = store, model_of(store, effects), (1.0, 0.0), never(store)
-    tired, one = LearnedSessions(*given, 3000, 50, 1, Fatigue(3, 2, 0.25)), np.zeros(3000)
+    tired, one = UserSimulator(*given, 3000, 50, 1, Fatigue(3, 2, 0.25)), np.zeros(3000)
     tags = MainTags.of(store.item_states).tags
     other = one + int((tags != tags[0]).nonzero()[0])
     tired.reset(seed=3)
@@ -66,18 +66,18 @@ def test_users_who_liked_one_main_tag_on_end_reward_less_for_a_while(store: Epis
     assert shares[3:5] == pytest.approx([0.25] * 2, abs=0.05)
     # A fourth like tires for two steps, too; then the run is broken.
     assert shares[5:] == pytest.approx([1 - 0.25 * 0.75, 1.0], abs=0.03)
-    untired = LearnedSessions(*given, 3000, 50)
+    untired = UserSimulator(*given, 3000, 50)
     untired.reset(seed=3)
     assert all(untired.step(one)[1].all() for _ in range(6))
 
 
 def test_sessions_end_at_the_longest_length_and_begin_anew(store: EpisodeStore) -> None:
     effects = torch.zeros(len(store.item_states.embeddings))
-    world = LearnedSessions(store, model_of(store, effects), (1.0, 0.0), never(store), 5, 3)
-    _, info = world.reset(seed=0)
+    environment = UserSimulator(store, model_of(store, effects), (1.0, 0.0), never(store), 5, 3)
+    _, info = environment.reset(seed=0)
     first = info["user_id"].copy()
     for step in range(3):
-        *_, truncated, info = world.step(np.arange(5))
+        *_, truncated, info = environment.step(np.arange(5))
         assert truncated.all() == (step == 2)
     users = store.episode_values("user")
     np.testing.assert_array_equal(first, users[:5])
@@ -88,11 +88,11 @@ def test_sessions_end_at_the_longest_length_and_begin_anew(store: EpisodeStore) 
 def test_equal_seeds_give_equal_sessions(store: EpisodeStore) -> None:
     effects = torch.zeros(len(store.item_states.embeddings))
     end = SessionEnd(Likeness.of(store.item_states), LoggedEnds.of(store, 10, 10_000, 0))
-    world = LearnedSessions(store, model_of(store, effects), (1.0, 0.0), end, 50, 20)
+    environment = UserSimulator(store, model_of(store, effects), (1.0, 0.0), end, 50, 20)
     played = []
     for seed in (7, 7, 8):
-        world.reset(seed)
-        steps = [world.step(np.full(50, i))[1:4] for i in range(6)]
+        environment.reset(seed)
+        steps = [environment.step(np.full(50, i))[1:4] for i in range(6)]
         played.append(np.concatenate([np.concatenate(step) for step in steps]))
     assert np.array_equal(played[0], played[1])
     assert not np.array_equal(played[0], played[2])

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _RANGES: Final = {
     "target": (-1e12, 1e12),
     "floor": (-1e12, 1e12),
-    "tilt": (0.0, 1e6),
+    "reward_weight": (0.0, 1e6),
     "temperature": (0.0, 1e6),
     "top_k": (1, 10**9),
     "tag_window": (0, 10**4),
@@ -54,7 +54,7 @@ class DecisionRule:
     floor: float | None = None
     """Returns-to-go asked for are held above this, also once a session has reached its target; None
     for no floor."""
-    tilt: float = 0.0
+    reward_weight: float = 0.0
     """β, weight of the reward model, whose predictions are log-odds of a reward, or rewards in
     standard deviations; 0 for none."""
     temperature: float = 0.0
@@ -119,7 +119,7 @@ class DecisionRule:
         target = "the largest return expected" if self.target is None else f"{self.target:g}"
         parts = [f"target {target}"]
         parts += [] if self.floor is None else [f"at least {self.floor:g} at every step"]
-        parts += [f"tilt {self.tilt:g}"] if self.tilt else []
+        parts += [f"reward weight {self.reward_weight:g}"] if self.reward_weight else []
         parts += [f"the {self.top_k} best"] if self.top_k else []
         parts += ["unseen items"] if self.exclude_seen else []
         parts += [f"no tag of the last {self.tag_window}"] if self.tag_window else []
@@ -216,17 +216,18 @@ class Decider:
     returns: ReturnToGo = field(default_factory=ReturnToGo)
     """What the returns-to-go of the training counted."""
     reward_model: "ItemRewardModel | None" = None
-    """f̂_r; needed for a tilt."""
+    """f̂_r; needed for a reward weight."""
     likeness: Likeness | None = None
     """Tags of the items; needed for a tag window."""
     main_tags: MainTags | None = None
     """Main tags of the items; needed for a tag run."""
 
     def __post_init__(self) -> None:
-        if self.rule.tilt and self.reward_model is None:
+        if self.rule.reward_weight and self.reward_model is None:
             raise InputError(
-                f"the rule has tilt {self.rule.tilt:g}, but the run has no reward model of items; "
-                "train it with --set rule.choose=true, or set the tilt to 0"
+                f"the rule has reward weight {self.rule.reward_weight:g}, but the run has no "
+                "reward model of items; train it with --set rule.choose=true, or set the reward "
+                "weight to 0"
             )
         if self.rule.tag_window and (self.likeness is None or not self.likeness.tags.shape[1]):
             raise InputError(
@@ -326,7 +327,7 @@ class Decider:
         shown: Shown | None = None,
     ) -> Tensor:
         """`scores` from the policy's outputs (B, n_items)."""
-        scores = self.tilted(logits, windows, users, shown)
+        scores = self.weighted(logits, windows, users, shown)
         self.require_numbers(scores)
         if forbidden is not None:
             scores = scores.masked_fill(forbidden, -torch.inf)
@@ -343,13 +344,13 @@ class Decider:
         return scores
 
     @torch.no_grad()
-    def tilted(
+    def weighted(
         self, logits: Tensor, windows: Windows, users: Tensor | None, shown: Shown | None
     ) -> Tensor:
         """The policy's outputs (B, n_items) plus β f̂_r; the arguments are those of `scores`."""
-        if not self.rule.tilt:
+        if not self.rule.reward_weight:
             return logits
-        return self.rewards(windows, users, shown).mul_(self.rule.tilt).add_(logits)
+        return self.rewards(windows, users, shown).mul_(self.rule.reward_weight).add_(logits)
 
     @staticmethod
     def require_numbers(scores: Tensor) -> None:

@@ -161,7 +161,7 @@ class SessionScorer:
             windows = decider.asked(sessions.windows(self._states, context), sessions.collected)
             # Learners may give what they keep, and scores are overwritten.
             outputs = decider.act_and_features(windows)[0].clone()
-            scores = decider.tilted(outputs, windows, sessions.users, sessions.shown)
+            scores = decider.weighted(outputs, windows, sessions.users, sessions.shown)
         else:
             if self._of_one is not None and len(sessions.users) == 1:
                 query = self._of_one(sessions)
@@ -176,7 +176,11 @@ class _Product:
     """Scores as a product of features with one matrix of all items, plus what was shown."""
 
     def __init__(self, decider: Decider, head: ItemHead, model: ItemRewardModel | None) -> None:
-        self._policy, self._tilt, self._model = decider.policy, decider.rule.tilt, model
+        self._policy, self._reward_weight, self._model = (
+            decider.policy,
+            decider.rule.reward_weight,
+            model,
+        )
         self._features = decider.policy.acting_features()
         self._exposure = head.exposure
         likeness = _likenesses(head, model)
@@ -184,7 +188,7 @@ class _Product:
         self._bias = head.bias.detach()
         if model is not None:
             factors.append(model.vectors)
-            self._bias = self._bias + self._tilt * model.item
+            self._bias = self._bias + self._reward_weight * model.item
         self._alike = None
         self._likeness = likeness[0] if likeness else None
         if self._likeness is not None:
@@ -197,7 +201,7 @@ class _Product:
     @classmethod
     def of(cls, decider: Decider) -> "_Product | None":
         """None for a policy that scores items in a way of its own."""
-        policy, model = decider.policy, decider.reward_model if decider.rule.tilt else None
+        policy, model = decider.policy, decider.reward_model if decider.rule.reward_weight else None
         kind, head = type(policy), policy.head
         own = kind.act is SequencePolicy.act
         own = own and kind.act_and_features is SequencePolicy.act_and_features
@@ -264,9 +268,9 @@ class _Product:
         if self._model is not None:
             tastes = self._model.tastes_after(shown)
             query = self._model.query(windows.states[:, -1], sessions.users, tastes)
-            inputs.append(self._tilt * query)
+            inputs.append(self._reward_weight * query)
             of_model = self._model.exposures(shown)[1:]
-            weights.append((self._tilt * of_model[0], self._tilt * of_model[1]))
+            weights.append((self._reward_weight * of_model[0], self._reward_weight * of_model[1]))
         factors = torch.cat(inputs, 1)
         if self._likeness is None:
             nothing = factors[:, :0]

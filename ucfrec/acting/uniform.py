@@ -1,4 +1,4 @@
-"""Uniformly random actions, the built-in policy `random` of every world."""
+"""Uniformly random actions, the built-in policy `random` of every environment."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -35,14 +35,15 @@ class Uniform(Memoryless):
         self._space = env.single_action_space
         if isinstance(self._space, spaces.Box) and not self._space.is_bounded():
             raise InputError(
-                "no vectors can be drawn uniformly, because the world's actions have no finite "
-                "bounds; collect its logs with another policy, or bound its action space"
+                "no vectors can be drawn uniformly, because the environment's actions have no "
+                "finite bounds; collect its logs with another policy, or bound its action space"
             )
         self._generator = np.random.default_rng([seed, 1])
         self._forbidden: IntArray | None = None
 
     def inform(self, info: Mapping[str, Any]) -> None:
-        """Read the (N, L) forbidden items of each session from `info`, if the world masks items."""
+        """Read the (N, L) forbidden items of each session from `info`, if the environment masks
+        items."""
         self._forbidden = info.get(FORBIDDEN)
 
     def act(

@@ -1,4 +1,4 @@
-"""Choose the tilt of a run by how it ranks the validation rows of its log.
+"""Choose the reward weight of a run by how it ranks the validation rows of its log.
 
 Where the log has no true sessions there is nothing to play, but every row tells what a user liked.
 A candidate is worth the mean rate, in the validation period, of the ten items that it would show,
@@ -27,7 +27,7 @@ SHOWN = 10
 _MOST_STEPS = 4000
 """Validation rows that are ranked at most."""
 _HALVINGS = 3
-"""How often the interval between the best tilt and the next larger one is halved."""
+"""How often the interval between the best reward weight and the next larger one is halved."""
 _AT_ONCE = 256
 
 
@@ -67,7 +67,7 @@ class RankedChoice:
             "find liked items no worse than the ten most liked ones do; no propensities are used",
             "warning": ""
             if self.supported
-            else "; WARNING: no candidate does, this one has no tilt",
+            else "; WARNING: no candidate does, this one has no reward weight",
             "candidates": [candidate.as_dict() for candidate in self.candidates],
         }
 
@@ -75,18 +75,19 @@ class RankedChoice:
 def choose_by_ranking(
     decider: Decider, train: EpisodeStore, validation: EpisodeStore, config: RuleConfig, seed: int
 ) -> RankedChoice:
-    """Choose the tilt of the rule of `decider`; its other parts stay.
+    """Choose the reward weight of the rule of `decider`; its other parts stay.
 
     Args:
         decider: the policy under its default rule, with a reward model.
         train: training episodes.
         validation: validation episodes.
-        config: `tilts` are the first candidates.
+        config: `reward_weights` are the first candidates.
         seed: of the validation rows that are drawn from more than 4,000.
 
     Returns:
-        The tilt with the highest rate among those with enough overlap; without any, no tilt. If
-        the next larger of the candidates overlaps too little, tilts between the two are tried.
+        The reward weight with the highest rate among those with enough overlap; without any, no
+        reward weight. If the next larger of the candidates overlaps too little, reward weights
+        between the two are tried.
     """
     rows = np.arange(validation.n_steps)
     if len(rows) > _MOST_STEPS:
@@ -99,21 +100,25 @@ def choose_by_ranking(
     most_liked = TrainingCounts.of(train).liked.topk(min(SHOWN, len(rates))).indices.numpy()
     floor = np.isin(items, most_liked)
     given = _Rows(validation, episodes, steps, items, liked, floor, rates)
-    tilts = sorted({0.0, *config.tilts})
+    reward_weights = sorted({0.0, *config.reward_weights})
     candidates: list[RankedRule] = []
 
-    def rank(tilts: Sequence[float]) -> None:
-        for tilt, top in zip(tilts, _tops(decider, tilts, given), strict=True):
-            candidates.append(_ranked(replace(decider.rule, tilt=tilt), top, given))
+    def rank(reward_weights: Sequence[float]) -> None:
+        for reward_weight, top in zip(
+            reward_weights, _tops(decider, reward_weights, given), strict=True
+        ):
+            candidates.append(
+                _ranked(replace(decider.rule, reward_weight=reward_weight), top, given)
+            )
 
-    rank(tilts)
+    rank(reward_weights)
     for _ in range(_HALVINGS):
         best = _best(candidates)
-        larger = [each for each in candidates if each.rule.tilt > best.rule.tilt]
-        nearest = min(larger, key=lambda each: each.rule.tilt, default=best)
+        larger = [each for each in candidates if each.rule.reward_weight > best.rule.reward_weight]
+        nearest = min(larger, key=lambda each: each.rule.reward_weight, default=best)
         if nearest.gain >= 0:
             break
-        rank([(best.rule.tilt + nearest.rule.tilt) / 2])
+        rank([(best.rule.reward_weight + nearest.rule.reward_weight) / 2])
     best = _best(candidates)
     return RankedChoice(best.rule, candidates, best.gain >= 0)
 
@@ -139,26 +144,37 @@ class _Rows:
 
 
 @torch.no_grad()
-def _tops(decider: Decider, tilts: Sequence[float], rows: _Rows) -> list[IntArray]:
-    """The items (M, `SHOWN`) that are shown with each tilt.
+def _tops(decider: Decider, reward_weights: Sequence[float], rows: _Rows) -> list[IntArray]:
+    """The items (M, `SHOWN`) that are shown with each reward weight.
 
-    Policy and reward model are computed once for all tilts.
+    Policy and reward model are computed once for all reward weights.
     """
-    plain, tops = replace(decider, rule=replace(decider.rule, tilt=0.0)), list[list[Tensor]]()
+    plain, tops = (
+        replace(decider, rule=replace(decider.rule, reward_weight=0.0)),
+        list[list[Tensor]](),
+    )
     starts = range(0, len(rows.steps), _AT_ONCE)
     with progress(len(rows.steps), "choose the rule", "rows") as bar:
         for first in starts:
             part = slice(first, first + _AT_ONCE)
             known = LoggedDecisions.at(plain, rows.store, rows.episodes[part], rows.steps[part])
             logits = plain.act(known.windows, known.collected)
-            liked = plain.rewards(known.windows, known.users, known.shown) if any(tilts) else 0.0
-            of_tilts = []
-            for tilt in tilts:
+            liked = (
+                plain.rewards(known.windows, known.users, known.shown)
+                if any(reward_weights)
+                else 0.0
+            )
+            of_reward_weights = []
+            for reward_weight in reward_weights:
                 scores = plain.scores_from(
-                    logits + tilt * liked, known.windows, known.forbidden, known.users, known.shown
+                    logits + reward_weight * liked,
+                    known.windows,
+                    known.forbidden,
+                    known.users,
+                    known.shown,
                 )
-                of_tilts.append(scores.topk(min(SHOWN, scores.shape[1])).indices)
-            tops.append(of_tilts)
+                of_reward_weights.append(scores.topk(min(SHOWN, scores.shape[1])).indices)
+            tops.append(of_reward_weights)
             bar.update(len(logits))
     return [torch.cat(parts).numpy() for parts in zip(*tops, strict=True)]
 

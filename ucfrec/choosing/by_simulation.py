@@ -1,4 +1,4 @@
-"""Choose the decision rule of a run on the validation sessions of its log, never in a world.
+"""Choose the decision rule of a run on the validation sessions of its log, never in an environment.
 
 The candidates are played in a model of the users: rewards from the run's reward model, calibrated
 on validation rows, or for new users from the tastes of training users, which the policy does not
@@ -28,7 +28,7 @@ from ucfrec.user_model.fatigue import Fatigue, LoggedRuns, fit_fatigue
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_report import fit_line, scores_of
 from ucfrec.user_model.reward_rows import RewardRows
-from ucfrec.user_model.simulator import LearnedSessions, LoggedEnds, SessionEnd
+from ucfrec.user_model.simulator import LoggedEnds, SessionEnd, UserSimulator
 from ucfrec.user_model.training_users import TrainingUsers, sessions_of
 
 _MOST_STEPS = 100_000
@@ -160,7 +160,7 @@ class RuleSearch:
         n, count = times * self._config.sessions, len(rules)
         if not count:
             return []
-        world = LearnedSessions(
+        environment = UserSimulator(
             *(self._store, self._model, self.calibration, self.end, n, self._longest, count),
             self.fatigue,
         )
@@ -169,7 +169,7 @@ class RuleSearch:
         users = np.arange(len(self._store.item_states.user_features))
         states = self._store.item_states
         actor = ManyRules(deciders, n, self._store.observation_size, states, users, seed=self._seed)
-        returns, lengths, shown = _played(world, actor, self._seed)
+        returns, lengths, shown = _played(environment, actor, self._seed)
         numbers = np.arange(count * n).reshape(count, n)
         return [
             self._candidate(rule, returns[of_rule], lengths[of_rule], shown[shown[:, 0] // n == i])
@@ -218,22 +218,22 @@ class RuleSearch:
 
 
 def _played(
-    world: LearnedSessions, actor: ManyRules, seed: int
+    environment: UserSimulator, actor: ManyRules, seed: int
 ) -> tuple[Float64Array, IntArray, IntArray]:
     """Play one session in each of the N environments.
 
     Returns:
         Returns (N,), lengths (N,), and the environment and item of every step, (M, 2).
     """
-    observations, info = world.reset(seed)
-    live = np.arange(world.num_envs)
+    observations, info = environment.reset(seed)
+    live = np.arange(environment.num_envs)
     returns, lengths = np.zeros(len(live)), np.zeros(len(live), dtype=np.int64)
     shown = list[IntArray]()
     with progress(len(live), "choose the rule", "sessions") as bar:
         while len(live):
             actor.inform(info)
             items, _ = actor.act(observations, np.ones(len(live), dtype=bool))
-            observations, rewards, terminated, truncated, info = world.step(items)
+            observations, rewards, terminated, truncated, info = environment.step(items)
             actor.observe(items, rewards)
             returns[live] += rewards
             lengths[live] += 1
@@ -242,7 +242,7 @@ def _played(
             bar.update(len(live) - len(going))
             if len(going) < len(live):
                 live = live[going]
-                world.keep(going)
+                environment.keep(going)
                 actor.keep(going)
                 observations, info = observations[going], {USER_IDS: info[USER_IDS][going]}
     return returns, lengths, np.concatenate(shown)
@@ -257,12 +257,13 @@ def choose_rule(
     seed: int,
     users: TrainingUsers | None = None,
 ) -> Choice:
-    """Choose target, floor and temperature, then the tilt.
+    """Choose target, floor and temperature, then the reward weight.
 
-    Where items have tags, tag window and temperature follow, and the tilt with the window; where
-    the log shows fatigue, the tag run, and temperature and tilt with it. With `users`, the most
-    promising rules are then played in more sessions. Of rules that the model cannot tell apart, the
-    one at the highest temperature is taken, which stays nearest to the log.
+    Where items have tags, tag window and temperature follow, and the reward weight with the
+    window; where the log shows fatigue, the tag run, and temperature and reward weight with it.
+    With `users`, the most promising rules are then played in more sessions. Of rules that the
+    model cannot tell apart, the one at the highest temperature is taken, which stays nearest to
+    the log.
 
     Args:
         decider: the policy under its default rule, with a reward model.
@@ -275,17 +276,17 @@ def choose_rule(
     """
     search = RuleSearch(decider, train, validation, config, seed, users)
     learned = decider.policy.values is not None and decider.policy.config.max_return
-    played = search.play([*_untilted(config, targets, learned)])
+    played = search.play([*_unweighted(config, targets, learned)])
     first = search.best(played)
-    played.extend(search.play([*_tilted(config, first.rule)]))
+    played.extend(search.play([*_weighted(config, first.rule)]))
     second = search.best(_simplest_first(played))
     if validation.item_states.tags.shape[1]:
         if filtered := search.play([*_filtered(config, second.rule, decider.known)]):
             third = search.best(_simplest_first(filtered)).rule
             windows = {each.rule.tag_window for each in filtered}
             others = (replace(third, tag_window=window) for window in sorted(windows))
-            tilted = search.play([rule for other in others for rule in _tilted(config, other)])
-            played.extend([*filtered, *tilted])
+            weighted = search.play([rule for other in others for rule in _weighted(config, other)])
+            played.extend([*filtered, *weighted])
         # Without a tag window, which may only have served to tire nobody.
         runs = [] if search.fatigue is None else [*_limited(config, second.rule)]
         if limited := search.play(runs):
@@ -309,7 +310,13 @@ def _simplest_first(candidates: Sequence[Candidate]) -> list[Candidate]:
 
 def _simplicity(candidate: Candidate) -> tuple[float, ...]:
     rule = candidate.rule
-    return rule.tag_run > 0, rule.tag_window > 0, -rule.temperature, rule.tilt, -rule.tag_run
+    return (
+        rule.tag_run > 0,
+        rule.tag_window > 0,
+        -rule.temperature,
+        rule.reward_weight,
+        -rule.tag_run,
+    )
 
 
 def _filtered(config: RuleConfig, rule: DecisionRule, known: int) -> Iterator[DecisionRule]:
@@ -331,13 +338,13 @@ def _limited(config: RuleConfig, rule: DecisionRule) -> Iterator[DecisionRule]:
 
 
 def _drawn(config: RuleConfig, rule: DecisionRule) -> Iterator[DecisionRule]:
-    """The rule at every other pair of temperature and tilt."""
-    for temperature, tilt in product(config.temperatures, config.tilts):
-        if (temperature, tilt) != (rule.temperature, rule.tilt):
-            yield replace(rule, temperature=temperature, tilt=tilt)
+    """The rule at every other pair of temperature and reward weight."""
+    for temperature, reward_weight in product(config.temperatures, config.reward_weights):
+        if (temperature, reward_weight) != (rule.temperature, rule.reward_weight):
+            yield replace(rule, temperature=temperature, reward_weight=reward_weight)
 
 
-def _untilted(
+def _unweighted(
     config: RuleConfig, targets: Mapping[float, float], learned: bool
 ) -> Iterator[DecisionRule]:
     for temperature in sorted(config.temperatures, reverse=True):
@@ -348,10 +355,10 @@ def _untilted(
             yield DecisionRule(None, temperature=temperature)
 
 
-def _tilted(config: RuleConfig, rule: DecisionRule) -> Iterator[DecisionRule]:
-    for tilt in config.tilts:
-        if tilt != rule.tilt:
-            yield replace(rule, tilt=tilt)
+def _weighted(config: RuleConfig, rule: DecisionRule) -> Iterator[DecisionRule]:
+    for reward_weight in config.reward_weights:
+        if reward_weight != rule.reward_weight:
+            yield replace(rule, reward_weight=reward_weight)
 
 
 def calibrate(model: ItemRewardModel, rows: RewardRows) -> tuple[float, float]:

@@ -33,7 +33,7 @@ class RuleConfig:
     floor at the same value."""
     temperatures: Annotated[tuple[_Temperature, ...], _SOME] = (0.0, 0.5, 1.0)
     """Candidates for the temperature."""
-    tilts: Annotated[tuple[_Tilt, ...], _SOME] = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
+    reward_weights: Annotated[tuple[_Tilt, ...], _SOME] = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
     """Candidates for β, the weight of the reward model."""
     tag_windows: Annotated[tuple[_Steps, ...], _SOME] = (0, 3, 10)
     """Candidates for the number of steps whose tags are left out, where items have tags."""
@@ -51,5 +51,5 @@ class RuleConfig:
     page of them; at most a quarter of the items that the log supports."""
     tolerance: Annotated[float, Field(ge=0, lt=1)] = 0.02
     """Share of the best estimate by which that of a rule at a higher temperature, or with less
-    tilt, may fall short: the standard error of the sessions, which is allowed in any case, does not
-    count what the model of the users gets wrong."""
+    reward weight, may fall short: the standard error of the sessions, which is allowed in any
+    case, does not count what the model of the users gets wrong."""

@@ -10,7 +10,7 @@ from ucfrec.commands.grid_options import (
     rows_explained,
     rows_given,
 )
-from ucfrec.commands.options import env_options, world_given
+from ucfrec.commands.options import env_options, environment_given
 from ucfrec.plugins import Benchmark, BenchmarkRequest, load_plugin
 from ucfrec.reporting.grid import chosen
 from ucfrec.reporting.rows_file import benchmarking
@@ -88,7 +88,7 @@ def run(options: argparse.Namespace) -> None:
         log_seed=options.log_seed,
         logs=options.logs,
         evaluation_seed=options.evaluation_seed,
-        world=world_given(options) if options.env else None,
+        environment=environment_given(options) if options.env else None,
         tasks=options.task,
         methods=options.method,
         training_seeds=options.training_seeds,

@@ -13,7 +13,7 @@ def card_of_evaluation(run: Path, row: Mapping[str, Any]) -> None:
     from ucfrec.reporting.model_card import add_measurement
 
     names = ("R_cum", "R_avg_pooled", "length", "episodes", "coverage", "diversity", "seed")
-    of = f"{row['world']}, {_rule(row)}, checkpoint {row['checkpoint']}"
+    of = f"{row['environment']}, {_rule(row)}, checkpoint {row['checkpoint']}"
     add_measurement(run, "ucfrec evaluate", of, _values(row, "R_cum", names))
 
 

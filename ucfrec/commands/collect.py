@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ucfrec.commands.options import world_given, world_options
+from ucfrec.commands.options import environment_given, environment_options
 from ucfrec.errors import InputError
 
 if TYPE_CHECKING:
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec collect`."""
-    world_options(parser)
+    environment_options(parser)
     parser.add_argument(
         "--behavior",
-        help="built-in policy that acts in the sessions (default: mixture, or random in worlds "
-        "that have no mixture)",
+        help="built-in policy that acts in the sessions (default: mixture, or random where it has no "
+        "mixture)",
     )
     parser.add_argument(
         "--sessions", type=int, default=20_000, help="number of sessions (default: 20000)"
@@ -33,13 +33,13 @@ def run(options: argparse.Namespace) -> None:
     """
     from ucfrec.evaluation.collect import collect
 
-    world = world_given(options)
-    simulator = world.simulator()
+    environment = environment_given(options)
+    simulator = environment.simulator()
     behavior = options.behavior or simulator.logging_behavior
     if behavior not in simulator.behaviors:
         known = ", ".join(simulator.behaviors)
-        raise InputError(f"{world.name} has no behavior {behavior!r}; it has {known}")
-    env = simulator.make(256, world.folder)
+        raise InputError(f"{environment.name} has no behavior {behavior!r}; it has {known}")
+    env = simulator.make(256, environment.folder)
     actor = simulator.behaviors[behavior](env, options.seed)
     played = collect(
         simulator,
@@ -48,7 +48,7 @@ def run(options: argparse.Namespace) -> None:
         options.sessions,
         options.seed,
         options.out,
-        env_name=world.title,
+        env_name=environment.title,
         behavior=behavior,
     )
     print(

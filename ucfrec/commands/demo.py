@@ -1,4 +1,5 @@
-"""`ucfrec demo`: every step from `collect` to `report`, on the logs of two simulated worlds."""
+"""`ucfrec demo`: every step from `collect` to `report`, on the logs of two simulated
+environments."""
 
 import argparse
 import os
@@ -11,7 +12,7 @@ from typing import Any
 from ucfrec.processes import pool_of_processes, without_ctrl_c
 from ucfrec.progress import progress
 
-WORLDS = ("synthetic-taobao", "synthetic-catalog")
+ENVIRONMENTS = ("synthetic-taobao", "synthetic-catalog")
 LEARNERS: dict[str, tuple[str, ...]] = {
     "bc": ("bc",),
     "dt": ("dt",),
@@ -30,7 +31,7 @@ class DemoConfig:
     """Sizes of the demo: minutes on two cores."""
 
     sessions: int = 6000
-    """Logged sessions of each world."""
+    """Logged sessions of each environment."""
     episodes: int = 1000
     """Evaluated episodes of each policy."""
     settings: Sequence[str] = (
@@ -69,52 +70,60 @@ def run(options: argparse.Namespace) -> None:
 def demo(out: Path, seed: int, config: DemoConfig) -> list[dict[str, Any]]:
     """Run the demo in the folder `out`; an interrupted demo that is run again resumes.
 
-    Writes `out/results.json`, `out/report.html` and, in `out/<world>`, the logs, store and runs of
-    each world, for use with the other commands, and in `stages` what these have in common.
+    Writes `out/results.json`, `out/report.html` and, in `out/<environment>`, the logs, store and
+    runs of each environment, for use with the other commands, and in `stages` what these have in
+    common.
 
     Returns:
-        The rows of `out/results.json`: one per world and policy, worlds in the order of `WORLDS`.
+        The rows of `out/results.json`: one per environment and policy, environments in the order
+        of `WORLDS`.
     """
+    from ucfrec.evaluation.environment import Environment
     from ucfrec.evaluation.evaluate import evaluate_behavior
     from ucfrec.evaluation.simulated_store import simulated_store
-    from ucfrec.evaluation.world import World
     from ucfrec.files.atomic import write_json
     from ucfrec.reporting.page import write_report
 
-    for world in WORLDS:
-        simulated_store(World(world), out / world, config.sessions, seed)
-    jobs = [(world, name) for name in reversed(LEARNERS) for world in WORLDS]
+    for environment in ENVIRONMENTS:
+        simulated_store(Environment(environment), out / environment, config.sessions, seed)
+    jobs = [(environment, name) for name in reversed(LEARNERS) for environment in ENVIRONMENTS]
     # One thread each: at this size two trainings side by side beat one on two threads.
     workers = min(len(jobs), os.cpu_count() or 1)
     with pool_of_processes(workers) as pool:
         with without_ctrl_c():
-            started = [pool.submit(_learn, out / world, name, seed, config) for world, name in jobs]
+            started = [
+                pool.submit(_learn, out / environment, name, seed, config)
+                for environment, name in jobs
+            ]
         with progress(len(jobs), "train and evaluate", "policies") as bar:
             for finished in as_completed(started):
                 finished.result()
                 bar.update()
         learned = {job: future.result() for job, future in zip(jobs, started, strict=True)}
     rows = []
-    for world in WORLDS:
+    for environment in ENVIRONMENTS:
         for name, behavior in BEHAVIORS.items():
-            row = evaluate_behavior(World(world), behavior, config.episodes, EVALUATION_SEED + seed)
-            learned[world, name] = row | {"policy": name}
+            row = evaluate_behavior(
+                Environment(environment), behavior, config.episodes, EVALUATION_SEED + seed
+            )
+            learned[environment, name] = row | {"policy": name}
         order = ("random", "logging", *LEARNERS, "optimal")
-        rows += [learned[world, name] for name in order]
+        rows += [learned[environment, name] for name in order]
     write_json(out / "results.json", rows)
-    runs = [out / world / name for world in WORLDS for name in LEARNERS]
+    runs = [out / environment / name for environment in ENVIRONMENTS for name in LEARNERS]
     items = out / "synthetic-catalog" / "logs" / "items.parquet"
     write_report(out / "report.html", runs, [out / "results.json"], items)
     return rows
 
 
 def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> dict[str, Any]:
-    """Train and evaluate the learner `name` in the world `folder.name`, in a worker process."""
+    """Train and evaluate the learner `name` in the environment `folder.name`, in a worker
+    process."""
     import torch
 
     from ucfrec.episodes.store import EpisodeStore
+    from ucfrec.evaluation.environment import Environment
     from ucfrec.evaluation.evaluate import evaluate_policy
-    from ucfrec.evaluation.world import World
     from ucfrec.runs.config import resolve_config
     from ucfrec.runs.run import train_run
     from ucfrec.runs.shared_stages import SharedStages
@@ -129,7 +138,7 @@ def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> dict[str, 
     train_run(EpisodeStore.open(folder / "store"), folder / name, resolved, shared=shared)
     trained = TrainedPolicy.load(folder / name)
     return evaluate_policy(
-        World(folder.name),
+        Environment(folder.name),
         trained,
         name,
         config.episodes,

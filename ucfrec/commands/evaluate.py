@@ -1,10 +1,10 @@
-"""`ucfrec evaluate`: measure the return of policies in a simulated world."""
+"""`ucfrec evaluate`: measure the return of policies in a simulated environment."""
 
 import argparse
 from pathlib import Path
 
 from ucfrec.commands.cards import card_of_evaluation
-from ucfrec.commands.options import rule_given, rule_options, world_given, world_options
+from ucfrec.commands.options import environment_given, environment_options, rule_given, rule_options
 from ucfrec.errors import InputError
 
 
@@ -13,7 +13,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "runs", nargs="*", type=Path, metavar="RUN", help="run folders of `ucfrec train`"
     )
-    world_options(parser)
+    environment_options(parser)
     parser.add_argument(
         "--episodes", type=int, default=1000, help="episodes of each policy (default: 1000)"
     )
@@ -40,18 +40,20 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.reporting.tables import format_rows
     from ucfrec.runs.trained_policy import TrainedPolicy
 
-    world = world_given(options)
+    environment = environment_given(options)
     if not options.runs and not options.behavior:
         raise InputError("name a run folder, or a built-in policy with --behavior")
     rows = []
     for run in options.runs:
         trained = TrainedPolicy.load(run, options.checkpoint)
         rule = rule_given(options, trained)
-        row = evaluate_policy(world, trained, trained.name, options.episodes, options.seed, rule)
+        row = evaluate_policy(
+            environment, trained, trained.name, options.episodes, options.seed, rule
+        )
         rows.append(row | {"run": without_folders(str(run)), "checkpoint": options.checkpoint})
         card_of_evaluation(run, rows[-1])
     rows += [
-        evaluate_behavior(world, behavior, options.episodes, options.seed)
+        evaluate_behavior(environment, behavior, options.episodes, options.seed)
         for behavior in options.behavior
     ]
     print(format_rows(rows))

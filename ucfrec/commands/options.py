@@ -9,14 +9,14 @@ from ucfrec.files.remote import Input, uri_or_path
 
 if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
-    from ucfrec.evaluation.world import World
+    from ucfrec.evaluation.environment import Environment
     from ucfrec.logs.mapping import Dataset, LogMapping
     from ucfrec.recommending.requests import Limits
     from ucfrec.recommending.responder import Responder
     from ucfrec.runs.trained_policy import TrainedPolicy
 
 
-def world_options(parser: argparse.ArgumentParser) -> None:
+def environment_options(parser: argparse.ArgumentParser) -> None:
     """Add --env with the options that belong to it, and --seed."""
     env_options(parser, required=True)
     parser.add_argument("--seed", type=int, default=0, help="seed of the sessions (default: 0)")
@@ -27,7 +27,7 @@ def env_options(parser: argparse.ArgumentParser, required: bool, use: str = "") 
 
     Args:
         required: whether --env must be given.
-        use: what the world is used for, for the help of --env.
+        use: what the environment is used for, for the help of --env.
     """
     parser.add_argument(
         "--env",
@@ -47,7 +47,7 @@ def env_options(parser: argparse.ArgumentParser, required: bool, use: str = "") 
         metavar="KEY[,KEY…]",
         help="of gymnasium:ID with a dict observation: entries that are observed, one after the "
         "other as one vector (default: none, states come from the items shown and their rewards; "
-        "worlds of vector actions need one)",
+        "environments of vector actions need one)",
     )
     parser.add_argument(
         "--item-features",
@@ -139,7 +139,7 @@ def rule_options(parser: argparse.ArgumentParser) -> None:
         help="never ask for less, also once a session has reached its target",
     )
     rule.add_argument(
-        "--tilt", type=float, metavar="BETA", help="weight of the reward model; 0 for none"
+        "--reward-weight", type=float, metavar="BETA", help="weight of the reward model; 0 for none"
     )
     rule.add_argument(
         "--temperature", type=float, help="draw items at this temperature; 0 takes the best"
@@ -252,7 +252,7 @@ def rule_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "Decisi
     parts = {
         "target": target,
         "floor": options.target_floor,
-        "tilt": options.tilt,
+        "reward_weight": options.reward_weight,
         "temperature": options.temperature,
         "top_k": options.top_k,
         "exclude_seen": options.exclude_seen or None,
@@ -281,10 +281,10 @@ def logs_given(options: argparse.Namespace) -> "tuple[tuple[Path, ...], LogMappi
     return dataset.resolve(options.logs, given)
 
 
-def world_given(options: argparse.Namespace) -> "World":
-    """The world that `env_options` name."""
-    from ucfrec.evaluation.world import World
+def environment_given(options: argparse.Namespace) -> "Environment":
+    """The environment that `env_options` name."""
+    from ucfrec.evaluation.environment import Environment
 
     observe = tuple(key for key in options.observe.split(",") if key)
     features = options.item_features
-    return World(options.env, options.env_folder, observe=observe, item_features=features)
+    return Environment(options.env, options.env_folder, observe=observe, item_features=features)

@@ -1,1 +1,1 @@
-"""Evaluation of policies: simulated worlds, and ranking on later logs."""
+"""Evaluation of policies: simulated environments, and ranking on later logs."""

@@ -31,17 +31,18 @@ ROWS_PER_GROUP: Final = 65_536
 
 @runtime_checkable
 class Catalog(Protocol):
-    """A simulated world with a table of its items."""
+    """A simulated environment with a table of its items."""
 
     def item_features(self) -> pa.Table:
         """One row per item in the order of the action indices, with a column `item_id`."""
 
 
-def world_items(env: VectorEnv[Any, Any, Any]) -> IntArray:
-    """Identifiers (n_items,) of a world's items in logs: those of its catalogue, or indices."""
-    world = env.unwrapped
-    if isinstance(world, Catalog):
-        return np.asarray(world.item_features()[ITEM_ID], dtype=np.int64)
+def environment_items(env: VectorEnv[Any, Any, Any]) -> IntArray:
+    """Identifiers (n_items,) of an environment's items in logs: those of its catalogue, or
+    indices."""
+    environment = env.unwrapped
+    if isinstance(environment, Catalog):
+        return np.asarray(environment.item_features()[ITEM_ID], dtype=np.int64)
     assert isinstance(env.single_action_space, spaces.Discrete)
     return np.arange(int(env.single_action_space.n))
 
@@ -62,18 +63,18 @@ def collect(
 
     `out` contains `sessions.parquet` (one row per step: user, session, time in ms, item or action,
     the simulator's feedback, the observation unless it is empty, and the propensity if it is known;
-    sessions played in parallel are interleaved), `items.parquet` if the world describes its items,
-    and `collect.json`, the record of the run. Sessions start 60 s apart and their steps 1 s apart.
-    Memory is bounded, because rows are written one row group at a time.
+    sessions played in parallel are interleaved), `items.parquet` if the environment describes its
+    items, and `collect.json`, the record of the run. Sessions start 60 s apart and their steps 1 s
+    apart. Memory is bounded, because rows are written one row group at a time.
 
     Args:
         simulator: names the feedback column.
-        env: a world made by `simulator`.
+        env: an environment made by `simulator`.
         actor: a behavior policy for `env`.
         sessions: number of sessions to play, at least 1.
         seed: environment i is seeded with `seed` + i.
         out: new folder.
-        env_name: name of the world in the record.
+        env_name: name of the environment in the record.
         behavior: name of the behavior policy in the record.
 
     Returns:
@@ -88,9 +89,9 @@ def collect(
         log = _SessionLog(folder / "sessions.parquet", env, simulator.feedback)
         played = rollout(env, actor, sessions, seed, log.record, describe="collect")
         log.close()
-        world = env.unwrapped
-        if isinstance(world, Catalog):
-            pq.write_table(world.item_features(), folder / "items.parquet")
+        environment = env.unwrapped
+        if isinstance(environment, Catalog):
+            pq.write_table(environment.item_features(), folder / "items.parquet")
         write_json(folder / "collect.json", _run_record(played, env_name, behavior, seed))
     return played
 
@@ -101,7 +102,7 @@ class _SessionLog:
     def __init__(self, path: Path, env: VectorEnv[Any, Any, Any], feedback: str) -> None:
         self._path, self._feedback = path, feedback
         discrete = isinstance(env.single_action_space, spaces.Discrete)
-        self._items = world_items(env) if discrete else None
+        self._items = environment_items(env) if discrete else None
         self._steps: list[Step] = []
         self._rows = 0
         self._played = np.zeros(env.num_envs, dtype=np.int64)

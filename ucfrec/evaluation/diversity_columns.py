@@ -8,7 +8,7 @@ from gymnasium.vector import VectorEnv
 
 from ucfrec.arrays import BoolArray, IntArray
 from ucfrec.episodes.item_counts import TrainingCounts
-from ucfrec.evaluation.collect import Catalog, world_items
+from ucfrec.evaluation.collect import Catalog, environment_items
 from ucfrec.evaluation.diversity import (
     Recommended,
     coverage,
@@ -41,13 +41,14 @@ def variety_columns(
     `counts` and `numbers`, which built-in policies do not have.
 
     Args:
-        env: a world of items.
+        env: an environment of items.
         recommended: the items of all steps.
         counts: item counts of the training log.
-        numbers: (items of the log,) the world's index of each item, −1 for items that it lacks.
+        numbers: (items of the log,) the environment's index of each item, −1 for items that it
+            lacks.
     """
     episodes, items = recommended.sessions()
-    n_items = len(world_items(env))
+    n_items = len(environment_items(env))
     row: dict[str, float | None] = dict.fromkeys(COLUMNS)
     row["coverage"] = coverage(items, n_items)
     row["coverage_per_turn"] = coverage_per_turn(items)
@@ -69,9 +70,9 @@ def variety_columns(
 
 
 def _incidence(env: VectorEnv[Any, Any, Any]) -> BoolArray | None:
-    """Tags (n_items, n_tags) of the world's catalogue; None if it has no tags."""
-    world = env.unwrapped
-    table = world.item_features() if isinstance(world, Catalog) else pa.table({})
+    """Tags (n_items, n_tags) of the environment's catalogue; None if it has no tags."""
+    environment = env.unwrapped
+    table = environment.item_features() if isinstance(environment, Catalog) else pa.table({})
     hot = [name for name in table.column_names if name.startswith(ONE_HOT)]
     if hot:
         return np.stack([np.asarray(table[name]) > 0 for name in hot], axis=1)

@@ -1,4 +1,4 @@
-"""Evaluate policies in simulated worlds."""
+"""Evaluate policies in simulated environments."""
 
 import time
 from collections.abc import Mapping
@@ -14,11 +14,11 @@ from ucfrec.acting.rollout import Actor, rollout
 from ucfrec.arrays import IntArray
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.errors import InputError
-from ucfrec.evaluation.collect import world_items
+from ucfrec.evaluation.collect import environment_items
 from ucfrec.evaluation.diversity import Recommended
 from ucfrec.evaluation.diversity_columns import COLUMNS, variety_columns
+from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.metrics import session_metrics
-from ucfrec.evaluation.world import World
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -28,30 +28,32 @@ SIDE_BY_SIDE = 512
 
 
 @random_state_kept()
-def evaluate_behavior(world: World, behavior: str, episodes: int, seed: int) -> dict[str, Any]:
-    """Result row of a world's built-in policy (`random`, `optimal`, …).
+def evaluate_behavior(
+    environment: Environment, behavior: str, episodes: int, seed: int
+) -> dict[str, Any]:
+    """Result row of an environment's built-in policy (`random`, `optimal`, …).
 
     Args:
-        world: the simulated world.
+        environment: the simulated environment.
         behavior: name of the policy.
         episodes: number of episodes to play.
         seed: seed of the environments and of the policy.
 
     Raises:
-        InputError: the world has no policy of that name.
+        InputError: the environment has no policy of that name.
     """
-    simulator = world.simulator()
+    simulator = environment.simulator()
     if behavior not in simulator.behaviors:
         known = ", ".join(simulator.behaviors)
-        raise InputError(f"{world.name} has no behavior {behavior!r}; it has {known}")
-    env = simulator.make(min(episodes, SIDE_BY_SIDE), world.folder)
+        raise InputError(f"{environment.name} has no behavior {behavior!r}; it has {known}")
+    env = simulator.make(min(episodes, SIDE_BY_SIDE), environment.folder)
     actor = simulator.behaviors[behavior](env, seed)
-    return _row(world, behavior, env, actor, episodes, seed)
+    return _row(environment, behavior, env, actor, episodes, seed)
 
 
 @random_state_kept()
 def evaluate_policy(
-    world: World,
+    environment: Environment,
     trained: TrainedPolicy,
     name: str,
     episodes: int,
@@ -61,7 +63,7 @@ def evaluate_policy(
     """Result row of a trained policy.
 
     Args:
-        world: the simulated world.
+        environment: the simulated environment.
         trained: the policy.
         name: name of the policy in the row.
         episodes: number of episodes to play.
@@ -69,13 +71,13 @@ def evaluate_policy(
         rule: the decision rule; None for the run's own.
 
     Raises:
-        InputError: the policy's actions or observations do not fit this world.
+        InputError: the policy's actions or observations do not fit this environment.
     """
-    env = world.simulator().make(min(episodes, SIDE_BY_SIDE), world.folder)
-    numbers = _item_numbers(world, env, trained)
+    env = environment.simulator().make(min(episodes, SIDE_BY_SIDE), environment.folder)
+    numbers = _item_numbers(environment, env, trained)
     rule = rule or trained.rule
     actor = trained.actor(env.num_envs, rule, numbers, seed)
-    row = _row(world, name, env, actor, episodes, seed, trained.counts, numbers)
+    row = _row(environment, name, env, actor, episodes, seed, trained.counts, numbers)
     return row | {
         "target_return": rule.target,
         "rule": rule.hash,
@@ -87,7 +89,7 @@ def evaluate_policy(
 
 
 def _row(
-    world: World,
+    environment: Environment,
     name: str,
     env: Any,
     actor: Actor,
@@ -97,7 +99,7 @@ def _row(
     numbers: IntArray | None = None,
 ) -> dict[str, Any]:
     start = time.perf_counter()
-    recommended, describe = Recommended(), f"{name} in {world.name}"
+    recommended, describe = Recommended(), f"{name} in {environment.name}"
     played = rollout(env, actor, episodes, seed, recommended.record, describe)
     seconds = time.perf_counter() - start
     variety: Mapping[str, float | None] = dict.fromkeys(COLUMNS)
@@ -105,7 +107,7 @@ def _row(
         variety = variety_columns(env, recommended, counts, numbers)
     env.close()
     return {
-        "world": world.title,
+        "environment": environment.title,
         "policy": name,
         **asdict(session_metrics(played, seed)),
         **variety,
@@ -117,34 +119,35 @@ def _row(
     }
 
 
-def _item_numbers(world: World, env: Any, trained: TrainedPolicy) -> IntArray | None:
-    """The world's index of each item of the policy, −1 for items it lacks; None for vectors."""
+def _item_numbers(environment: Environment, env: Any, trained: TrainedPolicy) -> IntArray | None:
+    """The environment's index of each item of the policy, −1 for items it lacks; None for
+    vectors."""
     space, sizes = env.single_action_space, trained.record["sizes"]
     provided = int(np.prod(env.single_observation_space.shape))
     expected = trained.logged_observation_size
     if expected > provided:
         raise InputError(
-            f"the policy observes {expected} numbers, {world.title} shows {provided}; train it on "
-            f"logs of {world.name}, collected with the same --observe"
+            f"the policy observes {expected} numbers, {environment.title} shows {provided}; "
+            f"train it on logs of {environment.name}, collected with the same --observe"
         )
     if not isinstance(space, spaces.Discrete):
         if sizes["items"] or space.shape != (sizes["action"],):
-            raise _misfit(world, f"vector actions of size {space.shape}")
+            raise _misfit(environment, f"vector actions of size {space.shape}")
         return None
-    known = world_items(env)
+    known = environment_items(env)
     ids = trained.item_ids
     if ids is None or ids.dtype.kind not in "iu":
-        raise _misfit(world, f"{len(known)} items with whole numbers as {schema.ITEM_ID}")
+        raise _misfit(environment, f"{len(known)} items with whole numbers as {schema.ITEM_ID}")
     order = np.argsort(known)
     nearest = order[np.minimum(np.searchsorted(known, ids, sorter=order), len(known) - 1)]
     numbers = np.where(known[nearest] == ids, nearest, -1)
     if (numbers < 0).all():
-        raise _misfit(world, f"items {known.min()} to {known.max()} as {schema.ITEM_ID}")
+        raise _misfit(environment, f"items {known.min()} to {known.max()} as {schema.ITEM_ID}")
     return numbers
 
 
-def _misfit(world: World, takes: str) -> InputError:
+def _misfit(environment: Environment, takes: str) -> InputError:
     return InputError(
-        f"{world.name} takes {takes}, which the policy was not trained on; train it on logs of "
-        f"{world.name}"
+        f"{environment.name} takes {takes}, which the policy was not trained on; train it on "
+        f"logs of {environment.name}"
     )

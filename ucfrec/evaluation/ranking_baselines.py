@@ -40,7 +40,7 @@ class PolicyRanker:
 
 @dataclass(frozen=True)
 class RewardRanker:
-    """Ranks items by the reward model that the run's decision rules tilt by."""
+    """Ranks items by the reward model that the run's decision rules reward weight by."""
 
     decider: Decider
     name: str = "reward model"

@@ -3,19 +3,19 @@
 from pathlib import Path
 
 from ucfrec.evaluation.collect import collect
-from ucfrec.evaluation.world import World
+from ucfrec.evaluation.environment import Environment
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.schema import ITEM_ID, SESSION_ID
 
 
 def simulated_store(
-    world: World, folder: Path, sessions: int, seed: int, behavior: str | None = None
+    environment: Environment, folder: Path, sessions: int, seed: int, behavior: str | None = None
 ) -> Path:
     """Collect logs in `folder/logs` and prepare `folder/store`; existing folders are reused.
 
     Args:
-        world: the simulator to play in.
+        environment: the simulator to play in.
         folder: holds both folders.
         sessions: number of sessions to play.
         seed: seed of the environments and of the behavior policy.
@@ -26,12 +26,14 @@ def simulated_store(
         The path of the store.
     """
     logs, store = folder / "logs", folder / "store"
-    simulator = world.simulator()
+    simulator = environment.simulator()
     if not logs.exists():
-        env = simulator.make(256, world.folder)
+        env = simulator.make(256, environment.folder)
         chosen = behavior or simulator.logging_behavior
         actor = simulator.behaviors[chosen](env, seed)
-        collect(simulator, env, actor, sessions, seed, logs, env_name=world.title, behavior=chosen)
+        collect(
+            simulator, env, actor, sessions, seed, logs, env_name=environment.title, behavior=chosen
+        )
     if not store.exists():
         items = logs / "items.parquet"
         features = (FeatureTable((items,), ITEM_ID),) if items.exists() else ()

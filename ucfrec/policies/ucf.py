@@ -39,7 +39,7 @@ class UCFConfig(PolicyConfig):
     """Attention heads; must divide `dim`."""
     lambda_mask: Weight = 0.0
     """λ, weight of the mask loss, which supervises attention. Every value above 0 lowered the
-    return in both simulated worlds in which it was varied."""
+    return in both simulated environments in which it was varied."""
     parent_window: Annotated[int, Field(ge=0, le=4096)] = 2
     """w, number of earlier states that are parents of an action in the mask loss."""
     parent_decay: Share = 0.6

@@ -249,7 +249,7 @@ def _description(graph: RuleGraph, trained: TrainedPolicy, rule: DecisionRule) -
             "float32",
             [b, graph.n_items],
             "log-probability of the policy plus the "
-            "tilt, up to a constant; -inf for items left out",
+            "reward weight, up to a constant; -inf for items left out",
         ),
         _entry("top_items", "int64", [b, k], "index of the best items; -1 if fewer are left"),
         _entry("top_scores", "float32", [b, k], "their log-probabilities at temperature 1, nats"),
@@ -263,8 +263,8 @@ def _description(graph: RuleGraph, trained: TrainedPolicy, rule: DecisionRule) -
         "outputs": outputs,
         "rule": rule.as_dict(),
         "rule_hash": rule.hash,
-        "rule_notes": "the graph applies target, floor, tilt, tag_window and tag_run; with "
-        "exclude_seen, put the session's items into `excluded`; with a temperature, draw from "
+        "rule_notes": "the graph applies target, floor, reward_weight, tag_window and tag_run; "
+        "with exclude_seen, put the session's items into `excluded`; with a temperature, draw from "
         "`scores`",
         "policy": trained.name,
         "reward": trained.record["reward"],

@@ -64,7 +64,7 @@ class RuleGraph(nn.Module):
         )
         self.head = _Head(policy.head)
         self.policy = _with_head(policy, self.head)
-        self.reward = None if not rule.tilt else _Reward(decider.reward_model)
+        self.reward = None if not rule.reward_weight else _Reward(decider.reward_model)
         self.tags = _Likeness(decider.likeness) if rule.tag_window else None
         self.main_tags = decider.main_tags
         if self.main_tags is not None:
@@ -104,7 +104,9 @@ class RuleGraph(nn.Module):
         shown = sessions.shown
         scores = self.head.logits(features, shown, normalized.returns_to_go[:, -1])
         if self.reward is not None:
-            scores = scores + self._rule.tilt * self.reward(windows.states[:, -1], shown, users)
+            scores = scores + self._rule.reward_weight * self.reward(
+                windows.states[:, -1], shown, users
+            )
         scores = _put(scores, excluded, torch.full_like(excluded, -torch.inf, dtype=scores.dtype))
         if self.tags is not None:
             scores = self._without_recent_tags(scores, shown)

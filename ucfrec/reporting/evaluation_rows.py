@@ -11,7 +11,7 @@ from ucfrec.reporting.result_row import ResultRow, RowKey, row_from_json
 from ucfrec.reporting.rows_file import read_lines
 
 _NOT_METRICS: Final = (
-    *("world", "policy", "seed", "train_seed", "fingerprint", "config", "wall_time_s"),
+    *("environment", "policy", "seed", "train_seed", "fingerprint", "config", "wall_time_s"),
     *("command", "commit", "versions", "target_return", "run", "checkpoint"),
     *("rule", "decision_rule"),
 )
@@ -34,7 +34,7 @@ def evaluation_row(evaluation: Mapping[str, Any], key: RowKey, **more: Any) -> R
         "metric": "R_cum",
         "metrics": numbers,
         "interval": (low, high),
-        "world": evaluation["world"],
+        "environment": evaluation["environment"],
         "target_return": evaluation.get("target_return"),
         "rule": evaluation.get("rule"),
         **{name: evaluation[name] for name in ("wall_time_s", "command", "commit", "versions")},
@@ -46,7 +46,7 @@ def as_evaluation(row: ResultRow) -> dict[str, Any]:
     """A result row with the keys of `ucfrec evaluate --json`; `seed` is the evaluation seed."""
     return {
         **row.as_line(),
-        "world": row.world or row.task,
+        "environment": row.environment or row.task,
         "policy": row.method,
         "seed": row.evaluation_seed,
         "train_seed": row.training_seed,

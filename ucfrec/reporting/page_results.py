@@ -37,8 +37,8 @@ class Estimates:
 class Results:
     """The result rows of a report."""
 
-    worlds: Mapping[str, Sequence[Row]]
-    """World to its rows of `ucfrec evaluate` or `ucfrec demo`."""
+    environments: Mapping[str, Sequence[Row]]
+    """Environment to its rows of `ucfrec evaluate` or `ucfrec demo`."""
     estimates: Sequence[Estimates]
 
 
@@ -48,22 +48,22 @@ def read_results(paths: Sequence[Path]) -> Results:
     Raises:
         InputError: a file is missing or has a row without the required fields.
     """
-    worlds: dict[str, list[Row]] = {}
+    environments: dict[str, list[Row]] = {}
     estimates: list[Estimates] = []
     for path in paths:
         rows = _rows_of(path)
         for row in rows:
             if "estimator" not in row:
-                worlds.setdefault(row["world"], []).append(row)
+                environments.setdefault(row["environment"], []).append(row)
         estimates += _estimates([row for row in rows if "estimator" in row])
-    return Results(worlds, estimates)
+    return Results(environments, estimates)
 
 
 def _rows_of(path: Path) -> list[Row]:
     rows = read_evaluations(path)
     for number, row in enumerate(rows, start=1):
         known = row if isinstance(row, dict) else {}
-        texts = ("estimator" if "estimator" in known else "world", "policy")
+        texts = ("estimator" if "estimator" in known else "environment", "policy")
         lacking = [name for name in texts if not isinstance(known.get(name), str)]
         # An estimate that nothing but a model stands behind has no interval.
         open_ended = "estimator" in known and known.get("R_cum_low") is None
@@ -112,20 +112,20 @@ def _policy_estimates(group: Sequence[Row]) -> Estimates:
     return Estimates(name, logged, rows, tuple(warnings))
 
 
-def worlds(results: Results) -> list[tuple[charts.BarChart, Table]]:
-    """Bar chart and table of each world."""
-    return [_world(world, rows) for world, rows in results.worlds.items()]
+def environments(results: Results) -> list[tuple[charts.BarChart, Table]]:
+    """Bar chart and table of each environment."""
+    return [_environment(environment, rows) for environment, rows in results.environments.items()]
 
 
-def _world(world: str, rows: Sequence[Row]) -> tuple[charts.BarChart, Table]:
+def _environment(environment: str, rows: Sequence[Row]) -> tuple[charts.BarChart, Table]:
     names = _row_names(rows)
     columns = [c for c in (*_METRICS, *_SEEDS) if any(row.get(c) is not None for row in rows)]
     body = [
         (name, [interval(row), *(_cell(row, column) for column in columns)])
         for name, row in zip(names, rows, strict=True)
     ]
-    table = Table(f"{world}: means of episodes", "policy", ["R_cum", *columns], body)
-    return _bars(f"R_cum in {world}, with 95% intervals", names, rows), table
+    table = Table(f"{environment}: means of episodes", "policy", ["R_cum", *columns], body)
+    return _bars(f"R_cum in {environment}, with 95% intervals", names, rows), table
 
 
 def estimates(results: Results) -> list[tuple[Estimates, charts.BarChart, Table]]:

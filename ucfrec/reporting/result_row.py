@@ -19,11 +19,11 @@ class RowKey:
     table: str
     """Table of the suite."""
     task: str
-    """Benchmark task or data file: the training data and the world of the evaluation."""
+    """Benchmark task or data file: the training data and the environment of the evaluation."""
     method: str
     """Row of the table."""
     policy: str
-    """Learner, or built-in policy of a world, that `method` uses."""
+    """Learner, or built-in policy of an environment, that `method` uses."""
     training_seed: int | None = None
     log_seed: int | None = None
     """Seed of simulated logs; None for real logs."""
@@ -60,7 +60,7 @@ class ResultRow(RowKey):
     """Name to finite number, of the measured metrics only."""
     interval: tuple[float, float] | None = None
     """95% interval of the value of `metric`, over episodes."""
-    world: str | None = None
+    environment: str | None = None
     """Simulator of the evaluation."""
     checkpoint: str | None = None
     """Evaluated weights, e.g. "best" or "last"."""
@@ -192,7 +192,7 @@ _READERS: Final[Mapping[str, Callable[[object], object]]] = {
     **dict.fromkeys(("suite", "table", "task", "method", "policy", "metric", "command"), _text),
     **dict.fromkeys(("training_seed", "log_seed", "evaluation_seed"), _optional(_seed)),
     **dict.fromkeys(("config_hash", "code_version", "data_fingerprint"), _optional(_text)),
-    **dict.fromkeys(("world", "checkpoint", "rule", "commit"), _optional(_text)),
+    **dict.fromkeys(("environment", "checkpoint", "rule", "commit"), _optional(_text)),
     **dict.fromkeys(("target_return", "wall_time_s", "peak_memory_mib"), _optional(_number)),
     "conditions": _mapping(_scalar),
     "metrics": _mapping(_number),

@@ -109,7 +109,7 @@ def latest(rows: Sequence[ResultRow]) -> list[ResultRow]:
 
 
 _SAME: Final = (
-    *("suite", "table", "task", "method", "world", "checkpoint"),
+    *("suite", "table", "task", "method", "environment", "checkpoint"),
     *("training_seed", "log_seed", "evaluation_seed"),
 )
 

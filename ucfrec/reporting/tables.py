@@ -11,7 +11,16 @@ from ucfrec.reporting.statistics import Summary, summary
 NONE = "–"
 """Cell of a missing value."""
 _EVALUATION = (
-    *("world", "policy", "R_cum", "R_avg_pooled", "R_avg_episode", "length", "episodes", "seed"),
+    *(
+        "environment",
+        "policy",
+        "R_cum",
+        "R_avg_pooled",
+        "R_avg_episode",
+        "length",
+        "episodes",
+        "seed",
+    ),
 )
 
 

@@ -21,7 +21,7 @@ NO_RESULTS = (
 
 @dataclass(frozen=True)
 class _Earned:
-    """Return of one policy in one world, over all its rows."""
+    """Return of one policy in one environment, over all its rows."""
 
     policy: str
     trained: bool
@@ -44,20 +44,22 @@ class _Earned:
 
 
 def verdict(results: Results) -> list[str]:
-    """One paragraph per world, then one per policy with estimates from logs."""
-    paragraphs = [_of_world(world, rows) for world, rows in results.worlds.items()]
+    """One paragraph per environment, then one per policy with estimates from logs."""
+    paragraphs = [
+        _of_environment(environment, rows) for environment, rows in results.environments.items()
+    ]
     paragraphs += [_of_estimates(one) for one in results.estimates]
     return paragraphs or [NO_RESULTS]
 
 
-def _of_world(world: str, rows: Sequence[Row]) -> str:
+def _of_environment(environment: str, rows: Sequence[Row]) -> str:
     earned = _earned(rows)
     trained = sorted((one for one in earned if one.trained), key=lambda one: -one.value)
     references = [one for one in earned if not one.trained]
     if not trained:
-        return f"In {world}, only built-in policies were evaluated: {_listed(references)}."
+        return f"In {environment}, only built-in policies were evaluated: {_listed(references)}."
     best, *others = trained
-    sentences = [_best(world, best, others)]
+    sentences = [_best(environment, best, others)]
     if references:
         sentences.append(_against(best, references))
     else:
@@ -90,7 +92,7 @@ def _earned(rows: Sequence[Row]) -> list[_Earned]:
     ]
 
 
-def _best(world: str, best: _Earned, others: Sequence[_Earned]) -> str:
+def _best(environment: str, best: _Earned, others: Sequence[_Earned]) -> str:
     if best.trainings > 1:
         how = (
             f"{shown(best.value)} in the mean of {best.trainings} trainings (their 95% intervals "
@@ -99,8 +101,10 @@ def _best(world: str, best: _Earned, others: Sequence[_Earned]) -> str:
     else:
         how = f"{shown(best.value)} (95% interval {shown(best.low)} to {shown(best.high)})"
     if not others:
-        return f"In {world}, {best.policy} earned {how} per episode."
-    text = f"In {world}, {best.policy} earned most of {len(others) + 1} trained policies: {how}"
+        return f"In {environment}, {best.policy} earned {how} per episode."
+    text = (
+        f"In {environment}, {best.policy} earned most of {len(others) + 1} trained policies: {how}"
+    )
     text += " per episode."
     close = [one for one in others if not best.above(one)]
     if close:

@@ -73,7 +73,8 @@ class TrainedPolicy:
     rule: DecisionRule
     """The decision rule of the run."""
     reward_model: ItemRewardModel | None = None
-    """Of the rewards of items, for decision rules with a tilt; None if the run fitted none."""
+    """Of the rewards of items, for decision rules with a reward weight; None if the run fitted
+    none."""
     counts: TrainingCounts | None = None
     """Item counts of the training steps; None if actions are vectors or the run lacks the file."""
 

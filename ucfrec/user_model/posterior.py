@@ -19,7 +19,7 @@ _LEAST: Final = 1e-6
 """Variance of tastes in every direction, relative to the mean."""
 
 
-class SessionTastes(nn.Module):
+class UserPosterior(nn.Module):
     """Tastes of the users of B sessions, from what was shown to them and earned."""
 
     root: Tensor

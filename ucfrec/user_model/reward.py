@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from ucfrec.episodes.exposure import Likeness, Shown
-from ucfrec.user_model.posterior import MEMORY, SessionTastes
+from ucfrec.user_model.posterior import MEMORY, UserPosterior
 
 FITTED: Final = "item_reward.safetensors"
 """File of a fitted model in its folder."""
@@ -26,7 +26,7 @@ class ItemRewardModel(nn.Module):
 
     x being the standardised state, e_i the centred embedding of the item, and exposure_i what
     repeating an item, or showing one like it, n steps after the last time adds (`Likeness`). For
-    new users, user_u and affinity_u are what the session tells of them (`SessionTastes`).
+    new users, user_u and affinity_u are what the session tells of them (`UserPosterior`).
     Item effects include those of tags and embeddings, which items without training rows have too.
     For rewards of two values the model is logistic: η is the log-odds of the higher one. Otherwise
     η is the standardised reward.
@@ -75,7 +75,7 @@ class ItemRewardModel(nn.Module):
         self.register_buffer("interaction", torch.zeros(state, dim))
         self.register_buffer("exposure", torch.zeros(4, LAGS))
         self.likeness = Likeness(items, dim, sizes.get("tags", 0))
-        self.tastes = SessionTastes(items, dim)
+        self.tastes = UserPosterior(items, dim)
 
     @property
     def reach(self) -> int:

@@ -56,7 +56,7 @@ class Design:
     weights: Tensor
     """(M,) how many rows each row counts for."""
     tastes: Tensor
-    """(M,) what `SessionTastes` of weight 1 add; zeros if sessions tell nothing."""
+    """(M,) what `UserPosterior` of weight 1 add; zeros if sessions tell nothing."""
 
     @classmethod
     def of(

@@ -83,7 +83,7 @@ def fit_item_reward_model(
     effects of items that contain those of the users who saw them predict best. What a user's
     effects tell of training rows, the history of the session must tell of a new user. So the
     effects of users are dropped once those of items are known, but for how much users differ, which
-    is what `SessionTastes` start from, and the other effects are fitted without them.
+    is what `UserPosterior` start from, and the other effects are fitted without them.
 
     Args:
         train: view of a store of items.
@@ -165,7 +165,7 @@ def _of_items(effects: Effects) -> Effects:
 
 
 def set_usual(model: ItemRewardModel, design: Design, effects: Effects) -> None:
-    """Set what items usually earn, for `SessionTastes`, from the effects of mean and items."""
+    """Set what items usually earn, for `UserPosterior`, from the effects of mean and items."""
     everywhere = effects["mean"] + effects.get("item", torch.zeros(()))
     if "content" in effects:
         everywhere = everywhere + design.of_content(effects["content"])
@@ -173,7 +173,7 @@ def set_usual(model: ItemRewardModel, design: Design, effects: Effects) -> None:
 
 
 def added_by_tastes(model: ItemRewardModel, shown: Shown, items: Tensor) -> Tensor:
-    """What `SessionTastes` of weight 1, after what was shown in M sessions, add to the scores (M,)
+    """What `UserPosterior` of weight 1, after what was shown in M sessions, add to the scores (M,)
     of items (M,)."""
     model.tastes.weigh(1.0)
     added = []

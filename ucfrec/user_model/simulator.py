@@ -107,7 +107,7 @@ class SessionEnd:
         return np.stack(columns, axis=1).astype(np.float32)
 
 
-class LearnedSessions:
+class UserSimulator:
     """N parallel sessions of logged users whose rewards and ends are drawn from models.
 
     A session begins as a logged one did: its user, and its observations step by step. It follows

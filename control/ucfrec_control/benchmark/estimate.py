@@ -11,9 +11,9 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.runs.run import new_policy, training_views
 from ucfrec_control.benchmark.cells import Cell
+from ucfrec_control.environments.environments import SIDE_BY_SIDE, environment_of_data, make_env
 from ucfrec_control.learners.rl_baselines import ALGORITHMS, timed_updates
 from ucfrec_control.learners.train import dataset_of
-from ucfrec_control.worlds.environments import SIDE_BY_SIDE, make_env, world_of_data
 
 _TIMED: Final = 5
 _WARM: Final = 2
@@ -37,18 +37,18 @@ def estimated_hours(cells: Sequence[Cell], workers: int) -> float:
     torch.set_num_threads(1)
     try:
         for cell in cells:
-            world = world_of_data(dataset_of(EpisodeStore.open(cell.store)))
-            kind = (world, cell.learner, cell.settings, *cell.rl.items())
+            environment = environment_of_data(dataset_of(EpisodeStore.open(cell.store)))
+            kind = (environment, cell.learner, cell.settings, *cell.rl.items())
             if kind not in trained:
                 trained[kind] = _training(cell)
             if not cell.episodes:
                 total += trained[kind]
                 continue
-            if world not in played:
-                played[world] = _step_of(world, cell.episodes)
+            if environment not in played:
+                played[environment] = _step_of(environment, cell.episodes)
             rounds = -(-cell.episodes // SIDE_BY_SIDE) * _EPISODE_STEPS
             both = 1 if cell.learner in ALGORITHMS else 2
-            evaluated = both * rounds * played[world] * max(1, len(cell.targets))
+            evaluated = both * rounds * played[environment] * max(1, len(cell.targets))
             total += trained[kind] + evaluated
     finally:
         torch.set_num_threads(threads)
@@ -88,9 +88,9 @@ def _training(cell: Cell) -> float:
     return config.train.steps * _seconds(update)
 
 
-def _step_of(world: str, episodes: int) -> float:
+def _step_of(environment: str, episodes: int) -> float:
     """Seconds of one step of the episodes that are played side by side."""
-    env = make_env(world, min(episodes, SIDE_BY_SIDE))
+    env = make_env(environment, min(episodes, SIDE_BY_SIDE))
     env.reset(seed=0)
     seconds = _seconds(lambda: env.step(env.action_space.sample()))
     env.close()

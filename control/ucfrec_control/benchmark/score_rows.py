@@ -35,7 +35,7 @@ def score_row(evaluation: Mapping[str, Any], key: RowKey, **fields: Any) -> Resu
         "metric": "score",
         "metrics": {name: float(value) for name, value in metrics.items()},
         "interval": (evaluation["score_low"], evaluation["score_high"]),
-        "world": evaluation["env_id"],
+        "environment": evaluation["env_id"],
         "checkpoint": evaluation["checkpoint"],
         "target_return": evaluation["target_return"],
         "rule": evaluation.get("rule"),

@@ -13,8 +13,8 @@ from ucfrec_control.benchmark.rates import read_rates
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.minari import is_minari, read_minari
 from ucfrec_control.data.trajectories import Trajectories
+from ucfrec_control.environments.scores import find_task
 from ucfrec_control.learners.evaluate import NO_TARGET
-from ucfrec_control.worlds.scores import find_task
 
 MAX_RETURN = "max"
 """`--target` for the largest return that the policy expects in each state."""

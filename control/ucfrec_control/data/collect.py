@@ -23,7 +23,7 @@ from ucfrec.settings import Count, require, settings_table
 from ucfrec_control.data.d4rl import write_d4rl
 from ucfrec_control.data.sac import SacConfig, SacLearner, seed_all
 from ucfrec_control.data.trajectories import PACKAGES, Trajectories
-from ucfrec_control.worlds.environments import SIDE_BY_SIDE, make_env
+from ucfrec_control.environments.environments import SIDE_BY_SIDE, make_env
 
 SHOWN: Final = ("dataset", "trajectories", "steps", "mean_return")
 

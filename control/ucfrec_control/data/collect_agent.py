@@ -15,7 +15,7 @@ from ucfrec_control.data.collect import roll_out
 from ucfrec_control.data.d4rl import write_d4rl
 from ucfrec_control.data.sac import seed_all
 from ucfrec_control.data.trajectories import PACKAGES
-from ucfrec_control.worlds.environments import make_env
+from ucfrec_control.environments.environments import make_env
 
 
 def collect_agent(

@@ -15,7 +15,7 @@ from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import atomic_file, read_json
 from ucfrec_control.data.hdf5 import opened, read_numbers
 from ucfrec_control.data.trajectories import Trajectories
-from ucfrec_control.worlds.scores import check_sizes, dataset_name, find_task
+from ucfrec_control.environments.scores import check_sizes, dataset_name, find_task
 
 _REQUIRED = ("observations", "actions", "rewards", "terminals")
 _FINAL = "infos/final_observations"

@@ -22,8 +22,8 @@ from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file, atomic_folder
 from ucfrec_control.data.hdf5 import require_inside
 from ucfrec_control.data.trajectories import Trajectories
-from ucfrec_control.worlds.antmaze import antmaze_settings, is_antmaze
-from ucfrec_control.worlds.scores import dataset_name
+from ucfrec_control.environments.antmaze import antmaze_settings, is_antmaze
+from ucfrec_control.environments.scores import dataset_name
 
 _ROOT = "MINARI_DATASETS_PATH"
 """Environment variable with the folder in which Minari keeps its datasets."""

@@ -18,16 +18,16 @@ from ucfrec.reporting.statistics import summary
 from ucfrec.runs.screened import SCREENING, flagged_columns
 from ucfrec.runs.trained_policy import DROPPED, RUN, TrainedPolicy, learner_of
 from ucfrec_control.data.trajectories import require_source
-from ucfrec_control.learners.presets import find_preset
-from ucfrec_control.learners.rl_baselines import RLPolicy, is_rl
-from ucfrec_control.worlds.environments import (
+from ucfrec_control.environments.environments import (
     SIDE_BY_SIDE,
     Wrap,
+    environment_of_data,
     make_env,
     mismatches,
-    world_of_data,
 )
-from ucfrec_control.worlds.scores import find_kind, require_task
+from ucfrec_control.environments.scores import find_kind, require_task
+from ucfrec_control.learners.presets import find_preset
+from ucfrec_control.learners.rl_baselines import RLPolicy, is_rl
 
 Trained = TrainedPolicy | RLPolicy
 CHECKPOINTS = ("last", "best")
@@ -78,10 +78,11 @@ def evaluate_run(
             # The best checkpoint is the last: the same weights would play the same episodes.
             rows += [{**row, "checkpoint": checkpoint} for row in rows]
             continue
-        world = world_of(trained, env_id)
+        environment = environment_of(trained, env_id)
         rows += [
-            _row(trained, world, rule, episodes, seed, distractor) | {"checkpoint": checkpoint}
-            for rule in rules_of(trained, world, targets)
+            _row(trained, environment, rule, episodes, seed, distractor)
+            | {"checkpoint": checkpoint}
+            for rule in rules_of(trained, environment, targets)
         ]
     return [row | {"run": without_folders(str(run))} for row in rows]
 
@@ -122,16 +123,16 @@ def load_run(run: Path, checkpoint: str) -> Trained:
     return trained
 
 
-def world_of(trained: Trained, env_id: str | None) -> str:
+def environment_of(trained: Trained, env_id: str | None) -> str:
     """`env_id`, or the environment of the data if it is None.
 
     Raises:
-        InputError: the environment of the data cannot be used; see `world_of_data`.
+        InputError: the environment of the data cannot be used; see `environment_of_data`.
     """
-    return env_id or world_of_data(trained.record["dataset"])
+    return env_id or environment_of_data(trained.record["dataset"])
 
 
-def open_world(
+def open_environment(
     trained: Trained,
     env_id: str,
     count: int,
@@ -205,7 +206,7 @@ def _row(
     record, dataset = trained.record, trained.record["dataset"]
     task = require_task(env_id, dataset["dataset"])
     began = time.perf_counter()
-    env = open_world(trained, env_id, min(episodes, SIDE_BY_SIDE), distractor=distractor)
+    env = open_environment(trained, env_id, min(episodes, SIDE_BY_SIDE), distractor=distractor)
     try:
         actor = trained.actor(env.num_envs, rule)
         played = rollout(env, actor, episodes, seed, describe=f"{trained.name} in {env_id}")

@@ -21,8 +21,8 @@ def find_preset(task: str, kind: str, policy: str) -> Preset:
     """The preset of a learner on one kind of dataset of a task.
 
     Args:
-        task: name of a `ucfrec_control.worlds.scores.Task`; "" for none.
-        kind: as `ucfrec_control.worlds.scores.find_kind` returns it.
+        task: name of a `ucfrec_control.environments.scores.Task`; "" for none.
+        kind: as `ucfrec_control.environments.scores.find_kind` returns it.
         policy: one of `ucfrec.policies.registry.policy_names`.
     """
     run = {"task": task, "kind": kind, "policy": policy}

@@ -29,7 +29,7 @@ from ucfrec.provenance import command_line, versions
 from ucfrec.runs.trained_policy import RUN
 from ucfrec.settings import BatchSize, Count, settings_table
 from ucfrec_control.data.trajectories import PACKAGES
-from ucfrec_control.worlds.scores import find_kind, find_task
+from ucfrec_control.environments.scores import find_kind, find_task
 
 ALGORITHMS = ("iql", "cql")
 CHECKPOINT_EVERY = 5000
@@ -49,9 +49,9 @@ class RLConfig:
     steps: Count
     """Number of updates."""
     task: str
-    """Name of a `ucfrec_control.worlds.scores.Task`, or ""; selects CORL's settings."""
+    """Name of a `ucfrec_control.environments.scores.Task`, or ""; selects CORL's settings."""
     kind: str
-    """Kind of dataset (`ucfrec_control.worlds.scores.find_kind`); selects CORL's settings."""
+    """Kind of dataset (`ucfrec_control.environments.scores.find_kind`); selects CORL's settings."""
     batch_size: BatchSize = 256
     """Transitions of an update."""
     learning_rate: Annotated[float, Field(gt=0, lt=1)] = 3e-4

@@ -11,8 +11,8 @@ from ucfrec.runs.config import Config
 from ucfrec.runs.screened import train_screened
 from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec_control.data.trajectories import PACKAGES, require_source
+from ucfrec_control.environments.scores import find_kind, find_task
 from ucfrec_control.learners.presets import Preset, find_preset
-from ucfrec_control.worlds.scores import find_kind, find_task
 
 
 def dataset_of(store: EpisodeStore) -> Mapping[str, Any]:

@@ -17,7 +17,7 @@ from matplotlib.image import imsave
 from ucfrec.acting.rollout import rollout
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file, atomic_folder
-from ucfrec_control.learners.evaluate import load_run, open_world, rules_of, world_of
+from ucfrec_control.learners.evaluate import environment_of, load_run, open_environment, rules_of
 
 Frame = npt.NDArray[np.uint8]
 """(height, width, 3)."""
@@ -61,15 +61,15 @@ def record_episode(
     if out.exists():
         raise InputError(f"{out} exists already; remove it or name another with --video")
     trained = load_run(run, checkpoint)
-    world = world_of(trained, env_id)
-    rule = rules_of(trained, world, () if target is None else (target,))[0]
+    environment = environment_of(trained, env_id)
+    rule = rules_of(trained, environment, () if target is None else (target,))[0]
     if not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")
     with (_video if out.suffix == _VIDEO else _frames)(out) as take:
-        with _rendering(world):
+        with _rendering(environment):
             recorder = partial(_Recorder, take=take)
-            env = open_world(
-                trained, world, 1, [recorder], distractor=distractor, render_mode="rgb_array"
+            env = open_environment(
+                trained, environment, 1, [recorder], distractor=distractor, render_mode="rgb_array"
             )
         try:
             played = rollout(env, trained.actor(1, rule), 1, seed, describe="record episode")
@@ -105,7 +105,7 @@ class _Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 @contextmanager
-def _rendering(world: str) -> Iterator[None]:
+def _rendering(environment: str) -> Iterator[None]:
     """Turn any error of rendering, for which OpenGL has no common class, into an InputError."""
     try:
         with warnings.catch_warnings():
@@ -116,8 +116,8 @@ def _rendering(world: str) -> Iterator[None]:
     except Exception as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(
-            f"{world} cannot be rendered ({reason}); install OpenGL (libegl1, or libosmesa6) and "
-            "set MUJOCO_GL to egl, or osmesa"
+            f"{environment} cannot be rendered ({reason}); install OpenGL (libegl1, or "
+            "libosmesa6) and set MUJOCO_GL to egl, or osmesa"
         ) from error
 
 

@@ -7,8 +7,8 @@ from typing import Any, Final
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
-from ucfrec.evaluation.world import World
 from ucfrec.files.locks import claim
 from ucfrec.reporting.evaluation_rows import evaluation_row
 from ucfrec.reporting.grid import Measurement
@@ -18,7 +18,7 @@ from ucfrec.runs.describe import promised
 from ucfrec.runs.screened import SCREENING, flagged_columns, train_screened
 from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec_simulators.distractor import DistractorWorld
+from ucfrec_simulators.distractor import DistractorEnvironment
 
 SUITE: Final = "recommendation"
 CHECKPOINT: Final = "best"
@@ -46,8 +46,8 @@ class Cell:
     task: str
     method: str
     policy: str
-    """One of `ucfrec.policies.registry.policy_names`, or a built-in policy of the worlds."""
-    worlds: tuple[World, ...]
+    """One of `ucfrec.policies.registry.policy_names`, or a built-in policy of the environments."""
+    environments: tuple[Environment, ...]
     evaluation: EvaluationPlan
     code_version: str
     log_seed: int | None
@@ -101,22 +101,23 @@ def key(cell: Cell) -> RowKey:
 
 
 def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
-    """Train the method, unless it is a built-in policy, and evaluate it in every world of the task.
+    """Train the method, unless it is a built-in policy, and evaluate it in every environment of
+    the task.
 
-    It acts by its run's own decision rule, which was chosen on its log, not in a world.
+    It acts by its run's own decision rule, which was chosen on its log, not in an environment.
 
     Args:
         cell: what to train and evaluate.
         row_key: key of the rows.
 
     Returns:
-        One row for each world, of trained methods with the best validation loss.
+        One row for each environment, of trained methods with the best validation loss.
     """
     episodes, seed = cell.evaluation.episodes, cell.evaluation.seed
     if cell.store is None or cell.run is None:
         return [
-            _row(evaluate_behavior(world, cell.policy, episodes, seed), row_key, world)
-            for world in cell.worlds
+            _row(evaluate_behavior(environment, cell.policy, episodes, seed), row_key, environment)
+            for environment in cell.environments
         ]
     # Cells that differ only in their evaluation share a run.
     with claim(cell.run, wait=True):
@@ -126,19 +127,21 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     details = {} if cell.screening is None else {SCREENING: flagged_columns(record[SCREENING])}
     trained = TrainedPolicy.load(cell.run, CHECKPOINT)
     rule = _rule(cell, trained)
-    for world in cell.worlds:
-        metrics = evaluate_policy(world, trained, cell.method, episodes, seed, rule)
+    for environment in cell.environments:
+        metrics = evaluate_policy(environment, trained, cell.method, episodes, seed, rule)
         fields = {"checkpoint": CHECKPOINT, "rule": f"{rule} ({rule.hash})"}
-        row = _row(metrics | training_metrics, row_key, world, **fields)
+        row = _row(metrics | training_metrics, row_key, environment, **fields)
         # Other methods are given a rule, but do not look at its target.
         target = row.target_return if cell.conditioned else None
         rows.append(replace(row, details={**row.details, **details}, target_return=target))
     return rows
 
 
-def _row(metrics: Mapping[str, Any], row_key: RowKey, world: World, **fields: Any) -> ResultRow:
+def _row(
+    metrics: Mapping[str, Any], row_key: RowKey, environment: Environment, **fields: Any
+) -> ResultRow:
     row = evaluation_row(metrics, row_key, **fields)
-    distractor = world.rate if isinstance(world, DistractorWorld) else None
+    distractor = environment.rate if isinstance(environment, DistractorEnvironment) else None
     return ResultRow(**vars(row) | {"conditions": {**row.conditions, "distractor": distractor}})
 
 

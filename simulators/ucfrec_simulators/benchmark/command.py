@@ -39,8 +39,8 @@ def run(request: BenchmarkRequest) -> str:
         The tables as Markdown.
 
     Raises:
-        InputError: the budget is unknown, another table than main is asked of a single world, or
-            cells failed.
+        InputError: the budget is unknown, another table than main is asked of a single
+            environment, or cells failed.
     """
     if request.budget not in BUDGETS:
         raise InputError(f"unknown budget {request.budget}; choose one of {', '.join(BUDGETS)}")
@@ -58,9 +58,11 @@ def run(request: BenchmarkRequest) -> str:
             raise InputError(f"--logs is {request.logs}; train on at least one")
         budget = replace(budget, logs=request.logs)
     _require_known(request)
-    plan = Plan(folder, budget, request.budget, request.log_seed, request.world, request.tasks)
+    plan = Plan(
+        folder, budget, request.budget, request.log_seed, request.environment, request.tasks
+    )
     tables, parts = request.tables, []
-    if request.world is not None:
+    if request.environment is not None:
         tables = [table for table in tables if table == "main"]
         if not tables:
             raise InputError("--env gives the table main only; leave out --table")

@@ -22,7 +22,7 @@ _SCREENING: Final = {"synthetic-taobao": 600.0}
 _ELSE: Final = {"step": 0.05, "copies": 40.0, "rewards": 11.0, "choice": 8.0, "screening": 10.0}
 """The same of other tasks."""
 _EVALUATION: Final = 5.0
-"""CPU seconds to evaluate a policy in a world."""
+"""CPU seconds to evaluate a policy in an environment."""
 
 
 def announcement(workers: int) -> Callable[[Sequence[Cell]], str]:
@@ -40,7 +40,7 @@ def announcement(workers: int) -> Callable[[Sequence[Cell]], str]:
 
 def estimated_hours(cells: Sequence[Cell]) -> float:
     """CPU hours of `cells`; what several share is counted once, finished trainings are not."""
-    evaluated = _EVALUATION * sum(len(cell.worlds) for cell in cells)
+    evaluated = _EVALUATION * sum(len(cell.environments) for cell in cells)
     seconds: dict[object, float] = {}
     for cell in cells:
         if cell.run is None or _finished(cell.run):

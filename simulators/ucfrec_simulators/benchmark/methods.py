@@ -28,7 +28,7 @@ PLAIN: Final = ("policy.exposure=false", "rule.choose=false")
 return."""
 PLUS: Final = ("policy.exposure=true", "rule.choose=true")
 """The additions that UCF has, for any learner of items: exposure features, and the decision rule
-chosen on the log, with the tilt by the reward model."""
+chosen on the log, with the reward weight by the reward model."""
 LEARNERS: Final[Mapping[str, Method]] = {
     "sasrec": Method("sasrec", conditioned=False),
     "bc": Method("bc", conditioned=False),
@@ -78,7 +78,7 @@ for it with `PLUS`. UCF has these additions by default, `ucf-plain` lacks them. 
 `ucf-wo-arch` are Table 3's ablations of `ucf`."""
 ADDITIONS: Final[Mapping[str, Method]] = {
     "ucf-wo-exposure": Method("ucf", ("policy.exposure=false",), vectors=False),
-    "ucf-wo-tilt": Method("ucf", ("rule.tilts=[0]",), vectors=False),
+    "ucf-wo-reward_weight": Method("ucf", ("rule.reward_weights=[0]",), vectors=False),
     "ucf-wo-rule": Method("ucf", ("rule.choose=false",), vectors=False),
     "ucf-weights": Method("ucf", ("policy.advantage_weights=true",)),
     "ucf-max-return": Method("ucf", ("policy.max_return=true",)),

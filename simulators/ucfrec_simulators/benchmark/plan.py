@@ -11,8 +11,8 @@ from typing import Final
 from ucfrec import schema
 from ucfrec.code_version import code_version, plugin_module
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.evaluation import gymnasium_world
-from ucfrec.evaluation.world import GYMNASIUM, World
+from ucfrec.evaluation import gymnasium_environment
+from ucfrec.evaluation.environment import GYMNASIUM, Environment
 from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import config_hash
 from ucfrec.runs.shared_stages import SharedStages
@@ -21,7 +21,7 @@ from ucfrec_simulators.benchmark import cells, tasks
 from ucfrec_simulators.benchmark.cells import Cell, EvaluationPlan
 from ucfrec_simulators.benchmark.methods import ADDITIONS, METHODS, PAPER, SCREENED, Method
 from ucfrec_simulators.benchmark.tasks import TASKS, BenchmarkTask, Log
-from ucfrec_simulators.distractor import OFF, ON, DistractorWorld, plant_distractor
+from ucfrec_simulators.distractor import OFF, ON, DistractorEnvironment, plant_distractor
 from ucfrec_simulators.folders import data_folder, folder_name
 
 
@@ -52,8 +52,8 @@ SWEPT: Final = ("synthetic-catalog", "synthetic-taobao")
 """Tasks that can be swept. Not VirtualTaobao: there all sequence policies reach the maximum
 return."""
 DISTRACTED: Final = {"synthetic-taobao": 0, "synthetic-catalog": 0, "kuairand": 2}
-"""Tasks that can have a distractor, and the index of the world that is played. KuaiRand is played
-as NX_10: all its sessions have the same length, so early exits do not hide the distractor's
+"""Tasks that can have a distractor, and the index of the environment that is played. KuaiRand is
+played as NX_10: all its sessions have the same length, so early exits do not hide the distractor's
 effect."""
 MAIN: Final = ("kuairand", "kuairec", "virtual-taobao", "synthetic-catalog", "sardine-boredinf")
 BUDGETS: Final[Mapping[str, Budget]] = {
@@ -111,8 +111,8 @@ _REAL: Final = {"kuairand": "kuairand", "kuairec": "kuairec", "virtual-taobao": 
 """Tasks that need files outside the package, and the subfolder of the data folder with them."""
 _PACKAGES: Final = {"sardine-static": sardine.PACKAGE, "sardine-boredinf": sardine.PACKAGE}
 """Tasks that need an optional package, and its name."""
-_DISTRACTOR: Final = DistractorWorld.__module__
-_GYMNASIUM_WORLD: Final = gymnasium_world.__name__
+_DISTRACTOR: Final = DistractorEnvironment.__module__
+_GYMNASIUM_ENVIRONMENT: Final = gymnasium_environment.__name__
 _ADDED: Final[Mapping[str, Method]] = {"ucf": METHODS["ucf"], **ADDITIONS, **PAPER}
 _MEMORYLESS: Final = ("bc", "popular", "crm-greedy")
 
@@ -126,32 +126,33 @@ class Plan:
         budget: Budget,
         name: str = "",
         log_seed: int = 0,
-        world: World | None = None,
+        environment: Environment | None = None,
         tasks: Sequence[str] = (),
     ) -> None:
         """Args:
-        folder: where logs, stores, worlds and runs are kept.
+        folder: where logs, stores, environments and runs are kept.
         budget: size of the benchmark.
         name: name of the budget, for the rows.
         log_seed: seed of the first simulated log of a task; the others have the seeds after it.
-        world: a world whose cells the main table has instead; None for the budget's tasks.
+        environment: an environment whose cells the main table has instead; None for the budget's
+            tasks.
         tasks: the only tasks of the tables; empty for all.
         """
         self._only = tasks
         self._folder, self._budget, self._name = folder, budget, name
-        self._log_seed, self._world = log_seed, world
+        self._log_seed, self._environment = log_seed, environment
         self._tasks: dict[tuple[str, int], BenchmarkTask] = {}
 
     def main(self) -> Iterator[Cell]:
-        """Cells of Table 2 with Table 3's ablations, and of the worlds' built-in policies."""
+        """Cells of Table 2 with Table 3's ablations, and of the environments' built-in policies."""
         own = self._available(self._only or self._budget.tasks)
-        for name in own if self._world is None else [self._world.title]:
+        for name in own if self._environment is None else [self._environment.title]:
             for log in range(self._budget.logs):
                 task = self._task(name, log)
                 for behavior in task.behaviors if log == 0 else ():
-                    code = _code(task.worlds)
+                    code = _code(task.environments)
                     yield Cell(
-                        *("main", self._name, name, behavior, behavior, task.worlds),
+                        *("main", self._name, name, behavior, behavior, task.environments),
                         *(self._budget.evaluation, code, None),
                     )
                 yield from self._all_trained("main", name, log, METHODS)
@@ -186,13 +187,19 @@ class Plan:
         for name in self._available(DISTRACTED if self._only else self._budget.distracted):
             for log in range(self._budget.logs):
                 clean = self._task(name, log)
-                world = clean.worlds[DISTRACTED[name]]
+                environment = clean.environments[DISTRACTED[name]]
                 planted = clean.store.with_name("distractor-store")
                 if not planted.exists():
                     plant_distractor(EpisodeStore.open(clean.store), planted)
-                worlds = tuple(DistractorWorld(world.name, world.folder, r) for r in (OFF, ON))
-                distracted = BenchmarkTask(planted, worlds, ())
-                both = {name: replace(clean, worlds=(world,)), f"{name}, distractor": distracted}
+                environments = tuple(
+                    DistractorEnvironment(environment.name, environment.folder, r)
+                    for r in (OFF, ON)
+                )
+                distracted = BenchmarkTask(planted, environments, ())
+                both = {
+                    name: replace(clean, environments=(environment,)),
+                    f"{name}, distractor": distracted,
+                }
                 # Cells that share a run lie far apart, so that no process waits for another's.
                 for seed, plan, label, title in product(
                     range(self._budget.seeds), plans, DISTRACTOR_METHODS, both
@@ -218,8 +225,8 @@ class Plan:
 
     def _task(self, name: str, log: int) -> BenchmarkTask:
         if (name, log) not in self._tasks:
-            world = self._world
-            made_of = (name,) if world is None else (world.name,)
+            environment = self._environment
+            made_of = (name,) if environment is None else (environment.name,)
             # Another version of the code may write different logs, so each version has its folder.
             code = code_version(tasks.__name__, *map(_module, tasks.LOGGED.get(name, made_of)))
             number = self._number(name, log)
@@ -227,7 +234,7 @@ class Plan:
             if name in tasks.LOGGED and number is not None:
                 which = f"{which}-of-{self._budget.logs}"
             folder = self._folder / "tasks" / f"{folder_name(name)}-{which}-{code}"
-            make = TASKS[name] if world is None else partial(tasks.simulated, world)
+            make = TASKS[name] if environment is None else partial(tasks.simulated, environment)
             given = Log(self._budget.sessions, self._log_seed + log, log, self._budget.logs)
             self._tasks[name, log] = make(folder, given)
         return self._tasks[name, log]
@@ -267,7 +274,7 @@ class Plan:
         memory = () if method.policy in _MEMORYLESS else (f"policy.context={_CONTEXT}",)
         cuts = self._budget.cuts.get(method.policy, ())
         settings = (*self._budget.settings, *memory, *cuts, *method.settings)
-        code = _code(task.worlds, policy_class(method.policy).__module__)
+        code = _code(task.environments, policy_class(method.policy).__module__)
         # Where nothing but items was logged, there are no columns to screen.
         screening = method.screening if store.observation_size else None
         identity = {"policy": method.policy, "settings": settings, "code": code}
@@ -279,7 +286,7 @@ class Plan:
             task=name,
             method=label,
             policy=method.policy,
-            worlds=task.worlds,
+            environments=task.environments,
             evaluation=evaluation or self._budget.evaluation,
             code_version=code,
             log_seed=self._number(task_name, log),
@@ -293,20 +300,20 @@ class Plan:
         )
 
 
-def _code(worlds: Sequence[World], *learner: str) -> str:
-    """The version of the code that a cell in `worlds` depends on."""
-    modules = [_module(world.name) for world in worlds]
-    distracted = any(isinstance(world, DistractorWorld) for world in worlds)
-    on_gymnasium = any(module in (_GYMNASIUM_WORLD, sardine.__name__) for module in modules)
+def _code(environments: Sequence[Environment], *learner: str) -> str:
+    """The version of the code that a cell in `environments` depends on."""
+    modules = [_module(environment.name) for environment in environments]
+    distracted = any(isinstance(environment, DistractorEnvironment) for environment in environments)
+    on_gymnasium = any(module in (_GYMNASIUM_ENVIRONMENT, sardine.__name__) for module in modules)
     apart = [] if distracted else [_DISTRACTOR]
-    apart += [] if on_gymnasium else [_GYMNASIUM_WORLD]
+    apart += [] if on_gymnasium else [_GYMNASIUM_ENVIRONMENT]
     return code_version(cells.__name__, *learner, *modules, exclude=apart)
 
 
-def _module(world: str) -> str:
-    if world.startswith(GYMNASIUM):
-        return _GYMNASIUM_WORLD
-    return plugin_module("simulators", world)
+def _module(environment: str) -> str:
+    if environment.startswith(GYMNASIUM):
+        return _GYMNASIUM_ENVIRONMENT
+    return plugin_module("simulators", environment)
 
 
 def _supports(method: Method, store: EpisodeStore) -> bool:

@@ -19,28 +19,31 @@ _Rows = Sequence[ResultRow]
 
 
 def plot_methods(rows: _Rows, folder: Path) -> list[Path]:
-    """One plot per world: return of every method, mean and standard deviation over seeds."""
-    return _by_world("methods", _bars, rows, folder)
+    """One plot per environment: return of every method, mean and standard deviation over seeds."""
+    return _by_environment("methods", _bars, rows, folder)
 
 
 def plot_additions(rows: _Rows, folder: Path) -> list[Path]:
-    """One plot per world: return of UCF with and without each addition, as in `plot_methods`."""
-    return _by_world("additions", _bars, rows, folder)
+    """One plot per environment: return of UCF with and without each addition, as in
+    `plot_methods`."""
+    return _by_environment("additions", _bars, rows, folder)
 
 
 def plot_sweeps(rows: _Rows, folder: Path) -> list[Path]:
-    """One plot per world: return of UCF with each setting, as in `plot_methods`."""
-    return _by_world("sweeps", _bars, rows, folder)
+    """One plot per environment: return of UCF with each setting, as in `plot_methods`."""
+    return _by_environment("sweeps", _bars, rows, folder)
 
 
 def plot_distractor(rows: _Rows, folder: Path) -> list[Path]:
-    """One plot per world with a distractor: returns without it, with it off, and with it on.
+    """One plot per environment with a distractor: returns without it, with it off, and with it on.
 
     Only rows whose target return is the largest training return are shown.
     """
     rows = [row for row in rows if row.conditions["quantiles"] == "1"]
-    planted = {row.world for row in rows if row.conditions["distractor"] is not None}
-    return _by_world("distractor", _triples, [r for r in rows if r.world in planted], folder)
+    planted = {row.environment for row in rows if row.conditions["distractor"] is not None}
+    return _by_environment(
+        "distractor", _triples, [r for r in rows if r.environment in planted], folder
+    )
 
 
 def _bars(axes: "Axes", rows: _Rows) -> None:
@@ -68,14 +71,14 @@ def _triples(axes: "Axes", rows: _Rows) -> None:
     axes.legend()
 
 
-def _by_world(
+def _by_environment(
     kind: str, draw: Callable[["Axes", _Rows], None], rows: _Rows, folder: Path
 ) -> list[Path]:
-    worlds = grouped(of_checkpoint(rows, "best"), lambda row: row.world)
+    environments = grouped(of_checkpoint(rows, "best"), lambda row: row.environment)
     return [
         path
-        for world, group in worlds.items()
-        for path in _saved(folder, f"{kind}-{world}", draw, group)
+        for environment, group in environments.items()
+        for path in _saved(folder, f"{kind}-{environment}", draw, group)
     ]
 
 

@@ -10,14 +10,15 @@ from ucfrec.reporting.statistics import grouped, paired_differences, summary
 from ucfrec.reporting.tables import NONE, markdown_table, mean_and_sd, signed_difference
 
 DISTRACTOR_RATES: Final = (None, 0.0, 1.0)
-"""Probability that the distractor is on in an evaluation; None: a world without a distractor."""
+"""Probability that the distractor is on in an evaluation; None: an environment without a
+distractor."""
 OURS: Final = "ucf"
 _Pair = tuple[int | None, int | None]
 _SHOWN: Final = ("R_cum", "R_avg_pooled", "R_avg_episode", "length")
 
 
 def method_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
-    """One line per world and method, in the order of the rows (Tables 2 and 3 of the paper).
+    """One line per environment and method, in the order of the rows (Tables 2 and 3 of the paper).
 
     Mean ± standard deviation over logs and training seeds. `promised` is the return that the model
     of the users, fitted to the log, gave the chosen rule. `− ucf` is the return less that of UCF
@@ -25,70 +26,75 @@ def method_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
     of logs, which counts what logs differ by.
     """
     columns = (*_SHOWN, "coverage", "target", "promised")
-    head = ("world", "method", "logs × seeds", *columns, f"− {OURS}")
+    head = ("environment", "method", "logs × seeds", *columns, f"− {OURS}")
     lines, shown = [], of_checkpoint(rows, checkpoint)
     less = difference_to_ours(shown)
-    for (world, method), group in grouped(shown, _line).items():
+    for (environment, method), group in grouped(shown, _line).items():
         spread = [mean_and_sd(numbers(group, name)) for name in (*_SHOWN, "coverage")]
         told = (_targets(group), mean_and_sd(numbers(group, "promised")))
-        lines.append((world, method, len(group), *spread, *told, less[world, method]))
+        lines.append((environment, method, len(group), *spread, *told, less[environment, method]))
     return markdown_table(head, lines)
 
 
 def difference_to_ours(rows: Sequence[ResultRow]) -> dict[tuple[str, str], str]:
-    """By (world, method): its return less that of UCF, as in `method_table`; a dash for UCF."""
+    """By (environment, method): its return less that of UCF, as in `method_table`; a dash for
+    UCF."""
     found: dict[tuple[str, str], str] = {}
-    for world, group in grouped(rows, lambda row: str(row.world)).items():
+    for environment, group in grouped(rows, lambda row: str(row.environment)).items():
         values = {
             name: {_pair(row): row.value for row in own}
             for name, own in grouped(group, lambda row: row.method).items()
         }
         ours = values.get(OURS, {})
         found |= {
-            (world, name): NONE if name == OURS else _less(own, ours)
+            (environment, name): NONE if name == OURS else _less(own, ours)
             for name, own in values.items()
         }
     return found
 
 
 def sweep_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
-    """One line per world and setting of UCF: return, validation loss and acceptance rate."""
-    head = ("world", "setting", "logs × seeds", "R_cum", "validation loss", "acceptance")
+    """One line per environment and setting of UCF: return, validation loss and acceptance rate."""
+    head = ("environment", "setting", "logs × seeds", "R_cum", "validation loss", "acceptance")
     lines = []
-    for (world, method), group in grouped(of_checkpoint(rows, checkpoint), _line).items():
+    for (environment, method), group in grouped(of_checkpoint(rows, checkpoint), _line).items():
         shown = ("R_cum", "validation_loss", "acceptance")
         spread = [mean_and_sd(numbers(group, name)) for name in shown]
-        lines.append((world, method, len(group), *spread))
+        lines.append((environment, method, len(group), *spread))
     return markdown_table(head, lines)
 
 
 def distractor_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
-    """One line per world, target and method: returns without, with it off, and with it on.
+    """One line per environment, target and method: returns without, with it off, and with it on.
 
     "off" and "on" are of policies trained with the distractor. `drop` is by how many percent the
     return with the distractor off is below that of the policy trained without a distractor.
     """
 
     def key(row: ResultRow) -> tuple[str, float, str]:
-        # Worlds together, the largest target first; methods stay in their order.
-        return str(row.world), -float(str(row.conditions["quantiles"])), row.method
+        # Environments together, the largest target first; methods stay in their order.
+        return str(row.environment), -float(str(row.conditions["quantiles"])), row.method
 
     groups = grouped(of_checkpoint(rows, checkpoint), key)
     lines = []
-    for (world, quantile, method), group in sorted(groups.items(), key=lambda item: item[0][:2]):
+    for (environment, quantile, method), group in sorted(
+        groups.items(), key=lambda item: item[0][:2]
+    ):
         by_pair = [
             {_pair(row): row.value for row in group if row.conditions["distractor"] == rate}
             for rate in DISTRACTOR_RATES
         ]
         pairs = [pair for pair in by_pair[0] if all(pair in other for other in by_pair)]
-        if not pairs:  # a world in which no distractor was planted
+        if not pairs:  # an environment in which no distractor was planted
             continue
         clean, off, on = ([values[pair] for pair in pairs] for values in by_pair)
         drop = [100 * (1 - with_it / without) for with_it, without in zip(off, clean, strict=True)]
         spread = [mean_and_sd(values) for values in (clean, off, on, drop)]
-        lines.append((world, f"{-quantile:g}", method, len(pairs), *spread))
+        lines.append((environment, f"{-quantile:g}", method, len(pairs), *spread))
     shown = ("no distractor", "distractor off", "distractor on", "drop, %")
-    return markdown_table(("world", "target quantile", "method", "logs × seeds", *shown), lines)
+    return markdown_table(
+        ("environment", "target quantile", "method", "logs × seeds", *shown), lines
+    )
 
 
 def of_checkpoint(rows: Sequence[ResultRow], checkpoint: str) -> list[ResultRow]:
@@ -122,7 +128,7 @@ def _pair(row: ResultRow) -> _Pair:
 
 
 def _line(row: ResultRow) -> tuple[str, str]:
-    return str(row.world), row.method
+    return str(row.environment), row.method
 
 
 def _targets(rows: Sequence[ResultRow]) -> str:

@@ -1,4 +1,4 @@
-"""The benchmark tasks: a store to train on, and the worlds to evaluate in."""
+"""The benchmark tasks: a store to train on, and the environments to evaluate in."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -9,8 +9,8 @@ from typing import Final
 import pyarrow as pa
 
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.simulated_store import simulated_store
-from ucfrec.evaluation.world import World
 from ucfrec.logs.mapping import Dataset, LogMapping, log_files
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.plugins import load_plugin
@@ -24,8 +24,8 @@ from ucfrec_simulators.kuai.kuairec import read_categories
 from ucfrec_simulators.kuai.logs import cut_by_exit, part_of, window, write_log
 
 EXIT_PRESETS: Final = ("", "-nx0", "-nx10", "-n4", "-n4-nx0", "-n1", "-n1-nx0")
-"""What follows the name of a Kuaishou world: repeats allowed or not, ten steps without an exit, and
-exit rules that look back four items and one instead of ten."""
+"""What follows the name of a Kuaishou environment: repeats allowed or not, ten steps without an
+exit, and exit rules that look back four items and one instead of ten."""
 KUAIRAND: Final = tuple(f"kuairand{preset}" for preset in EXIT_PRESETS)
 KUAIREC: Final = tuple(f"kuairec{preset}" for preset in EXIT_PRESETS)
 FLOORS: Final = tuple(BEHAVIORS)
@@ -53,35 +53,35 @@ class BenchmarkTask:
 
     store: Path
     """Episode store that methods are trained on."""
-    worlds: tuple[World, ...]
-    """Worlds that policies are evaluated in; the first is the one of the sweeps."""
+    environments: tuple[Environment, ...]
+    """Environments that policies are evaluated in; the first is the one of the sweeps."""
     behaviors: tuple[str, ...]
-    """Built-in policies of the worlds that are evaluated as references."""
+    """Built-in policies of the environments that are evaluated as references."""
 
 
 def virtual_taobao(folder: Path, log: Log) -> BenchmarkTask:
     """VirtualTaobao's published networks, with logs of the mixture of behaviors."""
-    world = World("virtual-taobao")
-    store = simulated_store(world, folder, log.sessions, log.seed)
-    return BenchmarkTask(store, (world,), ("random", "mixture", "best-constant"))
+    environment = Environment("virtual-taobao")
+    store = simulated_store(environment, folder, log.sessions, log.seed)
+    return BenchmarkTask(store, (environment,), ("random", "mixture", "best-constant"))
 
 
 def synthetic_taobao(folder: Path, log: Log) -> BenchmarkTask:
     """SyntheticTaobao, with logs of the mixture of behaviors; the optimal policy is known."""
-    world = World("synthetic-taobao")
-    store = simulated_store(world, folder, log.sessions, log.seed)
-    return BenchmarkTask(store, (world,), ("random", "mixture", "best-constant", "optimal"))
+    environment = Environment("synthetic-taobao")
+    store = simulated_store(environment, folder, log.sessions, log.seed)
+    return BenchmarkTask(store, (environment,), ("random", "mixture", "best-constant", "optimal"))
 
 
 def synthetic_catalog(folder: Path, log: Log) -> BenchmarkTask:
     """SyntheticCatalog, with logs of the mixture of behaviors; the optimal policy is known."""
-    world = World("synthetic-catalog")
-    store = simulated_store(world, folder, log.sessions, log.seed)
-    return BenchmarkTask(store, (world,), ("random", "mixture", "optimal"))
+    environment = Environment("synthetic-catalog")
+    store = simulated_store(environment, folder, log.sessions, log.seed)
+    return BenchmarkTask(store, (environment,), ("random", "mixture", "optimal"))
 
 
 def sardine(name: str, folder: Path, log: Log) -> BenchmarkTask:
-    """A world of SARDINE, with logs of its mixture of oracles.
+    """An environment of SARDINE, with logs of its mixture of oracles.
 
     A twelfth of the sessions are collected, because they have 100 steps.
 
@@ -92,26 +92,28 @@ def sardine(name: str, folder: Path, log: Log) -> BenchmarkTask:
     Raises:
         InputError: `sardine-rec` is not installed.
     """
-    return simulated(World(name), folder, replace(log, sessions=max(1, log.sessions // 12)))
+    return simulated(Environment(name), folder, replace(log, sessions=max(1, log.sessions // 12)))
 
 
-def simulated(world: World, folder: Path, log: Log) -> BenchmarkTask:
-    """Any world that needs no files, with logs of its mixture or, without one, of random actions.
+def simulated(environment: Environment, folder: Path, log: Log) -> BenchmarkTask:
+    """Any environment that needs no files, with logs of its mixture or, without one, of random
+    actions.
 
     Raises:
-        InputError: the world cannot be made.
+        InputError: the environment cannot be made.
     """
-    behaviors = tuple(world.simulator().behaviors)
-    store = simulated_store(world, folder, log.sessions, log.seed)
-    return BenchmarkTask(store, (world,), behaviors)
+    behaviors = tuple(environment.simulator().behaviors)
+    store = simulated_store(environment, folder, log.sessions, log.seed)
+    return BenchmarkTask(store, (environment,), behaviors)
 
 
 def kuairand(folder: Path, log: Log) -> BenchmarkTask:
-    """KuaiRand: trained on the earlier logs, evaluated in worlds completed from the later logs.
+    """KuaiRand: trained on the earlier logs, evaluated in environments completed from the later
+    logs.
 
     The training logs are cut into sessions by the exit rule. If the data folder has the random
-    exposures, training uses the standard log up to 21 April and the worlds are made from the random
-    rows, as in the public experiments. Otherwise the log is split at 28 April.
+    exposures, training uses the standard log up to 21 April and the environments are made from the
+    random rows, as in the public experiments. Otherwise the log is split at 28 April.
 
     Raises:
         InputError: the data folder lacks the official files.
@@ -126,18 +128,20 @@ def kuairand(folder: Path, log: Log) -> BenchmarkTask:
     basic = [file for file in files if file.name.startswith("video_features_basic_")]
     features = [*basic, *(file for file in files if file.name.startswith("user_features_"))]
     tags = {video: tag for file in basic for video, tag in read_tags(file).items()}
-    store, filled = folder / "store", folder / "world"
+    store, filled = folder / "store", folder / "environment"
     if not store.exists():
         rows = cut_by_exit(window(logs, "time_ms", learn), tags, EXITS["easyrl4rec-kuairand"])
         rows = part_of(rows, log.part, log.parts)
         _prepare("kuairand", rows, folder / "log_standard_learn.parquet", features, store)
     if not filled.exists():
-        played = folder / "world-store"
+        played = folder / "environment-store"
         if not played.exists():
             rows = window(logs, "time_ms", play)
-            _prepare("kuairand", rows, folder / "log_standard_world.parquet", features, played)
+            _prepare(
+                "kuairand", rows, folder / "log_standard_environment.parquet", features, played
+            )
         complete(EpisodeStore.open(played), tags, filled)
-    return BenchmarkTask(store, tuple(World(name, filled) for name in KUAIRAND), FLOORS)
+    return BenchmarkTask(store, tuple(Environment(name, filled) for name in KUAIRAND), FLOORS)
 
 
 def kuairec(folder: Path, log: Log) -> BenchmarkTask:
@@ -156,7 +160,7 @@ def kuairec(folder: Path, log: Log) -> BenchmarkTask:
         rows = cut_by_exit(rows, read_categories(source), EXITS["easyrl4rec-kuairec"])
         rows = part_of(rows, log.part, log.parts)
         _prepare("kuairec", rows, folder / "big_matrix_cut.parquet", features, store)
-    return BenchmarkTask(store, tuple(World(name, source) for name in KUAIREC), FLOORS)
+    return BenchmarkTask(store, tuple(Environment(name, source) for name in KUAIREC), FLOORS)
 
 
 def _prepare(dataset: str, rows: pa.Table, log: Path, features: list[Path], store: Path) -> None:
@@ -179,4 +183,5 @@ TASKS: Final[Mapping[str, Callable[[Path, Log], BenchmarkTask]]] = {
 }
 """Makers of the tasks by name. Arguments: the folder to keep it in, and which log."""
 LOGGED: Final[Mapping[str, tuple[str, ...]]] = {"kuairand": KUAIRAND, "kuairec": KUAIREC}
-"""Worlds of the tasks whose logs are given; any other task has the one world of its name."""
+"""Environments of the tasks whose logs are given; any other task has the one environment of its
+name."""

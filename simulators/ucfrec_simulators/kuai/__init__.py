@@ -1,1 +1,1 @@
-"""Worlds made from the Kuaishou logs, KuaiRec and KuaiRand."""
+"""Environments made from the Kuaishou logs, KuaiRec and KuaiRand."""

@@ -128,7 +128,7 @@ def complete(
     config: CompletionConfig | None = None,
     seed: int = 0,
 ) -> CompletionReport:
-    """Fit the completion model on the rows of `store` and write the world's files to `out`.
+    """Fit the completion model on the rows of `store` and write the environment's files to `out`.
 
     The model is fitted on the store's training rows, with early stopping on its validation rows.
     The report is of its test rows, which are later than both. The store must hold the evaluation

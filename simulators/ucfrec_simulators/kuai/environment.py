@@ -1,4 +1,5 @@
-"""The Kuaishou worlds: one item per step, rewards from a user × item table, exit by repeated tags.
+"""The Kuaishou environments: one item per step, rewards from a user × item table, exit by repeated
+tags.
 
 Source: `BaseEnv`, `KuaiEnv` and `KuaiRandEnv` of EasyRL4Rec, and their versions in DORL and CIRS.
 """
@@ -157,7 +158,7 @@ class KuaiEnv(SessionsEnv):
         """(N, n_items) whether each item would end each session by the exit rule in this step.
 
         Args:
-            exit_rule: another rule than the world's.
+            exit_rule: another rule than the environment's.
         """
         tiresome = self._tiresome(exit_rule or self.exit_rule)
         boring = np.zeros((self.num_envs, len(self._codes)), dtype=np.bool_)
@@ -233,7 +234,7 @@ def _coded(tags: Sequence[Sequence[int]]) -> tuple[IntArray, int]:
 
 
 def said(regime: str, exit_rule: ExitRule) -> str:
-    """What the command line says of a world's regime, by its name, and of its exit rule."""
+    """What the command line says of an environment's regime, by its name, and of its exit rule."""
     if REGIMES[regime].steps is not None:
         return f"regime {regime}"
     times = "a tag" if exit_rule.threshold == 0 else f"a tag shown {exit_rule.threshold + 1} times"

@@ -27,13 +27,13 @@ def sessions_by_exit(
         (N,) session of each row, numbered from 0 in the order of the rows.
     """
     _, starts, lengths = np.unique(users, return_index=True, return_counts=True)
-    world = KuaiEnv(len(starts), np.zeros((1, len(tags)), dtype=np.float32), tags, exit_rule)
-    world.reset(seed=0)
+    environment = KuaiEnv(len(starts), np.zeros((1, len(tags)), dtype=np.float32), tags, exit_rule)
+    environment.reset(seed=0)
     last = np.zeros(len(users), dtype=np.bool_)
     for step in range(lengths.max()):
         # Users without further rows repeat their last one, whose session is ended below anyway.
         rows = starts + np.minimum(step, lengths - 1)
-        _, _, terminated, truncated, _ = world.step(items[rows])
+        _, _, terminated, truncated, _ = environment.step(items[rows])
         active = step < lengths
         last[rows[active]] = (terminated | truncated)[active]
     last[starts + lengths - 1] = True

@@ -1,4 +1,4 @@
-"""The KuaiRand world: click probabilities completed from the rows of an evaluation window.
+"""The KuaiRand environment: click probabilities completed from the rows of an evaluation window.
 
 `python -m ucfrec_simulators.kuai.kuairand STORE VIDEO_FEATURES_BASIC --out FOLDER` makes its files
 from a store of that window.
@@ -42,19 +42,19 @@ def kuairand(
     exit_rule: ExitRule = EXITS["easyrl4rec-kuairand"],
     regime: Regime = REGIMES["FB"],
 ) -> KuaiEnv:
-    """The world of KuaiRand's users × videos; the reward is the probability of a click.
+    """The environment of KuaiRand's users × videos; the reward is the probability of a click.
 
     Args:
         num_envs: number of parallel sessions, N.
-        folder: written by `ucfrec_simulators.kuai.completion.complete`; None for `kuairand-world`
-            in the data folder.
+        folder: written by `ucfrec_simulators.kuai.completion.complete`; None for
+            `kuairand-environment` in the data folder.
         exit_rule: when users leave.
         regime: masking and length of sessions.
 
     Raises:
         InputError: a file is missing.
     """
-    folder = folder or data_folder("kuairand-world")
+    folder = folder or data_folder("kuairand-environment")
     for name in (USERS_FILE, ITEMS_FILE):
         if not (folder / name).is_file():
             raise InputError(f"{folder / name} is missing; {MAKE_IT}")
@@ -88,7 +88,7 @@ def read_tags(path: Path) -> dict[int, tuple[int, ...]]:
 
 
 def simulator(regime: str, exit_rule: ExitRule = EXITS["easyrl4rec-kuairand"]) -> Simulator:
-    """The world under one of `REGIMES` and an exit rule, for the command line."""
+    """The environment under one of `REGIMES` and an exit rule, for the command line."""
     return Simulator(
         summary=f"KuaiRand's videos, completed click rates; {said(regime, exit_rule)}",
         make=partial(kuairand, exit_rule=exit_rule, regime=REGIMES[regime]),
@@ -107,7 +107,7 @@ SIMULATOR_N1_NX_0: Final = simulator("NX_0", EXITS["dorl-main"])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Write the world's files from the command line; returns the exit status."""
+    """Write the environment's files from the command line; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m ucfrec_simulators.kuai.kuairand")
     parser.add_argument("store", type=Path, help="store of the evaluation window, reward is_click")
     parser.add_argument("video_features_basic", type=Path, help="the official file, for the tags")

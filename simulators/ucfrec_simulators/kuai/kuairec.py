@@ -1,4 +1,4 @@
-"""The KuaiRec world: the nearly fully observed users × videos of `small_matrix`."""
+"""The KuaiRec environment: the nearly fully observed users × videos of `small_matrix`."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -32,7 +32,7 @@ def kuairec(
     exit_rule: ExitRule = EXITS["easyrl4rec-kuairec"],
     regime: Regime = REGIMES["FB"],
 ) -> KuaiEnv:
-    """The world of 1,411 users × 3,327 videos.
+    """The environment of 1,411 users × 3,327 videos.
 
     The reward is the raw `watch_ratio`, clipped at 5, and 0 for the 0.4% of pairs that were never
     observed.
@@ -98,7 +98,7 @@ def parse_tags(text: str) -> tuple[int, ...]:
 
 
 def simulator(regime: str, exit_rule: ExitRule = EXITS["easyrl4rec-kuairec"]) -> Simulator:
-    """The world under one of `REGIMES` and an exit rule, for the command line."""
+    """The environment under one of `REGIMES` and an exit rule, for the command line."""
     return Simulator(
         summary=f"KuaiRec's fully observed videos, watch ratio; {said(regime, exit_rule)}",
         make=partial(kuairec, exit_rule=exit_rule, regime=REGIMES[regime]),

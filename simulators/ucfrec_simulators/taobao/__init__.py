@@ -1,1 +1,1 @@
-"""Worlds of ranked result pages: VirtualTaobao and the synthetic SyntheticTaobao."""
+"""Environments of ranked result pages: VirtualTaobao and the synthetic SyntheticTaobao."""

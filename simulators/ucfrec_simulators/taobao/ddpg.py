@@ -1,4 +1,5 @@
-"""DDPG behavior policies in the Taobao worlds: a learner in training, its snapshots, the last one.
+"""DDPG behavior policies in the Taobao environments: a learner in training, its snapshots, the
+last one.
 
 Stable-Baselines3 (extra `collect`) provides the networks, the replay buffer and the update. The
 sessions are played by `ucfrec.acting.rollout`, so that the steps learned from are those logged.
@@ -46,7 +47,7 @@ class DdpgConfig:
     hidden: int = 128
     learning_rate: float = 1e-3
     discount: float = 0.2
-    """Discount γ; small, since actions hardly affect later steps in these worlds."""
+    """Discount γ; small, since actions hardly affect later steps in these environments."""
     target_rate: float = 0.02
     """Polyak rate τ of the target networks."""
     noise: float = 0.1
@@ -79,12 +80,12 @@ class Learner:
     are logged. The value after the end of a session is 0, whether it terminated or was truncated.
 
     Args:
-        env: the Taobao world.
+        env: the Taobao environment.
         seed: seed of the networks, the noise and the batches.
         config: settings of the training.
 
     Raises:
-        InputError: `env` is not a Taobao world, or Stable-Baselines3 is not installed.
+        InputError: `env` is not a Taobao environment, or Stable-Baselines3 is not installed.
     """
 
     def __init__(self, env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig) -> None:
@@ -225,11 +226,11 @@ def snapshots(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig) -> l
     """Policy networks of one training after equal shares of its sessions, earliest first.
 
     They are trained at the first use and cached as safetensors in `$UCFREC_CACHE`
-    (`~/.cache/ucfrec`). The file's name is a hash of responses of the world, the configuration, the
-    seed and the libraries' versions. No logged session is a training session.
+    (`~/.cache/ucfrec`). The file's name is a hash of responses of the environment, the
+    configuration, the seed and the libraries' versions. No logged session is a training session.
 
     Raises:
-        InputError: `env` is not a Taobao world, or Stable-Baselines3 is not installed.
+        InputError: `env` is not a Taobao environment, or Stable-Baselines3 is not installed.
     """
     folder = Path(os.environ.get("UCFREC_CACHE", Path.home() / ".cache" / "ucfrec"))
     file = folder / f"ddpg-{_fingerprint(taobao(env), seed, config)}.safetensors"
@@ -267,13 +268,13 @@ def _train(
     return taken
 
 
-def _fingerprint(world: TaobaoEnv, seed: int, config: DdpgConfig) -> str:
+def _fingerprint(environment: TaobaoEnv, seed: int, config: DdpgConfig) -> str:
     generator = np.random.default_rng(53)
-    users, lengths = world.sample_users(256, generator)
+    users, lengths = environment.sample_users(256, generator)
     actions = generator.uniform(-1, 1, (256, ACTION_DIM)).astype(np.float32)
-    clicks = world.expected_clicks(users, np.zeros(256, dtype=np.int64), actions)
+    clicks = environment.expected_clicks(users, np.zeros(256, dtype=np.int64), actions)
     identity = {
-        "world": [type(world).__name__, world.num_envs, lengths.tolist()],
+        "environment": [type(environment).__name__, environment.num_envs, lengths.tolist()],
         "answers": clicks.round(4).tolist(),
         "config": asdict(config) | {"seed": seed},
         "versions": versions(["stable-baselines3"]),
@@ -305,4 +306,4 @@ BEHAVIORS: Final[Mapping[str, Callable[[VectorEnv[Any, Any, Any], int], Actor]]]
     "ddpg-snapshots": snapshot_mixture,
     "ddpg-expert": expert,
 }
-"""Behavior policies of every Taobao world."""
+"""Behavior policies of every Taobao environment."""

@@ -1,4 +1,5 @@
-"""The interface of the Taobao worlds, and the behavior policies that need only this interface."""
+"""The interface of the Taobao environments, and the behavior policies that need only this
+interface."""
 
 from abc import abstractmethod
 from typing import Any, Final
@@ -95,13 +96,15 @@ def split_observations(observations: Float32Array) -> tuple[Float32Array, Float3
 
 
 def taobao(env: VectorEnv[Any, Any, Any]) -> TaobaoEnv:
-    """The Taobao world within `env`.
+    """The Taobao environment within `env`.
 
     Raises:
-        InputError: `env` is not a Taobao world.
+        InputError: `env` is not a Taobao environment.
     """
     if not isinstance(env.unwrapped, TaobaoEnv):
-        raise InputError(f"this behavior policy serves Taobao worlds, not {type(env).__name__}")
+        raise InputError(
+            f"this behavior policy serves Taobao environments, not {type(env).__name__}"
+        )
     return env.unwrapped
 
 
@@ -122,11 +125,11 @@ def best_constant(
     """The constant action vector (27,) with the highest expected clicks over all users' pages.
 
     The best result of several cross-entropy searches, since one may end in a local optimum. It uses
-    the world's expected clicks, which no recommender can, and draws its users from a separate
+    the environment's expected clicks, which no recommender can, and draws its users from a separate
     random stream, independent of all episodes.
 
     Args:
-        env: the world.
+        env: the environment.
         seed: seed of the search.
         restarts: number of searches.
         pages: pages, drawn again in every round, on which actions are scored.
@@ -169,6 +172,6 @@ def best_constant_actor(env: VectorEnv[Any, Any, Any], seed: int) -> Constant:
     """A non-personalised baseline: always the action of `best_constant`.
 
     Raises:
-        InputError: `env` is not a Taobao world.
+        InputError: `env` is not a Taobao environment.
     """
     return Constant(best_constant(taobao(env), seed))

@@ -1,4 +1,4 @@
-"""A synthetic Taobao world, without downloads and with a known optimal policy."""
+"""A synthetic Taobao environment, without downloads and with a known optimal policy."""
 
 from pathlib import Path
 from typing import Any, Final
@@ -45,18 +45,18 @@ class SyntheticTaobao(TaobaoEnv):
 
     Args:
         num_envs: number of parallel sessions, N.
-        world_seed: seed of the users' tastes; independent of the seed of `reset`.
+        environment_seed: seed of the users' tastes; independent of the seed of `reset`.
     """
 
-    def __init__(self, num_envs: int = 1, world_seed: int = 0) -> None:
+    def __init__(self, num_envs: int = 1, environment_seed: int = 0) -> None:
         super().__init__(num_envs)
-        world = np.random.default_rng([world_seed, 21])
+        environment = np.random.default_rng([environment_seed, 21])
         per_attribute = 1 / np.sqrt(len(ATTRIBUTES))
-        self._common = world.normal(0, 0.45, ACTION_DIM)
-        self._tastes = world.normal(0, 0.35 * per_attribute, (USER_BITS, ACTION_DIM))
-        self._drift = world.normal(0, 0.25, ACTION_DIM)
-        self._patience = world.normal(0, 0.4 * per_attribute, USER_BITS)
-        self._popularity = [world.dirichlet(np.full(size, 2.0)) for size in ATTRIBUTES]
+        self._common = environment.normal(0, 0.45, ACTION_DIM)
+        self._tastes = environment.normal(0, 0.35 * per_attribute, (USER_BITS, ACTION_DIM))
+        self._drift = environment.normal(0, 0.25, ACTION_DIM)
+        self._patience = environment.normal(0, 0.4 * per_attribute, USER_BITS)
+        self._popularity = [environment.dirichlet(np.full(size, 2.0)) for size in ATTRIBUTES]
 
     def sample_users(
         self, count: int, generator: np.random.Generator
@@ -111,9 +111,9 @@ QUALITIES: Final = ((0.1, 0.2, 0.25), (0.4, 0.2, 0.25), (0.7, 0.2, 0.20), (0.95,
 
 def optimal(env: VectorEnv[Any, Any, Any], seed: int) -> Rule:
     """The optimal policy, which always plays a*; `seed` is unused."""
-    world = taobao(env)
-    assert isinstance(world, SyntheticTaobao)
-    return Rule(world.optimal_actions)
+    environment = taobao(env)
+    assert isinstance(environment, SyntheticTaobao)
+    return Rule(environment.optimal_actions)
 
 
 def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:

@@ -29,7 +29,7 @@ OBSERVATIONS = 4
 SPACE = Box(np.float32([-1, -3]), np.float32([2, 3]))
 
 
-class _World(gymnasium.Env[Any, Any]):
+class _Environment(gymnasium.Env[Any, Any]):
     observation_space = Box(-np.inf, np.inf, (OBSERVATIONS,), np.float32)
     action_space = SPACE
 
@@ -47,7 +47,7 @@ AGENTS = {
 def saved(folder: Path, name: str) -> tuple[Path, Any]:
     kind, settings = AGENTS[name]
     small = {"buffer_size": 10} if name in ("sac", "sac-sde", "td3", "ddpg") else {}
-    model = kind("MlpPolicy", _World(), seed=0, device="cpu", **small, **settings)
+    model = kind("MlpPolicy", _Environment(), seed=0, device="cpu", **small, **settings)
     with torch.no_grad():
         for parameter in model.policy.parameters():
             parameter += 0.3 * torch.randn_like(parameter)

@@ -20,7 +20,7 @@ from ucfrec_control.data.collect import CollectConfig, collect
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.sac import SacConfig, SacLearner
 from ucfrec_control.data.trajectories import Trajectories
-from ucfrec_control.worlds.scores import find_kind
+from ucfrec_control.environments.scores import find_kind
 
 ENV = "InvertedPendulum-v5"
 CONFIG = CollectConfig(

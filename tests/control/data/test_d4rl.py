@@ -25,7 +25,7 @@ from ucfrec.files.locks import is_lock_or_scratch
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl, write_d4rl
 from ucfrec_control.data.minari import is_minari, read_minari, write_minari
-from ucfrec_control.worlds.scores import find_kind, require_task
+from ucfrec_control.environments.scores import find_kind, require_task
 
 LENGTHS = (4, 1, 6, 3)
 

@@ -24,11 +24,11 @@ from ucfrec_control.benchmark.methods import METHODS, TABLES
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.distractor import add_distractor
+from ucfrec_control.environments.environments import make_env, mismatches
+from ucfrec_control.environments.scores import TASKS
 from ucfrec_control.learners.evaluate import evaluate_run
 from ucfrec_control.learners.presets import find_preset
 from ucfrec_control.learners.train import train_control
-from ucfrec_control.worlds.environments import make_env, mismatches
-from ucfrec_control.worlds.scores import TASKS
 
 TINY = ["train.steps=4", "train.validate_every=2", "policy.dim=16", "policy.context=5"]
 SETTINGS = [argument for setting in TINY for argument in ("--set", setting)]
@@ -357,7 +357,7 @@ def test_a_benchmark_goes_on_where_it_was(
         assert row["conditions"].items() >= {"budget": "small", "episodes": 2}.items()
         assert row["metrics"].keys() >= {"score", "return", "length", "validation_loss"}
         assert (row["training_seed"], row["evaluation_seed"]) == (0, 1000)
-        assert {"world", "versions", "commit", "command", "code_version"} <= row.keys()
+        assert {"environment", "versions", "commit", "command", "code_version"} <= row.keys()
     assert str(tmp_path) not in results.read_text()
     before = results.read_text()
     assert main(arguments) == 0

@@ -14,9 +14,9 @@ from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
+from ucfrec_control.environments.environments import make_env
 from ucfrec_control.learners.evaluate import evaluate_run
 from ucfrec_control.learners.video import record_episode
-from ucfrec_control.worlds.environments import make_env
 
 SMALL = {"width": 64, "height": 48, "max_episode_steps": 4}
 TINY = ("train.steps=2", "train.validate_every=2", "policy.dim=16", "policy.context=5")
@@ -65,7 +65,7 @@ def test_frames_show_the_first_episode_from_its_start(run: Path, tmp_path: Path)
         record(run, tmp_path / "frames")
 
 
-def test_a_video_has_the_frames_at_the_speed_of_the_world(
+def test_a_video_has_the_frames_at_the_speed_of_the_environment(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="the extra video is not installed")

@@ -15,8 +15,8 @@ from tests.support.result_rows import result_row
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior
-from ucfrec.evaluation.world import World
 from ucfrec.files.atomic import read_json
 from ucfrec.plugins import Benchmark, BenchmarkRequest, load_plugin
 from ucfrec.reporting.result_row import ResultRow
@@ -67,12 +67,12 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     built_in = [(name, None, None) for name in ("random", "mixture", "optimal")]
     trained = [(n, log, s) for log in (0, 1) for s in (0, 1) for n in some]
     assert [(r.method, r.log_seed, r.training_seed) for r in rows] == [*built_in, *trained]
-    assert {(r.suite, r.table, r.world) for r in rows} == {
+    assert {(r.suite, r.table, r.environment) for r in rows} == {
         ("recommendation", "main", "synthetic-catalog")
     }
     assert {r.checkpoint for r in rows if r.training_seed is not None} == {"best"}
     assert len({r.data_fingerprint for r in rows if r.training_seed is not None}) == 2
-    played = evaluate_behavior(World("synthetic-catalog"), "optimal", 8, 1_000_000)
+    played = evaluate_behavior(Environment("synthetic-catalog"), "optimal", 8, 1_000_000)
     found = next(row for row in rows if row.method == "optimal")
     assert found.value == played["R_cum"]
     assert found.interval == (played["R_cum_low"], played["R_cum_high"])
@@ -122,7 +122,7 @@ def test_any_gymnasium_environment_is_measured(
 ) -> None:
     monkeypatch.setitem(BUDGETS, "small", replace(TINY, seeds=1))
     monkeypatch.setattr(plan, "METHODS", {name: METHODS[name] for name in ("item-knn", "dt")})
-    name = "gymnasium:tests.support.gymnasium_worlds:ucfrec-test/Discrete-v0"
+    name = "gymnasium:tests.support.gymnasium_environments:ucfrec-test/Discrete-v0"
     command = ["benchmark", "recommendation", "--env", name, "--observe", "secret"]
     command += ["--out", str(tmp_path / "out"), "--workers", "1"]
     assert main([*command, "--table", "sweeps"]) == 2
@@ -132,7 +132,7 @@ def test_any_gymnasium_environment_is_measured(
     assert f"| {title} | dt | 1 |" in capsys.readouterr().out
     rows = read_rows(tmp_path / "out" / "results.jsonl")
     assert [row.method for row in rows] == ["random", "item-knn", "dt"]
-    assert {(row.task, row.world, row.log_seed) for row in rows[1:]} == {(title, title, 0)}
+    assert {(row.task, row.environment, row.log_seed) for row in rows[1:]} == {(title, title, 0)}
     random = next(row for row in rows if row.method == "random")
     assert random.metrics["length"] == 5
     assert {path.parent for path in tmp_path.rglob("run.json")} == {
@@ -149,9 +149,9 @@ def test_sardine_is_left_out_where_it_is_not_installed(
 
 
 @pytest.mark.usefixtures("no_data")
-def test_a_world_has_the_code_version_of_what_it_runs_through() -> None:
+def test_a_environment_has_the_code_version_of_what_it_runs_through() -> None:
     def code(name: str) -> str:
-        return plan._code((World(name),))
+        return plan._code((Environment(name),))
 
     assert code("sardine-static") == code("sardine-boredinf")
     assert len({code(name) for name in ("sardine-static", "gymnasium:x", "synthetic-catalog")}) == 3
@@ -186,7 +186,7 @@ def test_every_cell_of_every_table_has_a_configuration(
     distractors = [cell for cell in given.distractor() if cell.task.endswith("distractor")]
     planted = EpisodeStore.open(distractors[0].store)  # type: ignore[arg-type]
     assert planted.observation_size == 92
-    assert [world.rate for world in distractors[0].worlds] == [0.0, 1.0]  # type: ignore[attr-defined]
+    assert [environment.rate for environment in distractors[0].environments] == [0.0, 1.0]  # type: ignore[attr-defined]
     assert {cell.evaluation.target_quantile for cell in given.distractor()} == {1.0, 0.99}
     for table in (given.main, given.additions, given.sweeps, given.distractor):
         paper = [cell for cell in table() if cell.method == "ucf-paper"]
@@ -394,17 +394,19 @@ def test_windows_drop_repeats_and_are_cut(tmp_path: Path) -> None:
 
 
 @pytest.mark.realdata
-def test_kuairand_learns_from_what_came_before_its_worlds(tmp_path: Path) -> None:
+def test_kuairand_learns_from_what_came_before_its_environments(tmp_path: Path) -> None:
     data_folder("kuairand")
     task = kuairand(tmp_path, Log(0, 0))
-    learned, played = (EpisodeStore.open(tmp_path / name) for name in ("store", "world-store"))
+    learned, played = (
+        EpisodeStore.open(tmp_path / name) for name in ("store", "environment-store")
+    )
     last, first = (
         f(store.step_values("timestamp", *store.all_steps()))
         for f, store in ((np.max, learned), (np.min, played))
     )
     assert last < first
     assert learned.lengths.max() <= EXITS["easyrl4rec-kuairand"].max_turn
-    row = evaluate_behavior(task.worlds[2], "random", 50, 0)
+    row = evaluate_behavior(task.environments[2], "random", 50, 0)
     assert row["length"] == 10
 
 

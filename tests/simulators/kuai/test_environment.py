@@ -1,4 +1,4 @@
-"""The Kuaishou worlds against a plain reading of their rules, one user at a time."""
+"""The Kuaishou environments against a plain reading of their rules, one user at a time."""
 
 import time
 from dataclasses import replace
@@ -23,9 +23,9 @@ from ucfrec.acting.uniform import Uniform
 from ucfrec.episodes.states import ItemStates
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import collect
+from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import _item_numbers
 from ucfrec.evaluation.simulator import Simulator
-from ucfrec.evaluation.world import World
 from ucfrec.policies.dt import DTConfig, DTPolicy
 from ucfrec.schema import FORBIDDEN
 from ucfrec_simulators.behaviors import Constant
@@ -38,7 +38,7 @@ RULES = [replace(rule, sliced=sliced) for rule in EXITS.values() for sliced in (
 
 
 @st.composite
-def worlds(draw: st.DrawFn) -> tuple[np.ndarray, list[tuple[int, ...]]]:
+def environments(draw: st.DrawFn) -> tuple[np.ndarray, list[tuple[int, ...]]]:
     n_items, n_tags = draw(st.integers(2, 40)), draw(st.integers(1, 30))
     rng = np.random.default_rng(draw(st.integers(0, 999)))
     sizes = rng.integers(0, min(4, n_tags) + 1, size=n_items)
@@ -47,11 +47,11 @@ def worlds(draw: st.DrawFn) -> tuple[np.ndarray, list[tuple[int, ...]]]:
 
 
 @pytest.mark.parametrize("rule", RULES, ids=str)
-@given(world=worlds(), seed=st.integers(0, 999))
+@given(environment=environments(), seed=st.integers(0, 999))
 def test_every_exit_agrees_with_a_plain_reading(
-    rule: ExitRule, world: tuple[np.ndarray, list[tuple[int, ...]]], seed: int
+    rule: ExitRule, environment: tuple[np.ndarray, list[tuple[int, ...]]], seed: int
 ) -> None:
-    rewards, tags = world
+    rewards, tags = environment
     env = KuaiEnv(4, rewards, tags, rule)
     env.reset(seed=seed)
     sessions = [Plain(tags, rule) for _ in range(4)]
@@ -173,7 +173,8 @@ def test_what_does_not_fit_is_refused() -> None:
 
 @pytest.mark.parametrize("regime", REGIMES)
 def test_a_policy_plays_what_is_there_and_allowed(regime: str) -> None:
-    """Its catalogue has items that the world lacks, and lacks some that the world has."""
+    """Its catalogue has items that the environment lacks, and lacks some that the environment
+    has."""
     env = small(4, regime=regime)
     numbers = np.concatenate([np.arange(39, 4, -1), [-1] * 6])
     embeddings = torch.randn(len(numbers), 3, generator=torch.Generator().manual_seed(0))
@@ -243,12 +244,12 @@ def known_items(ids: list[Any]) -> Any:
 
 def test_items_are_found_by_what_the_logs_call_them(tmp_path: Path) -> None:
     env = small()  # item 0 is called 217, item 39 is called 100
-    numbers = _item_numbers(World("kuai"), env, known_items([1, 100, 103, 104, 217]))
+    numbers = _item_numbers(Environment("kuai"), env, known_items([1, 100, 103, 104, 217]))
     assert numbers is not None
     assert numbers.tolist() == [-1, 39, 38, -1, 0]
     for wrong in ([1, 2], ["100"]):
         with pytest.raises(InputError, match="which the policy was not trained on"):
-            _item_numbers(World("kuai"), env, known_items(wrong))
+            _item_numbers(Environment("kuai"), env, known_items(wrong))
     simulator = Simulator("", lambda n, folder: env, {}, "pay")
     collect(simulator, env, Uniform(env, 0), 20, 0, tmp_path / "logs", env_name="", behavior="")
     log = pd.read_parquet(tmp_path / "logs" / "sessions.parquet")

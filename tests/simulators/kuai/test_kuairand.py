@@ -1,4 +1,4 @@
-"""The completed KuaiRand world: what it finds in planted clicks, and in the real rows."""
+"""The completed KuaiRand environment: what it finds in planted clicks, and in the real rows."""
 
 import json
 import shutil
@@ -48,16 +48,18 @@ def planted_store(folder: Path, seed: int = 0, clicks: str = "planted") -> Episo
     return EpisodeStore.open(folder / "store")
 
 
-def test_planted_clicks_are_found_and_the_world_pays_them(tmp_path: Path) -> None:
+def test_planted_clicks_are_found_and_the_environment_pays_them(tmp_path: Path) -> None:
     store = planted_store(tmp_path / "log")
     tags = {item: (item % 7,) for item in range(ITEMS) if item % 5}
-    report = complete(store, tags, tmp_path / "world", QUICK)
+    report = complete(store, tags, tmp_path / "environment", QUICK)
     assert report.auc > 0.85
     assert report.log_loss < 0.45 < report.base_log_loss
     assert report.calibration_error < 0.06
     assert (report.users, report.items) == (USERS, ITEMS)
-    assert json.loads((tmp_path / "world" / "completion.json").read_text())["auc"] == report.auc
-    env = kuairand(16, tmp_path / "world")
+    assert (
+        json.loads((tmp_path / "environment" / "completion.json").read_text())["auc"] == report.auc
+    )
+    env = kuairand(16, tmp_path / "environment")
     assert env.tags[0] == (-1,)
     assert env.tags[6] == (6,)
     users, items = np.indices((USERS, ITEMS))
@@ -88,7 +90,7 @@ def test_the_same_seed_gives_the_same_files_and_nothing_is_left_of_a_failure(
 
 
 @pytest.mark.realdata
-def test_real_rows_make_a_world_that_can_be_believed(
+def test_real_rows_make_a_environment_that_can_be_believed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Judged by 29–30 April; what policies learn from, the days before, stays out."""
@@ -102,10 +104,10 @@ def test_real_rows_make_a_world_that_can_be_believed(
         shutil.copy(source / file, folder / file)
     files, mapping = load_plugin("datasets", "kuairand").resolve([folder], LogMapping())
     prepare(files, mapping, tmp_path / "store", PrepareOptions(embedding_size=16))
-    arguments = [str(tmp_path / "store"), str(basic), "--out", str(tmp_path / "world")]
+    arguments = [str(tmp_path / "store"), str(basic), "--out", str(tmp_path / "environment")]
     assert main(arguments) == 0
     assert "27285 users × 7583 items" in capsys.readouterr().out
-    report = json.loads((tmp_path / "world" / "completion.json").read_text())
+    report = json.loads((tmp_path / "environment" / "completion.json").read_text())
     assert report["auc"] > 0.62
     assert report["log_loss"] < report["base_log_loss"] - 0.03
     assert report["calibration_error"] < 0.06
@@ -113,7 +115,7 @@ def test_real_rows_make_a_world_that_can_be_believed(
     tags = read_tags(basic)
     assert max(map(len, tags.values())) <= 3
     for regime in REGIMES.values():
-        env = kuairand(16, tmp_path / "world", regime=regime)
+        env = kuairand(16, tmp_path / "environment", regime=regime)
         best = rollout(env, oracle(env, 0), 16, 0)
         dull = rollout(env, Uniform(env, 0), 16, 0)
         assert best.returns.mean() > 1.3 * dull.returns.mean()

@@ -163,11 +163,11 @@ def test_each_session_is_served_by_one_snapshot() -> None:
 
 
 @pytest.mark.slow
-def test_a_training_is_kept_and_its_seed_and_world_decide_it(cache: Path) -> None:
+def test_a_training_is_kept_and_its_seed_and_environment_decide_it(cache: Path) -> None:
     need_sb3()
 
-    def weights(world: int, seed: int) -> np.ndarray:
-        env = SyntheticTaobao(16, world_seed=world)
+    def weights(environment: int, seed: int) -> np.ndarray:
+        env = SyntheticTaobao(16, environment_seed=environment)
         networks = ddpg.snapshots(env, seed, SMALL)
         return np.stack([network[4].weight.detach().numpy().copy() for network in networks])
 
@@ -179,12 +179,12 @@ def test_a_training_is_kept_and_its_seed_and_world_decide_it(cache: Path) -> Non
     file.unlink()
     np.testing.assert_array_equal(first, weights(0, 0))
     assert not np.array_equal(first[0], first[1])
-    for world, seed in ((0, 1), (1, 0)):
-        assert not np.array_equal(first, weights(world, seed))
+    for environment, seed in ((0, 1), (1, 0)):
+        assert not np.array_equal(first, weights(environment, seed))
     assert len(list(cache.iterdir())) == 3
 
 
-def test_other_worlds_are_refused() -> None:
+def test_other_environments_are_refused() -> None:
     for make in ddpg.BEHAVIORS.values():
-        with pytest.raises(InputError, match="serves Taobao worlds"):
+        with pytest.raises(InputError, match="serves Taobao environments"):
             make(SyntheticCatalog(2), 0)

@@ -1,4 +1,4 @@
-"""The worlds whose best policy is known: that it is, and that it is the best."""
+"""The environments whose best policy is known: that it is, and that it is the best."""
 
 from itertools import product
 
@@ -24,9 +24,9 @@ def played(simulator: Simulator, behavior: str, episodes: int, seed: int = 0) ->
     return rollout(env, simulator.behaviors[behavior](env, seed), episodes, seed)
 
 
-@pytest.mark.parametrize("world", [SyntheticTaobao, SyntheticCatalog])
-def test_gymnasium_accepts_it(world: type[SyntheticTaobao] | type[SyntheticCatalog]) -> None:
-    check_env(SingleSession(world(1)), skip_render_check=True)
+@pytest.mark.parametrize("environment", [SyntheticTaobao, SyntheticCatalog])
+def test_gymnasium_accepts_it(environment: type[SyntheticTaobao] | type[SyntheticCatalog]) -> None:
+    check_env(SingleSession(environment(1)), skip_render_check=True)
 
 
 @pytest.mark.parametrize("simulator", [TAOBAO, CATALOG])
@@ -36,13 +36,13 @@ def test_same_seed_same_numbers_and_another_differs(simulator: Simulator) -> Non
     assert not np.array_equal(first.returns, other.returns)
 
 
-@pytest.mark.parametrize("world", [SyntheticTaobao(8), SyntheticCatalog(8)])
-def test_an_ended_session_is_replaced_within_the_step(world: SessionsEnv) -> None:
-    before, _ = world.reset(seed=0)
-    world.action_space.seed(0)
+@pytest.mark.parametrize("environment", [SyntheticTaobao(8), SyntheticCatalog(8)])
+def test_an_ended_session_is_replaced_within_the_step(environment: SessionsEnv) -> None:
+    before, _ = environment.reset(seed=0)
+    environment.action_space.seed(0)
     ends = 0
     for _ in range(40):
-        after, _, terminated, truncated, info = world.step(world.action_space.sample())
+        after, _, terminated, truncated, info = environment.step(environment.action_space.sample())
         ended = terminated | truncated
         ends += ended.sum()
         final = info.get("final_obs", np.full(8, None))
@@ -103,7 +103,7 @@ def test_taobao_sessions_are_about_eight_pages() -> None:
 @pytest.mark.parametrize("max_turn", [1, 2, 4, 5, 6])
 def test_rotation_is_optimal_by_brute_force(max_turn: int) -> None:
     env = SyntheticCatalog(
-        1, n_items=6, n_tags=4, n_users=3, boredom_window=3, max_turn=max_turn, world_seed=5
+        1, n_items=6, n_tags=4, n_users=3, boredom_window=3, max_turn=max_turn, environment_seed=5
     )
     best = np.zeros(3)
     for items in product(range(6), repeat=max_turn):

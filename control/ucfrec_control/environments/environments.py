@@ -13,12 +13,18 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 from ucfrec.arrays import Array
 from ucfrec.errors import InputError
-from ucfrec_control.worlds.antmaze import GoalObservations, antmaze_settings, is_antmaze, is_rebuilt
+from ucfrec_control.environments.antmaze import (
+    GoalObservations,
+    antmaze_settings,
+    is_antmaze,
+    is_rebuilt,
+)
 
 SIDE_BY_SIDE = 50
 """Largest number of episodes played at once; the policy chooses all their actions together."""
 _MOST_FRAMES = 1000
-"""Largest number of simulated frames a step, which data of others states; MuJoCo's worlds: 5."""
+"""Largest number of simulated frames a step, which data of others states; MuJoCo's environments:
+5."""
 
 Wrap = Callable[[gymnasium.Env[Any, Any]], gymnasium.Wrapper[Any, Any, Any, Any]]
 
@@ -82,7 +88,7 @@ def make_env(
         ) from None
 
 
-def world_of_data(dataset: Mapping[str, Any]) -> str:
+def environment_of_data(dataset: Mapping[str, Any]) -> str:
     """The environment that a dataset names.
 
     Args:

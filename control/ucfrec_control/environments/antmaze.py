@@ -12,7 +12,7 @@ from gymnasium.spaces import Box, Dict
 
 from ucfrec.arrays import Float32Array
 from ucfrec.errors import InputError
-from ucfrec_control.worlds.scores import D4RL_ANTMAZE, find_task
+from ucfrec_control.environments.scores import D4RL_ANTMAZE, find_task
 
 _STEPS = {"umaze": 700, "medium": 1000, "large": 1000}
 _REBUILT = {D4RL_ANTMAZE.format(maze=maze): (maze, limit) for maze, limit in _STEPS.items()}
@@ -20,7 +20,7 @@ _REBUILT = {D4RL_ANTMAZE.format(maze=maze): (maze, limit) for maze, limit in _ST
 for _id, (_maze, _limit) in _REBUILT.items():
     gymnasium.register(
         _id,
-        "ucfrec_control.worlds.d4rl_antmaze:D4RLAntMaze",
+        "ucfrec_control.environments.d4rl_antmaze:D4RLAntMaze",
         max_episode_steps=_limit,
         kwargs={"maze": _maze},
     )
@@ -33,7 +33,7 @@ def is_antmaze(env_id: str) -> bool:
 
 
 def is_rebuilt(env_id: str) -> bool:
-    """Return whether `env_id` names a maze of `ucfrec_control.worlds.d4rl_antmaze`."""
+    """Return whether `env_id` names a maze of `ucfrec_control.environments.d4rl_antmaze`."""
     return env_id in _REBUILT
 
 

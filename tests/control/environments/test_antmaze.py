@@ -1,4 +1,4 @@
-"""AntMaze: D4RL's vectors, D4RL's world, success times a hundred."""
+"""AntMaze: D4RL's vectors, D4RL's environment, success times a hundred."""
 
 import json
 import sys
@@ -20,16 +20,16 @@ from ucfrec.errors import InputError
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.minari import read_minari
-from ucfrec_control.learners.evaluate import load_run, open_world
-from ucfrec_control.worlds.antmaze import antmaze_settings
-from ucfrec_control.worlds.environments import make_env, mismatches
-from ucfrec_control.worlds.scores import find_kind, require_task
+from ucfrec_control.environments.antmaze import antmaze_settings
+from ucfrec_control.environments.environments import make_env, mismatches
+from ucfrec_control.environments.scores import find_kind, require_task
+from ucfrec_control.learners.evaluate import load_run, open_environment
 
 needs_robotics = pytest.mark.skipif(
     find_spec("gymnasium_robotics") is None, reason="the extra antmaze is not installed"
 )
 REBUILT = "d4rl/antmaze-umaze-v2"
-WORLDS = (REBUILT, "AntMaze_UMaze-v4")
+ENVIRONMENTS = (REBUILT, "AntMaze_UMaze-v4")
 TINY = ("train.steps=2", "train.validate_every=2", "policy.dim=16", "policy.context=5")
 
 D4RL_MAZES = {
@@ -66,7 +66,7 @@ def ant_columns(lengths: tuple[int, ...]) -> dict[str, Float32Array]:
 
 
 @needs_robotics
-@pytest.mark.parametrize("env_id", WORLDS)
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_observations_are_laid_out_as_the_adapter_stores_them(env_id: str, tmp_path: Path) -> None:
     env = make_env(env_id, 2)
     assert isinstance(env, gymnasium.vector.SyncVectorEnv)
@@ -98,8 +98,8 @@ def test_the_rebuilt_maze_is_where_d4rl_has_it(maze: str, limit: int) -> None:
     env_id = f"d4rl/antmaze-{maze}-v2"
     env = make_env(env_id, 1)
     assert isinstance(env, gymnasium.vector.SyncVectorEnv)
-    world = env.envs[0].unwrapped
-    model = world.ant_env.model  # type: ignore[attr-defined]
+    environment = env.envs[0].unwrapped
+    model = environment.ant_env.model  # type: ignore[attr-defined]
     # D4RL: the cell of row i and column j is at (4j − 4, 4i − 4), so that the start is at (0, 0).
     cells = {
         (4 * j - 4, 4 * i - 4): cell
@@ -109,14 +109,14 @@ def test_the_rebuilt_maze_is_where_d4rl_has_it(maze: str, limit: int) -> None:
     wanted = {at for at, cell in cells.items() if cell == "#"}
     names = [model.geom(i).name for i in range(model.ngeom)]
     blocks = [i for i, name in enumerate(names) if name.startswith("block")]
-    found = model.geom_pos[blocks, :2] - world.origin  # type: ignore[attr-defined]
+    found = model.geom_pos[blocks, :2] - environment.origin  # type: ignore[attr-defined]
     assert {(round(x), round(y)) for x, y in found} == wanted
     assert gymnasium.spec(env_id).max_episode_steps == limit
     assert (model.opt.timestep, set(model.actuator_gear[:, 0])) == (0.02, {30.0})
     starts, goals = [], []
     for seed in range(30):
         starts.append(env.reset(seed=seed)[0][0, :2])
-        goals.append(world.goal - world.origin)  # type: ignore[attr-defined]
+        goals.append(environment.goal - environment.origin)  # type: ignore[attr-defined]
     env.close()
     (goal,) = (at for at, cell in cells.items() if cell == "G")
     off = np.array(goals) - goal
@@ -140,9 +140,9 @@ class Teleported:
         self._steps += 1
         if self._steps == 3:
             for one in self._env.envs[::2]:
-                world = one.unwrapped
-                ant = world.ant_env  # type: ignore[attr-defined]
-                there = np.concatenate([world.goal, ant.data.qpos[2:]])  # type: ignore[attr-defined]
+                environment = one.unwrapped
+                ant = environment.ant_env  # type: ignore[attr-defined]
+                there = np.concatenate([environment.goal, ant.data.qpos[2:]])  # type: ignore[attr-defined]
                 ant.set_state(there, ant.data.qvel)
         return np.zeros((self._env.num_envs, 8), dtype=np.float32), None
 
@@ -151,7 +151,7 @@ class Teleported:
 
 
 @needs_robotics
-@pytest.mark.parametrize("env_id", WORLDS)
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_a_success_ends_the_episode_and_scores_a_hundred(env_id: str) -> None:
     env = make_env(env_id, 4, settings={"max_episode_steps": 8})
     assert isinstance(env, gymnasium.vector.SyncVectorEnv)
@@ -175,7 +175,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @needs_robotics
-def test_runs_on_d4rl_files_are_judged_in_d4rls_world(
+def test_runs_on_d4rl_files_are_judged_in_d4rls_environment(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "rows.json"
@@ -220,15 +220,15 @@ def test_minari_mazes_are_those_of_the_data(
     assert any("gymnasium-robotics 1.2.0" in text for text in mismatches(source, source["env_id"]))
     policy = load_run(run, "last")
     policy.record["dataset"].update(source)
-    world = open_world(policy, source["env_id"], 1)
-    starts = [world.reset(seed=seed)[0][0] for seed in range(5)]
+    environment = open_environment(policy, source["env_id"], 1)
+    starts = [environment.reset(seed=seed)[0][0] for seed in range(5)]
     np.testing.assert_array_equal(starts[0], trajectories.observations[0])
     # The cell of "r", three rows down at the left, whatever the seed.
     assert np.abs(np.array(starts)[:, :2] - (-4, -4)).max() <= 1
-    world.close()
+    environment.close()
 
 
-def test_names_of_d4rl_tell_its_worlds() -> None:
+def test_names_of_d4rl_tell_its_environments() -> None:
     task = require_task("antmaze")
     for name, maze in {
         "antmaze-umaze-v2": "umaze",
@@ -258,7 +258,7 @@ def test_without_gymnasium_robotics_one_line_says_what_to_install(
 
 
 @needs_robotics
-def test_d4rl_files_keep_their_world_in_minari(
+def test_d4rl_files_keep_their_environment_in_minari(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))

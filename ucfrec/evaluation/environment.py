@@ -1,4 +1,4 @@
-"""Simulated worlds by name."""
+"""Simulated environments by name."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,11 +9,11 @@ from ucfrec.evaluation.simulator import Simulator
 from ucfrec.plugins import load_plugin
 
 GYMNASIUM: Final = "gymnasium:"
-"""Start of the names of worlds that are Gymnasium environments."""
+"""Start of the names of environments that are Gymnasium environments."""
 
 
 @dataclass(frozen=True)
-class World:
+class Environment:
     """A simulator and what it is made from."""
 
     name: str
@@ -41,7 +41,7 @@ class World:
                 `item_features`.
         """
         if self.name.startswith(GYMNASIUM):
-            from ucfrec.evaluation.gymnasium_world import gymnasium_simulator
+            from ucfrec.evaluation.gymnasium_environment import gymnasium_simulator
 
             env_id = self.name.removeprefix(GYMNASIUM)
             return gymnasium_simulator(env_id, self.observe, self.item_features)

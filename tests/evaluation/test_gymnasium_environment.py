@@ -1,4 +1,4 @@
-"""Any Gymnasium environment is a world: its actions, observations, users, logs and seeds."""
+"""Any Gymnasium environment is an environment: its actions, observations, users, logs and seeds."""
 
 import json
 from pathlib import Path
@@ -9,58 +9,60 @@ import pyarrow.parquet as pq
 import pytest
 from gymnasium import spaces
 
-from tests.support.gymnasium_worlds import ITEMS, LENGTH
+from tests.support.gymnasium_environments import ITEMS, LENGTH
 from ucfrec.acting.rollout import Step, rollout
 from ucfrec.acting.uniform import Uniform
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
-from ucfrec.evaluation.collect import world_items
-from ucfrec.evaluation.gymnasium_world import GymnasiumWorld
-from ucfrec.evaluation.world import World
+from ucfrec.evaluation.collect import environment_items
+from ucfrec.evaluation.environment import Environment
+from ucfrec.evaluation.gymnasium_environment import GymnasiumEnvironment
 from ucfrec.schema import USER_IDS
 
-MODULE = "tests.support.gymnasium_worlds"
+MODULE = "tests.support.gymnasium_environments"
 
 
-def world(name: str, num_envs: int = 3, observe: tuple[str, ...] = ()) -> GymnasiumWorld:
-    return GymnasiumWorld(f"{MODULE}:ucfrec-test/{name}-v0", num_envs, observe)
+def environment(
+    name: str, num_envs: int = 3, observe: tuple[str, ...] = ()
+) -> GymnasiumEnvironment:
+    return GymnasiumEnvironment(f"{MODULE}:ucfrec-test/{name}-v0", num_envs, observe)
 
 
 @pytest.mark.parametrize(
     ("name", "first"), [("Discrete", 0), ("Discrete-from-3", 3), ("MultiDiscrete", 0)]
 )
 def test_single_items_are_numbered_from_0(name: str, first: int) -> None:
-    env = world(name)
+    env = environment(name)
     assert env.single_action_space == spaces.Discrete(ITEMS)
-    assert world_items(env).tolist() == [0, 1, 2, 3]
+    assert environment_items(env).tolist() == [0, 1, 2, 3]
     env.reset(seed=0)
     _, rewards, _, _, _ = env.step(np.array([0, 3, 1]))
     np.testing.assert_array_equal(rewards, first + np.array([0, 3, 1]))
 
 
 def test_vectors_are_played_within_their_bounds() -> None:
-    env = world("Box", 2, ("secret",))
+    env = environment("Box", 2, ("secret",))
     env.reset(seed=0)
     _, rewards, _, _, _ = env.step(np.array([[0.5, -9, 9], [0, 0, 0]], dtype=np.float32))
     np.testing.assert_allclose(rewards, [0.5 - 1 + 2, 0])
 
 
 def test_named_entries_are_observed_in_their_order() -> None:
-    env = world("Discrete", 3, ("secret", "step"))
+    env = environment("Discrete", 3, ("secret", "step"))
     observations, _ = env.reset(seed=0)
     assert observations.shape == (3, 2 + LENGTH + 1)
     assert observations.dtype == np.float32
     np.testing.assert_array_equal(observations[:, 0], observations[:, 1])
     assert len(np.unique(observations[:, 0])) == 3, "sessions are not copies of each other"
     np.testing.assert_array_equal(observations[:, 2:], np.eye(LENGTH + 1)[[0, 0, 0]])
-    swapped, _ = world("Discrete", 3, ("step", "secret")).reset(seed=0)
+    swapped, _ = environment("Discrete", 3, ("step", "secret")).reset(seed=0)
     np.testing.assert_array_equal(swapped, np.roll(observations, LENGTH + 1, axis=1))
 
 
 def test_without_names_a_dict_is_not_observed_and_a_category_is_one_hot() -> None:
-    observations, _ = world("Discrete").reset(seed=0)
+    observations, _ = environment("Discrete").reset(seed=0)
     assert observations.shape == (3, 0)
-    env = world("Whole")
+    env = environment("Whole")
     observations, _ = env.reset(seed=0)
     np.testing.assert_array_equal(observations, np.eye(LENGTH + 1)[[0, 0, 0]])
     observations, *_ = env.step(np.array([0, 1, 2]))
@@ -69,7 +71,7 @@ def test_without_names_a_dict_is_not_observed_and_a_category_is_one_hot() -> Non
 
 def test_sessions_end_in_the_step_that_ends_them() -> None:
     steps: list[Step] = []
-    env = world("Discrete", 3, ("step",))
+    env = environment("Discrete", 3, ("step",))
     played = rollout(env, Uniform(env, 0), 7, 0, steps.append)
     assert played.lengths.tolist() == [LENGTH] * 7
     last = [step for step in steps if step.truncated.any()]
@@ -82,24 +84,24 @@ def test_sessions_end_in_the_step_that_ends_them() -> None:
 
 
 def test_neighbouring_seeds_share_no_session() -> None:
-    env = world("Discrete", 50, ("secret",))
+    env = environment("Discrete", 50, ("secret",))
     secrets = [env.reset(seed=seed)[0][:, 0] for seed in (0, 1, 0)]
     np.testing.assert_array_equal(secrets[0], secrets[2])
     assert not set(secrets[0]) & set(secrets[1])
 
 
 def test_users_are_passed_on_and_must_be_numbers() -> None:
-    env = world("Users")
+    env = environment("Users")
     _, info = env.reset(seed=0)
     assert info[USER_IDS].tolist() == [77, 77, 77]
     _, _, _, _, info = env.step(np.array([0, 1, 2]))
     assert info[USER_IDS].tolist() == [77, 77, 77]
     with pytest.raises(InputError, match=r"info\['user_id'\] is 'Ann'; it must be a whole number"):
-        world("Names").reset(seed=0)
+        environment("Names").reset(seed=0)
 
 
 def test_the_user_that_reset_gives_is_that_of_the_whole_session() -> None:
-    env, steps = world("Visitors"), list[Step]()
+    env, steps = environment("Visitors"), list[Step]()
     rollout(env, Uniform(env, 0), 7, 0, steps.append)
     of = set[tuple[int, int]]()
     for step in steps:
@@ -107,7 +109,7 @@ def test_the_user_that_reset_gives_is_that_of_the_whole_session() -> None:
         of |= set(zip(step.episodes.tolist(), step.user_ids.tolist(), strict=True))
     # Each of the three copies plays its first, second and third visitor.
     assert of == {(episode, 1000 + episode // 3) for episode in range(7)}
-    env = world("Some-visitors")
+    env = environment("Some-visitors")
     with pytest.raises(InputError, match="only some sessions or steps have info"):
         rollout(env, Uniform(env, 0), 4, 0)
 
@@ -126,14 +128,14 @@ def test_the_user_that_reset_gives_is_that_of_the_whole_session() -> None:
 )
 def test_what_cannot_be_played_is_said(name: str, observe: tuple[str, ...], said: str) -> None:
     with pytest.raises(InputError, match=said):
-        world(name, 1, observe)
+        environment(name, 1, observe)
 
 
-def test_a_missing_module_and_options_of_other_worlds_are_refused() -> None:
+def test_a_missing_module_and_options_of_other_environments_are_refused() -> None:
     with pytest.raises(InputError, match="No module named 'not_there'"):
-        GymnasiumWorld("not_there:X-v0", 1)
+        GymnasiumEnvironment("not_there:X-v0", 1)
     with pytest.raises(InputError, match="are for gymnasium:ID; leave them out for synthetic-cat"):
-        World("synthetic-catalog", observe=("step",)).simulator()
+        Environment("synthetic-catalog", observe=("step",)).simulator()
 
 
 def test_from_the_environment_to_an_evaluation_on_the_command_line(
@@ -162,13 +164,13 @@ def test_from_the_environment_to_an_evaluation_on_the_command_line(
     frame = pd.read_json(rows)
     assert frame["policy"].tolist() == ["bc", "random"]
     assert (frame["length"] == LENGTH).all()
-    assert set(frame["world"]) == {f"{name} --observe secret"}
+    assert set(frame["environment"]) == {f"{name} --observe secret"}
     capsys.readouterr()
     assert main(["evaluate", run, "--env", name, "--episodes", "8"]) == 2
     assert "collected with the same --observe" in capsys.readouterr().err
 
 
-def test_a_world_that_shows_nothing_is_logged_without_observations(
+def test_a_environment_that_shows_nothing_is_logged_without_observations(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     name = f"gymnasium:{MODULE}:ucfrec-test/MultiDiscrete-v0"

@@ -1,4 +1,4 @@
-"""Any Gymnasium environment as a simulated world: `gymnasium:ID`."""
+"""Any Gymnasium environment as a simulated environment: `gymnasium:ID`."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -33,20 +33,20 @@ def gymnasium_simulator(
 
     Args:
         env_id: identifier as `gymnasium.make` takes it; `module:ID` imports `module` first.
-        observe: entries of a dict observation that are observed, see `GymnasiumWorld`.
+        observe: entries of a dict observation that are observed, see `GymnasiumEnvironment`.
         item_features: file or attribute with item features, see `gymnasium_items.item_table`.
     """
 
-    def make(num_envs: int, folder: Path | None) -> GymnasiumWorld:
+    def make(num_envs: int, folder: Path | None) -> GymnasiumEnvironment:
         if item_features is None:
-            return GymnasiumWorld(env_id, num_envs, observe)
+            return GymnasiumEnvironment(env_id, num_envs, observe)
         return GymnasiumCatalog(env_id, num_envs, partial(item_table, item_features), observe)
 
     summary = f"the Gymnasium environment {env_id}"
     return Simulator(summary, make, behaviors={"random": Uniform}, feedback=REWARD)
 
 
-class GymnasiumWorld(SyncVectorEnv):
+class GymnasiumEnvironment(SyncVectorEnv):
     """N copies of a Gymnasium environment with `AutoresetMode.SAME_STEP`.
 
     Actions are items 0 to n − 1 where the environment's are `Discrete(n)` or `MultiDiscrete([n])`,
@@ -57,9 +57,9 @@ class GymnasiumWorld(SyncVectorEnv):
     are recommended and nothing is chosen from a dict, or the observation has no fixed size; states
     then come from the items shown.
 
-    Of `info`, the world passes on `user_id`, a whole number. One that `reset` gives is that of the
-    whole session, but for steps that give another. `reset(seed=s)` seeds copy i with a number drawn
-    from (s, i), so that two seeds share no sessions.
+    Of `info`, the environment passes on `user_id`, a whole number. One that `reset` gives is that
+    of the whole session, but for steps that give another. `reset(seed=s)` seeds copy i with a
+    number drawn from (s, i), so that two seeds share no sessions.
 
     Args:
         env_id: identifier as `gymnasium.make` takes it; `module:ID` imports `module` first.
@@ -111,15 +111,15 @@ class GymnasiumWorld(SyncVectorEnv):
             )
 
 
-class GymnasiumCatalog(GymnasiumWorld):
-    """A `GymnasiumWorld` of items that have features.
+class GymnasiumCatalog(GymnasiumEnvironment):
+    """A `GymnasiumEnvironment` of items that have features.
 
     Args:
-        env_id, num_envs, observe: as for `GymnasiumWorld`.
+        env_id, num_envs, observe: as for `GymnasiumEnvironment`.
         items: reads the item table.
 
     Raises:
-        InputError: as `GymnasiumWorld`, or the actions are vectors.
+        InputError: as `GymnasiumEnvironment`, or the actions are vectors.
     """
 
     def __init__(
@@ -137,7 +137,7 @@ class GymnasiumCatalog(GymnasiumWorld):
 
 
 class _Session(gymnasium.Wrapper[Float32Array, Any, Any, Any]):
-    """One environment as `GymnasiumWorld` describes it."""
+    """One environment as `GymnasiumEnvironment` describes it."""
 
     def __init__(self, env_id: str, observe: tuple[str, ...]) -> None:
         try:
@@ -182,7 +182,7 @@ class _Session(gymnasium.Wrapper[Float32Array, Any, Any, Any]):
 def _actions(
     space: spaces.Space[Any], env_id: str
 ) -> tuple[spaces.Discrete | spaces.Box, Callable[[Any], Any]]:
-    """The world's action space, and what turns its actions into the environment's."""
+    """The environment's action space, and what turns its actions into the environment's."""
     if isinstance(space, spaces.Discrete):
         start = space.start
         return spaces.Discrete(space.n), lambda item: start + item

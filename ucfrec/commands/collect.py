@@ -16,8 +16,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     environment_options(parser)
     parser.add_argument(
         "--behavior",
-        help="built-in policy that acts in the sessions (default: mixture, or random where it has no "
-        "mixture)",
+        help="built-in policy that acts in the sessions (default: mixture if there is one, else "
+        "random)",
     )
     parser.add_argument(
         "--sessions", type=int, default=20_000, help="number of sessions (default: 20000)"

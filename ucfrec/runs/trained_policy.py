@@ -18,7 +18,6 @@ from ucfrec.acting.session_scorer import SessionScorer
 from ucfrec.arrays import Array, Float32Array, IntArray
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.item_counts import TrainingCounts
-from ucfrec.episodes.main_tags import MainTags
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
@@ -32,6 +31,7 @@ from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
 from ucfrec.runs.config import config_from_dict
 from ucfrec.runs.record import is_of_store, require_run_record
+from ucfrec.user_model.main_tags import MainTags
 from ucfrec.user_model.reward import FITTED, ItemRewardModel
 
 if TYPE_CHECKING:

@@ -83,7 +83,7 @@ def traced(arguments: Sequence[str]) -> Tracer:
         status = command([*arguments])
     finally:
         sys.setprofile(None)
-        threading.setprofile(None)  # type: ignore[arg-type]
+        threading.setprofile(None)
     if status:
         raise SystemExit(status)
     return tracer

@@ -34,7 +34,6 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.logged_decisions import session_scores
 from ucfrec.choosing.by_simulation import RuleSearch
 from ucfrec.choosing.config import RuleConfig
-from ucfrec.code_version import code_version
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.policies.registry import policy_class
@@ -319,7 +318,6 @@ def main() -> None:
                 policy="ucf",
                 conditions={"items": items, "rounds": case.rounds, "sessions": options.sessions}
                 | ({} if options.engine == TORCH else {"engine": options.engine}),
-                code_version=code_version(Path(__file__), "ucfrec.recommending.responder"),
                 metric="ratio",
                 metrics=found,
                 wall_time_s=float(wall.sum()),

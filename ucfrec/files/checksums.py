@@ -1,8 +1,7 @@
 """Checksums of the files of a store or a run, recorded in its `meta.json` or `run.json`.
 
-XXH3 (64 bits) runs at the speed of memory, where CRC-32 of zlib has a quarter of it: see
-`benchmarks/checksum_cost.py`. It finds accidents, not forgers: who can change a file can change its
-checksum.
+XXH3 (64 bits) runs at the speed of memory, where CRC-32 of zlib has a quarter of it. It finds
+accidents, not forgers: who can change a file can change its checksum.
 """
 
 import os

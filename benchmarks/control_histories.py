@@ -29,7 +29,7 @@ from ucfrec.reporting.result_row import ResultRow, RowKey
 from ucfrec.reporting.rows_file import benchmarking, read_rows
 from ucfrec.reporting.statistics import grouped
 from ucfrec.reporting.tables import markdown_table
-from ucfrec.runs.run import training_views
+from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_control.benchmark.budgets import BUDGETS, Budget
 from ucfrec_control.benchmark.cells import Cell, config, key, measure_scores

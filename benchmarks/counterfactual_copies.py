@@ -112,7 +112,7 @@ def key(cell: Cell) -> RowKey:
         evaluation_seed=EVALUATION_SEED,
         conditions={"mood": cell.mood, "sessions": cell.sessions, "episodes": cell.episodes},
         code_version=code_version(Path(__file__), *modules, "ucfrec_simulators.synthetic_catalog"),
-        data_fingerprint=EpisodeStore.open(cell.folder / "store").meta["fingerprint"],
+        data_fingerprint=EpisodeStore.open(cell.folder / "store").record.fingerprint,
     )
 
 

@@ -32,7 +32,7 @@ from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows
 from ucfrec.reporting.tables import markdown_table
 from ucfrec.runs.config import resolve_config
-from ucfrec.runs.run import new_policy, training_views
+from ucfrec.runs.start import new_policy, training_views
 
 RESULTS = Path("runs/gpu_rates/results.jsonl")
 PRECISIONS = ("float32", "bfloat16")

@@ -113,7 +113,7 @@ def measured(folder: Path, seed: int) -> list[ResultRow]:
                 training_seed=seed,
                 conditions={"judged_steps": len(rows)},
                 code_version=code_version(Path(__file__), fit_item_reward_model.__module__),
-                data_fingerprint=store.meta["fingerprint"],
+                data_fingerprint=store.record.fingerprint,
                 metric="loss",
                 metrics=metrics,
                 **provenance(),

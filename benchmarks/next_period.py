@@ -81,7 +81,7 @@ def result_row(row: dict[str, Any], store: Path, folder: Path, days: str) -> Res
         conditions={"days": days, "k": row["k"]},
         config_hash=config_hash(record["config"]) if own else None,
         code_version=code_version(Path(__file__), "ucfrec.runs.run", *modules),
-        data_fingerprint=EpisodeStore.open(store).meta["fingerprint"],
+        data_fingerprint=EpisodeStore.open(store).record.fingerprint,
         metric="hit_rate_liked",
         metrics={name: row[name] for name in (*MEASURES, "coverage") if row[name] is not None},
         interval=tuple(row["hit_rate_liked_interval"]),

@@ -53,7 +53,7 @@ def key(cell: Cell) -> RowKey:
         training_seed=0,
         conditions={"lambda_mask": cell.lambda_mask, "parent_action": cell.parent_action},
         code_version=code_version(Path(__file__), "ucfrec.runs.run", "ucfrec.policies.ucf"),
-        data_fingerprint=EpisodeStore.open(cell.store).meta["fingerprint"],
+        data_fingerprint=EpisodeStore.open(cell.store).record.fingerprint,
     )
 
 

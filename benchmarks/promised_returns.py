@@ -40,7 +40,8 @@ from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows, read_rows
 from ucfrec.reporting.tables import markdown_table
 from ucfrec.runs.config import resolve_config
-from ucfrec.runs.run import train_run, training_views
+from ucfrec.runs.run import train_run
+from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.schema import PROPENSITY
 from ucfrec.user_model.training_users import TrainingUsers, fit_training_users
@@ -120,9 +121,9 @@ def row(
             "reward_weight": rule.reward_weight,
             "episodes": EPISODES,
         },
-        config_hash=config_hash(trained.record["config"]),
+        config_hash=config_hash(trained.record.settings),
         code_version=code_version(RuleSearch.__module__, fit_training_users.__module__),
-        data_fingerprint=store.meta["fingerprint"],
+        data_fingerprint=store.record.fingerprint,
         metric="R_cum",
         metrics={"R_cum": played["R_cum"], **promised},
         interval=(played["R_cum_low"], played["R_cum_high"]),

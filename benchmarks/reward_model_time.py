@@ -32,7 +32,7 @@ from ucfrec.counterfactual.augment import sample_transitions
 from ucfrec.counterfactual.reward_model import CRMConfig
 from ucfrec.counterfactual.reward_model_fit import fit_crm
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.runs.run import training_views
+from ucfrec.runs.start import training_views
 torch.set_num_threads(1)
 seed = int(sys.argv[2])
 views = training_views(EpisodeStore.open(Path(sys.argv[1])))

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from ucfrec.runs.describe import describe_run, promised
 
 from tests.support.tagged import tagged_store
 from ucfrec.acting.decision import Decider, DecisionRule
@@ -25,9 +26,9 @@ from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.policies.heads import ItemHead
 from ucfrec.runs.config import config_from_dict, resolve_config
-from ucfrec.runs.describe import describe_run, promised
 from ucfrec.runs.refit import refit
-from ucfrec.runs.run import train_run, training_views
+from ucfrec.runs.run import train_run
+from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.user_model.reward_fit import fit_item_reward_model
 from ucfrec.user_model.reward_rows import RewardRows
@@ -370,7 +371,7 @@ def test_a_refit_learns_from_all_rows_and_chooses_nothing_anew(
     store = EpisodeStore.open(folder / "store")
     record = refit(store, folder / "run", tmp_path / "refit")
     again = TrainedPolicy.load(tmp_path / "refit")
-    assert record["train_steps"] == store.n_steps > trained.record["train_steps"]
+    assert record["train_steps"] == store.n_steps > trained.record.train_steps
     assert record["policy"]["steps"] == max(1, trained.record["policy"]["best_step"])
     assert "policy        trained on all rows, up to step" in describe_run(record)
     assert again.rule == trained.rule

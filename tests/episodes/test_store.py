@@ -107,7 +107,7 @@ def test_neither_shards_nor_the_size_of_appends_show(
         some_states().save(pieces / "item_states.safetensors")
         parts = EpisodeStore.open(pieces)
 
-        assert parts.meta["n_shards"] >= min(len(lengths), sum(lengths) // (shard_steps + 8))
+        assert parts.record.n_shards >= min(len(lengths), sum(lengths) // (shard_steps + 8))
         layout = {"n_shards": 1, "files": {}}
         assert {**parts.meta, **layout} == {**whole.meta, **layout}
         assert parts.lengths.tolist() == lengths
@@ -122,7 +122,7 @@ def test_large_stores_are_cut_between_episodes(folder: Path) -> None:
     store = write_store(folder / "store", random_episodes(lengths), shard_steps=6)
     cut = [np.diff(np.load(p)).tolist() for p in sorted(folder.glob("store/shard-*/offsets.npy"))]
     assert list(chain(*cut)) == lengths
-    assert len(cut) == store.meta["n_shards"] > 2
+    assert len(cut) == store.record.n_shards > 2
     # A shard is full when it holds 6 steps; the episode that fills it is not torn apart.
     assert all(sum(shard) >= 6 > sum(shard[:-1]) for shard in cut[:-1])
 
@@ -132,7 +132,7 @@ def test_splits_are_counted_in_the_record(folder: Path) -> None:
     store = write_store(folder / "store", episodes, shard_steps=6)
     for number, name in enumerate(schema.SPLITS):
         mine = [e for e in episodes if e.split == number]
-        assert store.meta["splits"][name] == {
+        assert store.record.splits[name] == {
             "episodes": len(mine),
             "steps": sum(map(len, mine)),
         }
@@ -157,7 +157,7 @@ def fingerprint(
 ) -> str:
     with tempfile.TemporaryDirectory(dir=folder) as name:
         store = EpisodeStore.write(Path(name) / "store", steps, lengths, of_episodes)
-        return str(store.meta["fingerprint"])
+        return str(store.record.fingerprint)
 
 
 @pytest.mark.parametrize("items", [True, False])
@@ -646,7 +646,7 @@ def test_opening_reads_the_record_only(folder: Path) -> None:
     for column in folder.glob("store/shard-*/*"):
         column.write_bytes(bytes(column.stat().st_size))
     store = EpisodeStore.open(folder / "store")
-    assert store.meta["n_steps"] == sum(LENGTHS)
+    assert store.record.n_steps == sum(LENGTHS)
 
 
 def test_columns_are_mapped_not_read(folder: Path) -> None:

@@ -79,8 +79,8 @@ def test_a_store_is_made_from_remote_logs_in_a_remote_place(
     local = EpisodeStore.open(tmp_path / "store").meta
     with local_paths(argparse.Namespace(store=Input(f"{place}/store"))) as options:
         found = EpisodeStore.open(options.store)
-        assert found.meta["fingerprint"] == local["fingerprint"]
-        assert found.meta["source"]["files"] == [f"{place}/logs/{file.name}" for file in files]
+        assert found.record.fingerprint == local["fingerprint"]
+        assert found.record.source["files"] == [f"{place}/logs/{file.name}" for file in files]
         assert not list(found._columns._sealed.faults())  # type: ignore[union-attr]
         copy = options.store
     assert not copy.exists()
@@ -164,7 +164,7 @@ def test_only_columns_that_are_read_are_copied_from_logs(tmp_path: Path, place: 
         assert on_disk(given.log) < 0.2 * size
         fetch(given.log)
         assert given.log.read_bytes() == (tmp_path / "log.parquet").read_bytes()
-    stores = [EpisodeStore.open(tmp_path / name).meta["fingerprint"] for name in ("local", "store")]
+    stores = [EpisodeStore.open(tmp_path / name).record.fingerprint for name in ("local", "store")]
     assert stores[0] == stores[1]
 
 

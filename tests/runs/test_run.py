@@ -73,7 +73,7 @@ def test_a_run_killed_at_any_moment_ends_as_if_left_alone(
 
 def test_the_record_tells_what_was_done(store: Path, left_alone: Path) -> None:
     record = json.loads((left_alone / "run.json").read_text())
-    assert record["fingerprint"] == EpisodeStore.open(store).meta["fingerprint"]
+    assert record["fingerprint"] == EpisodeStore.open(store).record.fingerprint
     assert record["config"]["train"]["steps"] == 120
     assert {"command", "seed", "versions", "wall_time_s"} <= record.keys()
     report = record["augmentation"]
@@ -244,7 +244,7 @@ def test_a_run_goes_on_with_the_same_item_states_and_not_with_fewer_steps(tmp_pa
         return EpisodeStore.open(store.path)
 
     first, other = sealed_store(0), sealed_store(1)
-    assert first.meta["fingerprint"] == other.meta["fingerprint"]
+    assert first.record.fingerprint == other.record.fingerprint
 
     def train(store: EpisodeStore, steps: int) -> dict[str, Any]:
         settings = ["policy.dim=8", "train.batch_size=8", "rule.choose=false"]

@@ -68,7 +68,7 @@ def test_the_distractor_goes_with_the_reward_and_nothing_else_changes(
     assert observed.shape[1] == planted.observation_size == store.observation_size + 1
     agreed = float((observed[:, 0] == high).mean())
     assert agreed == 1 if flip == 0 else agreed == pytest.approx(agreement, abs=0.03)
-    assert planted.meta["source"]["distractor"]["rate"] == pytest.approx(observed[:, 0].mean())
+    assert planted.record.source["distractor"]["rate"] == pytest.approx(observed[:, 0].mean())
     if store.observation_size:
         before = store.step_values(schema.OBSERVATION, *store.all_steps())
         np.testing.assert_array_equal(observed[:, 1:], before)
@@ -76,7 +76,7 @@ def test_the_distractor_goes_with_the_reward_and_nothing_else_changes(
     for file in store.path.rglob("*"):
         if file.is_file() and file.name not in own:
             assert file.read_bytes() == (planted.path / file.relative_to(store.path)).read_bytes()
-    assert planted.meta["fingerprint"] != store.meta["fingerprint"]
+    assert planted.record.fingerprint != store.record.fingerprint
     assert {**planted.meta, "columns": 0, "fingerprint": 0, "source": 0, "files": 0} == {
         **store.meta,
         "columns": 0,

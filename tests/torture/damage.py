@@ -90,7 +90,7 @@ def read_store(path: Path) -> list[Any]:
     from ucfrec.files.parquet import read_ids
 
     store = EpisodeStore.open(path)
-    columns = [store.step_values(name, *store.all_steps()) for name in store.meta["columns"]]
+    columns = [store.step_values(name, *store.all_steps()) for name in store.record.columns]
     episodes = [store.episode_values(name) for name in schema.EPISODE_DTYPES]
     states = store.item_states
     _, sealed = sealed_record(path, "meta.json", "")

@@ -18,10 +18,8 @@ from typing import Any, Final
 
 from ucfrec import schema
 from ucfrec.episodes.item_table import ITEM_STATES
-from ucfrec.episodes.record import RECORD
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder
-from ucfrec.files.checksums import seal
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.binding import explained, open_tables
 from ucfrec.logs.clean import DUPLICATES, require_rows
@@ -181,13 +179,13 @@ def prepare(
             numbers = StepNumbers.of(log, found.measures, found.scratch)
             with progress(report["steps"], "write the store", "steps") as bar:
                 writer = write_steps(folder, found.episodes(), found.spool, numbers, bar)
-            meta = writer.finish(report["reward"], report, write_ids(log, folder))
+            record = writer.finish(report["reward"], report, write_ids(log, folder))
             if log.key == schema.ITEM_ID:
                 _write_states(found, folder, options.embedding_size, like)
             if like is not None:
                 users = (each.users for each in found.episodes())
                 write_episode_users(log, folder / EPISODE_USERS, users)
-            seal(folder, RECORD, meta)
+            record.sealed(folder)
     return report
 
 

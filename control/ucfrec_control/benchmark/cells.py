@@ -132,7 +132,7 @@ def key(cell: Cell) -> RowKey:
         evaluation_seed=cell.evaluation_seed,
         conditions=conditions,
         code_version=cell.code_version,
-        data_fingerprint=EpisodeStore.open(cell.store).meta["fingerprint"],
+        data_fingerprint=EpisodeStore.open(cell.store).record.fingerprint,
     )
 
 

@@ -13,7 +13,7 @@ from ucfrec.provenance import provenance
 from ucfrec.reporting.grid import Measurement, run_grid
 from ucfrec.reporting.result_row import ResultRow, RowKey
 from ucfrec.reporting.tables import NONE
-from ucfrec.runs.run import training_views
+from ucfrec.runs.start import training_views
 from ucfrec_control.data.distractor import DISTRACTORS, zoo_store
 from ucfrec_control.data.trajectories import PACKAGES
 
@@ -72,7 +72,7 @@ def _key(cell: Cell) -> RowKey:
         training_seed=SEED,
         conditions={"distractor": cell.distractor},
         code_version=code_version(__name__),
-        data_fingerprint=EpisodeStore.open(cell.store).meta["fingerprint"],
+        data_fingerprint=EpisodeStore.open(cell.store).record.fingerprint,
     )
 
 
@@ -106,7 +106,7 @@ _MEASUREMENT: Final = Measurement(_key, _config, _measure)
 
 def verdicts(report: Mapping[str, Any], store: EpisodeStore) -> list[dict[str, Any]]:
     """The verdict of a screening report (as a mapping) on each state dimension of `store`."""
-    added = {each["dimension"] for each in store.meta["source"].get("distractors", [])}
+    added = {each["dimension"] for each in store.record.source.get("distractors", [])}
     return [
         {
             "dimension": d["dimension"],

@@ -3,11 +3,11 @@
 import argparse
 
 import torch
+from ucfrec.runs.describe import describe_run
 
 from ucfrec.commands.train import training_options
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.runs.config import resolve_config
-from ucfrec.runs.describe import describe_run
 from ucfrec.runs.screened import describe_screened
 from ucfrec_control.learners.train import dataset_of, preset_of, train_control
 

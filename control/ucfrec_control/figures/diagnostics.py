@@ -25,8 +25,8 @@ from ucfrec.files.atomic import read_json
 from ucfrec.fitting.checkpoint import load_tensors, load_weights
 from ucfrec.policies.ucf import UCFPolicy
 from ucfrec.runs.config import Config, config_from_dict
-from ucfrec.runs.run import training_views
 from ucfrec.runs.screened import without_columns
+from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import DROPPED, RUN, TrainedPolicy
 from ucfrec.runs.trained_policy import store_of as trained_store
 

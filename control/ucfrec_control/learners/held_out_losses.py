@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.runs.run import training_views
 from ucfrec.runs.screened import without_columns
+from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 _BATCHES, _BATCH = 8, 512

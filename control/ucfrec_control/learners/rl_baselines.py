@@ -151,7 +151,7 @@ def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dict[
     d3rlpy = _d3rlpy()
     if (out / RUN).exists():
         existing: dict[str, Any] = read_json(out / RUN)
-        wanted = (plain_config(config, seed), store.meta["fingerprint"])
+        wanted = (plain_config(config, seed), store.record.fingerprint)
         if (existing["config"], existing["fingerprint"]) != wanted:
             raise InputError(
                 f"{out} has a run with other settings or data; remove it or name another folder"
@@ -227,9 +227,9 @@ def _begin(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> None:
         "command": command_line(),
         "config": plain_config(config, seed),
         "seed": seed,
-        "sizes": {"state": store.state_size, "action": store.meta["columns"][schema.ACTION][0]},
-        "fingerprint": store.meta["fingerprint"],
-        "dataset": dict(store.meta["source"]),
+        "sizes": {"state": store.state_size, "action": store.record.columns[schema.ACTION][0]},
+        "fingerprint": store.record.fingerprint,
+        "dataset": dict(store.record.source),
         "versions": versions((*PACKAGES, "d3rlpy")),
         "threads": torch.get_num_threads(),
         "wall_time_s": 0.0,

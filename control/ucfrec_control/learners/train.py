@@ -21,7 +21,7 @@ def dataset_of(store: EpisodeStore) -> Mapping[str, Any]:
     Raises:
         InputError: `store` is not a control store.
     """
-    source: Mapping[str, Any] = store.meta["source"]
+    source: Mapping[str, Any] = store.record.source
     if "env_id" not in source:
         raise InputError(
             f"{store.path} is not a control store; write one with `ucfrec-control prepare`"

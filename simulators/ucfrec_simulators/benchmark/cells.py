@@ -5,6 +5,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
+from ucfrec.runs.describe import promised
+
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.environment import Environment
@@ -14,7 +16,6 @@ from ucfrec.reporting.evaluation_rows import evaluation_row
 from ucfrec.reporting.grid import Measurement
 from ucfrec.reporting.result_row import ResultRow, RowKey
 from ucfrec.runs.config import Config, resolve_config
-from ucfrec.runs.describe import promised
 from ucfrec.runs.screened import SCREENING, flagged_columns, train_screened
 from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -84,7 +85,7 @@ def key(cell: Cell) -> RowKey:
     if cell.store is not None:
         quantile = cell.evaluation.target_quantile
         conditions["quantiles"] = "rule" if quantile is None else f"{quantile:g}"
-        fingerprint = EpisodeStore.open(cell.store).meta["fingerprint"]
+        fingerprint = EpisodeStore.open(cell.store).record.fingerprint
     return RowKey(
         suite=SUITE,
         table=cell.table,

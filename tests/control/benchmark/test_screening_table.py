@@ -19,8 +19,8 @@ from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.reporting.rows_file import read_rows
 from ucfrec.reporting.tables import NONE
 from ucfrec.runs.config import resolve_config
-from ucfrec.runs.run import training_views
 from ucfrec.runs.screened import flagged_columns
+from ucfrec.runs.start import training_views
 from ucfrec_control.benchmark import screening_table
 from ucfrec_control.benchmark.budgets import Budget
 from ucfrec_control.benchmark.folders import stores_of
@@ -136,4 +136,4 @@ def test_the_distractor_is_flagged_and_no_true_dimension(tmp_path: Path) -> None
     config = ScreeningConfig(hidden=128, shared_steps=700, own_steps=250, max_transitions=50_000)
     report = screen(training_views(store)[0], config, seed=0)
     assert report.flagged == (11,)
-    assert store.meta["columns"][schema.OBSERVATION] == [12]
+    assert store.record.columns[schema.OBSERVATION] == [12]

@@ -135,7 +135,7 @@ def test_a_distractor_is_the_reward_bit_and_nothing_else_changes(
             np.testing.assert_array_equal(other.episode_values(name), store.episode_values(name))
         np.testing.assert_array_equal(other.returns, store.returns)
         again = add_distractor(store, tmp_path / f"{flip}-again", flip, seed=1)
-        assert again.meta["fingerprint"] == other.meta["fingerprint"]
+        assert again.record.fingerprint == other.record.fingerprint
     with pytest.raises(InputError, match=r"must be in \[0, 1\]"):
         add_distractor(store, tmp_path / "x", flip=1.5)
 

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from ucfrec.code_version import code_version
+from ucfrec.episodes.record import StoreRecord
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.files.checksums import sealed_record
 from ucfrec.files.locks import scratch_folder
 from ucfrec.provenance import provenance
 from ucfrec.reporting.result_row import ResultRow
@@ -50,8 +50,7 @@ def open_seconds(path: Path) -> float:
 
 def read_seconds(path: Path) -> float:
     """Wall seconds of reading every sealed file into one buffer."""
-    _, sealed = sealed_record(path, "meta.json", "")
-    assert sealed is not None
+    sealed = StoreRecord.read(path).checksums(path)
     buffer = bytearray(BLOCK)
     began = time.perf_counter()
     for name in sealed.files:
@@ -63,8 +62,7 @@ def read_seconds(path: Path) -> float:
 
 def verify_seconds(path: Path) -> float:
     """Wall seconds of comparing every sealed file with its checksum."""
-    _, sealed = sealed_record(path, "meta.json", "")
-    assert sealed is not None
+    sealed = StoreRecord.read(path).checksums(path)
     began = time.perf_counter()
     assert not list(sealed.faults())
     return time.perf_counter() - began

@@ -126,15 +126,14 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     trained = TrainedPolicy.load(run)
     found = evaluate_policy(cell.environment, trained, cell.arm, cell.episodes, EVALUATION_SEED)
     found |= {
-        "train_wall_time_s": record["wall_time_s"],
-        "validation_loss": record["policy"]["best_validation"],
+        "train_wall_time_s": record.wall_time_s,
+        "validation_loss": record.finished.best_validation,
     }
     details: dict[str, Any] = {}
-    if "augmentation" in record:
-        report = record["augmentation"]
-        found |= {"acceptance": report["acceptance"], "delta": report["delta"]}
-        found |= {"r2_without_z": report["reward_model"]["r2_without_z"]}
-        details = {"actions": report["actions"]}
+    if (report := record.augmentation) is not None:
+        found |= {"acceptance": report.acceptance, "delta": report.delta}
+        found |= {"r2_without_z": report.reward_model.r2_without_z}
+        details = {"actions": report.actions and asdict(report.actions)}
     return [evaluation_row(found, row_key, details=details, rule=str(trained.rule))]
 
 

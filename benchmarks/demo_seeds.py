@@ -19,7 +19,7 @@ from ucfrec.reporting.evaluation_rows import evaluation_row
 from ucfrec.reporting.result_row import ResultRow, RowKey
 from ucfrec.reporting.rows_file import append_rows, read_rows
 from ucfrec.reporting.tables import markdown_table, mean_and_sd
-from ucfrec.runs.trained_policy import read_record
+from ucfrec.runs.record import read_record
 
 
 def row_of(evaluation: Mapping[str, Any], seed: int, code: str) -> ResultRow:
@@ -68,7 +68,7 @@ def main() -> None:
             rows.append(row)
             if not any(row.covers(known) for known in read_rows(results)):
                 run = folder / row.task / row.method
-                config = read_record(run)["config"] if row.config_hash else None
+                config = read_record(run).settings if row.config_hash else None
                 append_rows(results, [row], config)
     lines = []
     for environment in ENVIRONMENTS:

@@ -65,8 +65,8 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     name = f"{cell.lambda_mask}-{cell.parent_action}-{row_key.code_version}"
     folder = cell.out / cell.store.parent.name / name
     record = train_run(EpisodeStore.open(cell.store), folder, cell.config)
-    loss = {"validation_loss": record["policy"]["best_validation"]}
-    given = {"metric": "validation_loss", "metrics": loss, "wall_time_s": record["wall_time_s"]}
+    loss = {"validation_loss": record.finished.best_validation}
+    given = {"metric": "validation_loss", "metrics": loss, "wall_time_s": record.wall_time_s}
     return [ResultRow(**vars(row_key), **given, **provenance())]
 
 

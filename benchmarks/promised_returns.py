@@ -93,7 +93,7 @@ def measured(
         row(name, log, seed, rule, {m: played[m][i].value for m in MODELS}, trained, store)
         for i, rule in enumerate(rules)
     ]
-    return rows, trained.record["config"]
+    return rows, trained.record.settings
 
 
 def row(

@@ -176,9 +176,9 @@ def test_csv_and_parquet_give_the_same_store(tmp_path: Path) -> None:
     mapping = LogMapping(columns_given(["user_id=uid", "timestamp=when"]), reward="reward * 2")
     for kind in ("csv", "parquet"):
         prepare([write(log, tmp_path / f"log.{kind}")], mapping, tmp_path / kind, SMALL)
-    stores = [EpisodeStore.open(tmp_path / kind).meta for kind in ("csv", "parquet")]
-    assert stores[0]["fingerprint"] == stores[1]["fingerprint"]
-    assert stores[0]["reward"] == "reward * 2"
+    stores = [EpisodeStore.open(tmp_path / kind).record for kind in ("csv", "parquet")]
+    assert stores[0].fingerprint == stores[1].fingerprint
+    assert stores[0].reward == "reward * 2"
     assert steps_of(tmp_path / "csv")["user_id"].str.startswith("u").all()
 
 
@@ -207,8 +207,8 @@ def test_times_of_every_unit_and_zone_are_read(
     finally:
         monkeypatch.undo()
         time.tzset()
-    found, wanted = (EpisodeStore.open(tmp_path / name).meta for name in ("found", "wanted"))
-    assert found["fingerprint"] == wanted["fingerprint"]
+    found, wanted = (EpisodeStore.open(tmp_path / name).record for name in ("found", "wanted"))
+    assert found.fingerprint == wanted.fingerprint
     embeddings = [
         EpisodeStore.open(tmp_path / name).item_states.embeddings for name in ("found", "featured")
     ]
@@ -585,8 +585,8 @@ def test_files_of_different_make_are_read_together(tmp_path: Path) -> None:
     ]
     apart = prepare(parts, LogMapping(), tmp_path / "b", SMALL)
     assert whole["rows_read"] == apart["rows_read"]
-    stores = [EpisodeStore.open(tmp_path / name).meta for name in "ab"]
-    assert stores[0]["fingerprint"] == stores[1]["fingerprint"]
+    stores = [EpisodeStore.open(tmp_path / name).record for name in "ab"]
+    assert stores[0].fingerprint == stores[1].fingerprint
 
 
 def test_an_optional_column_of_some_files_is_left_out_with_a_note(tmp_path: Path) -> None:

@@ -51,7 +51,7 @@ class Source(Entry):
     mapping: dict[str, Any] | None = None
     """The column mapping (`ucfrec.logs.mapping.LogMapping`) as JSON."""
     session_by: Text | None = None
-    session_gap_ms: Annotated[Number, Field(ge=0, lt=2**48)] | None = None
+    session_gap_ms: Count | None = None
     duplicates: Literal["highest", "lowest", "first", "last"] = "highest"
     """Which of several rows with the same user, item and time was kept."""
     rows_read: Count | None = None

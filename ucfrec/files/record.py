@@ -39,7 +39,7 @@ def _inside(files: dict[str, tuple[int, str]]) -> dict[str, tuple[int, str]]:
 
 
 class Entry(BaseModel):
-    """An immutable JSON object; optional entries that are None are left out of the JSON."""
+    """An immutable JSON object; optional entries that are None or empty are left out."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -49,8 +49,12 @@ class Entry(BaseModel):
         return {
             name: value
             for name, value in dump(self).items()
-            if value is not None or name not in fields or fields[name].is_required()
+            if name not in fields or fields[name].is_required() or not _absent(value)
         }
+
+
+def _absent(value: object) -> bool:
+    return value is None or (isinstance(value, tuple | list | dict) and not value)
 
 
 class Record(Entry):
@@ -114,7 +118,7 @@ class Record(Entry):
         Returns:
             The record with the list of files.
         """
-        return self._written(folder, files_of(folder, self.FILE, self.files))
+        return self.with_entries(files=files_of(folder, self.FILE, self.files)).written(folder)
 
     def reopened(self, folder: Path, kept: Container[str]) -> Self:
         """Write the record before files of the folder change.
@@ -124,12 +128,12 @@ class Record(Entry):
             kept: files that will not change; the others are no longer listed.
         """
         listed = {name: entry for name, entry in self.files.items() if name in kept}
-        return self if listed == self.files else self._written(folder, listed)
+        return self if listed == self.files else self.with_entries(files=listed).written(folder)
 
-    def _written(self, folder: Path, files: Mapping[str, tuple[int, str]]) -> Self:
-        record = self.with_entries(files=dict(files))
-        write_sealed_json(folder / self.FILE, record.model_dump())
-        return record
+    def written(self, folder: Path) -> Self:
+        """Write the record as it is; returns it."""
+        write_sealed_json(folder / self.FILE, self.model_dump())
+        return self
 
     def checksums(self, folder: Path) -> Sealed:
         """Of the other files of the folder of this record."""

@@ -19,7 +19,7 @@ def copies_table(runs: Sequence[tuple[str, AugmentationReport]]) -> Table:
         ("R² with the abduced z, which has seen the reward", [m.r2 for m in models]),
         ("standard deviation of the reward", [m.reward_std for m in models]),
         ("active latent dimensions",
-         [f"{m['active_dimensions']} of {m['latent_dim']}" for m in models]),
+         [f"{m.active_dimensions} of {m.latent_dim}" for m in models]),
         ("share of z in the reward's variance", [m.z_share for m in models]),
         ("leak: correlation of z with E[r | s, a]", [m.z_leak for m in models]),
         ("edited copies", [r.copies for r in reports]),
@@ -30,7 +30,7 @@ def copies_table(runs: Sequence[tuple[str, AugmentationReport]]) -> Table:
         ("bound δ + ε_r", [r.bound for r in reports]),
         ("mean-move ratio (1: one shift for all states)", [m.mean_move_ratio for m in moves]),
         ("effective rank of the moves",
-         [f"{shown(m['effective_rank'])} of {m['dimensions']}" for m in moves]),
+         [f"{shown(m.effective_rank)} of {m.dimensions}" for m in moves]),
         ("median length of a move ‖Δ‖₂", [m.length_quantiles.get("0.5") for m in moves]),
     ]  # fmt: skip
     if any(asked):

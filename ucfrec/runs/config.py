@@ -89,7 +89,7 @@ def config_from_dict(values: object) -> Config:
         raise InputError("the run's configuration has no policy_name")
     if "seed" not in values:
         raise InputError("the run's configuration has no seed")
-    tables = {name: values[name] for name in values if isinstance(values[name], Mapping)}
+    tables = {name: values[name] for name in values if name not in ("policy_name", "seed")}
     settings = _from_mapping(tables, "the run's configuration")
     return _build(values["policy_name"], settings, values["seed"])
 

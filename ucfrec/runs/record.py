@@ -156,7 +156,7 @@ class RunRecord(TrainingRecord):
     reward: Text
     """The expression that computed the rewards."""
     session_by: Text | None
-    session_gap_ms: Annotated[Number, Field(ge=0, lt=2**48)] | None
+    session_gap_ms: Count | None
     observation_size: Count
     train_episodes: Count
     train_steps: Count

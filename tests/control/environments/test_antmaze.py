@@ -219,7 +219,8 @@ def test_minari_mazes_are_those_of_the_data(
     assert (source["env_id"], source["env_settings"]["maze_map"]) == ("AntMaze_UMaze-v4", maze)
     assert any("gymnasium-robotics 1.2.0" in text for text in mismatches(source, source["env_id"]))
     policy = load_run(run, "last")
-    policy.record["dataset"].update(source)
+    data = Source.model_validate(source)
+    policy = replace(policy, record=policy.record.with_entries(data=data))
     environment = open_environment(policy, source["env_id"], 1)
     starts = [environment.reset(seed=seed)[0][0] for seed in range(5)]
     np.testing.assert_array_equal(starts[0], trajectories.observations[0])

@@ -48,8 +48,8 @@ class Source(Entry):
     """The logs."""
     dataset: Text | None = None
     """Name of the dataset adapter, or of the dataset."""
-    mapping: dict[str, Any] | None = None
-    """The column mapping (`ucfrec.logs.mapping.LogMapping`) as JSON."""
+    mapping: dict[Text, Text] = Field(default_factory=dict)
+    """Log column to the column of the files or the SQL expression that it was."""
     session_by: Text | None = None
     session_gap_ms: Count | None = None
     duplicates: Literal["highest", "lowest", "first", "last"] = "highest"

@@ -83,6 +83,8 @@ class PrepareOptions:
     temp_folder: Path | None = None
     """Folder for spilled rows; None for the parent of the store (the system's for `validate`)."""
 
+    dataset: str | None = None
+    """Name of the dataset adapter, for the record."""
     engine: str = "duckdb"
     """What reads and sorts the rows, one of `ENGINES`: DuckDB on this machine, or Spark. The store
     is the same."""
@@ -287,6 +289,8 @@ def _prepared(
                 _require_known_ids(log, mapping, features)
                 report = _report(rows, spool, cut, measures)
                 report = {"reward": reward, **report, "duplicates": options.duplicates}
+                report["dataset"] = options.dataset
+                report["mapping"] = {name: str(column) for name, column in mapping.columns.items()}
                 stage.update()
         yield _Prepared(rows, spool, cut, measures, features, report, scratch)
 

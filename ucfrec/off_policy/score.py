@@ -107,10 +107,8 @@ def logged_sessions(
     if not trained.logged_observation_size:
         mapping = LogMapping({schema.OBSERVATION: ""}).over(mapping)
     gap_ms = record.session_gap_ms
-    # Older runs did not record `session_by`, but they did record the gap.
-    session_by = record.session_by or (None if gap_ms is None else "gap")
     reward = Expression(record.reward, str(run / RUN))
-    options = PrepareOptions(reward, session_by, memory_limit=memory_limit)
+    options = PrepareOptions(reward, record.session_by, memory_limit=memory_limit)
     if gap_ms is not None:
         options = replace(options, gap_minutes=gap_ms / 60_000)
     with scratch_folder(Path(gettempdir()), "logs") as scratch:

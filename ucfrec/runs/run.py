@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -37,19 +38,6 @@ from ucfrec.user_model.reward_report import ItemRewardReport
 from ucfrec.user_model.training_users import TRAINING_USERS, TrainingUsers, fit_training_users
 
 _OVERLAY = "overlay.safetensors"
-
-
-@dataclass(frozen=True)
-class _Request:
-    """The arguments of `train_run`."""
-
-    store: EpisodeStore
-    out: Path
-    config: Config
-    about: Mapping[str, Any]
-    more_augmentation: Overlay | None
-    on_all_rows: bool
-    shared: SharedStages
 
 
 @dataclass(frozen=True)
@@ -123,46 +111,45 @@ def train_run(
             too few training episodes or constant rewards, or the policy does not support its
             actions, or another process is training in `out`.
     """
-    request = _Request(store, out, config, about or {}, more_augmentation, on_all_rows, shared)
-    if not distributed.leads():
-        return _train(request)
-    with claimed(out, "trained"):
-        remove_leftovers(out.parent)
-        remove_leftovers_within(out)
-        return _train(request)
+    with claimed(out, "trained") if distributed.leads() else nullcontext():
+        if distributed.leads():
+            remove_leftovers(out.parent)
+            remove_leftovers_within(out)
+        begun = time.perf_counter()
+        run = _prepare_inputs(store, out, config, about or {}, on_all_rows, shared)
+        overlay, augmentation = _augment(run)
+        fit = _train_policy(run, overlay, more_augmentation, on_all_rows)
+        if not distributed.leads():
+            return run.record
+        chosen = run.record.rule is not None and run.record.policy == fit
+        record = run.record.with_entries(augmentation=augmentation, policy=fit)
+        if run.logged.has_items and config.rule.choose and not chosen:
+            user_model = _fit_user_model(run)
+            rule = _choose_rule(run, user_model)
+            record = record.with_entries(reward_model=user_model.report, rule=rule)
+        _write_samples(run)
+        seconds = record.wall_time_s + time.perf_counter() - begun
+        return record.with_entries(wall_time_s=seconds).sealed(out)
 
 
-def _train(request: _Request) -> RunRecord:
-    """Algorithm 1 of the paper, then the choice of the decision rule."""
-    begun = time.perf_counter()
-    run = _prepare_inputs(request)
-    overlay, augmentation = _augment(run)
-    fit = _train_policy(run, overlay, request.more_augmentation, request.on_all_rows)
-    if not distributed.leads():
-        return run.record
-    chosen = run.record.rule is not None and run.record.policy == fit
-    record = run.record.with_entries(augmentation=augmentation, policy=fit)
-    if run.logged.has_items and run.config.rule.choose and not chosen:
-        user_model = _fit_user_model(run)
-        rule = _choose_rule(run, user_model)
-        record = record.with_entries(reward_model=user_model.report, rule=rule)
-    _write_samples(run)
-    seconds = record.wall_time_s + time.perf_counter() - begun
-    return record.with_entries(wall_time_s=seconds).sealed(run.out)
-
-
-def _prepare_inputs(request: _Request) -> _Inputs:
+def _prepare_inputs(
+    store: EpisodeStore,
+    out: Path,
+    config: Config,
+    about: Mapping[str, Any],
+    on_all_rows: bool,
+    shared: SharedStages,
+) -> _Inputs:
     """Check all inputs and begin the run or reopen it; views of the episodes, untrained policy."""
-    store, out, config = request.store, request.out, request.config
     train, validation = logged, held_out = training_views(store)
-    if request.on_all_rows:
+    if on_all_rows:
         train = logged = store
     if distributed.leads():
         require_startable(store, train, out, config)
     policy = new_policy(train, config)
     if distributed.leads():
         if not (out / RUN).exists():
-            begin(store, train, validation, out, config, request.about)
+            begin(store, train, validation, out, config, about)
         RunRecord.read(out).reopened(out, INPUTS)
         distributed.wait()  # the others wait at the beginning of the command
     record = RunRecord.read(out).with_entries(config=config)
@@ -176,7 +163,7 @@ def _prepare_inputs(request: _Request) -> _Inputs:
         policy = new_policy(view, config)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     return _Inputs(
-        *(record, out, config, request.shared, device),
+        *(record, out, config, shared, device),
         *(logged, held_out, view, validation, policy.to(device)),
     )
 

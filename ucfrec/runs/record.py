@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal
 
 from pydantic import (
     AfterValidator,
+    BeforeValidator,
     ConfigDict,
     Field,
     PlainSerializer,
@@ -34,10 +35,17 @@ RUN: Final = "run.json"
 
 
 def _complete(sizes: dict[str, int]) -> dict[str, int]:
-    for name in ("state", "action", "items"):
+    of_items = ("users", "tags") if sizes.get("items") else ()
+    for name in ("state", "action", "items", *of_items):
         if name not in sizes:
             raise ValueError(f"there is no size {name!r}")
     return sizes
+
+
+def _whole(value: object) -> object:
+    if isinstance(value, Mapping) and value.keys() != {"definition", "discount", "horizon"}:
+        raise ValueError("it needs definition, discount and horizon")
+    return value
 
 
 def _levels(quantiles: dict[str, float]) -> dict[str, float]:
@@ -160,7 +168,7 @@ class RunRecord(TrainingRecord):
     observation_size: Count
     train_episodes: Count
     train_steps: Count
-    return_to_go: ReturnToGo
+    return_to_go: Annotated[ReturnToGo, BeforeValidator(_whole)]
     return_quantiles: Annotated[dict[str, Number], AfterValidator(_levels)]
     """Of the training sessions' returns, by share."""
     mean_return: Number

@@ -17,7 +17,7 @@ PACKAGES = {
 }
 ORDER = (
     {"arrays", "schema", "errors", "processes"},
-    {"files", "progress", "plugins", "provenance", "settings", "code_version"},
+    {"files", "progress", "plugins", "provenance", "settings"},
     {"fitting"},
     {"episodes"},
     {"logs", "user_model"},

@@ -67,6 +67,8 @@ class BenchmarkRequest:
     """Names of the only tasks to measure; empty for all."""
     methods: Sequence[str] = ()
     """Names of the only methods to measure; empty for all."""
+    again: bool = False
+    """Whether cells that have rows are measured again."""
     training_seeds: int | None = None
     """Number of training seeds of each cell; None for the budget's."""
 

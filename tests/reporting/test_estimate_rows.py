@@ -22,7 +22,7 @@ ROW = {
 
 
 def test_a_row_goes_to_json_and_back() -> None:
-    row = estimate_row(ROW, training_seed=1, config_hash="c0ffee", code_version="1234")
+    row = estimate_row(ROW, training_seed=1, config_hash="c0ffee")
     assert (row.suite, row.method, row.value, row.interval) == ("off-policy", "DR", 3.5, (3.0, 4.0))
     assert row.conditions["run"] == "ucf"  # no path of any machine
     assert row.conditions["discount"] == 0.9
@@ -40,6 +40,6 @@ def test_a_row_goes_to_json_and_back() -> None:
 @pytest.mark.parametrize("name", ["R_cum_low", "R_cum_high"])
 def test_an_estimate_may_have_no_interval(name: str) -> None:
     open_ended = ROW | {"R_cum_low": None, "R_cum_high": None}
-    row = estimate_row(open_ended, training_seed=1, config_hash="c0ffee", code_version="1234")
+    row = estimate_row(open_ended, training_seed=1, config_hash="c0ffee")
     assert row.interval is None
     assert as_estimate(row)[name] is None

@@ -73,7 +73,7 @@ def test_rows_of_ope_are_drawn_in_the_report(folder: Path, tmp_path: Path) -> No
     rows = [
         estimate_row(
             estimate(name, value) | about | {"policy": policy},
-            training_seed=0, config_hash="c", code_version="v",
+            training_seed=0, config_hash="c",
         ).to_json()
         for name, policy, value in ((LOGGED, "behavior", 2.0), ("DR", "ucf", 4.0))
     ]  # fmt: skip

@@ -18,7 +18,6 @@ WHOLE = result_row(
     evaluation_seed=1_000_000,
     conditions={"budget": "small", "episodes": 5, "rate": 0.5, "on": True, "none": None},
     config_hash="ab",
-    code_version="cd",
     data_fingerprint="ef",
     interval=(1.0, 3.0),
     target_return=4.0,

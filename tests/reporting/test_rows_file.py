@@ -165,11 +165,11 @@ def test_a_measurement_is_claimed_until_its_process_dies(tmp_path: Path) -> None
 
 
 def test_of_rows_that_measure_the_same_the_last_counts() -> None:
-    old = result_row(1.0, code_version=None)
+    old = result_row(1.0)
     rows = [
         old,
         result_row(2.0, training_seed=1),
-        result_row(3.0, code_version="b", conditions={}),
+        result_row(3.0, data_fingerprint="b", conditions={}),
         result_row(4.0, conditions={"budget": "full"}),
     ]
     assert sorted(row.value for row in latest(rows)) == [2.0, 3.0, 4.0]

@@ -92,6 +92,7 @@ def run(options: argparse.Namespace) -> None:
         tasks=options.task,
         methods=options.method,
         training_seeds=options.training_seeds,
+        again=options.again,
     )
     with benchmarking(results):
         print(suite.run(request))

@@ -11,7 +11,7 @@ from ucfrec.reporting.rows_file import latest, read_rows
 
 
 def grid_options(parser: argparse.ArgumentParser, out: str, workers: int) -> None:
-    """Add --out, --results, --workers and --show-only.
+    """Add --out, --results, --workers, --again and --show-only.
 
     Args:
         out: default of --out.
@@ -35,6 +35,11 @@ def grid_options(parser: argparse.ArgumentParser, out: str, workers: int) -> Non
         type=int,
         default=workers,
         help=f"parallel processes, one thread each (default: {workers})",
+    )
+    parser.add_argument(
+        "--again",
+        action="store_true",
+        help="remove the rows and runs of the chosen cells first; resume without it",
     )
     parser.add_argument(
         "--show-only",

@@ -253,13 +253,12 @@ def _write(
     """Write the rows of all candidates, if asked to."""
     if options.json is None:
         return
-    from ucfrec.code_version import code_version
     from ucfrec.files.atomic import write_json
     from ucfrec.provenance import config_hash
     from ucfrec.reporting.estimate_rows import estimate_row
     from ucfrec.runs.trained_policy import read_record
 
-    version, written = code_version("ucfrec.off_policy.evaluate"), []
+    written = []
     for name, report in reports.items():
         for row in report.rows:
             record = read_record(Path(row["run"]))
@@ -268,7 +267,6 @@ def _write(
                 row | about,
                 training_seed=record["seed"],
                 config_hash=config_hash(record["config"]),
-                code_version=version,
             )
             written.append(found.to_json())
     write_json(options.json, written)

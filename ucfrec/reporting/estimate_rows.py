@@ -16,9 +16,7 @@ _FIELDS: Final = (
 _CONDITIONS: Final = ("run", "discount", "pages", "anonymous", "sessions", "steps")
 
 
-def estimate_row(
-    estimate: Mapping[str, Any], *, training_seed: int, config_hash: str, code_version: str
-) -> ResultRow:
+def estimate_row(estimate: Mapping[str, Any], *, training_seed: int, config_hash: str) -> ResultRow:
     """Convert a row of `ucfrec.off_policy.evaluate` to a result row.
 
     Numbers become metrics; whatever else the row has, the verdict first of all, becomes details.
@@ -27,7 +25,6 @@ def estimate_row(
         estimate: the row, with `checkpoint`.
         training_seed: of the run.
         config_hash: of the run's configuration.
-        code_version: of the estimator.
     """
     others = {
         name: value
@@ -49,7 +46,6 @@ def estimate_row(
         evaluation_seed=estimate["seed"],
         conditions={**conditions, "choice": estimate["choice"]},
         config_hash=config_hash,
-        code_version=code_version,
         data_fingerprint=estimate["fingerprint"],
         metric="R_cum",
         metrics=metrics,

@@ -12,7 +12,7 @@ Scalar = str | int | float | bool | None
 
 @dataclass(frozen=True, kw_only=True)
 class RowKey:
-    """Identifies a measurement, including its code version; equal keys are the same measurement."""
+    """Identifies a measurement; rows with equal keys are of the same one."""
 
     suite: str
     """The benchmark suite, e.g. recommendation, control, robustness, step-time."""
@@ -33,8 +33,6 @@ class RowKey:
     """Other settings of the measurement: budget, episodes, distractor, …"""
     config_hash: str | None = None
     """Hash of the training configuration, which `configurations.jsonl` holds."""
-    code_version: str | None = None
-    """See `ucfrec.code_version`; None in rows of older versions."""
     data_fingerprint: str | None = None
     """Fingerprint of the store."""
 
@@ -191,7 +189,7 @@ def _optional(read: Callable[[object], object]) -> Callable[[object], object]:
 _READERS: Final[Mapping[str, Callable[[object], object]]] = {
     **dict.fromkeys(("suite", "table", "task", "method", "policy", "metric", "command"), _text),
     **dict.fromkeys(("training_seed", "log_seed", "evaluation_seed"), _optional(_seed)),
-    **dict.fromkeys(("config_hash", "code_version", "data_fingerprint"), _optional(_text)),
+    **dict.fromkeys(("config_hash", "data_fingerprint"), _optional(_text)),
     **dict.fromkeys(("environment", "checkpoint", "rule", "commit"), _optional(_text)),
     **dict.fromkeys(("target_return", "wall_time_s", "peak_memory_mib"), _optional(_number)),
     "conditions": _mapping(_scalar),

@@ -81,6 +81,15 @@ def append_rows(
         _append(path, [row.to_json() for row in rows])
 
 
+def remove_rows(path: Path, keys: Sequence[RowKey]) -> None:
+    """Remove the rows of some measurements from a file; atomic, other rows stay as they are."""
+    with claim(path, wait=True):
+        rows = read_rows(path)
+        kept = [row for row in rows if not any(key.covers(row) for key in keys)]
+        if len(kept) < len(rows):
+            _write(path, b"", [row.to_json() for row in kept])
+
+
 def read_configurations(folder: Path) -> dict[str, Mapping[str, Any]]:
     """Read the configurations of the rows in `folder`: hash to configuration.
 
@@ -100,7 +109,7 @@ def read_configurations(folder: Path) -> dict[str, Mapping[str, Any]]:
 
 
 def latest(rows: Sequence[ResultRow]) -> list[ResultRow]:
-    """The last row of each measurement, regardless of code version, data and configuration."""
+    """The last row of each measurement, regardless of data and configuration."""
     last = {
         (*(getattr(row, name) for name in _SAME), str(sorted(row.conditions.items()))): row
         for row in rows
@@ -151,6 +160,10 @@ def _append(path: Path, values: Sequence[Mapping[str, Any]]) -> None:
     before = path.read_bytes() if path.exists() else b""
     if before and not before.endswith(b"\n"):
         before += b"\n"
+    _write(path, before, values)
+
+
+def _write(path: Path, before: bytes, values: Sequence[Mapping[str, Any]]) -> None:
     with atomic_file(path) as scratch, scratch.open("wb") as file:
         file.write(before)
         for value in values:

@@ -323,7 +323,7 @@ def _inputs(
     device: torch.device,
     *settings: CRMConfig | CSGConfig | AugmentConfig,
 ) -> dict[str, Any]:
-    """All that a reward model or copies depend on, but the code."""
+    """All that a reward model or copies depend on."""
     return {
         "data": train.meta["fingerprint"],
         "item_states": train.meta.get(FILES, {}).get(ITEM_STATES),

@@ -5,9 +5,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-from ucfrec.code_version import code_version
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import provenance
 from ucfrec.reporting.grid import Measurement
 from ucfrec.reporting.result_row import ResultRow, RowKey
@@ -34,20 +32,6 @@ SCORES, ROBUSTNESS = "control", "robustness"
 """Suites of the rows."""
 TARGET: Final = "target"
 """Condition of rows of budgets with several target returns."""
-OF_ITEMS: Final = (
-    *("ucfrec.acting.best_items", "ucfrec.user_model.fatigue", "ucfrec.user_model.simulator"),
-    *("ucfrec.acting.logged_decisions", "ucfrec.choosing.many_rules"),
-    *("ucfrec.acting.session_scorer", "ucfrec.counterfactual.action_copies"),
-    *("ucfrec.user_model.reward_effects", "ucfrec.user_model.reward_fit"),
-    *("ucfrec.user_model.reward_mean", "ucfrec.user_model.reward"),
-    *("ucfrec.user_model.reward_report", "ucfrec.user_model.reward_rows"),
-    *("ucfrec.user_model.posterior", "ucfrec.user_model.training_users"),
-    *("ucfrec.episodes.exposure", "ucfrec.episodes.item_counts", "ucfrec.episodes.item_table"),
-    *("ucfrec.episodes.main_tags", "ucfrec.episodes.states", "ucfrec.policies.item_sampling"),
-    *("ucfrec.choosing.by_ranking", "ucfrec.choosing.by_simulation"),
-)
-"""Modules that control imports but does not run, because its actions are vectors: changes to them
-change none of its rows."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +53,6 @@ class Cell:
     """Training seed."""
     episodes: int
     evaluation_seed: int
-    code_version: str
     rl: Mapping[str, Any] = field(default_factory=dict)
     """Settings of IQL and CQL, as of `rl_config`."""
     distractor: str | None = None
@@ -102,19 +85,9 @@ class Cell:
         return found if self.all_targets else found[:1]
 
 
-def code_of(learner: str, *more: str) -> str:
-    """The version of the code that a cell of `learner` depends on.
-
-    Args:
-        learner: as `Cell.learner`.
-        more: further modules that the measurement uses.
-    """
-    rl = "ucfrec_control.learners.rl_baselines"
-    is_rl = learner in ALGORITHMS
-    learner_module = rl if is_rl else policy_class(learner).__module__
-    parts = ("ucfrec_control.learners.train", "ucfrec_control.learners.evaluate")
-    apart = OF_ITEMS if is_rl else (*OF_ITEMS, rl)
-    return code_version(__name__, *parts, learner_module, *more, exclude=apart)
+def made(cell: Cell) -> list[Path]:
+    """Folders of the cell's run and of the stages that it shares."""
+    return [folder for folder in (cell.run, cell.shared.folder) if folder is not None]
 
 
 def key(cell: Cell) -> RowKey:
@@ -131,7 +104,6 @@ def key(cell: Cell) -> RowKey:
         training_seed=cell.seed,
         evaluation_seed=cell.evaluation_seed,
         conditions=conditions,
-        code_version=cell.code_version,
         data_fingerprint=EpisodeStore.open(cell.store).meta["fingerprint"],
     )
 
@@ -188,5 +160,5 @@ def measure_robustness(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     return [score_row(evaluations[0], row_key, **fields, **provenance(PACKAGES))]
 
 
-SCORE_MEASUREMENT: Final = Measurement(key, config, measure_scores)
-ROBUSTNESS_MEASUREMENT: Final = Measurement(key, config, measure_robustness)
+SCORE_MEASUREMENT: Final = Measurement(key, config, measure_scores, made)
+ROBUSTNESS_MEASUREMENT: Final = Measurement(key, config, measure_robustness, made)

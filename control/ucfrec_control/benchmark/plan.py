@@ -6,8 +6,8 @@ from pathlib import Path
 from ucfrec.reporting.grid import chosen
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec_control.benchmark.budgets import Budget
-from ucfrec_control.benchmark.cells import SCORE_MEASUREMENT, SCORES, Cell, code_of
-from ucfrec_control.benchmark.folders import run_name, stages_of, stores_of
+from ucfrec_control.benchmark.cells import SCORE_MEASUREMENT, SCORES, Cell
+from ucfrec_control.benchmark.folders import stages_of, stores_of
 from ucfrec_control.benchmark.methods import MAIN, TABLES
 from ucfrec_control.benchmark.rates import rl_settings_of, settings_of
 from ucfrec_control.benchmark.run_cells import run_cells
@@ -23,6 +23,7 @@ def benchmark(
     workers: int,
     table: str = MAIN,
     methods: Sequence[str] = (),
+    again: bool = False,
 ) -> list[ResultRow]:
     """Train and evaluate the cells without a row in `results`; returns the rows of all cells.
 
@@ -35,6 +36,7 @@ def benchmark(
         workers: number of processes, of one thread each.
         table: a key of `TABLES`.
         methods: rows of the table; empty for all.
+        again: as of `run_grid`.
 
     Raises:
         InputError: a file is missing, a method is not in the table, `results` has other content,
@@ -42,7 +44,7 @@ def benchmark(
     """
     selected = chosen(TABLES[table], methods, "method")
     cells = cells_of(data, folder, budget, name, table, selected)
-    return run_cells(cells, SCORE_MEASUREMENT, results, workers, f"benchmark {table}")
+    return run_cells(cells, SCORE_MEASUREMENT, results, workers, f"benchmark {table}", again)
 
 
 def cells_of(
@@ -56,7 +58,6 @@ def cells_of(
         for method in methods:
             learner, method_settings = TABLES[table][method]
             settings = (*method_settings, *budget.of_methods.get(method, ()))
-            code = code_of(learner)
             for seed in range(budget.seeds_of(file, method)):
                 yield Cell(
                     suite=SCORES,
@@ -67,11 +68,10 @@ def cells_of(
                     learner=learner,
                     settings=settings_of(budget, name, learner, settings),
                     store=store,
-                    run=runs / file / run_name(method, code, seed),
+                    run=runs / file / f"{method}-{seed}",
                     seed=seed,
                     episodes=budget.episodes,
                     evaluation_seed=budget.evaluation_seed,
-                    code_version=code,
                     rl=rl_settings_of(budget, name, learner),
                     all_targets=budget.all_targets,
                     shared=stages_of(folder),

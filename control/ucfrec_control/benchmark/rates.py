@@ -17,7 +17,7 @@ from ucfrec.reporting.grid import Measurement, chosen
 from ucfrec.reporting.result_row import ResultRow, RowKey
 from ucfrec.reporting.statistics import grouped
 from ucfrec_control.benchmark.budgets import RATES, Budget
-from ucfrec_control.benchmark.cells import Cell, code_of, config, key
+from ucfrec_control.benchmark.cells import Cell, config, key, made
 from ucfrec_control.benchmark.folders import stores_of
 from ucfrec_control.benchmark.methods import METHODS, METHODS_WO_TIME, Methods
 from ucfrec_control.benchmark.run_cells import run_cells
@@ -169,6 +169,7 @@ def search_rates(
     workers: int,
     methods: Sequence[str] = (),
     steps: int | None = None,
+    again: bool = False,
 ) -> list[ResultRow]:
     """Train every method at every rate, without copies; returns a row with the validation loss of
     each training.
@@ -182,6 +183,7 @@ def search_rates(
         workers: number of processes, of one thread each.
         methods: some of `SEARCHED`; empty for all.
         steps: updates of a training; None for the budget's.
+        again: as of `run_grid`.
 
     Raises:
         InputError: a file is missing or has no validation trajectories, a method is unknown,
@@ -189,7 +191,7 @@ def search_rates(
     """
     selected = chosen(SEARCHED, methods, "method")
     cells = _cells(data, folder, budget, name, selected, steps)
-    return run_cells(cells, _MEASUREMENT, results, workers, SUITE)
+    return run_cells(cells, _MEASUREMENT, results, workers, SUITE, again)
 
 
 def _cells(
@@ -208,7 +210,6 @@ def _cells(
             )
         for method in methods:
             learner, own = SEARCHED[method]
-            code = code_of(learner)
             rl = learner in ALGORITHMS
             for rate in RATES[name]:
                 searched = (f"{_COPIES}=0", *shorter, f"train.{RATE}={rate:g}", *own)
@@ -222,11 +223,10 @@ def _cells(
                         learner=learner,
                         settings=() if rl else (*budget.settings_of(learner), *searched),
                         store=store,
-                        run=folder / SUITE / name / file / f"{method}-{rate:g}-{part}{code}-{seed}",
+                        run=folder / SUITE / name / file / f"{method}-{rate:g}-{part}{seed}",
                         seed=seed,
                         episodes=0,
                         evaluation_seed=budget.evaluation_seed,
-                        code_version=code,
                         rl={**budget.rl[learner], **rl_shorter, RATE: rate} if rl else {},
                     )
 
@@ -249,7 +249,7 @@ def _measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     return [row]
 
 
-_MEASUREMENT: Final = Measurement(key, config, _measure)
+_MEASUREMENT: Final = Measurement(key, config, _measure, made)
 
 
 def best_rates(rows: Sequence[ResultRow]) -> dict[str, float]:

@@ -15,8 +15,8 @@ from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.statistics import grouped, summary
 from ucfrec_control.benchmark.budgets import BUDGETS as SCORE_BUDGETS
 from ucfrec_control.benchmark.budgets import MEDIUM, Budget
-from ucfrec_control.benchmark.cells import ROBUSTNESS, ROBUSTNESS_MEASUREMENT, Cell, code_of
-from ucfrec_control.benchmark.folders import run_name, stages_of, stores_of
+from ucfrec_control.benchmark.cells import ROBUSTNESS, ROBUSTNESS_MEASUREMENT, Cell
+from ucfrec_control.benchmark.folders import stages_of, stores_of
 from ucfrec_control.benchmark.methods import METHODS as LEARNERS
 from ucfrec_control.benchmark.methods import METHODS_WO_TIME
 from ucfrec_control.benchmark.rates import settings_of
@@ -36,8 +36,6 @@ BUDGETS = {
 SHOWN = ("clean", "score", "drop", "score_at_one", "drop_at_one")
 SHOWN_LARGEST = ("method", "at 0", "at 1")
 SHOWN_LOSSES = ("loss", "loss_at_zero", "rise")
-_CODE = (zoo_store.__module__, "ucfrec_control.learners.held_out_losses")
-"""Further modules that the cells depend on."""
 
 
 def robustness(
@@ -48,6 +46,7 @@ def robustness(
     name: str,
     workers: int,
     methods: Sequence[str] = (),
+    again: bool = False,
 ) -> list[ResultRow]:
     """Train and evaluate the cells without a row in `results`; returns the rows of all cells.
 
@@ -59,13 +58,14 @@ def robustness(
         name: name of the budget, for the rows.
         workers: number of processes, of one thread each.
         methods: some of `METHODS`; empty for all.
+        again: as of `run_grid`.
 
     Raises:
         InputError: a file is missing, a method is unknown, `results` has other content, or cells
             failed.
     """
     cells = robustness_cells(data, folder, budget, name, chosen(METHODS, methods, "method"))
-    return run_cells(cells, ROBUSTNESS_MEASUREMENT, results, workers, ROBUSTNESS)
+    return run_cells(cells, ROBUSTNESS_MEASUREMENT, results, workers, ROBUSTNESS, again)
 
 
 def robustness_cells(
@@ -83,7 +83,6 @@ def robustness_cells(
             runs = folder / f"robustness-{name}" / file / distractor
             for method in methods:
                 learner, method_settings = LEARNERS["ucf" if method in SCREENED else method]
-                code = code_of(learner, *_CODE)
                 for seed in range(budget.seeds):
                     yield Cell(
                         suite=ROBUSTNESS,
@@ -94,11 +93,10 @@ def robustness_cells(
                         learner=learner,
                         settings=settings_of(budget, name, learner, method_settings),
                         store=store,
-                        run=runs / run_name(method, code, seed),
+                        run=runs / f"{method}-{seed}",
                         seed=seed,
                         episodes=budget.episodes,
                         evaluation_seed=budget.evaluation_seed,
-                        code_version=code,
                         distractor=distractor,
                         screening=SCREENED.get(method),
                         shared=stages_of(folder),

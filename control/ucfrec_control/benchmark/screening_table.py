@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from ucfrec.code_version import code_version
 from ucfrec.counterfactual.screening import ScreeningConfig, screen
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.provenance import provenance
@@ -37,7 +36,7 @@ class Cell:
 
 
 def screening_table(
-    data: Path, stores: Path, files: Sequence[str], results: Path, workers: int
+    data: Path, stores: Path, files: Sequence[str], results: Path, workers: int, again: bool = False
 ) -> list[ResultRow]:
     """Screen every file, clean and with each distractor, that has no row in `results` yet.
 
@@ -47,6 +46,7 @@ def screening_table(
         files: names of files in `data`, without their ending.
         results: file of JSON lines.
         workers: number of processes, of one thread each.
+        again: as of `run_grid`.
 
     Returns:
         The rows of all screenings.
@@ -59,7 +59,7 @@ def screening_table(
         for file in files
         for distractor in DISTRACTORS
     ]
-    return run_grid(cells, _MEASUREMENT, results, workers, SCREENING)
+    return run_grid(cells, _MEASUREMENT, results, workers, SCREENING, again=again)
 
 
 def _key(cell: Cell) -> RowKey:
@@ -71,7 +71,6 @@ def _key(cell: Cell) -> RowKey:
         policy=SCREENING,
         training_seed=SEED,
         conditions={"distractor": cell.distractor},
-        code_version=code_version(__name__),
         data_fingerprint=EpisodeStore.open(cell.store).meta["fingerprint"],
     )
 

@@ -62,6 +62,7 @@ def run(options: argparse.Namespace) -> None:
                 options.workers,
                 options.table,
                 options.method,
+                options.again,
             )
     with rows_explained(options):
         print_scores(rows, options.table, budget.rates)

@@ -54,6 +54,7 @@ def run(options: argparse.Namespace) -> None:
                 options.workers,
                 options.method,
                 options.steps,
+                options.again,
             )
     by, values = ("task", "method", RATE), ("validation_loss",)
     with rows_explained(options):

@@ -59,7 +59,8 @@ def run(options: argparse.Namespace) -> None:
         cells += cells_of_part(part, data_given(options), options.out, budget, options.budget)
         with benchmarking(results):
             how = ROBUSTNESS_MEASUREMENT if robust else SCORE_MEASUREMENT
-            rows = run_cells(cells, how, results, options.workers, f"reproduce {options.part}")
+            said = f"reproduce {options.part}"
+            rows = run_cells(cells, how, results, options.workers, said, options.again)
     pictures = options.out / options.part
     with rows_explained(options):
         if robust:

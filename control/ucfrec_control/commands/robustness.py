@@ -53,6 +53,7 @@ def run(options: argparse.Namespace) -> None:
                 options.budget,
                 options.workers,
                 options.method,
+                options.again,
             )
     with rows_explained(options):
         print_robustness(rows)

@@ -25,9 +25,8 @@ def run(options: argparse.Namespace) -> None:
     else:
         with benchmarking(results_given(options)):
             files, stores = BUDGETS["full"].files, stores_of(options.out)
-            rows = screening_table(
-                data_given(options), stores, files, results_given(options), options.workers
-            )
+            given = data_given(options), stores, files, results_given(options)
+            rows = screening_table(*given, options.workers, options.again)
     with rows_explained(options):
         print(format_rows(screening_rows(rows), SHOWN_SCREENING))
     print(f"\nrows: {results_given(options)}")

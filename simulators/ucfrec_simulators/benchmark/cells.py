@@ -49,7 +49,6 @@ class Cell:
     """One of `ucfrec.policies.registry.policy_names`, or a built-in policy of the environments."""
     environments: tuple[Environment, ...]
     evaluation: EvaluationPlan
-    code_version: str
     log_seed: int | None
     """Seed of a simulated log, or number of the part of a given log; None for all of it."""
     training_seed: int | None = None
@@ -95,7 +94,6 @@ def key(cell: Cell) -> RowKey:
         log_seed=cell.log_seed,
         evaluation_seed=cell.evaluation.seed,
         conditions=conditions,
-        code_version=cell.code_version,
         data_fingerprint=fingerprint,
     )
 
@@ -180,4 +178,9 @@ def config(cell: Cell) -> dict[str, Any] | None:
     return asdict(cell.config) | screening
 
 
-MEASUREMENT: Final = Measurement(key, config, measure)
+def made(cell: Cell) -> list[Path]:
+    """Folders of the cell's run and of the stages that it shares."""
+    return [folder for folder in (cell.run, cell.shared.folder) if folder is not None]
+
+
+MEASUREMENT: Final = Measurement(key, config, measure, made)

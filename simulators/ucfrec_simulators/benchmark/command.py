@@ -72,6 +72,7 @@ def run(request: BenchmarkRequest) -> str:
             "installed"
             for name in plan.missing()
         ]
+    again = request.again
     plotted = find_spec("matplotlib") is not None
     for table in tables:
         cells = [
@@ -80,7 +81,7 @@ def run(request: BenchmarkRequest) -> str:
             if not request.methods or cell.run is None or cell.method in request.methods
         ]
         said = announcement(request.workers)
-        rows = run_grid(cells, MEASUREMENT, request.results, request.workers, table, said)
+        rows = run_grid(cells, MEASUREMENT, request.results, request.workers, table, said, again)
         parts.append(_shown(table, rows))
         if plotted:
             for _, _, draw in _SHOWN[table]:

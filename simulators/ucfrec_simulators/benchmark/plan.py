@@ -9,15 +9,12 @@ from pathlib import Path
 from typing import Final
 
 from ucfrec import schema
-from ucfrec.code_version import code_version, plugin_module
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.evaluation import gymnasium_environment
-from ucfrec.evaluation.environment import GYMNASIUM, Environment
-from ucfrec.policies.registry import policy_class
+from ucfrec.evaluation.environment import Environment
 from ucfrec.provenance import config_hash
 from ucfrec.runs.shared_stages import SharedStages
 from ucfrec_simulators import sardine
-from ucfrec_simulators.benchmark import cells, tasks
+from ucfrec_simulators.benchmark import tasks
 from ucfrec_simulators.benchmark.cells import Cell, EvaluationPlan
 from ucfrec_simulators.benchmark.methods import ADDITIONS, METHODS, PAPER, SCREENED, Method
 from ucfrec_simulators.benchmark.tasks import TASKS, BenchmarkTask, Log
@@ -111,8 +108,6 @@ _REAL: Final = {"kuairand": "kuairand", "kuairec": "kuairec", "virtual-taobao": 
 """Tasks that need files outside the package, and the subfolder of the data folder with them."""
 _PACKAGES: Final = {"sardine-static": sardine.PACKAGE, "sardine-boredinf": sardine.PACKAGE}
 """Tasks that need an optional package, and its name."""
-_DISTRACTOR: Final = DistractorEnvironment.__module__
-_GYMNASIUM_ENVIRONMENT: Final = gymnasium_environment.__name__
 _ADDED: Final[Mapping[str, Method]] = {"ucf": METHODS["ucf"], **ADDITIONS, **PAPER}
 _MEMORYLESS: Final = ("bc", "popular", "crm-greedy")
 
@@ -150,10 +145,9 @@ class Plan:
             for log in range(self._budget.logs):
                 task = self._task(name, log)
                 for behavior in task.behaviors if log == 0 else ():
-                    code = _code(task.environments)
                     yield Cell(
                         *("main", self._name, name, behavior, behavior, task.environments),
-                        *(self._budget.evaluation, code, None),
+                        *(self._budget.evaluation, None),
                     )
                 yield from self._all_trained("main", name, log, METHODS)
 
@@ -226,14 +220,11 @@ class Plan:
     def _task(self, name: str, log: int) -> BenchmarkTask:
         if (name, log) not in self._tasks:
             environment = self._environment
-            made_of = (name,) if environment is None else (environment.name,)
-            # Another version of the code may write different logs, so each version has its folder.
-            code = code_version(tasks.__name__, *map(_module, tasks.LOGGED.get(name, made_of)))
             number = self._number(name, log)
             which = "whole" if number is None else str(number)
             if name in tasks.LOGGED and number is not None:
                 which = f"{which}-of-{self._budget.logs}"
-            folder = self._folder / "tasks" / f"{folder_name(name)}-{which}-{code}"
+            folder = self._folder / "tasks" / f"{folder_name(name)}-{which}"
             make = TASKS[name] if environment is None else partial(tasks.simulated, environment)
             given = Log(self._budget.sessions, self._log_seed + log, log, self._budget.logs)
             self._tasks[name, log] = make(folder, given)
@@ -274,10 +265,9 @@ class Plan:
         memory = () if method.policy in _MEMORYLESS else (f"policy.context={_CONTEXT}",)
         cuts = self._budget.cuts.get(method.policy, ())
         settings = (*self._budget.settings, *memory, *cuts, *method.settings)
-        code = _code(task.environments, policy_class(method.policy).__module__)
         # Where nothing but items was logged, there are no columns to screen.
         screening = method.screening if store.observation_size else None
-        identity = {"policy": method.policy, "settings": settings, "code": code}
+        identity = {"policy": method.policy, "settings": settings}
         identity |= {} if screening is None else {"screening": screening}
         run_hash = config_hash(identity | {"data": store.meta["fingerprint"]})
         yield Cell(
@@ -288,7 +278,6 @@ class Plan:
             policy=method.policy,
             environments=task.environments,
             evaluation=evaluation or self._budget.evaluation,
-            code_version=code,
             log_seed=self._number(task_name, log),
             training_seed=seed,
             store=task.store,
@@ -298,22 +287,6 @@ class Plan:
             conditioned=method.conditioned,
             screening=screening,
         )
-
-
-def _code(environments: Sequence[Environment], *learner: str) -> str:
-    """The version of the code that a cell in `environments` depends on."""
-    modules = [_module(environment.name) for environment in environments]
-    distracted = any(isinstance(environment, DistractorEnvironment) for environment in environments)
-    on_gymnasium = any(module in (_GYMNASIUM_ENVIRONMENT, sardine.__name__) for module in modules)
-    apart = [] if distracted else [_DISTRACTOR]
-    apart += [] if on_gymnasium else [_GYMNASIUM_ENVIRONMENT]
-    return code_version(cells.__name__, *learner, *modules, exclude=apart)
-
-
-def _module(environment: str) -> str:
-    if environment.startswith(GYMNASIUM):
-        return _GYMNASIUM_ENVIRONMENT
-    return plugin_module("simulators", environment)
 
 
 def _supports(method: Method, store: EpisodeStore) -> bool:

@@ -1,11 +1,7 @@
 """Every table's cells are what their names say, and %BC goes through the benchmark."""
 
-import sys
-from dataclasses import replace
-from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
-from types import FrameType
 
 import numpy as np
 import pytest
@@ -16,17 +12,8 @@ from ucfrec.errors import InputError
 from ucfrec.runs.config import Config, resolve_config
 from ucfrec_control.benchmark import robustness
 from ucfrec_control.benchmark.budgets import BUDGETS, SWEEPS, Budget
-from ucfrec_control.benchmark.cells import (
-    OF_ITEMS,
-    ROBUSTNESS,
-    code_of,
-    key,
-    measure_robustness,
-    measure_scores,
-)
-from ucfrec_control.benchmark.folders import run_name
 from ucfrec_control.benchmark.methods import EQUAL_TIME, MAIN, METHODS, PAPER, PURSUING, TABLES
-from ucfrec_control.benchmark.plan import benchmark, cells_of
+from ucfrec_control.benchmark.plan import benchmark
 from ucfrec_control.benchmark.rates import settings_of
 from ucfrec_control.commands.benchmark import budgets_of
 from ucfrec_control.data.distractor import zoo_store
@@ -164,62 +151,12 @@ def test_the_best_trajectories_are_cloned_and_evaluated(
     chosen = {}
     for method in rows:
         runs = tmp_path / "runs" / "tiny" / "hopper_medium-made"
-        run = runs / run_name(method, code_of(METHODS[method][0]), 0)
+        run = runs / f"{method}-0"
         actor = load_run(run, "last").actor(len(seen), DecisionRule(1.0))
         actor.begin(np.arange(len(seen)))
         chosen[method] = actor.act(seen, np.ones(len(seen), dtype=bool))[0].mean()
     # One in five is good: all of the best 10%, four fifths of the best 25%.
     assert chosen["bc"] < -0.2 < 0.2 < chosen["bc-25"] < chosen["bc-10"]
-
-
-IMPORTED_BY_THEM_ALONE = (
-    *("ucfrec.acting.sessions", "ucfrec.episodes.group_auc", "ucfrec.processes"),
-)
-"""Modules that `code_version` leaves out together with `OF_ITEMS`."""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("table", [MAIN, ROBUSTNESS])
-def test_no_cell_runs_code_of_items(table: str, tmp_path: Path) -> None:
-    """Rows stay valid when that code changes, so they must not depend on it."""
-    write_hdf5(tmp_path / "hopper_medium-zoo.hdf5", hopper_like((30, 8, 25) * 8))
-    settings = ("train.steps=2", "train.warmup_steps=1", "train.validate_every=2", "crm.epochs=1")
-    small = replace(BUDGETS["small"], files=("hopper_medium-zoo",), seeds=1, episodes=1)
-    budget = replace(small, settings=(*small.settings, *settings, "csg.epochs=1"))
-    given = tmp_path, tmp_path / "runs", budget, "small"
-    if table == MAIN:
-        (cell,) = cells_of(*given, MAIN, ["ucf"])
-    else:
-        (cell,) = robustness.robustness_cells(*given, ["ucf"], ["deterministic"])
-    called: set[str] = set()
-
-    def remember(frame: FrameType, event: str, argument: object) -> None:
-        if frame.f_code.co_name != "<module>":
-            called.add(frame.f_code.co_filename)
-
-    measure = measure_scores if table == MAIN else measure_robustness
-    before = sys.gettrace()
-    sys.settrace(remember)
-    try:
-        measure(cell, key(cell))
-    finally:
-        sys.settrace(before)
-    assert str(source_of("ucfrec.policies.ucf")) in called
-    left_out = (*OF_ITEMS, *IMPORTED_BY_THEM_ALONE)
-    assert [name for name in left_out if str(source_of(name)) in called] == []
-
-
-def source_of(module: str) -> Path:
-    spec = find_spec(module)
-    assert spec is not None
-    assert spec.origin is not None
-    return Path(spec.origin)
-
-
-def test_cells_of_one_learner_run_through_the_same_code() -> None:
-    codes = {learner: code_of(learner) for learner in ("ucf", "dt", "iql", "cql")}
-    assert codes["ucf"] != codes["dt"]
-    assert codes["iql"] == codes["cql"] != codes["dt"]
 
 
 def test_a_store_of_other_data_of_the_same_name_is_refused(tmp_path: Path) -> None:

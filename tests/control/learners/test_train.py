@@ -357,7 +357,7 @@ def test_a_benchmark_goes_on_where_it_was(
         assert row["conditions"].items() >= {"budget": "small", "episodes": 2}.items()
         assert row["metrics"].keys() >= {"score", "return", "length", "validation_loss"}
         assert (row["training_seed"], row["evaluation_seed"]) == (0, 1000)
-        assert {"environment", "versions", "commit", "command", "code_version"} <= row.keys()
+        assert {"environment", "versions", "commit", "command"} <= row.keys()
     assert str(tmp_path) not in results.read_text()
     before = results.read_text()
     assert main(arguments) == 0

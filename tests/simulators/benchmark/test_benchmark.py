@@ -101,13 +101,18 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     assert suite.run(request) == said
     assert len(read_rows(results)) == len(rows)
     assert suite.show(["main", "sweeps"], rows) in said
-    # Code that a row runs through has changed: trained and played again.
+    # Trained and played again: the same numbers.
     monkeypatch.setattr(plan, "METHODS", {"popular": METHODS["popular"]})
-    monkeypatch.setattr(plan, "code_version", lambda *roots, exclude=(): "other")
-    suite.run(request)
-    again = read_rows(results)[len(rows) :]
-    assert {row.code_version for row in again} == {"other"}
-    assert {row.method for row in again} == {"random", "mixture", "optimal", "popular"}
+    weights = [path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("best.safetensors")]
+    suite.run(replace(request, again=True))
+    again = read_rows(results)
+    assert len(again) == len(rows)
+    methods = [row.method for row in again]
+    assert methods == [*4 * ["dt+"], "random", "mixture", "optimal", *4 * ["popular"]]
+    first, second = (sorted((r.method, str(r.log_seed), r.value) for r in x) for x in (rows, again))
+    assert first == second
+    left = [path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("best.safetensors")]
+    assert len(set(left) - set(weights)) == 4
     seeds = replace(request, evaluation_seed=5, log_seed=3, logs=1)
     suite.run(seeds)
     last = read_rows(results)[-1]
@@ -146,15 +151,6 @@ def test_sardine_is_left_out_where_it_is_not_installed(
     monkeypatch.setitem(plan._PACKAGES, "sardine-static", "not_installed")
     budget = replace(TINY, tasks=("sardine-static", "synthetic-catalog"))
     assert Plan(tmp_path, budget).missing() == ["sardine-static"]
-
-
-@pytest.mark.usefixtures("no_data")
-def test_a_environment_has_the_code_version_of_what_it_runs_through() -> None:
-    def code(name: str) -> str:
-        return plan._code((Environment(name),))
-
-    assert code("sardine-static") == code("sardine-boredinf")
-    assert len({code(name) for name in ("sardine-static", "gymnasium:x", "synthetic-catalog")}) == 3
 
 
 @pytest.mark.usefixtures("no_data")

@@ -18,7 +18,7 @@ PACKAGES = {
 ORDER = (
     {"arrays", "schema", "errors", "processes"},
     {"files", "progress", "plugins", "provenance", "settings"},
-    {"fitting"},
+    {"results", "fitting"},
     {"episodes"},
     {"logs", "user_model"},
     {"counterfactual"},
@@ -29,6 +29,7 @@ ORDER = (
     {"evaluation", "recommending"},
     {"off_policy"},
     {"reporting"},
+    {"benchmark"},
     {"recommender"},
     {"commands"},
     {"__init__", "__main__"},

@@ -6,7 +6,7 @@ import math
 import pytest
 
 from ucfrec.reporting.estimate_rows import as_estimate, estimate_row
-from ucfrec.reporting.result_row import row_from_json
+from ucfrec.results.row import row_from_json
 
 ROW = {
     "estimator": "DR", "policy": "ucf", "choice": "softmax", "R_cum": 3.5, "R_cum_low": 3.0,

@@ -9,8 +9,8 @@ from ucfrec.errors import InputError
 from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior
 from ucfrec.reporting.evaluation_rows import as_evaluation, evaluation_row, read_evaluations
-from ucfrec.reporting.result_row import RowKey
-from ucfrec.reporting.rows_file import append_rows
+from ucfrec.results.row import RowKey
+from ucfrec.results.rows_file import append_rows
 
 KEY = RowKey(
     suite="s",

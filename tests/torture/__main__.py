@@ -27,8 +27,8 @@ from tests.torture import damage, fuzz, limits
 from tests.torture.ends import Ends
 from tests.torture.made import Inputs, temporary
 from ucfrec.provenance import provenance
-from ucfrec.reporting.result_row import ResultRow, RowKey
-from ucfrec.reporting.rows_file import append_rows, read_rows, remove_rows
+from ucfrec.results.row import ResultRow, RowKey
+from ucfrec.results.rows_file import append_rows, read_rows, remove_rows
 
 FULL = {
     "kills": 500,

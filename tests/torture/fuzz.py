@@ -257,7 +257,7 @@ def _targets(inputs: Inputs) -> dict[str, tuple[Path, str, Reader]]:
     from ucfrec.fitting.metrics_log import read_metrics
     from ucfrec.logs.mapping import read_mapping
     from ucfrec.reporting.evaluation_rows import read_evaluations
-    from ucfrec.reporting.rows_file import read_configurations, read_rows
+    from ucfrec.results.rows_file import read_configurations, read_rows
     from ucfrec.runs.config import resolve_config
 
     texts = _texts(inputs)

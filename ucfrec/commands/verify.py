@@ -38,7 +38,7 @@ def _verified(path: Path) -> int:
     from ucfrec.files.checksums import sealed_record
 
     if path.is_file():
-        from ucfrec.reporting.rows_file import read_rows
+        from ucfrec.results.rows_file import read_rows
 
         print(one_line(f"{path}: {len(read_rows(path))} result rows, all readable"))
         return 0

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from ucfrec.provenance import without_folders
-from ucfrec.reporting.result_row import ResultRow
+from ucfrec.results.row import ResultRow
 
 SUITE: Final = "off-policy"
 _FIELDS: Final = (

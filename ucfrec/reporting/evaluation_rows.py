@@ -7,8 +7,8 @@ from typing import Any, Final
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json
 from ucfrec.reporting.estimate_rows import SUITE, as_estimate
-from ucfrec.reporting.result_row import ResultRow, RowKey, row_from_json
-from ucfrec.reporting.rows_file import read_lines
+from ucfrec.results.row import ResultRow, RowKey, row_from_json
+from ucfrec.results.rows_file import read_lines
 
 _NOT_METRICS: Final = (
     *("environment", "policy", "seed", "train_seed", "fingerprint", "config", "wall_time_s"),

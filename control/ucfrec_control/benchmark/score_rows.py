@@ -6,8 +6,8 @@ from typing import Any, Final
 
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json
-from ucfrec.reporting.result_row import ResultRow, RowKey, row_from_json
-from ucfrec.reporting.rows_file import read_rows
+from ucfrec.results.row import ResultRow, RowKey, row_from_json
+from ucfrec.results.rows_file import read_rows
 
 EVALUATE: Final = "evaluate"
 """Suite of the rows of `evaluate --json`."""

@@ -9,18 +9,18 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from ucfrec.benchmark.tables import of_best_target
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import read_json
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.provenance import config_hash
 from ucfrec.reporting.plot_style import label, save
-from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.statistics import grouped
+from ucfrec.results.row import ResultRow
 from ucfrec.runs.trained_policy import RUN
-from ucfrec_control.benchmark.cells import ROBUSTNESS, SCORES
+from ucfrec_control.benchmark.methods import ROBUSTNESS, SCORES
 from ucfrec_control.benchmark.robustness import drops, loss_rises
 from ucfrec_control.benchmark.score_rows import EVALUATE, read_scores
-from ucfrec_control.benchmark.tables import of_best_target
 from ucfrec_control.data.trajectories import require_source
 from ucfrec_control.figures import diagnostics, plots
 from ucfrec_control.learners.evaluate import method_of

@@ -13,13 +13,14 @@ from tests.support.control_files import hopper_like, write_hdf5
 from tests.support.real_data import data_folder
 from ucfrec import schema
 from ucfrec.acting.rollout import rollout
+from ucfrec.benchmark.cells import Budget, Evaluation
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.policies.registry import BUILT_IN
 from ucfrec.runs.config import resolve_config
-from ucfrec_control.benchmark.budgets import BUDGETS, Budget
+from ucfrec_control.benchmark.budgets import BUDGETS
 from ucfrec_control.benchmark.methods import METHODS, TABLES
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
@@ -338,7 +339,9 @@ def test_a_benchmark_goes_on_where_it_was(
 ) -> None:
     write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
     settings = (*TINY, "policy.dim=32", "crm.epochs=1", "csg.epochs=1")
-    monkeypatch.setitem(BUDGETS, "small", Budget(("hopper_medium-made",), 1, 2, settings))
+    monkeypatch.setitem(
+        BUDGETS, "small", Budget("small", ("hopper_medium-made",), 1, Evaluation(2, 1000), settings)
+    )
     monkeypatch.setitem(TABLES, "main", {m: METHODS[m] for m in ("lsdt", "ucf")})
     results = tmp_path / "control.jsonl"
     arguments = ["benchmark", str(tmp_path), "--out", str(tmp_path / "runs")]

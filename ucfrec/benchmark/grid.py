@@ -16,10 +16,14 @@ from ucfrec.errors import InputError
 from ucfrec.processes import interruptions_raised, pool_of_processes, without_ctrl_c
 from ucfrec.progress import progress
 from ucfrec.provenance import config_hash, peak_memory_mib, reset_peak_memory
-from ucfrec.reporting.result_row import ResultRow, RowKey
-from ucfrec.reporting.rows_file import append_rows, measuring, read_rows, remove_rows
+from ucfrec.results.row import ResultRow, RowKey
+from ucfrec.results.rows_file import append_rows, measuring, read_rows, remove_rows
 
 Cell = TypeVar("Cell")
+
+
+def _nothing(cell: object) -> Sequence[Path]:
+    return ()
 
 
 @dataclass(frozen=True)
@@ -32,7 +36,7 @@ class Measurement(Generic[Cell]):
     """Training configuration of the cell; None if nothing is trained."""
     measure: Callable[[Cell, RowKey], list[ResultRow]]
     """Measures the cell; returns its rows, all with the given key. Runs with one thread."""
-    made: Callable[[Cell], Sequence[Path]] = lambda cell: ()
+    made: Callable[[Cell], Sequence[Path]] = _nothing
     """Folders of what a measurement makes and finds again: runs and shared stages."""
 
 
@@ -102,6 +106,8 @@ def run_grid(
     known = read_rows(results)
     found = {name: [row for row in known if t.key.covers(row)] for name, t in tasks.items()}
     missing = [name for name, rows in found.items() if not rows]
+    # Seed by seed: when it is interrupted, its rows are whole tables of fewer seeds.
+    missing.sort(key=lambda name: -1 if (seed := tasks[name].key.training_seed) is None else seed)
     counted = f"{len(tasks)} cells, {len(missing)} of them left to measure"
     print(f"{describe}: {counted}", file=sys.stderr)
     if missing:

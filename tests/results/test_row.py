@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.support.result_rows import result_row
 from ucfrec.errors import InputError
-from ucfrec.reporting.result_row import ResultRow, RowKey, row_from_json
+from ucfrec.results.row import ResultRow, RowKey, row_from_json
 
 WHOLE = result_row(
     2.5,

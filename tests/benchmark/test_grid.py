@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
+from ucfrec.benchmark.grid import Measurement, chosen, run_grid
 from ucfrec.errors import InputError
-from ucfrec.reporting.grid import Measurement, chosen, run_grid
-from ucfrec.reporting.result_row import ResultRow, RowKey
-from ucfrec.reporting.rows_file import read_configurations, read_rows
+from ucfrec.results.row import ResultRow, RowKey
+from ucfrec.results.rows_file import read_configurations, read_rows
 
 Cell = tuple[str, int]
 """A folder for marks, and a number."""
@@ -148,8 +148,8 @@ def test_a_line_that_is_no_row_is_named_before_anything_is_measured(tmp_path: Pa
 _RUN = """
 import json, sys
 from pathlib import Path
-from tests.reporting.test_grid import HOW
-from ucfrec.reporting.grid import run_grid
+from tests.benchmark.test_grid import HOW
+from ucfrec.benchmark.grid import run_grid
 if __name__ == "__main__":
     folder, workers, *numbers = sys.argv[1:]
     cells = [(folder, int(number)) for number in numbers]

@@ -12,7 +12,7 @@ from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file
 from ucfrec.files.locks import claim, claimed, remove_leftovers
 from ucfrec.provenance import config_hash
-from ucfrec.reporting.result_row import ResultRow, RowKey, row_from_json
+from ucfrec.results.row import ResultRow, RowKey, row_from_json
 
 CONFIGURATIONS: Final = "configurations.jsonl"
 """File next to the rows with each of their configurations, by hash."""

@@ -1,0 +1,95 @@
+"""Result rows of a cell: a trained method or a built-in policy in the environments of its task."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, Final
+
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.benchmark.cells import Cell, measured_by, opened
+from ucfrec.evaluation.environment import Environment
+from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
+from ucfrec.files.locks import claim
+from ucfrec.reporting.evaluation_rows import evaluation_row
+from ucfrec.results.row import ResultRow, RowKey
+from ucfrec.runs.describe import promised
+from ucfrec.runs.screened import SCREENING, flagged_columns, train_screened
+from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec_simulators.distractor import DistractorEnvironment
+
+CHECKPOINT: Final = "best"
+
+
+def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
+    """Train the method, unless it is a built-in policy, and evaluate it in every environment of
+    the task.
+
+    It acts by its run's own decision rule, which was chosen on its log, not in an environment.
+
+    Args:
+        cell: what to train and evaluate.
+        row_key: key of the rows.
+
+    Returns:
+        One row for each environment, of trained methods with the best validation loss.
+    """
+    episodes, seed = cell.evaluation.episodes, cell.evaluation.seed
+    if cell.run is None:
+        return [
+            _row(evaluate_behavior(environment, cell.policy, episodes, seed), row_key, environment)
+            for environment in cell.environments
+        ]
+    # Cells that differ only in their evaluation share a run.
+    with claim(cell.run, wait=True):
+        record = train_screened(
+            opened(cell), cell.run, cell.config, cell.screening, shared=cell.shared
+        )
+    training_metrics, rows = _training_metrics(record), []
+    details = {} if cell.screening is None else {SCREENING: flagged_columns(record[SCREENING])}
+    trained = TrainedPolicy.load(cell.run, CHECKPOINT)
+    rule = _rule(cell, trained)
+    for environment in cell.environments:
+        metrics = evaluate_policy(environment, trained, cell.method, episodes, seed, rule)
+        fields = {"checkpoint": CHECKPOINT, "rule": f"{rule} ({rule.hash})"}
+        row = _row(metrics | training_metrics, row_key, environment, **fields)
+        # Other methods are given a rule, but do not look at its target.
+        target = row.target_return if cell.conditioned else None
+        rows.append(replace(row, details={**row.details, **details}, target_return=target))
+    return rows
+
+
+def _row(
+    metrics: Mapping[str, Any], row_key: RowKey, environment: Environment, **fields: Any
+) -> ResultRow:
+    row = evaluation_row(metrics, row_key, **fields)
+    distractor = environment.rate if isinstance(environment, DistractorEnvironment) else None
+    return ResultRow(**vars(row) | {"conditions": {**row.conditions, "distractor": distractor}})
+
+
+def _training_metrics(record: Mapping[str, Any]) -> dict[str, float]:
+    """Metrics that the run's record holds about its training."""
+    metrics = {
+        "train_wall_time_s": record["wall_time_s"],
+        "validation_loss": record["policy"]["best_validation"],
+    }
+    if (value := promised(record.get("rule", {}))) is not None:
+        metrics |= {"estimated_value": value[0], "estimated_value_error": value[1]}
+    if "augmentation" not in record:
+        return metrics
+    augmentation = record["augmentation"]
+    model = augmentation["reward_model"]
+    return metrics | {
+        "acceptance": augmentation["acceptance"],
+        "crm_r2": model["r2"],
+        "crm_r2_without_z": model["r2_without_z"],
+    }
+
+
+def _rule(cell: Cell, trained: TrainedPolicy) -> DecisionRule:
+    """The run's own rule, or with the plan's target."""
+    quantile = cell.evaluation.target_quantile
+    if quantile is None or not cell.conditioned:
+        return trained.rule
+    return replace(trained.rule, target=trained.target_return(quantile))
+
+
+MEASUREMENT: Final = measured_by(measure)

@@ -4,8 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from ucfrec_control.benchmark.cells import ROBUSTNESS, SCORES
-from ucfrec_control.benchmark.estimate import estimated_hours
 
 from tests.support.control_files import hopper_like, write_hdf5
 from tests.support.result_rows import result_row

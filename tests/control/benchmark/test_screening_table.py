@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from ucfrec_control.benchmark.folders import stores_of
 
 from tests.support.causes import QUICK, planted_vectors
 from tests.support.control_files import hopper_like, write_hdf5
@@ -23,6 +22,7 @@ from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import training_views
 from ucfrec.runs.screened import flagged_columns
 from ucfrec_control.benchmark import screening_table
+from ucfrec_control.benchmark.plan import stores_of
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.distractor import add_distractor

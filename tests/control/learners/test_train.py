@@ -20,7 +20,7 @@ from ucfrec.files.atomic import read_json
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.policies.registry import BUILT_IN
 from ucfrec.runs.config import resolve_config
-from ucfrec_control.benchmark.budgets import BUDGETS
+from ucfrec_control.benchmark.budgets import BUDGETS, ZOO
 from ucfrec_control.benchmark.methods import METHODS, TABLES
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
@@ -315,7 +315,7 @@ def test_a_clone_of_a_zoo_file_hops(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.realdata
-@pytest.mark.parametrize("file", BUDGETS["full"].files)
+@pytest.mark.parametrize("file", ZOO)
 def test_each_zoo_file_trains_ucf_that_its_environment_judges(tmp_path: Path, file: str) -> None:
     data, store, run = data_folder("control") / f"{file}.hdf5", tmp_path / "store", tmp_path / "run"
     assert main(["prepare", str(data), "--out", str(store)]) == 0

@@ -1,39 +1,75 @@
-"""Result rows of all benchmarks: the measurement, its numbers and their origin."""
+"""Result rows of all measurements: what was measured, its numbers and their origin."""
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import MISSING, dataclass, field, fields
-from typing import Any, Final
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, field, fields, replace
+from typing import Annotated, Any, Final
+
+from annotated_types import Ge, Lt
+from pydantic import (
+    AfterValidator,
+    AllowInfNan,
+    ConfigDict,
+    Strict,
+    TypeAdapter,
+    ValidationError,
+)
 
 from ucfrec.errors import InputError
 
-Scalar = str | int | float | bool | None
+Text = Annotated[str, Strict()]
+Number = Annotated[float, Strict(), AllowInfNan(False)]
+Whole = Annotated[int, Strict()]
+
+
+def plain(value: Any) -> Any:
+    """`value` as JSON; numbers that are not finite are None."""
+    if isinstance(value, Mapping):
+        return {str(name): plain(one) for name, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(one) for one in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _finite(value: Any) -> Any:
+    if plain(value) != value:
+        raise ValueError("every number should be finite")
+    return value
+
+
+Json = Annotated[Any, AfterValidator(_finite)]
+Seed = Annotated[int, Strict(), Ge(0), Lt(2**63)]
+Scalar = Text | Annotated[bool, Strict()] | Whole | Number | None
 
 
 @dataclass(frozen=True, kw_only=True)
 class RowKey:
     """Identifies a measurement; rows with equal keys are of the same one."""
 
-    suite: str
-    """The benchmark suite, e.g. recommendation, control, robustness, step-time."""
-    table: str
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
+    suite: Text
+    """Benchmark suite or command, e.g. recommendation, control, evaluate, off-policy."""
+    table: Text
     """Table of the suite."""
-    task: str
+    task: Text
     """Benchmark task or data file: the training data and the environment of the evaluation."""
-    method: str
+    method: Text
     """Row of the table."""
-    policy: str
-    """Learner, or built-in policy of an environment, that `method` uses."""
-    training_seed: int | None = None
-    log_seed: int | None = None
+    policy: Text
+    """Policy that `method` uses: a trained one by its kind, or a built-in one of an environment."""
+    training_seed: Seed | None = None
+    log_seed: Seed | None = None
     """Seed of simulated logs; None for real logs."""
-    evaluation_seed: int | None = None
+    evaluation_seed: Seed | None = None
     """Seed of the evaluated episodes; the same for every training seed."""
-    conditions: Mapping[str, Scalar] = field(default_factory=dict)
+    conditions: Mapping[Text, Scalar] = field(default_factory=dict)
     """Other settings of the measurement: budget, episodes, distractor, …"""
-    config_hash: str | None = None
+    config_hash: Text | None = None
     """Hash of the training configuration, which `configurations.jsonl` holds."""
-    data_fingerprint: str | None = None
+    data_fingerprint: Text | None = None
     """Fingerprint of the store."""
 
     def covers(self, row: "ResultRow") -> bool:
@@ -52,34 +88,64 @@ _KEY_FIELDS: Final = tuple(f.name for f in fields(RowKey) if f.name != "conditio
 class ResultRow(RowKey):
     """One measurement and its numbers; a line of a file of result rows is its `to_json`."""
 
-    metric: str
+    metric: Text
     """Name of the metric that tables show."""
-    metrics: Mapping[str, float]
+    metrics: Mapping[Text, Number]
     """Name to finite number, of the measured metrics only."""
-    interval: tuple[float, float] | None = None
+    interval: tuple[Number, Number] | None = None
     """95% interval of the value of `metric`, over episodes."""
-    environment: str | None = None
+    environment: Text | None = None
     """Simulator of the evaluation."""
-    checkpoint: str | None = None
+    checkpoint: Text | None = None
     """Evaluated weights, e.g. "best" or "last"."""
-    target_return: float | None = None
+    target_return: Number | None = None
     """Target return of the evaluation, in reward units."""
-    rule: str | None = None
+    rule: Text | None = None
     """How the policy acts and how its target return was chosen, in words."""
-    details: Mapping[str, Any] = field(default_factory=dict)
+    details: Mapping[Text, Json] = field(default_factory=dict)
     """JSON values other than metrics, e.g. the screening result of each dimension."""
-    wall_time_s: float | None = None
+    wall_time_s: Number | None = None
     """Wall time of the evaluation in seconds; that of the training is `train_wall_time_s`."""
-    peak_memory_mib: float | None = None
+    peak_memory_mib: Number | None = None
     """Peak resident memory of the process during the measurement, in MiB."""
-    command: str = ""
-    commit: str | None = None
-    versions: Mapping[str, str] = field(default_factory=dict)
+    command: Text = ""
+    commit: Text | None = None
+    versions: Mapping[Text, Text] = field(default_factory=dict)
 
     @property
     def value(self) -> float:
         """Value of `metric`, which tables show."""
         return self.metrics[self.metric]
+
+    def __getitem__(self, name: str) -> Any:
+        """A field, condition, metric or end of the interval by its name, as in `as_line`."""
+        return self.as_line()[name]
+
+    def extended(self, values: Mapping[str, Any], **changes: Any) -> "ResultRow":
+        """The row with further values: finite numbers are metrics, the rest that is not None are
+        details.
+
+        Args:
+            values: by name.
+            changes: other fields that change.
+        """
+        metrics = {name: float(value) for name, value in values.items() if _is_number(value)}
+        details = {
+            name: plain(value)
+            for name, value in values.items()
+            if name not in metrics and plain(value) is not None
+        }
+        return replace(
+            self,
+            metrics={**self.metrics, **metrics},
+            details={**self.details, **details},
+            **changes,
+        )
+
+    def of(self, key: RowKey) -> "ResultRow":
+        """The row as a measurement `key`, whose conditions are added to its own."""
+        own = {**self.conditions, **key.conditions}
+        return replace(self, **{**vars(key), "conditions": own})
 
     def as_line(self) -> dict[str, Any]:
         """Every field, condition and metric in one flat mapping, for tables and figures."""
@@ -101,6 +167,7 @@ class ResultRow(RowKey):
 
 
 _NESTED: Final = ("conditions", "metrics", "interval", "details", "versions")
+_ROWS: Final = TypeAdapter(ResultRow)
 
 
 def row_from_json(value: object, where: str) -> ResultRow:
@@ -115,89 +182,18 @@ def row_from_json(value: object, where: str) -> ResultRow:
     """
     if not isinstance(value, dict):
         raise InputError(f"{where} is no result row; delete it to measure it again")
-    if unknown := sorted(set(map(str, value)) - _READERS.keys()):
-        raise InputError(f"{where} is no result row: it has an unknown field {unknown[0]!r}")
-    if lacking := [name for name in _REQUIRED if name not in value]:
-        raise InputError(f"{where} is no result row: it has no {lacking[0]}")
-    given: dict[str, Any] = {}
-    for name, content in value.items():
-        try:
-            given[name] = _READERS[name](content)
-        except (TypeError, ValueError, OverflowError):
-            raise InputError(f"{where} is no result row: its {name} is {content!r:.60}") from None
-    row = ResultRow(**given)
+    try:
+        row = _ROWS.validate_python(value)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False)[0]
+        place = ".".join(map(str, first["loc"]))
+        raise InputError(f"{where} is no result row: {place!r:.60}: {first['msg']}") from None
+    except RecursionError:
+        raise InputError(f"{where} is no result row: it is nested too deeply") from None
     if row.metric not in row.metrics:
         raise InputError(f"{where} is no result row: its metrics lack {row.metric!r:.60}")
     return row
 
 
-def _text(value: object) -> str:
-    if not isinstance(value, str):
-        raise TypeError
-    return value
-
-
-def _seed(value: object) -> int:
-    if type(value) is not int or not 0 <= value < 2**63:
-        raise ValueError
-    return value
-
-
-def _number(value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise TypeError
-    if not math.isfinite(number := float(value)):
-        raise ValueError
-    return number
-
-
-def _scalar(value: object) -> Scalar:
-    if value is None or isinstance(value, (str, bool)):
-        return value
-    return value if isinstance(value, int) and abs(value) < 2**63 else _number(value)
-
-
-def _interval(value: object) -> tuple[float, float]:
-    if not isinstance(value, list):
-        raise TypeError
-    low, high = map(_number, value)
-    return low, high
-
-
-def _json(value: object) -> object:
-    """Check that every number of a JSON value is finite."""
-    if isinstance(value, list):
-        return [_json(item) for item in value]
-    if isinstance(value, dict):
-        return {_text(name): _json(item) for name, item in value.items()}
-    return _scalar(value)
-
-
-def _mapping(read: Callable[[object], object]) -> Callable[[object], dict[str, object]]:
-    def read_all(value: object) -> dict[str, object]:
-        if not isinstance(value, dict):
-            raise TypeError
-        return {_text(name): read(item) for name, item in value.items()}
-
-    return read_all
-
-
-def _optional(read: Callable[[object], object]) -> Callable[[object], object]:
-    return lambda value: None if value is None else read(value)
-
-
-_READERS: Final[Mapping[str, Callable[[object], object]]] = {
-    **dict.fromkeys(("suite", "table", "task", "method", "policy", "metric", "command"), _text),
-    **dict.fromkeys(("training_seed", "log_seed", "evaluation_seed"), _optional(_seed)),
-    **dict.fromkeys(("config_hash", "data_fingerprint"), _optional(_text)),
-    **dict.fromkeys(("environment", "checkpoint", "rule", "commit"), _optional(_text)),
-    **dict.fromkeys(("target_return", "wall_time_s", "peak_memory_mib"), _optional(_number)),
-    "conditions": _mapping(_scalar),
-    "metrics": _mapping(_number),
-    "interval": _optional(_interval),
-    "details": _mapping(_json),
-    "versions": _mapping(_text),
-}
-_REQUIRED: Final = tuple(
-    f.name for f in fields(ResultRow) if f.default is MISSING and f.default_factory is MISSING
-)
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 from ucfrec.errors import InputError
-from ucfrec.files.atomic import atomic_file
+from ucfrec.files.atomic import atomic_file, read_json, write_json
 from ucfrec.files.locks import claim, claimed, remove_leftovers
 from ucfrec.provenance import config_hash
 from ucfrec.results.row import ResultRow, RowKey, row_from_json
@@ -25,6 +25,27 @@ def read_rows(path: Path) -> list[ResultRow]:
         InputError: a line is no result row, or the file is not UTF-8 text.
     """
     return [row_from_json(value, f"{path}, line {n}") for n, value in read_lines(path)]
+
+
+def read_results(path: Path) -> list[ResultRow]:
+    """Read the rows of JSON lines, or of a JSON list (`.json`) as commands write with `--json`.
+
+    Raises:
+        InputError: the file is missing or has other content.
+    """
+    if path.suffix != ".json":
+        if not path.exists():
+            raise InputError(f"{path} does not exist; check the path")
+        return read_rows(path)
+    rows = read_json(path)
+    if not isinstance(rows, list):
+        raise InputError(f"{path} holds no list of result rows; name a file that --json wrote")
+    return [row_from_json(row, f"{path}, row {n}") for n, row in enumerate(rows, start=1)]
+
+
+def write_results(path: Path, rows: Sequence[ResultRow]) -> None:
+    """Write rows as a JSON list, for `read_results`."""
+    write_json(path, [row.to_json() for row in rows])
 
 
 def read_lines(path: Path) -> list[tuple[int, object]]:

@@ -10,7 +10,6 @@ from ucfrec.provenance import provenance
 from ucfrec.results.row import ResultRow, RowKey
 from ucfrec.runs.screened import SCREENING
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec_control.benchmark.score_rows import score_row
 from ucfrec_control.benchmark.screening_table import verdicts
 from ucfrec_control.data.distractor import CLEAN
 from ucfrec_control.data.trajectories import PACKAGES
@@ -81,8 +80,7 @@ def measure_scores(cell: Cell, row_key: RowKey) -> list[ResultRow]:
         seed=cell.evaluation.seed,
         targets=targets_of(cell),
     )
-    made = provenance(PACKAGES)
-    rows = [score_row(evaluation, row_key, **made) for evaluation in evaluations]
+    rows = [row.of(row_key) for row in evaluations]
     if not cell.evaluation.all_targets:
         return rows
     # Rows of one seed that differ in their target are measurements of their own.
@@ -107,10 +105,10 @@ def measure_robustness(cell: Cell, row_key: RowKey) -> list[ResultRow]:
         for value in ((0.0,) if cell.conditions[DISTRACTOR] == CLEAN else (0.0, 1.0))
     ]
     losses = held_out_losses(TrainedPolicy.load(cell.run, "last"), store)
-    metrics = {"score_at_one": evaluations[-1]["score"], **losses}
-    details = {SCREENING: verdicts(record[SCREENING], store)} if cell.screening else {}
-    fields = {"metrics": metrics, "details": details}
-    return [score_row(evaluations[0], row_key, **fields, **provenance(PACKAGES))]
+    more: dict[str, Any] = {"score_at_one": evaluations[-1].value, **losses}
+    if cell.screening:
+        more[SCREENING] = verdicts(record[SCREENING], store)
+    return [evaluations[0].of(row_key).extended(more)]
 
 
 def measure_rate(cell: Cell, row_key: RowKey) -> list[ResultRow]:

@@ -95,7 +95,7 @@ def screening_rows(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
     `weakest_true` is the smallest effect among the true dimensions, of each the larger one of the
     two; dimensions that were not tested are left out.
     """
-    lines = []
+    lines: list[dict[str, Any]] = []
     for row in rows:
         verdicts = row.details.get("screening")
         if verdicts is None:

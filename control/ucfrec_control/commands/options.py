@@ -4,7 +4,6 @@ import argparse
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from ucfrec.benchmark.cells import Budget
 from ucfrec.commands.grid_options import budget_options, grid_options
@@ -14,7 +13,6 @@ from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.minari import is_minari, read_minari
 from ucfrec_control.data.trajectories import Trajectories
 from ucfrec_control.environments.scores import find_task
-from ucfrec_control.learners.evaluate import NO_TARGET
 
 MAX_RETURN = "max"
 """`--target` for the largest return that the policy expects in each state."""
@@ -112,13 +110,3 @@ def _rates_given(options: argparse.Namespace) -> Mapping[str, float] | None:
     if not found:
         raise InputError(f"{options.rates} has no rates of budget {options.budget}")
     return found
-
-
-def shown_score(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A row of `evaluate_run` with its score, interval and target as text."""
-    interval = f"{row['score']:.1f} [{row['score_low']:.1f}, {row['score_high']:.1f}]"
-    target = "none" if row["rule"] == NO_TARGET else MAX_RETURN
-    if row["target_return"] is not None:
-        target = f"{row['target_return']:g}"
-    mean_return = f"{row['return']:.1f}"
-    return {**row, "score": interval, "target_return": target, "return": mean_return}

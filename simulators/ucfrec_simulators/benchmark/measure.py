@@ -9,7 +9,6 @@ from ucfrec.benchmark.cells import Cell, measured_by, opened
 from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.files.locks import claim
-from ucfrec.reporting.evaluation_rows import evaluation_row
 from ucfrec.results.row import ResultRow, RowKey
 from ucfrec.runs.describe import promised
 from ucfrec.runs.screened import SCREENING, flagged_columns, train_screened
@@ -43,31 +42,35 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
         record = train_screened(
             opened(cell), cell.run, cell.config, cell.screening, shared=cell.shared
         )
-    training_metrics, rows = _training_metrics(record), []
-    details = {} if cell.screening is None else {SCREENING: flagged_columns(record[SCREENING])}
+    about, rows = _training_metrics(record), []
+    if cell.screening is not None:
+        about[SCREENING] = flagged_columns(record[SCREENING])
     trained = TrainedPolicy.load(cell.run, CHECKPOINT)
     rule = _rule(cell, trained)
     for environment in cell.environments:
-        metrics = evaluate_policy(environment, trained, cell.method, episodes, seed, rule)
-        fields = {"checkpoint": CHECKPOINT, "rule": f"{rule} ({rule.hash})"}
-        row = _row(metrics | training_metrics, row_key, environment, **fields)
+        found = evaluate_policy(environment, trained, cell.method, episodes, seed, rule)
         # Other methods are given a rule, but do not look at its target.
-        target = row.target_return if cell.conditioned else None
-        rows.append(replace(row, details={**row.details, **details}, target_return=target))
+        target = found.target_return if cell.conditioned else None
+        row = replace(
+            _row(found, row_key, environment),
+            checkpoint=CHECKPOINT,
+            rule=f"{rule} ({rule.hash})",
+            target_return=target,
+            details={},
+        )
+        rows.append(row.extended(about))
     return rows
 
 
-def _row(
-    metrics: Mapping[str, Any], row_key: RowKey, environment: Environment, **fields: Any
-) -> ResultRow:
-    row = evaluation_row(metrics, row_key, **fields)
-    distractor = environment.rate if isinstance(environment, DistractorEnvironment) else None
-    return ResultRow(**vars(row) | {"conditions": {**row.conditions, "distractor": distractor}})
+def _row(found: ResultRow, row_key: RowKey, environment: Environment) -> ResultRow:
+    rate = environment.rate if isinstance(environment, DistractorEnvironment) else None
+    row = found.of(row_key)
+    return replace(row, conditions={**row.conditions, "distractor": rate})
 
 
-def _training_metrics(record: Mapping[str, Any]) -> dict[str, float]:
+def _training_metrics(record: Mapping[str, Any]) -> dict[str, Any]:
     """Metrics that the run's record holds about its training."""
-    metrics = {
+    metrics: dict[str, Any] = {
         "train_wall_time_s": record["wall_time_s"],
         "validation_loss": record["policy"]["best_validation"],
     }

@@ -88,6 +88,8 @@ class Budget:
     """Further settings of single methods, by name; they win over the method's own."""
     fewer_seeds: Mapping[str, int] = field(default_factory=dict)
     """Training seeds of methods and tasks that have fewer, by name."""
+    seeds_in: Mapping[str, int] = field(default_factory=dict)
+    """Training seeds of tables that have others than `seeds`."""
     tasks_of: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Tasks of tables that have others than `tasks`."""
     optional: tuple[str, ...] = ()
@@ -120,9 +122,9 @@ class Budget:
         Raises:
             InputError: `seeds` or `logs` is below 1.
         """
-        for name, number in (("--training-seeds", seeds), ("--logs", logs)):
+        for name, number in (("training seeds", seeds), ("logs", logs)):
             if number is not None and number < 1:
-                raise InputError(f"{name} is {number}; at least one is needed")
+                raise InputError(f"{number} {name} are requested; at least one is needed")
         evaluation = self.evaluation
         if evaluation_seed is not None:
             evaluation = replace(evaluation, seed=evaluation_seed)

@@ -39,8 +39,6 @@ _FEWER: Final = {
     ROBUSTNESS: MEDIUM,
     RATES: _TRIED,
 }
-_SEEDS: Final = {("small", ROBUSTNESS): 2, ("small", RATES): 1, ("full", RATES): 1}
-"""Training seeds of tables that have others than their budget, by budget and table."""
 TRIED_RATES: Final = {"small": (2e-3, 6e-3, 2e-2), "full": (1e-4, 3e-4, 1e-3)}
 """Learning rates that are tried, by the name of the budget."""
 BUDGETS: Final = {
@@ -52,6 +50,7 @@ BUDGETS: Final = {
         tasks=ZOO,
         tasks_of={**_FEWER, LAMBDA: _SWEPT},
         seeds=4,
+        seeds_in={ROBUSTNESS: 2, RATES: 1},
         evaluation=Evaluation(episodes=20, seed=1000),
         settings=(
             "train.steps=4000",
@@ -88,6 +87,7 @@ BUDGETS: Final = {
         optional=ANTMAZE,
         tasks_of=_FEWER,
         seeds=5,
+        seeds_in={RATES: 1},
         evaluation=Evaluation(episodes=100, seed=1000, all_targets=True),
         of_policies=dict.fromkeys(ALGORITHMS, ("steps=1000000",)),
         of_methods=_longer(100_000),
@@ -105,6 +105,6 @@ def budget_of(table: str, name: str) -> Budget:
         budget,
         tasks=budget.tasks_in(table),
         tasks_of={},
-        seeds=_SEEDS.get((name, table), budget.seeds),
+        seeds=budget.seeds_in.get(table, budget.seeds),
         evaluation=replace(budget.evaluation, all_targets=every),
     )

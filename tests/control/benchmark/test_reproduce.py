@@ -64,7 +64,7 @@ def test_one_command_makes_a_figure_and_says_beforehand_how_long(
     assert main(arguments) == 0
     said = capsys.readouterr().err
     assert "reproduce figure-5: 1 cells, 1 of them left to measure" in said
-    assert "reproduce figure-5: about 0.0 hours here with --workers 1" in said
+    assert "reproduce figure-5: about 0.0 hours with --workers 1" in said
     assert {row.method for row in read_rows(tmp_path / "out" / "results.jsonl")} == {"ucf"}
     assert list((tmp_path / "out" / "figure-5").glob("moves-*.png"))
 

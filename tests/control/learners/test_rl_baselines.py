@@ -93,7 +93,7 @@ def test_equal_seeds_train_equal_actors_that_are_judged_as_others_are(
     assert a == b != c
     (row,) = evaluate_run(tmp_path / "a", episodes=2, seed=0)
     assert (row["method"], row["checkpoint"], row["target_return"]) == (algorithm, "last", None)
-    assert row["fingerprint"] == store.meta["fingerprint"]
+    assert row.data_fingerprint == store.meta["fingerprint"]
     capsys.readouterr()
     asked = ["evaluate", str(tmp_path / "a"), "--episodes", "2"]
     assert main(asked) == 0

@@ -107,8 +107,8 @@ def row(environment: str, policy: str, value: float, **more: Any) -> ResultRow:
 
 def estimate(name: str, value: float, policy: str = "ucf", **more: Any) -> ResultRow:
     """A row of `ucfrec ope`; `more` are metrics, conditions, details and other fields."""
-    given = {"suite": SUITE, "task": "logs", "environment": None, "policy": policy}
-    return row("", name, value, **given | more)
+    given = {"suite": SUITE, "task": "logs", "policy": policy}
+    return row("logs", name, value, **given | more)
 
 
 def number(cell: str) -> float:

@@ -24,11 +24,10 @@ from typing import Any
 import httpx
 import numpy as np
 
-from ucfrec.code_version import code_version
 from ucfrec.provenance import provenance
-from ucfrec.reporting.result_row import ResultRow
-from ucfrec.reporting.rows_file import append_rows
 from ucfrec.reporting.tables import markdown_table
+from ucfrec.results.row import ResultRow
+from ucfrec.results.rows_file import append_rows
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 RESULTS = Path("runs/serve_load/results.jsonl")
@@ -144,7 +143,6 @@ def main() -> None:
                     "threads": options.threads,
                     "seconds": options.seconds,
                 },
-                code_version=code_version(Path(__file__), "ucfrec.recommending.web"),
                 data_fingerprint=trained.record.get("fingerprint"),
                 metric="rate",
                 metrics=found,

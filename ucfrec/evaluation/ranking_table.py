@@ -11,7 +11,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.ranking import MEASURES, Period, compare, rank_steps, rankers_named
 from ucfrec.evaluation.ranking_baselines import PolicyRanker, RewardRanker, baselines
-from ucfrec.provenance import provenance
+from ucfrec.provenance import config_hash, provenance
 from ucfrec.results.row import ResultRow
 from ucfrec.runs.trained_policy import TrainedPolicy, store_of
 
@@ -74,7 +74,7 @@ def ranking_rows(
     period = Period.of(later, np.asarray(users))
     ranked = {name: rank_steps(ranker, later, k, period.users) for name, ranker in named.items()}
     reference = next(iter(named))
-    rules = dict(zip(named, (policy.rule for policy in policies), strict=False))
+    own = dict(zip(named, policies, strict=False))
     shared: dict[str, Any] = {
         "suite": SUITE,
         "table": SUITE,
@@ -95,8 +95,15 @@ def ranking_rows(
     rows = []
     for one in compare(period, ranked, k, reference, seed):
         row = ResultRow(method=one.name, policy=one.name, **shared)
-        if rule := rules.get(one.name):
-            row = row.extended({"decision_rule": rule.as_dict()}, rule=rule.hash)
+        if one.name in own:
+            rule, record = own[one.name].rule, own[one.name].trained.record
+            row = row.extended(
+                {"decision_rule": rule.as_dict()},
+                rule=rule.hash,
+                policy=record["config"]["policy_name"],
+                training_seed=record["seed"],
+                config_hash=config_hash(record["config"]),
+            )
         low, high = one.intervals[METRIC]
         interval = (low, high) if math.isfinite(low) and math.isfinite(high) else None
         measured = {

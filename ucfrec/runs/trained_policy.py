@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import Decider, DecisionRule
@@ -19,7 +18,6 @@ from ucfrec.acting.session_scorer import SessionScorer
 from ucfrec.arrays import Array, Float32Array, IntArray
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.item_counts import TrainingCounts
-from ucfrec.episodes.main_tags import MainTags
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
@@ -27,12 +25,13 @@ from ucfrec.errors import InputError, InputNote, damage_explained
 from ucfrec.files.atomic import read_json
 from ucfrec.files.checksums import sealed_record
 from ucfrec.files.parquet import read_ids
-from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors
+from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors, load_trained
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
 from ucfrec.runs.config import config_from_dict
 from ucfrec.runs.record import is_of_store, require_run_record
+from ucfrec.user_model.main_tags import MainTags
 from ucfrec.user_model.reward import FITTED, ItemRewardModel
 
 if TYPE_CHECKING:
@@ -107,7 +106,7 @@ class TrainedPolicy:
         )
         with random_state_kept():
             build = lambda: learner(config.policy, record["sizes"])  # noqa: E731
-            policy = load_module(path, build, _weights(path))
+            policy = load_module(path, build, load_trained(path))
         policy.eval()
         states = run / ITEM_STATES
         trained = cls(
@@ -373,11 +372,6 @@ def learner_of(record: Mapping[str, Any]) -> str:
     if augmented == policy_class(config.policy_name).augmented:
         return config.policy_name
     return f"{config.policy_name}-{'augmented' if augmented else 'no-augmentation'}"
-
-
-def _weights(path: Path) -> dict[str, Tensor]:
-    tensors, _ = load_tensors(path)
-    return {name: t for name, t in tensors.items() if not name.startswith("optimizer.")}
 
 
 def _rule(path: Path) -> DecisionRule:

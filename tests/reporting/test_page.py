@@ -119,7 +119,7 @@ def test_runs_on_other_data_are_not_compared(runs: Path, tmp_path: Path) -> None
 
 def test_the_page_stands_alone(runs: Path, tmp_path: Path) -> None:
     results = tmp_path / "rows.json"
-    results.write_text(json.dumps([row("taobao", "ucf", 3.0)]))
+    write_results(results, [row("taobao", "ucf", 3.0)])
     page = page_of(tmp_path / "report.html", runs / "ucf", results=(results,))
     assert not [given for _, given in page.elements if given.keys() & {"src", "href", "xlink:href"}]
     assert not {tag for tag, _ in page.elements} & {"script", "link", "iframe", "object", "img"}
@@ -141,7 +141,7 @@ def test_names_from_outside_are_shown_and_never_run(runs: Path, tmp_path: Path) 
     record["reward"] = HOSTILE
     (hostile / "run.json").write_text(json.dumps(record))
     results = tmp_path / "rows.jsonl"
-    results.write_text(json.dumps(row(HOSTILE, HOSTILE, 1.0)) + "\n")
+    append_rows(results, [row(HOSTILE, HOSTILE, 1.0)])
     page = page_of(tmp_path / "report.html", hostile, results=(results,))
     tags = {tag for tag, _ in page.elements}
     assert not tags & {"script", "img"}

@@ -375,7 +375,7 @@ def test_ope_estimates_propensities_if_asked_and_says_so(
     printed = capsys.readouterr().out
     assert {"IPS", "DR"} <= set(rows)
     assert f"with the propensities of {len(log):,} steps estimated (held-out loss" in printed
-    assert rows["DR"]["declared"].startswith("with the propensities of")
+    assert rows["DR"].details["declared"].startswith("with the propensities of")
     assert rows["DR"]["wanted_lift"] == 0.5
     assert "name the least one first" in refused([*arguments, "--reward-range", "1", "0"], capsys)
 

@@ -98,10 +98,10 @@ def rewritten(run: Path, to: Path, **changes: Any) -> Path:
     return to
 
 
-def row(environment: str, policy: str, value: float, **more: Any) -> ResultRow:
+def row(environment: str, name: str, value: float, **more: Any) -> ResultRow:
     """A row of `ucfrec evaluate`: of a built-in policy without `training_seed`."""
     given = {"suite": "evaluate", "table": "evaluate", "training_seed": None, "checkpoint": None}
-    given |= {"task": environment, "environment": environment, "method": policy, "policy": policy}
+    given |= {"task": environment, "environment": environment, "method": name, "policy": name}
     return result_row(value, **given | {"interval": (value - 0.5, value + 1.5)} | more)
 
 

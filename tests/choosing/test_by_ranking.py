@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.support.tagged import tagged_log, tagged_mapping
-from ucfrec.acting.logged_decisions import session_scores
+from ucfrec.acting.scorer import logged_scores
 from ucfrec.choosing.by_ranking import SHOWN
 from ucfrec.episodes.item_counts import liked_steps
 from ucfrec.episodes.store import EpisodeStore
@@ -34,10 +34,10 @@ def test_all_reward_weights_at_once_are_judged_as_each_rule_alone(tmp_path: Path
     candidates = read_json(tmp_path / "run" / "run.json")["rule"]["candidates"]
     assert len({each["rule"]["reward_weight"] for each in candidates}) == len(candidates) > 2
     for each in candidates:
-        decider = trained.decider(
+        scorer = trained.scorer(
             replace(trained.rule, reward_weight=each["rule"]["reward_weight"])
         )
-        scores = session_scores(decider, validation, episodes, steps)
+        scores = logged_scores(scorer, validation, episodes, steps)
         top = scores.topk(SHOWN).indices.numpy()
         hits = (top == items[:, None]).any(1)[liked].mean()
         assert each["hits"] == pytest.approx(float(np.asarray(hits)), abs=1e-9)

@@ -11,8 +11,9 @@ import pytest
 import torch
 
 from tests.support.tagged import tagged_store
-from ucfrec.acting.decision import Decider, DecisionRule
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
+from ucfrec.acting.scorer import Scorer
 from ucfrec.acting.rollout import rollout
 from ucfrec.choosing.by_ranking import choose_by_ranking
 from ucfrec.choosing.by_simulation import RuleSearch, calibrate, choose_rule
@@ -53,19 +54,26 @@ def trained(folder: Path) -> TrainedPolicy:
     return TrainedPolicy.load(folder / "run")
 
 
-def with_bias(trained: TrainedPolicy, bias: torch.Tensor) -> Decider:
+def with_bias(
+    trained: TrainedPolicy,
+    bias: torch.Tensor,
+    store: EpisodeStore | None = None,
+    model: ItemRewardModel | None = None,
+) -> Scorer:
     """A policy that shows items, (24,), by another bias; its run is not changed."""
-    decider = trained.decider(DecisionRule(2.0))
-    policy = copy.deepcopy(decider.policy)
+    policy = copy.deepcopy(trained.policy)
     with torch.no_grad():
         assert isinstance(policy.head, ItemHead)
         policy.head.bias.copy_(bias)
-    return replace(decider, policy=policy)
+    states = trained.item_states if store is None else store.item_states
+    return Scorer(
+        policy, DecisionRule(2.0), states, trained.returns, model or trained.reward_model
+    )
 
 
 def search_of(folder: Path, trained: TrainedPolicy, config: RuleConfig = FEW) -> RuleSearch:
     views = training_views(EpisodeStore.open(folder / "store"))
-    return RuleSearch(trained.decider(DecisionRule(2.0)), *views, config, seed=0)
+    return RuleSearch(trained.scorer(DecisionRule(2.0)), *views, config, seed=0)
 
 
 def test_a_run_acts_by_the_rule_that_it_chose_and_says_how(
@@ -110,7 +118,7 @@ def test_rules_played_side_by_side_do_what_each_does_alone(
     search = search_of(folder, trained)
     rules = [
         DecisionRule(2.0, temperature=1.0),
-        DecisionRule(1.0, floor=1.0, reward_weight=2.0, temperature=0.5),
+        DecisionRule(1.0, minimum_target=1.0, reward_weight=2.0, temperature=0.5),
         DecisionRule(3.0, tag_window=3),
         DecisionRule(3.0, reward_weight=4.0, tag_window=2, temperature=2.0),
     ]
@@ -124,9 +132,9 @@ def test_rules_played_side_by_side_do_what_each_does_alone(
     users = np.arange(len(validation.item_states.user_features))
     for rule, candidate in zip(rules, together, strict=True):
         # A session a row, with sessions that begin anew and rows that are no longer live.
-        decider = replace(trained.decider(rule), likeness=Likeness.of(validation.item_states))
+        scorer = trained.scorer(rule)
         actor = PolicyActor(
-            *(decider, n, validation.observation_size, validation.item_states, None, users), seed=0
+            *(scorer, n, validation.observation_size, validation.item_states, None, users), seed=0
         )
         alone = rollout(environment, actor, n, 0)  # type: ignore[arg-type]
         assert candidate.value == pytest.approx(float(alone.returns.mean()), abs=1e-9)
@@ -168,14 +176,14 @@ def test_calibration_undoes_a_stretched_and_shifted_score(folder: Path) -> None:
 def test_every_kind_of_candidate_is_played(folder: Path, trained: TrainedPolicy) -> None:
     views = training_views(EpisodeStore.open(folder / "store"))
     targets = {quantile: trained.target_return(quantile) for quantile in FEW.quantiles}
-    found = choose_rule(trained.decider(DecisionRule(2.0)), targets, *views, FEW, 0)
+    found = choose_rule(trained.scorer(DecisionRule(2.0)), targets, *views, FEW, 0)
     rules = [candidate.rule for candidate in found.candidates]
     assert len(set(rules)) == len(rules)
     assert {rule.temperature for rule in rules} == set(FEW.temperatures)
     assert {rule.reward_weight for rule in rules} == set(FEW.reward_weights)
     together = {(rule.tag_window, rule.reward_weight) for rule in rules}
     assert together == set(product((0, 3, 10), FEW.reward_weights))
-    assert {rule.floor is None for rule in rules} == {True, False}
+    assert {rule.minimum_target is None for rule in rules} == {True, False}
 
 
 def test_what_the_log_supports_only_without_recent_tags_is_found(
@@ -202,16 +210,16 @@ def test_users_who_tire_are_shown_no_longer_runs(tmp_path: Path, trained: Traine
     train, validation = training_views(store)
     model, _ = fit_item_reward_model(train, validation, tmp_path / "model", 0)
     one_tag = torch.where(torch.arange(24) % 4 == 0, 9.0, 0.0)
-    decider = replace(with_bias(trained, one_tag), reward_model=model)
+    scorer = with_bias(trained, one_tag, store, model)
     config = replace(FEW, tag_windows=(0,), temperatures=(1.0,), reward_weights=(0.0,))
-    found = choose_rule(decider, {0.9: 2.0, 1.0: 3.0}, train, validation, config, 0)
+    found = choose_rule(scorer, {0.9: 2.0, 1.0: 3.0}, train, validation, config, 0)
     assert found.fatigue is not None
     assert (found.fatigue.length, found.fatigue.steps) == (3, 4)
     assert found.rule.tag_run == 2
     runs = {candidate.rule.tag_run for candidate in found.candidates}
     assert runs == set(FEW.tag_runs)
     none = replace(config, tag_runs=(0,))
-    unlimited = choose_rule(decider, {0.9: 2.0, 1.0: 3.0}, train, validation, none, 0)
+    unlimited = choose_rule(scorer, {0.9: 2.0, 1.0: 3.0}, train, validation, none, 0)
     assert {candidate.rule.tag_run for candidate in unlimited.candidates} == {0}
     assert found.as_dict()["fatigue"]["length"] == 3
 
@@ -261,8 +269,8 @@ def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_pat
     # The chosen rule was played again in four times the sessions.
     views = training_views(store)
     tastes = fit_training_users(views[0], tmp_path / "run" / TRAINING_USERS, config.seed)
-    decider = trained.decider(DecisionRule(2.0))
-    more = RuleSearch(decider, *views, replace(config.rule, sessions=160), config.seed, tastes)
+    scorer = trained.scorer(DecisionRule(2.0))
+    more = RuleSearch(scorer, *views, replace(config.rule, sessions=160), config.seed, tastes)
     (played,) = more.play([trained.rule])
     assert promised(record["rule"]) == (played.value, played.error)
 
@@ -274,9 +282,9 @@ def test_of_rules_that_the_model_cannot_tell_apart_the_widest_draws_are_taken(
     train, validation = training_views(store)
     model, _ = fit_item_reward_model(train, validation, tmp_path / "model", 0)
     one_tag = torch.where(torch.arange(24) % 4 == 0, 9.0, 0.0)
-    decider = replace(with_bias(trained, one_tag), reward_model=model)
+    scorer = with_bias(trained, one_tag, store, model)
     config = replace(FEW, tag_windows=(0,), tolerance=0.1)
-    found = choose_rule(decider, {0.9: 2.0, 1.0: 3.0}, train, validation, config, 0)
+    found = choose_rule(scorer, {0.9: 2.0, 1.0: 3.0}, train, validation, config, 0)
     rule = found.rule
     assert rule.tag_run > 0
     same_run = [each for each in found.candidates if each.rule.tag_run == rule.tag_run]
@@ -321,9 +329,9 @@ def test_reward_weights_below_the_first_that_overlaps_too_little_are_ranked_too(
 ) -> None:
     views = training_views(EpisodeStore.open(folder / "store"))
     liked = TrainingCounts.of(views[0]).liked.topk(10).indices
-    decider = with_bias(trained, torch.zeros(24).index_fill(0, liked, 50.0))
+    scorer = with_bias(trained, torch.zeros(24).index_fill(0, liked, 50.0))
     few = RuleConfig(reward_weights=(0.0, 1000.0))
-    found = choose_by_ranking(decider, *views, few, 0)
+    found = choose_by_ranking(scorer, *views, few, 0)
     reward_weights = [each.rule.reward_weight for each in found.candidates]
     assert reward_weights[:2] == [0.0, 1000.0]
     assert found.candidates[1].gain < 0
@@ -342,8 +350,8 @@ def test_a_rule_without_overlap_has_no_reward_weight_and_says_so(
 ) -> None:
     views = training_views(EpisodeStore.open(folder / "store"))
     liked = TrainingCounts.of(views[0]).liked.topk(10).indices
-    decider = with_bias(trained, torch.zeros(24).index_fill(0, liked, -1e4))
-    found = choose_by_ranking(decider, *views, RuleConfig(reward_weights=(0.0, 1.0)), 0)
+    scorer = with_bias(trained, torch.zeros(24).index_fill(0, liked, -1e4))
+    found = choose_by_ranking(scorer, *views, RuleConfig(reward_weights=(0.0, 1.0)), 0)
     assert not found.supported
     assert found.rule.reward_weight == 0
     assert "WARNING" in found.as_dict()["warning"]

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from tests.policies.test_ucf import CATALOG, ITEMS, SMALL, VECTORS, K, other, random_windows
-from ucfrec.acting.decision import Decider, DecisionRule
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.scorer import Scorer
 from ucfrec.episodes.exposure import Exposed
 from ucfrec.episodes.states import ItemStates
 from ucfrec.errors import InputError
@@ -67,9 +68,9 @@ def test_every_learner_trains_and_acts_with_the_additions(name: str, sizes: dict
     assert {"action_loss", "value_loss"} <= scalars.keys()
     assert scalars["value_loss"] < before["value_loss"]
     assert torch.isfinite(policy.action_loss(windows))
-    collected = torch.tensor([0.0, 1.0, 2.0]).double()
+    history = history_of(windows, torch.tensor([0.0, 1.0, 2.0]).double())
     for rule in (DecisionRule(None), DecisionRule(2.0)):
-        assert torch.isfinite(Decider(policy, rule).act(windows, collected)).all()
+        assert torch.isfinite(Scorer(policy, rule).act(history)).all()
     if sizes["items"]:
         term = policy.head.exposure  # type: ignore[union-attr]
         moved = torch.cat([parameter.flatten() for parameter in term.parameters()])

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.acting.decision import Decider, DecisionRule
-from ucfrec.acting.logged_decisions import LoggedDecisions
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.scorer import Scorer, logged_history
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.choosing.config import RuleConfig
 from ucfrec.episodes.item_counts import TrainingCounts, liked_steps
@@ -73,12 +73,12 @@ class RankedChoice:
 
 
 def choose_by_ranking(
-    decider: Decider, train: EpisodeStore, validation: EpisodeStore, config: RuleConfig, seed: int
+    scorer: Scorer, train: EpisodeStore, validation: EpisodeStore, config: RuleConfig, seed: int
 ) -> RankedChoice:
-    """Choose the reward weight of the rule of `decider`; its other parts stay.
+    """Choose the reward weight of the rule of `scorer`; its other parts stay.
 
     Args:
-        decider: the policy under its default rule, with a reward model.
+        scorer: the policy under its default rule, with a reward model.
         train: training episodes.
         validation: validation episodes.
         config: `reward_weights` are the first candidates.
@@ -105,10 +105,10 @@ def choose_by_ranking(
 
     def rank(reward_weights: Sequence[float]) -> None:
         for reward_weight, top in zip(
-            reward_weights, _tops(decider, reward_weights, given), strict=True
+            reward_weights, _tops(scorer, reward_weights, given), strict=True
         ):
             candidates.append(
-                _ranked(replace(decider.rule, reward_weight=reward_weight), top, given)
+                _ranked(replace(scorer.rule, reward_weight=reward_weight), top, given)
             )
 
     rank(reward_weights)
@@ -144,38 +144,24 @@ class _Rows:
 
 
 @torch.no_grad()
-def _tops(decider: Decider, reward_weights: Sequence[float], rows: _Rows) -> list[IntArray]:
+def _tops(scorer: Scorer, reward_weights: Sequence[float], rows: _Rows) -> list[IntArray]:
     """The items (M, `SHOWN`) that are shown with each reward weight.
 
     Policy and reward model are computed once for all reward weights.
     """
-    plain, tops = (
-        replace(decider, rule=replace(decider.rule, reward_weight=0.0)),
-        list[list[Tensor]](),
-    )
+    scorers = [scorer.under(replace(scorer.rule, reward_weight=each)) for each in reward_weights]
+    tops = list[list[Tensor]]()
     starts = range(0, len(rows.steps), _AT_ONCE)
     with progress(len(rows.steps), "choose the rule", "rows") as bar:
         for first in starts:
             part = slice(first, first + _AT_ONCE)
-            known = LoggedDecisions.at(plain, rows.store, rows.episodes[part], rows.steps[part])
-            logits = plain.act(known.windows, known.collected)
-            liked = (
-                plain.rewards(known.windows, known.users, known.shown)
-                if any(reward_weights)
-                else 0.0
-            )
-            of_reward_weights = []
-            for reward_weight in reward_weights:
-                scores = plain.scores_from(
-                    logits + reward_weight * liked,
-                    known.windows,
-                    known.forbidden,
-                    known.users,
-                    known.shown,
-                )
-                of_reward_weights.append(scores.topk(min(SHOWN, scores.shape[1])).indices)
-            tops.append(of_reward_weights)
-            bar.update(len(logits))
+            episodes, steps = rows.episodes[part], rows.steps[part]
+            known, seen = logged_history(scorer, rows.store, episodes, steps)
+            history = scorer.with_target(known)
+            query = scorer.query(history, rewards=any(reward_weights))
+            scores = (each.scores_of(query, history, excluded=seen) for each in scorers)
+            tops.append([each.topk(min(SHOWN, each.shape[1])).indices for each in scores])
+            bar.update(len(steps))
     return [torch.cat(parts).numpy() for parts in zip(*tops, strict=True)]
 
 

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from ucfrec.acting.decision import Decider, DecisionRule
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.choosing.config import RuleConfig
 from ucfrec.choosing.many_rules import ManyRules
@@ -110,7 +111,7 @@ class RuleSearch:
 
     def __init__(
         self,
-        decider: Decider,
+        scorer: Scorer,
         train: EpisodeStore,
         validation: EpisodeStore,
         config: RuleConfig,
@@ -119,7 +120,7 @@ class RuleSearch:
     ) -> None:
         """
         Args:
-            decider: the policy under its default rule, with a reward model.
+            scorer: the policy under its default rule, with a reward model.
             train: training episodes, to which the model of the ends is fitted.
             validation: sessions to begin, and to calibrate the reward model on.
             config: candidates and conditions.
@@ -127,16 +128,13 @@ class RuleSearch:
             users: whose training sessions are begun instead, and whose tastes give the rewards;
                 None for the reward model's word.
         """
-        assert decider.reward_model is not None
-        self._decider, self._config, self._seed = decider, config, seed
-        model = decider.reward_model
+        assert scorer.reward_model is not None
+        self._scorer, self._config, self._seed = scorer, config, seed
+        model = scorer.reward_model
         require_blas_memory()
         states = validation.item_states
-        self._likeness = likeness = Likeness.of(states)
-        self._tags = MainTags.of(states)
-        logged = (
-            LoggedRuns.of(v, self._tags, model.lags, _MOST_STEPS) for v in (train, validation)
-        )
+        likeness, tags = Likeness.of(states), MainTags.of(states)
+        logged = (LoggedRuns.of(v, tags, model.lags, _MOST_STEPS) for v in (train, validation))
         self.fatigue = fit_fatigue(*logged) if model.binary else None
         end = SessionEnd(likeness, LoggedEnds.of(train, model.lags, _MOST_STEPS, seed))
         self._longest, self.end = int(train.lengths.max()), end
@@ -164,11 +162,10 @@ class RuleSearch:
             *(self._store, self._model, self.calibration, self.end, n, self._longest, count),
             self.fatigue,
         )
-        filtering = replace(self._decider, likeness=self._likeness, main_tags=self._tags)
-        deciders = [replace(filtering, rule=rule) for rule in rules]
+        scorers = [self._scorer.under(rule) for rule in rules]
         users = np.arange(len(self._store.item_states.user_features))
         states = self._store.item_states
-        actor = ManyRules(deciders, n, self._store.observation_size, states, users, seed=self._seed)
+        actor = ManyRules(scorers, n, self._store.observation_size, states, users, seed=self._seed)
         returns, lengths, shown = _played(environment, actor, self._seed)
         numbers = np.arange(count * n).reshape(count, n)
         return [
@@ -249,7 +246,7 @@ def _played(
 
 
 def choose_rule(
-    decider: Decider,
+    scorer: Scorer,
     targets: Mapping[float, float],
     train: EpisodeStore,
     validation: EpisodeStore,
@@ -257,7 +254,7 @@ def choose_rule(
     seed: int,
     users: TrainingUsers | None = None,
 ) -> Choice:
-    """Choose target, floor and temperature, then the reward weight.
+    """Choose target, minimum target and temperature, then the reward weight.
 
     Where items have tags, tag window and temperature follow, and the reward weight with the
     window; where the log shows fatigue, the tag run, and temperature and reward weight with it.
@@ -266,7 +263,7 @@ def choose_rule(
     the log.
 
     Args:
-        decider: the policy under its default rule, with a reward model.
+        scorer: the policy under its default rule, with a reward model.
         targets: return (reward units) of each quantile in `config.quantiles`.
         train: training episodes.
         validation: validation episodes.
@@ -274,14 +271,14 @@ def choose_rule(
         seed: of the sessions and the draws.
         users: see `RuleSearch`.
     """
-    search = RuleSearch(decider, train, validation, config, seed, users)
-    learned = decider.policy.values is not None and decider.policy.config.max_return
+    search = RuleSearch(scorer, train, validation, config, seed, users)
+    learned = scorer.policy.values is not None and scorer.policy.config.max_return
     played = search.play([*_unweighted(config, targets, learned)])
     first = search.best(played)
     played.extend(search.play([*_weighted(config, first.rule)]))
     second = search.best(_simplest_first(played))
     if validation.item_states.tags.shape[1]:
-        if filtered := search.play([*_filtered(config, second.rule, decider.known)]):
+        if filtered := search.play([*_filtered(config, second.rule, scorer.known)]):
             third = search.best(_simplest_first(filtered)).rule
             windows = {each.rule.tag_window for each in filtered}
             others = (replace(third, tag_window=window) for window in sorted(windows))
@@ -350,7 +347,7 @@ def _unweighted(
     for temperature in sorted(config.temperatures, reverse=True):
         for target in dict.fromkeys(targets[quantile] for quantile in config.quantiles):
             yield DecisionRule(target, temperature=temperature)
-            yield DecisionRule(target, floor=target, temperature=temperature)
+            yield DecisionRule(target, minimum_target=target, temperature=temperature)
         if learned:
             yield DecisionRule(None, temperature=temperature)
 

@@ -1,16 +1,16 @@
 """Several decision rules of one policy, played side by side."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ucfrec.acting.decision import Decider
 from ucfrec.acting.policy_actor import PolicyActor
+from ucfrec.acting.scorer import Scorer
+from ucfrec.acting.sessions import History
 from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Windows
@@ -28,7 +28,7 @@ class ManyRules(PolicyActor):
 
     def __init__(
         self,
-        deciders: Sequence[Decider],
+        scorers: Sequence[Scorer],
         episodes: int,
         observation_size: int,
         item_states: ItemStates,
@@ -37,18 +37,18 @@ class ManyRules(PolicyActor):
     ) -> None:
         """
         Args:
-            deciders: C rules of the same policy of items; none leaves out seen items.
+            scorers: C rules of the same policy of items; none leaves out seen items.
             episodes: n, number of episodes of each rule.
             observation_size: see `PolicyActor`.
             item_states: see `PolicyActor`.
             user_ids: see `PolicyActor`.
             seed: of the draws of each rule.
         """
-        rows = len(deciders) * episodes
-        super().__init__(deciders[0], rows, observation_size, item_states, None, user_ids, seed)
-        self._deciders = deciders
-        self._generators = [torch.Generator().manual_seed(seed) for _ in deciders]
-        self._rule = np.repeat(np.arange(len(deciders)), episodes)
+        rows = len(scorers) * episodes
+        super().__init__(scorers[0], rows, observation_size, item_states, None, user_ids, seed)
+        self._scorers = scorers
+        self._generators = [torch.Generator().manual_seed(seed) for _ in scorers]
+        self._rule = np.repeat(np.arange(len(scorers)), episodes)
 
     def keep(self, rows: IntArray) -> None:
         """Forget all episodes but those of `rows`, which become the only environments."""
@@ -56,27 +56,26 @@ class ManyRules(PolicyActor):
         self._rule = self._rule[rows]
 
     def _decided(
-        self, rows: Tensor, windows: Windows, collected: Tensor, *given: Any
+        self, rows: Tensor, history: History, excluded: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         decided = []
         for rules, ends in self._batches(self._rule[rows.numpy()]):
-            parts = [slice(*pair) for pair in pairwise(ends)]
-            asked = [
-                self._deciders[rule].asked(_at(windows, part), collected[part])
+            parts = [history.at(slice(*pair)) for pair in pairwise(ends)]
+            aimed = [
+                self._scorers[rule].with_target(part).windows
                 for rule, part in zip(rules, parts, strict=True)
             ]
-            logits = self._policy.act(_joined(asked).to(self._policy.state_mean.device)).cpu()
-            of_rules = torch.split(logits, [len(each.mask) for each in asked])
-            for rule, part, window, values in zip(rules, parts, asked, of_rules, strict=True):
-                decider, (forbidden, users, shown) = self._deciders[rule], given
-                scores = decider.scores_from(
-                    values,
-                    window,
-                    None if forbidden is None else forbidden[part],
-                    None if users is None else users[part],
-                    None if shown is None else shown.at(part),
+            together = replace(history.at(slice(ends[0], ends[-1])), windows=Windows.joined(aimed))
+            weighted = any(self._scorers[rule].rule.reward_weight for rule in rules)
+            query = self._scorer.query(together, rewards=weighted)
+            for rule, part, (first, last) in zip(rules, parts, pairwise(ends), strict=True):
+                scorer = self._scorers[rule]
+                scores = scorer.scores_of(
+                    query.at(slice(first - ends[0], last - ends[0])),
+                    part,
+                    excluded=None if excluded is None else excluded[first:last],
                 )
-                decided.append(decider.rule.choose(scores, self._generators[rule]))
+                decided.append(scorer.rule.choose(scores, self._generators[rule]))
         items, chances = zip(*decided, strict=True)
         return torch.cat(items), torch.cat(chances)
 
@@ -94,14 +93,3 @@ class ManyRules(PolicyActor):
                 batch, ends = [], [ends[-1]]
             batch, ends = [*batch, number], [*ends, end]
         yield batch, ends
-
-
-def _at(windows: Windows, rows: slice) -> Windows:
-    columns = {each.name: getattr(windows, each.name)[rows] for each in fields(windows)}
-    return replace(windows, **columns)
-
-
-def _joined(parts: Sequence[Windows]) -> Windows:
-    return Windows(
-        *(torch.cat([getattr(part, each.name) for part in parts]) for each in fields(Windows))
-    )

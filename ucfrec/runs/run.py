@@ -12,7 +12,8 @@ import numpy as np
 import torch
 
 from ucfrec import schema
-from ucfrec.acting.decision import Decider, DecisionRule
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import Float32Array
 from ucfrec.choosing.by_ranking import RankedChoice, choose_by_ranking
 from ucfrec.choosing.by_simulation import Choice, choose_rule
@@ -385,7 +386,7 @@ def _rule(
     model, report = fit()  # read from the folder
     trained = TrainedPolicy.load(out, in_training=True)
     targets = {quantile: trained.target_return(quantile) for quantile in config.rule.quantiles}
-    decider = Decider(policy, trained.rule, trained.returns, model)
+    scorer = Scorer(policy, trained.rule, trained.item_states, trained.returns, model)
     choice: Choice | RankedChoice
     if trained.returns.per_session:
         users = None
@@ -393,9 +394,9 @@ def _rule(
             like = partial(fit_training_users, train, out / TRAINING_USERS, config.seed)
             shared.provide(inputs, fit_training_users.__module__, out, (TRAINING_USERS,), like)
             users = like()  # read from the file
-        choice = choose_rule(decider, targets, train, validation, config.rule, config.seed, users)
+        choice = choose_rule(scorer, targets, train, validation, config.rule, config.seed, users)
     else:
-        choice = choose_by_ranking(decider, train, validation, config.rule, config.seed)
+        choice = choose_by_ranking(scorer, train, validation, config.rule, config.seed)
     write_json(out / RULE, choice.rule.as_dict())
     return dataclasses.asdict(report), choice.as_dict()
 
@@ -404,4 +405,4 @@ def _write_samples(out: Path, validation: EpisodeStore) -> None:
     """Save a few recommendations for the report, by the run's decision rule."""
     if validation.has_items:
         trained = TrainedPolicy.load(out, in_training=True)
-        write_json(out / SAMPLES, sample_recommendations(trained.decider(), validation))
+        write_json(out / SAMPLES, sample_recommendations(trained.scorer(), validation))

@@ -14,7 +14,8 @@ from tests.support.served import learn_tastes
 from tests.support.tagged import ITEMS, tagged_log, tagged_store
 from ucfrec import EpisodeStore, Recommender
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.logged_decisions import LoggedDecisions, seen_before, session_scores
+from ucfrec.acting.scorer import logged_history, logged_scores
+from ucfrec.acting.sessions import seen_before
 from ucfrec.evaluation.ranking import Steps
 from ucfrec.evaluation.ranking_baselines import PolicyRanker
 from ucfrec.logs import LogMapping
@@ -33,7 +34,7 @@ SETTINGS = {
 }  # fmt: skip
 RULES = {
     "target": DecisionRule(3.0, temperature=1.0),
-    "floor": DecisionRule(1.0, floor=0.5, temperature=0.7),
+    "minimum": DecisionRule(1.0, minimum_target=0.5, temperature=0.7),
     "best": DecisionRule(3.0),
     "learned": DecisionRule(None, temperature=1.0),
     "filters": DecisionRule(3.0, temperature=2.0, top_k=9, exclude_seen=True, tag_window=2),
@@ -85,15 +86,12 @@ def test_logged_sessions_are_read_as_far_back_as_a_rule_looks(
     folder: Path, trained: TrainedPolicy
 ) -> None:
     for rule in (DecisionRule(3.0, tag_run=10), DecisionRule(3.0, tag_window=10)):
-        decider = replace(trained, reward_model=None).decider(rule)
-        assert decider.policy.config.context < 10
+        scorer = replace(trained, reward_model=None).scorer(rule)
+        assert scorer.policy.config.context < 10
         logged = EpisodeStore.open(folder / "store")
-        known = LoggedDecisions.at(decider, logged, np.array([0]), logged.lengths[:1] - 1)
-        assert known.shown.items.shape == (1, 10)
-        far = LoggedDecisions.at(
-            trained.decider(rule), logged, np.array([0]), logged.lengths[:1] - 1
-        )
-        assert far.shown.items.shape == (1, MEMORY)
+        at = logged, np.array([0]), logged.lengths[:1] - 1
+        assert logged_history(scorer, *at)[0].shown.items.shape == (1, 10)
+        assert logged_history(trained.scorer(rule), *at)[0].shown.items.shape == (1, MEMORY)
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -183,8 +181,8 @@ def test_items_of_a_session_count_as_seen_from_the_next_step(folder: Path) -> No
     starts = np.maximum.accumulate(np.where(steps == 0, np.arange(200), 0))
     for row in range(200):
         assert set(seen[row].nonzero()[:, 0].tolist()) == set(items[starts[row] : row].tolist())
-    decider = trained.decider(replace(trained.rule, exclude_seen=True))
-    left_out = np.isneginf(session_scores(decider, store, episodes, steps).numpy())
+    scorer = trained.scorer(replace(trained.rule, exclude_seen=True))
+    left_out = np.isneginf(logged_scores(scorer, store, episodes, steps).numpy())
     np.testing.assert_array_equal(left_out, seen.numpy())
 
 

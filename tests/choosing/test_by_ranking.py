@@ -34,9 +34,7 @@ def test_all_reward_weights_at_once_are_judged_as_each_rule_alone(tmp_path: Path
     candidates = read_json(tmp_path / "run" / "run.json")["rule"]["candidates"]
     assert len({each["rule"]["reward_weight"] for each in candidates}) == len(candidates) > 2
     for each in candidates:
-        scorer = trained.scorer(
-            replace(trained.rule, reward_weight=each["rule"]["reward_weight"])
-        )
+        scorer = trained.scorer(replace(trained.rule, reward_weight=each["rule"]["reward_weight"]))
         scores = logged_scores(scorer, validation, episodes, steps)
         top = scores.topk(SHOWN).indices.numpy()
         hits = (top == items[:, None]).any(1)[liked].mean()

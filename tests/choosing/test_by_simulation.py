@@ -13,8 +13,8 @@ import torch
 from tests.support.tagged import tagged_store
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
-from ucfrec.acting.scorer import Scorer
 from ucfrec.acting.rollout import rollout
+from ucfrec.acting.scorer import Scorer
 from ucfrec.choosing.by_ranking import choose_by_ranking
 from ucfrec.choosing.by_simulation import RuleSearch, calibrate, choose_rule
 from ucfrec.choosing.config import RuleConfig
@@ -30,6 +30,7 @@ from ucfrec.runs.describe import describe_run, promised
 from ucfrec.runs.refit import refit
 from ucfrec.runs.run import train_run, training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_fit import fit_item_reward_model
 from ucfrec.user_model.reward_rows import RewardRows
 from ucfrec.user_model.simulator import LoggedEnds, SessionEnd, UserSimulator
@@ -66,9 +67,7 @@ def with_bias(
         assert isinstance(policy.head, ItemHead)
         policy.head.bias.copy_(bias)
     states = trained.item_states if store is None else store.item_states
-    return Scorer(
-        policy, DecisionRule(2.0), states, trained.returns, model or trained.reward_model
-    )
+    return Scorer(policy, DecisionRule(2.0), states, trained.returns, model or trained.reward_model)
 
 
 def search_of(folder: Path, trained: TrainedPolicy, config: RuleConfig = FEW) -> RuleSearch:

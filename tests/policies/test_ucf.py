@@ -1,6 +1,7 @@
 """Invariants of the architectures: what must never move a prediction, and what must."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -22,11 +23,11 @@ CATALOG = {"state": S, "action": 4, "items": ITEMS}
 SMALL = {"context": K, "dim": 16}
 
 
-def build(name: str, sizes: dict[str, int]) -> SequencePolicy:
+def build(name: str, sizes: dict[str, int], **settings: Any) -> SequencePolicy:
     torch.manual_seed(0)
     learner = policy_class(name)
     own = {"kernel_groups": 4} if name == "lsdt" else {}
-    policy = learner(learner.Config(**SMALL, **own), sizes)
+    policy = learner(learner.Config(**SMALL, **own, **settings), sizes)
     if sizes["items"]:
         policy.head.start_from(torch.randn(ITEMS, 4), torch.rand(ITEMS))
     for parameter in policy.parameters():

@@ -208,6 +208,8 @@ def write_graph(
     """
     try:
         with _quiet(), torch.no_grad():
+            # What is computed once must not be a part of the graph.
+            module(*arguments)
             torch.onnx.export(
                 module,
                 arguments,

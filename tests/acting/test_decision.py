@@ -192,16 +192,18 @@ def test_items_left_out_are_ranked_last_and_good_ones_first(rule: DecisionRule) 
 def test_a_target_is_of_a_session_or_of_every_step() -> None:
     collected = torch.tensor([0.0, 3.0, 9.0]).double()
     session, step = ReturnToGo(), ReturnToGo("horizon", horizon=2)
-    rule = DecisionRule(5.0)
-    assert rule.asked(session, collected, None).tolist() == [5, 2, -4]
-    assert rule.asked(step, collected, None).tolist() == [5, 5, 5]
-    floored = replace(rule, floor=1.5)
-    assert floored.asked(session, collected, None).tolist() == [5, 2, 1.5]
-    assert floored.asked(step, collected, None).tolist() == [5, 5, 5]
     best = torch.tensor([0.5, 1.0, 2.0])
+
+    def targets(returns: ReturnToGo, *rule: float | None) -> list[float]:
+        found: list[float] = DecisionRule(*rule).target_returns(returns, collected, best).tolist()
+        return found
+
+    assert targets(session, 5.0) == [5, 2, -4]
+    assert targets(session, 5.0, 1.5) == [5, 2, 1.5]
+    assert targets(step, 5.0) == targets(step, 5.0, 1.5) == [5, 5, 5]
     for returns in (session, step):
-        assert DecisionRule(None).asked(returns, collected, best).tolist() == [0.5, 1, 2]
-        assert DecisionRule(None, floor=1.0).asked(returns, collected, best).tolist() == [1, 1, 2]
+        assert targets(returns, None) == [0.5, 1, 2]
+        assert targets(returns, None, 1.0) == [1, 1, 2]
 
 
 # The best items.

@@ -16,13 +16,11 @@ from typing import Any
 import pandas as pd
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.code_version import code_version
 from ucfrec.commands.cli import main as ucfrec
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.ranking import MEASURES
 from ucfrec.files.atomic import read_json
 from ucfrec.logs.mapping import log_files
-from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows
@@ -69,7 +67,6 @@ def result_row(row: dict[str, Any], store: Path, folder: Path, days: str) -> Res
     record = read_record(folder)
     own = "decision_rule" in row
     learner = record["config"]["policy_name"] if own else row["policy"]
-    modules = [policy_class(learner).__module__] if own else []
     return ResultRow(
         suite="next-period",
         table="next-period",
@@ -80,7 +77,6 @@ def result_row(row: dict[str, Any], store: Path, folder: Path, days: str) -> Res
         evaluation_seed=row["seed"],
         conditions={"days": days, "k": row["k"]},
         config_hash=config_hash(record["config"]) if own else None,
-        code_version=code_version(Path(__file__), "ucfrec.runs.run", *modules),
         data_fingerprint=EpisodeStore.open(store).meta["fingerprint"],
         metric="hit_rate_liked",
         metrics={name: row[name] for name in (*MEASURES, "coverage") if row[name] is not None},

@@ -24,7 +24,6 @@ from typing import Any
 import httpx
 import numpy as np
 
-from ucfrec.code_version import code_version
 from ucfrec.provenance import provenance
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows
@@ -144,7 +143,6 @@ def main() -> None:
                     "threads": options.threads,
                     "seconds": options.seconds,
                 },
-                code_version=code_version(Path(__file__), "ucfrec.recommending.web"),
                 data_fingerprint=trained.record.get("fingerprint"),
                 metric="rate",
                 metrics=found,

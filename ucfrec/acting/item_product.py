@@ -16,11 +16,11 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.sessions import History
 from ucfrec.arrays import Float32Array
 from ucfrec.episodes.exposure import Exposed, Likeness, Shown
-from ucfrec.episodes.main_tags import MainTags
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
+from ucfrec.user_model.main_tags import MainTags
 from ucfrec.user_model.reward import ItemRewardModel
 
 

@@ -10,7 +10,6 @@ from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.record import REMEDY
 from ucfrec.errors import InputError, one_line
 from ucfrec.files.checksums import Sealed
-from ucfrec.files.remote import fetch
 
 _DTYPES: Final = {
     schema.OFFSETS: "<i8",
@@ -38,7 +37,6 @@ def load_column(
     if sealed is not None:
         sealed.require(file)
     path = store / file
-    fetch(path)
     try:
         # Mapping compares the header with the size of the file before it takes memory.
         values: Array = np.load(path, mmap_mode="r")

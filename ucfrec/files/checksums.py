@@ -1,8 +1,7 @@
 """Checksums of the files of a store or a run, recorded in its `meta.json` or `run.json`.
 
-XXH3 (64 bits) runs at the speed of memory, where CRC-32 of zlib has a quarter of it: see
-`benchmarks/checksum_cost.py`. It finds accidents, not forgers: who can change a file can change its
-checksum.
+XXH3 (64 bits) runs at the speed of memory, where CRC-32 of zlib has a quarter of it. It finds
+accidents, not forgers: who can change a file can change its checksum.
 """
 
 import os
@@ -16,7 +15,6 @@ import xxhash
 from ucfrec.errors import InputError, explain_os_error
 from ucfrec.files.atomic import CHECKSUM, read_json, write_sealed_json
 from ucfrec.files.locks import is_lock_or_scratch
-from ucfrec.files.remote import fetch
 
 FILES: Final = "files"
 """Entry of a record with size and checksum of the files beside it: {path: [bytes, hexadecimal]}."""
@@ -151,7 +149,6 @@ class Sealed:
     def _fault(self, name: str) -> str:
         size, stated = self.files[name]
         path = self.folder / name
-        fetch(path)
         try:
             return _size_fault(path, size) or (
                 "" if file_checksum(path) == stated else "has another content than was written"

@@ -24,7 +24,7 @@ from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.checksums import seal
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.binding import explained, open_tables
-from ucfrec.logs.clean import DUPLICATES, require_rows
+from ucfrec.logs.clean import require_rows
 from ucfrec.logs.distributions import RewardPasses, distributions
 from ucfrec.logs.engine import engine
 from ucfrec.logs.feature_tables import load_features, require_known_ids
@@ -38,6 +38,7 @@ from ucfrec.logs.ids import (
     write_episode_users,
     write_ids,
 )
+from ucfrec.logs.kept import DUPLICATES
 from ucfrec.logs.mapping import SESSIONS, FeatureTable, LogMapping, log_files
 from ucfrec.logs.measures import Measures, binned_rewards, measure, sampled_rewards
 from ucfrec.logs.order import count_unsorted
@@ -77,7 +78,7 @@ class PrepareOptions:
     embedding_size: int = 32
     """Most dimensions of an item embedding."""
     duplicates: str = "highest"
-    """Key of `ucfrec.logs.clean.DUPLICATES`: which of several rows with the same user, item or
+    """Key of `ucfrec.logs.kept.DUPLICATES`: which of several rows with the same user, item or
     action, and time is kept; with "first" and "last" the order of files and rows matters."""
     memory_limit: str = "2GB"
     """Memory of the process, e.g. "2GB", for logs of any size; rows spill to disk. From "800MB" on

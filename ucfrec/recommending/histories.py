@@ -15,6 +15,7 @@ from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.logs.clean import EARLIEST_MS
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.histories import frame_histories, read_histories
+from ucfrec.logs.kept import kept_in_order
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.runs.trained_policy import RUN, TrainedPolicy, duplicates_of
 
@@ -72,22 +73,28 @@ class Histories:
         )
 
     @classmethod
-    def from_plain(cls, frame: pd.DataFrame, by_id: bool) -> Self | None:
+    def from_plain(cls, frame: pd.DataFrame, by_id: bool, duplicates: str) -> Self | None:
         """Read a frame that needs no SQL; None for any other frame.
 
         Its columns are `user_id`, `item_id`, `timestamp` (ms), with `by_id` also `session_id`, all
-        int64, and `reward`, a number; no row is out of range or repeats another's user, item and
-        time.
+        int64, and `reward`, a number; no row is out of range.
         """
         columns = _plain_columns(frame, by_id)
         if columns is None:
             return None
         rewards, users, items, times, *sessions = columns
-        order = np.lexsort((items, times, users))
+        table = {
+            "user": users,
+            schema.TIMESTAMP: times,
+            schema.ITEM: items,
+            schema.REWARD: rewards,
+            "row": np.arange(len(users)),
+        }
+        if by_id:
+            table["session"] = sessions[0]
+        order = kept_in_order(table, duplicates)
         rewards, users, items, times, *sessions = (each[order] for each in columns)
         same_user = users[1:] == users[:-1]
-        if (same_user & (items[1:] == items[:-1]) & (times[1:] == times[:-1])).any():
-            return None
         owner = np.concatenate([[0], np.cumsum(~same_user)])
         ends = np.append(np.flatnonzero(~same_user), len(users) - 1)
         recent = ends[owner] - np.arange(len(users)) < LONGEST_HISTORY
@@ -205,7 +212,7 @@ def histories_of_frame(
     """
     by_id = _session_by(trained) == schema.SESSION_ID
     if not trained.record["observation_size"] and mapping == LogMapping():
-        plain = Histories.from_plain(frame, by_id)
+        plain = Histories.from_plain(frame, by_id, duplicates_of(trained.record))
         if plain is not None:
             return iter((plain,))
     has_rewards = schema.REWARD in getattr(frame, "columns", ())

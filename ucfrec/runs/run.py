@@ -15,8 +15,7 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import Float32Array
-from ucfrec.choosing.by_ranking import RankedChoice, choose_by_ranking
-from ucfrec.choosing.by_simulation import Choice, choose_rule
+from ucfrec.choosing.choose import choose_rule
 from ucfrec.counterfactual.augment import AugmentConfig
 from ucfrec.counterfactual.copies import MODELS, counterfactual_copies, require_rewards_vary
 from ucfrec.counterfactual.generators import CSGConfig
@@ -55,8 +54,8 @@ from ucfrec.runs.trained_policy import (
     TrainedPolicy,
     store_from,
 )
-from ucfrec.user_model.reward_fit import fit_item_reward_model, reward_model_sizes
-from ucfrec.user_model.training_users import TRAINING_USERS, fit_training_users
+from ucfrec.user_model.model import UserModel
+from ucfrec.user_model.reward_fit import reward_model_sizes
 
 _MOST_RETURNS = 1_000_001
 _QUANTILES = (0.5, 0.75, 0.9, 0.95, 0.99, 1.0)
@@ -379,26 +378,17 @@ def _rule(
     config: Config,
     shared: SharedStages,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Fit the reward model of items and choose the rule; returns the reports of both."""
-    fit = partial(fit_item_reward_model, train, validation, out / REWARD_MODEL, config.seed)
+    """Fit the user model and choose the rule; returns the reports of both."""
+    fit = partial(UserModel.fit, train, validation, out / REWARD_MODEL, config.seed)
     inputs = _inputs(train, validation, config.seed, torch.device("cpu"))
-    shared.provide(inputs, fit_item_reward_model.__module__, out, (REWARD_MODEL,), fit)
-    model, report = fit()  # read from the folder
+    shared.provide(inputs, UserModel.__module__, out, (REWARD_MODEL,), fit)
+    users = fit()  # read from the folder
     trained = TrainedPolicy.load(out, in_training=True)
     targets = {quantile: trained.target_return(quantile) for quantile in config.rule.quantiles}
-    scorer = Scorer(policy, trained.rule, trained.item_states, trained.returns, model)
-    choice: Choice | RankedChoice
-    if trained.returns.per_session:
-        users = None
-        if report.new_users:
-            like = partial(fit_training_users, train, out / TRAINING_USERS, config.seed)
-            shared.provide(inputs, fit_training_users.__module__, out, (TRAINING_USERS,), like)
-            users = like()  # read from the file
-        choice = choose_rule(scorer, targets, train, validation, config.rule, config.seed, users)
-    else:
-        choice = choose_by_ranking(scorer, train, validation, config.rule, config.seed)
+    scorer = Scorer(policy, trained.rule, trained.item_states, trained.returns, users.reward)
+    choice = choose_rule(scorer, users, targets, train, validation, config.rule, config.seed)
     write_json(out / RULE, choice.rule.as_dict())
-    return dataclasses.asdict(report), choice.as_dict()
+    return dataclasses.asdict(users.reward_report), choice.as_dict()
 
 
 def _write_samples(out: Path, validation: EpisodeStore) -> None:

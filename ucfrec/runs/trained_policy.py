@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
@@ -26,7 +25,7 @@ from ucfrec.errors import InputError, InputNote, damage_explained
 from ucfrec.files.atomic import read_json
 from ucfrec.files.checksums import sealed_record
 from ucfrec.files.parquet import read_ids
-from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors
+from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors, load_trained
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
@@ -103,7 +102,7 @@ class TrainedPolicy:
         )
         with random_state_kept():
             build = lambda: learner(config.policy, record["sizes"])  # noqa: E731
-            policy = load_module(path, build, _weights(path))
+            policy = load_module(path, build, load_trained(path))
         policy.eval()
         states = run / ITEM_STATES
         trained = cls(
@@ -360,11 +359,6 @@ def learner_of(record: Mapping[str, Any]) -> str:
     if augmented == policy_class(config.policy_name).augmented:
         return config.policy_name
     return f"{config.policy_name}-{'augmented' if augmented else 'no-augmentation'}"
-
-
-def _weights(path: Path) -> dict[str, Tensor]:
-    tensors, _ = load_tensors(path)
-    return {name: t for name, t in tensors.items() if not name.startswith("optimizer.")}
 
 
 def _rule(path: Path) -> DecisionRule:

@@ -39,11 +39,11 @@ OF_ITEMS: Final = (
     *("ucfrec.acting.logged_decisions", "ucfrec.choosing.many_rules"),
     *("ucfrec.acting.session_scorer", "ucfrec.counterfactual.action_copies"),
     *("ucfrec.user_model.reward_effects", "ucfrec.user_model.reward_fit"),
-    *("ucfrec.user_model.reward_mean", "ucfrec.user_model.reward"),
+    *("ucfrec.counterfactual.effects_mean", "ucfrec.user_model.reward"),
     *("ucfrec.user_model.reward_report", "ucfrec.user_model.reward_rows"),
     *("ucfrec.user_model.posterior", "ucfrec.user_model.training_users"),
     *("ucfrec.episodes.exposure", "ucfrec.episodes.item_counts", "ucfrec.episodes.item_table"),
-    *("ucfrec.episodes.main_tags", "ucfrec.episodes.states", "ucfrec.policies.item_sampling"),
+    *("ucfrec.user_model.main_tags", "ucfrec.episodes.states", "ucfrec.policies.item_sampling"),
     *("ucfrec.choosing.by_ranking", "ucfrec.choosing.by_simulation"),
 )
 """Modules that control imports but does not run, because its actions are vectors: changes to them

@@ -5,7 +5,8 @@
 `one user`: a line of JSON to the line that answers it, as `ucfrec recommend --stream` and `serve`
 do; beside it, a store of every request. With `--items 1000000` also for a catalogue of random
 copies of the run's items. `one user's frame`: `Recommender.recommend`, beside reading the frame by
-SQL. `all users`: `ucfrec recommend` without its start, beside a store of all requests. `choose the rule`:
+SQL. `all users`: `ucfrec recommend` without its start, beside a store of all requests.
+`choose the rule`:
 decision rules played side by side, and one after the other. `VirtualTaobao`: pages of 4,096
 sessions, beside the authors' environment (--original, their repository) page by page.
 

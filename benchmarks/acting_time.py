@@ -150,7 +150,7 @@ def frame_ways(run: Path) -> tuple[Way, Way]:
     frame = pd.DataFrame({schema.USER_ID: np.full(10, 1), schema.ITEM_ID: items[:10]})
     frame[schema.TIMESTAMP] = BEGAN + np.cumsum(rng.integers(1, 60_000, 10))
     frame[schema.REWARD] = rng.random(10).round()
-    if policy.trained.record["session_by"] == schema.SESSION_ID:
+    if policy.trained.record.session_by == schema.SESSION_ID:
         frame[schema.SESSION_ID] = 1
     named = LogMapping({schema.ITEM_ID: schema.ITEM_ID})
     return lambda: policy.recommend(frame), lambda: policy.recommend(frame, mapping=named)
@@ -171,7 +171,7 @@ def log_ways(trained: TrainedPolicy, store: EpisodeStore, folder: Path) -> tuple
     )
     # The way of the run's reward to its column is not what is measured.
     log = folder / "log.parquet"
-    frame.assign(**{trained.record["reward"]: frame[schema.REWARD]}).to_parquet(log)
+    frame.assign(**{trained.record.reward: frame[schema.REWARD]}).to_parquet(log)
     scorer = trained.scorer()
 
     def batches() -> Iterator[Histories]:

@@ -33,7 +33,7 @@ from ucfrec.off_policy.score import logged_sessions, scored_steps
 from ucfrec.policies.item_knn import ItemKNNPolicy
 from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
-from ucfrec.runs.run import training_views
+from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.user_model.posterior import MEMORY
 from ucfrec.user_model.reward import ItemRewardModel

@@ -75,12 +75,12 @@ def test_a_store_is_made_from_remote_logs_in_a_remote_place(
     assert main(["prepare", f"{place}/logs/*.parquet", "--out", f"{place}/store"]) == 0
     assert f"store: {place}/store" in capsys.readouterr().out
     prepare(files, read_mapping(_empty(tmp_path)), tmp_path / "store")
-    local = EpisodeStore.open(tmp_path / "store").meta
+    local = EpisodeStore.open(tmp_path / "store").record
     with local_paths(argparse.Namespace(store=Input(f"{place}/store"))) as options:
         found = EpisodeStore.open(options.store)
-        assert found.meta["fingerprint"] == local["fingerprint"]
-        assert found.meta["source"]["files"] == [f"{place}/logs/{file.name}" for file in files]
-        assert not list(found._columns._sealed.faults())  # type: ignore[union-attr]
+        assert found.record.fingerprint == local.fingerprint
+        assert found.record.source.files == tuple(f"{place}/logs/{file.name}" for file in files)
+        assert not list(found._columns._sealed.faults())
         copy = options.store
     assert not copy.exists()
     # A folder of logs; the store is there already.

@@ -59,9 +59,8 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise InputError(f"{path} is damaged ({error}); {REMEDY}") from None
-    # Older versions wrote no checksum.
     about, _, checksum = stated.get("about", "{}").partition("\n")
-    if checksum and checksum != _checksum(tensors, about):
+    if checksum != _checksum(tensors, about):
         raise InputError(f"{path} is damaged (its checksum differs); restore it or train again")
     with damage_explained(path, REMEDY):
         return tensors, dict(json.loads(about))

@@ -18,10 +18,8 @@ from typing import Any, Final
 
 from ucfrec import schema
 from ucfrec.episodes.item_table import ITEM_STATES
-from ucfrec.episodes.record import RECORD
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder
-from ucfrec.files.checksums import seal
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.binding import explained, open_tables
 from ucfrec.logs.clean import require_rows
@@ -86,6 +84,8 @@ class PrepareOptions:
     temp_folder: Path | None = None
     """Folder for spilled rows; None for the parent of the store (the system's for `validate`)."""
 
+    dataset: str | None = None
+    """Name of the dataset adapter, for the record."""
     engine: str = "duckdb"
     """What reads and sorts the rows, one of `ENGINES`: DuckDB on this machine, or Spark. The store
     is the same."""
@@ -182,13 +182,13 @@ def prepare(
             numbers = StepNumbers.of(log, found.measures, found.scratch)
             with progress(report["steps"], "write the store", "steps") as bar:
                 writer = write_steps(folder, found.episodes(), found.spool, numbers, bar)
-            meta = writer.finish(report["reward"], report, write_ids(log, folder))
+            record = writer.finish(report["reward"], report, write_ids(log, folder))
             if log.key == schema.ITEM_ID:
                 _write_states(found, folder, options.embedding_size, like)
             if like is not None:
                 users = (each.users for each in found.episodes())
                 write_episode_users(log, folder / EPISODE_USERS, users)
-            seal(folder, RECORD, meta)
+            record.sealed(folder)
     return report
 
 
@@ -290,6 +290,8 @@ def _prepared(
                 _require_known_ids(log, mapping, features)
                 report = _report(rows, spool, cut, measures)
                 report = {"reward": reward, **report, "duplicates": options.duplicates}
+                report["dataset"] = options.dataset
+                report["mapping"] = {name: str(column) for name, column in mapping.columns.items()}
                 stage.update()
         yield _Prepared(rows, spool, cut, measures, features, report, scratch)
 

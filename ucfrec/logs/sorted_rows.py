@@ -111,8 +111,8 @@ def check_sorted(
     Raises:
         InputError: a reward is too large to train with.
     """
-    spools = (Spool(folder and folder / name) for name in ("clean", "placed"))
-    rows = SortedRows(log, *spools)
+    spools = [Spool(folder and folder / name) for name in ("clean", "placed")]
+    rows = SortedRows(log, spools[0], spools[1])
     reasons = list(REASONS)
     large, largest = 0, 0.0
     for batch in _whole_keys(_columns(batch, log) for batch in batches):

@@ -129,7 +129,7 @@ def _description(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
             "already seen; padded with -1, at least one column",
         ),
     ]
-    if observed := trained.record["observation_size"]:
+    if observed := trained.record.observation_size:
         inputs.append(
             _entry(
                 "observations",
@@ -162,10 +162,10 @@ def _description(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
         "tag_run; with exclude_seen, put the session's items into `excluded`; with a temperature, "
         "draw from `scores`",
         "policy": trained.name,
-        "reward": trained.record["reward"],
-        "session_by": trained.record.get("session_by"),
-        "session_gap_ms": trained.record["session_gap_ms"],
-        "fingerprint": trained.record.get("fingerprint"),
+        "reward": trained.record.reward,
+        "session_by": trained.record.session_by,
+        "session_gap_ms": trained.record.session_gap_ms,
+        "fingerprint": trained.record.fingerprint,
         "item_ids": trained.item_ids.tolist(),
         "user_ids": trained.user_ids.tolist(),
     }

@@ -17,7 +17,7 @@ from ucfrec.logs.expressions import Expression
 from ucfrec.logs.histories import frame_histories, read_histories
 from ucfrec.logs.kept import kept_in_order
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.runs.trained_policy import RUN, TrainedPolicy, duplicates_of
+from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 
 _PLAIN = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP)
 _MOST_PLAIN_ROWS = 1_000_000
@@ -187,7 +187,7 @@ def histories_of_files(
         LONGEST_HISTORY,
         memory_limit,
         session_by=_session_by(trained),
-        duplicates=duplicates_of(trained.record),
+        duplicates=trained.record.data.duplicates,
     )
     return map(Histories.from_batch, batches)
 
@@ -211,8 +211,8 @@ def histories_of_frame(
         InputError: a column is missing, or has values that cannot be used.
     """
     by_id = _session_by(trained) == schema.SESSION_ID
-    if not trained.record["observation_size"] and mapping == LogMapping():
-        plain = Histories.from_plain(frame, by_id, duplicates_of(trained.record))
+    if not trained.record.observation_size and mapping == LogMapping():
+        plain = Histories.from_plain(frame, by_id, trained.record.data.duplicates)
         if plain is not None:
             return iter((plain,))
     has_rewards = schema.REWARD in getattr(frame, "columns", ())
@@ -222,7 +222,7 @@ def histories_of_frame(
         schema.REWARD if has_rewards else _reward(trained),
         LONGEST_HISTORY,
         session_by=_session_by(trained),
-        duplicates=duplicates_of(trained.record),
+        duplicates=trained.record.data.duplicates,
     )
     return map(Histories.from_batch, batches)
 
@@ -256,17 +256,17 @@ def _plain_columns(frame: pd.DataFrame, by_id: bool) -> list[Array] | None:
 
 
 def _reward(trained: TrainedPolicy) -> Expression:
-    return Expression(trained.record["reward"], str(trained.folder / RUN))
+    return Expression(trained.record.reward, str(trained.folder / RUN))
 
 
 def _columns_used(trained: TrainedPolicy, mapping: LogMapping) -> LogMapping:
-    if trained.record["observation_size"]:
+    if trained.record.observation_size:
         return mapping
     return LogMapping({schema.OBSERVATION: ""}).over(mapping)
 
 
 def _session_by(trained: TrainedPolicy) -> str:
-    by_id = trained.record.get("session_by") == schema.SESSION_ID
+    by_id = trained.record.session_by == schema.SESSION_ID
     return schema.SESSION_ID if by_id else "user"
 
 

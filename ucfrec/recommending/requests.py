@@ -20,7 +20,7 @@ from ucfrec.logs.clean import DAY_MS, EARLIEST_MS
 from ucfrec.logs.kept import kept_in_order
 from ucfrec.recommending.histories import LONGEST_HISTORY
 from ucfrec.recommending.row_rewards import RowRewards
-from ucfrec.runs.trained_policy import TrainedPolicy, duplicates_of
+from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import settings_table
 
 _Integer = Annotated[StrictInt, Field(ge=-(2**63), lt=2**63)]
@@ -193,9 +193,9 @@ class HistoryReader:
     def of(cls, trained: TrainedPolicy) -> "HistoryReader":
         """The reader for a policy; its `rewards` have to be closed."""
         return cls(
-            duplicates_of(trained.record),
-            trained.record.get("session_by") == schema.SESSION_ID,
-            trained.record["observation_size"],
+            trained.record.data.duplicates,
+            trained.record.session_by == schema.SESSION_ID,
+            trained.record.observation_size,
             RowRewards.of(trained),
         )
 

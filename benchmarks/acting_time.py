@@ -46,7 +46,6 @@ from ucfrec.recommending.stream import answer_stream
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows
 from ucfrec.reporting.tables import markdown_table
-from ucfrec.runs.config import config_from_dict
 from ucfrec.runs.run import training_views
 from ucfrec.runs.trained_policy import REWARD_MODEL, TrainedPolicy
 from ucfrec.user_model.model import UserModel
@@ -83,8 +82,8 @@ def enlarged(trained: TrainedPolicy, items: int) -> TrainedPolicy:
     assert model is not None
     n_items = len(states.embeddings)
     rows = torch.randint(n_items, (items,), generator=torch.Generator().manual_seed(0))
-    sizes = {**trained.record["sizes"], "items": items}
-    config = config_from_dict(trained.record["config"])
+    sizes = {**trained.record.sizes, "items": items}
+    config = trained.record.config
     policy = policy_class(config.policy_name)(config.policy, sizes)
     larger = ItemRewardModel(sizes)
     for old, new in ((trained.policy, policy), (model, larger)):

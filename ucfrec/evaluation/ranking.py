@@ -98,7 +98,7 @@ def rank_steps(ranker: Ranker, store: EpisodeStore, k: int, users: Array) -> Ran
         shown = store.step_values(schema.ITEM, batch.episodes, batch.steps).astype(np.int64)
         scores = ranker.scores(batch)
         if len(scores) == 1:
-            parts.append(_ranked_alike(scores[0], torch.from_numpy(shown), k))
+            parts.append(_ranked_alike(scores[0], shown, k))
         else:
             parts.append(_ranked(scores, torch.from_numpy(shown), k))
     ranks, top = (np.concatenate(columns) for columns in zip(*parts, strict=True))
@@ -131,7 +131,7 @@ def _ranked(scores: Tensor, shown: Tensor, k: int) -> tuple[Float64Array, IntArr
     return ranks.numpy(), scores.topk(k, dim=1).indices.numpy()
 
 
-def _ranked_alike(scores: Tensor, shown: Tensor, k: int) -> tuple[Float64Array, IntArray]:
+def _ranked_alike(scores: Tensor, shown: IntArray, k: int) -> tuple[Float64Array, IntArray]:
     """`_ranked` for scores (n_items,) that all steps share, which are sorted only once."""
     ranks = rankdata(-scores.double().numpy(), method="average")
     top = np.broadcast_to(scores.topk(k).indices.numpy(), (len(shown), k))

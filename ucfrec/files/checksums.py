@@ -151,13 +151,15 @@ class Sealed:
     def _fault(self, name: str) -> str:
         size, stated = self.files[name]
         path = self.folder / name
-        fetch(path)
         try:
+            fetch(path)
             return _size_fault(path, size) or (
                 "" if file_checksum(path) == stated else "has another content than was written"
             )
         except OSError as error:
             return f"cannot be read ({explain_os_error(error)})"
+        except ValueError as error:  # a name that no file can have
+            return f"cannot be read ({error})"
 
     def _error(self, name: str, fault: str) -> InputError:
         return InputError(f"{self.folder / name} {fault}; restore the file, or {self.remedy}")

@@ -1,7 +1,6 @@
 """The web server's application: recommendations, health, metrics and a page on all of them."""
 
 import asyncio
-import json
 import sys
 import time
 import traceback
@@ -19,6 +18,7 @@ from starlette.requests import ClientDisconnect
 
 from ucfrec import __version__
 from ucfrec.errors import InputError
+from ucfrec.files.atomic import json_text
 from ucfrec.recommending.batcher import Batcher, QueueFullError
 from ucfrec.recommending.requests import Request, parsed
 from ucfrec.recommending.responder import Answer, Responder
@@ -177,7 +177,7 @@ async def _body(http: HTTPRequest, most: int) -> bytes:
 
 def _response(status: int, body: Any, headers: Any = None) -> Response:
     # One-line errors may quote text that is no Unicode; \u escapes can carry it.
-    return Response(json.dumps(body), status, headers, media_type=_JSON)
+    return Response(json_text(body), status, headers, media_type=_JSON)
 
 
 def _inline(schema: dict[str, Any]) -> dict[str, Any]:

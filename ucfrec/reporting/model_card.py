@@ -12,7 +12,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.files.atomic import atomic_file, read_json, write_json
+from ucfrec.files.atomic import atomic_file, json_text, read_json, write_json
 from ucfrec.files.checksums import CARD, MEASURED
 from ucfrec.files.locks import claim
 from ucfrec.provenance import config_hash
@@ -75,7 +75,7 @@ def _read(run: Path) -> list[dict[str, Any]]:
 
 
 def _plain(value: object) -> object:
-    return value if isinstance(value, (int, float, str, bool)) else json.loads(json.dumps(value))
+    return value if isinstance(value, (int, float, str, bool)) else json.loads(json_text(value))
 
 
 def _about(record: Mapping[str, Any]) -> str:

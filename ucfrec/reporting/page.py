@@ -1,7 +1,5 @@
 """The HTML report on runs: conclusions from their results, and how they were trained."""
 
-import json
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from ucfrec import __version__
 from ucfrec.counterfactual.reward_model_fit import fit_warning
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.files.atomic import atomic_file, read_json
+from ucfrec.files.atomic import atomic_file, json_text, read_json
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.reporting import charts
 from ucfrec.reporting.copies import copies_table, moves_chart
@@ -147,10 +145,10 @@ def _warnings_of(run: _Run) -> list[str]:
         bound_is_useful = run.copies["bound"] < model["reward_std"]
         if not (bound_is_useful and run.copies["moves"]["edits"]):
             warnings.append(run.copies["verdict"])
-    # A refit has no validation rows, and its loss is not a number.
-    best = run.record.get("policy", {}).get("best_validation", math.nan)
+    # A refit has no validation rows, and so no loss.
+    best = run.record.get("policy", {}).get("best_validation")
     popularity = run.references.get("popularity")
-    if math.isfinite(best) and popularity is not None and best >= popularity:
+    if best is not None and popularity is not None and best >= popularity:
         warnings.append(
             f"the best validation loss, {best:.4g}, is not below {popularity:.4g}, the loss of "
             "showing items by popularity: the policy learned nothing about users"
@@ -184,7 +182,7 @@ def _variables(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any
         "moves": moves_chart(styled),
         "samples": [(run.name, sample_tables(run.folder, features)) for run in item_runs],
         "differences": _differences(runs),
-        "records": [(run.name, json.dumps(run.record, indent=2)) for run in runs],
+        "records": [(run.name, json_text(run.record, indent=2)) for run in runs],
     }
 
 

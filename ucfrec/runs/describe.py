@@ -1,5 +1,6 @@
 """What a finished run did, in a few lines."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,20 +15,22 @@ def describe_run(record: Mapping[str, Any]) -> str:
         report = record["augmentation"]
         crm, moves = report["reward_model"], report["moves"]
         lines += [
-            f"reward model  R² {crm['r2']:.3f} with z, {crm['r2_without_z']:.3f} without; "
+            f"reward model  R² {_text(crm['r2'], '.3f')} with z, "
+            f"{_text(crm['r2_without_z'], '.3f')} without; "
             f"{crm['active_dimensions']} of {crm['latent_dim']} latent dimensions active",
         ]
         if report["proposals"]:
             lines.append(
                 f"edits         {report['copies']} copies, acceptance {report['acceptance']:.1%}, "
-                f"mean-move ratio {moves['mean_move_ratio']:.2f}, effective rank "
+                f"mean-move ratio {_text(moves['mean_move_ratio'], '.2f')}, effective rank "
                 f"{moves['effective_rank']:.1f} of {moves['dimensions']}"
             )
         if (actions := report.get("actions")) is not None:
             lines.append(
                 f"other actions {actions['copies']:,} copies of {actions['proposals']:,} asked "
-                f"about; their reward differs by {actions['mean_change']:+.3g} on average, "
-                f"{actions['earns_more']:.0%} of them earn more"
+                f"about; their reward differs by "
+                f"{_text(actions['mean_change'], '+.3g')} on average, "
+                f"{_text(actions['earns_more'], '.0%')} of them earn more"
             )
         lines.append(
             f"bound         δ + ε_r = {report['delta']:.3g} + {report['epsilon_r']:.3g}: "
@@ -42,6 +45,11 @@ def describe_run(record: Mapping[str, Any]) -> str:
     if "rule" in record:
         lines.append(_describe_rule(record["rule"], record["reward_model"]))
     return "\n".join(lines)
+
+
+def _text(value: float | None, form: str) -> str:
+    """A number of a record as text; a dash where JSON had to hold null, as for NaN."""
+    return "–" if value is None or not math.isfinite(value) else f"{value:{form}}"
 
 
 def _describe_rule(choice: Mapping[str, Any], model: Mapping[str, Any]) -> str:

@@ -32,6 +32,7 @@ from ucfrec.fitting import distributed
 from ucfrec.fitting.checkpoint import save_tensors
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
+from ucfrec.policies.checks import require_sound
 from ucfrec.policies.heads import ItemHead
 from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import command_line, versions
@@ -127,6 +128,7 @@ def _train(
         _require_startable(store, train, out, config)
     policy = new_policy(train, config)
     if distributed.leads():
+        require_sound(policy, train, config.policy_name)
         if not (out / RUN).exists():
             _begin(store, train, validation, out, config, about or {})
         reopen(out, RUN, read_json(out / RUN), INPUTS)

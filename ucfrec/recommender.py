@@ -14,9 +14,10 @@ import pyarrow.parquet as pq
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.locks import scratch_folder
+from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.logs.clean import REASONS
 from ucfrec.logs.histories import log_table
 from ucfrec.logs.mapping import LogMapping
@@ -25,6 +26,7 @@ from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
 from ucfrec.reporting.model_card import write_card
 from ucfrec.runs.config import config_from_dict, resolve_config
+from ucfrec.runs.reference_losses import learned_nothing
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy, describe_trained
 
@@ -115,7 +117,9 @@ class Recommender:
             if out is None:
                 # Whoever fits next removes the run, should this process be killed.
                 out = scratch.enter_context(scratch_folder(temporary, "run")) / "run"
-            train_run(store, Path(out), self.config)
+            record = train_run(store, Path(out), self.config)
+            if warning := learned_nothing(record, read_metrics(Path(out) / "policy")):
+                warnings.warn(InputNote(warning), stacklevel=2)
             write_card(Path(out))
             trained = TrainedPolicy.load(Path(out))
             kept = scratch.pop_all()

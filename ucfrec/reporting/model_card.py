@@ -6,7 +6,7 @@ which every evaluation of the run adds its newest values; nothing in it is typed
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path, PurePath
 from typing import Any
@@ -15,8 +15,10 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.files.atomic import atomic_file, json_text, read_json, write_json
 from ucfrec.files.checksums import CARD, MEASURED
 from ucfrec.files.locks import claim
+from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.provenance import config_hash
 from ucfrec.reporting.tables import markdown_table, shown
+from ucfrec.runs.reference_losses import learned_nothing
 from ucfrec.runs.trained_policy import REFIT_OF, RULE, learner_of, read_record
 
 
@@ -35,7 +37,7 @@ def write_card(run: Path) -> Path:
         "## How it acts",
         _rule(run),
         "## Limits",
-        "\n".join(f"- {limit}" for limit in _limits(record)),
+        "\n".join(f"- {limit}" for limit in _limits(record, read_metrics(run / "policy"))),
         "## Measured",
         _measured(_read(run)),
     ]
@@ -136,7 +138,7 @@ def _rule(run: Path) -> str:
     )
 
 
-def _limits(record: Mapping[str, Any]) -> list[str]:
+def _limits(record: Mapping[str, Any], logged: Container[str]) -> list[str]:
     source, items = record.get("data") or {}, record["sizes"]["items"]
     limits = []
     if REFIT_OF in record:
@@ -157,13 +159,8 @@ def _limits(record: Mapping[str, Any]) -> list[str]:
         )
     elif unknown:
         limits.append(f"{unknown:,} steps of its logs have no propensity.")
-    best = record.get("policy", {}).get("best_validation")
-    popularity = record.get("reference_losses", {}).get("popularity")
-    if best is not None and popularity is not None and best >= popularity:
-        limits.append(
-            f"Its validation loss, {best:.4g}, is not below that of showing items by popularity, "
-            f"{popularity:.4g}: it learned nothing about users."
-        )
+    if warning := learned_nothing(record, logged):
+        limits.append(f"{warning[0].upper()}{warning[1:]}.")
     copies = record.get("augmentation")
     if copies is not None:
         limits.append(f"Counterfactual copies: {copies['verdict']}")

@@ -24,6 +24,7 @@ from ucfrec.reporting.page_results import environments, estimates, read_results
 from ucfrec.reporting.samples import read_features, sample_tables
 from ucfrec.reporting.tables import Table, shown
 from ucfrec.reporting.verdict import verdict
+from ucfrec.runs.reference_losses import learned_nothing
 from ucfrec.runs.trained_policy import AUGMENTATION, RUN, learner_of, read_record
 
 _REMEDY = "restore it or train again"
@@ -145,14 +146,7 @@ def _warnings_of(run: _Run) -> list[str]:
         bound_is_useful = run.copies["bound"] < model["reward_std"]
         if not (bound_is_useful and run.copies["moves"]["edits"]):
             warnings.append(run.copies["verdict"])
-    # A refit has no validation rows, and so no loss.
-    best = run.record.get("policy", {}).get("best_validation")
-    popularity = run.references.get("popularity")
-    if best is not None and popularity is not None and best >= popularity:
-        warnings.append(
-            f"the best validation loss, {best:.4g}, is not below {popularity:.4g}, the loss of "
-            "showing items by popularity: the policy learned nothing about users"
-        )
+    warnings.append(learned_nothing(run.record, run.logged))
     return [text for text in warnings if text]
 
 

@@ -1,15 +1,21 @@
 """What a finished run did, in a few lines."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Any
 
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.runs.reference_losses import learned_nothing
 from ucfrec.runs.trained_policy import REFIT_OF
 
 
-def describe_run(record: Mapping[str, Any]) -> str:
-    """Summary of a finished run's record, a few lines of text."""
+def describe_run(record: Mapping[str, Any], logged: Container[str] = ()) -> str:
+    """Summary of a finished run, a few lines of text.
+
+    Args:
+        record: of the run.
+        logged: names of the scalars that its training logged; see `learned_nothing`.
+    """
     lines = []
     if "augmentation" in record:
         report = record["augmentation"]
@@ -38,10 +44,13 @@ def describe_run(record: Mapping[str, Any]) -> str:
         )
         lines += [f"warning       {warning}" for warning in report["warnings"]]
     policy = record["policy"]
-    found = f"best validation loss {policy['best_validation']:.4g} at step {policy['best_step']}"
+    best = _text(policy["best_validation"], ".4g")
+    found = f"best validation loss {best} at step {policy['best_step']}"
     if REFIT_OF in record:
         found = f"trained on all rows, up to step {policy['best_step']}"
     lines.append(f"policy        {found} of {policy['steps']}, {policy['seconds']:.0f} s")
+    if warning := learned_nothing(record, logged):
+        lines.append(f"warning       {warning}")
     if "rule" in record:
         lines.append(_describe_rule(record["rule"], record["reward_model"]))
     return "\n".join(lines)

@@ -48,6 +48,7 @@ def card_of_ranking(
             low, high = interval
             values[name] = f"{row[name]:.4g} [{low:.4g}, {high:.4g}]"
     of = f"{on}, {_rule(row)}, k {row['k']}, checkpoint {row['checkpoint']}"
+    of += f", liked: {row['liked']}"
     add_measurement(run, "ucfrec rank", of, values, said)
 
 

@@ -1,8 +1,8 @@
 """Ranking metrics on a later period: the rank of the items that users were shown or clicked.
 
 At every step, the whole catalogue is ranked from what was known before the step; no negatives are
-sampled (Krichene & Rendle, KDD 2020). A step is *liked* (a click) if its reward, scaled to [0, 1]
-as in item states, is at least `ucfrec.episodes.item_counts.LIKED`.
+sampled (Krichene & Rendle, KDD 2020). What counts as *liked* (a click) is said by
+`ucfrec.evaluation.liked`.
 """
 
 import warnings
@@ -21,6 +21,7 @@ from ucfrec.episodes.group_auc import group_auc
 from ucfrec.episodes.item_counts import liked_steps
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
+from ucfrec.evaluation.liked import Liked
 from ucfrec.evaluation.metrics import resampled_ratios
 
 _SCORES_AT_ONCE = 2**24
@@ -151,12 +152,13 @@ class Period:
     n_items: int
 
     @classmethod
-    def of(cls, store: EpisodeStore, users: Array) -> "Period":
-        """The steps of `store`; `users` (E,) are the user identifiers of its E episodes."""
+    def of(cls, store: EpisodeStore, users: Array, liked: Liked = liked_steps) -> "Period":
+        """The steps of `store`; `users` (E,) are the user identifiers of its E episodes, and
+        `liked` says of steps whether they were liked."""
         episodes, steps = store.all_steps()
         items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
         n_items = len(store.item_states.embeddings)
-        return cls(users[episodes], items, liked_steps(store, episodes, steps), n_items)
+        return cls(users[episodes], items, liked(store, episodes, steps), n_items)
 
     @property
     def item_rates(self) -> Float64Array:

@@ -36,7 +36,10 @@ def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
     """
     record = trained.record
     if record["fingerprint"] == logged.meta["fingerprint"]:
-        return 1.0
+        held_out = np.zeros(logged.n_episodes, dtype=bool)
+        if REFIT_OF not in record:
+            held_out = logged.episode_values(schema.SPLIT) == schema.SPLITS.index("test")
+        return float(logged.lengths[~held_out].sum() / logged.n_steps)
     try:
         store = store_of(trained.folder, record)
     except InputError:

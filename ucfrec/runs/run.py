@@ -24,6 +24,7 @@ from ucfrec.fitting import distributed
 from ucfrec.fitting.loop import Fit
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
+from ucfrec.policies.checks import require_sound
 from ucfrec.runs.config import Config
 from ucfrec.runs.policy_fit import fit_policy
 from ucfrec.runs.record import RUN, RuleRecord, RunRecord, read_augmentation
@@ -134,6 +135,7 @@ def _prepare_inputs(
         require_startable(store, train, out, config)
     policy = new_policy(train, config)
     if distributed.leads():
+        require_sound(policy, train, config.policy_name)
         if not (out / RUN).exists():
             begin(store, train, validation, out, config, about)
         RunRecord.read(out).reopened(out, INPUTS)

@@ -378,11 +378,15 @@ def _rule(
     shared: SharedStages,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Fit the user model and choose the rule; returns the reports of both."""
-    fit = partial(UserModel.fit, train, validation, out / REWARD_MODEL, config.seed)
-    inputs = _inputs(train, validation, config.seed, torch.device("cpu"))
+    trained = TrainedPolicy.load(out, in_training=True)
+    simulated = trained.returns.per_session
+    fit = partial(UserModel.fit, train, validation, out / REWARD_MODEL, config.seed, simulated)
+    inputs = {
+        **_inputs(train, validation, config.seed, torch.device("cpu")),
+        "simulated": simulated,
+    }
     shared.provide(inputs, UserModel.__module__, out, (REWARD_MODEL,), fit)
     users = fit()  # read from the folder
-    trained = TrainedPolicy.load(out, in_training=True)
     targets = {quantile: trained.target_return(quantile) for quantile in config.rule.quantiles}
     decider = Decider(policy, trained.rule, trained.returns, users.reward)
     choice = choose_rule(decider, users, targets, train, validation, config.rule, config.seed)

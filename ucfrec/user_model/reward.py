@@ -154,6 +154,8 @@ class ItemRewardModel(nn.Module):
         for name in ("user", "affinity", "state", "interaction", "exposure"):
             buffer = self.get_buffer(name)
             buffer.copy_(effects.get(name, torch.zeros(buffer.shape)).view(buffer.shape))
+        if "context" in effects:
+            self.interaction[-len(effects["context"]) :] += effects["context"]
         self.item.copy_(effects["mean"] + effects.get("item", torch.zeros(())))
         if "content" in effects:
             self.item.add_(of_content(effects["content"]))

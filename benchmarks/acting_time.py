@@ -34,7 +34,6 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.logged_decisions import session_scores
 from ucfrec.choosing.by_simulation import RuleSearch
 from ucfrec.choosing.config import RuleConfig
-from ucfrec.code_version import code_version
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.policies.registry import policy_class
@@ -47,8 +46,7 @@ from ucfrec.recommending.stream import answer_stream
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows
 from ucfrec.reporting.tables import markdown_table
-from ucfrec.runs.config import config_from_dict
-from ucfrec.runs.run import training_views
+from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import REWARD_MODEL, TrainedPolicy
 from ucfrec.user_model.model import UserModel
 from ucfrec.user_model.reward import ItemRewardModel
@@ -84,8 +82,8 @@ def enlarged(trained: TrainedPolicy, items: int) -> TrainedPolicy:
     assert model is not None
     n_items = len(states.embeddings)
     rows = torch.randint(n_items, (items,), generator=torch.Generator().manual_seed(0))
-    sizes = {**trained.record["sizes"], "items": items}
-    config = config_from_dict(trained.record["config"])
+    sizes = {**trained.record.sizes, "items": items}
+    config = trained.record.config
     policy = policy_class(config.policy_name)(config.policy, sizes)
     larger = ItemRewardModel(sizes)
     for old, new in ((trained.policy, policy), (model, larger)):
@@ -150,7 +148,7 @@ def frame_ways(run: Path) -> tuple[Way, Way]:
     frame = pd.DataFrame({schema.USER_ID: np.full(10, 1), schema.ITEM_ID: items[:10].to_numpy()})
     frame[schema.TIMESTAMP] = BEGAN + np.cumsum(rng.integers(1, 60_000, 10))
     frame[schema.REWARD] = rng.random(10).round()
-    if policy.trained.record["session_by"] == schema.SESSION_ID:
+    if policy.trained.record.session_by == schema.SESSION_ID:
         frame[schema.SESSION_ID] = 1
     named = LogMapping({schema.ITEM_ID: schema.ITEM_ID})
     return lambda: policy.recommend(frame), lambda: policy.recommend(frame, mapping=named)
@@ -171,7 +169,7 @@ def log_ways(trained: TrainedPolicy, store: EpisodeStore, folder: Path) -> tuple
     )
     # The way of the run's reward to its column is not what is measured.
     log = folder / "log.parquet"
-    frame.assign(**{trained.record["reward"]: frame[schema.REWARD]}).to_parquet(log)
+    frame.assign(**{trained.record.reward: frame[schema.REWARD]}).to_parquet(log)
     decider = trained.decider()
 
     def batches() -> Iterator[Histories]:
@@ -319,7 +317,6 @@ def main() -> None:
                 policy="ucf",
                 conditions={"items": items, "rounds": case.rounds, "sessions": options.sessions}
                 | ({} if options.engine == TORCH else {"engine": options.engine}),
-                code_version=code_version(Path(__file__), "ucfrec.recommending.responder"),
                 metric="ratio",
                 metrics=found,
                 wall_time_s=float(wall.sum()),

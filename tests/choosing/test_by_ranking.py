@@ -20,7 +20,8 @@ from ucfrec.files.atomic import read_json
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.policies.heads import ItemHead
 from ucfrec.runs.config import resolve_config
-from ucfrec.runs.run import train_run, training_views
+from ucfrec.runs.run import train_run
+from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SETTINGS = ["train.steps=5", "policy.dim=16", "policy.context=4", "augment.copies=0"]

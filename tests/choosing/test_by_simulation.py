@@ -21,9 +21,10 @@ from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.policies.heads import ItemHead
 from ucfrec.runs.config import config_from_dict, resolve_config
-from ucfrec.runs.describe import describe_run, promised
+from ucfrec.runs.record import RuleRecord, read_record
 from ucfrec.runs.refit import refit
-from ucfrec.runs.run import train_run, training_views
+from ucfrec.runs.run import train_run
+from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import REWARD_MODEL, TrainedPolicy
 from ucfrec.user_model.model import UserModel
 
@@ -87,9 +88,11 @@ def test_a_run_acts_by_the_rule_that_it_chose_and_says_how(
     best = max(rule["candidates"], key=lambda each: each["value"])
     own = next(each for each in rule["candidates"] if each["rule"] == rule["rule"])
     assert own["value"] >= best["value"] - best["error"] or best["items"] < rule["least_items"]
-    assert promised(rule) == (own["value"], own["error"])
-    assert f"promised by it {own['value']:.4g} ±" in describe_run(record)
-    assert promised({**rule, "candidates": []}) is None
+    found = read_record(folder / "run")
+    assert found.rule is not None
+    assert found.rule.simulated == (own["value"], own["error"])
+    assert f"promised by it {own['value']:.4g} ±" in found.describe()
+    assert RuleRecord.model_validate({**rule, "candidates": []}).simulated is None
 
 
 def test_a_reward_weight_pays_where_the_reward_model_knows_the_items(
@@ -221,11 +224,14 @@ def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_pat
     config = resolve_config("bc", None, [*SMALL, "train.validate_every=20", *rule])
     store = tiring_store(tmp_path)
     record = train_run(store, tmp_path / "run", config)
-    assert record["reward_model"]["new_users"]
-    assert "tastes of training users" in record["rule"]["chosen_by"]
-    users = record["rule"]["users"]
-    assert users["steps"] == users["effective_steps"] == record["train_steps"]
-    assert list(users["calibration"]) == record["rule"]["calibration"]
+    assert record.reward_model is not None
+    assert record.reward_model.new_users
+    assert record.rule is not None
+    assert "tastes of training users" in record.rule.chosen_by
+    choice = record.rule.model_dump()
+    users = choice["users"]
+    assert users["steps"] == users["effective_steps"] == record.train_steps
+    assert list(users["calibration"]) == choice["calibration"]
     # Nothing that acts knows these tastes.
     trained = TrainedPolicy.load(tmp_path / "run")
     model = trained.reward_model
@@ -237,7 +243,7 @@ def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_pat
     four_times = replace(config.rule, sessions=160)
     more = RuleSearch(*given, *training_views(store), four_times, config.seed)
     (simulated,) = more.simulate([trained.rule])
-    assert promised(record["rule"]) == (simulated.value, simulated.error)
+    assert record.rule.simulated == (simulated.value, simulated.error)
 
 
 def test_of_rules_that_the_model_cannot_tell_apart_the_widest_draws_are_taken(
@@ -307,9 +313,9 @@ def test_a_refit_learns_from_all_rows_and_chooses_nothing_anew(
     store = EpisodeStore.open(folder / "store")
     record = refit(store, folder / "run", tmp_path / "refit")
     again = TrainedPolicy.load(tmp_path / "refit")
-    assert record["train_steps"] == store.n_steps > trained.record["train_steps"]
-    assert record["policy"]["steps"] == max(1, trained.record["policy"]["best_step"])
-    assert "policy        trained on all rows, up to step" in describe_run(record)
+    assert record.train_steps == store.n_steps > trained.record.train_steps
+    assert record.finished.steps == max(1, trained.record.finished.best_step)
+    assert "policy        trained on all rows, up to step" in record.describe()
     assert again.rule == trained.rule
     assert again.reward_model is not None
     assert trained.reward_model is not None

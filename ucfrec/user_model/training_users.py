@@ -126,7 +126,7 @@ def propensity_weights(
     user's steps of equal weight that tell as much, (Σ w)² / Σ w² (Kish). None if the log does not
     have every p.
     """
-    if schema.PROPENSITY not in view.meta["columns"]:
+    if schema.PROPENSITY not in view.record.columns:
         return None
     propensities = view.step_values(schema.PROPENSITY, episodes, steps).astype(np.float64)
     if not (propensities > 0).all():

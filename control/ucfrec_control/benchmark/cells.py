@@ -132,7 +132,7 @@ def key(cell: Cell) -> RowKey:
         evaluation_seed=cell.evaluation_seed,
         conditions=conditions,
         code_version=cell.code_version,
-        data_fingerprint=EpisodeStore.open(cell.store).meta["fingerprint"],
+        data_fingerprint=EpisodeStore.open(cell.store).record.fingerprint,
     )
 
 
@@ -183,7 +183,8 @@ def measure_robustness(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     ]
     losses = held_out_losses(TrainedPolicy.load(cell.run, "last"), store)
     metrics = {"score_at_one": evaluations[-1]["score"], **losses}
-    details = {SCREENING: verdicts(record[SCREENING], store)} if cell.screening else {}
+    screening = record.screening
+    details = {} if screening is None else {SCREENING: verdicts(screening.dimensions, store)}
     fields = {"metrics": metrics, "details": details}
     return [score_row(evaluations[0], row_key, **fields, **provenance(PACKAGES))]
 

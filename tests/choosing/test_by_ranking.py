@@ -51,7 +51,7 @@ def chosen(folder: Path, liked_bias: float, *weights: float) -> RuleChoice:
     return choose_by_ranking(replace(decider, policy=policy), *views, config, 0)
 
 
-def test_all_reward_weights_at_once_are_judged_as_each_rule_alone(folder: Path) -> None:
+def test_all_reward_weights_at_once_are_evaluated_as_each_rule_alone(folder: Path) -> None:
     trained = TrainedPolicy.load(folder / "run")
     _, validation = training_views(EpisodeStore.open(folder / "store"))
     episodes, steps = validation.all_steps()

@@ -176,7 +176,7 @@ def _logistic(inputs: Tensor, ended: BoolArray, weights: bool = True) -> dict[st
     rate, zeros = float(ended.mean()) if len(ended) else 0.0, torch.zeros_like(inputs[:0].sum(0))
     if not weights:
         bias = torch.logit(torch.tensor(rate).double())
-        return {"mean": zeros, "scale": zeros + 1, "weights": zeros, "bias": bias}
+        return {"mean": zeros, "scale": zeros + 1, "weights": zeros.clone(), "bias": bias}
     mean, spread = inputs.mean(0), inputs.std(0, correction=0)
     scale = torch.where(spread > 0, spread, 1.0)
     model = LogisticRegression(C=1 / _PENALTY, max_iter=1000)

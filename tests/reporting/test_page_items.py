@@ -20,7 +20,7 @@ from tests.support.episodes import (
     step_columns,
 )
 from tests.support.report_page import HOSTILE, SOURCE, number, page_of, record_of, rewritten, row
-from ucfrec.acting.logged_decisions import session_scores
+from ucfrec.acting.scorer import logged_scores
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError
@@ -121,7 +121,7 @@ def test_samples_are_what_the_policy_shows(folder: Path, tmp_path: Path) -> None
     held_out = held_out.split("validation")
     first = held_out.windows(np.array([0]), held_out.lengths[:1] - 1, 5)
     assert samples["rule"] == str(trained.rule)
-    scores = session_scores(trained.decider(), held_out, np.array([0]), held_out.lengths[:1] - 1)
+    scores = logged_scores(trained.scorer(), held_out, np.array([0]), held_out.lengths[:1] - 1)
     best = scores[0].topk(5).indices
     session = samples["sessions"][0]
     assert session["recommended"] == best.tolist()

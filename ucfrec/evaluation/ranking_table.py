@@ -63,7 +63,7 @@ def ranking_rows(
     counts = trained.counts
     assert counts is not None
     fitted_on = None if train is None else train.split("train")
-    model = [] if trained.reward_model is None else [RewardRanker(trained.decider())]
+    model = [] if trained.reward_model is None else [RewardRanker(trained.scorer())]
     named = rankers_named([*policies, *model, *baselines(counts, fitted_on, seed)])
     k = min(k, len(counts.shown))
     period = Period.of(later, np.asarray(users))

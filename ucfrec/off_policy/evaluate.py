@@ -351,7 +351,7 @@ def step_features(trained: TrainedPolicy, batch: ScoredSteps) -> tuple[Array, Te
     """
     assert trained.item_states is not None
     embeddings = trained.item_states.embeddings
-    items = batch.windows.actions[:, -1]
+    items = batch.items
     known = items >= 0
     probabilities = batch.log_probabilities.exp()
     target = probabilities.gather(1, items[:, None].clamp(min=0))[:, 0].double() * known
@@ -359,7 +359,7 @@ def step_features(trained: TrainedPolicy, batch: ScoredSteps) -> tuple[Array, Te
     of_chosen, of_shown = scores_of(batch.scores.log_softmax(-1), items, probabilities)
     seen = StepInputs(
         context=context_of(batch),
-        state_size=batch.windows.states.shape[2],
+        state_size=batch.states.shape[1],
         chosen=embeddings[items] * known[:, None],
         shown=probabilities @ embeddings,
         scores=torch.stack([of_chosen, of_shown], dim=1),

@@ -73,7 +73,9 @@ def test_all_items_at_once_end_sessions_as_each_alone() -> None:
     likeness, logged = planted_ends(400)
     end, _ = SessionEnd.fit(likeness, logged, logged, 0)
     steps, rewards = torch.from_numpy(logged.steps), torch.from_numpy(logged.rewards)
-    together = end.of_all_items(logged.shown, rewards.unsqueeze(1).expand(-1, ITEMS), steps)
+    every = torch.arange(ITEMS).expand(400, -1)
+    rewards = rewards.unsqueeze(1).expand(-1, ITEMS)
+    together = end.of_items(logged.shown, every, rewards, steps)
     for item in range(ITEMS):
         alone = end.probabilities(
             *(logged.shown, torch.full((400,), item), logged.rewards, logged.steps)

@@ -148,6 +148,7 @@ def choose_by_simulation(
     first = search.best(tried).rule
     tried += search.simulate([*_variants(first, reward_weight=config.reward_weights)])
     second = search.best(tried).rule
+    tried += _with_lookahead(search, second, config, train)
     if validation.item_states.tags.shape[1]:
         tried += _with_tag_window(search, second, config, scorer.known)
         # Without a tag window, which may only have served to tire no one.
@@ -166,6 +167,18 @@ def choose_by_simulation(
         else "; WARNING: the log supports no candidate, this one shows the most different items",
         details={**users.report(), "least_items": search.least_items},
     )
+
+
+def _with_lookahead(
+    search: RuleSearch, rule: DecisionRule, config: RuleConfig, train: EpisodeStore
+) -> list[SimulatedRule]:
+    """The rule with a lookahead, if more than chance ends sessions."""
+    mean = float(train.returns.sum(dtype=np.float64)) / train.n_steps
+    lookaheads = [each * mean for each in config.lookaheads if each * mean > 0]
+    if search.users.session_end_report.kept == "constant":
+        return []
+    weights = {"reward_weight": config.lookahead_weights, "policy_weight": config.policy_weights}
+    return search.simulate([*_variants(rule, lookahead=lookaheads, **weights)])
 
 
 def _with_tag_window(
@@ -221,8 +234,8 @@ def _variants(rule: DecisionRule, **values: Sequence[Any]) -> Iterator[DecisionR
 def _simplicity(candidate: SimulatedRule) -> tuple[float, ...]:
     rule = candidate.rule
     return (
-        *(rule.tag_run > 0, rule.tag_window > 0, -rule.temperature),
-        *(rule.reward_weight, -rule.tag_run),
+        *(rule.tag_run > 0, rule.tag_window > 0, rule.lookahead > 0, -rule.temperature),
+        *(rule.reward_weight, rule.lookahead, -rule.policy_weight, -rule.tag_run),
     )
 
 

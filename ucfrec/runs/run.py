@@ -206,7 +206,7 @@ def _fit_user_model(run: _Inputs) -> UserModel:
 def _choose_rule(run: _Inputs, users: UserModel) -> RuleRecord:
     """Choose the decision rule: by simulation in the user model, or by ranking."""
     trained = TrainedPolicy.load(run.out, in_training=True)
-    parts = trained.item_states, trained.returns, users.reward
+    parts = trained.item_states, trained.returns, users.reward, users.session_end
     scorer = Scorer(run.policy, trained.rule, *parts)
     config = run.config.rule
     targets = {quantile: trained.target_return(quantile) for quantile in config.quantiles}

@@ -23,7 +23,7 @@ from ucfrec.user_model.reward_rows import RewardRows
 from ucfrec.user_model.session_end import LoggedEnds, SessionEnd, SessionEndReport
 from ucfrec.user_model.training_users import TrainingUsers, fit_training_users
 
-_SESSIONS: Final = "sessions.safetensors"
+SESSIONS: Final = "sessions.safetensors"
 """File of session ends, fatigue and calibration in the model's folder."""
 _MOST_STEPS: Final = 100_000
 """Logged steps that session ends, fatigue and calibration are fitted to at most."""
@@ -73,7 +73,7 @@ class UserModel:
         require_blas_memory()
         reward, report = fit_item_reward_model(train, validation, folder, seed)
         users = fit_training_users(train, folder, seed) if simulated and train.has_users else None
-        tags, path = MainTags.of(validation.item_states), folder / _SESSIONS
+        tags, path = MainTags.of(validation.item_states), folder / SESSIONS
         if not path.exists():
             runs = (LoggedRuns.of(v, tags, reward.lags, _MOST_STEPS) for v in (train, validation))
             tired = fit_fatigue(*runs) if reward.binary else None
@@ -132,3 +132,17 @@ class UserModel:
             "session_end": dataclasses.asdict(self.session_end_report),
             "fatigue": None if self.fatigue is None else dataclasses.asdict(self.fatigue),
         }
+
+
+def load_session_end(folder: Path, reward: ItemRewardModel | None) -> SessionEnd | None:
+    """The model of session ends in the folder of a user model; None if there is none.
+
+    Raises:
+        InputError: its file is damaged.
+    """
+    path = folder / SESSIONS
+    if reward is None or not path.exists():
+        return None
+    tensors, _ = load_tensors(path)
+    with damage_explained(path, REMEDY):
+        return SessionEnd.of(reward.likeness, tensors)

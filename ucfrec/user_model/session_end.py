@@ -21,6 +21,10 @@ _PENALTY: Final = 1.0
 """L2 penalty of the logistic regression on standardised inputs."""
 _LAGS: Final = 6
 """Items shown before whose likeness counts."""
+_REWARD: Final = 3
+"""Number of the input that is the step's reward."""
+_REMEMBERED: Final = 10
+"""Items shown before that are compared with the item."""
 _FEWEST: Final = 20
 """Fewest steps that end a session, and that do not, from which more than their share is told."""
 _LOGISTIC: Final = ("mean", "scale", "weights", "bias")
@@ -91,7 +95,7 @@ class SessionEnd:
 
     A constant, a logistic regression, or boosted trees, of the number of the step, its reward, how
     alike its item is to each of the last six, the largest of these over the last 2, 3 and 4, and
-    how often the item was shown in the last 1, 3 and all of the steps that are remembered.
+    how often the item was shown in the last 1, 3 and 10.
     """
 
     likeness: Likeness
@@ -137,6 +141,14 @@ class SessionEnd:
             return cls(likeness, BoostedTrees.of(tensors).tensors())
         return cls(likeness, {name: tensors[name] for name in _LOGISTIC})
 
+    @property
+    def uses_rewards(self) -> bool:
+        """Whether the reward of the step counts."""
+        if "thresholds" in self.tensors:
+            leaf = self.tensors["left"] == torch.arange(self.tensors["left"].shape[1])
+            return bool(((self.tensors["inputs"] == _REWARD) & ~leaf).any())
+        return bool(self.tensors["weights"][_REWARD] != 0)
+
     def probabilities(
         self, shown: Shown, items: Tensor, rewards: Float64Array, steps: IntArray
     ) -> Float64Array:
@@ -145,20 +157,24 @@ class SessionEnd:
         inputs = _inputs(self.likeness, LoggedEnds(shown, items, rewards, steps, nothing))
         return torch.sigmoid(self._log_odds(inputs)).numpy()
 
-    def of_all_items(self, shown: Shown, rewards: Tensor, steps: Tensor) -> Tensor:
-        """Probabilities (B, n_items) that sessions end if they show each of the items.
+    def of_items(self, shown: Shown, items: Tensor, rewards: Tensor, steps: Tensor) -> Tensor:
+        """Probabilities (B, C) that sessions end if they show items.
 
         Args:
             shown: what they showed before.
-            rewards: (B, n_items) that the items would be given.
+            items: (B, C) int64.
+            rewards: (B, C) that the items would be given.
             steps: (B,) number of the step.
         """
-        alike = [self.likeness.to_all(_profile(self.likeness, shown, lag)) for lag in range(_LAGS)]
-        numbers = torch.arange(rewards.shape[1])
-        repeated = shown.items.unsqueeze(2) == numbers
+        alike = [
+            self.likeness.to_candidates(_profile(self.likeness, shown, lag), items)
+            for lag in range(_LAGS)
+        ]
+        repeated = shown.items.unsqueeze(2) == items.unsqueeze(1)
         inputs = _columns(torch.stack(alike, 1), repeated, rewards, steps.unsqueeze(1))
-        odds = self._log_odds(inputs.reshape(-1, inputs.shape[-1]))
-        return torch.sigmoid(odds).view(rewards.shape)
+        return torch.sigmoid(self._log_odds(inputs.flatten(0, 1))).unflatten(
+            0, (-1, items.shape[1])
+        )
 
     def _log_odds(self, inputs: Tensor) -> Tensor:
         """(M,) from inputs (M, F), float64."""
@@ -208,5 +224,5 @@ def _columns(alike: Tensor, repeated: Tensor, rewards: Tensor, steps: Tensor) ->
     columns = [torch.log1p(numbers), numbers, numbers.clamp(max=1), rewards.double()]
     columns += [*alike.double().unbind(1)]
     columns += [alike[:, :reach].amax(1).double() for reach in (2, 3, 4)]
-    columns += [repeated[:, :reach].sum(1).double() for reach in (1, 3, repeated.shape[1])]
+    columns += [repeated[:, :reach].sum(1).double() for reach in (1, 3, _REMEMBERED)]
     return torch.stack(columns, -1)

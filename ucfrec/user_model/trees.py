@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any, Final, Self
 
 import numpy as np
@@ -87,14 +88,24 @@ class BoostedTrees:
                 raise ValueError(f"{name} are beyond the trees")
         return cls(**given)
 
+    @cached_property
+    def depth(self) -> int:
+        """Largest number of steps from a root to a leaf."""
+        nodes, reached, depth = self.values.shape[1], torch.zeros_like(self.left[:, :1]), 0
+        while depth < nodes:
+            children = [side.gather(1, reached) for side in (self.left, self.right)]
+            if torch.equal(children[0], reached) and torch.equal(children[1], reached):
+                break
+            reached, depth = torch.cat(children, 1), depth + 1
+        return depth
+
     def __call__(self, inputs: Tensor) -> Tensor:
         """Log-odds (M,) float64 from inputs (M, F)."""
         columns = inputs.double().T
         trees, rows = self.values.shape[0], columns.shape[1]
         node = torch.zeros(trees, rows, dtype=torch.int64)
         row = torch.arange(rows).expand(trees, rows)
-        # A tree of L leaves is at most L − 1 deep.
-        for _ in range((self.values.shape[1] - 1) // 2):
+        for _ in range(self.depth):
             value = columns[self.inputs.gather(1, node), row]
             goes_left = value <= self.thresholds.gather(1, node)
             node = torch.where(goes_left, self.left.gather(1, node), self.right.gather(1, node))

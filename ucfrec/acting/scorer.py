@@ -87,6 +87,9 @@ class Scorer:
         self.policy, self.rule, self.states = policy, rule, states
         self.returns, self.reward_model = returns or ReturnToGo(), reward_model
         self.session_end = session_end
+        self._outcomes: tuple[float, float] | None = None
+        if session_end is not None and reward_model is not None and bool(reward_model.binary):
+            self._outcomes = float(reward_model.reward_low), float(reward_model.reward_high)
         self._items = ItemProduct(policy, reward_model, states)
         self._engine: Callable[[Sessions], Factors] | None = None
         self._require_parts()
@@ -326,13 +329,12 @@ class Scorer:
         best = scores.topk(min(_LOOKED_AT, self._items.count), dim=1).indices
         steps = history.windows.timesteps[:, -1]
         some, recent = rewards.gather(1, best), history.shown.latest(model.lags)
-        if bool(model.binary) and end.uses_rewards:
-            liked = (some - model.reward_low) / span
-            high, low = (
-                end.of_items(recent, best, torch.full_like(some, float(reward)), steps)
-                for reward in (model.reward_high, model.reward_low)
+        if self._outcomes is not None and end.uses_rewards:
+            low, high = (
+                end.of_items(recent, best, torch.full_like(some, reward), steps)
+                for reward in self._outcomes
             )
-            ends = liked * high + (1 - liked) * low
+            ends = low + (high - low) * (some - model.reward_low) / span
         else:
             ends = end.of_items(recent, best, some, steps)
         added = (weight * ahead * (1 - ends)).to(scores.dtype)

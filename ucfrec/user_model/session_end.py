@@ -102,6 +102,9 @@ class SessionEnd:
     tensors: Mapping[str, Tensor]
     """Those of `BoostedTrees`; or `mean` and `scale` (F,) of the inputs, `weights` (F,) and `bias`
     (), all float64."""
+    uses_rewards: bool = dataclasses.field(init=False)
+    """Whether the reward of the step counts."""
+    _trees: BoostedTrees | None = dataclasses.field(init=False)
 
     @classmethod
     def fit(
@@ -141,13 +144,15 @@ class SessionEnd:
             return cls(likeness, BoostedTrees.of(tensors).tensors())
         return cls(likeness, {name: tensors[name] for name in _LOGISTIC})
 
-    @property
-    def uses_rewards(self) -> bool:
-        """Whether the reward of the step counts."""
-        if "thresholds" in self.tensors:
-            leaf = self.tensors["left"] == torch.arange(self.tensors["left"].shape[1])
-            return bool(((self.tensors["inputs"] == _REWARD) & ~leaf).any())
-        return bool(self.tensors["weights"][_REWARD] != 0)
+    def __post_init__(self) -> None:
+        trees = BoostedTrees(**self.tensors) if "thresholds" in self.tensors else None
+        object.__setattr__(self, "_trees", trees)
+        if trees is None:
+            uses = bool(self.tensors["weights"][_REWARD] != 0)
+        else:
+            inner = trees.left != torch.arange(trees.left.shape[1])
+            uses = bool(((trees.inputs == _REWARD) & inner).any())
+        object.__setattr__(self, "uses_rewards", uses)
 
     def probabilities(
         self, shown: Shown, items: Tensor, rewards: Float64Array, steps: IntArray
@@ -179,8 +184,8 @@ class SessionEnd:
     def _log_odds(self, inputs: Tensor) -> Tensor:
         """(M,) from inputs (M, F), float64."""
         tensors = self.tensors
-        if "thresholds" in tensors:
-            return BoostedTrees(**tensors)(inputs)
+        if self._trees is not None:
+            return self._trees(inputs)
         standard = (inputs - tensors["mean"]) / tensors["scale"]
         return standard @ tensors["weights"] + tensors["bias"]
 

@@ -1,9 +1,8 @@
 """Gradient-boosted trees, fitted by scikit-learn and kept as tensors: data, never a program."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from functools import cached_property
-from typing import Any, Final, Self
+from dataclasses import dataclass, field
+from typing import Final, Self
 
 import numpy as np
 import torch
@@ -17,6 +16,8 @@ _SETTINGS: Final = {
     "max_leaf_nodes": 8,
     "early_stopping": True,
 }
+
+_NODES: Final = ("inputs", "thresholds", "left", "right", "values")
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,8 @@ class BoostedTrees:
     """(T, N) float64."""
     base: Tensor
     """() float64, what the trees' sum starts from."""
+    depth: int = field(init=False)
+    """Largest number of steps from a root to a leaf."""
 
     @classmethod
     def fit(cls, inputs: Array, target: Array, seed: int) -> Self:
@@ -51,7 +54,7 @@ class BoostedTrees:
         model = HistGradientBoostingClassifier(random_state=seed, **_SETTINGS).fit(inputs, target)
         trees = [trees[0].nodes for trees in model._predictors]
         size = max(len(nodes) for nodes in trees)
-        columns = {each.name: np.zeros((len(trees), size)) for each in fields(cls)[:-1]}
+        columns = {name: np.zeros((len(trees), size)) for name in _NODES}
         for tree, nodes in enumerate(trees):
             own, leaf = np.arange(len(nodes)), nodes["is_leaf"] == 1
             for name, values in (
@@ -69,7 +72,7 @@ class BoostedTrees:
 
     def tensors(self) -> dict[str, Tensor]:
         """The fields by name, to be saved."""
-        return {each.name: getattr(self, each.name) for each in fields(self)}
+        return {name: getattr(self, name) for name in (*_NODES, "base")}
 
     @classmethod
     def of(cls, tensors: Mapping[str, Tensor]) -> Self:
@@ -78,7 +81,7 @@ class BoostedTrees:
         Raises:
             ValueError: they are no trees.
         """
-        given: dict[str, Any] = {each.name: tensors[each.name] for each in fields(cls)}
+        given = {name: tensors[name] for name in (*_NODES, "base")}
         shape = given["values"].shape
         for name, most in (("inputs", 2**15), ("left", shape[1]), ("right", shape[1])):
             numbers = given[name]
@@ -88,25 +91,19 @@ class BoostedTrees:
                 raise ValueError(f"{name} are beyond the trees")
         return cls(**given)
 
-    @cached_property
-    def depth(self) -> int:
-        """Largest number of steps from a root to a leaf."""
+    def __post_init__(self) -> None:
         nodes, reached, depth = self.values.shape[1], torch.zeros_like(self.left[:, :1]), 0
-        while depth < nodes:
+        while depth < nodes and not torch.equal(self.left.gather(1, reached), reached):
             children = [side.gather(1, reached) for side in (self.left, self.right)]
-            if torch.equal(children[0], reached) and torch.equal(children[1], reached):
-                break
-            reached, depth = torch.cat(children, 1), depth + 1
-        return depth
+            reached, depth = torch.cat(children, 1).unique(dim=1), depth + 1
+        object.__setattr__(self, "depth", depth)
 
     def __call__(self, inputs: Tensor) -> Tensor:
         """Log-odds (M,) float64 from inputs (M, F)."""
         columns = inputs.double().T
-        trees, rows = self.values.shape[0], columns.shape[1]
-        node = torch.zeros(trees, rows, dtype=torch.int64)
-        row = torch.arange(rows).expand(trees, rows)
+        node = torch.zeros(self.values.shape[0], columns.shape[1], dtype=torch.int64)
         for _ in range(self.depth):
-            value = columns[self.inputs.gather(1, node), row]
-            goes_left = value <= self.thresholds.gather(1, node)
+            values = columns.gather(0, self.inputs.gather(1, node))
+            goes_left = values <= self.thresholds.gather(1, node)
             node = torch.where(goes_left, self.left.gather(1, node), self.right.gather(1, node))
         return self.base + self.values.gather(1, node).sum(0)

@@ -43,10 +43,10 @@ from ucfrec.recommending.recommend import recommend
 from ucfrec.recommending.requests import Limits
 from ucfrec.recommending.responder import ENGINES, TORCH, Responder
 from ucfrec.recommending.stream import answer_stream
-from ucfrec.reporting.result_row import ResultRow
-from ucfrec.reporting.rows_file import append_rows
 from ucfrec.reporting.tables import markdown_table
-from ucfrec.runs.run import training_views
+from ucfrec.results.row import ResultRow
+from ucfrec.results.rows_file import append_rows
+from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import REWARD_MODEL, TrainedPolicy
 from ucfrec.user_model.model import UserModel
 from ucfrec.user_model.reward import ItemRewardModel

@@ -12,11 +12,14 @@ import sys
 import tempfile
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ucfrec.arrays import Float32Array
+
+if TYPE_CHECKING:
+    from ucfrec.results.row import ResultRow
 
 ENV, EPISODES = "Hopper-v5", 150
 TARGETS = (50.0, 150.0, 250.0)
@@ -88,14 +91,14 @@ def train(file: Path, folder: Path) -> Path:
 # each target return.
 
 
-def evaluate(run: Path) -> list[dict[str, Any]]:
+def evaluate(run: Path) -> "list[ResultRow]":
     """One result row a target return."""
     from ucfrec_control.learners.evaluate import evaluate_run
 
     return evaluate_run(run, episodes=20, seed=100, targets=TARGETS, checkpoints=("best",))
 
 
-def main(folder: Path) -> list[dict[str, Any]]:
+def main(folder: Path) -> "list[ResultRow]":
     """Run all parts; returns the result rows, none without the extra."""
     missing = [name for name in ("h5py", "mujoco") if find_spec(name) is None]
     if missing:

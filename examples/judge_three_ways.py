@@ -23,7 +23,8 @@ from ucfrec.evaluation.simulated_store import simulated_store
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.off_policy.evaluate import evaluate_off_policy
 from ucfrec.off_policy.score import logged_sessions, score
-from ucfrec.reporting.tables import format_rows
+from ucfrec.reporting.tables import evaluation_table
+from ucfrec.results.row import ResultRow
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -54,7 +55,7 @@ def train(folder: Path) -> dict[str, Path]:
 # the logging policy and of `optimal` before you look at a policy's.
 
 
-def by_playing(runs: dict[str, Path]) -> list[dict[str, object]]:
+def by_playing(runs: dict[str, Path]) -> list[ResultRow]:
     """One result row a policy: `R_cum` is the mean return of an episode."""
     rows = [evaluate_behavior(ENVIRONMENT, name, EPISODES, SEED) for name in ("random", "mixture")]
     for name, run in runs.items():
@@ -94,7 +95,9 @@ def from_logs(runs: dict[str, Path], fresh: Path) -> pd.DataFrame:
         for warning in estimates.warnings:
             print(f"{name}: {warning}")
         print(f"{name}: {estimates.verdict.headline}")
-        rows += [row | {"policy": name} for row in estimates.rows]
+        rows += [
+            row.as_line() | {"estimator": row.method, "policy": name} for row in estimates.rows
+        ]
     return pd.DataFrame(rows)
 
 
@@ -126,12 +129,12 @@ def by_what_came_next(runs: dict[str, Path], fresh: Path) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def main(folder: Path) -> tuple[list[dict[str, object]], pd.DataFrame, pd.DataFrame]:
+def main(folder: Path) -> tuple[list[ResultRow], pd.DataFrame, pd.DataFrame]:
     """Train, judge three ways and print all three tables."""
     runs = train(folder)
 
     played = by_playing(runs)
-    print(f"1. played in the simulator\n{format_rows(played)}\n")
+    print(f"1. played in the simulator\n{evaluation_table(played)}\n")
 
     simulator = ENVIRONMENT.simulator()
     env = simulator.make(256, None)

@@ -20,7 +20,7 @@ def test_the_three_ways_of_judging_are_shown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     played, estimated, ranked = judge_three_ways.main(tmp_path)
-    earned = {str(row["policy"]): float(str(row["R_cum"])) for row in played}
+    earned = {row.method: row.value for row in played}
     assert earned["random"] < earned["bc"] < earned["ucf"] < earned["optimal"]
     weighted = estimated[estimated["estimator"] == "PDIS"]
     assert (weighted["effective_sessions"] < 100).all()  # what the text warns of

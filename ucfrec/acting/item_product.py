@@ -290,7 +290,7 @@ class _Tags:
         profile = F.pad(profile[:, :-1], (0, 1))
         if items is not None:
             tags = self._places[items]  # (B, C, T)
-            return profile.gather(1, tags.flatten(1)).unflatten(1, tags.shape[1:]).sum(2)
+            return profile.gather(1, tags.flatten(1)).view(tags.shape).sum(2)
         columns = [profile.index_select(1, column) for column in self._distinct.unbind(1)]
         return torch.stack(columns).sum(0).index_select(1, self._which)
 

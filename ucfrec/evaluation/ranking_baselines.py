@@ -28,7 +28,7 @@ class PolicyRanker:
     """Ranks items as a trained policy does under its decision rule, before anything is drawn."""
 
     def __init__(self, trained: TrainedPolicy, rule: DecisionRule | None, name: str) -> None:
-        self.name, self._scorer = name, trained.scorer(rule)
+        self.name, self.trained, self._scorer = name, trained, trained.scorer(rule)
         self.rule = self._scorer.rule
 
     def scores(self, steps: Steps) -> Tensor:

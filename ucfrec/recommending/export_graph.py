@@ -128,8 +128,14 @@ def random_sessions(scorer: Scorer, sessions: int, seed: int) -> Sessions:
     if observed:
         size = (sessions, scorer.policy.config.context, observed)
         observations = torch.from_numpy(rng.normal(size=size).astype(np.float32))
-    given = (items, rewards, steps, rewards.sum(1, dtype=np.float64), users)
-    return Sessions(*map(torch.from_numpy, given), observations)
+    return Sessions(
+        items=torch.from_numpy(items),
+        rewards=torch.from_numpy(rewards),
+        steps=torch.from_numpy(steps),
+        collected=torch.from_numpy(rewards.sum(1, dtype=np.float64)),
+        users=torch.from_numpy(users),
+        observations=observations,
+    )
 
 
 def inputs_of(sessions: Sessions) -> dict[str, Tensor]:

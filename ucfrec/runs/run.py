@@ -229,7 +229,7 @@ def _dependencies(
     device: torch.device,
     *settings: CRMConfig | CSGConfig | AugmentConfig,
 ) -> dict[str, Any]:
-    """All that a shared stage depends on, but the code."""
+    """All that a reward model or copies depend on."""
     return {
         "data": train.record.fingerprint,
         "item_states": train.record.files.get(ITEM_STATES),

@@ -142,6 +142,15 @@ def rule_options(parser: argparse.ArgumentParser) -> None:
         "--reward-weight", type=float, metavar="BETA", help="weight of the reward model; 0 for none"
     )
     rule.add_argument(
+        "--policy-weight", type=float, metavar="W", help="weight of the policy; 0 for none"
+    )
+    rule.add_argument(
+        "--lookahead",
+        type=float,
+        metavar="RETURN",
+        help="expected return after a step that does not end the session; 0 for none",
+    )
+    rule.add_argument(
         "--temperature", type=float, help="draw items at this temperature; 0 takes the best"
     )
     rule.add_argument("--top-k", type=int, metavar="N", help="draw from the N best items only")
@@ -253,6 +262,8 @@ def rule_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "Decisi
         "target": target,
         "minimum_target": options.minimum_target,
         "reward_weight": options.reward_weight,
+        "policy_weight": options.policy_weight,
+        "lookahead": options.lookahead,
         "temperature": options.temperature,
         "top_k": options.top_k,
         "exclude_seen": options.exclude_seen or None,

@@ -198,8 +198,9 @@ def _train_policy(
 def _fit_user_model(run: _Inputs) -> UserModel:
     """Fit what users would do: the reward of every item, session ends and fatigue."""
     inputs = _dependencies(run.logged, run.held_out, run.config.seed, torch.device("cpu"))
-    folder = run.out / REWARD_MODEL
-    fit = partial(UserModel.fit, run.logged, run.held_out, folder, run.config.seed)
+    inputs["simulated"] = simulated = run.record.return_to_go.per_session
+    given = run.logged, run.held_out, run.out / REWARD_MODEL, run.config.seed
+    fit = partial(UserModel.fit, *given, simulated)
     run.shared.provide(inputs, UserModel.__module__, run.out, (REWARD_MODEL,), fit)
     return fit()  # read from the folder
 
@@ -207,7 +208,7 @@ def _fit_user_model(run: _Inputs) -> UserModel:
 def _choose_rule(run: _Inputs, users: UserModel) -> RuleRecord:
     """Choose the decision rule: by simulation in the user model, or by ranking."""
     trained = TrainedPolicy.load(run.out, in_training=True)
-    parts = trained.item_states, trained.returns, users.reward
+    parts = trained.item_states, trained.returns, users.reward, users.session_end
     scorer = Scorer(run.policy, trained.rule, *parts)
     config = run.config.rule
     targets = {quantile: trained.target_return(quantile) for quantile in config.quantiles}

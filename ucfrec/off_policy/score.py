@@ -26,7 +26,7 @@ from ucfrec.logs.ids import EPISODE_USERS
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.progress import progress
-from ucfrec.runs.record import store_of
+from ucfrec.runs.record import RUN, store_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SESSION, PROBABILITY, RANK, GREEDY = "session", "probability", "rank", "greedy_item_id"

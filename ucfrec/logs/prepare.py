@@ -46,7 +46,7 @@ from ucfrec.logs.sessions import Cut, Episodes, by_sessions, episodes, split_bou
 from ucfrec.logs.sorted_rows import SortedRows, check_sorted, sorted_batches
 from ucfrec.logs.spool import Spool
 from ucfrec.logs.steps import StepNumbers, write_steps
-from ucfrec.logs.summary import build_report, require_variety
+from ucfrec.logs.summary import build_report, note_equal_times, require_variety
 from ucfrec.logs.typed import TypedLog, typed_log
 from ucfrec.progress import progress
 
@@ -280,6 +280,7 @@ def _prepared(
                 require_rows(log, len(rows.clean), rows.dropped)
                 if like is None:
                     require_variety(rows)
+                note_equal_times(rows)
                 stage.update()
                 spool, cut = _cut(rows, options, like, scratch)
                 stage.update()

@@ -6,6 +6,7 @@ duplicates and writes the others to a spool with numbers in place of ids.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -16,7 +17,7 @@ from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray
 from ucfrec.logs.clean import REASONS, faults, require_rewards_in_range
 from ucfrec.logs.engine import as_numpy
-from ucfrec.logs.kept import kept_rows, same_key
+from ucfrec.logs.kept import Digests, Hashes, digests, in_hashed_order, kept_rows
 from ucfrec.logs.row_vectors import RowVectors
 from ucfrec.logs.spool import Spool
 from ucfrec.logs.typed import ROWS, TypedLog
@@ -34,7 +35,7 @@ class SortedRows:
 
     log: TypedLog
     clean: Spool
-    """Usable rows in order of user, time and choice: `user` (int64 in the order of the ids),
+    """Usable rows in order of user, time and hash: `user` (int64 in the order of the ids),
     `item` (code, int32) or `action`, `timestamp`, `reward` (float64) and, if the log has them,
     `session` (with sessions by session_id), `observation`, `propensity` (NaN if unknown) and
     `is_random`."""
@@ -49,6 +50,8 @@ class SortedRows:
     """Number of rows."""
     conflicts: int = 0
     """Number of duplicates with another reward than the row that is kept."""
+    tied: int = 0
+    """Number of usable rows that share their user and time."""
     first_ms: int = 0
     """Time of the earliest usable row."""
     last_ms: int = 0
@@ -94,7 +97,7 @@ def sorted_batches(
 
 
 def _read(log: TypedLog, query: str) -> Iterator[pa.RecordBatch]:
-    return iter(log.connection.sql(query).to_arrow_reader(log.batch_rows))
+    yield from log.connection.sql(query).to_arrow_reader(log.batch_rows)
 
 
 def check_sorted(
@@ -111,11 +114,11 @@ def check_sorted(
     Raises:
         InputError: a reward is too large to train with.
     """
-    spools = (Spool(folder and folder / name) for name in ("clean", "placed"))
-    rows = SortedRows(log, *spools)
+    clean, placed = (Spool(folder and folder / name) for name in ("clean", "placed"))
+    rows, hashes = SortedRows(log, clean, placed), _hashes(log)
     reasons = list(REASONS)
     large, largest = 0, 0.0
-    for batch in _whole_keys(_columns(batch, log) for batch in batches):
+    for batch in _whole_times(_columns(batch, log) for batch in batches):
         rows.read += len(batch["fault"])
         placed = batch["fault"] < _UNPLACED
         order = {name: batch[name] for name in ("user", "timestamp", "row")}
@@ -129,12 +132,14 @@ def check_sorted(
         rows.conflicts += kept.conflicts
         rows.dropped["duplicate"] += kept.duplicates
         rows.dropped["reward_not_finite"] += kept.undefined
-        clean = {name: values[kept.rows] for name, values in batch.items() if name in _spooled(log)}
-        size = np.abs(clean[schema.REWARD])
+        order, tied = in_hashed_order(batch, kept.rows, hashes)
+        rows.tied += tied
+        good = {name: batch[name][order] for name in batch if name in _spooled(log)}
+        size = np.abs(good[schema.REWARD])
         large += int(np.count_nonzero(size > schema.LARGEST_REWARD))
         largest = max(largest, float(size.max(initial=0)))
-        rows.count(clean)
-        rows.clean.append(clean)
+        rows.count(good)
+        rows.clean.append(good)
     # The connection answers no query before the last batch.
     if log.key == schema.ITEM_ID:
         (rows.items,) = log.one("SELECT count(*) FROM item_codes")
@@ -243,13 +248,38 @@ def _columns(batch: pa.RecordBatch, log: TypedLog) -> dict[str, Array]:
     return columns
 
 
-def _whole_keys(batches: Iterator[dict[str, Array]]) -> Iterator[dict[str, Array]]:
-    """The same rows in batches that end between two keys, so that no duplicates are parted."""
+def _hashes(log: TypedLog) -> Hashes:
+    """Hashes by code."""
+    # The connection itself answers no query before the last batch of its rows.
+    asked, users_have_codes = log.connection.cursor(), has_codes(log, schema.USER_ID)
+
+    def of_codes(name: str, begin: int, end: int) -> Digests:
+        query = (
+            f"SELECT {name} FROM {CODES[name]} WHERE code BETWEEN {begin} AND {end} ORDER BY code"
+        )
+        return digests([each for (each,) in asked.execute(query).fetchall()])
+
+    @cache
+    def of_all_items() -> Digests:
+        return of_codes(schema.ITEM_ID, 0, np.iinfo(np.int32).max)
+
+    def of_users(codes: Array) -> Digests:
+        if not users_have_codes:
+            return digests(codes.tolist())
+        begin = int(codes[0])
+        return of_codes(schema.USER_ID, begin, int(codes[-1]))[codes - begin]
+
+    return Hashes(of_users, lambda codes: of_all_items()[codes])
+
+
+def _whole_times(batches: Iterator[dict[str, Array]]) -> Iterator[dict[str, Array]]:
+    """The same rows in batches that end between two times of a user: equal times stay together."""
     held: dict[str, Array] = {}
     for batch in batches:
         if held:
             batch = {name: np.concatenate([held[name], batch[name]]) for name in batch}
-        starts = np.flatnonzero(~same_key(batch))
+        users, times = batch["user"], batch[schema.TIMESTAMP]
+        starts = np.flatnonzero((users[1:] != users[:-1]) | (times[1:] != times[:-1]))
         if not len(starts):
             held = batch
             continue

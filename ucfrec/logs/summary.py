@@ -1,6 +1,7 @@
 """Report on what `prepare` read, dropped and kept, as a dictionary and as a text table."""
 
 import math
+import warnings
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any, Final
@@ -8,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from ucfrec import schema
-from ucfrec.errors import InputError, one_line
+from ucfrec.errors import InputError, InputNote, one_line
 from ucfrec.files.remote import origin
 from ucfrec.logs.clean import REASONS
 from ucfrec.logs.distributions import Distribution
@@ -17,6 +18,8 @@ from ucfrec.logs.measures import Measures
 from ucfrec.logs.sessions import Cut
 from ucfrec.logs.sorted_rows import SortedRows
 
+_MANY: Final = 0.2
+"""Share of the rows from which on what happens to them is worth a warning."""
 CONFLICT: Final = "duplicates with a different reward from the kept row"
 """Describes `conflicting_duplicates` of the report."""
 
@@ -31,6 +34,18 @@ def require_variety(rows: SortedRows) -> None:
         raise InputError(
             f"{rows.log.name}: all {len(rows.clean)} rewards equal {rows.lowest:g}, so there is "
             "nothing to learn; choose another reward expression"
+        )
+
+
+def note_equal_times(rows: SortedRows) -> None:
+    """Warn of a log in which many rows share their user and time."""
+    if rows.tied > _MANY * len(rows.clean):
+        warnings.warn(
+            f"{rows.log.name}: {rows.tied / len(rows.clean):.0%} of the rows share their time with "
+            "another row of the user, so their order is unknown and is not learned; log finer "
+            "times if there are any",
+            InputNote,
+            stacklevel=2,
         )
 
 
@@ -59,6 +74,7 @@ def build_report(
         "dropped": {**rows.dropped, "short_episode": len(rows.clean) - measures.steps},
         "conflicting_duplicates": rows.conflicts,
         "unsorted_rows": unsorted,
+        "equal_times": rows.tied,
         "steps": measures.steps,
         "episodes": measures.episodes,
         "sessions": measures.sessions,
@@ -114,6 +130,7 @@ def format_report(report: Mapping[str, Any]) -> str:
         lines.append(("  conflicting duplicates", conflicts))
     lines += [
         ("  out of order", f"{report['unsorted_rows']:,} (sorted, none dropped)"),
+        ("  at equal times", f"{report['equal_times']:,} (in no order that could be learned)"),
         ("steps kept", f"{report['steps']:,}"),
         ("users", f"{report['users']:,}"),
     ]

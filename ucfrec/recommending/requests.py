@@ -199,7 +199,7 @@ class HistoryReader:
             RowRewards.of(trained),
         )
 
-    def read(self, rows: Sequence[Row]) -> UserHistory:
+    def read(self, rows: Sequence[Row], user_id: int | str) -> UserHistory:
         """The history of the rows of one user.
 
         Raises:
@@ -224,7 +224,7 @@ class HistoryReader:
             if {*map(len, given)} == {self.observation_size}:
                 columns[schema.OBSERVATION] = np.asarray(given, dtype=np.float64)
         columns[schema.REWARD] = np.asarray(self.rewards.of_rows(rows), dtype=np.float64)
-        order = kept_in_order(columns, self.duplicates)[-LONGEST_HISTORY:]
+        order = kept_in_order(columns, self.duplicates, user_id)[-LONGEST_HISTORY:]
         observation = None
         if self.observation_size:
             observation = self._observation(rows, int(order[-1]))

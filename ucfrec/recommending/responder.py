@@ -134,7 +134,7 @@ class Responder:
             return [outcome for outcome in outcomes if outcome is not None]
 
     def _asked(self, number: int, request: Request) -> _Asked:
-        history = self._reader.read(request.history)
+        history = self._reader.read(request.history, request.user_id)
         known = self._items.positions(history.item_ids)
         if (known < 0).any() and not self._skip_unknown:
             unknown = sorted(set(history.item_ids[known < 0].tolist()))

@@ -14,8 +14,8 @@ import pytest
 from ucfrec.errors import InputError
 from ucfrec.files.locks import SCRATCH
 from ucfrec.logs import LogMapping, PrepareOptions, prepare, validate
-from ucfrec.logs.binding import Table, glob_pattern, open_tables, text
 from ucfrec.logs.engine import engine
+from ucfrec.logs.tables import Table, glob_pattern, open_tables, text
 
 SECRET = "the content of a file that nobody named"
 

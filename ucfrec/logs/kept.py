@@ -15,7 +15,7 @@ import xxhash
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, IntArray
-from ucfrec.logs.binding import MAX_FLOAT
+from ucfrec.logs.tables import MAX_FLOAT
 
 DUPLICATES: Final = {
     "highest": "has the highest",

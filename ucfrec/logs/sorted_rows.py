@@ -20,7 +20,7 @@ from ucfrec.logs.engine import as_numpy
 from ucfrec.logs.kept import Digests, Hashes, digests, in_hashed_order, kept_rows
 from ucfrec.logs.row_vectors import RowVectors
 from ucfrec.logs.spool import Spool
-from ucfrec.logs.typed import ROWS, TypedLog
+from ucfrec.logs.typed import ROWS, WANTED, TypedLog
 
 CODES: Final = {schema.USER_ID: "user_codes", schema.ITEM_ID: "item_codes"}
 """Id column to the table of its ids and their codes, numbers in the order of the ids."""
@@ -189,7 +189,8 @@ def with_faults(log: TypedLog, rows: str, conditions: Mapping[str, str]) -> str:
     )
     unplaced = f"{schema.USER_ID} IS NULL OR {schema.TIMESTAMP} IS NULL"
     fault = f"CASE {cases} ELSE 0 END + CASE WHEN {unplaced} THEN {_UNPLACED} ELSE 0 END"
-    query = f"SELECT *, CAST({fault} AS SMALLINT) AS fault FROM {rows}"
+    values = f"* EXCLUDE ({WANTED})" if log.has_condition else "*"
+    query = f"SELECT {values}, CAST({fault} AS SMALLINT) AS fault FROM {rows}"
     if log.key == schema.ITEM_ID:
         return query
     zeros = [0.0] * log.vector_size[schema.ACTION]

@@ -1,7 +1,6 @@
 """Report on what `prepare` read, dropped and kept, as a dictionary and as a text table."""
 
 import math
-import warnings
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any, Final
@@ -9,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from ucfrec import schema
-from ucfrec.errors import InputError, InputNote, one_line
+from ucfrec.errors import InputError, one_line
 from ucfrec.files.remote import origin
 from ucfrec.logs.clean import REASONS
 from ucfrec.logs.distributions import Distribution
@@ -18,8 +17,6 @@ from ucfrec.logs.measures import Measures
 from ucfrec.logs.sessions import Cut
 from ucfrec.logs.sorted_rows import SortedRows
 
-_MANY: Final = 0.2
-"""Share of the rows from which on what happens to them is worth a warning."""
 CONFLICT: Final = "duplicates with a different reward from the kept row"
 """Describes `conflicting_duplicates` of the report."""
 
@@ -34,18 +31,6 @@ def require_variety(rows: SortedRows) -> None:
         raise InputError(
             f"{rows.log.name}: all {len(rows.clean)} rewards equal {rows.lowest:g}, so there is "
             "nothing to learn; choose another reward expression"
-        )
-
-
-def note_equal_times(rows: SortedRows) -> None:
-    """Warn of a log in which many rows share their user and time."""
-    if rows.tied > _MANY * len(rows.clean):
-        warnings.warn(
-            f"{rows.log.name}: {rows.tied / len(rows.clean):.0%} of the rows share their time with "
-            "another row of the user, so their order is unknown and is not learned; log finer "
-            "times if there are any",
-            InputNote,
-            stacklevel=2,
         )
 
 
@@ -71,7 +56,11 @@ def build_report(
     report = {
         "files": [origin(file) for table in log.tables for file in table.files],
         "rows_read": rows.read,
-        "dropped": {**rows.dropped, "short_episode": len(rows.clean) - measures.steps},
+        "dropped": {
+            **rows.dropped,
+            "long_session": measures.long_rows,
+            "short_episode": len(rows.clean) - measures.steps - measures.long_rows,
+        },
         "conflicting_duplicates": rows.conflicts,
         "unsorted_rows": unsorted,
         "equal_times": rows.tied,
@@ -128,9 +117,11 @@ def format_report(report: Mapping[str, Any]) -> str:
         kept = DUPLICATES[report.get("duplicates", "highest")]
         conflicts = f"{report['conflicting_duplicates']:,}  {CONFLICT}, which {kept}"
         lines.append(("  conflicting duplicates", conflicts))
+    if report["equal_times"]:
+        text = f"{report['equal_times']:,} (in no order that could be learned)"
+        lines.append(("  at equal times", text))
     lines += [
         ("  out of order", f"{report['unsorted_rows']:,} (sorted, none dropped)"),
-        ("  at equal times", f"{report['equal_times']:,} (in no order that could be learned)"),
         ("steps kept", f"{report['steps']:,}"),
         ("users", f"{report['users']:,}"),
     ]

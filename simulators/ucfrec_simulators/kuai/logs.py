@@ -10,8 +10,8 @@ import pyarrow.parquet as pq
 
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file
-from ucfrec.logs.binding import glob_pattern, text
 from ucfrec.logs.engine import engine
+from ucfrec.logs.tables import glob_pattern, text
 from ucfrec.schema import SESSION_ID
 from ucfrec_simulators.kuai.environment import ExitRule
 from ucfrec_simulators.kuai.exit_cuts import sessions_by_exit

@@ -12,7 +12,7 @@ from ucfrec import schema
 from ucfrec.errors import InputError, InputNote
 from ucfrec.logs.binding import Bound, bind, explained, wrong_type
 from ucfrec.logs.engine import rows_of_batch
-from ucfrec.logs.expressions import columns_of
+from ucfrec.logs.expressions import NotScalarError, columns_of
 from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping
 from ucfrec.logs.tables import (
     MAX_FLOAT,
@@ -336,18 +336,26 @@ def _reward(
     try:
         return table, bind(connection, table, "for the reward", reward)
     except InputError:
-        read = {name.casefold() for name in columns_of(connection, reward)}
-        words = [n for n, kind in table.types if kind == "VARCHAR" and n.casefold() in read]
-        if not words:
-            raise
-        counts = ", ".join(f"count({quoted(name)})" for name in words)
-        (row,) = connection.sql(f"SELECT {counts} FROM {table.of(words).sql}").fetchall()
-        empty = {name for name, count in zip(words, row, strict=True) if not count}
+        empty = _empty_words(connection, table, reward)
         if not empty:
             raise
         kinds = ((name, NOTHING if name in empty else kind) for name, kind in table.types)
         table = replace(table, types=tuple(kinds))
         return table, bind(connection, table, "for the reward", reward)
+
+
+def _empty_words(connection: duckdb.DuckDBPyConnection, table: Table, given: str) -> set[str]:
+    """Columns of text without a value that an expression reads."""
+    try:
+        read = {name.casefold() for name in columns_of(connection, given)}
+    except NotScalarError:
+        return set()
+    words = [n for n, kind in table.types if kind == "VARCHAR" and n.casefold() in read]
+    if not words:
+        return set()
+    counts = ", ".join(f"count({quoted(name)})" for name in words)
+    (row,) = connection.sql(f"SELECT {counts} FROM {table.of(words).sql}").fetchall()
+    return {name for name, count in zip(words, row, strict=True) if not count}
 
 
 _IDS: Final = (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID)

@@ -162,7 +162,7 @@ def table(connection: duckdb.DuckDBPyConnection, log: Path) -> Table:
 def test_honest_expressions_are_values_of_a_log(
     connection: duckdb.DuckDBPyConnection, table: Table, text: str
 ) -> None:
-    sql, kind = bind(connection, table, "for the test", text)
+    sql, kind, *_ = bind(connection, table, "for the test", text)
     relation = connection.sql(f"SELECT {sql} AS x FROM log")
     assert [str(found) for found in relation.types] == [kind]
     assert relation.to_arrow_table().shape == (300, 1)
@@ -441,7 +441,7 @@ def test_soup_is_refused_or_is_a_value_of_each_row(
 ) -> None:
     """No other error than InputError, and none of the engine but for values that do not convert."""
     with contextlib.suppress(InputError):
-        sql, _ = bind(connection, table, "for the test", text)
+        sql, *_ = bind(connection, table, "for the test", text)
         with contextlib.suppress(
             duckdb.ConversionException, duckdb.InvalidInputException, duckdb.OutOfRangeException
         ):
@@ -467,7 +467,7 @@ def joined(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
 def test_sums_of_honest_parts_are_accepted(
     connection: duckdb.DuckDBPyConnection, table: Table, text: str
 ) -> None:
-    sql, _ = bind(connection, table, "for the test", text)
+    sql, *_ = bind(connection, table, "for the test", text)
     assert len(connection.sql(f"SELECT TRY({sql}) FROM log").fetchall()) == 300
 
 

@@ -7,7 +7,7 @@ tree) and every node of the tree must be of a kind listed here.
 
 import json
 import re
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from ucfrec.errors import InputError
@@ -193,7 +193,7 @@ def columns_of(connection: "duckdb.DuckDBPyConnection", given: str) -> tuple[str
 
 
 def with_numbers_for_truth_values(
-    connection: "duckdb.DuckDBPyConnection", given: str, columns: Container[str]
+    connection: "duckdb.DuckDBPyConnection", given: str, columns: Collection[str]
 ) -> str:
     """The same expression with 0 and 1 in place of the truth values of some columns.
 

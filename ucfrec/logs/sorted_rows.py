@@ -5,11 +5,13 @@ duplicates and writes the others to a spool with numbers in place of ids.
 """
 
 from collections.abc import Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Final
 
+import duckdb
 import numpy as np
 import pyarrow as pa
 
@@ -114,37 +116,53 @@ def check_sorted(
     Raises:
         InputError: a reward is too large to train with.
     """
-    clean, placed = (Spool(folder and folder / name) for name in ("clean", "placed"))
-    rows, hashes = SortedRows(log, clean, placed), _hashes(log)
-    reasons = list(REASONS)
-    large, largest = 0, 0.0
-    for batch in _whole_times(_columns(batch, log) for batch in batches):
-        rows.read += len(batch["fault"])
-        placed = batch["fault"] < _UNPLACED
-        order = {name: batch[name] for name in ("user", "timestamp", "row")}
-        rows.placed.append(_where(placed, order))
-        counts = np.bincount(batch["fault"] % _UNPLACED, minlength=len(reasons) + 1)
-        for reason, n in zip(reasons, counts[1:], strict=True):
-            rows.dropped[reason] += int(n)
-        usable = batch.pop("fault") == 0
-        batch = _where(usable, batch)
-        kept = kept_rows(batch, duplicates)
-        rows.conflicts += kept.conflicts
-        rows.dropped["duplicate"] += kept.duplicates
-        rows.dropped["reward_not_finite"] += kept.undefined
-        order, tied = in_hashed_order(batch, kept.rows, hashes)
-        rows.tied += tied
-        good = {name: batch[name][order] for name in batch if name in _spooled(log)}
-        size = np.abs(good[schema.REWARD])
-        large += int(np.count_nonzero(size > schema.LARGEST_REWARD))
-        largest = max(largest, float(size.max(initial=0)))
-        rows.count(good)
-        rows.clean.append(good)
-    # The connection answers no query before the last batch.
+    spools = [Spool(None if folder is None else folder / name) for name in ("clean", "placed")]
+    rows = SortedRows(log, spools[0], spools[1])
+    rewards = _Rewards()
+    # The connection itself answers no query before the last batch of its rows.
+    with closing(log.connection.cursor()) as asked:
+        hashes = _hashes(log, asked)
+        for batch in _whole_times(_columns(batch, log) for batch in batches):
+            _check_batch(rows, batch, duplicates, hashes, rewards)
     if log.key == schema.ITEM_ID:
         (rows.items,) = log.one("SELECT count(*) FROM item_codes")
-    require_rewards_in_range(log, large, len(rows.clean), largest)
+    require_rewards_in_range(log, rewards.large, len(rows.clean), rewards.largest)
     return rows
+
+
+@dataclass
+class _Rewards:
+    """How large rewards are."""
+
+    large: int = 0
+    """Number of those that are too large."""
+    largest: float = 0.0
+
+
+def _check_batch(
+    rows: SortedRows, batch: dict[str, Array], duplicates: str, hashes: Hashes, rewards: _Rewards
+) -> None:
+    rows.read += len(batch["fault"])
+    placed = np.asarray(batch["fault"] < _UNPLACED)
+    rows.placed.append(_where(placed, {n: batch[n] for n in ("user", "timestamp", "row")}))
+    reasons = list(REASONS)
+    counts = np.bincount(batch["fault"] % _UNPLACED, minlength=len(reasons) + 1)
+    for reason, n in zip(reasons, counts[1:], strict=True):
+        rows.dropped[reason] += int(n)
+    usable = np.asarray(batch.pop("fault") == 0)
+    batch = _where(usable, batch)
+    kept = kept_rows(batch, duplicates)
+    rows.conflicts += kept.conflicts
+    rows.dropped["duplicate"] += kept.duplicates
+    rows.dropped["reward_not_finite"] += kept.undefined
+    order, tied = in_hashed_order(batch, kept.rows, hashes)
+    rows.tied += tied
+    good = {name: batch[name][order] for name in batch if name in _spooled(rows.log)}
+    size = np.abs(good[schema.REWARD])
+    rewards.large += int(np.count_nonzero(size > schema.LARGEST_REWARD))
+    rewards.largest = max(rewards.largest, float(size.max(initial=0)))
+    rows.count(good)
+    rows.clean.append(good)
 
 
 def _where(chosen: BoolArray, batch: dict[str, Array]) -> dict[str, Array]:
@@ -249,10 +267,9 @@ def _columns(batch: pa.RecordBatch, log: TypedLog) -> dict[str, Array]:
     return columns
 
 
-def _hashes(log: TypedLog) -> Hashes:
-    """Hashes by code."""
-    # The connection itself answers no query before the last batch of its rows.
-    asked, users_have_codes = log.connection.cursor(), has_codes(log, schema.USER_ID)
+def _hashes(log: TypedLog, asked: duckdb.DuckDBPyConnection) -> Hashes:
+    """Hashes by code, for which `asked` has the tables of `code_tables`."""
+    users_have_codes = has_codes(log, schema.USER_ID)
 
     def of_codes(name: str, begin: int, end: int) -> Digests:
         query = (
@@ -268,7 +285,8 @@ def _hashes(log: TypedLog) -> Hashes:
         if not users_have_codes:
             return digests(codes.tolist())
         begin = int(codes[0])
-        return of_codes(schema.USER_ID, begin, int(codes[-1]))[codes - begin]
+        found: Digests = of_codes(schema.USER_ID, begin, int(codes[-1]))[codes - begin]
+        return found
 
     return Hashes(of_users, lambda codes: of_all_items()[codes])
 

@@ -290,7 +290,7 @@ def _times(rows: Sequence[Row]) -> list[int]:
     times = []
     for n, row in enumerate(rows):
         # DuckDB rounds halves away from zero.
-        when = math.floor(row["timestamp"] + 0.5)
+        when = math.floor(float(row["timestamp"]) + 0.5)
         if not _EARLIEST_MS <= when <= latest:
             raise InputError(
                 f"history.{n}: timestamp {row['timestamp']} is before 1971 or more than a day "

@@ -234,6 +234,8 @@ def test_every_dropped_row_has_a_reason(tmp_path: Path) -> None:
     dropped = dict(report["dropped"])
     assert dropped.pop("short_episode") > 0
     assert dropped == {
+        "left_out": 0,
+        "long_session": 0,
         "null_key": 4,
         "clock_out_of_range": 3,
         "vector_not_finite": 0,
@@ -421,7 +423,7 @@ FAULTS: dict[str, tuple[Change, PrepareOptions, str]] = {
     "text time": (
         lambda log: log.__setitem__("timestamp", "noon"),
         CORRECT,
-        r"timestamp \(timestamp\) is VARCHAR",
+        r"timestamp \(timestamp\) is 'noon', no ISO 8601 time",
     ),
     "real ids": (
         lambda log: log.__setitem__("user_id", log["user_id"] + 0.5),

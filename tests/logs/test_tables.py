@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.logs.histories import read_histories
 from ucfrec.logs.mapping import FeatureTable, LogMapping, log_files
@@ -276,8 +277,6 @@ def test_users_of_text_and_of_integers_are_the_same_if_their_text_is(
         like=tmp_path / "store",
     )
     known = [*map(str, pq.read_table(tmp_path / "store" / "users.parquet")["user_id"].to_pylist())]
-    from ucfrec.episodes.store import EpisodeStore
-
     numbers = EpisodeStore.open(tmp_path / "found").episode_values("user")
     users = pq.read_table(tmp_path / "found" / "episode_users.parquet")["user_id"].to_pylist()
     expected = [known.index(str(each)) if str(each) in known else -1 for each in users]
@@ -407,3 +406,13 @@ def test_files_are_listed_once(tmp_path: Path) -> None:
     given = [tmp_path, tmp_path / "a", tmp_path / "a" / "log.parquet"]
     assert log_files(given) == (tmp_path / "a" / "log.parquet",)
     assert os.listdir(tmp_path) == ["a"]
+
+
+def test_a_store_in_a_folder_that_is_called_like_a_column_is_read(tmp_path: Path) -> None:
+    path = write(make_log(), tmp_path / "log.parquet")
+    store = tmp_path / "item_id=3" / "user_id=4" / "store"
+    store.parent.mkdir(parents=True)
+    prepare([path], LogMapping(), store, SMALL)
+    report = prepare([path], LogMapping(), tmp_path / "like", SMALL, like=store)
+    assert (report["steps"], report["dropped"]["unknown_item"]) == (400, 0)
+    assert (EpisodeStore.open(tmp_path / "like").episode_values("user") >= 0).all()

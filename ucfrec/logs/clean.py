@@ -48,7 +48,7 @@ def faults(log: TypedLog, known_items: Path | None = None) -> dict[str, str]:
     if schema.ACTION in log.vector_size:
         conditions["vector_not_finite"] = not_finite(schema.ACTION)
     if known_items is not None:
-        source = f"read_parquet({text(glob_pattern(known_items))})"
+        source = f"read_parquet({text(glob_pattern(known_items))}, hive_partitioning = false)"
         known = f"SELECT CAST(item_id AS VARCHAR) FROM {source}"
         conditions["unknown_item"] = f"CAST({log.key} AS VARCHAR) NOT IN ({known})"
     return conditions

@@ -46,7 +46,8 @@ def number_ids(
             continue
         _keep(log, measures, name, f"kept_{table}")
         if like is not None:
-            source = f"read_parquet({text(glob_pattern(like / file))}, file_row_number = true)"
+            options = "file_row_number = true, hive_partitioning = false"
+            source = f"read_parquet({text(glob_pattern(like / file))}, {options})"
             # Ids may be integers in the store and text in the log, or vice versa: 07 is not 7.
             kind = log.id_type(name)
             cast = f"TRY_CAST({name} AS {kind})"

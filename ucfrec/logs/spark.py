@@ -97,15 +97,7 @@ def sorted_with_spark(
     with _session(master) as spark, _failures():
         found = _surveyed(spark, files, vectors(typed.names))
         sizes = vector_sizes(found.vectors)
-        log = TypedLog(
-            connection,
-            typed.tables,
-            typed.names,
-            sizes,
-            typed.session_by,
-            mapping.earliest_ms,
-            mapping.where is not None,
-        )
+        log = typed.log(connection, sizes, mapping)
         require_observations(tables, found.bad, sum(found.rows))
         tasks = _row_tasks(log, files, found.rows, known_items)
         rows = _run(spark, tasks, _schema(log))

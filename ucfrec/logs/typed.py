@@ -99,6 +99,23 @@ class TypedColumns:
     session_by: str
     """"session_id", "gap" or "user"."""
 
+    def log(
+        self,
+        connection: duckdb.DuckDBPyConnection,
+        vector_size: dict[str, int],
+        mapping: LogMapping,
+    ) -> TypedLog:
+        """The log of these columns, whose rows `connection` has."""
+        return TypedLog(
+            connection,
+            self.tables,
+            self.names,
+            vector_size,
+            self.session_by,
+            mapping.earliest_ms,
+            mapping.where is not None,
+        )
+
 
 def typed_columns(
     connection: duckdb.DuckDBPyConnection,
@@ -178,15 +195,7 @@ def typed_log(
             bad, n_rows = connection.sql(observation_counts()).fetchall()[0]
     sizes = vector_sizes(counts)
     require_observations(tables, bad, n_rows)
-    return TypedLog(
-        connection,
-        typed.tables,
-        typed.names,
-        sizes,
-        typed.session_by,
-        mapping.earliest_ms,
-        mapping.where is not None,
-    )
+    return typed.log(connection, sizes, mapping)
 
 
 def vectors(columns: Iterable[str]) -> tuple[str, ...]:

@@ -35,7 +35,7 @@ def window(files: Sequence[Path], time: str, where: str) -> pa.Table:
     key = f"{USER}, {VIDEO}, {time}"
     with engine(files, Path(gettempdir())) as connection:
         rows = connection.sql(
-            f"SELECT * FROM {read}([{names}]) WHERE {where} "
+            f"SELECT * FROM {read}([{names}], hive_partitioning = false) WHERE {where} "
             f"QUALIFY row_number() OVER (PARTITION BY {key}) = 1 ORDER BY {USER}, {time}, {VIDEO}"
         ).to_arrow_table()
     if not rows.num_rows:

@@ -77,7 +77,7 @@ class LikedExpression:
         table = FrameTable((source,), types)
         with engine_in_memory() as connection, explained(connection, (table,), source):
             connection.register(_ROWS, pa.table({name: rewards for name, _ in types}))
-            sql, kind = bind(connection, table, "for --liked", self._expression)
+            sql, kind, *_ = bind(connection, table, "for --liked", self._expression)
             if kind != "BOOLEAN":
                 raise InputError(
                     f"{self._expression.origin} {self._expression} is {kind}, not true or false; "

@@ -8,7 +8,7 @@ from typing import Any, Final, Protocol
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import json_text
 from ucfrec.recommending.requests import Limits, Request, Row, StreamRequest, parsed
-from ucfrec.recommending.responder import Responder
+from ucfrec.recommending.responder import Responder, exact_id
 
 REMEMBERED: Final = 1_000_000
 """Rows that a stream remembers; whoever was heard of longest ago is forgotten first."""
@@ -111,7 +111,7 @@ def _together(
             continue
         answer = answers[number]
         if isinstance(answer, InputError):
-            yield {"user_id": request.user_id, "error": str(answer), "line": number}
+            yield {"user_id": exact_id(request.user_id), "error": str(answer), "line": number}
         else:
             remembered.keep(request, whole[number].history)
             yield answer.as_dict(request.user_id)

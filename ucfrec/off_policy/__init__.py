@@ -19,7 +19,6 @@ _HOMES = {
     "Modelled": "logged_steps",
     "Verdict": "verdict",
     "as_pages": "pages",
-    "cluster_probabilities": "logged_steps",
     "diagnose": "diagnostics",
     "estimate": "estimators",
     "judge": "verdict",

@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 
 from ucfrec.arrays import Float32Array, Float64Array, IntArray
-from ucfrec.off_policy.on_disk import array_on_disk
+from ucfrec.off_policy.features import array_on_disk
 from ucfrec.processes import require_blas_memory
 from ucfrec.progress import progress
 
@@ -27,6 +27,25 @@ _SHARES = (0.01, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
 """How much of the group's share in the logs may be mixed in; never nothing, so that no probability
 is 0."""
 _TEMPERATURES = (0.7, 1.0, 1.4, 2.0, 3.0)
+_MOST_ITEM_GROUPS = 32
+
+
+def default_groups(items: int) -> int:
+    """How many groups a catalogue has: the root of its items, from 2 to 32."""
+    return int(np.clip(round(items**0.5), 2, _MOST_ITEM_GROUPS))
+
+
+def group_items(embeddings: Float32Array, groups: int, seed: int) -> IntArray:
+    """(n_items,) group of every item, from 0, by k-means of embeddings (n_items, D).
+
+    Items of equal embeddings are in one group, so there may be fewer than `groups`.
+    """
+    # Importing scikit-learn takes a second, which no other estimate must cost.
+    from sklearn.cluster import KMeans
+
+    distinct = len(np.unique(embeddings, axis=0))
+    means = KMeans(min(groups, distinct), n_init=4, random_state=seed).fit(embeddings)
+    return np.asarray(np.unique(means.labels_, return_inverse=True)[1], dtype=np.int64)
 
 
 @dataclass(frozen=True)

@@ -92,14 +92,13 @@ def diagnose(
         segment: (S,) number of each session's segment (of users, of weeks, of contexts known before
             the first choice), each of which is tested alone.
     """
-    lacking = steps.per_session(np.isnan(steps.propensity).astype(np.float64)) > 0
-    users = len(lacking) if steps.user is None else len(np.unique(steps.user))
+    lacking, users = steps.lacking, int(steps.users.max()) + 1
     if lacking.all():
         nothing = (None, (), (), 0.0, 1.0, 0, None, None, None)
         return Diagnosis(len(lacking), users, len(lacking), *nothing)
     known = steps.known()
-    by_user = _summed(_users(known), known.session_weights)
-    rewarded = _summed(_users(known), np.abs(known.session_weights * known.returns))
+    by_user = np.bincount(known.users, known.session_weights)
+    rewarded = np.bincount(known.users, np.abs(known.session_weights * known.returns))
     if reward_range is None:
         reward_range = (float(steps.reward.min()), float(steps.reward.max()))
     return Diagnosis(
@@ -141,7 +140,7 @@ def weight_tests(steps: LoggedSteps, segment: IntArray | None = None) -> tuple[W
         groups.append((f"segment {number}", steps.session_weights[there], there))
     found = []
     for name, values, sessions in groups:
-        user = sessions if steps.user is None else steps.user[sessions]
+        user = steps.users[sessions]
         if len(np.unique(user)) >= ENOUGH_TO_TEST:
             (mean,), (error,) = cluster_means(values[:, None], user)
             found.append((name, float(mean), float(error)))
@@ -157,7 +156,7 @@ def _group_weights(steps: LoggedSteps, ratios: Float64Array) -> list[tuple[str, 
     """Name, mean weight and its error of each item group that the evaluated policy shows."""
     if steps.groups is None:
         return []
-    user = steps.session if steps.user is None else steps.user[steps.session]
+    user = steps.users[steps.session]
     found = []
     for number in range(steps.groups.target.shape[1]):
         here = steps.groups.number == number
@@ -186,7 +185,7 @@ def implied_items(steps: LoggedSteps, listed: BoolArray, items: int) -> WeightTe
         users, or without propensities.
     """
     known = ~np.isnan(steps.propensity)
-    user = steps.session if steps.user is None else steps.user[steps.session]
+    user = steps.users[steps.session]
     if not known.any() or len(np.unique(user[known])) < ENOUGH_TO_TEST:
         return None
     shares = np.where(listed[known], 1 / steps.propensity[known], 0.0) / items
@@ -247,18 +246,6 @@ def identification_bounds(
     return float(earned + worth * low), float(earned + worth * high)
 
 
-def _users(steps: LoggedSteps) -> IntArray:
-    """(S,) users numbered from 0."""
-    if steps.user is None:
-        return np.arange(len(steps.first))
-    return np.asarray(np.unique(steps.user, return_inverse=True)[1])
-
-
-def _summed(users: IntArray, values: Float64Array) -> Float64Array:
-    """(U,) sums of values (S,) by user."""
-    return np.bincount(users, values).astype(np.float64)
-
-
 def _by_place(steps: LoggedSteps) -> list[IntArray]:
     """The rows of every place in a session, sessions in order."""
     order = np.argsort(steps.step, kind="stable")
@@ -266,7 +253,7 @@ def _by_place(steps: LoggedSteps) -> list[IntArray]:
 
 
 def _effective_by_step(steps: LoggedSteps) -> tuple[float, ...]:
-    users, weights = _users(steps), steps.weights
+    users, weights = steps.users, steps.weights
     # An ended session keeps the weight of its last step.
     summed, found = np.bincount(users).astype(np.float64), []
     for place, rows in enumerate(_by_place(steps)):

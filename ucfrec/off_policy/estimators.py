@@ -140,11 +140,7 @@ def _groups(steps: LoggedSteps) -> Iterator[tuple[LoggedSteps, dict[str, Terms]]
         if not steps.pages:
             plain["FQE"] = Terms(steps.model.v[steps.first], ones, ones, biased=True)
     yield steps, plain
-    without = steps.per_session(np.isnan(steps.propensity).astype(np.float64)) > 0
-    if without.all():
-        return
-    known = steps.known()
-    if weighted := session_terms(known):
+    if not steps.lacking.all() and (weighted := session_terms(known := steps.known())):
         yield known, weighted
 
 

@@ -24,7 +24,6 @@ action, the first of them 1, and (B, P) their mean over the evaluated policy's a
 states (what is linear in features has its exact mean over these actions)."""
 
 FOLDS = 5
-_ROWS_AT_ONCE = 2**13
 _CLOSE = 1e-6
 _ROUNDS = 10
 """Regressions of FQE for each step of the longest session, unless they settle before: a linear Q
@@ -59,38 +58,6 @@ class ModelReport:
         )
 
 
-@dataclass(frozen=True)
-class Fitted:
-    """What the models say of N steps, and how good they are."""
-
-    modelled: Modelled
-    report: ModelReport
-
-
-def cross_fitted(
-    features: Float32Array,
-    at_policy: Float32Array,
-    reward: Float64Array,
-    session: IntArray,
-    seed: int,
-    user: IntArray | None = None,
-    discount: float = 1.0,
-) -> Modelled:
-    """`fit_models` for features (N, P) that lie in memory.
-
-    Args:
-        features: (N, P) of the logged state and action; the first is 1.
-        at_policy: (N, P) their mean over the evaluated policy's actions in the same states.
-    """
-
-    def chunks() -> Iterator[tuple[Float32Array, Float32Array]]:
-        for begin in range(0, len(features), _ROWS_AT_ONCE):
-            rows = slice(begin, begin + _ROWS_AT_ONCE)
-            yield features[rows], at_policy[rows]
-
-    return fit_models(chunks, reward, session, seed, user, discount).modelled
-
-
 def fit_models(
     chunks: Chunks,
     reward: Float64Array,
@@ -98,7 +65,7 @@ def fit_models(
     seed: int,
     user: IntArray | None = None,
     discount: float = 1.0,
-) -> Fitted:
+) -> tuple[Modelled, ModelReport]:
     """Linear models of reward and Q, cross-fitted over users: no session is predicted by a model
     that saw it, nor by one that saw another session of its user.
 
@@ -109,6 +76,9 @@ def fit_models(
         seed: draws the folds.
         user: (S,) whose session each is; None where each is somebody else's.
         discount: γ of Q.
+
+    Returns:
+        What the models say of the N steps, and how good they are.
 
     Raises:
         InputError: there are fewer than two users.
@@ -128,7 +98,7 @@ def fit_models(
             for fold in range(len(sums.rows))
         ]
         modelled, at_logged = _predicted(chunks, fits, folds, bar.update)
-    return Fitted(modelled, _report(modelled, at_logged, reward, last, discount, fits))
+    return modelled, _report(modelled, at_logged, reward, last, discount, fits)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Any
 
 from ucfrec_control.benchmark.methods import LONGER, WITH_TIME
 from ucfrec_control.environments.scores import find_task
-from ucfrec_control.learners.rl_baselines import ALGORITHMS
+from ucfrec_control.training.rl_baselines import ALGORITHMS
 
 
 @dataclass(frozen=True)

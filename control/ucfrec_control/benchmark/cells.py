@@ -19,16 +19,16 @@ from ucfrec_control.benchmark.score_rows import score_row
 from ucfrec_control.benchmark.screening_table import verdicts
 from ucfrec_control.data.distractor import CLEAN
 from ucfrec_control.data.trajectories import PACKAGES
-from ucfrec_control.learners.evaluate import evaluate_run
-from ucfrec_control.learners.held_out_losses import held_out_losses
-from ucfrec_control.learners.rl_baselines import (
+from ucfrec_control.training.evaluate import evaluate_run
+from ucfrec_control.training.held_out_losses import held_out_losses
+from ucfrec_control.training.rl_baselines import (
     ALGORITHMS,
     RLConfig,
     plain_config,
     rl_config,
     train_rl,
 )
-from ucfrec_control.learners.train import dataset_of, preset_of, train_control
+from ucfrec_control.training.train import dataset_of, preset_of, train_control
 
 SCORES, ROBUSTNESS = "control", "robustness"
 """Suites of the rows."""
@@ -109,10 +109,10 @@ def code_of(learner: str, *more: str) -> str:
         learner: as `Cell.learner`.
         more: further modules that the measurement uses.
     """
-    rl = "ucfrec_control.learners.rl_baselines"
+    rl = "ucfrec_control.training.rl_baselines"
     is_rl = learner in ALGORITHMS
     learner_module = rl if is_rl else policy_class(learner).__module__
-    parts = ("ucfrec_control.learners.train", "ucfrec_control.learners.evaluate")
+    parts = ("ucfrec_control.training.train", "ucfrec_control.training.evaluate")
     apart = OF_ITEMS if is_rl else (*OF_ITEMS, rl)
     return code_version(__name__, *parts, learner_module, *more, exclude=apart)
 

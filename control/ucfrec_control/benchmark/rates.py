@@ -23,8 +23,8 @@ from ucfrec_control.benchmark.methods import METHODS, METHODS_WO_TIME, Methods
 from ucfrec_control.benchmark.run_cells import run_cells
 from ucfrec_control.data.distractor import zoo_store
 from ucfrec_control.data.trajectories import PACKAGES
-from ucfrec_control.learners.rl_baselines import ALGORITHMS, action_loss, train_rl
-from ucfrec_control.learners.train import train_control
+from ucfrec_control.training.rl_baselines import ALGORITHMS, action_loss, train_rl
+from ucfrec_control.training.train import train_control
 
 SUITE: Final = "rates"
 """Suite of the rows."""

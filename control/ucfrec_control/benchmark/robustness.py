@@ -36,7 +36,7 @@ BUDGETS = {
 SHOWN = ("clean", "score", "drop", "score_at_one", "drop_at_one")
 SHOWN_LARGEST = ("method", "at 0", "at 1")
 SHOWN_LOSSES = ("loss", "loss_at_zero", "rise")
-_CODE = (zoo_store.__module__, "ucfrec_control.learners.held_out_losses")
+_CODE = (zoo_store.__module__, "ucfrec_control.training.held_out_losses")
 """Further modules that the cells depend on."""
 
 

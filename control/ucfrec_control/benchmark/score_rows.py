@@ -20,7 +20,7 @@ _DETAILS: Final = ("distractors", "dataset_versions", "warnings")
 
 
 def score_row(evaluation: Mapping[str, Any], key: RowKey, **fields: Any) -> ResultRow:
-    """Convert a row of `ucfrec_control.learners.evaluate.evaluate_run` to a result row.
+    """Convert a row of `ucfrec_control.training.evaluate.evaluate_run` to a result row.
 
     Args:
         evaluation: the row of `evaluate_run`.

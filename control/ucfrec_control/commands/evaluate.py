@@ -12,8 +12,8 @@ from ucfrec.provenance import provenance
 from ucfrec.reporting.tables import format_rows
 from ucfrec_control.commands.options import shown_score, target_given
 from ucfrec_control.data.trajectories import PACKAGES
-from ucfrec_control.learners.evaluate import CHECKPOINTS, SHOWN, evaluate_run
-from ucfrec_control.learners.video import record_episode
+from ucfrec_control.training.evaluate import CHECKPOINTS, SHOWN, evaluate_run
+from ucfrec_control.training.video import record_episode
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -14,7 +14,7 @@ from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.minari import is_minari, read_minari
 from ucfrec_control.data.trajectories import Trajectories
 from ucfrec_control.environments.scores import find_task
-from ucfrec_control.learners.evaluate import NO_TARGET
+from ucfrec_control.training.evaluate import NO_TARGET
 
 MAX_RETURN = "max"
 """`--target` for the largest return that the policy expects in each state."""

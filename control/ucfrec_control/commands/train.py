@@ -9,7 +9,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.describe import describe_run
 from ucfrec.runs.screened import describe_screened
-from ucfrec_control.learners.train import dataset_of, preset_of, train_control
+from ucfrec_control.training.train import dataset_of, preset_of, train_control
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

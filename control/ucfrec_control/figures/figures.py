@@ -23,7 +23,7 @@ from ucfrec_control.benchmark.score_rows import EVALUATE, read_scores
 from ucfrec_control.benchmark.tables import of_best_target
 from ucfrec_control.data.trajectories import require_source
 from ucfrec_control.figures import diagnostics, plots
-from ucfrec_control.learners.evaluate import method_of
+from ucfrec_control.training.evaluate import method_of
 
 LOWS = (0.0, 0.1, 0.2, 0.3, 0.4)
 HIGHS = (0.3, 0.4, 0.5, 0.6, 0.8, 1.0)

@@ -22,10 +22,10 @@ from ucfrec_control.benchmark.plan import benchmark
 from ucfrec_control.benchmark.rates import best_rates, search_rates
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
-from ucfrec_control.learners import rl_baselines
-from ucfrec_control.learners.evaluate import evaluate_run
-from ucfrec_control.learners.rl_baselines import RLConfig, rl_config, train_rl
-from ucfrec_control.learners.train import dataset_of
+from ucfrec_control.training import rl_baselines
+from ucfrec_control.training.evaluate import evaluate_run
+from ucfrec_control.training.rl_baselines import RLConfig, rl_config, train_rl
+from ucfrec_control.training.train import dataset_of
 
 pytest.importorskip("d3rlpy", reason="the extra rl is not installed")
 from d3rlpy.algos.qlearning.torch.cql_impl import CQLImpl

@@ -100,7 +100,7 @@ def is_rl(record: Mapping[str, Any]) -> bool:
 
 
 def rl_config(dataset: Mapping[str, Any], algorithm: Any, **settings: Any) -> RLConfig:
-    """The settings for the data that `ucfrec_control.learners.train.dataset_of` describes.
+    """The settings for the data that `ucfrec_control.training.train.dataset_of` describes.
 
     Args:
         dataset: description of the data.
@@ -291,7 +291,7 @@ def _learner(config: RLConfig, device: str = "cpu:0") -> Any:
     if config.algorithm == "iql":
         return _iql(d3rlpy, config).create(device=device)
     if config.task == "antmaze":
-        from ucfrec_control.learners.clipped_cql import ClippedCQL
+        from ucfrec_control.training.clipped_cql import ClippedCQL
 
         return ClippedCQL(_cql(d3rlpy, config), device, _LOWEST_GAP)
     return _cql(d3rlpy, config).create(device=device)

@@ -28,7 +28,7 @@ def find_preset(task: str, kind: str, policy: str) -> Preset:
     run = {"task": task, "kind": kind, "policy": policy}
     tables: dict[str, dict[str, Any]] = {}
     targets: list[float] = []
-    text = files("ucfrec_control.learners").joinpath("presets.toml").read_text(encoding="utf-8")
+    text = files("ucfrec_control.training").joinpath("presets.toml").read_text(encoding="utf-8")
     for rule in tomllib.loads(text)["rule"]:
         if not all(_names(rule.get(key, value), value) for key, value in run.items()):
             continue

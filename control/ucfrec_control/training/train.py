@@ -12,7 +12,7 @@ from ucfrec.runs.screened import train_screened
 from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec_control.data.trajectories import PACKAGES, require_source
 from ucfrec_control.environments.scores import find_kind, find_task
-from ucfrec_control.learners.presets import Preset, find_preset
+from ucfrec_control.training.presets import Preset, find_preset
 
 
 def dataset_of(store: EpisodeStore) -> Mapping[str, Any]:

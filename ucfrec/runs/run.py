@@ -15,10 +15,14 @@ from ucfrec import schema
 from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.arrays import Float32Array
 from ucfrec.choosing.choose import choose_rule
-from ucfrec.counterfactual.augment import AugmentConfig
-from ucfrec.counterfactual.copies import MODELS, counterfactual_copies, require_rewards_vary
+from ucfrec.counterfactual.augmentation import (
+    MODELS,
+    counterfactual_augmentation,
+    require_rewards_vary,
+)
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
+from ucfrec.counterfactual.state_augmentation import AugmentConfig
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
@@ -142,7 +146,7 @@ def _train(
     if view is not train:
         train, policy = view, new_policy(view, config)
     policy = policy.to(device)
-    if config.augment.makes_copies:
+    if config.augment.augments:
         with distributed.leader_first():
             overlay, record["augmentation"] = _counterfactuals(
                 *(train, validation, out, config, device),
@@ -169,7 +173,7 @@ def _train(
 def _require_startable(store: EpisodeStore, train: EpisodeStore, out: Path, config: Config) -> None:
     if (out / RUN).exists():
         _require_same(read_json(out / RUN), store, out, config)
-    elif config.augment.makes_copies:
+    elif config.augment.augments:
         require_rewards_vary(train)
 
 
@@ -302,7 +306,7 @@ def _counterfactuals(
     settings = (config.crm, config.csg, config.augment)
 
     def make() -> None:
-        overlay, report = counterfactual_copies(
+        overlay, report = counterfactual_augmentation(
             train, validation, *settings, out, config.seed, device
         )
         overlay.save(out / _OVERLAY)
@@ -310,7 +314,7 @@ def _counterfactuals(
 
     if not (out / AUGMENTATION).exists():
         inputs = _inputs(train, validation, config.seed, device, *settings)
-        module = counterfactual_copies.__module__
+        module = counterfactual_augmentation.__module__
         shared.provide(inputs, module, out, (*MODELS, _OVERLAY, AUGMENTATION), make)
     return Overlay.load(out / _OVERLAY), read_json(out / AUGMENTATION)
 

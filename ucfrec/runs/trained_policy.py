@@ -368,7 +368,7 @@ def learner_of(record: Mapping[str, Any]) -> str:
     learner's default.
     """
     config = config_from_dict(record["config"])
-    augmented = config.augment.makes_copies
+    augmented = config.augment.augments
     if augmented == policy_class(config.policy_name).augmented:
         return config.policy_name
     return f"{config.policy_name}-{'augmented' if augmented else 'no-augmentation'}"

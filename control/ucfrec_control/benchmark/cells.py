@@ -37,7 +37,7 @@ TARGET: Final = "target"
 OF_ITEMS: Final = (
     *("ucfrec.acting.best_items", "ucfrec.user_model.fatigue", "ucfrec.user_model.simulator"),
     *("ucfrec.acting.logged_decisions", "ucfrec.choosing.many_rules"),
-    *("ucfrec.acting.session_scorer", "ucfrec.counterfactual.action_copies"),
+    *("ucfrec.acting.session_scorer", "ucfrec.counterfactual.action_augmentation"),
     *("ucfrec.user_model.reward_effects", "ucfrec.user_model.reward_fit"),
     *("ucfrec.counterfactual.effects_mean", "ucfrec.user_model.reward"),
     *("ucfrec.user_model.reward_report", "ucfrec.user_model.reward_rows"),

@@ -10,13 +10,13 @@ import numpy as np
 import torch
 
 from ucfrec.arrays import Float64Array
-from ucfrec.counterfactual.augment import accept
 from ucfrec.counterfactual.generators import (
     CounterfactualStateGenerator,
     TangentGenerator,
     make_generator,
 )
 from ucfrec.counterfactual.reward_model import CausalRewardModel
+from ucfrec.counterfactual.state_augmentation import accept
 from ucfrec.counterfactual.transitions import sample_transitions
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay, Transitions
@@ -54,7 +54,7 @@ def store_of(run: Path) -> EpisodeStore:
     return without_columns(store, record.get(DROPPED, ()))
 
 
-def has_copies(run: Path) -> bool:
+def is_augmented(run: Path) -> bool:
     """Whether edited copies were made for a run."""
     return (run / _REPORT).exists() and read_json(run / _REPORT)["proposals"] > 0
 
@@ -185,7 +185,7 @@ def attention(run: Path, seed: int = 0) -> Float64Array:
 
 
 def _augmentation(run: Path) -> Mapping[str, Any]:
-    if not has_copies(run):
+    if not is_augmented(run):
         raise InputError(f"{run} has no edited copies; train it with augment.copies of 1 or more")
     found: Mapping[str, Any] = read_json(run / _REPORT)
     return found

@@ -171,7 +171,7 @@ def _distinguished(runs: Sequence[_Run]) -> list[_Run]:
 
 def _of_runs(runs: Sequence[_Run]) -> Iterator[_Plan]:
     for run in _first(runs, lambda run: (run.group, run.method)):
-        if diagnostics.has_copies(run.path):
+        if diagnostics.is_augmented(run.path):
             yield _Plan("moves", run.name, partial(_moves, run))
             yield _Plan("states", run.name, partial(_states, run))
             yield _Plan("acceptance", run.name, partial(_acceptance, run))

@@ -53,7 +53,7 @@ def estimated_hours(cells: Sequence[Cell]) -> float:
             seconds[log] = _REWARDS.get(task, _ELSE["rewards"])
         if cell.screening is not None:
             seconds[cell.store, SCREENING] = _SCREENING.get(task, _ELSE["screening"])
-        if config.augment.makes_copies:
+        if config.augment.augments:
             settings = repr((config.crm, config.csg, config.augment))
             seconds[log, settings] = _COPIES.get(task, _ELSE["copies"])
     return (evaluated + sum(seconds.values())) / 3600

@@ -8,10 +8,10 @@ from ucfrec.reporting import charts
 from ucfrec.reporting.tables import Table, shown
 
 Report = Mapping[str, Any]
-"""An `ucfrec.counterfactual.augment.AugmentationReport` as JSON."""
+"""An `ucfrec.counterfactual.state_augmentation.AugmentationReport` as JSON."""
 
 
-def copies_table(runs: Sequence[tuple[str, Report]]) -> Table:
+def augmentation_table(runs: Sequence[tuple[str, Report]]) -> Table:
     """Quality of the reward model and of the edits, one column per run (name, report)."""
     reports = [report for _, report in runs]
     models, moves = [r["reward_model"] for r in reports], [r["moves"] for r in reports]

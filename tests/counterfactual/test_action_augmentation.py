@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tests.support.planted import f, planted, planted_store
 from ucfrec import schema
-from ucfrec.counterfactual.action_copies import ActionReport, OtherActions, logged_actions
+from ucfrec.counterfactual.action_augmentation import ActionReport, OtherActions, logged_actions
 from ucfrec.counterfactual.clusters import ActionSupport
 from ucfrec.counterfactual.generators import CSGConfig, state_clusters
 from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig

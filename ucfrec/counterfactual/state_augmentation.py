@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.arrays import BoolArray, Float32Array, IntArray
-from ucfrec.counterfactual.action_copies import ActionReport
+from ucfrec.counterfactual.action_augmentation import ActionReport
 from ucfrec.counterfactual.edit_statistics import MoveReport, MoveStatistics
 from ucfrec.counterfactual.generators import Generator
 from ucfrec.counterfactual.reward_model import CausalRewardModel
@@ -57,7 +57,7 @@ class AugmentConfig:
     """Maximum number of steps to propose edits for; from a larger store, episodes are sampled."""
 
     @property
-    def makes_copies(self) -> bool:
+    def augments(self) -> bool:
         """Whether there are copies of any kind."""
         return self.copies > 0 or self.actions > 0
 

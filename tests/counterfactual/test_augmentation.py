@@ -9,11 +9,11 @@ import torch
 
 from tests.support.planted import planted_store
 from ucfrec import schema
-from ucfrec.counterfactual.augment import AugmentConfig
-from ucfrec.counterfactual.copies import counterfactual_copies
+from ucfrec.counterfactual.augmentation import counterfactual_augmentation
 from ucfrec.counterfactual.effects_mean import EffectTransitions
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
+from ucfrec.counterfactual.state_augmentation import AugmentConfig
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay
@@ -29,7 +29,7 @@ def one_thread() -> None:
 
 
 def test_from_views_to_an_overlay(tmp_path: Path) -> None:
-    overlay, report = counterfactual_copies(
+    overlay, report = counterfactual_augmentation(
         planted_store().split("train"),
         planted_store().split("validation"),
         QUICK,
@@ -46,7 +46,7 @@ def test_from_views_to_an_overlay(tmp_path: Path) -> None:
 def made(config: AugmentConfig, folder: Path, kind: str = "tangent") -> Overlay:
     views = planted_store().split("train"), planted_store().split("validation")
     csg = CSGConfig(kind=kind, epochs=1, hidden=32)  # type: ignore[arg-type]
-    return counterfactual_copies(*views, QUICK, csg, config, folder, seed=0)[0]
+    return counterfactual_augmentation(*views, QUICK, csg, config, folder, seed=0)[0]
 
 
 def test_asking_about_actions_leaves_the_edits_as_they_are(tmp_path: Path) -> None:
@@ -61,7 +61,7 @@ def test_actions_alone_need_no_generator(tmp_path: Path) -> None:
     views = planted_store().split("train"), planted_store().split("validation")
     config = AugmentConfig(copies=0, actions=1, epsilon_r=3.0, reward_quantile=0.5)
     kind = CSGConfig(kind="faithful")
-    overlay, report = counterfactual_copies(*views, QUICK, kind, config, tmp_path, seed=0)
+    overlay, report = counterfactual_augmentation(*views, QUICK, kind, config, tmp_path, seed=0)
     assert not (tmp_path / "csg").exists()
     assert (len(overlay.copy_source), report.copies, report.proposals) == (0, 0, 0)
     assert report.verdict == "no state is edited"
@@ -116,7 +116,7 @@ def test_additive_effects_read_the_other_item_where_it_would_have_been_shown(
     train, validation = store.split("train"), store.split("validation")
     config = AugmentConfig(copies=0, actions=2, epsilon_r=10.0)
     crm = CRMConfig(mean="effects", epochs=1, hidden=16)
-    overlay, report = counterfactual_copies(
+    overlay, report = counterfactual_augmentation(
         train, validation, crm, CSGConfig(), config, tmp_path, seed=0
     )
     assert report.actions is not None

@@ -8,18 +8,18 @@ import numpy as np
 import torch
 
 from ucfrec import schema
-from ucfrec.counterfactual.action_copies import OtherActions, logged_actions
-from ucfrec.counterfactual.augment import (
-    AugmentationReport,
-    AugmentConfig,
-    augment,
-    candidates,
-)
+from ucfrec.counterfactual.action_augmentation import OtherActions, logged_actions
 from ucfrec.counterfactual.clusters import ActionSupport
 from ucfrec.counterfactual.effects_mean import EffectsMean, EffectTransitions
 from ucfrec.counterfactual.generators import CSGConfig, make_generator, state_clusters
 from ucfrec.counterfactual.reward_model import CRMConfig
 from ucfrec.counterfactual.reward_model_fit import fit_crm
+from ucfrec.counterfactual.state_augmentation import (
+    AugmentationReport,
+    AugmentConfig,
+    augment,
+    candidates,
+)
 from ucfrec.counterfactual.transitions import Read, sample_steps, sample_transitions
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay
@@ -28,8 +28,8 @@ from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.user_model.reward_fit import fit_item_reward_model
 
 MODELS: Final = ("item-reward", "crm", "csg")
-"""Folders of the checkpoints of `counterfactual_copies`; which of them there are depends on the
-settings."""
+"""Folders of the checkpoints of `counterfactual_augmentation`; which of them there are depends on
+the settings."""
 _CPU: Final = torch.device("cpu")
 
 
@@ -50,7 +50,7 @@ def require_rewards_vary(train: EpisodeStore) -> None:
 
 
 @random_state_kept()
-def counterfactual_copies(
+def counterfactual_augmentation(
     train: EpisodeStore,
     validation: EpisodeStore,
     crm_config: CRMConfig,

@@ -10,8 +10,6 @@ from torch import Tensor
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.policies.base import SequencePolicy, interleave
-from ucfrec.policies.dc import DCConfig, DCPolicy
-from ucfrec.policies.dt import DTConfig, DTPolicy
 from ucfrec.policies.losses import parent_targets
 from ucfrec.policies.lsdt import LSDTConfig, LSDTPolicy
 from ucfrec.policies.registry import policy_class
@@ -238,52 +236,25 @@ def test_supervision_draws_attention_to_the_parents() -> None:
     assert distances[2] < 0.1
 
 
-def test_parameters_of_dt_are_the_official_ones_less_the_unused() -> None:
-    """727,695 for Hopper; its return and state heads and its word table are never used."""
-    policy = DTPolicy(DTConfig(), {"state": 11, "action": 3, "items": 0})
-    unused = (128 * 11 + 11) + (128 + 1) + 128
-    assert sum(p.numel() for p in policy.parameters()) == 727_695 - unused
-
-
-def test_parameters_of_dc_are_the_official_ones() -> None:
-    """535,939 for Hopper, 1,858,307 at d = 256; nothing in them is unused."""
-    sizes = {"state": 11, "action": 3, "items": 0}
-    for dim, official in ((128, 535_939), (256, 1_858_307)):
-        policy = DCPolicy(DCConfig(dim=dim), sizes)
-        assert sum(p.numel() for p in policy.parameters()) == official
-
-
-def test_parameters_of_lsdt_are_the_official_ones_less_the_unused() -> None:
-    """1,134,111 for Hopper; its return and state heads, and the five taps of each of 16 kernels
-    that look ahead and are masked, in three blocks, are never used."""
-    policy = LSDTPolicy(LSDTConfig(), {"state": 11, "action": 3, "items": 0})
-    unused = (128 * 11 + 11) + (128 + 1) + 3 * 16 * 5 * (64 + 1)
-    assert sum(p.numel() for p in policy.parameters()) == 1_134_111 - unused
+@pytest.mark.parametrize(
+    ("name", "dim", "official", "unused"),
+    [
+        # Return and state heads, and the word table.
+        ("dt", 128, 727_695, (128 * 11 + 11) + (128 + 1) + 128),
+        ("dc", 128, 535_939, 0),
+        ("dc", 256, 1_858_307, 0),
+        # Return and state heads, and five masked taps of 16 kernels in three blocks.
+        ("lsdt", 128, 1_134_111, (128 * 11 + 11) + (128 + 1) + 3 * 16 * 5 * (64 + 1)),
+    ],
+)
+def test_parameters_are_the_official_ones_less_the_unused(
+    name: str, dim: int, official: int, unused: int
+) -> None:
+    policy_type = policy_class(name)
+    policy = policy_type(policy_type.Config(dim=dim), {"state": 11, "action": 3, "items": 0})
+    assert sum(p.numel() for p in policy.parameters()) == official - unused
 
 
 def test_lsdt_refuses_a_width_that_does_not_split() -> None:
     with pytest.raises(InputError, match=r"policy\.dim is 48; .* 16 kernel_groups"):
         LSDTPolicy(LSDTConfig(dim=48), VECTORS)
-
-
-@pytest.mark.parametrize("name", ["dt", "dc", "lsdt"])
-@pytest.mark.parametrize(("field", "first"), [("actions", 11), ("states", 10)])
-def test_a_change_at_step_ten_shows_where_the_official_code_shows_it(
-    name: str, field: str, first: int
-) -> None:
-    torch.manual_seed(0)
-    learner = {"dt": DTPolicy, "dc": DCPolicy, "lsdt": LSDTPolicy}[name]
-    policy = learner(learner.Config(), VECTORS).eval()
-    windows = Windows(
-        states=torch.randn(1, 20, S),
-        actions=torch.rand(1, 20, A),
-        rewards=torch.zeros(1, 20),
-        returns_to_go=torch.rand(1, 20),
-        timesteps=torch.arange(20).unsqueeze(0),
-        mask=torch.ones(1, 20, dtype=torch.bool),
-    )
-    values = getattr(windows, field).clone()
-    values[:, 10] += 1.0
-    changed = predictions(policy, replace(windows, **{field: values}))
-    moved = (changed != predictions(policy, windows)).any(-1)[0].nonzero()
-    assert int(moved[0]) == first

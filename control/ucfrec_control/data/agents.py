@@ -21,7 +21,8 @@ import torch
 from gymnasium.spaces import Box
 from torch import Tensor, nn
 
-from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
+from ucfrec.acting.uniform import Memoryless
+from ucfrec.arrays import BoolArray, Float32Array
 from ucfrec.errors import InputError
 
 _MOST_BYTES: Final = {"policy.pth": 2**30, "data": 2**26}
@@ -56,7 +57,7 @@ _KINDS: Final = (
 )
 
 
-class Agent:
+class Agent(Memoryless):
     """The deterministic action of a saved agent plus Gaussian noise (an `Actor` of `rollout`)."""
 
     def __init__(self, network: nn.Module, squashed: bool, space: Box, noise: float, seed: int):
@@ -72,9 +73,6 @@ class Agent:
         self._noise, self._seed = noise, seed
         self._generator = np.random.default_rng(seed)
 
-    def begin(self, rows: IntArray) -> None:
-        """Do nothing: the agent has no memory."""
-
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[Float32Array, None]:
         """Actions (N, A) within the action space, and None."""
         with torch.no_grad():
@@ -84,9 +82,6 @@ class Agent:
             mean = self._low + half * (mean + 1)
         noise = self._noise * half * self._generator.normal(size=mean.shape)
         return np.clip(mean + noise, self._low, self._high).astype(np.float32), None
-
-    def observe(self, actions: Array, rewards: Float32Array) -> None:
-        """Do nothing: the agent has no memory."""
 
 
 def read_agent(file: Path, observations: int, space: Box, noise: float, seed: int) -> Agent:

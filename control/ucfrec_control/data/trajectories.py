@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from ucfrec import schema
 from ucfrec.arrays import BoolArray, Float32Array, Float64Array, IntArray
@@ -18,8 +19,23 @@ PACKAGES = ("gymnasium", "mujoco", "gymnasium-robotics", "minari", "h5py")
 """Packages, besides those of the core, whose versions affect numerical results."""
 
 
+class _Distractor(BaseModel):
+    dimension: int
+
+
+class _Source(BaseModel):
+    """What a store or a run records of its data; further entries are allowed."""
+
+    model_config = ConfigDict(strict=True)
+    dataset: str
+    env_id: str | None
+    versions: dict[str, str]
+    env_settings: dict[str, Any] = {}
+    distractors: list[_Distractor] = []
+
+
 def require_source(source: object, where: Path) -> None:
-    """Check what a store or a run says of its data: it may be somebody else's.
+    """Check what a store or a run records of its data, which is untrusted input.
 
     Args:
         source: as `Trajectories.source`, which a store's and a run's JSON files repeat.
@@ -28,26 +44,15 @@ def require_source(source: object, where: Path) -> None:
     Raises:
         InputError: an entry is missing or has another type.
     """
-    found: Mapping[str, Any] = source if isinstance(source, Mapping) else {}
-    for name, kind in (("dataset", str), ("env_id", str | None), ("versions", Mapping)):
-        if name not in found or not isinstance(found[name], kind):
-            raise _bad_source(where, name, found.get(name))
-    for name, value in found["versions"].items():
-        if not isinstance(value, str):
-            raise _bad_source(where, f"version of {name}", value)
-    if not isinstance(settings := found.get("env_settings", {}), Mapping):
-        raise _bad_source(where, "env_settings", settings)
-    added = found.get("distractors", [])
-    for each in added if isinstance(added, list) else [added]:
-        if not isinstance(each, Mapping) or type(each.get("dimension")) is not int:
-            raise _bad_source(where, "distractors", added)
-
-
-def _bad_source(where: Path, name: str, value: object) -> InputError:
-    return InputError(
-        f"{where} does not describe control data: its {name} is {value!r:.60}; restore it, or "
-        "prepare the data again"
-    )
+    try:
+        _Source.model_validate(source)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        name = ".".join(map(str, first["loc"])) or "source"
+        raise InputError(
+            f"{where} does not describe control data: its {name} is {first['input']!r:.60}; "
+            "restore it, or prepare the data again"
+        ) from None
 
 
 @dataclass(frozen=True)

@@ -231,11 +231,3 @@ def _coded(tags: Sequence[Sequence[int]]) -> tuple[IntArray, int]:
     codes = np.full((len(tags), lengths.max()), len(known), dtype=np.int64)
     codes[np.arange(codes.shape[1]) < lengths[:, None]] = numbers
     return codes, len(known)
-
-
-def said(regime: str, exit_rule: ExitRule) -> str:
-    """What the command line says of an environment's regime, by its name, and of its exit rule."""
-    if REGIMES[regime].steps is not None:
-        return f"regime {regime}"
-    times = "a tag" if exit_rule.threshold == 0 else f"a tag shown {exit_rule.threshold + 1} times"
-    return f"regime {regime}; users leave at {times} among the {exit_rule.window} items before"

@@ -1,4 +1,4 @@
-"""DDPG behavior policies in the Taobao environments: a learner in training, its snapshots, the
+"""DDPG behavior policies in the Taobao environments: one that is being trained, its snapshots, the
 last one.
 
 Stable-Baselines3 (extra `collect`) provides the networks, the replay buffer and the update. The
@@ -20,14 +20,21 @@ from gymnasium.vector import VectorEnv
 from torch import nn
 
 from ucfrec.acting.rollout import Actor, Step, rollout
-from ucfrec.acting.uniform import Memoryless
+from ucfrec.acting.uniform import Memoryless, Uniform
 from ucfrec.arrays import BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.provenance import versions
 from ucfrec_simulators.behaviors import Actions, SessionMixture, truncated_normal
-from ucfrec_simulators.taobao.environment import ACTION_DIM, MAX_CLICKS, TaobaoEnv, taobao
+from ucfrec_simulators.taobao.environment import (
+    ACTION_DIM,
+    MAX_CLICKS,
+    TaobaoEnv,
+    best_constant_actor,
+    taobao,
+    zero_actor,
+)
 
 
 @dataclass(frozen=True)
@@ -72,7 +79,7 @@ class Noisy(Memoryless):
         return truncated_normal(mean, self._noise, self._generator)
 
 
-class Learner:
+class Training:
     """DDPG (Lillicrap et al., 2016) as an actor that learns from every step played.
 
     After a uniform warm-up, it serves all N sessions with its current network and noise; the
@@ -252,7 +259,7 @@ def snapshots(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig) -> l
 def _train(
     env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig
 ) -> list[dict[str, torch.Tensor]]:
-    learner = Learner(env, seed, config)
+    ongoing = Training(env, seed, config)
     taken: list[dict[str, torch.Tensor]] = []
     ended = 0
 
@@ -260,11 +267,11 @@ def _train(
         nonlocal ended
         ended += int((step.terminated | step.truncated).sum())
         while ended * config.snapshots >= (len(taken) + 1) * config.sessions:
-            taken.append({k: v.clone() for k, v in learner.network.state_dict().items()})
+            taken.append({k: v.clone() for k, v in ongoing.network.state_dict().items()})
 
     # A separate random stream, so that no logged session is a training session.
     users_seed = int(np.random.SeedSequence([seed, 52]).generate_state(1)[0])
-    rollout(env, learner, config.sessions, users_seed, watch, describe="train DDPG")
+    rollout(env, ongoing, config.sessions, users_seed, watch, describe="train DDPG")
     return taken
 
 
@@ -282,9 +289,9 @@ def _fingerprint(environment: TaobaoEnv, seed: int, config: DdpgConfig) -> str:
     return hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:16]
 
 
-def training(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig = DEFAULT) -> Learner:
-    """A learner from its first step on: the logged sessions are its training sessions."""
-    return Learner(env, seed, config)
+def training(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig = DEFAULT) -> Training:
+    """A training from its first step on: the logged sessions are its training sessions."""
+    return Training(env, seed, config)
 
 
 def snapshot_mixture(
@@ -305,5 +312,12 @@ BEHAVIORS: Final[Mapping[str, Callable[[VectorEnv[Any, Any, Any], int], Actor]]]
     "ddpg-training": training,
     "ddpg-snapshots": snapshot_mixture,
     "ddpg-expert": expert,
+}
+"""Behavior policies by DDPG."""
+COMMON: Final[Mapping[str, Callable[[VectorEnv[Any, Any, Any], int], Actor]]] = {
+    "random": Uniform,
+    "zero": zero_actor,
+    "best-constant": best_constant_actor,
+    **BEHAVIORS,
 }
 """Behavior policies of every Taobao environment."""

@@ -20,11 +20,9 @@ from ucfrec_simulators.taobao.environment import (
     PAGE_INDICES,
     USER_BITS,
     TaobaoEnv,
-    best_constant_actor,
     default_action,
     split_observations,
     taobao,
-    zero_actor,
 )
 
 BEST_CLICK_PROBABILITY: Final = 0.9
@@ -136,13 +134,6 @@ def _make(num_envs: int, folder: Path | None) -> SyntheticTaobao:
 SIMULATOR: Final = Simulator(
     summary="built-in users with a known best action: 27 ranking weights per page, 0-10 clicks",
     make=_make,
-    behaviors={
-        "random": Uniform,
-        "zero": zero_actor,
-        "best-constant": best_constant_actor,
-        "mixture": mixture,
-        "optimal": optimal,
-        **ddpg.BEHAVIORS,
-    },
+    behaviors={**ddpg.COMMON, "mixture": mixture, "optimal": optimal},
     feedback="clicks",
 )

@@ -99,7 +99,7 @@ def test_equal_seeds_train_equal_actors_that_are_judged_as_others_are(
 
 def learner_of(task: str, kind: str, algorithm: str = "cql", **settings: float) -> Any:
     with random_state_kept():
-        learner = rl_baselines._learner(RLConfig(algorithm, 10, task, kind, **settings))
+        learner = rl_baselines._algorithm(RLConfig(algorithm, 10, task, kind, **settings))
         learner.create_impl((29,), 8)
     return learner
 

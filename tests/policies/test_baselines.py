@@ -143,7 +143,7 @@ def test_the_entropy_constraint_holds_and_its_multiplier_follows(sizes: dict[str
         if beta < 0:
             assert policy.log_multiplier.item() < before
         else:
-            assert entropies[beta] > 0.8 * policy.floor
+            assert entropies[beta] > 0.8 * policy.least_entropy
     assert entropies[-1e3] < entropies[0.9] - 0.5
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ucfrec import schema
-from ucfrec.counterfactual.action_augmentation import OtherActions, logged_actions
+from ucfrec.counterfactual.action_augmentation import ActionGenerator, logged_actions
 from ucfrec.counterfactual.clusters import ActionSupport
 from ucfrec.counterfactual.generators import CSGConfig, make_generator, state_clusters
 from ucfrec.counterfactual.reward_model import CRMConfig
@@ -104,9 +104,9 @@ def counterfactual_augmentation(
     states = crm.normalised_states(training.states.to(device)).cpu()
     labels = clusters.nearest(states).numpy()
     support = ActionSupport(labels, logged_actions(train, *sampled))
-    others = OtherActions(train, crm, clusters, support, report.epsilon_r, report.delta, read)
-    asked_at = candidates(train, config, np.random.default_rng(seed))
-    copies, found = others.ask(*asked_at, config.actions, seed)
+    others = ActionGenerator(train, crm, clusters, support, report.epsilon_r, report.delta, read)
+    places = candidates(train, config, np.random.default_rng(seed))
+    copies, found = others.propose(*places, config.actions, seed)
     return overlay.joined(copies), replace(report, actions=found)
 
 

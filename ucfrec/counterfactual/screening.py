@@ -103,7 +103,7 @@ class DimensionReport:
     """Share it explains of the reward's variance."""
     reward_p_value: float | None
     measures_reward: bool | None
-    """Whether it tells of the reward after the fact; None where that does not matter."""
+    """Whether it records the reward after the fact; None where that does not matter."""
     causes: bool
     """Whether it counts as having an effect, be it for want of evidence, or with others that are no
     help one by one."""
@@ -166,7 +166,7 @@ def screen(train: EpisodeStore, config: ScreeningConfig, seed: int) -> Screening
             leaks = [dimension for dimension, yes in measures.items() if yes]
             r2 = _Errors.of(shared, data, [leaks], config, seed).r2(0) if leaks else r2
     if r2 < config.min_reward_r2:
-        # Only what measures the reward can be without effect; the effects of the rest are left out.
+        # Only what measures the reward can be without effect; the effects of the rest are excluded.
         measures |= measured([dimension for dimension in tested if dimension not in measures])
         tested = [dimension for dimension in tested if measures[dimension]]
     effects, r2 = _effects(shared, data, tested, config, seed, r2)

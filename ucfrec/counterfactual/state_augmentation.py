@@ -45,13 +45,13 @@ class AugmentConfig:
     copies: Annotated[int, Field(ge=0, le=1000)] = 1
     """Maximum number of edited copies of each episode, whose states differ; 0 for none."""
     actions: Annotated[int, Field(ge=0, le=1000)] = 0
-    """Number of other actions to ask about at each step: a copy of the episode up to this step ends
-    with the other action and the reward that it would have earned, where the reward model can tell.
+    """Number of other actions to propose at each step: a copy of the episode up to this step ends
+    with the other action and its counterfactual reward, where the reward model is accurate enough.
     With neither actions nor copies, no reward model is fitted."""
     edits_per_copy: Annotated[int, Field(ge=0, le=1_000_000)] = 0
     """Maximum number of edited steps in a copy; 0 means no limit."""
     reward_quantile: Quantile = 0.3
-    """Steps with a reward below this quantile are neither edited nor asked about."""
+    """Steps with a reward below this quantile are neither edited nor given other actions."""
     epsilon_r: Annotated[float, Field(ge=0, le=1e15)] | None = None
     """ε_r, tolerance of the reward gate in reward units; unset, 0.1 × standard deviation of the
     rewards."""
@@ -164,7 +164,7 @@ class AugmentationReport:
     reward_model: CRMReport
     """Quality of the reward model."""
     actions: ActionReport | None = None
-    """Action copies; None if no other action was asked about."""
+    """Action copies; None if no other action was proposed."""
 
 
 def accept(

@@ -1,4 +1,4 @@
-"""What a policy would have earned, estimated from logs of another policy.
+"""Off-policy estimates: the return of a policy, from logs of another policy.
 
 The array functions need no ucfrec run:
 

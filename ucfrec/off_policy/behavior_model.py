@@ -3,7 +3,7 @@
 Groups by a multinomial logistic regression on the state before the choice, items within a group by
 their share of its logged steps. Every user is predicted by a model of other users (cross-fitting),
 and those predictions are calibrated by one temperature and by mixing in the group's share of the
-logs, as much as predicts best: all of it where the state tells nothing.
+logs, as much as predicts best: all of it where the state predicts nothing.
 """
 
 from collections.abc import Callable, Iterator
@@ -91,7 +91,7 @@ def fit_behavior(
         group: (N,) their groups, from 0.
         session: (N,) number of each step's session, from 0.
         seed: draws folds and samples.
-        user: (S,) of each session; None where each is somebody else's.
+        user: (S,) of each session; None where each is of another user.
     """
     rng = np.random.default_rng(seed)
     owner = session if user is None else np.unique(user, return_inverse=True)[1][session]

@@ -70,12 +70,12 @@ class Diagnosis:
     """Shape k of the Pareto tail of the weights (`pareto_tail`)."""
     bounds: tuple[float, float] | None
     """Between these lies the value if the propensities are true, whatever the choices that the logs
-    lack would earn; up to the sampling error of PDIS."""
+    lack are worth; up to the sampling error of PDIS."""
 
     @property
     def stops_telling_at(self) -> int | None:
         """First step (from 1) with fewer effective users than an estimate needs; None if the logs
-        tell to the end."""
+        suffice to the end."""
         few = [n < ENOUGH_USERS for n in self.effective_by_step]
         return few.index(True) + 1 if any(few) else None
 
@@ -120,7 +120,7 @@ def diagnose(
 def weight_tests(steps: LoggedSteps, segment: IntArray | None = None) -> tuple[WeightTest, ...]:
     """Two-sided tests that mean weights are 1: the ratios of each step, the session products, and
     those of each segment and item group. Errors are clustered by user; what fewer than 30 users
-    have is left out.
+    have is excluded.
 
     Over all steps, the ratios of an item group's own have the mean of the evaluated policy's
     probability of the group; their quotient is tested.
@@ -228,22 +228,22 @@ def pareto_tail(weights: Float64Array) -> float | None:
 def identification_bounds(
     steps: LoggedSteps, reward_range: tuple[float, float]
 ) -> tuple[float, float]:
-    """PDIS plus the least and the most that choices without support could have earned.
+    """PDIS plus the least and the most that choices without support could return.
 
     At step t a share 1 − E_n[w_t] of the evaluated policy's sessions has left what the logs support
-    (Manski 1990, for weights: Khan et al., AISTATS 2024); each of their steps earns something in
+    (Manski 1990, for weights: Khan et al., AISTATS 2024); each of their steps has a reward in
     `reward_range`, or nothing once the session has ended. No session is longer than the longest
     logged.
     """
     totals = step_totals(steps, steps.weights) / len(steps.first)
     lacking = np.maximum(1 - totals, 0)
     worth = float((steps.discount ** np.arange(len(totals)) * lacking).sum())
-    earned = steps.per_session(steps.discounts * steps.weights * steps.reward).mean()
+    supported = steps.per_session(steps.discounts * steps.weights * steps.reward).mean()
     low, high = reward_range
     # A single step is always taken; a longer session may end.
     if len(totals) > 1:
         low, high = min(low, 0.0), max(high, 0.0)
-    return float(earned + worth * low), float(earned + worth * high)
+    return float(supported + worth * low), float(supported + worth * high)
 
 
 def _by_place(steps: LoggedSteps) -> list[IntArray]:

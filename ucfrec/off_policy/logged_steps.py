@@ -49,7 +49,7 @@ class LoggedSteps:
     """
 
     session: IntArray
-    """(N,) number of each step's session: 0 to S − 1, never falling, none left out."""
+    """(N,) number of each step's session: 0 to S − 1, never falling, without gaps."""
     reward: Float64Array
     """(N,) in any unit; estimates are in the same unit."""
     propensity: Float64Array
@@ -59,7 +59,7 @@ class LoggedSteps:
     model: Modelled | None = None
     user: IntArray | None = None
     """(S,) whose session it is: sessions of one user are resampled together. None where every
-    session is somebody else's."""
+    session is of another user."""
     discount: float = 1.0
     """γ in (0, 1]: a reward at step t (from 0) counts γ^t."""
     cluster_propensity: Float64Array | None = None
@@ -180,7 +180,7 @@ class LoggedSteps:
         return earlier
 
     def known(self) -> "LoggedSteps":
-        """The sessions of whose every step the propensity is known, numbered anew.
+        """The sessions of whose every step the propensity is known, renumbered.
 
         Raises:
             InputError: there is none.
@@ -190,7 +190,7 @@ class LoggedSteps:
         return self.only(~self.lacking)
 
     def only(self, keep: BoolArray) -> "LoggedSteps":
-        """The sessions that `keep` (S,) marks, numbered anew.
+        """The sessions that `keep` (S,) marks, renumbered.
 
         Raises:
             InputError: it marks none.
@@ -209,7 +209,7 @@ class LoggedSteps:
         Args:
             order: (N,) steps in their new order.
             session: (N,) session of each, in the new order.
-            user: (S,) of the new sessions; None where each is somebody else's.
+            user: (S,) of the new sessions; None where each is of another user.
         """
         return replace(self, session=session, user=user, **self._columns(order))
 

@@ -56,7 +56,7 @@ class Selection:
     corrected: float
     """Value of the first without the luck of having been chosen."""
     regret: float
-    """With 95% confidence the first earns at most so much less than the best of them; 0 if it is
+    """With 95% confidence the first is at most this far below the best of them; 0 if it is
     best beyond doubt (Hsu, Annals of Statistics 1984, with the clustered bootstrap)."""
 
     @property
@@ -88,7 +88,7 @@ def select(
         names: K candidates.
         terms: (S, K) whose means over sessions are the estimates, e.g. `influences` of DR.
         seed: draws the resamples.
-        user: (S,) whose session each is; None where each is somebody else's.
+        user: (S,) whose session each is; None where each is of another user.
 
     Raises:
         InputError: there is no candidate, shapes differ, or a term is not finite.
@@ -155,7 +155,7 @@ class Choice:
 
     @property
     def headline(self) -> str:
-        """Which candidate to take, or that the logs do not tell."""
+        """Which candidate to take, or that the logs do not show it."""
         if self.selection is None:
             return "The logs allow no conclusion on any of the candidates"
         return self.selection.headline
@@ -221,7 +221,7 @@ def _require_same_sessions(reports: "Mapping[str, OffPolicyReport]") -> None:
 def names_of(candidates: Sequence[Mapping[str, object]]) -> list[str]:
     """Names that say what differs among the candidates, e.g. "target return 5, greedy".
 
-    Candidates that differ have different names: numbers have the digits that tell them apart.
+    Candidates that differ have different names: numbers have the digits that distinguish them.
 
     Args:
         candidates: of each, what it is made of, e.g. run, target return and rule.

@@ -3,7 +3,7 @@
 A saved agent is a zip file: tensors in `policy.pth`, and settings in `data`, a JSON file in which
 whatever JSON cannot say is pickled. Unpickling runs what its author wrote. Here the tensors are
 read by PyTorch's loader of plain weights, the JSON without its pickled parts, and the network is
-rebuilt from the names and shapes of the tensors. What that does not tell is refused.
+rebuilt from the names and shapes of the tensors. What these do not determine is refused.
 """
 
 import io
@@ -96,8 +96,8 @@ def read_agent(file: Path, observations: int, space: Box, noise: float, seed: in
 
     Raises:
         InputError: the file is missing or damaged, or its network is not one of layers that its
-            tensors tell in full (perceptrons of SAC, TQC, TD3, DDPG, PPO, A2C or TRPO), or of other
-            sizes.
+            tensors determine in full (perceptrons of SAC, TQC, TD3, DDPG, PPO, A2C or TRPO), or of
+            other sizes.
     """
     tensors, settings = _contents(file)
     kind, names = _kind_of(file, tensors)

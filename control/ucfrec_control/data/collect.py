@@ -52,7 +52,7 @@ class CollectConfig:
         """Check the fields against each other."""
         require(
             self.steps > self.sac.learning_starts,
-            f"steps is {self.steps}, all of them uniform play; learning starts after "
+            f"steps is {self.steps}, all of them uniform actions; learning starts after "
             f"{self.sac.learning_starts}",
             "steps",
             "sac.learning_starts",
@@ -286,8 +286,8 @@ def _choose(
     expert = int(returns.argmax())
     if returns[expert] <= random_return:
         raise InputError(
-            f"the best policy earns {returns[expert]:.1f}, random play {random_return:.1f}; train "
-            "for more --steps into another folder"
+            f"the best policy returns {returns[expert]:.1f}, random actions {random_return:.1f}; "
+            "train for more --steps into another folder"
         )
     threshold = random_return + fraction * (returns[expert] - random_return)
     return int((returns >= threshold).argmax()), expert
@@ -316,12 +316,12 @@ def _roll_out(training: _Training, index: int, env_id: str, seed: int, size: int
 def roll_out(
     actor: Actor, env_id: str, size: int, key: tuple[int, ...], describe: str
 ) -> Trajectories:
-    """Play whole episodes, with at least `size` steps in total.
+    """Roll out whole episodes, with at least `size` steps in total.
 
     Every round has a fixed number of episodes, so that short episodes are not overrepresented.
 
     Args:
-        actor: who plays.
+        actor: whose actions are taken.
         env_id: Gymnasium environment.
         size: least number of steps.
         key: seeds of the episodes.

@@ -165,7 +165,7 @@ def attention(run: Path, seed: int = 0) -> Float64Array:
     The mean over heads and over full windows of validation episodes; a row sums to one.
 
     Raises:
-        InputError: the learner is not UCF, no episode fills a window, or the store is gone.
+        InputError: the policy is not UCF, no episode fills a window, or the store is gone.
     """
     trained = TrainedPolicy.load(run)
     if not isinstance(trained.policy, UCFPolicy):

@@ -58,7 +58,7 @@ def evaluate_run(
         run: a run folder on a control store.
         episodes: episodes of a row.
         seed: seed of the environments and the bootstrap.
-        env_id: environment to play; None for that of the data.
+        env_id: environment to evaluate in; None for that of the data.
         targets: target returns, None for the largest that the policy expects in each state; empty
             for those of the preset, or that one if the policy was trained to know it.
         checkpoints: "last", "best" or both.
@@ -75,7 +75,7 @@ def evaluate_run(
         trained = load_run(run, checkpoint)
         training = trained.record["policy"]
         if rows and training["best_step"] == training["steps"]:
-            # The best checkpoint is the last: the same weights would play the same episodes.
+            # The best checkpoint is the last: the same weights would give the same episodes.
             rows += [{**row, "checkpoint": checkpoint} for row in rows]
             continue
         environment = environment_of(trained, env_id)
@@ -184,13 +184,13 @@ def method_of(record: Mapping[str, Any]) -> str:
 def rules_of(
     trained: Trained, env_id: str, given: Sequence[float | None] = ()
 ) -> Sequence[DecisionRule | None]:
-    """The target returns given, else those of the preset, as rules; (None,) for learners without a
+    """The target returns given, else those of the preset, as rules; (None,) for policies without a
     target return."""
-    dataset, learner = trained.record["dataset"], trained.record["config"]["policy_name"]
-    if isinstance(trained, RLPolicy) or learner == "bc":
+    dataset, method = trained.record["dataset"], trained.record["config"]["policy_name"]
+    if isinstance(trained, RLPolicy) or method == "bc":
         return (None,)
     task = require_task(env_id, dataset["dataset"])
-    preset = find_preset(task.name, find_kind(dataset["dataset"]), learner).targets
+    preset = find_preset(task.name, find_kind(dataset["dataset"]), method).targets
     own = (None,) if trained.policy.config.max_return else preset
     return [DecisionRule(target) for target in given or own]
 
@@ -209,23 +209,23 @@ def _row(
     env = open_environment(trained, env_id, min(episodes, SIDE_BY_SIDE), distractor=distractor)
     try:
         actor = trained.actor(env.num_envs, rule)
-        played = rollout(env, actor, episodes, seed, describe=f"{trained.name} in {env_id}")
+        rolled_out = rollout(env, actor, episodes, seed, describe=f"{trained.name} in {env_id}")
     finally:
         env.close()
     seconds = time.perf_counter() - began
-    low, high = task.score(bootstrap_interval(played.returns, seed))
+    low, high = task.score(bootstrap_interval(rolled_out.returns, seed))
     return {
         "dataset": dataset["dataset"],
         "method": method_of(record),
         "seed": record["seed"],
         "target_return": rule and rule.target,
         "rule": NO_TARGET if rule is None else str(rule),
-        "score": float(task.score(played.returns.mean())),
+        "score": float(task.score(rolled_out.returns.mean())),
         "score_low": float(low),
         "score_high": float(high),
-        "score_std": summary(task.score(played.returns)).sd if episodes > 1 else None,
-        "return": float(played.returns.mean()),
-        "length": float(played.lengths.mean()),
+        "score_std": summary(task.score(rolled_out.returns)).sd if episodes > 1 else None,
+        "return": float(rolled_out.returns.mean()),
+        "length": float(rolled_out.lengths.mean()),
         "episodes": episodes,
         "evaluation_seed": seed,
         "env_id": env_id,

@@ -1,4 +1,4 @@
-"""Settings and target returns per task, kind of dataset and learner: `presets.toml`."""
+"""Settings and target returns per task, kind of dataset and method: `presets.toml`."""
 
 import tomllib
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ class Preset:
 
 
 def find_preset(task: str, kind: str, policy: str) -> Preset:
-    """The preset of a learner on one kind of dataset of a task.
+    """The preset of a method on one kind of dataset of a task.
 
     Args:
         task: name of a `ucfrec_control.environments.scores.Task`; "" for none.

@@ -31,7 +31,7 @@ def dataset_of(store: EpisodeStore) -> Mapping[str, Any]:
 
 
 def preset_of(dataset: Mapping[str, Any], policy: str) -> Preset:
-    """The preset of a learner on the dataset that `dataset_of` describes."""
+    """The preset of a method on the dataset that `dataset_of` describes."""
     task = find_task(dataset["env_id"], dataset["dataset"])
     return find_preset(task.name if task else "", find_kind(dataset["dataset"]), policy)
 

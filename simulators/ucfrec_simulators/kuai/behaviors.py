@@ -15,14 +15,14 @@ from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators.kuai.environment import EXITS, REGIMES, ExitRule, KuaiEnv
 
 MASK: Final = ExitRule(window=10, threshold=0, max_turn=100)
-"""Whose tags `random-mask` leaves out: those of the last ten items, in every environment."""
+"""Whose tags `random-mask` excludes: those of the last ten items, in every environment."""
 
 
 class RandomMask(Memoryless):
     """A uniformly random item without a tag of the last ten, and that is not masked.
 
-    If there is none, any item that is not masked. It knows no rewards: a floor for what a policy
-    earns by not repeating itself.
+    If there is none, any item that is not masked. It uses no rewards: a baseline for what not
+    repeating itself is worth.
     """
 
     def __init__(self, environment: KuaiEnv, seed: int) -> None:
@@ -43,7 +43,7 @@ class Oracle(Memoryless):
     """The item of highest true reward that is not masked and does not end the session.
 
     It reads the environment's rewards, which no recommender can. It is greedy and so not optimal:
-    it does not plan beyond the current step. If every item left ends the session, it plays the one
+    it does not plan beyond the current step. If every item left ends the session, it shows the one
     of highest reward.
     """
 

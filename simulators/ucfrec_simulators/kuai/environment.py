@@ -62,7 +62,7 @@ EXITS: Final = {
 
 @dataclass(frozen=True)
 class Regime:
-    """How an evaluation is played."""
+    """How an evaluation is run."""
 
     masked: bool
     """Whether an item may be recommended only once per session."""
@@ -89,7 +89,7 @@ class KuaiEnv(SessionsEnv):
     """One item per step to a user drawn uniformly; the reward is the table's entry.
 
     A session terminates in the step whose item triggers the `ExitRule`, and the reward of that step
-    counts. It is truncated at its maximum length. If the regime masks items, playing an item twice
+    counts. It is truncated at its maximum length. If the regime masks items, showing an item twice
     in a session is an error: `info["forbidden"]` (N, maximum length) lists the items already shown,
     padded with −1.
 
@@ -107,7 +107,7 @@ class KuaiEnv(SessionsEnv):
 
     Raises:
         InputError: tags or ids do not match the table, or there are fewer items than steps of a
-            masked session. In `step`: a masked item was played.
+            masked session. In `step`: a masked item was shown.
     """
 
     def __init__(

@@ -2,7 +2,7 @@
 last one.
 
 Stable-Baselines3 (extra `collect`) provides the networks, the replay buffer and the update. The
-sessions are played by `ucfrec.acting.rollout`, so that the steps learned from are those logged.
+sessions are run by `ucfrec.acting.rollout`, so that the steps learned from are those logged.
 """
 
 import hashlib
@@ -80,7 +80,7 @@ class Noisy(Memoryless):
 
 
 class Training:
-    """DDPG (Lillicrap et al., 2016) as an actor that learns from every step played.
+    """DDPG (Lillicrap et al., 2016) as an actor that learns from every step taken.
 
     After a uniform warm-up, it serves all N sessions with its current network and noise; the
     propensity is the density of the action. It learns from the live rows only, which are those that
@@ -102,7 +102,7 @@ class Training:
         self._generator = np.random.default_rng([seed, 51])
         self._model = _sb3_model(env, seed, config)
         self._ended = np.zeros(env.num_envs, dtype=np.bool_)
-        self._played: _Played | None = None
+        self._taken: _Taken | None = None
         self._steps, self._due = 0, 0.0
 
     @property
@@ -122,8 +122,8 @@ class Training:
             Actions (N, A) and their densities (N,).
         """
         scaled = observations / self._high
-        if self._played is not None:
-            self._learn(self._played, scaled)
+        if self._taken is not None:
+            self._learn(self._taken, scaled)
         self._ended[:] = False
         if self._steps < self._config.warm_up:
             box = (len(observations), ACTION_DIM)
@@ -132,22 +132,22 @@ class Training:
         else:
             mean = _forward(self.network, scaled)
             actions, density = truncated_normal(mean, self._config.noise, self._generator)
-        self._played = _Played(scaled, np.flatnonzero(live))
+        self._taken = _Taken(scaled, np.flatnonzero(live))
         return actions, density
 
     def observe(self, actions: Actions, rewards: Float32Array) -> None:
         """Keep the step until its next observations are known."""
-        assert self._played is not None
-        self._played.actions, self._played.rewards = actions, rewards / np.float32(MAX_CLICKS)
+        assert self._taken is not None
+        self._taken.actions, self._taken.rewards = actions, rewards / np.float32(MAX_CLICKS)
 
-    def _learn(self, played: "_Played", next_observations: Float32Array) -> None:
-        buffer, rows, config = self._model.replay_buffer, played.rows, self._config
+    def _learn(self, taken: "_Taken", next_observations: Float32Array) -> None:
+        buffer, rows, config = self._model.replay_buffer, taken.rows, self._config
         # `ReplayBuffer.add` takes steps of all N sessions; only the M live ones may enter.
         slots = (buffer.pos + np.arange(len(rows))) % buffer.buffer_size
-        buffer.observations[slots, 0] = played.observations[rows]
+        buffer.observations[slots, 0] = taken.observations[rows]
         buffer.next_observations[slots, 0] = next_observations[rows]
-        buffer.actions[slots, 0] = played.actions[rows]
-        buffer.rewards[slots, 0] = played.rewards[rows]
+        buffer.actions[slots, 0] = taken.actions[rows]
+        buffer.rewards[slots, 0] = taken.rewards[rows]
         buffer.dones[slots, 0] = self._ended[rows]
         buffer.full |= buffer.pos + len(rows) >= buffer.buffer_size
         buffer.pos = (buffer.pos + len(rows)) % buffer.buffer_size
@@ -160,7 +160,7 @@ class Training:
 
 
 @dataclass
-class _Played:
+class _Taken:
     """A step whose next observations are not known yet."""
 
     observations: Float32Array
@@ -172,7 +172,7 @@ class _Played:
 
 
 class _Spaces(gymnasium.Env[Float32Array, Actions]):
-    """The spaces that Stable-Baselines3 needs; the sessions themselves are played by `rollout`."""
+    """The spaces that Stable-Baselines3 needs; the sessions themselves are run by `rollout`."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
         self.observation_space = gymnasium.spaces.Box(-1, 1, env.single_observation_space.shape)

@@ -154,7 +154,7 @@ def best_constant(env: TaobaoEnv, seed: int) -> Float32Array:
 
 
 def zero_actor(env: VectorEnv[Any, Any, Any], seed: int) -> Constant:
-    """A policy that always plays the zero action; `seed` is unused."""
+    """A policy that always takes the zero action; `seed` is unused."""
     return Constant(np.zeros(ACTION_DIM, dtype=np.float32))
 
 

@@ -87,7 +87,7 @@ class VirtualTaobao(TaobaoEnv):
                 axis=1,
             )
             lengths = _weights(self._leave_model(torch.from_numpy(users)))
-        # The original checks for the end after a page, so a drawn length of 0 plays one page.
+        # The original checks for the end after a page, so a drawn length of 0 gives one page.
         return users, np.maximum(draw_categories(lengths, generator.random(count)), 1)
 
     def expected_clicks(

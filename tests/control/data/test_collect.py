@@ -141,7 +141,7 @@ def test_the_threshold_lies_between_random_and_expert_also_below_zero(fraction: 
     medium, expert = module._choose(rows, -1250.0, fraction)
     assert expert == 4
     assert [(value + 1250) / 1050 >= fraction for value in returns].index(True) == medium
-    with pytest.raises(InputError, match=r"random play -100\.0; train for more"):
+    with pytest.raises(InputError, match=r"random actions -100\.0; train for more"):
         module._choose(rows, -100.0, fraction)
 
 

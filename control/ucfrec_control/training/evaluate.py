@@ -26,8 +26,8 @@ from ucfrec_control.environments.environments import (
     mismatches,
 )
 from ucfrec_control.environments.scores import find_kind, require_task
-from ucfrec_control.training.presets import find_preset
 from ucfrec_control.training.rl_baselines import RLPolicy, is_rl
+from ucfrec_control.training.train import find_preset
 
 Trained = TrainedPolicy | RLPolicy
 CHECKPOINTS = ("last", "best")

@@ -32,8 +32,8 @@ from ucfrec_control.commands.benchmark import budgets_of
 from ucfrec_control.data.distractor import zoo_store
 from ucfrec_control.environments.scores import find_kind, require_task
 from ucfrec_control.training.evaluate import load_run
-from ucfrec_control.training.presets import find_preset
 from ucfrec_control.training.rl_baselines import ALGORITHMS
+from ucfrec_control.training.train import find_preset
 
 
 def resolved(table: str, budget: Budget, file: str) -> dict[str, Config]:

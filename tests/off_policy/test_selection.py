@@ -197,5 +197,5 @@ def test_names_say_what_differs() -> None:
         "target return 1000002",
         "largest target return expected",
     ]
-    closest = [{"target return": t} for t in (0.1 + 0.2, 0.3)]
-    assert len(set(names_of(closest))) == 2
+    closest = [{"target return": t} for t in (0.1 + 0.2, 0.3, 0.25)]
+    assert len(set(names_of(closest))) == 3

@@ -14,7 +14,7 @@ together, from one bootstrap that draws users and treats all candidates alike:
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,9 +26,6 @@ if TYPE_CHECKING:
     from ucfrec.off_policy.evaluate import OffPolicyReport
 
 LEVEL = 0.95
-_FEWEST_DIGITS: Final = 6
-_MOST_DIGITS: Final = 17
-"""As many distinguish any two floats."""
 
 
 @dataclass(frozen=True)
@@ -235,12 +232,8 @@ def names_of(candidates: Sequence[Mapping[str, object]]) -> list[str]:
 
 def _parts(key: str, values: Sequence[object]) -> list[str]:
     """What the names say of one part of all candidates."""
-    parts: list[str] = []
-    for digits in range(_FEWEST_DIGITS, _MOST_DIGITS + 1):
-        parts = [_part(key, value, digits) for value in values]
-        if len(set(parts)) == len(set(values)):
-            break
-    return parts
+    short, full = ([_part(key, value, digits) for value in values] for digits in (6, 17))
+    return short if len(set(short)) == len(set(values)) else full
 
 
 def _part(key: str, value: object, digits: int) -> str:

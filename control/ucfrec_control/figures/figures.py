@@ -172,9 +172,8 @@ def _distinguished(runs: Sequence[_Run]) -> list[_Run]:
 def _of_runs(runs: Sequence[_Run]) -> Iterator[_Plan]:
     for run in _first(runs, lambda run: (run.group, run.method)):
         if diagnostics.is_augmented(run.path):
-            yield _Plan("moves", run.name, partial(_moves, run))
-            yield _Plan("states", run.name, partial(_states, run))
-            yield _Plan("acceptance", run.name, partial(_acceptance, run))
+            for kind in ("moves", "states", "acceptance"):
+                yield _Plan(kind, run.name, partial(_of_copies, run, kind))
         if run.policy == "ucf":
             yield _Plan("attention", run.name, partial(_attention, run))
     for run in _first(runs, lambda run: run.group):
@@ -189,15 +188,12 @@ def _first(runs: Iterable[_Run], key: Callable[[_Run], Any]) -> Iterable[_Run]:
     return first.values()
 
 
-def _moves(run: _Run) -> Figure:
-    return plots.move_histogram(*diagnostics.move_histogram(run.path), run.title)
-
-
-def _states(run: _Run) -> Figure:
-    return plots.state_overlay(*diagnostics.edited_states(run.path), run.title)
-
-
-def _acceptance(run: _Run) -> Figure:
+def _of_copies(run: _Run, kind: str) -> Figure:
+    """A figure of the edited copies of a run."""
+    if kind == "states":
+        return plots.state_overlay(*diagnostics.edited_states(run.path), run.title)
+    if kind == "moves":
+        return plots.move_histogram(*diagnostics.move_histogram(run.path), run.title)
     band = diagnostics.move_histogram(run.path)[2]
     shares = diagnostics.acceptance_grid(run.path, LOWS, HIGHS)
     return plots.acceptance_heatmap(LOWS, HIGHS, shares, band, run.title)

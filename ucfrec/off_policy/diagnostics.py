@@ -97,7 +97,7 @@ def diagnose(
         nothing = (None, (), (), 0.0, 1.0, 0, None, None, None)
         return Diagnosis(len(lacking), users, len(lacking), *nothing)
     known = steps.known()
-    by_user = np.bincount(known.users, known.session_weights)
+    by_user = np.bincount(known.users, known.session_weights).astype(np.float64)
     rewarded = np.bincount(known.users, np.abs(known.session_weights * known.returns))
     if reward_range is None:
         reward_range = (float(steps.reward.min()), float(steps.reward.max()))

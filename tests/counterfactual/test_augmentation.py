@@ -11,10 +11,10 @@ from tests.support.causes import planted_vectors
 from tests.support.planted import planted_store
 from ucfrec import schema
 from ucfrec.counterfactual.augmentation import counterfactual_augmentation, interventions
+from ucfrec.counterfactual.effects_mean import EffectTransitions
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
 from ucfrec.counterfactual.state_augmentation import AugmentConfig
-from ucfrec.counterfactual.transitions import EffectTransitions
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay

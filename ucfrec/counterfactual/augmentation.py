@@ -11,6 +11,7 @@ import torch
 from ucfrec import schema
 from ucfrec.counterfactual.action_augmentation import ActionGenerator, logged_actions
 from ucfrec.counterfactual.clusters import ActionSupport
+from ucfrec.counterfactual.effects_mean import EffectsMean, EffectTransitions
 from ucfrec.counterfactual.generators import CSGConfig, make_generator, state_clusters
 from ucfrec.counterfactual.reward_model import CRMConfig
 from ucfrec.counterfactual.reward_model_fit import fit_crm
@@ -20,13 +21,7 @@ from ucfrec.counterfactual.state_augmentation import (
     augment,
     candidates,
 )
-from ucfrec.counterfactual.transitions import (
-    EffectsMean,
-    EffectTransitions,
-    Read,
-    sample_steps,
-    sample_transitions,
-)
+from ucfrec.counterfactual.transitions import Read, sample_steps, sample_transitions
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay
 from ucfrec.errors import InputError

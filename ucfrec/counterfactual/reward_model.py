@@ -7,7 +7,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from ucfrec.counterfactual.transitions import EffectsMean
+from ucfrec.counterfactual.effects_mean import EffectsMean
 from ucfrec.settings import (
     BatchSize,
     LearningRate,

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from ucfrec.arrays import Float32Array
+from ucfrec.counterfactual.effects_mean import EffectsMean
 from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, kl_to_prior
-from ucfrec.counterfactual.transitions import EffectsMean
 from ucfrec.episodes.windows import Transitions
 from ucfrec.errors import InputError
 from ucfrec.fitting.loop import LoopConfig, fit

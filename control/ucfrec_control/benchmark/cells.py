@@ -39,7 +39,7 @@ OF_ITEMS: Final = (
     *("ucfrec.acting.logged_decisions", "ucfrec.choosing.many_rules"),
     *("ucfrec.acting.session_scorer", "ucfrec.counterfactual.action_augmentation"),
     *("ucfrec.user_model.reward_effects", "ucfrec.user_model.reward_fit"),
-    *("ucfrec.counterfactual.transitions", "ucfrec.user_model.reward"),
+    *("ucfrec.counterfactual.effects_mean", "ucfrec.user_model.reward"),
     *("ucfrec.user_model.reward_report", "ucfrec.user_model.reward_rows"),
     *("ucfrec.user_model.posterior", "ucfrec.user_model.training_users"),
     *("ucfrec.episodes.exposure", "ucfrec.episodes.item_counts", "ucfrec.episodes.item_table"),

@@ -74,7 +74,7 @@ def train(file: Path, folder: Path) -> Path:
     """Write the store of `file` and train UCF on it; returns the run folder."""
     from ucfrec.runs.config import resolve_config
     from ucfrec_control.data.d4rl import read_d4rl
-    from ucfrec_control.learners.train import dataset_of, preset_of, train_control
+    from ucfrec_control.training.train import dataset_of, preset_of, train_control
 
     store = read_d4rl(file).write_store(folder / "store")
     returns: Float32Array = store.returns
@@ -93,7 +93,7 @@ def train(file: Path, folder: Path) -> Path:
 
 def evaluate(run: Path) -> "list[ResultRow]":
     """One result row a target return."""
-    from ucfrec_control.learners.evaluate import evaluate_run
+    from ucfrec_control.training.evaluate import evaluate_run
 
     return evaluate_run(run, episodes=20, seed=100, targets=TARGETS, checkpoints=("best",))
 

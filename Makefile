@@ -8,7 +8,7 @@ BIN := .venv/bin
 # once. One thread each, or the workers' linear algebra fights over the cores.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --durations 30
 
-.PHONY: demo test test-slow torture bench lint types docs wheel clean
+.PHONY: demo test test-slow torture lint types docs wheel clean
 
 demo: .venv/base  ## Set up and run the main job end to end on simulated logs.
 	$(BIN)/ucfrec demo --out demo-out
@@ -19,17 +19,11 @@ test: .venv/dev  ## Set up and run the tests, all but the slow ones.
 test-slow: .venv/dev  ## The slow tests: trainings and worlds that take many seconds each.
 	$(PYTEST) -m slow --no-loadscope-reorder
 
-# SCALE is a share of the cases. What the file of rows has for this code is not measured again.
+# SCALE is a share of the cases. What build/torture.jsonl has for this code is not measured again.
 SCALE ?= 1
 torture: .venv/dev  ## Kill, interrupt, corrupt, fuzz and starve the commands; print a table.
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.torture --scale $(SCALE) \
-	  --results benchmarks/results/torture.jsonl
-
-# What the benchmarks compare with: a clone of github.com/beanie00/Decision-ConvFormer, and one of
-# this repository at an earlier commit. Either may be left out.
-BENCH_FLAGS ?=
-bench: .venv/dev build/peers  ## Measure the goals of docs/scale.md, hours; resumes.
-	PYTHONPATH=build/peers $(BIN)/python benchmarks/bench.py $(BENCH_FLAGS)
+	  --results build/torture.jsonl
 
 lint: .venv/dev  ## Style.
 	$(BIN)/ruff check .
@@ -56,10 +50,6 @@ wheel: .venv/dev  ## Build the wheel into dist/.
 .venv/docs: .venv/base
 	$(BIN)/pip install -q $(PIP_FLAGS) -c constraints.txt -e ".[docs]"
 	touch $@
-
-build/peers:  # old releases, apart from ours, that the authors' DC is written for
-	$(BIN)/pip install -q --no-deps --target $@ transformers==4.6.0 huggingface-hub==0.0.8 \
-	  regex sacremoses
 
 clean:
 	rm -rf .venv dist build demo-out

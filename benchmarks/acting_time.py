@@ -32,11 +32,8 @@ import torch
 from ucfrec import Recommender, schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.logged_decisions import session_scores
-from ucfrec.acting.policy_actor import PolicyActor
-from ucfrec.acting.rollout import rollout
 from ucfrec.choosing.by_simulation import RuleSearch
 from ucfrec.choosing.config import RuleConfig
-from ucfrec.code_version import code_version
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.policies.registry import policy_class
@@ -49,11 +46,10 @@ from ucfrec.recommending.stream import answer_stream
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows
 from ucfrec.reporting.tables import markdown_table
-from ucfrec.runs.config import config_from_dict
-from ucfrec.runs.run import training_views
-from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.runs.start import training_views
+from ucfrec.runs.trained_policy import REWARD_MODEL, TrainedPolicy
+from ucfrec.user_model.model import UserModel
 from ucfrec.user_model.reward import ItemRewardModel
-from ucfrec.user_model.simulator import UserSimulator
 
 RESULTS = Path("runs/acting_time/results.jsonl")
 HISTORY, SESSIONS, PAGES, LOG_USERS = 20, 4096, 300, 5000
@@ -86,8 +82,8 @@ def enlarged(trained: TrainedPolicy, items: int) -> TrainedPolicy:
     assert model is not None
     n_items = len(states.embeddings)
     rows = torch.randint(n_items, (items,), generator=torch.Generator().manual_seed(0))
-    sizes = {**trained.record["sizes"], "items": items}
-    config = config_from_dict(trained.record["config"])
+    sizes = {**trained.record.sizes, "items": items}
+    config = trained.record.config
     policy = policy_class(config.policy_name)(config.policy, sizes)
     larger = ItemRewardModel(sizes)
     for old, new in ((trained.policy, policy), (model, larger)):
@@ -152,7 +148,7 @@ def frame_ways(run: Path) -> tuple[Way, Way]:
     frame = pd.DataFrame({schema.USER_ID: np.full(10, 1), schema.ITEM_ID: items[:10].to_numpy()})
     frame[schema.TIMESTAMP] = BEGAN + np.cumsum(rng.integers(1, 60_000, 10))
     frame[schema.REWARD] = rng.random(10).round()
-    if policy.trained.record["session_by"] == schema.SESSION_ID:
+    if policy.trained.record.session_by == schema.SESSION_ID:
         frame[schema.SESSION_ID] = 1
     named = LogMapping({schema.ITEM_ID: schema.ITEM_ID})
     return lambda: policy.recommend(frame), lambda: policy.recommend(frame, mapping=named)
@@ -173,7 +169,7 @@ def log_ways(trained: TrainedPolicy, store: EpisodeStore, folder: Path) -> tuple
     )
     # The way of the run's reward to its column is not what is measured.
     log = folder / "log.parquet"
-    frame.assign(**{trained.record["reward"]: frame[schema.REWARD]}).to_parquet(log)
+    frame.assign(**{trained.record.reward: frame[schema.REWARD]}).to_parquet(log)
     decider = trained.decider()
 
     def batches() -> Iterator[Histories]:
@@ -198,39 +194,20 @@ def log_ways(trained: TrainedPolicy, store: EpisodeStore, folder: Path) -> tuple
     return (lambda: list(recommend(trained, batches(), 10))), before, len(store)
 
 
-def rule_ways(trained: TrainedPolicy, store: EpisodeStore, sessions: int) -> tuple[Way, Way]:
-    """Play 8 rules side by side, and one after the other."""
-    views, target = training_views(store), trained.target_return(1.0)
-    decider, config = trained.decider(DecisionRule(target)), RuleConfig(sessions=sessions)
-    search = RuleSearch(decider, *views, config, seed=0)
+def rule_ways(run: Path, store: EpisodeStore, sessions: int) -> tuple[Way, Way]:
+    """Simulate 8 rules side by side, and one after the other."""
+    trained, views = TrainedPolicy.load(run), training_views(store)
+    target, config = trained.target_return(1.0), RuleConfig(sessions=sessions)
+    decider = trained.decider(DecisionRule(target))
+    users = UserModel.fit(*views, run / REWARD_MODEL, 0)
+    search = RuleSearch(decider, users, *views, config, seed=0)
     rules = [
         DecisionRule(target, floor=floor, reward_weight=reward_weight, temperature=temperature)
         for floor in (None, target)
         for reward_weight in (0.0, 4.0)
         for temperature in (0.0, 0.5)
     ]
-    _, validation = views
-    states, model = validation.item_states, trained.reward_model
-    assert model is not None
-    users = np.arange(len(states.user_features))
-    longest = int(views[0].lengths.max())
-    environment = UserSimulator(
-        *(validation, model, search.calibration, search.end, sessions, longest)
-    )
-
-    def one_by_one() -> list[float]:
-        returns = []
-        for rule in rules:
-            actor = PolicyActor(
-                *(replace(decider, rule=rule), sessions, validation.observation_size),
-                *(states, None, users),
-                seed=0,
-            )
-            played = rollout(environment, actor, sessions, 0)  # type: ignore[arg-type]
-            returns.append(float(played.returns.mean()))
-        return returns
-
-    return lambda: [each.value for each in search.play(rules)], one_by_one
+    return lambda: search.simulate(rules), lambda: [search.simulate([rule]) for rule in rules]
 
 
 def taobao_ways(original: Path) -> tuple[Way, Way, tuple[int, int]]:
@@ -296,7 +273,7 @@ def cases(options: argparse.Namespace, folder: Path) -> Iterator[tuple[Case, int
         now, before, users = log_ways(trained, some, folder)
         yield Case("all users", (now, before), rounds, (users, users)), items
     if "choose the rule" in wanted:
-        ways = rule_ways(trained, store, options.sessions)
+        ways = rule_ways(options.run, store, options.sessions)
         yield Case("choose the rule", ways, rounds), items
     if "VirtualTaobao" in wanted and options.original:
         first, second, units = taobao_ways(options.original)
@@ -340,7 +317,6 @@ def main() -> None:
                 policy="ucf",
                 conditions={"items": items, "rounds": case.rounds, "sessions": options.sessions}
                 | ({} if options.engine == TORCH else {"engine": options.engine}),
-                code_version=code_version(Path(__file__), "ucfrec.recommending.responder"),
                 metric="ratio",
                 metrics=found,
                 wall_time_s=float(wall.sum()),

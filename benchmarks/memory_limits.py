@@ -25,7 +25,6 @@ from pathlib import Path
 import numpy as np
 from prepare_time import make_log
 
-from ucfrec.code_version import code_version
 from ucfrec.logs.engine import anonymous_bytes, bytes_of
 from ucfrec.provenance import provenance
 from ucfrec.reporting.result_row import ResultRow
@@ -208,7 +207,6 @@ def main() -> None:
                 method=command,
                 policy="ucf",
                 conditions={"rows": rows, "limit": options.limit, "threads": 1, **grouped},
-                code_version=code_version(Path(__file__), "ucfrec.commands.cli"),
                 metric="anonymous_mib",
                 metrics=metrics,
                 wall_time_s=one.wall_s,

@@ -16,17 +16,15 @@ from typing import Any
 import pandas as pd
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.code_version import code_version
 from ucfrec.commands.cli import main as ucfrec
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.ranking import MEASURES
 from ucfrec.files.atomic import read_json
 from ucfrec.logs.mapping import log_files
-from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows
-from ucfrec.runs.trained_policy import read_record
+from ucfrec.runs.record import read_record
 from ucfrec_simulators.folders import data_folder
 
 SETTINGS = ("train.steps=2000", "policy.dim=64")
@@ -68,20 +66,18 @@ def result_row(row: dict[str, Any], store: Path, folder: Path, days: str) -> Res
     """The result row of one row of `ucfrec rank --json`."""
     record = read_record(folder)
     own = "decision_rule" in row
-    learner = record["config"]["policy_name"] if own else row["policy"]
-    modules = [policy_class(learner).__module__] if own else []
+    learner = record.config.policy_name if own else row["policy"]
     return ResultRow(
         suite="next-period",
         table="next-period",
         task="kuairand",
         method=row["policy"],
         policy=learner,
-        training_seed=record["seed"] if own else None,
+        training_seed=record.seed if own else None,
         evaluation_seed=row["seed"],
         conditions={"days": days, "k": row["k"]},
-        config_hash=config_hash(record["config"]) if own else None,
-        code_version=code_version(Path(__file__), "ucfrec.runs.run", *modules),
-        data_fingerprint=EpisodeStore.open(store).meta["fingerprint"],
+        config_hash=config_hash(record.settings) if own else None,
+        data_fingerprint=EpisodeStore.open(store).record.fingerprint,
         metric="hit_rate_liked",
         metrics={name: row[name] for name in (*MEASURES, "coverage") if row[name] is not None},
         interval=tuple(row["hit_rate_liked_interval"]),
@@ -127,7 +123,7 @@ def main() -> None:
         ranked = read_json(folder.with_suffix(".json"))
         rows = [result_row(row, store, folder, days) for row in ranked]
         append_rows(results, [row for row in rows if row.config_hash is None])
-        config = read_record(folder)["config"]
+        config = read_record(folder).settings
         append_rows(results, [row for row in rows if row.config_hash], config)
 
 

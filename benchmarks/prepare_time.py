@@ -170,7 +170,6 @@ def compare(options: argparse.Namespace, rows: int, folder: Path) -> list[tuple[
     """Measure all methods on a log of `rows` rows; returns lines of the table."""
     import shutil
 
-    from ucfrec.code_version import code_version
     from ucfrec.provenance import provenance
     from ucfrec.reporting.result_row import ResultRow
     from ucfrec.reporting.rows_file import append_rows
@@ -205,7 +204,6 @@ def compare(options: argparse.Namespace, rows: int, folder: Path) -> list[tuple[
             policy="none",
             log_seed=options.seed,
             conditions=conditions,
-            code_version=code_version(Path(__file__), "ucfrec.logs.prepare"),
             metric="ratio",
             metrics=metrics,
             wall_time_s=wall,

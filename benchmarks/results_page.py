@@ -1,60 +1,77 @@
 """docs/tables.md: the tables of results, written from the rows in benchmarks/results.
 
     python benchmarks/results_page.py          # writes the page, and its pictures with matplotlib
-    python benchmarks/results_page.py --check  # fails where the page is not what the rows say
+    python benchmarks/results_page.py --check  # fails where the page does not follow from the rows
 
-Rows of earlier code count: the page says which commits measured a table.
+Numbers have at most three significant digits. The page names the commits that measured a table.
 """
 
 import argparse
+import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from textwrap import TextWrapper
-from typing import Any
+from typing import Final
 
-from counterfactual_copies import difference_table as copies_table
+import numpy as np
 
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import latest, read_rows
-from ucfrec.reporting.statistics import grouped, summary
-from ucfrec.reporting.tables import NONE, markdown_table, mean_and_sd
-from ucfrec_control.benchmark.robustness import SHOWN as SHOWN_DROPS
-from ucfrec_control.benchmark.robustness import SHOWN_LARGEST, drops, largest_drops
-from ucfrec_control.benchmark.tables import difference_table, over_seeds, score_table
-from ucfrec_simulators.benchmark.methods import ADDITIONS, METHODS, PAPER
-from ucfrec_simulators.benchmark.tables import difference_to_ours, distractor_table, sweep_table
+from ucfrec.reporting.statistics import Summary, grouped, summary
+from ucfrec.reporting.tables import NONE, markdown_table
 
-HERE = Path(__file__).parent
-RESULTS, PAGE = HERE / "results", HERE.parent / "docs" / "tables.md"
-PICTURES = HERE.parent / "docs" / "assets" / "tables"
-PUBLISHED = """\
+ROOT = Path(__file__).parents[1]
+RESULTS, PAGE = ROOT / "benchmarks" / "results", ROOT / "docs" / "tables.md"
+PICTURES = ROOT / "docs" / "assets" / "tables"
+FILES = (
+    *("recommendation", "counterfactual_copies"),
+    *("control", "control_robustness", "control_histories"),
+)
+PAPER = """\
 | method | KuaiRand R_cum | R_avg | KuaiRec R_cum | R_avg | VirtualTB R_cum | R_avg |
 |---|---|---|---|---|---|---|
-| DT4Rec | 6.82 ± 2.45 | 0.569 | 28.54 ± 10.42 | 0.880 | 76.79 ± 22.63 | 5.442 |
-| CDT4Rec | 7.33 ± 1.98 | 0.651 | 30.49 ± 10.19 | 1.006 | 79.21 ± 22.38 | 5.649 |
-| EDT4Rec | 7.58 ± 1.84 | 0.650 | 31.07 ± 10.98 | 1.040 | 79.67 ± 21.67 | 5.674 |
-| UCF | 7.62 ± 1.79 | 0.655 | 31.87 ± 10.55 | 1.058 | 80.42 ± 21.15 | 5.696 |"""
+| DT4Rec | 6.82 ± 2.45 | 0.569 | 28.5 ± 10.4 | 0.880 | 76.8 ± 22.6 | 5.44 |
+| CDT4Rec | 7.33 ± 1.98 | 0.651 | 30.5 ± 10.2 | 1.01 | 79.2 ± 22.4 | 5.65 |
+| EDT4Rec | 7.58 ± 1.84 | 0.650 | 31.1 ± 11.0 | 1.04 | 79.7 ± 21.7 | 5.67 |
+| UCF | 7.62 ± 1.79 | 0.655 | 31.9 ± 10.6 | 1.06 | 80.4 ± 21.2 | 5.70 |"""
 ENVIRONMENTS = (
-    "**VirtualTaobao** cannot tell good methods apart: one constant action earns 10 clicks of 10 "
+    "**VirtualTaobao** does not separate good methods: one constant action gets 10 clicks of 10 "
     "on every page.",
-    "**KuaiRand FB and NX_0** (N = 10) tell whether a policy stops repeating tags, and then how "
-    "well it knows the items' click rates; `random-mask` is what the first alone earns. With N = 4 "
-    "or 1 there is less to stop.",
+    "**KuaiRand FB and NX_0** (`kuairand`, `kuairand-nx0`, N = 10) show whether a policy stops "
+    "repeating tags, and then how well it knows the items' click rates; `random-mask` is the "
+    "return of the first alone.",
     "**KuaiRand NX_10** has sessions of ten steps whatever is shown: planning has nothing to gain, "
-    "one-step greed is the floor to beat.",
-    "**The synthetic catalogue** punishes greed, and its optimum is known. We wrote it.",
-    "**SARDINE BoredInf** was written by nobody here. Nothing is known of a user at first, and "
-    "five clicks on one topic bore: it tells who learns tastes within a session, and who gives "
-    "them a rest.",
-    "None of them says what real users would do: see [what the numbers cannot "
+    "and the one-step greedy policy is the baseline to beat.",
+    "**The synthetic catalogue** punishes greedy policies, and its optimum is known. It is our "
+    "own simulator.",
+    "**SARDINE BoredInf** is by other authors. Nothing is known of a user at first, and five "
+    "clicks on one topic bore: it shows which method learns tastes within a session and varies "
+    "topics.",
+    "No simulator shows what real users would do: see [what the numbers cannot "
     "tell](numbers.md#what-they-cannot-tell).",
 )
-BUILT_IN = ("oracle", "optimal", "best-constant")
-"""Policies that know an environment; never the best of a column."""
+BUILT_IN: Final = ("random", "random-mask", "oracle", "mixture", "optimal", "best-constant")
+"""Policies that come with a simulator."""
+KNOWING: Final = ("oracle", "optimal", "best-constant")
+"""Policies that know their simulator; never the best of a column."""
+BASELINES = ("popular", "item-rate", "item-rate-mask", "item-knn", "crm-greedy")
+SEQUENCE = ("sasrec", "bc", "bc-10", "dt", "dt4rec", "cdt4rec", "edt4rec")
+UCF = (
+    *("ucf-paper", "ucf-paper-algorithm-5", "ucf-plain", "ucf-wo-exposure"),
+    *("ucf-wo-reward-weight", "ucf-wo-rule", "ucf-weights", "ucf-max-return"),
+    *("ucf-actions", "ucf-both", "ucf-wo-count", "ucf-wo-arch", "ucf"),
+)
+METHODS = (*BUILT_IN, *BASELINES, *SEQUENCE, *(f"{name}+shared" for name in SEQUENCE), *UCF)
+"""Order of the lines."""
+NEAR = 0.05
+"""Share of the best score by which control's scores may be lower and still be bold."""
+_Seeds = tuple[int | None, int | None]
+_Files = Mapping[str, Sequence[ResultRow]]
+_Values = Mapping[_Seeds, float]
 
 
 def fill(text: str, subsequent_indent: str = "") -> str:
@@ -65,6 +82,331 @@ def fill(text: str, subsequent_indent: str = "") -> str:
     return wrapper.fill(text)
 
 
+def decimals(value: float, digits: int) -> int:
+    """Decimals that give `value` so many significant digits; negative above 10^digits."""
+    return digits - 1 - math.floor(math.log10(abs(value))) if value else 0
+
+
+def rounded(value: float, digits: int = 3, most: int = 99, sign: str = "") -> str:
+    """`value` with so many significant digits and at most `most` decimals, never as 1e+03."""
+    places = min(decimals(round(value, decimals(value, digits)), digits), most)
+    text = f"{round(value, places):{sign}.{max(places, 0)}f}"
+    return text if float(text) else text.lstrip("+-")
+
+
+def error(spread: float, mean: float) -> str:
+    """` ± spread`: two significant digits, one where the mean's three hide it, 0 for rounding."""
+    if spread <= 1e-6 * abs(mean):
+        return " ± 0"
+    return f" ± {rounded(spread, 1 if spread < 0.5 * 10.0 ** -decimals(mean, 3) else 2)}"
+
+
+def level(sample: Summary, standard_error: bool = False) -> str:
+    """A mean ± standard deviation or error over seeds; one value has none."""
+    if not sample.count:
+        return NONE
+    spread = sample.standard_error if standard_error else sample.sd
+    return rounded(sample.mean) + (error(spread, sample.mean) if sample.count > 1 else "")
+
+
+def difference(sample: Summary, over_logs: Summary | None = None, unit: str = "") -> str:
+    """A mean difference ± its standard error, in brackets the error over the means of logs."""
+    if not sample.count:
+        return NONE
+    if sample.count == 1 or not sample.standard_error:
+        return rounded(sample.mean, sign="+") + unit
+    known = sample.standard_error
+    text = rounded(sample.mean, most=max(decimals(known, 2), 0), sign="+") + unit
+    text += f" ± {rounded(known, 2)}{unit}"
+    if over_logs is not None and over_logs.count > 1:
+        text += f" ({rounded(over_logs.standard_error, 2)}{unit})"
+    return text
+
+
+def named_apart(rows: Sequence[ResultRow]) -> list[ResultRow]:
+    """Rows in which a simulator's behavior and a trained method of one name have two names."""
+    trained = {row.method for row in rows if row.training_seed is not None}
+    return [
+        replace(row, method=f"{row.method} (of the simulator)")
+        if row.training_seed is None and row.method in trained
+        else row
+        for row in rows
+    ]
+
+
+def by_seeds(rows: Iterable[ResultRow]) -> dict[_Seeds, float]:
+    """The value of each (log seed, training seed)."""
+    return {(row.log_seed, row.training_seed): row.value for row in rows}
+
+
+def minus(values: _Values, others: _Values) -> dict[_Seeds, float]:
+    """Differences for equal seeds; a value that no seed changes is compared with each."""
+    same = {seeds: value for seeds, value in values.items() if seeds in others}
+    if not same and len(values) == 1:
+        same = dict.fromkeys(others, *values.values())
+    return {seeds: value - others[seeds] for seeds, value in same.items()}
+
+
+def over_logs(differences: _Values) -> Summary:
+    """Summary of the means of logs."""
+    of_logs = grouped(differences.items(), lambda item: item[0][0]).values()
+    return summary(float(np.mean([value for _, value in own])) for own in of_logs)
+
+
+def pivot(rows: Sequence[ResultRow], cell: Callable[[str, str, Sequence[ResultRow]], str]) -> str:
+    """One line per method and one column per environment; `cell` gets (environment, method, their
+    rows)."""
+    environments = list(dict.fromkeys(str(row.environment) for row in rows))
+    of = grouped(rows, lambda row: (str(row.environment), row.method))
+    known = {row.method: None for row in rows}
+    order = [*(n for n in METHODS if n in known), *(n for n in known if n not in METHODS)]
+    lines = [
+        (name, *(cell(e, name, of[e, name]) if (e, name) in of else NONE for e in environments))
+        for name in order
+    ]
+    return markdown_table(("method", *environments), lines)
+
+
+def minus_ucf(rows: Sequence[ResultRow]) -> Callable[[str, str, Sequence[ResultRow]], str]:
+    """A cell of `pivot`: the return minus that of UCF of the same log and training seed."""
+    ours = {
+        environment: by_seeds(row for row in own if row.method == "ucf")
+        for environment, own in grouped(rows, lambda row: str(row.environment)).items()
+    }
+
+    def cell(environment: str, method: str, group: Sequence[ResultRow]) -> str:
+        found = minus(by_seeds(group), ours[environment])
+        return NONE if method == "ucf" else difference(summary(found.values()), over_logs(found))
+
+    return cell
+
+
+def returns(rows: Sequence[ResultRow]) -> str:
+    """Returns, average rewards, and returns minus those of UCF."""
+    best: dict[str, float] = {}
+    for (environment, method), own in grouped(
+        rows, lambda row: (str(row.environment), row.method)
+    ).items():
+        if method not in KNOWING:
+            mean = summary(row.value for row in own).mean
+            best[environment] = max(best.get(environment, mean), mean)
+
+    def cell(environment: str, method: str, group: Sequence[ResultRow]) -> str:
+        found = summary(row.value for row in group)
+        text = level(found)
+        return f"**{text}**" if found.mean == best[environment] and method not in KNOWING else text
+
+    parts = [
+        "R_cum, mean ± standard deviation over logs and training seeds:",
+        pivot(rows, cell),
+        "R_avg, the mean reward per step of a session:",
+        pivot(rows, lambda *at: level(summary(row.metrics["R_avg_episode"] for row in at[2]))),
+        fill(
+            "R_cum minus that of `ucf` of the same log and training seed, ± standard error over "
+            "the pairs, in brackets over the means of logs:"
+        ),
+        pivot(rows, minus_ucf(rows)),
+    ]
+    return "\n\n".join(parts)
+
+
+def components(rows: Sequence[ResultRow]) -> str:
+    """The return of UCF, and differences without or with one component more."""
+    less = minus_ucf(rows)
+    return pivot(
+        rows,
+        lambda environment, method, own: (
+            level(summary(row.value for row in own))
+            if method == "ucf"
+            else less(environment, method, own)
+        ),
+    )
+
+
+def estimated(files: _Files) -> Sequence[ResultRow]:
+    """Rows of the main table whose decision rule was chosen in the user model."""
+    return [row for row in of("recommendation", "main")(files) if "promised" in row.metrics]
+
+
+def estimates(rows: Sequence[ResultRow]) -> str:
+    """Estimated and actual returns of the chosen rules, and the mean absolute error."""
+
+    def cell(_: str, __: str, group: Sequence[ResultRow]) -> str:
+        estimate = summary(row.metrics["promised"] for row in group).mean
+        return f"{rounded(estimate)} → {rounded(summary(row.value for row in group).mean)}"
+
+    def off(own: Sequence[ResultRow]) -> str:
+        return rounded(summary(abs(row.metrics["promised"] - row.value) for row in own).mean, 2)
+
+    lines = []
+    for environment, own in grouped(rows, lambda row: str(row.environment)).items():
+        logs = grouped(own, lambda row: str(row.log_seed)).items()
+        of_logs = ", ".join(f"log {name}: {off(group)}" for name, group in logs)
+        lines.append((environment, len(own), off(own), of_logs))
+    head = ("environment", "rows", "mean absolute error", "by log")
+    return f"{pivot(rows, cell)}\n\n{markdown_table(head, lines)}"
+
+
+def augmentation(rows: Sequence[ResultRow]) -> str:
+    """Paired differences of each kind of augmentation to none; over all sizes in percent."""
+    lines: list[tuple[object, ...]] = []
+    percent: dict[tuple[float, str], dict[_Seeds, list[float]]] = {}
+    sizes = dict.fromkeys(_case(row) for row in rows)
+    for (mood, size), own in sorted(grouped(rows, _case).items()):
+        arms = {name: by_seeds(group) for name, group in grouped(own, lambda r: r.method).items()}
+        base = arms["none"]
+        for arm in sorted(arms, key=AUGMENTATION.index):
+            found = minus(arms[arm], base) if arm != "none" else {}
+            lines.append((f"{mood:g}", size, arm, level(summary(arms[arm].values())), *_of(found)))
+            for seeds, value in found.items():
+                share = 100 * value / summary(base.values()).mean
+                percent.setdefault((mood, arm), {}).setdefault(seeds, []).append(share)
+    for (mood, arm), shares in percent.items():
+        count = sum(each == mood for each, _ in sizes)
+        found = {seeds: float(np.mean(v)) for seeds, v in shares.items() if len(v) == count}
+        if count > 1:
+            lines.append((f"{mood:g}", "all", arm, NONE, *_of(found, "%")))
+    head = ("mood", "sessions", "augmentation", "R_cum", "minus none", "pairs ahead")
+    return markdown_table(head, lines)
+
+
+AUGMENTATION: Final = ("none", "state", "action", "both", "none+reward weight")
+
+
+def _case(row: ResultRow) -> tuple[float, int]:
+    return float(str(row.conditions["mood"])), int(str(row.conditions["sessions"]))
+
+
+def _of(found: _Values, unit: str = "") -> tuple[str, str]:
+    if not found:
+        return NONE, NONE
+    ahead = f"{sum(value > 0 for value in found.values())} of {len(found)}"
+    return difference(summary(found.values()), over_logs(found), unit), ahead
+
+
+def settings(rows: Sequence[ResultRow]) -> str:
+    """One line per setting of UCF."""
+    names = ("R_cum", "validation_loss", "acceptance")
+    lines = [
+        (method, len(own), *(level(summary(row.metrics[name] for row in own)) for name in names))
+        for method, own in grouped(rows, lambda row: row.method).items()
+    ]
+    head = ("setting", "logs × seeds", "R_cum", "validation loss", "accepted edits")
+    return markdown_table(head, lines)
+
+
+def distractor(rows: Sequence[ResultRow]) -> str:
+    """Returns of policies trained without the distractor, and with it, shown off and on."""
+    lines = []
+    cases = grouped(rows, lambda r: (str(r.environment), str(r.conditions["quantiles"]), r.method))
+    for case, own in sorted(cases.items(), key=lambda item: (item[0][0], -float(item[0][1]))):
+        clean, off, on = (
+            by_seeds(row for row in own if row.conditions["distractor"] == rate)
+            for rate in (None, 0, 1)
+        )
+        lost = [100 * (1 - off[seeds] / value) for seeds, value in clean.items()]
+        means = [level(summary(each.values())) for each in (clean, off, on)]
+        lines.append((*case, *means, difference(summary(lost))))
+    head = ("environment", "target quantile", "method", "without", "off", "on", "lost when off, %")
+    return markdown_table(head, lines)
+
+
+def scores(rows: Sequence[ResultRow], references: Sequence[str] = ("ucf",)) -> str:
+    """Scores by data file, then each method's score minus that of `references`."""
+    tasks = list(dict.fromkeys(row.task for row in rows))
+    head = ("method", *(task.removesuffix("-zoo") for task in tasks), "mean")
+    of = grouped(rows, lambda row: (row.method, row.task))
+    methods = dict.fromkeys(row.method for row in rows)
+    values = {name: [by_seeds(of.get((name, task), ())) for task in tasks] for name in methods}
+    found = {name: _with_mean(own) for name, own in values.items()}
+    best = [
+        max(each.mean for each in column if each.count)
+        for column in zip(*found.values(), strict=True)
+    ]
+
+    def cell(sample: Summary, highest: float) -> str:
+        text = level(sample, standard_error=True)
+        return f"**{text}**" if sample.mean >= highest - NEAR * abs(highest) else text
+
+    lines = [(name, *map(cell, own, best)) for name, own in found.items()]
+    parts = [
+        "Scores, mean ± standard error over training seeds; bold: within 5% of the best:",
+        markdown_table(head, lines),
+    ]
+    for reference in references:
+        less = {
+            name: _with_mean([minus(*pair) for pair in zip(own, values[reference], strict=True)])
+            for name, own in values.items()
+            if name != reference
+        }
+        shown = [(name, *map(difference, own)) for name, own in less.items()]
+        parts += [
+            f"Minus the score of `{reference}` of the same training seed, ± standard error:",
+            markdown_table(head, [line for line in shown if set(line[1:]) != {NONE}]),
+        ]
+    return "\n\n".join(parts)
+
+
+def _with_mean(of_tasks: Sequence[_Values]) -> list[Summary]:
+    """Summaries of data files, then that of the mean over files of each seed; of one mean where
+    files differ in their seeds, of none where a file has no score."""
+    found = [summary(own.values()) for own in of_tasks]
+    if all(set(own) == set(of_tasks[0]) for own in of_tasks):
+        means = [float(np.mean([own[seeds] for own in of_tasks])) for seeds in of_tasks[0]]
+    else:
+        means = [float(np.mean([each.mean for each in found]))] if all(of_tasks) else []
+    return [*found, summary(means)]
+
+
+def robustness(rows: Sequence[ResultRow]) -> str:
+    """The largest loss of each method, then the score and the loss in every case."""
+    clean = {
+        (row.task, row.method, row.training_seed): row.value
+        for row in rows
+        if row.conditions["distractor"] == "none"
+    }
+    lines, losses = [], {}
+    planted = [row for row in rows if row.conditions["distractor"] != "none"]
+    cases = grouped(planted, lambda row: (row.method, row.task, row.conditions["distractor"]))
+    for (method, task, kind), own in cases.items():
+        starts = [clean[row.task, row.method, row.training_seed] for row in own]
+        ends = [[row.metrics[name] for row in own] for name in ("score", "score_at_one")]
+        lost = [
+            summary(100 * (1 - end / start) for end, start in zip(each, starts, strict=True))
+            for each in ends
+        ]
+        losses[method, task, kind] = [each.mean for each in lost]
+        cells = [level(summary(each)) for each in (starts, *ends)]
+        told = [rounded(each.mean, most=1) for each in lost]
+        lines.append((task.removesuffix("-zoo"), kind, method, *cells, *told))
+    of_methods = grouped(losses.items(), lambda item: item[0][0])
+    largest = [
+        (method, *(rounded(max(each[at] for _, each in own), most=1) for at in (0, 1)))
+        for method, own in of_methods.items()
+    ]
+    head = ("file", "distractor", "method", "without", "at 0", "at 1", "lost at 0, %", "at 1, %")
+    parts = [
+        "Largest loss of each method, a mean over seeds, in percent of the score without the "
+        "distractor:",
+        markdown_table(("method", "at 0", "at 1"), largest),
+        "Scores, mean ± standard deviation over seeds, and losses:",
+        markdown_table(head, lines),
+    ]
+    return "\n\n".join(parts)
+
+
+def of(name: str, table: str) -> Callable[[_Files], Sequence[ResultRow]]:
+    """Chooses the rows of a table of a file."""
+    return lambda files: [row for row in files.get(name, ()) if row.table == table]
+
+
+def histories(files: _Files) -> Sequence[ResultRow]:
+    """Rows of shorter histories on the best quarter, and those they are compared with."""
+    same_time = [r for r in of("control", "equal-time")(files) if "-25" in r.method]
+    cloning = [r for r in of("control", "main")(files) if r.method in ("bc-10", "bc-25")]
+    return [*files.get("control_histories", ()), *same_time, *cloning]
+
+
 @dataclass(frozen=True)
 class Section:
     """A part of the page."""
@@ -72,304 +414,164 @@ class Section:
     title: str
     about: str
     command: str
-    rows: Callable[[Mapping[str, Sequence[ResultRow]]], Sequence[ResultRow]]
+    rows: Callable[[_Files], Sequence[ResultRow]]
     table: Callable[[Sequence[ResultRow]], str]
 
-    def text(self, files: Mapping[str, Sequence[ResultRow]]) -> str:
+    def text(self, files: _Files) -> str:
         """The part as Markdown."""
         rows = self.rows(files)
-        about, origin = fill(self.about), fill(_origin(rows, self.command))
-        parts = [f"## {self.title}", about, self.table(rows), origin]
-        return "\n\n".join(part for part in parts if part)
+        parts = [f"## {self.title}", fill(self.about), self.table(rows)]
+        return "\n\n".join([*parts, fill(_origin(rows, self.command))])
 
 
 def _origin(rows: Sequence[ResultRow], command: str) -> str:
     """What measured the rows, and how long it took."""
     commits = sorted({row.commit[:7] for row in rows if row.commit})
     trained = {
-        (row.method, row.training_seed, row.config_hash, row.data_fingerprint): row.metrics[
-            "train_wall_time_s"
-        ]
+        (row.method, row.training_seed, row.config_hash, row.metrics["train_wall_time_s"])
         for row in rows
         if "train_wall_time_s" in row.metrics
     }
-    hours = (sum(trained.values()) + sum(row.wall_time_s or 0.0 for row in rows)) / 3600
-    parts = [f"{len(rows)} rows", f"`{command}`"]
-    if trained:
-        parts.append(f"{hours:.1f} hours of one core")
-    known = "an unknown commit" if not commits else ", ".join(f"`{each}`" for each in commits)
-    return f"*{'; '.join(parts)}; measured at {known}.*"
-
-
-def pivot(
-    rows: Sequence[ResultRow], cell: Callable[[str, str, Sequence[ResultRow]], str], methods: Any
-) -> str:
-    """One line a method and one column an environment; `cell` is given (environment, method, their
-    rows)."""
-    environments = list(dict.fromkeys(str(row.environment) for row in rows))
-    of = grouped(rows, lambda row: (str(row.environment), row.method))
-    named = {row.method: None for row in rows}
-    order = [*(n for n in named if n not in methods), *(n for n in methods if n in named)]
-    lines = [
-        (name, *(cell(w, name, of[w, name]) if (w, name) in of else NONE for w in environments))
-        for name in order
-    ]
-    return markdown_table(("method", *environments), lines)
-
-
-def returns_and_differences(rows: Sequence[ResultRow]) -> str:
-    """Returns, then average rewards, then what each method earns less than UCF."""
-    best: dict[str, float] = {}
-    for (environment, method), group in grouped(
-        rows, lambda row: (str(row.environment), row.method)
-    ).items():
-        mean = summary(row.value for row in group).mean
-        if method not in BUILT_IN:
-            best[environment] = max(best.get(environment, mean), mean)
-
-    def earned(environment: str, method: str, group: Sequence[ResultRow]) -> str:
-        said = mean_and_sd(row.value for row in group)
-        is_best = summary(row.value for row in group).mean == best.get(environment)
-        return f"**{said}**" if is_best and method not in BUILT_IN else said
-
-    def average(environment: str, method: str, group: Sequence[ResultRow]) -> str:
-        return mean_and_sd(row.metrics["R_avg_episode"] for row in group)
-
-    differences = difference_to_ours(rows)
-    parts = [
-        "R_cum, mean ± standard deviation over logs and training seeds:",
-        pivot(rows, earned, METHODS),
-        "R_avg, the mean reward of a session's step:",
-        pivot(rows, average, METHODS),
-        fill(
-            "R_cum less that of `ucf` of the same log and seed, ± standard error over the pairs, "
-            "in brackets over the means of logs:"
-        ),
-        pivot(rows, lambda environment, method, _: differences[environment, method], METHODS),
-    ]
-    return "\n\n".join(parts)
-
-
-def additions(rows: Sequence[ResultRow]) -> str:
-    """What UCF earns with and without each addition, as differences."""
-    differences = difference_to_ours(rows)
-
-    def cell(environment: str, method: str, group: Sequence[ResultRow]) -> str:
-        if method == "ucf":
-            return mean_and_sd(row.value for row in group)
-        return differences[environment, method]
-
-    return pivot(rows, cell, {"ucf": None, **ADDITIONS, **PAPER})
-
-
-def promises(rows: Sequence[ResultRow]) -> str:
-    """What was promised of the chosen rules, and what came; then how far off it was."""
-
-    def cell(environment: str, method: str, group: Sequence[ResultRow]) -> str:
-        said = summary(row.metrics["promised"] for row in group).mean
-        return f"{said:.3g} → {summary(row.value for row in group).mean:.3g}"
-
-    def off(own: Sequence[ResultRow]) -> str:
-        return f"{summary(abs(row.metrics['promised'] - row.value) for row in own).mean:.2g}"
-
-    lines = []
-    for environment, own in grouped(rows, lambda row: str(row.environment)).items():
-        logs = grouped(own, lambda row: str(row.log_seed)).items()
-        of_logs = ", ".join(f"log {name} {off(group)}" for name, group in logs)
-        lines.append((environment, len(own), off(own), of_logs))
-    told = markdown_table(("environment", "rows", "off by, mean", "by log"), lines)
-    return f"{pivot(rows, cell, METHODS)}\n\n{told}"
-
-
-def promised(files: Mapping[str, Sequence[ResultRow]]) -> Sequence[ResultRow]:
-    """Rows of the main table whose rule was chosen, and that say what it promised."""
-    return [row for row in of("recommendation", "main")(files) if "promised" in row.metrics]
-
-
-def scores(rows: Sequence[ResultRow], references: Sequence[str] = ("ucf",)) -> str:
-    """Table 1's shape: last checkpoints, then each method's score less that of `references`."""
-    last = [row for row in rows if row.checkpoint == "last"]
-    parts = [
-        "Scores, mean ± standard error over seeds; bold: within 5% of the best:",
-        of_lines(score_table(last, "last")),
-    ]
-    for reference in references:
-        parts += [
-            f"Scores less that of `{reference}` of the same seed, ± standard error:",
-            of_lines(difference_table(last, reference)),
-        ]
-    return "\n\n".join(parts)
-
-
-def losses_to_distractors(rows: Sequence[ResultRow]) -> str:
-    """The largest drop of each method, then all."""
-    shown = ("task", "distractor", "method")
-    largest = markdown_table(
-        SHOWN_LARGEST,
-        [
-            (line["method"], *(f"{line[at]:.1f}" for at in SHOWN_LARGEST[1:]))
-            for line in largest_drops(rows)
-        ],
-    )
-    parts = [
-        "Each method's largest loss, of means over seeds, in percent of the clean score:",
-        largest,
-        "Scores, mean ± standard deviation over seeds, and losses in percent:",
-        of_lines(over_seeds(drops(rows), shown, SHOWN_DROPS)),
-    ]
-    return "\n\n".join(parts)
-
-
-def of_lines(lines: Sequence[Mapping[str, Any]]) -> str:
-    """A table whose columns are those of its first line."""
-    return markdown_table(list(lines[0]), [list(line.values()) for line in lines])
-
-
-def of(name: str, table: str, dated: bool = True) -> Callable[..., Sequence[ResultRow]]:
-    """Chooses the rows of `table` of a file; if `dated`, those with the version of their code."""
-
-    def chosen(files: Mapping[str, Sequence[ResultRow]]) -> Sequence[ResultRow]:
-        rows = [row for row in files.get(name, ()) if row.table == table]
-        return [row for row in rows if row.code_version or not dated]
-
-    return chosen
-
-
-def histories(files: Mapping[str, Sequence[ResultRow]]) -> Sequence[ResultRow]:
-    """What learns from the best quarter with shorter histories, and what that is compared with."""
-    shorter = [r for r in of("control_histories", "equal-time")(files) if "-context-" in r.method]
-    same_time = [r for r in of("control", "equal-time")(files) if "-25" in r.method]
-    cloning = [r for r in of("control", "main")(files) if r.method in ("bc-10", "bc-25")]
-    return [*shorter, *same_time, *cloning] if shorter else []
+    seconds = sum(each[-1] for each in trained) + sum(row.wall_time_s or 0.0 for row in rows)
+    known = ", ".join(f"`{each}`" for each in commits)
+    hours = f"{rounded(seconds / 3600, 2)} hours of one core"
+    return f"*{len(rows)} rows; {command}; {hours}; measured at {known}.*"
 
 
 RUN = "ucfrec benchmark recommendation --table"
 CONTROL = "ucfrec-control benchmark $UCFREC_DATA/control --budget small --table"
+IN_TAG = "(in the git tag `benchmarks-2026-11`)"
 SECTIONS = (
     Section(
         "Recommendation (Table 2)",
-        "A learner's name stands for it as its authors have it, `+` for it with what UCF has as "
-        "well: exposure features, and a decision rule with a reward weight by the reward model, "
-        "chosen on the log. `ucf-plain` is UCF without them, `ucf-paper` the paper's. `…-mask` "
-        "leaves out the tags of the last ten items. Bold is the highest of a column among what "
-        "knows no environment.",
-        f"{RUN} main",
+        "A method's name stands for it as published, `+shared` for it with the components that UCF "
+        "has as well: exposure features, and a decision rule with a reward weight, chosen on the "
+        "log. `ucf-plain` is UCF without them, `ucf-paper` is the paper's UCF. `…-mask` leaves out "
+        "the tags of the last ten items. Bold is the highest mean of a column among policies that "
+        "do not know the simulator. The shared components decide, not the network: with them UCF "
+        "is level with EDT4Rec in the catalogue, all methods are level in KuaiRand, and behavior "
+        "cloning is ahead of UCF by 2 in SARDINE.",
+        f"`{RUN} main`",
         of("recommendation", "main"),
-        returns_and_differences,
+        returns,
     ),
     Section(
-        "Additions to the paper, one by one",
-        "What UCF earns, and by how much more or less without one of the additions, or with "
-        "something more.",
-        f"{RUN} additions",
+        "The shared components, one by one",
+        "The return of UCF, and the difference without one component, or with one more. Exposure "
+        "features are worth 6.6 of 8.8 in the catalogue and cost 2.2 in SARDINE; the chosen "
+        "decision rule is worth most of the return in KuaiRand and SARDINE.",
+        f"`{RUN} additions`",
         of("recommendation", "additions"),
-        additions,
+        components,
     ),
     Section(
-        "What was promised, and what came",
-        "The return that the model of the users, fitted to the log alone, gave the rule that was "
-        "chosen, and the return in the environment: means over logs and training seeds. Rows "
-        "measured before they said so are missing.",
-        f"{RUN} main",
-        promised,
-        promises,
+        "Estimated and actual return",
+        "The return that the user model, fitted to the log alone, estimates for the decision rule "
+        "that was chosen, and the return in the simulator: means over logs and training seeds of "
+        "the rows that record the estimate.",
+        f"`{RUN} main`",
+        estimated,
+        estimates,
     ),
     Section(
-        "Counterfactual copies",
-        "Return less that of no copies, by log and training seed, in the synthetic catalogue; "
-        "mood is the strength of a planted confounder of each session. Over all sizes: in percent "
-        "of the return without copies.",
-        "python benchmarks/counterfactual_copies.py --out runs/copies",
+        "Counterfactual augmentation",
+        "Return minus that without augmentation, by log and training seed, in the synthetic "
+        "catalogue, ± standard error over the pairs, in brackets over the means of logs. Mood is "
+        "the strength of a planted confounder of each session. Over all sizes in percent of the "
+        "return without augmentation. Augmented actions gain with a confounder and nothing "
+        "without; augmented states change nothing significant.",
+        f"`python benchmarks/counterfactual_copies.py --out runs/copies` {IN_TAG}",
         of("counterfactual_copies", "counterfactual-copies"),
-        copies_table,
+        augmentation,
     ),
     Section(
         "Settings of UCF",
-        "",
-        f"{RUN} sweeps",
+        "In the synthetic catalogue. Supervision of the attention (λ) never helped; the band of "
+        "the edits and the gate change nothing.",
+        f"`{RUN} sweeps`",
         of("recommendation", "sweeps"),
-        sweep_table,
+        settings,
     ),
     Section(
         "A distractor that causes nothing",
-        "",
-        f"{RUN} distractor",
+        "A planted observation that goes with the reward in the log and causes nothing. Dropping "
+        "what screening flags (`ucf-dropped`) loses nothing; UCF itself loses up to 65%.",
+        f"`{RUN} distractor`",
         of("recommendation", "distractor"),
-        distractor_table,
+        distractor,
     ),
     Section(
         "Control (Tables 1 and 3)",
-        "Normalised scores of the last checkpoint after 4,000 steps in batches of 16, a hundredth "
-        "of what the authors' settings learn from (IQL: 50,000 in batches of 64, CQL: 10,000). "
-        "Learning rates were chosen on validation loss by one search for all learners (IQL's with "
-        "20,000 steps, CQL's with 2,500). Where no standard error stands there is one seed, and a "
-        "difference may be luck.",
-        f"{CONTROL} main",
+        "Normalized scores of the last checkpoint after 4,000 steps in batches of 16, a hundredth "
+        "of the authors' training (IQL: 50,000 in batches of 64, CQL: 10,000). Learning rates were "
+        "chosen on validation loss by one search for all methods. Without a standard error there "
+        "is one seed, and a difference may be chance. At equal steps UCF is between DT and DC, "
+        "and all sequence policies are behind cloning the best quarter of the trajectories.",
+        f"`{CONTROL} main`",
         of("control", "main"),
         scores,
     ),
     Section(
-        "Control: the same training time",
-        "The same files, rates and batches, but more steps for what learns faster (x2, x3, x8). "
-        "Trainings of UCF x2 and of cloning x8 take about as long as DT's and DC's, trainings of "
-        "UCF x3 as long as LSDT's, half as long again. The paper's UCF has 4,000 steps here too. "
-        "`best-25` learns from the best quarter of the trajectories. One seed where no "
-        "standard error stands.",
-        f"{CONTROL} equal-time",
+        "Control at equal training time",
+        "The same files, rates and batches, but more steps for the faster methods (x2, x3, x8). "
+        "UCF x2 and cloning x8 train about as long as DT and DC, UCF x3 as long as LSDT, half "
+        "as long again. The paper's UCF has 4,000 steps here too. `best-25` learns from the best "
+        "quarter of the trajectories. UCF without augmentation is ahead of DT, DC and LSDT on all "
+        "trajectories, and level with cloning the best quarter.",
+        f"`{CONTROL} equal-time`",
         of("control", "equal-time"),
         partial(scores, references=("ucf-x2", "ucf-wo-count-x2", "ucf-wo-count-best-25-x2")),
     ),
     Section(
-        "Control: what a history is worth",
-        "Trained as above on the best quarter of the trajectories, with histories of 1 and of 5 "
-        "steps (`context`) at as many predictions per update, beside the rows with 20 steps and "
-        "behaviour cloning. Made after the scores with 20 steps on `hopper_medium-expert` were "
-        "seen. One seed where no standard error stands.",
-        "python benchmarks/control_histories.py --data $UCFREC_DATA/control --out runs/control",
+        "Control: the value of a history",
+        "Trained on the best quarter of the trajectories, with histories of 1 and of 5 steps "
+        "(`context`) at as many predictions per update, beside the rows with 20 steps and behavior "
+        "cloning. Tried after the scores with 20 steps on `hopper_medium-expert` were seen. "
+        "UCF and LSDT without a history are level and have the highest means: MuJoCo's "
+        "observation is the whole state, and a history adds only who acted with what noise.",
+        f"`python benchmarks/control_histories.py --out runs/control` {IN_TAG}",
         histories,
         partial(scores, references=("ucf-wo-count-best-25-x2-context-1",)),
     ),
     Section(
         "Control: ways to pursue reward",
-        "All without embeddings of time steps, as UCF is: advantage weights, the largest return "
-        "that the policy expects as target, both, and the best quarter of the trajectories. One "
-        "seed, and of `weights` one file, of DC with `max-return` five: a difference may be luck.",
-        f"{CONTROL} pursuing",
+        "All without embeddings of time steps: advantage weights, the largest return that the "
+        "policy expects as target, both, and the best quarter of the trajectories. One seed, so a "
+        "difference may be chance. Only the best quarter helps every method.",
+        f"`{CONTROL} pursuing`",
         of("control", "pursuing"),
         scores,
     ),
     Section(
-        "Control: what a distractor costs (Figures 3 and 4)",
-        "Policies trained with a distractor in their states and played with it fixed to 0, and the "
-        "same policies with it fixed to 1.",
-        "ucfrec-control robustness --data $UCFREC_DATA/control --budget small",
+        "Control: the cost of a distractor (Figures 3 and 4)",
+        "Policies trained with a distractor in their states and evaluated with it fixed to 0, and "
+        "the same policies with it fixed to 1. Dropping what screening flags costs nothing.",
+        "`ucfrec-control robustness --data $UCFREC_DATA/control --budget small`",
         of("control_robustness", "robustness"),
-        losses_to_distractors,
+        robustness,
     ),
 )
 
 
-def page(files: Mapping[str, Sequence[ResultRow]], pictures: Sequence[str]) -> str:
+def page(files: _Files, pictures: Sequence[str]) -> str:
     """The whole page as Markdown."""
     head = fill(
-        "Written by `python benchmarks/results_page.py` from the rows in "
-        "`benchmarks/results`. What they mean is in [What was found](results.md), what was tried "
-        "in [the log](log.md). Every benchmark says how long it will take before it starts, and "
-        "goes on where it was interrupted."
+        "Written by `python benchmarks/results_page.py` from the rows in `benchmarks/results`. "
+        "[Results](results.md) explains them, the [lab notebook](log.md) lists what was tried. "
+        "Every benchmark prints how long it will take before it starts, and resumes where it was "
+        "interrupted."
     )
     paper = fill(
-        "**Its numbers, of its environments**: they do not compare with ours. "
-        "The best public match for a return of 7 to 8 in KuaiRand is repeats allowed with N = 10; "
-        "DORL's published 11.85 over 27.6 steps is NX_0 at N = 4, the environments "
-        "`kuairand-n4-nx0` here. KuaiRec's files were not at hand."
+        "**These are numbers of the paper's own simulators and do not compare with ours.** The "
+        "best public match for a return of 7 to 8 in KuaiRand is repeats allowed with N = 10; "
+        "DORL's published 11.9 over 27.6 steps is NX_0 at N = 4, `kuairand-n4-nx0` here. KuaiRec's "
+        "files were not available."
     )
     shown = "\n".join(f"![{name}](assets/tables/{name}.svg)" for name in pictures)
-    environments = "\n".join(
-        fill(f"- {environment}", subsequent_indent="  ") for environment in ENVIRONMENTS
-    )
-    parts = ["# Tables", head, "## What each environment can and cannot tell", environments]
+    about = "\n".join(fill(f"- {each}", subsequent_indent="  ") for each in ENVIRONMENTS)
+    parts = ["# Tables", head, "## What each simulator can and cannot show", about]
     parts += [section.text(files) for section in SECTIONS if section.rows(files)]
-    parts += ["## The paper's Table 2", paper, PUBLISHED]
+    parts += ["## The paper's Table 2", paper, PAPER]
     parts += ["## Pictures", shown] if pictures else []
     return "\n\n".join(parts) + "\n"
 
@@ -380,23 +582,11 @@ def main() -> None:
     )
     parser.add_argument("--check", action="store_true", help="compare instead of writing")
     options = parser.parse_args()
-    names = (
-        *("recommendation", "counterfactual_copies"),
-        *("control", "control_robustness", "control_histories"),
-    )
-    files = {name: latest(read_rows(RESULTS / f"{name}.jsonl")) for name in names}
+    files = {name: named_apart(latest(read_rows(RESULTS / f"{name}.jsonl"))) for name in FILES}
     if not options.check and find_spec("matplotlib") is not None:
         from results_pictures import draw
 
-        PICTURES.mkdir(parents=True, exist_ok=True)
-        draw(
-            of("recommendation", "main")(files),
-            of("counterfactual_copies", "counterfactual-copies")(files),
-            {table: of("control", table)(files) for table in ("main", "equal-time")},
-            PICTURES,
-        )
-        for drawn in PICTURES.glob("*.png"):
-            drawn.unlink()
+        draw(files, METHODS, PICTURES)
     text = page(files, [path.stem for path in sorted(PICTURES.glob("*.svg"))])
     if not options.check:
         PAGE.write_text(text, encoding="utf-8")

@@ -24,7 +24,6 @@ from typing import Any
 import httpx
 import numpy as np
 
-from ucfrec.code_version import code_version
 from ucfrec.provenance import provenance
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows
@@ -49,13 +48,13 @@ def request(trained: TrainedPolicy, rows: int) -> bytes:
     assert trained.item_ids is not None
     rng = np.random.default_rng(0)
     items = rng.choice(trained.item_ids, size=rows).tolist()
-    size = trained.record["observation_size"]
+    size = trained.record.observation_size
     history: list[dict[str, Any]] = [
         {"item_id": item, "timestamp": 1_700_000_000_000 + 1000 * n, "reward": n % 2}
         for n, item in enumerate(items)
     ]
     for row in history:
-        if trained.record.get("session_by") == "session_id":
+        if trained.record.session_by == "session_id":
             row["session_id"] = 1
         if size:
             row["observation"] = [0.0] * size
@@ -144,8 +143,7 @@ def main() -> None:
                     "threads": options.threads,
                     "seconds": options.seconds,
                 },
-                code_version=code_version(Path(__file__), "ucfrec.recommending.web"),
-                data_fingerprint=trained.record.get("fingerprint"),
+                data_fingerprint=trained.record.fingerprint,
                 metric="rate",
                 metrics=found,
                 wall_time_s=time.perf_counter() - began,

@@ -6,7 +6,7 @@ Appends the rows to runs/step_time/results.jsonl, or to --results, and prints a 
 are kept: the policies are timed in turn, so a slower machine slows all of them. CLONE is a clone of
 github.com/beanie00/Decision-ConvFormer, whose network is timed, too, in its authors' size (3
 layers, window of 6); it needs transformers 4.6.0, huggingface-hub 0.0.8, regex and sacremoses on
-the path (`make bench` installs them in a folder of their own).
+the path (`pip install --no-deps --target FOLDER`, apart from ours).
 """
 
 import argparse
@@ -19,7 +19,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ucfrec.code_version import code_version
 from ucfrec.episodes.windows import Windows
 from ucfrec.fitting.row_optimizer import RowAdamW
 from ucfrec.policies.base import SequencePolicy
@@ -143,7 +142,6 @@ def main() -> None:
         of_reference = f"{of_peers[f'ratio_to_{REFERENCE}']:.3f}" if REFERENCE in steps else "–"
         dt_ratio = f"{middle:.2f} [{low:.2f}, {high:.2f}]"
         lines.append((name, dt_ratio, f"{of_peers['ratio_to_dc']:.3f}", of_reference))
-        module = policy_class("dc" if name == REFERENCE else name).__module__
         row = ResultRow(
             suite="step-time",
             table="step-time",
@@ -151,7 +149,6 @@ def main() -> None:
             method=name,
             policy=name,
             conditions=sizes,
-            code_version=code_version(Path(__file__), module),
             metric="ratio",
             metrics={"ratio": middle, "ratio_10": low, "ratio_90": high, **of_peers},
             wall_time_s=float(own.sum()),

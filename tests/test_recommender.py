@@ -60,7 +60,7 @@ def test_a_store_its_logs_and_a_frame_of_them_train_the_same_policy(
     else:
         policy.fit(log, tmp_path / "run", **rules)  # type: ignore[arg-type]
     assert policy.run == tmp_path / "run"
-    assert policy.trained.record["fingerprint"] == fitted.trained.record["fingerprint"]
+    assert policy.trained.record.fingerprint == fitted.trained.record.fingerprint
     pd.testing.assert_frame_equal(policy.recommend(log), fitted.recommend(log))
 
 

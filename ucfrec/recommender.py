@@ -24,9 +24,9 @@ from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
 from ucfrec.reporting.model_card import write_card
-from ucfrec.runs.config import config_from_dict, resolve_config
+from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
-from ucfrec.runs.trained_policy import TrainedPolicy, describe_trained
+from ucfrec.runs.trained_policy import TrainedPolicy
 
 
 class Recommender:
@@ -62,7 +62,7 @@ class Recommender:
     def __repr__(self) -> str:
         if self._trained is None:
             return f"Recommender({self.config.policy_name!r}, not trained)"
-        return f"Recommender({describe_trained(self._trained.record)})"
+        return f"Recommender({self._trained.record.summary})"
 
     def fit(
         self,
@@ -219,7 +219,7 @@ class Recommender:
         """
         policy = cls()
         policy._folder, policy._trained = Path(run), TrainedPolicy.load(Path(run))
-        policy.config = config_from_dict(policy._trained.record["config"])
+        policy.config = policy._trained.record.config
         return policy
 
 

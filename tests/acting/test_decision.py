@@ -15,12 +15,12 @@ from torch import Tensor
 from tests.policies.test_ucf import CATALOG, ITEMS, VECTORS, B, K, build, other, random_windows
 from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.episodes.exposure import Likeness, Shown
-from ucfrec.episodes.main_tags import MainTags
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.policies.dt import DTConfig, DTPolicy
+from ucfrec.user_model.main_tags import MainTags
 
 SCORES = torch.tensor([[1.0, 3.0, -math.inf, 2.0], [0.0, 0.0, 5.0, -1.0]])
 rules = st.builds(

@@ -21,7 +21,7 @@ from ucfrec.logs import LogMapping
 from ucfrec.off_policy.score import logged_sessions, scored_steps
 from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
-from ucfrec.runs.run import training_views
+from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.user_model.posterior import MEMORY
 from ucfrec.user_model.reward_fit import fit_item_reward_model

@@ -1,37 +1,63 @@
-"""The reward weight chosen by ranking is judged by what each rule would have shown."""
+"""The reward weight chosen by ranking is evaluated by what each rule would have shown."""
 
+import copy
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from tests.support.tagged import tagged_log, tagged_mapping
+from ucfrec.acting.decision import Decider
 from ucfrec.acting.logged_decisions import session_scores
-from ucfrec.choosing.by_ranking import SHOWN
-from ucfrec.episodes.item_counts import liked_steps
+from ucfrec.choosing.by_ranking import SHOWN, choose_by_ranking
+from ucfrec.choosing.choice import RankedRule, RuleChoice
+from ucfrec.choosing.config import RuleConfig
+from ucfrec.episodes.item_counts import TrainingCounts, liked_steps
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
 from ucfrec.logs.prepare import PrepareOptions, prepare
+from ucfrec.policies.heads import ItemHead
 from ucfrec.runs.config import resolve_config
-from ucfrec.runs.run import train_run, training_views
+from ucfrec.runs.run import train_run
+from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SETTINGS = ["train.steps=5", "policy.dim=16", "policy.context=4", "augment.copies=0"]
 
 
-def test_all_reward_weights_at_once_are_judged_as_each_rule_alone(tmp_path: Path) -> None:
-    tagged_log().to_parquet(tmp_path / "log.parquet")
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("ranking")
+    tagged_log().to_parquet(folder / "log.parquet")
     options = PrepareOptions(reward="reward", session_by="user", embedding_size=6)
-    prepare([tmp_path / "log.parquet"], tagged_mapping(tmp_path), tmp_path / "store", options)
-    store = EpisodeStore.open(tmp_path / "store")
-    train_run(store, tmp_path / "run", resolve_config("ucf", None, SETTINGS))
-    trained = TrainedPolicy.load(tmp_path / "run")
-    _, validation = training_views(store)
+    prepare([folder / "log.parquet"], tagged_mapping(folder), folder / "store", options)
+    store = EpisodeStore.open(folder / "store")
+    train_run(store, folder / "run", resolve_config("ucf", None, SETTINGS))
+    return folder
+
+
+def chosen(folder: Path, liked_bias: float, *weights: float) -> RuleChoice:
+    """The choice for a policy that shows the ten most liked items by their bias."""
+    views = training_views(EpisodeStore.open(folder / "store"))
+    liked = TrainingCounts.of(views[0]).liked.topk(10).indices
+    decider: Decider = TrainedPolicy.load(folder / "run").decider()
+    policy = copy.deepcopy(decider.policy)
+    assert isinstance(policy.head, ItemHead)
+    with torch.no_grad():
+        policy.head.bias.copy_(torch.zeros(24).index_fill(0, liked, liked_bias))
+    config = RuleConfig(reward_weights=weights)
+    return choose_by_ranking(replace(decider, policy=policy), *views, config, 0)
+
+
+def test_all_reward_weights_at_once_are_judged_as_each_rule_alone(folder: Path) -> None:
+    trained = TrainedPolicy.load(folder / "run")
+    _, validation = training_views(EpisodeStore.open(folder / "store"))
     episodes, steps = validation.all_steps()
     liked = liked_steps(validation, episodes, steps)
     items = validation.step_values("item", episodes, steps)
-    candidates = read_json(tmp_path / "run" / "run.json")["rule"]["candidates"]
+    candidates = read_json(folder / "run" / "run.json")["rule"]["candidates"]
     assert len({each["rule"]["reward_weight"] for each in candidates}) == len(candidates) > 2
     for each in candidates:
         decider = trained.decider(
@@ -41,3 +67,25 @@ def test_all_reward_weights_at_once_are_judged_as_each_rule_alone(tmp_path: Path
         top = scores.topk(SHOWN).indices.numpy()
         hits = (top == items[:, None]).any(1)[liked].mean()
         assert each["hits"] == pytest.approx(float(np.asarray(hits)), abs=1e-9)
+
+
+def test_reward_weights_below_the_first_that_overlaps_too_little_are_ranked_too(
+    folder: Path,
+) -> None:
+    found = chosen(folder, 50.0, 0.0, 1000.0)
+    ranked = [each for each in found.candidates if isinstance(each, RankedRule)]
+    weights = [each.rule.reward_weight for each in ranked]
+    assert weights[:2] == [0.0, 1000.0]
+    assert ranked[1].gain < 0
+    assert not found.warning
+    overlapping = [each for each in ranked if each.gain >= 0]
+    assert found.rule == max(overlapping, key=lambda each: each.item_rate).rule
+    too_large = min(each.rule.reward_weight for each in ranked if each.gain < 0)
+    largest = max(each.rule.reward_weight for each in overlapping)
+    assert too_large - largest == 1000 / 2 ** (len(weights) - 2)
+
+
+def test_a_rule_without_overlap_has_no_reward_weight_and_says_so(folder: Path) -> None:
+    found = chosen(folder, -1e4, 0.0, 1.0)
+    assert found.rule.reward_weight == 0
+    assert "WARNING" in found.warning

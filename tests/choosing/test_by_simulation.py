@@ -12,27 +12,21 @@ import torch
 
 from tests.support.tagged import tagged_store
 from ucfrec.acting.decision import Decider, DecisionRule
-from ucfrec.acting.policy_actor import PolicyActor
-from ucfrec.acting.rollout import rollout
-from ucfrec.choosing.by_ranking import choose_by_ranking
-from ucfrec.choosing.by_simulation import RuleSearch, calibrate, choose_rule
+from ucfrec.choosing.by_simulation import RuleSearch, choose_by_simulation
+from ucfrec.choosing.choice import RuleChoice
 from ucfrec.choosing.config import RuleConfig
-from ucfrec.episodes.exposure import Likeness
-from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.policies.heads import ItemHead
 from ucfrec.runs.config import config_from_dict, resolve_config
-from ucfrec.runs.describe import describe_run, promised
+from ucfrec.runs.record import RuleRecord, read_record
 from ucfrec.runs.refit import refit
-from ucfrec.runs.run import train_run, training_views
-from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec.user_model.reward_fit import fit_item_reward_model
-from ucfrec.user_model.reward_rows import RewardRows
-from ucfrec.user_model.simulator import LoggedEnds, SessionEnd, UserSimulator
-from ucfrec.user_model.training_users import TRAINING_USERS, fit_training_users
+from ucfrec.runs.run import train_run
+from ucfrec.runs.start import training_views
+from ucfrec.runs.trained_policy import REWARD_MODEL, TrainedPolicy
+from ucfrec.user_model.model import UserModel
 
 SMALL = ["train.steps=60", "train.learning_rate=3e-3", "train.warmup_steps=5", "policy.dim=16"]
 SETTINGS = [*SMALL, "train.validate_every=20", "policy.context=6", "augment.copies=0"]
@@ -63,32 +57,49 @@ def with_bias(trained: TrainedPolicy, bias: torch.Tensor) -> Decider:
     return replace(decider, policy=policy)
 
 
+def users_of(run: Path, store: EpisodeStore) -> UserModel:
+    """The user model of a run, or one that is fitted in its folder."""
+    return UserModel.fit(*training_views(store), run / REWARD_MODEL, 0)
+
+
 def search_of(folder: Path, trained: TrainedPolicy, config: RuleConfig = FEW) -> RuleSearch:
-    views = training_views(EpisodeStore.open(folder / "store"))
-    return RuleSearch(trained.decider(DecisionRule(2.0)), *views, config, seed=0)
+    store, decider = EpisodeStore.open(folder / "store"), trained.decider(DecisionRule(2.0))
+    users = users_of(folder / "run", store)
+    return RuleSearch(decider, users, *training_views(store), config, seed=0)
+
+
+def chosen(
+    decider: Decider, store: EpisodeStore, run: Path, config: RuleConfig, *targets: float
+) -> RuleChoice:
+    users = users_of(run, store)
+    decider = replace(decider, reward_model=users.reward)
+    given = dict(zip((0.9, 1.0), targets, strict=True))
+    return choose_by_simulation(decider, users, given, *training_views(store), config, 0)
 
 
 def test_a_run_acts_by_the_rule_that_it_chose_and_says_how(
     folder: Path, trained: TrainedPolicy
 ) -> None:
     record = read_json(folder / "run" / "run.json")
-    chosen = record["rule"]
-    assert trained.rule == DecisionRule.from_dict(chosen["rule"], "the record")
-    assert "validation" in chosen["chosen_by"]
+    rule = record["rule"]
+    assert trained.rule == DecisionRule.from_dict(rule["rule"], "the record")
+    assert "validation" in rule["chosen_by"]
     assert record["reward_model"]["loss"] < record["reward_model"]["base_loss"]
-    best = max(chosen["candidates"], key=lambda each: each["value"])
-    own = next(each for each in chosen["candidates"] if each["rule"] == chosen["rule"])
-    assert own["value"] >= best["value"] - best["error"] or best["items"] < chosen["least_items"]
-    assert promised(chosen) == (own["value"], own["error"])
-    assert f"promised by it {own['value']:.4g} ±" in describe_run(record)
-    assert promised({**chosen, "candidates": []}) is None
+    best = max(rule["candidates"], key=lambda each: each["value"])
+    own = next(each for each in rule["candidates"] if each["rule"] == rule["rule"])
+    assert own["value"] >= best["value"] - best["error"] or best["items"] < rule["least_items"]
+    found = read_record(folder / "run")
+    assert found.rule is not None
+    assert found.rule.simulated == (own["value"], own["error"])
+    assert f"promised by it {own['value']:.4g} ±" in found.describe()
+    assert RuleRecord.model_validate({**rule, "candidates": []}).simulated is None
 
 
 def test_a_reward_weight_pays_where_the_reward_model_knows_the_items(
     folder: Path, trained: TrainedPolicy
 ) -> None:
     search = search_of(folder, trained)
-    plain, weighted = search.play(
+    plain, weighted = search.simulate(
         [
             DecisionRule(2.0, reward_weight=reward_weight, temperature=1.0)
             for reward_weight in (0, 4)
@@ -98,15 +109,14 @@ def test_a_reward_weight_pays_where_the_reward_model_knows_the_items(
     assert weighted.items < plain.items
 
 
-def test_playing_a_rule_twice_gives_the_same(folder: Path, trained: TrainedPolicy) -> None:
+def test_a_rule_simulated_twice_gives_the_same(folder: Path, trained: TrainedPolicy) -> None:
     rule = DecisionRule(2.0, reward_weight=1.0, temperature=0.5)
-    assert search_of(folder, trained).play([rule]) == search_of(folder, trained).play([rule])
+    assert search_of(folder, trained).simulate([rule]) == search_of(folder, trained).simulate(
+        [rule]
+    )
 
 
-def test_rules_played_side_by_side_do_what_each_does_alone(
-    folder: Path, trained: TrainedPolicy
-) -> None:
-    train, validation = training_views(EpisodeStore.open(folder / "store"))
+def test_rules_side_by_side_do_what_each_does_alone(folder: Path, trained: TrainedPolicy) -> None:
     search = search_of(folder, trained)
     rules = [
         DecisionRule(2.0, temperature=1.0),
@@ -114,61 +124,32 @@ def test_rules_played_side_by_side_do_what_each_does_alone(
         DecisionRule(3.0, tag_window=3),
         DecisionRule(3.0, reward_weight=4.0, tag_window=2, temperature=2.0),
     ]
-    together = search.play(rules)
-    model, n = trained.reward_model, FEW.sessions
-    assert model is not None
-    ends = LoggedEnds.of(train, model.lags, 100_000, 0)
-    end = SessionEnd(Likeness.of(validation.item_states), ends)
-    longest = int(train.lengths.max())
-    environment = UserSimulator(validation, model, search.calibration, end, n, longest)
-    users = np.arange(len(validation.item_states.user_features))
-    for rule, candidate in zip(rules, together, strict=True):
-        # A session a row, with sessions that begin anew and rows that are no longer live.
-        decider = replace(trained.decider(rule), likeness=Likeness.of(validation.item_states))
-        actor = PolicyActor(
-            *(decider, n, validation.observation_size, validation.item_states, None, users), seed=0
-        )
-        alone = rollout(environment, actor, n, 0)  # type: ignore[arg-type]
-        assert candidate.value == pytest.approx(float(alone.returns.mean()), abs=1e-9)
-        assert candidate.length == pytest.approx(float(alone.lengths.mean()), abs=1e-9)
-        assert candidate == search.play([rule])[0]
+    assert search.simulate(rules) == [search.simulate([rule])[0] for rule in rules]
 
 
 def test_unsupported_and_narrow_rules_are_not_allowed(folder: Path, trained: TrainedPolicy) -> None:
     search = search_of(folder, trained)
-    (played,) = search.play([DecisionRule(2.0, temperature=1.0)])
-    assert search.allowed(played)
-    assert not search.allowed(replace(played, support=0.5))
-    assert not search.allowed(replace(played, items=1.0))
-    worse = replace(played, value=played.value - 10)
-    better = replace(played, value=played.value + 10, items=1.0)
-    assert search.best([better, worse, played]) == played
+    (simulated,) = search.simulate([DecisionRule(2.0, temperature=1.0)])
+    assert search.allowed(simulated)
+    assert not search.allowed(replace(simulated, support=0.5))
+    assert not search.allowed(replace(simulated, items=1.0))
+    worse = replace(simulated, value=simulated.value - 10)
+    better = replace(simulated, value=simulated.value + 10, items=1.0)
+    assert search.best([better, worse, simulated]) == simulated
     # Within a standard error of the best, the first, which is the simplest.
-    close = replace(played, value=played.value - played.error / 2)
-    assert search.best([close, played]) == close
+    close = replace(simulated, value=simulated.value - simulated.error / 2)
+    assert search.best([close, simulated]) == close
     # Or within the tolerance.
-    sure = replace(played, error=0.0)
+    sure = replace(simulated, error=0.0)
     assert search.best([replace(sure, value=0.985 * sure.value), sure]).value < sure.value
     assert search.best([replace(sure, value=0.975 * sure.value), sure]) == sure
-    assert search.best([replace(played, items=1.0), replace(played, items=1.5)]).items == 1.5
+    assert search.best([replace(simulated, items=1.0), replace(simulated, items=1.5)]).items == 1.5
 
 
-def test_calibration_undoes_a_stretched_and_shifted_score(folder: Path) -> None:
-    train, validation = training_views(EpisodeStore.open(folder / "store"))
-    model, _ = fit_item_reward_model(train, validation, folder / "model", 0)
-    rows = RewardRows.of(train, model.lags, 10_000, 0)
-    slope, intercept = calibrate(model, rows)
-    for name in ("item", "user", "state", "affinity", "interaction", "exposure"):
-        model.get_buffer(name).mul_(2)
-    model.item.add_(1)
-    assert calibrate(model, rows)[0] == pytest.approx(slope / 2, rel=1e-3)
-    assert calibrate(model, rows)[1] == pytest.approx(intercept - slope / 2, abs=1e-3)
-
-
-def test_every_kind_of_candidate_is_played(folder: Path, trained: TrainedPolicy) -> None:
-    views = training_views(EpisodeStore.open(folder / "store"))
-    targets = {quantile: trained.target_return(quantile) for quantile in FEW.quantiles}
-    found = choose_rule(trained.decider(DecisionRule(2.0)), targets, *views, FEW, 0)
+def test_every_kind_of_candidate_is_simulated(folder: Path, trained: TrainedPolicy) -> None:
+    targets = (trained.target_return(quantile) for quantile in FEW.quantiles)
+    store, decider = EpisodeStore.open(folder / "store"), trained.decider(DecisionRule(2.0))
+    found = chosen(decider, store, folder / "run", FEW, *targets)
     rules = [candidate.rule for candidate in found.candidates]
     assert len(set(rules)) == len(rules)
     assert {rule.temperature for rule in rules} == set(FEW.temperatures)
@@ -181,102 +162,97 @@ def test_every_kind_of_candidate_is_played(folder: Path, trained: TrainedPolicy)
 def test_what_the_log_supports_only_without_recent_tags_is_found(
     folder: Path, trained: TrainedPolicy
 ) -> None:
-    train, validation = training_views(EpisodeStore.open(folder / "store"))
+    store = EpisodeStore.open(folder / "store")
     # The best shows item 0 for ever, drawing shows items that the log hardly has; items 0 to 3
     # share no tag.
     narrow = with_bias(trained, torch.tensor([12.0, 10.0, 8.0, 6.0] + [0.0] * 20))
     config = replace(
         FEW,
-        least_impressions=int(train.item_counts()[:4].min()),
+        least_impressions=int(training_views(store)[0].item_counts()[:4].min()),
         temperatures=(0.0, 4.0),
         reward_weights=(0.0,),
         tag_windows=(0, 3),
     )
-    found = choose_rule(narrow, {0.9: 2.0, 1.0: 2.0}, train, validation, config, 0)
-    assert found.supported
+    found = chosen(narrow, store, folder / "run", config, 2.0, 2.0)
+    assert not found.warning
     assert found.rule == DecisionRule(2.0, temperature=0.0, tag_window=3)
 
 
 def test_users_who_tire_are_shown_no_longer_runs(tmp_path: Path, trained: TrainedPolicy) -> None:
     store = tiring_store(tmp_path)
-    train, validation = training_views(store)
-    model, _ = fit_item_reward_model(train, validation, tmp_path / "model", 0)
-    one_tag = torch.where(torch.arange(24) % 4 == 0, 9.0, 0.0)
-    decider = replace(with_bias(trained, one_tag), reward_model=model)
+    decider = with_bias(trained, torch.where(torch.arange(24) % 4 == 0, 9.0, 0.0))
     config = replace(FEW, tag_windows=(0,), temperatures=(1.0,), reward_weights=(0.0,))
-    found = choose_rule(decider, {0.9: 2.0, 1.0: 3.0}, train, validation, config, 0)
-    assert found.fatigue is not None
-    assert (found.fatigue.length, found.fatigue.steps) == (3, 4)
+    found = chosen(decider, store, tmp_path, config, 2.0, 3.0)
+    fatigue = found.as_dict()["fatigue"]
+    assert (fatigue["length"], fatigue["steps"]) == (3, 4)
     assert found.rule.tag_run == 2
     runs = {candidate.rule.tag_run for candidate in found.candidates}
     assert runs == set(FEW.tag_runs)
     none = replace(config, tag_runs=(0,))
-    unlimited = choose_rule(decider, {0.9: 2.0, 1.0: 3.0}, train, validation, none, 0)
+    unlimited = chosen(decider, store, tmp_path, none, 2.0, 3.0)
     assert {candidate.rule.tag_run for candidate in unlimited.candidates} == {0}
-    assert found.as_dict()["fatigue"]["length"] == 3
 
 
-def test_the_most_promising_rules_are_played_in_more_sessions(
+def test_rules_of_the_highest_value_are_simulated_in_more_sessions(
     folder: Path, trained: TrainedPolicy
 ) -> None:
     few = replace(FEW, sessions=10)
     search, more = (search_of(folder, trained, each) for each in (few, replace(few, sessions=40)))
     reward_weights = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
-    played = search.play(
+    simulated = search.simulate(
         [
             DecisionRule(2.0, reward_weight=reward_weight, temperature=1.0)
             for reward_weight in reward_weights
         ]
     )
-    allowed = [each for each in played if search.allowed(each)]
+    allowed = [each for each in simulated if search.allowed(each)]
     worst = min(allowed, key=lambda each: each.value)
-    again = search.play_finalists(played, worst)
+    again = search.finalists(simulated, worst)
     assert again[0].rule == worst.rule
     assert len(again) == min(8, len(allowed))
     highest = sorted((each.value for each in allowed), reverse=True)[: len(again) - 1]
     found = {each.rule for each in again[1:]}
     assert all(each.rule in found for each in allowed if each.value > highest[-1] and each != worst)
-    assert again[1] == more.play([again[1].rule])[0]
+    assert again[1] == more.simulate([again[1].rule])[0]
 
 
 def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_path: Path) -> None:
-    one = ("temperatures=[1.0]", "reward weights=[0.0, 4.0]", "tag_windows=[0]", "tag_runs=[0]")
+    one = ("temperatures=[1.0]", "reward_weights=[0.0, 4.0]", "tag_windows=[0]", "tag_runs=[0]")
     rule = [
         f"rule.{each}" for each in (*one, "sessions=40", "least_items=2", "least_impressions=1")
     ]
     config = resolve_config("bc", None, [*SMALL, "train.validate_every=20", *rule])
     store = tiring_store(tmp_path)
     record = train_run(store, tmp_path / "run", config)
-    assert record["reward_model"]["new_users"]
-    assert "tastes of training users" in record["rule"]["chosen_by"]
-    users = record["rule"]["users"]
-    assert users["steps"] == users["effective_steps"] == record["train_steps"]
-    assert list(users["calibration"]) == record["rule"]["calibration"]
+    assert record.reward_model is not None
+    assert record.reward_model.new_users
+    assert record.rule is not None
+    assert "tastes of training users" in record.rule.chosen_by
+    choice = record.rule.model_dump()
+    users = choice["users"]
+    assert users["steps"] == users["effective_steps"] == record.train_steps
+    assert list(users["calibration"]) == choice["calibration"]
     # Nothing that acts knows these tastes.
     trained = TrainedPolicy.load(tmp_path / "run")
     model = trained.reward_model
     assert model is not None
     assert not model.affinity.any()
     assert not model.user.any()
-    # The chosen rule was played again in four times the sessions.
-    views = training_views(store)
-    tastes = fit_training_users(views[0], tmp_path / "run" / TRAINING_USERS, config.seed)
-    decider = trained.decider(DecisionRule(2.0))
-    more = RuleSearch(decider, *views, replace(config.rule, sessions=160), config.seed, tastes)
-    (played,) = more.play([trained.rule])
-    assert promised(record["rule"]) == (played.value, played.error)
+    # The chosen rule was simulated again in four times the sessions.
+    given = (trained.decider(DecisionRule(2.0)), users_of(tmp_path / "run", store))
+    four_times = replace(config.rule, sessions=160)
+    more = RuleSearch(*given, *training_views(store), four_times, config.seed)
+    (simulated,) = more.simulate([trained.rule])
+    assert record.rule.simulated == (simulated.value, simulated.error)
 
 
 def test_of_rules_that_the_model_cannot_tell_apart_the_widest_draws_are_taken(
     tmp_path: Path, trained: TrainedPolicy
 ) -> None:
     store = tiring_store(tmp_path)
-    train, validation = training_views(store)
-    model, _ = fit_item_reward_model(train, validation, tmp_path / "model", 0)
-    one_tag = torch.where(torch.arange(24) % 4 == 0, 9.0, 0.0)
-    decider = replace(with_bias(trained, one_tag), reward_model=model)
+    decider = with_bias(trained, torch.where(torch.arange(24) % 4 == 0, 9.0, 0.0))
     config = replace(FEW, tag_windows=(0,), tolerance=0.1)
-    found = choose_rule(decider, {0.9: 2.0, 1.0: 3.0}, train, validation, config, 0)
+    found = chosen(decider, store, tmp_path, config, 2.0, 3.0)
     rule = found.rule
     assert rule.tag_run > 0
     same_run = [each for each in found.candidates if each.rule.tag_run == rule.tag_run]
@@ -316,39 +292,6 @@ def tiring_store(folder: Path) -> EpisodeStore:
     return EpisodeStore.open(folder / "store")
 
 
-def test_reward_weights_below_the_first_that_overlaps_too_little_are_ranked_too(
-    folder: Path, trained: TrainedPolicy
-) -> None:
-    views = training_views(EpisodeStore.open(folder / "store"))
-    liked = TrainingCounts.of(views[0]).liked.topk(10).indices
-    decider = with_bias(trained, torch.zeros(24).index_fill(0, liked, 50.0))
-    few = RuleConfig(reward_weights=(0.0, 1000.0))
-    found = choose_by_ranking(decider, *views, few, 0)
-    reward_weights = [each.rule.reward_weight for each in found.candidates]
-    assert reward_weights[:2] == [0.0, 1000.0]
-    assert found.candidates[1].gain < 0
-    assert found.supported
-    overlapping = [each for each in found.candidates if each.gain >= 0]
-    best = max(overlapping, key=lambda each: each.item_rate)
-    assert found.rule == best.rule
-    too_large = min(each.rule.reward_weight for each in found.candidates if each.gain < 0)
-    assert too_large - max(each.rule.reward_weight for each in overlapping) == 1000 / 2 ** (
-        len(reward_weights) - 2
-    )
-
-
-def test_a_rule_without_overlap_has_no_reward_weight_and_says_so(
-    folder: Path, trained: TrainedPolicy
-) -> None:
-    views = training_views(EpisodeStore.open(folder / "store"))
-    liked = TrainingCounts.of(views[0]).liked.topk(10).indices
-    decider = with_bias(trained, torch.zeros(24).index_fill(0, liked, -1e4))
-    found = choose_by_ranking(decider, *views, RuleConfig(reward_weights=(0.0, 1.0)), 0)
-    assert not found.supported
-    assert found.rule.reward_weight == 0
-    assert "WARNING" in found.as_dict()["warning"]
-
-
 def test_a_finished_run_that_is_trained_again_keeps_its_rule(
     folder: Path, trained: TrainedPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -370,9 +313,9 @@ def test_a_refit_learns_from_all_rows_and_chooses_nothing_anew(
     store = EpisodeStore.open(folder / "store")
     record = refit(store, folder / "run", tmp_path / "refit")
     again = TrainedPolicy.load(tmp_path / "refit")
-    assert record["train_steps"] == store.n_steps > trained.record["train_steps"]
-    assert record["policy"]["steps"] == max(1, trained.record["policy"]["best_step"])
-    assert "policy        trained on all rows, up to step" in describe_run(record)
+    assert record.train_steps == store.n_steps > trained.record.train_steps
+    assert record.finished.steps == max(1, trained.record.finished.best_step)
+    assert "policy        trained on all rows, up to step" in record.describe()
     assert again.rule == trained.rule
     assert again.reward_model is not None
     assert trained.reward_model is not None

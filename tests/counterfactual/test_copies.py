@@ -11,13 +11,13 @@ from tests.support.planted import planted_store
 from ucfrec import schema
 from ucfrec.counterfactual.augment import AugmentConfig
 from ucfrec.counterfactual.copies import counterfactual_copies
+from ucfrec.counterfactual.effects_mean import EffectTransitions
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay
 from ucfrec.user_model.reward_fit import fit_item_reward_model
-from ucfrec.user_model.reward_mean import EffectTransitions
 
 QUICK = CRMConfig(epochs=2, hidden=32)
 LOOSE = AugmentConfig(copies=2, epsilon_r=3.0)

@@ -156,7 +156,7 @@ def test_the_real_log_in_shuffled_order_gives_the_same_store(tmp_path: Path) -> 
         files, _ = DATASET.resolve([source], LogMapping())
         prepare(files, mapping, tmp_path / name, PrepareOptions(embedding_size=8))
     stores = [EpisodeStore.open(tmp_path / name) for name in "ab"]
-    assert stores[0].meta["fingerprint"] == stores[1].meta["fingerprint"]
+    assert stores[0].record.fingerprint == stores[1].record.fingerprint
     assert stores[0].item_states.embeddings.equal(stores[1].item_states.embeddings)
 
 

@@ -20,7 +20,8 @@ from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.simulated_store import simulated_store
 from ucfrec.runs.config import resolve_config
-from ucfrec.runs.run import train_run, training_views
+from ucfrec.runs.run import train_run
+from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_simulators.kuai.environment import EXITS, KuaiEnv
 

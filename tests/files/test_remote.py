@@ -13,9 +13,9 @@ import pytest
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files.remote import Input, Output, _opened, fetch, local_paths, uri_or_path
-from ucfrec.logs.mapping import LogMapping, read_mapping
-from ucfrec.logs.prepare import PrepareOptions, prepare
+from ucfrec.files.remote import Input, Output, _opened, local_paths, uri_or_path
+from ucfrec.logs.mapping import read_mapping
+from ucfrec.logs.prepare import prepare
 
 START = 1_700_000_000_000
 
@@ -58,7 +58,6 @@ def place(request: pytest.FixtureRequest) -> str:
     name = re.sub(r"\W", "-", request.node.name)
     if request.param == "bucket":
         return f"{request.getfixturevalue('bucket')}/{name}"
-    pytest.importorskip("fsspec")
     return f"memory://{name}"
 
 
@@ -76,12 +75,12 @@ def test_a_store_is_made_from_remote_logs_in_a_remote_place(
     assert main(["prepare", f"{place}/logs/*.parquet", "--out", f"{place}/store"]) == 0
     assert f"store: {place}/store" in capsys.readouterr().out
     prepare(files, read_mapping(_empty(tmp_path)), tmp_path / "store")
-    local = EpisodeStore.open(tmp_path / "store").meta
+    local = EpisodeStore.open(tmp_path / "store").record
     with local_paths(argparse.Namespace(store=Input(f"{place}/store"))) as options:
         found = EpisodeStore.open(options.store)
-        assert found.meta["fingerprint"] == local["fingerprint"]
-        assert found.meta["source"]["files"] == [f"{place}/logs/{file.name}" for file in files]
-        assert not list(found._columns._sealed.faults())  # type: ignore[union-attr]
+        assert found.record.fingerprint == local.fingerprint
+        assert found.record.source.files == tuple(f"{place}/logs/{file.name}" for file in files)
+        assert not list(found._columns._sealed.faults())
         copy = options.store
     assert not copy.exists()
     # A folder of logs; the store is there already.
@@ -140,73 +139,39 @@ def test_an_unknown_kind_of_place_is_one_line(capsys: pytest.CaptureFixture[str]
     assert message.count("\n") == 1
 
 
-def on_disk(path: Path) -> int:
-    """Bytes that a file takes, without its holes."""
-    return path.stat().st_blocks * 512
+@pytest.mark.parametrize("name", ["a\\b.parquet", "..\\b.parquet", "c:b.parquet"])
+def test_a_name_that_would_lead_out_of_the_folder_is_refused(tmp_path: Path, name: str) -> None:
+    system, folder = _opened("memory://names-that-lead-out")
+    with system.open(f"{folder}/{name}", "wb") as out:
+        out.write(b"1")
+    with pytest.raises(InputError, match="has a file named"):  # noqa: SIM117
+        with local_paths(argparse.Namespace(log=Input("memory://names-that-lead-out"))):
+            raise AssertionError("the block must not run")
+    system.rm(folder, recursive=True)
 
 
-def test_only_columns_that_are_read_are_copied_from_logs(tmp_path: Path, place: str) -> None:
-    log = pd.read_parquet(write_log(tmp_path / "log.parquet"))
-    log = pd.concat([log] * 20, ignore_index=True)
-    log["timestamp"] += np.arange(len(log))
-    generator = np.random.default_rng(0)
-    log["reward.more"] = generator.normal(size=len(log))
-    log["long"] = list(generator.normal(size=(len(log), 100)))
-    log.to_parquet(tmp_path / "log.parquet", row_group_size=1000)
-    put(tmp_path / "log.parquet", f"{place}/log.parquet")
-    options = PrepareOptions(reward='reward * 2 + "reward.more"', session_by="user")
-    prepare([tmp_path / "log.parquet"], LogMapping(), tmp_path / "local", options)
-    with local_paths(argparse.Namespace(log=Input(f"{place}/log.parquet"))) as given:
-        size = given.log.stat().st_size
-        assert size == (tmp_path / "log.parquet").stat().st_size > 2e6
-        assert on_disk(given.log) < 0.1 * size
-        prepare([given.log], LogMapping(), tmp_path / "store", options)
-        assert on_disk(given.log) < 0.2 * size
-        fetch(given.log)
-        assert given.log.read_bytes() == (tmp_path / "log.parquet").read_bytes()
-    stores = [EpisodeStore.open(tmp_path / name).meta["fingerprint"] for name in ("local", "store")]
-    assert stores[0] == stores[1]
-
-
-def test_only_columns_that_are_read_are_copied_from_a_store(tmp_path: Path, place: str) -> None:
-    n = 300_000
+def test_whole_files_are_copied_both_ways(tmp_path: Path, place: str) -> None:
+    n = 30_000
     rewards = np.random.default_rng(0).normal(size=n).astype(np.float32)
     steps = {"reward": rewards, "item": np.zeros(n), "timestamp": np.arange(n)}
     EpisodeStore.write(tmp_path / "store", steps, np.full(n // 10, 10), shard_steps=n // 2)
     with local_paths(argparse.Namespace(out=Output(f"{place}/store"))) as options:
         shutil.copytree(tmp_path / "store", options.out)
     with local_paths(argparse.Namespace(store=Input(f"{place}/store"))) as options:
-        store = EpisodeStore.open(options.store)
-        np.testing.assert_array_equal(store.step_values("reward", *store.all_steps()), rewards)
-        for number in range(2):
-            shard = options.store / f"shard-0000{number}"
-            assert on_disk(shard / "timestamp.npy") == 0
-            assert on_disk(shard / "reward.npy") >= 4 * n // 2
-    # A column is checked when it is read.
-    file = tmp_path / "store" / "shard-00001" / "timestamp.npy"
-    content = bytearray(file.read_bytes())
-    content[-1] ^= 1
-    file.write_bytes(content)
-    put(file, f"{place}/store/shard-00001/timestamp.npy")
-
-    def first(column: str) -> float:
-        with local_paths(argparse.Namespace(store=Input(f"{place}/store"))) as options:
-            store = EpisodeStore.open(options.store)
-            return float(store.step_values(column, np.array([0]), np.array([0]))[0])
-
-    assert first("reward") == rewards[0]
-    with pytest.raises(InputError, match=f"{place}/store/shard-00001/timestamp.npy has another"):
-        first("timestamp")
+        copies = {p.relative_to(options.store) for p in options.store.rglob("*") if p.is_file()}
+        for name in copies:
+            assert (options.store / name).read_bytes() == (tmp_path / "store" / name).read_bytes()
+    assert len(copies) == sum(path.is_file() for path in (tmp_path / "store").rglob("*"))
 
 
-def test_a_file_that_changes_meanwhile_is_an_error(tmp_path: Path, place: str) -> None:
-    log = pd.DataFrame({"a": np.random.default_rng(0).normal(size=200_000)})
-    log.to_parquet(tmp_path / "log.parquet")
-    put(tmp_path / "log.parquet", f"{place}/log.parquet")
-    with local_paths(argparse.Namespace(log=Input(f"{place}/log.parquet"))) as options:
-        pd.concat([log, log]).to_parquet(tmp_path / "log.parquet")
-        system, path = _opened(f"{place}/log.parquet")
-        with system.open_output_stream(path) as out:
-            out.write((tmp_path / "log.parquet").read_bytes())
-        with pytest.raises(InputError, match="changed while it was read"):
-            fetch(options.log, ["a"])
+def test_a_file_that_changes_meanwhile_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put(write_log(tmp_path / "log.parquet"), "memory://changing/log.parquet")
+    system, _ = _opened("memory://changing")
+    found = system.find("/changing", detail=True)
+    grown = {name: {**about, "size": about["size"] + 1} for name, about in found.items()}
+    monkeypatch.setattr(type(system), "find", lambda *_, **__: grown)
+    with pytest.raises(InputError, match="changed while it was read"):  # noqa: SIM117
+        with local_paths(argparse.Namespace(log=Input("memory://changing/log.parquet"))):
+            raise AssertionError("the block must not run")

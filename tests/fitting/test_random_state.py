@@ -21,7 +21,8 @@ from ucfrec.fitting.loop import LoopConfig, fit
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.registry import BUILT_IN
 from ucfrec.runs.config import resolve_config
-from ucfrec.runs.run import new_policy, train_run
+from ucfrec.runs.run import train_run
+from ucfrec.runs.start import new_policy
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 

@@ -49,7 +49,7 @@ def counted(values: Array, found: dict[str, Any]) -> None:
 def test_lengths_popularity_and_few_rewards(tmp_path: Path) -> None:
     rewards = np.random.default_rng(1).integers(3, size=900) / 2
     store = prepared(tmp_path, rewards)
-    summary = store.meta["source"]["summary"]
+    summary = store.record.source.model_dump()["summary"]
     counted(store.lengths, summary["session_lengths"])
     assert summary["session_lengths"]["edges"][:4] == [1, 2, 4, 8]
     items = store.step_values(schema.ITEM, *store.all_steps())
@@ -62,7 +62,7 @@ def test_items_that_were_never_shown_are_counted(tmp_path: Path) -> None:
     pd.DataFrame({"item_id": range(1, 301), "price": 1.5}).to_csv(tmp_path / "f.csv", index=False)
     features = (FeatureTable((tmp_path / "f.csv",), "item_id"),)
     store = prepared(tmp_path, np.arange(400) % 2, LogMapping(item_features=features))
-    popularity = store.meta["source"]["summary"]["item_popularity"]
+    popularity = store.record.source.model_dump()["summary"]["item_popularity"]
     shown = len(np.unique(store.step_values(schema.ITEM, *store.all_steps())))
     assert popularity["edges"][:2] == [0, 1]
     assert popularity["counts"][0] == 300 - shown
@@ -73,7 +73,7 @@ def test_many_rewards_fall_into_equal_bins_and_none_is_lost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rewards = np.random.default_rng(1).standard_cauchy(1200)
-    found = prepared(tmp_path, rewards).meta["source"]["summary"]["rewards"]
+    found = prepared(tmp_path, rewards).record.source.model_dump()["summary"]["rewards"]
     assert len(found["counts"]) == 20
     assert sum(found["counts"]) == 1200
     np.testing.assert_allclose(np.diff(found["edges"]), np.ptp(found["edges"]) / 20)
@@ -86,6 +86,6 @@ def test_many_rewards_fall_into_equal_bins_and_none_is_lost(
     # A larger log is sampled, to the same answer whatever the order of its rows.
     monkeypatch.setattr(measures, "SAMPLE_ROWS", 400)
     (tmp_path / "again").mkdir()
-    sampled = prepared(tmp_path / "again", rewards).meta["source"]["summary"]["rewards"]
+    sampled = prepared(tmp_path / "again", rewards).record.source.model_dump()["summary"]["rewards"]
     assert abs(sampled["quantiles"]["0.5"]) < 0.5
     assert sum(sampled["counts"]) == 1200

@@ -352,7 +352,7 @@ def test_a_store_of_somebody_else_brings_no_program(
     meta = read_json(tmp_path / "store" / "meta.json")
     (tmp_path / "store" / "meta.json").write_text(json.dumps({**meta, "reward": text}))
     fit(tmp_path / "store", tmp_path / "run")
-    assert TrainedPolicy.load(tmp_path / "run").record["reward"] == text
+    assert TrainedPolicy.load(tmp_path / "run").record.reward == text
     log, out = str(trained / "log.parquet"), str(tmp_path / "result")
     before = snapshot(tmp_path)
     for command, to in (("recommend", "--out"), ("score", "--out"), ("ope", "--json")):

@@ -67,7 +67,7 @@ def steps_of(out: Path) -> pd.DataFrame:
     columns |= {n: store.episode_values(n)[episodes] for n in schema.EPISODE_DTYPES}
     columns |= {
         name: store.step_values(name, episodes, steps)
-        for name in store.meta["columns"]
+        for name in store.record.columns
         if name not in (schema.ACTION, schema.OBSERVATION)
     }
     frame = pd.DataFrame(columns)
@@ -152,7 +152,7 @@ def test_order_of_rows_and_files_is_immaterial(tmp_path: Path) -> None:
         SMALL,
     )
     stores = [EpisodeStore.open(tmp_path / name) for name in ("once", "again")]
-    assert stores[0].meta["fingerprint"] == stores[1].meta["fingerprint"]
+    assert stores[0].record.fingerprint == stores[1].record.fingerprint
     assert stores[0].item_states.embeddings.equal(stores[1].item_states.embeddings)
     assert again["rows_read"] == len(log)
     assert again["unsorted_rows"] > 0
@@ -165,7 +165,7 @@ def test_another_row_is_another_fingerprint(tmp_path: Path) -> None:
     prepare([write(log, tmp_path / "a.parquet")], LogMapping(), tmp_path / "a", SMALL)
     log["item_id"] += 1
     prepare([write(log, tmp_path / "b.parquet")], LogMapping(), tmp_path / "b", SMALL)
-    prints = [EpisodeStore.open(tmp_path / name).meta["fingerprint"] for name in "ab"]
+    prints = [EpisodeStore.open(tmp_path / name).record.fingerprint for name in "ab"]
     assert prints[0] != prints[1]
 
 
@@ -176,9 +176,10 @@ def test_csv_and_parquet_give_the_same_store(tmp_path: Path) -> None:
     mapping = LogMapping(columns_given(["user_id=uid", "timestamp=when"]), reward="reward * 2")
     for kind in ("csv", "parquet"):
         prepare([write(log, tmp_path / f"log.{kind}")], mapping, tmp_path / kind, SMALL)
-    stores = [EpisodeStore.open(tmp_path / kind).meta for kind in ("csv", "parquet")]
-    assert stores[0]["fingerprint"] == stores[1]["fingerprint"]
-    assert stores[0]["reward"] == "reward * 2"
+    stores = [EpisodeStore.open(tmp_path / kind).record for kind in ("csv", "parquet")]
+    assert stores[0].fingerprint == stores[1].fingerprint
+    assert stores[0].reward == "reward * 2"
+    assert stores[0].source.mapping == {"user_id": "uid", "timestamp": "when"}
     assert steps_of(tmp_path / "csv")["user_id"].str.startswith("u").all()
 
 
@@ -207,8 +208,8 @@ def test_times_of_every_unit_and_zone_are_read(
     finally:
         monkeypatch.undo()
         time.tzset()
-    found, wanted = (EpisodeStore.open(tmp_path / name).meta for name in ("found", "wanted"))
-    assert found["fingerprint"] == wanted["fingerprint"]
+    found, wanted = (EpisodeStore.open(tmp_path / name).record for name in ("found", "wanted"))
+    assert found.fingerprint == wanted.fingerprint
     embeddings = [
         EpisodeStore.open(tmp_path / name).item_states.embeddings for name in ("found", "featured")
     ]
@@ -363,7 +364,7 @@ def test_a_store_like_another_has_its_numbers(tmp_path: Path) -> None:
         prepare([tmp_path / "b.parquet"], LogMapping(), tmp_path / "c", SMALL, like=tmp_path)
     assert report["dropped"]["unknown_item"] == (later["item_id"] >= 12).sum()
     store = EpisodeStore.open(tmp_path / "b")
-    assert store.meta["splits"]["train"]["steps"] == report["steps"] == store.n_steps
+    assert store.record.splits["train"]["steps"] == report["steps"] == store.n_steps
     assert set(store.episode_values("user")) == {-1, *range(25)}
     like = EpisodeStore.open(tmp_path / "a").item_states
     assert store.item_states.embeddings.equal(like.embeddings)
@@ -585,8 +586,8 @@ def test_files_of_different_make_are_read_together(tmp_path: Path) -> None:
     ]
     apart = prepare(parts, LogMapping(), tmp_path / "b", SMALL)
     assert whole["rows_read"] == apart["rows_read"]
-    stores = [EpisodeStore.open(tmp_path / name).meta for name in "ab"]
-    assert stores[0]["fingerprint"] == stores[1]["fingerprint"]
+    stores = [EpisodeStore.open(tmp_path / name).record for name in "ab"]
+    assert stores[0].fingerprint == stores[1].fingerprint
 
 
 def test_an_optional_column_of_some_files_is_left_out_with_a_note(tmp_path: Path) -> None:
@@ -842,4 +843,4 @@ def test_memory_stays_within_the_limit(tmp_path: Path) -> None:
         text=True,
     )
     assert int(end.stdout) * 1024 < limit
-    assert EpisodeStore.open(tmp_path / "store").meta["n_steps"] == rows
+    assert EpisodeStore.open(tmp_path / "store").record.n_steps == rows

@@ -1,4 +1,4 @@
-"""Rows that are sorted and checked in batches are those that the one SQL query keeps."""
+"""Rows that are sorted and checked in batches are those that pandas keeps."""
 
 from pathlib import Path
 
@@ -7,13 +7,14 @@ import pandas as pd
 import pytest
 
 from ucfrec.logs.binding import open_tables
-from ucfrec.logs.clean import DUPLICATES, check_rows, drop_counts
 from ucfrec.logs.engine import engine
+from ucfrec.logs.kept import DUPLICATES
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.sorted_rows import check_sorted, sorted_batches
 from ucfrec.logs.typed import typed_log
 
 START = 1_700_000_000_000
+PAYLOAD = ["propensity", "is_random", "session_id"]
 
 
 def make_log(seed: int, text: bool) -> pd.DataFrame:
@@ -29,7 +30,6 @@ def make_log(seed: int, text: bool) -> pd.DataFrame:
             "propensity": generator.choice([0.25, 0.5, np.nan], n),
             "is_random": generator.integers(2, size=n),
             "session_id": generator.integers(3, size=n),
-            "observation": list(generator.integers(2, size=(n, 2)).astype("f4")),
         }
     )
     log["user_id"], log["item_id"] = log["user_id"].astype("Int64"), log["item_id"].astype("Int64")
@@ -43,38 +43,49 @@ def make_log(seed: int, text: bool) -> pd.DataFrame:
     return log
 
 
+def kept_by_pandas(log: pd.DataFrame, duplicates: str) -> tuple[pd.DataFrame, dict[str, int]]:
+    """The rows to keep, in order of user, time and item, and the number of the others by reason."""
+    missing = log[["user_id", "item_id", "timestamp"]].isna().any(axis=1)
+    late = ~missing & (log["timestamp"] < START)
+    left = log[~missing & ~late].reset_index(names="row")
+    left["bad"] = ~np.isfinite(left["reward"])
+    rule = {"highest": -left["reward"], "lowest": left["reward"], "first": left["row"]}
+    left["rule"] = rule.get(duplicates, -left["row"])
+    key = ["user_id", "timestamp", "item_id"]
+    order = left.sort_values([*key, "bad", "rule", "propensity", "session_id", "is_random"])
+    single = order.drop_duplicates(key)
+    good = single[~single["bad"]]
+    return good, {
+        "null_key": int(missing.sum()),
+        "clock_out_of_range": int(late.sum()),
+        "duplicate": len(left) - len(single),
+        "reward_not_finite": len(single) - len(good),
+    }
+
+
 @pytest.mark.parametrize("duplicates", DUPLICATES)
 @pytest.mark.parametrize("text", [False, True])
-@pytest.mark.parametrize("session_by", ["gap", "session_id"])
-def test_both_ways_keep_the_same_rows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, duplicates: str, text: bool, session_by: str
+@pytest.mark.parametrize("in_memory", [False, True])
+def test_the_rows_that_are_kept_are_those_of_pandas(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, duplicates: str, text: bool, in_memory: bool
 ) -> None:
     monkeypatch.setattr("ucfrec.logs.engine.BATCH_ROWS", 64)
     path = tmp_path / "log.parquet"
-    make_log(len(duplicates), text).to_parquet(path)
+    given = make_log(len(duplicates), text)
+    given.to_parquet(path)
+    expected, dropped = kept_by_pandas(given, duplicates)
+    folder = None if in_memory else tmp_path
     with engine([path], tmp_path) as connection:
         tables = tuple(open_tables(connection, [path]))
-        given = LogMapping(), "reward", session_by, tmp_path, duplicates
-        log = check_rows(connection, tables, *given)
-        columns = ("timestamp", "reward", "propensity", "is_random", "observation")
-        order = "user_id, timestamp, item_id"
-        expected = connection.sql(
-            f"SELECT dense_rank() OVER (ORDER BY user_id) AS u, "
-            f"dense_rank() OVER (ORDER BY item_id) AS i, {', '.join(columns)} FROM clean "
-            f"ORDER BY {order}"
-        ).df()
-        dropped = drop_counts(log)
-    with engine([path], tmp_path) as connection:
-        tables = tuple(open_tables(connection, [path]))
-        log = typed_log(connection, tables, LogMapping(), "reward", session_by, tmp_path)
-        rows = check_sorted(log, sorted_batches(log, None, tmp_path), duplicates, tmp_path)
+        log = typed_log(connection, tables, LogMapping(), "reward", "gap", tmp_path)
+        rows = check_sorted(log, sorted_batches(log, None, folder), duplicates, folder)
         found = {name: rows.clean.read(name, 0, len(rows.clean)) for name in rows.clean.names}
-    assert rows.dropped == dropped
+    assert {name: n for name, n in rows.dropped.items() if n} == dropped
     assert rows.read == 400
     assert 0 < rows.conflicts <= dropped["duplicate"]
-    for name in columns:
-        values = np.stack(expected[name].tolist()).astype(found[name].dtype)
-        np.testing.assert_array_equal(found[name], values)
-    for name, ranks in (("user", "u"), ("item", "i")):
-        _, places = np.unique(found[name], return_inverse=True)
-        np.testing.assert_array_equal(places, expected[ranks] - 1)
+    for name in ("timestamp", "reward", "propensity", "is_random"):
+        np.testing.assert_array_equal(found[name], expected[name].astype(found[name].dtype))
+    for name in ("user", "item"):
+        # Codes are in the order of the ids.
+        ranks = expected[f"{name}_id"].astype("category").cat.codes
+        assert [*np.unique(found[name], return_inverse=True)[1]] == [*ranks]

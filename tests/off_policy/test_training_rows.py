@@ -15,7 +15,8 @@ from ucfrec.logs import LogMapping
 from ucfrec.off_policy.evaluate import evaluate_off_policy
 from ucfrec.off_policy.score import logged_sessions
 from ucfrec.off_policy.training_rows import share_seen
-from ucfrec.runs.trained_policy import TrainedPolicy, store_of
+from ucfrec.runs.record import store_of
+from ucfrec.runs.trained_policy import TrainedPolicy
 
 
 @pytest.mark.parametrize(("seen", "expected"), [(0, 0.0), (300, 0.5)])
@@ -74,7 +75,7 @@ def test_without_the_training_store_nothing_is_known(
     shutil.copytree(folder / "store", tmp_path / "store")
     for store in (tmp_path / "gone", tmp_path / "store"):
         places = {"store": str(store), "store_from_run": "../gone"}
-        moved = replace(trained, record={**trained.record, **places})
+        moved = replace(trained, record=trained.record.with_entries(**places))
         with logged_sessions(
             folder / "run", trained, [folder / "rest.parquet"], LogMapping()
         ) as logged:
@@ -86,7 +87,7 @@ def test_a_run_that_was_moved_with_its_store_finds_it(
 ) -> None:
     for name in ("run", "store"):
         shutil.copytree(folder / name, tmp_path / name)
-    record = {**trained.record, "store": str(tmp_path / "gone")}
+    record = trained.record.with_entries(store=str(tmp_path / "gone"))
     found = store_of(tmp_path / "run", record)
     assert found is not None
     assert found.path == (tmp_path / "store").resolve()

@@ -32,7 +32,7 @@ from ucfrec.policies.dt4rec import DT4RecPolicy
 from ucfrec.policies.edt4rec import EDT4RecPolicy, _consistent, _entropy
 from ucfrec.policies.registry import policy_class
 from ucfrec.runs.config import resolve_config
-from ucfrec.runs.run import new_policy
+from ucfrec.runs.start import new_policy
 
 NEW = ("dt4rec", "cdt4rec", "edt4rec", "sasrec")
 both_heads = pytest.mark.parametrize("sizes", [VECTORS, CATALOG], ids=["vectors", "items"])

@@ -5,11 +5,12 @@ from typing import Any
 import pytest
 
 from tests.support.report_page import SOURCE
+from ucfrec.episodes.record import Source
 from ucfrec.reporting.data_quality import data_quality
 
 
 def test_the_numbers_are_those_of_the_report() -> None:
-    quality = data_quality({"data": SOURCE})
+    quality = data_quality(Source.model_validate(SOURCE))
     assert quality.rows is not None
     assert ("rows read", ["1,200"]) in quality.rows.rows
     assert ("items", ["9"]) in quality.rows.rows
@@ -26,16 +27,8 @@ def test_the_numbers_are_those_of_the_report() -> None:
     assert quality.quantiles.rows[0][1] == ["1", "1", "2", "3", "6.5", "7"]
 
 
-@pytest.mark.parametrize("record", [{}, {"data": {}}, {"data": {"dataset": "hopper"}}])
-def test_what_is_not_recorded_is_left_out(record: dict[str, Any]) -> None:
-    quality = data_quality(record)
+@pytest.mark.parametrize("source", [{}, {"dataset": "hopper"}])
+def test_what_is_not_recorded_is_left_out(source: dict[str, Any]) -> None:
+    quality = data_quality(Source.model_validate(source))
     assert (quality.rows, quality.dropped, quality.quantiles) == (None, None, None)
-    assert quality.pictures == []
-
-
-def test_a_store_from_before_the_summary_has_counts_and_no_pictures() -> None:
-    source = {name: value for name, value in SOURCE.items() if name != "summary"}
-    quality = data_quality({"data": source})
-    assert quality.rows is not None
-    assert quality.quantiles is None
     assert quality.pictures == []

@@ -13,13 +13,16 @@ from ucfrec.reporting.model_card import CARD, MEASURED, add_measurement, write_c
 from ucfrec.runs.config import resolve_config
 
 RECORD: dict[str, Any] = {
+    "files": {}, "command": "ucfrec train", "store": "store", "store_from_run": None,
+    "session_gap_ms": 1_800_000, "wall_time_s": 9.0,
     "seed": 4, "reward": "is_click", "session_by": "gap", "fingerprint": "f" * 64,
     "train_episodes": 1200, "train_steps": 5400, "mean_return": 0.75,
-    "return_quantiles": {"0.5": 1.0, "1.0": 9.0}, "sizes": {"items": 80, "state": 9, "action": 8},
+    "return_quantiles": {"0.5": 1.0, "1.0": 9.0},
+    "sizes": {"items": 80, "state": 9, "action": 8, "users": 33, "tags": 0},
     "observation_size": 0,
     "return_to_go": {"definition": "session", "discount": 0.9, "horizon": 1},
     "versions": {"ucfrec": "0.1.0"}, "reference_losses": {"uniform": 4.4, "popularity": 3.6},
-    "policy": {"steps": 300, "best_validation": 3.5},
+    "policy": {"steps": 300, "best_step": 200, "best_validation": 3.5, "seconds": 8.0},
     "data": {
         "files": ["/home/me/secret/log.parquet"], "users": 33,
         "time_range_ms": [1_574_553_600_000, 1_575_158_400_000], "unknown_propensities": 7,
@@ -57,21 +60,19 @@ def test_it_says_data_reward_rule_and_limits(tmp_path: Path) -> None:
 
 
 def test_limits_follow_the_record(tmp_path: Path) -> None:
-    worse = {"steps": 300, "best_validation": 3.7}
+    worse = RECORD["policy"] | {"best_validation": 3.7}
     data = {"files": []}
-    copies = {"verdict": "trust none of them"}
-    write_card(run(tmp_path / "run", policy=worse, data=data, augmentation=copies))
+    write_card(run(tmp_path / "run", policy=worse, data=data))
     card = text_of(tmp_path / "run")
     assert "3.7, is not below that of showing items by popularity, 3.6: it learned nothing" in card
     assert "Its logs have no propensities" in card
-    assert "Counterfactual copies: trust none of them" in card
     (tmp_path / "run" / "decision_rule.json").unlink()
     write_card(tmp_path / "run")
     assert "Its decision rule is not chosen yet." in text_of(tmp_path / "run")
 
 
 def test_a_refit_knows_all_rows_of_its_store(tmp_path: Path) -> None:
-    refitted = {"steps": 300, "best_validation": float("nan")}
+    refitted = RECORD["policy"] | {"best_validation": float("nan")}
     write_card(run(tmp_path / "run", policy=refitted, refit_of={}))
     card = text_of(tmp_path / "run")
     assert "2019-11-24 00:00 to 2019-12-01 00:00" in card

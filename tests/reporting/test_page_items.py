@@ -161,8 +161,8 @@ def test_data_quality_comes_from_the_run_folder(folder: Path, tmp_path: Path) ->
     assert "not recorded" not in page.text
 
 
-def test_a_run_from_before_is_shown_with_what_it_recorded(folder: Path, tmp_path: Path) -> None:
-    old = rewritten(folder / "ucf", tmp_path / "old", data=None, reference_losses=None)
+def test_a_run_is_shown_with_what_it_recorded(folder: Path, tmp_path: Path) -> None:
+    old = rewritten(folder / "ucf", tmp_path / "old", data={}, reference_losses=None)
     (old / "samples.json").unlink()
     (old / "policy" / "metrics.jsonl").unlink()
     text = page_of(tmp_path / "report.html", old).text

@@ -13,7 +13,7 @@ from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.policy_fit import fit_policy
-from ucfrec.runs.run import new_policy, training_views
+from ucfrec.runs.start import new_policy, training_views
 
 SETTINGS = [
     "train.steps=16", "train.validate_every=4", "train.batch_size=16", "train.warmup_steps=2",

@@ -1,29 +1,28 @@
-"""Records of runs: every entry that is read has its type."""
+"""The record of a run: damage to any entry is one line, from whatever reads it."""
 
+import shutil
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tests.recommending.test_recommend import SMALL, random_log
+from tests.support.records import DAMAGE, damaged, paths
+from ucfrec.commands.cli import main
+from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.runs.record import require_run_record
+from ucfrec.files.atomic import read_json, write_json
+from ucfrec.logs import LogMapping, PrepareOptions, prepare
+from ucfrec.runs.config import resolve_config
+from ucfrec.runs.record import RunRecord, read_record
+from ucfrec.runs.run import train_run
+from ucfrec.runs.trained_policy import TrainedPolicy
 
-RECORD: dict[str, Any] = {
-    "config": {"policy_name": "bc", "seed": 0, "train": {"steps": 3}},
-    "sizes": {"state": 4, "action": 2, "items": 0},
-    "fingerprint": "f1",
-    "observation_size": 4,
-    "return_quantiles": {"0.5": 1.0, "1.0": 2},
-    "return_to_go": {"definition": "session", "discount": 0.9, "horizon": 1},
-    "reward": "reward",
-    "train_episodes": 3,
-    "train_steps": 9,
-    "session_by": None,
-}
-PATH = Path("run") / "run.json"
+OPTIONAL = {"reference_losses", "augmentation", "policy", "reward_model", "rule"}
+"""Entries of stages that may not have ended."""
 anything = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
     lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
@@ -31,45 +30,103 @@ anything = st.recursive(
 )
 
 
-def test_a_record_passes() -> None:
-    require_run_record(PATH, RECORD)
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log and a run on it, without checksums of its files."""
+    folder = tmp_path_factory.mktemp("records")
+    random_log().to_parquet(folder / "log.parquet")
+    options = PrepareOptions(reward="reward", session_by="gap", gap_minutes=20)
+    prepare([folder / "log.parquet"], LogMapping(), folder / "store", options)
+    config = resolve_config("ucf", None, [*SMALL, "augment.copies=1", "crm.epochs=1"])
+    train_run(EpisodeStore.open(folder / "store"), folder / "run", config)
+    write_json(folder / "run" / "run.json", record_of(folder) | {"files": {}})
+    return folder
 
 
-@pytest.mark.parametrize("name", [name for name in RECORD if name != "session_by"])
-def test_a_missing_entry_is_named(name: str) -> None:
-    record = {key: value for key, value in RECORD.items() if key != name}
-    with pytest.raises(InputError, match=rf"run\.json is damaged: its {name} is None"):
-        require_run_record(PATH, record)
+def record_of(folder: Path) -> dict[str, Any]:
+    record: dict[str, Any] = read_json(folder / "run" / "run.json")
+    return record
+
+
+def test_what_is_written_comes_back(folder: Path, tmp_path: Path) -> None:
+    record = read_record(folder / "run")
+    record.written(tmp_path)
+    assert read_json(tmp_path / "run.json") == record_of(folder)
+    assert record.data == EpisodeStore.open(folder / "store").record.source
+    assert record.session_gap_ms == 20 * 60_000
+
+
+@pytest.mark.parametrize("kind", DAMAGE)
+def test_every_entry_is_checked(folder: Path, tmp_path: Path, kind: str) -> None:
+    value, said = record_of(folder), dict[tuple[str, ...], str]()
+    for path in paths(value, depth=1):
+        damaged(tmp_path / "run.json", value, path, DAMAGE[kind])
+        if path[0] == "files":
+            continue
+        try:
+            RunRecord.read(tmp_path)
+        except InputError as error:
+            said[path] = str(error)
+            continue
+        # An entry of a stage that has not ended, or a value that it may have.
+        may_be_absent = path[0] in OPTIONAL or path[0] in ("data", "config", "library")
+        assert kind not in ("huge", "list") or path[0] in ("rule", "data"), path
+        assert kind != "missing" or may_be_absent or len(path) > 1, path
+    assert said
+    assert all("run.json" in text and "\n" not in text for text in said.values())
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
+    ("path", "value", "says"),
     [
-        ("config", {"policy_name": "bc"}),
-        ("config", {"policy_name": "no such", "seed": 0}),
-        ("config", {"policy_name": 3, "seed": 0}),
-        ("config", {"policy_name": ["bc"], "seed": 0}),
-        ("config", {"policy_name": "bc", "seed": "x"}),
-        ("config", {"policy_name": "bc", "seed": 0, "train": {"steps": "many"}}),
-        ("sizes", {"state": -1, "action": 2, "items": 0}),
-        ("sizes", {"state": 10**30, "action": 2, "items": 0}),
-        ("return_quantiles", {"half": 1.0}),
-        ("return_quantiles", {}),
-        ("return_quantiles", {"0.5": float("nan")}),
-        ("session_gap_ms", "soon"),
-        ("screening", {"how": "drop"}),
-        ("screening", {"dimensions": [{"dimension": 0, "causes": "no"}]}),
-        ("mean_return", 10**400),
-        ("policy", []),
+        (("session_gap_ms",), DAMAGE["missing"], "run.json has no session_gap_ms; train it again"),
+        (("session_gap_ms",), "soon", "its session_gap_ms is 'soon'; train it again"),
+        (("config", "policy_name"), "no such", "no policy is called 'no such'"),
+        (("config", "seed"), "x", "seed is 'x'"),
+        (("config", "train", "steps"), "many", "train.steps is 'many'"),
+        (("sizes", "state"), -1, "its sizes.state is -1"),
+        (("return_quantiles",), {"half": 1.0}, "its return_quantiles is {'half': 1.0}"),
+        (("return_to_go", "horizon"), 0, "horizon 0"),
+        (("policy", "steps"), "many", "its policy.steps is 'many'"),
+        (("augmentation", "moves"), [], "its augmentation.moves is []"),
+        (("data", "unknown_propensities"), "some", "its data.unknown_propensities is 'some'"),
+        (("rule", "rule", "temperature"), -1, "temperature"),
     ],
 )
-def test_an_entry_of_another_type_is_named(name: str, value: object) -> None:
-    with pytest.raises(InputError, match=r"run\.json") as caught:
-        require_run_record(PATH, {**RECORD, name: value})
-    assert str(caught.value).isprintable()
+def test_every_command_says_what_is_wrong(
+    folder: Path,
+    tmp_path: Path,
+    path: tuple[str, ...],
+    value: object,
+    says: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(folder / "run", run)
+    damaged(run / "run.json", record_of(folder), path, value)
+    log, out = str(folder / "log.parquet"), str(tmp_path / "out")
+    for command in (
+        ["verify", str(run)],
+        ["recommend", str(run), log, "--out", f"{out}.parquet"],
+        ["report", str(run), "--out", f"{out}.html"],
+    ):
+        assert main(command) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "run.json" in line
+        assert says in line
 
 
-@given(name=st.sampled_from(sorted(RECORD)), value=anything)
-def test_no_value_gives_another_error(name: str, value: object) -> None:
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(data=st.data(), value=anything)
+def test_no_value_gives_another_error(folder: Path, data: st.DataObject, value: object) -> None:
+    record = record_of(folder)
+    path = data.draw(st.sampled_from(list(paths(record))))
+    copy = folder / "copy"
+    copy.mkdir(exist_ok=True)
+    damaged(copy / "run.json", record, path, value)
     with suppress(InputError):
-        require_run_record(PATH, {**RECORD, name: value})
+        RunRecord.read(copy).describe()
+
+
+def test_the_policy_is_read_with_its_record(folder: Path) -> None:
+    assert TrainedPolicy.load(folder / "run").record == read_record(folder / "run")

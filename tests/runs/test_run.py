@@ -7,7 +7,6 @@ import resource
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,15 +15,14 @@ import torch
 from tests.support import killed_run
 from tests.support.episodes import random_episodes, some_states, write_store
 from ucfrec.commands.cli import main
-from ucfrec.episodes.record import RECORD
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay
 from ucfrec.errors import InputError, InputNote
-from ucfrec.files.checksums import seal
 from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.runs.config import resolve_config
+from ucfrec.runs.record import RunRecord
 from ucfrec.runs.run import train_run
-from ucfrec.runs.trained_policy import RUN, TrainedPolicy
+from ucfrec.runs.trained_policy import TrainedPolicy
 
 ROOT = Path(__file__).parents[2]
 
@@ -73,7 +71,7 @@ def test_a_run_killed_at_any_moment_ends_as_if_left_alone(
 
 def test_the_record_tells_what_was_done(store: Path, left_alone: Path) -> None:
     record = json.loads((left_alone / "run.json").read_text())
-    assert record["fingerprint"] == EpisodeStore.open(store).meta["fingerprint"]
+    assert record["fingerprint"] == EpisodeStore.open(store).record.fingerprint
     assert record["config"]["train"]["steps"] == 120
     assert {"command", "seed", "versions", "wall_time_s"} <= record.keys()
     report = record["augmentation"]
@@ -107,7 +105,7 @@ def test_without_copies_no_reward_model_is_trained(store: Path, tmp_path: Path) 
     settings = [*killed_run.SETTINGS, "augment.copies=0", "train.steps=10"]
     store_ = EpisodeStore.open(store)
     record = train_run(store_, tmp_path / "run", resolve_config("ucf", None, settings))
-    assert "augmentation" not in record
+    assert record.augmentation is None
     assert not (tmp_path / "run" / "crm").exists()
     assert TrainedPolicy.load(tmp_path / "run").name == "ucf-no-augmentation"
 
@@ -140,8 +138,10 @@ def test_other_items_with_every_addition(tmp_path: Path, learner: str) -> None:
         *("policy.return_to_go=horizon", "policy.horizon=2", "rule.choose=false"),
     ]
     record = train_run(store, tmp_path / "run", resolve_config(learner, None, settings))
-    assert record["augmentation"]["actions"]["copies"] > 10
-    assert np.isfinite(record["policy"]["best_validation"])
+    assert record.augmentation is not None
+    assert record.augmentation.actions is not None
+    assert record.augmentation.actions.copies > 10
+    assert np.isfinite(record.finished.best_validation)
 
 
 def test_a_store_without_validation_holds_some_training_episodes_out(tmp_path: Path) -> None:
@@ -240,13 +240,13 @@ def test_a_run_goes_on_with_the_same_item_states_and_not_with_fewer_steps(tmp_pa
 
     def sealed_store(seed: int) -> EpisodeStore:
         store = write_store(tmp_path / f"store-{seed}", episodes, some_states(seed=seed))
-        seal(store.path, RECORD, store.meta)
+        store.record.sealed(store.path)
         return EpisodeStore.open(store.path)
 
     first, other = sealed_store(0), sealed_store(1)
-    assert first.meta["fingerprint"] == other.meta["fingerprint"]
+    assert first.record.fingerprint == other.record.fingerprint
 
-    def train(store: EpisodeStore, steps: int) -> dict[str, Any]:
+    def train(store: EpisodeStore, steps: int) -> RunRecord:
         settings = ["policy.dim=8", "train.batch_size=8", "rule.choose=false"]
         config = resolve_config("bc", None, [*settings, f"train.steps={steps}"])
         return train_run(store, tmp_path / "run", config)
@@ -257,8 +257,7 @@ def test_a_run_goes_on_with_the_same_item_states_and_not_with_fewer_steps(tmp_pa
     with pytest.raises(InputError, match="steps is 4 in the run, 2 now"):
         train(first, 2)
     record = train(first, 8)
-    assert record["policy"]["steps"] == 8
-    del record["policy"]
-    seal(tmp_path / "run", RUN, record)
+    assert record.finished.steps == 8
+    record.with_entries(policy=None).sealed(tmp_path / "run")
     with pytest.warns(InputNote, match="has not ended"):
         TrainedPolicy.load(tmp_path / "run")

@@ -55,8 +55,8 @@ def test_what_is_dropped_might_never_have_been_logged(items: bool, tmp_path: Pat
     config = resolve_config("ucf", None, SETTINGS)
     record = train_screened(store, tmp_path / "dropped", config, "drop")
     plain = train_screened(never, tmp_path / "plain", config, None)
-    assert record["dropped_observations"] == list(FLAGGED)
-    assert record["sizes"] == plain["sizes"]
+    assert record.dropped_observations == FLAGGED
+    assert record.sizes == plain.sizes
     for name in ("overlay", "policy/last", "policy/best"):
         one, other = (
             load_tensors(tmp_path / run / f"{name}.safetensors")[0] for run in ("dropped", "plain")
@@ -80,12 +80,12 @@ def test_a_run_goes_on_as_it_was_started_and_is_refitted_so(tmp_path: Path) -> N
     config = resolve_config("bc", None, SETTINGS)
     record = train_screened(store, tmp_path / "run", config, "drop")
     again = train_screened(store, tmp_path / "run", config, "drop")
-    assert (again["screening"], again["policy"]) == (record["screening"], record["policy"])
+    assert (again.screening, again.policy) == (record.screening, record.policy)
     for other in ("copies", None):
         with pytest.raises(InputError, match="was started with --screen drop"):
             train_screened(store, tmp_path / "run", config, other)
     whole = refit(store, tmp_path / "run", tmp_path / "whole")
-    assert whole["sizes"] == record["sizes"]
+    assert whole.sizes == record.sizes
     assert TrainedPolicy.load(tmp_path / "whole").dropped == FLAGGED
 
 
@@ -93,8 +93,8 @@ def test_copies_intervene_on_the_flagged_columns_of_states_of_items(tmp_path: Pa
     store = planted_items(tmp_path / "store", 30, 8)
     config = resolve_config("dt", None, SETTINGS)
     record = train_screened(store, tmp_path / "run", config, "copies")
-    assert "dropped_observations" not in record
-    assert record["sizes"]["state"] == store.state_size
+    assert not record.dropped_observations
+    assert record.sizes["state"] == store.state_size
 
 
 def test_runs_that_share_stages_are_screened_once(
@@ -118,14 +118,15 @@ def test_runs_that_share_stages_are_screened_once(
             resolve_config("bc", None, SETTINGS, seed),
             how,
             shared=shared,
-        )["screening"]
+        ).screening
         for store in stores
         for how in ("copies", "drop")
         for seed in (0, 1)
     ]
     assert screened_stores == [(store.path, 0) for store in stores]
-    assert [record.pop("how") for record in records[:3]] == ["copies", "copies", "drop"]
-    assert records[0] == records[1] == records[2]
+    found = [screening for screening in records if screening is not None]
+    assert [each.how for each in found[:3]] == ["copies", "copies", "drop"]
+    assert found[0].dimensions == found[1].dimensions == found[2].dimensions
 
 
 def test_screening_that_leaves_no_state_is_refused(

@@ -31,8 +31,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = resolve_config("dt", None, SMALL)
     train_run(EpisodeStore.open(folder / "store"), folder / "run", config)
     record = read_json(folder / "run" / "run.json")
-    del record["files"]
-    write_json(folder / "run" / "run.json", record)
+    write_json(folder / "run" / "run.json", record | {"files": {}})
     return folder / "run"
 
 

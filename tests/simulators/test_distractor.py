@@ -68,7 +68,9 @@ def test_the_distractor_goes_with_the_reward_and_nothing_else_changes(
     assert observed.shape[1] == planted.observation_size == store.observation_size + 1
     agreed = float((observed[:, 0] == high).mean())
     assert agreed == 1 if flip == 0 else agreed == pytest.approx(agreement, abs=0.03)
-    assert planted.meta["source"]["distractor"]["rate"] == pytest.approx(observed[:, 0].mean())
+    assert planted.record.source.others["distractor"]["rate"] == pytest.approx(
+        observed[:, 0].mean()
+    )
     if store.observation_size:
         before = store.step_values(schema.OBSERVATION, *store.all_steps())
         np.testing.assert_array_equal(observed[:, 1:], before)
@@ -76,14 +78,9 @@ def test_the_distractor_goes_with_the_reward_and_nothing_else_changes(
     for file in store.path.rglob("*"):
         if file.is_file() and file.name not in own:
             assert file.read_bytes() == (planted.path / file.relative_to(store.path)).read_bytes()
-    assert planted.meta["fingerprint"] != store.meta["fingerprint"]
-    assert {**planted.meta, "columns": 0, "fingerprint": 0, "source": 0, "files": 0} == {
-        **store.meta,
-        "columns": 0,
-        "fingerprint": 0,
-        "source": 0,
-        "files": 0,
-    }
+    assert planted.record.fingerprint != store.record.fingerprint
+    own_entries = {"columns": {}, "fingerprint": "", "source": None, "files": {}}
+    assert planted.record.with_entries(**own_entries) == store.record.with_entries(**own_entries)
 
 
 def test_clicks_that_are_the_rule_are_high_and_equal_rewards_are_refused(tmp_path: Path) -> None:
@@ -192,7 +189,7 @@ def test_screening_finds_the_distractor_among_items_and_drops_it_to_the_last_bit
     planted = plant_distractor(store, tmp_path / "planted")
     config = resolve_config("ucf", overrides=[*TINY, "crm.epochs=1", "rule.choose=false"])
     record = train_screened(planted, tmp_path / "dropped", config, "drop")
-    assert record["dropped_observations"] == [0]
+    assert record.dropped_observations == (0,)
     train_run(store, tmp_path / "plain", config)
     for file in ("overlay", "policy/best", "policy/last"):
         dropped, plain = (

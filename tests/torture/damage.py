@@ -86,19 +86,16 @@ def read_store(path: Path) -> list[Any]:
     """All that ucfrec reads of a store."""
     from ucfrec import schema
     from ucfrec.episodes.store import EpisodeStore
-    from ucfrec.files.checksums import sealed_record
     from ucfrec.files.parquet import read_ids
 
     store = EpisodeStore.open(path)
-    columns = [store.step_values(name, *store.all_steps()) for name in store.meta["columns"]]
+    columns = [store.step_values(name, *store.all_steps()) for name in store.record.columns]
     episodes = [store.episode_values(name) for name in schema.EPISODE_DTYPES]
     states = store.item_states
-    _, sealed = sealed_record(path, "meta.json", "")
-    if sealed is not None:
-        sealed.require_small()
+    store.record.checksums(path).require_small()
     ids = [read_ids(path / f"{name}.parquet", f"{name[:-1]}_id") for name in ("users", "items")]
     used = ("n_steps", "n_episodes", "reward", "fingerprint", "source", "splits")
-    meta = {name: store.meta.get(name) for name in used}
+    meta = {name: getattr(store.record, name) for name in used}
     return [*columns, *episodes, states.embeddings.numpy(), states.reward_high, *ids, repr(meta)]
 
 
@@ -113,7 +110,7 @@ def read_run(path: Path) -> list[Any]:
         found += [tensor.numpy() for tensor in trained.policy.state_dict().values()]
         found += [trained.item_ids, trained.user_ids]
     used = ("config", "sizes", "return_quantiles", "reward", "fingerprint", "train_steps")
-    found.append(repr({name: trained.record.get(name) for name in used}))
+    found.append(repr({name: getattr(trained.record, name) for name in used}))
     return [*found, repr(read_metrics(path / "policy"))]
 
 

@@ -282,7 +282,7 @@ def _targets(inputs: Inputs) -> dict[str, tuple[Path, str, Reader]]:
             from ucfrec.runs.trained_policy import TrainedPolicy
 
             trained = TrainedPolicy.load(folder(path, levels))
-            observations = np.zeros((2, trained.record["observation_size"]), dtype=np.float32)
+            observations = np.zeros((2, trained.record.observation_size), dtype=np.float32)
             return trained.actor(2).act(observations, np.array([True, False]))
 
         return read

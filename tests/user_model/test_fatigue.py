@@ -8,8 +8,8 @@ import torch
 
 from tests.support.episodes import N_ITEMS, Logged, some_states, write_store
 from ucfrec.arrays import BoolArray, IntArray
-from ucfrec.episodes.main_tags import MainTags
 from ucfrec.user_model.fatigue import Fatigue, LoggedRuns, fit_fatigue
+from ucfrec.user_model.main_tags import MainTags
 
 LAGS = 10
 

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from ucfrec.arrays import Float64Array, IntArray
-from ucfrec.choosing.by_simulation import calibrate
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
@@ -21,6 +20,7 @@ from ucfrec.user_model.reward_fit import (
     fit_item_reward_model,
     refit_item_reward_model,
 )
+from ucfrec.user_model.reward_report import calibrate
 from ucfrec.user_model.reward_rows import RewardRows
 
 ITEMS, USERS, LENGTH, DIM, TAGS = 40, 150, 20, 4, 6

@@ -1,5 +1,6 @@
 """Training users stand for new ones: their tastes are found, also in logs of who knew them."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -76,18 +77,18 @@ def store_of(
 
 def chances(users: TrainingUsers, rows: RewardRows) -> Float64Array:
     """(M,) the calibrated chances that users like what is shown in the rows."""
-    slope, intercept = users.calibration
+    slope, intercept = users.report.calibration
     scores = users.model.score(rows.states, rows.shown, rows.users, rows.items)
     return torch.sigmoid(slope * scores + intercept).double().numpy()
 
 
 def test_tastes_are_found(tmp_path: Path) -> None:
     train, kind = log_of_tastes()
-    users = fit_training_users(train, tmp_path / "users", seed=0)
+    users = fit_training_users(train, tmp_path, seed=0)
     rows = RewardRows.at(train, *train.all_steps(), LAGS)
     liked = rows.items.numpy() % KINDS == kind[rows.users.numpy()]
     found = chances(users, rows)
-    assert "affinity" in {tried.effect for tried in users.effects if tried.kept}
+    assert "affinity" in {tried.effect for tried in users.report.effects if tried.kept}
     assert found[liked].mean() == pytest.approx(LIKED, abs=0.15)
     assert found[~liked].mean() == pytest.approx(OTHER, abs=0.05)
 
@@ -98,9 +99,14 @@ def test_what_the_logs_policy_knew_makes_no_item_look_better(tmp_path: Path) -> 
     first = rows.items.numpy() < HALF
     users = fit_training_users(log_of_moods(0.7), tmp_path / "weighted", seed=0)
     crude = fit_training_users(log_of_moods(0.7, told=False), tmp_path / "crude", seed=0)
-    assert users.weighted
-    assert users.effective_steps < users.steps == USERS * LENGTH == crude.effective_steps
-    assert not crude.weighted
+    assert users.report.weighted
+    assert (
+        users.report.effective_steps
+        < users.report.steps
+        == USERS * LENGTH
+        == crude.report.effective_steps
+    )
+    assert not crude.report.weighted
     mean = (LIKED + OTHER) / 2
     found, without = chances(users, rows), chances(crude, rows)
     assert without[first].mean() - without[~first].mean() > 0.3
@@ -113,7 +119,7 @@ def test_of_states_only_observations_and_features_of_users_count(tmp_path: Path)
     items, seen = rng.integers(ITEMS, size=(USERS, LENGTH)), rng.random((USERS, LENGTH)) < 0.5
     rewards = rng.random(seen.shape) < np.where(seen, LIKED, OTHER)
     train = store_of(items, rewards, None, seen)
-    users = fit_training_users(train, tmp_path / "users", seed=0)
+    users = fit_training_users(train, tmp_path, seed=0)
     found = chances(users, RewardRows.at(train, *train.all_steps(), LAGS))
     assert found[seen.ravel()].mean() == pytest.approx(LIKED, abs=0.03)
     assert found[~seen.ravel()].mean() == pytest.approx(OTHER, abs=0.03)
@@ -131,7 +137,7 @@ def test_a_fit_repeats_and_is_read_again(tmp_path: Path) -> None:
     first = fit_training_users(train, tmp_path / "a", seed=0)
     again = fit_training_users(train, tmp_path / "b", seed=0)
     read = fit_training_users(train, tmp_path / "a", seed=0)
-    assert first.report() == again.report() == read.report()
+    assert first.report == again.report == read.report
     for name, value in first.model.state_dict().items():
         assert torch.equal(value, again.model.state_dict()[name]), name
         assert torch.equal(value, read.model.state_dict()[name]), name
@@ -139,11 +145,13 @@ def test_a_fit_repeats_and_is_read_again(tmp_path: Path) -> None:
 
 def test_a_file_with_another_report_is_named(tmp_path: Path) -> None:
     train, _ = log_of_tastes()
-    users = fit_training_users(train, tmp_path / "a", seed=0)
-    for report in ({}, {**users.report(), "calibration": 1.0}, {**users.report(), "more": 1}):
-        save_tensors(tmp_path / "b", users.model.state_dict(), report)
-        with pytest.raises(InputError, match="b is damaged"):
-            fit_training_users(train, tmp_path / "b", seed=0)
+    users = fit_training_users(train, tmp_path, seed=0)
+    (file,) = tmp_path.iterdir()
+    report = dataclasses.asdict(users.report)
+    for other in ({}, {**report, "calibration": 1.0}, {**report, "more": 1}):
+        save_tensors(file, users.model.state_dict(), other)
+        with pytest.raises(InputError, match="damaged"):
+            fit_training_users(train, tmp_path, seed=0)
 
 
 @given(

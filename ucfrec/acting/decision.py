@@ -11,12 +11,12 @@ from torch import Tensor
 from ucfrec.acting.best_items import best_items
 from ucfrec.episodes.exposure import Likeness, Shown
 from ucfrec.episodes.item_table import WINDOW
-from ucfrec.episodes.main_tags import MainTags
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.provenance import config_hash
+from ucfrec.user_model.main_tags import MainTags
 
 if TYPE_CHECKING:
     from ucfrec.user_model.reward import ItemRewardModel

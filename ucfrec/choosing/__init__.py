@@ -1,1 +1,1 @@
-"""The choice of the decision rule: candidates, their evaluation, the rule that is kept."""
+"""Which decision rule is best for what users would do: `choose_rule` returns a `RuleChoice`."""

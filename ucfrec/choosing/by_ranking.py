@@ -1,13 +1,13 @@
 """Choose the reward weight of a run by how it ranks the validation rows of its log.
 
-Where the log has no true sessions there is nothing to play, but every row tells what a user liked.
+Where the log has no true sessions there is nothing to simulate, but every row tells what a user
+liked.
 A candidate is worth the mean rate, in the validation period, of the ten items that it would show,
 and overlaps with the log enough if it finds liked items no worse than the ten most liked ones do.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from ucfrec import schema
 from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.acting.logged_decisions import LoggedDecisions
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
+from ucfrec.choosing.choice import RankedRule, RuleChoice
 from ucfrec.choosing.config import RuleConfig
 from ucfrec.episodes.item_counts import TrainingCounts, liked_steps
 from ucfrec.episodes.store import EpisodeStore
@@ -31,116 +32,76 @@ _HALVINGS = 3
 _AT_ONCE = 256
 
 
-@dataclass(frozen=True)
-class RankedRule:
-    """A rule and how it ranks validation rows."""
-
-    rule: DecisionRule
-    item_rate: float
-    """Mean share of liked impressions, in the validation period, of the items shown."""
-    hits: float
-    """Share of liked validation rows whose item is among those shown."""
-    gain: float
-    """Difference of `hits` from that of the most liked training items."""
-    gain_error: float
-    """Its standard error over rows."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """As a JSON object; the rule's fields are those of `DecisionRule.as_dict`."""
-        return {**asdict(self), "rule": self.rule.as_dict()}
-
-
-@dataclass(frozen=True)
-class RankedChoice:
-    """The rule that was chosen, and all candidates."""
-
-    rule: DecisionRule
-    candidates: Sequence[RankedRule]
-    supported: bool
-    """Whether the rule finds liked items no worse than the ten most liked; if not, none does."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """As a JSON object, with what chose the rule in words."""
-        return {
-            "rule": self.rule.as_dict(),
-            "chosen_by": "mean rate, on validation rows, of the ten items shown, among rules that "
-            "find liked items no worse than the ten most liked ones do; no propensities are used",
-            "warning": ""
-            if self.supported
-            else "; WARNING: no candidate does, this one has no reward weight",
-            "candidates": [candidate.as_dict() for candidate in self.candidates],
-        }
-
-
 def choose_by_ranking(
     decider: Decider, train: EpisodeStore, validation: EpisodeStore, config: RuleConfig, seed: int
-) -> RankedChoice:
+) -> RuleChoice:
     """Choose the reward weight of the rule of `decider`; its other parts stay.
 
-    Args:
-        decider: the policy under its default rule, with a reward model.
-        train: training episodes.
-        validation: validation episodes.
-        config: `reward_weights` are the first candidates.
-        seed: of the validation rows that are drawn from more than 4,000.
-
-    Returns:
-        The reward weight with the highest rate among those with enough overlap; without any, no
-        reward weight. If the next larger of the candidates overlaps too little, reward weights
-        between the two are tried.
+    Of those with enough overlap, the one with the highest rate is chosen; without any, none. If
+    the next larger of the candidates overlaps too little, reward weights between the two are tried.
+    The arguments are those of `ucfrec.choosing.choose.choose_rule`; `config.reward_weights` are the
+    first candidates, and `seed` is of the validation rows that are drawn from more than 4,000.
     """
-    rows = np.arange(validation.n_steps)
-    if len(rows) > _MOST_STEPS:
-        drawn = np.random.default_rng(seed).choice(len(rows), _MOST_STEPS, replace=False)
-        rows = np.sort(drawn)
-    episodes, steps = validation.locate(rows)
-    liked = liked_steps(validation, episodes, steps)
-    items = validation.step_values(schema.ITEM, episodes, steps).astype(np.int64)
-    rates = _rates(validation)
-    most_liked = TrainingCounts.of(train).liked.topk(min(SHOWN, len(rates))).indices.numpy()
-    floor = np.isin(items, most_liked)
-    given = _Rows(validation, episodes, steps, items, liked, floor, rates)
-    reward_weights = sorted({0.0, *config.reward_weights})
+    rows = _Rows.of(train, validation, seed)
     candidates: list[RankedRule] = []
 
-    def rank(reward_weights: Sequence[float]) -> None:
-        for reward_weight, top in zip(
-            reward_weights, _tops(decider, reward_weights, given), strict=True
-        ):
-            candidates.append(
-                _ranked(replace(decider.rule, reward_weight=reward_weight), top, given)
-            )
+    def rank(weights: Sequence[float]) -> RankedRule:
+        for weight, top in zip(weights, _tops(decider, weights, rows), strict=True):
+            rule = replace(decider.rule, reward_weight=weight)
+            candidates.append(_ranked(rule, top, rows))
+        allowed = [each for each in candidates if each.gain >= 0]
+        return max(allowed, key=lambda each: each.item_rate) if allowed else candidates[0]
 
-    rank(reward_weights)
+    best = rank(sorted({0.0, *config.reward_weights}))
     for _ in range(_HALVINGS):
-        best = _best(candidates)
-        larger = [each for each in candidates if each.rule.reward_weight > best.rule.reward_weight]
+        weight = best.rule.reward_weight
+        larger = [each for each in candidates if each.rule.reward_weight > weight]
         nearest = min(larger, key=lambda each: each.rule.reward_weight, default=best)
         if nearest.gain >= 0:
             break
-        rank([(best.rule.reward_weight + nearest.rule.reward_weight) / 2])
-    best = _best(candidates)
-    return RankedChoice(best.rule, candidates, best.gain >= 0)
-
-
-def _best(candidates: Sequence[RankedRule]) -> RankedRule:
-    """The candidate of the highest rate among those that overlap enough, or else the first."""
-    allowed = [each for each in candidates if each.gain >= 0]
-    return max(allowed, key=lambda each: each.item_rate) if allowed else candidates[0]
+        best = rank([(weight + nearest.rule.reward_weight) / 2])
+    return RuleChoice(
+        rule=best.rule,
+        chosen_by="mean rate, on validation rows, of the ten items shown, among rules that find "
+        "liked items no worse than the ten most liked ones do; no propensities are used",
+        candidates=candidates,
+        warning=""
+        if best.gain >= 0
+        else "; WARNING: no candidate does, this one has no reward weight",
+    )
 
 
 @dataclass(frozen=True)
 class _Rows:
-    """M validation rows: where they are, what was shown and liked, what the floor hits."""
+    """M validation rows: where they are, what was shown and liked, what the baseline hits."""
 
     store: EpisodeStore
     episodes: IntArray
     steps: IntArray
     items: IntArray
     liked: BoolArray
-    floor: BoolArray
+    baseline: BoolArray
+    """Whether the item is one of the most liked training items."""
     rates: Float64Array
-    """(n_items,) of all items in the period."""
+    """(n_items,) share of liked impressions of every item in the period; NaN if never shown."""
+
+    @classmethod
+    def of(cls, train: EpisodeStore, validation: EpisodeStore, seed: int) -> "_Rows":
+        numbers = np.arange(validation.n_steps)
+        if len(numbers) > _MOST_STEPS:
+            drawn = np.random.default_rng(seed).choice(len(numbers), _MOST_STEPS, replace=False)
+            numbers = np.sort(drawn)
+        episodes, steps = validation.locate(numbers)
+        items = validation.step_values(schema.ITEM, episodes, steps).astype(np.int64)
+        counts = TrainingCounts.of(validation)
+        shown, liked = counts.shown.double().numpy(), counts.liked.double().numpy()
+        with np.errstate(invalid="ignore"):
+            rates = liked / np.where(shown > 0, shown, np.nan)
+        most_liked = TrainingCounts.of(train).liked.topk(min(SHOWN, len(rates))).indices.numpy()
+        return cls(
+            *(validation, episodes, steps, items, liked_steps(validation, episodes, steps)),
+            *(np.isin(items, most_liked), rates),
+        )
 
 
 @torch.no_grad()
@@ -149,39 +110,27 @@ def _tops(decider: Decider, reward_weights: Sequence[float], rows: _Rows) -> lis
 
     Policy and reward model are computed once for all reward weights.
     """
-    plain, tops = (
-        replace(decider, rule=replace(decider.rule, reward_weight=0.0)),
-        list[list[Tensor]](),
-    )
-    starts = range(0, len(rows.steps), _AT_ONCE)
+    plain = replace(decider, rule=replace(decider.rule, reward_weight=0.0))
+    tops = list[list[Tensor]]()
     with progress(len(rows.steps), "choose the rule", "rows") as bar:
-        for first in starts:
+        for first in range(0, len(rows.steps), _AT_ONCE):
             part = slice(first, first + _AT_ONCE)
             known = LoggedDecisions.at(plain, rows.store, rows.episodes[part], rows.steps[part])
-            logits = plain.act(known.windows, known.collected)
-            liked = (
-                plain.rewards(known.windows, known.users, known.shown)
-                if any(reward_weights)
-                else 0.0
+            windows, of_users = known.windows, (known.users, known.shown)
+            logits = plain.act(windows, known.collected)
+            rewards = plain.rewards(windows, *of_users) if any(reward_weights) else 0.0
+            weighted = (logits + weight * rewards for weight in reward_weights)
+            scores = (
+                plain.scores_from(each, windows, known.forbidden, *of_users) for each in weighted
             )
-            of_reward_weights = []
-            for reward_weight in reward_weights:
-                scores = plain.scores_from(
-                    logits + reward_weight * liked,
-                    known.windows,
-                    known.forbidden,
-                    known.users,
-                    known.shown,
-                )
-                of_reward_weights.append(scores.topk(min(SHOWN, scores.shape[1])).indices)
-            tops.append(of_reward_weights)
+            tops.append([each.topk(min(SHOWN, each.shape[1])).indices for each in scores])
             bar.update(len(logits))
     return [torch.cat(parts).numpy() for parts in zip(*tops, strict=True)]
 
 
 def _ranked(rule: DecisionRule, top: IntArray, rows: _Rows) -> RankedRule:
     hit = (top == rows.items[:, None]).any(1)[rows.liked].astype(np.float64)
-    ahead = hit - rows.floor[rows.liked]
+    ahead = hit - rows.baseline[rows.liked]
     shown = rows.rates[top]
     some = len(hit) > 0
     return RankedRule(
@@ -191,11 +140,3 @@ def _ranked(rule: DecisionRule, top: IntArray, rows: _Rows) -> RankedRule:
         gain=float(ahead.mean()) if some else 0.0,
         gain_error=float(ahead.std() / len(ahead) ** 0.5) if some else 0.0,
     )
-
-
-def _rates(validation: EpisodeStore) -> Float64Array:
-    """Share of liked impressions of each item in the period, (n_items,); NaN if never shown."""
-    counts = TrainingCounts.of(validation)
-    shown = counts.shown.double().numpy()
-    with np.errstate(invalid="ignore"):
-        return np.asarray(counts.liked.double().numpy() / np.where(shown > 0, shown, np.nan))

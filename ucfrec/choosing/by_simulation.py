@@ -1,189 +1,92 @@
-"""Choose the decision rule of a run on the validation sessions of its log, never in an environment.
+"""Choose the decision rule in sessions simulated in the user model.
 
-The candidates are played in a model of the users: rewards from the run's reward model, calibrated
-on validation rows, or for new users from the tastes of training users, which the policy does not
-know (`ucfrec.user_model.training_users`); ends of sessions from a logistic regression on the
-training rows. What a model says of a policy holds only where the log supports it, so a candidate
-must keep to items that the training log shows often enough, and to more than a handful of them.
+Rewards come from the run's reward model, calibrated on validation rows, or for new users from the
+tastes of training users, which the policy does not know (`ucfrec.user_model.training_users`). What
+a model says of a policy holds only where the log supports it, so a candidate must keep to items
+that the training log shows often enough, and to more than a handful of them.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from itertools import product
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from ucfrec.acting.decision import Decider, DecisionRule
 from ucfrec.arrays import Float64Array, IntArray
+from ucfrec.choosing.choice import RuleChoice, SimulatedRule
 from ucfrec.choosing.config import RuleConfig
-from ucfrec.choosing.many_rules import ManyRules
-from ucfrec.episodes.exposure import Likeness
-from ucfrec.episodes.main_tags import MainTags
+from ucfrec.choosing.many_rules import roll_out
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.processes import require_blas_memory
-from ucfrec.progress import progress
-from ucfrec.schema import USER_IDS
-from ucfrec.user_model.fatigue import Fatigue, LoggedRuns, fit_fatigue
-from ucfrec.user_model.reward import ItemRewardModel
-from ucfrec.user_model.reward_report import fit_line, scores_of
-from ucfrec.user_model.reward_rows import RewardRows
-from ucfrec.user_model.simulator import LoggedEnds, SessionEnd, UserSimulator
-from ucfrec.user_model.training_users import TrainingUsers, sessions_of
+from ucfrec.user_model.model import UserModel
+from ucfrec.user_model.simulator import UserSimulator
+from ucfrec.user_model.training_users import sessions_of
 
-_MOST_STEPS = 100_000
-"""Logged steps that the models of the users are fitted to at most."""
-_FINALISTS, _TIMES = 8, 4
-"""Rules that are played again where users differ in their tastes, and in how many times the
-sessions: few sessions there say as much of the users as of the rules."""
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A rule and what it did in the model of the users."""
-
-    rule: DecisionRule
-    value: float
-    """Mean return of a session, in reward units."""
-    error: float
-    """Its standard error over the sessions."""
-    length: float
-    """Mean number of steps of a session."""
-    support: float
-    """Share of decisions on items that the log supports."""
-    items: float
-    """Effective number of items shown."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """As a JSON object; the rule's fields are those of `DecisionRule.as_dict`."""
-        return {**asdict(self), "rule": self.rule.as_dict()}
-
-
-@dataclass(frozen=True)
-class Choice:
-    """The rule that was chosen, and all candidates."""
-
-    rule: DecisionRule
-    candidates: Sequence[Candidate]
-    calibration: tuple[float, float]
-    """Slope and intercept of the scores that rewards were drawn from, on held-out rows."""
-    users: TrainingUsers | None
-    """Whose tastes rewards were drawn from; None for the run's reward model."""
-    fatigue: Fatigue | None
-    """What tires the users in their model; None for nothing."""
-    least_items: float
-    """Smallest effective number of items that was asked for."""
-    supported: bool
-    """Whether the log supports what the rule does; if not, no candidate's was."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """As a JSON object, with what chose the rule in words."""
-        return {
-            "rule": self.rule.as_dict(),
-            "chosen_by": self._chosen_by(),
-            "warning": ""
-            if self.supported
-            else "; WARNING: the log supports no candidate, this one "
-            "shows the most different items",
-            "calibration": list(self.calibration),
-            "users": None if self.users is None else self.users.report(),
-            "fatigue": None if self.fatigue is None else asdict(self.fatigue),
-            "least_items": self.least_items,
-            "candidates": [candidate.as_dict() for candidate in self.candidates],
-        }
-
-    def _chosen_by(self) -> str:
-        if self.users is None:
-            return (
-                "mean return of validation users' sessions in the run's reward model, calibrated "
-                "on validation rows; no propensities are used"
-            )
-        weighted = "weighted by their propensities" if self.users.weighted else "without weights"
-        return (
-            "mean return of sessions of new users, who have the tastes of training users; these "
-            f"are fitted to {self.users.steps:,} training rows {weighted}"
-        )
+_FINALISTS: Final = 8
+"""Rules that are simulated again where users differ in their tastes, …"""
+_TIMES: Final = 4
+"""… in so many times the sessions: few sessions there say as much of the users as of the rules."""
 
 
 class RuleSearch:
-    """Plays decision rules of one policy in a model of the users."""
+    """Simulates decision rules of one policy in a user model."""
 
     def __init__(
         self,
         decider: Decider,
+        users: UserModel,
         train: EpisodeStore,
         validation: EpisodeStore,
         config: RuleConfig,
         seed: int,
-        users: TrainingUsers | None = None,
     ) -> None:
         """
         Args:
-            decider: the policy under its default rule, with a reward model.
-            train: training episodes, to which the model of the ends is fitted.
-            validation: sessions to begin, and to calibrate the reward model on.
+            decider: the policy under its default rule, with the reward model of `users`.
+            users: the user model; where it has training users, their sessions are begun, otherwise
+                validation sessions.
+            train: training episodes.
+            validation: validation episodes.
             config: candidates and conditions.
             seed: of the sessions and the draws.
-            users: whose training sessions are begun instead, and whose tastes give the rewards;
-                None for the reward model's word.
         """
-        assert decider.reward_model is not None
-        self._decider, self._config, self._seed = decider, config, seed
-        model = decider.reward_model
-        require_blas_memory()
-        states = validation.item_states
-        self._likeness = likeness = Likeness.of(states)
-        self._tags = MainTags.of(states)
-        logged = (
-            LoggedRuns.of(v, self._tags, model.lags, _MOST_STEPS) for v in (train, validation)
-        )
-        self.fatigue = fit_fatigue(*logged) if model.binary else None
-        end = SessionEnd(likeness, LoggedEnds.of(train, model.lags, _MOST_STEPS, seed))
-        self._longest, self.end = int(train.lengths.max()), end
-        if users is None:
-            rows = RewardRows.of(validation, model.reach, _MOST_STEPS, seed)
-            self._store, self._model = validation, model
-            self.calibration = calibrate(model, rows)
-        else:
-            self._store, self._model = sessions_of(train, seed), users.model
-            self.calibration = users.calibration
+        self.users, self._config, self._seed = users, config, seed
+        self._decider = replace(decider, likeness=users.reward.likeness, main_tags=users.main_tags)
+        self._store = validation if users.training_users is None else sessions_of(train, seed)
+        self._longest = int(train.lengths.max())
         self._supported = train.item_counts() >= config.least_impressions
-        self.least_items = min(config.least_items, self._supported.sum() / 4)
+        self.least_items = float(min(config.least_items, self._supported.sum() / 4))
 
-    def play(self, rules: Sequence[DecisionRule], times: int = 1) -> list[Candidate]:
-        """Play sessions by each of the rules, side by side, all with the same draws.
+    def simulate(self, rules: Sequence[DecisionRule], times: int = 1) -> list[SimulatedRule]:
+        """Roll out each of the rules, side by side, all with the same draws.
 
         Args:
-            rules: to play.
+            rules: to roll out.
             times: how many times the sessions of the configuration.
         """
-        n, count = times * self._config.sessions, len(rules)
-        if not count:
+        n = times * self._config.sessions
+        if not rules:
             return []
-        environment = UserSimulator(
-            *(self._store, self._model, self.calibration, self.end, n, self._longest, count),
-            self.fatigue,
+        simulator = UserSimulator(
+            self.users, self._store, n, self._longest, self._seed, times=len(rules)
         )
-        filtering = replace(self._decider, likeness=self._likeness, main_tags=self._tags)
-        deciders = [replace(filtering, rule=rule) for rule in rules]
-        users = np.arange(len(self._store.item_states.user_features))
-        states = self._store.item_states
-        actor = ManyRules(deciders, n, self._store.observation_size, states, users, seed=self._seed)
-        returns, lengths, shown = _played(environment, actor, self._seed)
-        numbers = np.arange(count * n).reshape(count, n)
+        deciders = [replace(self._decider, rule=rule) for rule in rules]
+        states, size = self._store.item_states, self._store.observation_size
+        returns, lengths, shown = roll_out(simulator, deciders, n, states, size, self._seed)
+        numbers = np.arange(len(returns)).reshape(len(rules), n)
         return [
-            self._candidate(rule, returns[of_rule], lengths[of_rule], shown[shown[:, 0] // n == i])
-            for i, (rule, of_rule) in enumerate(zip(rules, numbers, strict=True))
+            self._simulated(rule, returns[own], lengths[own], shown[shown[:, 0] // n == i, 1])
+            for i, (rule, own) in enumerate(zip(rules, numbers, strict=True))
         ]
 
-    def _candidate(
-        self, rule: DecisionRule, returns: Float64Array, lengths: IntArray, shown: IntArray
-    ) -> Candidate:
-        """What `rule` did in n sessions, (n,) each; `shown` (M, 2) are sessions and items."""
-        n, items = len(returns), shown[:, 1]
-        shares = np.bincount(items) / len(items)
+    def _simulated(
+        self, rule: DecisionRule, returns: Float64Array, lengths: IntArray, items: IntArray
+    ) -> SimulatedRule:
+        """What `rule` did in n sessions, (n,) each, by showing `items` (M,)."""
+        n, shares = len(returns), np.bincount(items) / len(items)
         shares = shares[shares > 0]
-        return Candidate(
+        return SimulatedRule(
             rule=rule,
             value=float(returns.mean()),
             error=float(returns.std(ddof=1) / n**0.5) if n > 1 else 0.0,
@@ -192,156 +95,105 @@ class RuleSearch:
             items=float(np.exp(-(shares * np.log(shares)).sum())),
         )
 
-    def allowed(self, candidate: Candidate) -> bool:
+    def allowed(self, candidate: SimulatedRule) -> bool:
         """Whether the log supports what the candidate did."""
         enough = candidate.items >= self.least_items
         return enough and candidate.support >= self._config.least_support
 
-    def play_finalists(self, played: Sequence[Candidate], best: Candidate) -> list[Candidate]:
-        """The best and the most promising of the allowed candidates, played in more sessions."""
-        allowed = [each for each in played if self.allowed(each)]
-        promising = sorted(allowed, key=lambda each: each.value, reverse=True)
-        rules = dict.fromkeys(each.rule for each in (best, *promising))
-        return self.play([*rules][:_FINALISTS], _TIMES)
+    def finalists(
+        self, candidates: Sequence[SimulatedRule], best: SimulatedRule
+    ) -> list[SimulatedRule]:
+        """The best and those of the highest value among the allowed, in more sessions."""
+        allowed = [each for each in candidates if self.allowed(each)]
+        highest = sorted(allowed, key=lambda each: each.value, reverse=True)
+        rules = dict.fromkeys(each.rule for each in (best, *highest))
+        return self.simulate([*rules][:_FINALISTS], _TIMES)
 
-    def best(self, candidates: Sequence[Candidate]) -> Candidate:
-        """The first of the allowed candidates within an error, or the tolerance, of the best.
+    def best(self, candidates: Sequence[SimulatedRule]) -> SimulatedRule:
+        """The simplest of the allowed candidates within an error, or the tolerance, of the best.
 
         If none is allowed, the one with the most effective items.
         """
-        allowed = [candidate for candidate in candidates if self.allowed(candidate)]
+        allowed = [each for each in candidates if self.allowed(each)]
         if not allowed:
-            return max(candidates, key=lambda candidate: candidate.items)
-        top = max(allowed, key=lambda candidate: candidate.value)
+            return max(candidates, key=lambda each: each.items)
+        top = max(allowed, key=lambda each: each.value)
         enough = top.value - max(top.error, self._config.tolerance * abs(top.value))
-        return next(candidate for candidate in allowed if candidate.value >= enough)
+        return min((each for each in allowed if each.value >= enough), key=_simplicity)
 
 
-def _played(
-    environment: UserSimulator, actor: ManyRules, seed: int
-) -> tuple[Float64Array, IntArray, IntArray]:
-    """Play one session in each of the N environments.
-
-    Returns:
-        Returns (N,), lengths (N,), and the environment and item of every step, (M, 2).
-    """
-    observations, info = environment.reset(seed)
-    live = np.arange(environment.num_envs)
-    returns, lengths = np.zeros(len(live)), np.zeros(len(live), dtype=np.int64)
-    shown = list[IntArray]()
-    with progress(len(live), "choose the rule", "sessions") as bar:
-        while len(live):
-            actor.inform(info)
-            items, _ = actor.act(observations, np.ones(len(live), dtype=bool))
-            observations, rewards, terminated, truncated, info = environment.step(items)
-            actor.observe(items, rewards)
-            returns[live] += rewards
-            lengths[live] += 1
-            shown.append(np.stack([live, items], axis=1))
-            going = np.flatnonzero(~(terminated | truncated))
-            bar.update(len(live) - len(going))
-            if len(going) < len(live):
-                live = live[going]
-                environment.keep(going)
-                actor.keep(going)
-                observations, info = observations[going], {USER_IDS: info[USER_IDS][going]}
-    return returns, lengths, np.concatenate(shown)
-
-
-def choose_rule(
+def choose_by_simulation(
     decider: Decider,
+    users: UserModel,
     targets: Mapping[float, float],
     train: EpisodeStore,
     validation: EpisodeStore,
     config: RuleConfig,
     seed: int,
-    users: TrainingUsers | None = None,
-) -> Choice:
-    """Choose target, floor and temperature, then the reward weight.
+) -> RuleChoice:
+    """Choose target, minimum target and temperature, then the reward weight.
 
     Where items have tags, tag window and temperature follow, and the reward weight with the
     window; where the log shows fatigue, the tag run, and temperature and reward weight with it.
-    With `users`, the most promising rules are then played in more sessions. Of rules that the
-    model cannot tell apart, the one at the highest temperature is taken, which stays nearest to
-    the log.
-
-    Args:
-        decider: the policy under its default rule, with a reward model.
-        targets: return (reward units) of each quantile in `config.quantiles`.
-        train: training episodes.
-        validation: validation episodes.
-        config: candidates and conditions.
-        seed: of the sessions and the draws.
-        users: see `RuleSearch`.
+    For new users, the rules of the highest value are then simulated in more sessions. Of rules that
+    the model cannot tell apart, the one at the highest temperature is taken, which stays nearest to
+    the log. The arguments are those of `choose_rule`.
     """
-    search = RuleSearch(decider, train, validation, config, seed, users)
-    learned = decider.policy.values is not None and decider.policy.config.max_return
-    played = search.play([*_unweighted(config, targets, learned)])
-    first = search.best(played)
-    played.extend(search.play([*_weighted(config, first.rule)]))
-    second = search.best(_simplest_first(played))
+    search = RuleSearch(decider, users, train, validation, config, seed)
+    learned = decider.policy.values is not None and bool(decider.policy.config.max_return)
+    tried = search.simulate([*_unweighted(config, targets, learned)])
+    first = search.best(tried).rule
+    tried += search.simulate([*_variants(first, reward_weight=config.reward_weights)])
+    second = search.best(tried).rule
     if validation.item_states.tags.shape[1]:
-        if filtered := search.play([*_filtered(config, second.rule, decider.known)]):
-            third = search.best(_simplest_first(filtered)).rule
-            windows = {each.rule.tag_window for each in filtered}
-            others = (replace(third, tag_window=window) for window in sorted(windows))
-            weighted = search.play([rule for other in others for rule in _weighted(config, other)])
-            played.extend([*filtered, *weighted])
-        # Without a tag window, which may only have served to tire nobody.
-        runs = [] if search.fatigue is None else [*_limited(config, second.rule)]
-        if limited := search.play(runs):
-            third = search.best(_simplest_first(limited)).rule
-            played.extend([*limited, *search.play([*_drawn(config, third)])])
-    best = search.best(_simplest_first(played))
-    if users is not None:
-        finalists = search.play_finalists(played, best)
-        best = search.best(_simplest_first(finalists))
-        rules = {each.rule for each in finalists}
-        played = [*(each for each in played if each.rule not in rules), *finalists]
-    supported, least_items = search.allowed(best), float(search.least_items)
-    return Choice(
-        *(best.rule, played, search.calibration, users, search.fatigue, least_items, supported)
+        tried += _with_tag_window(search, second, config, decider.known)
+        # Without a tag window, which may only have served to tire no one.
+        tried += _with_tag_run(search, second, config)
+    best = search.best(tried)
+    if users.training_users is not None:
+        finalists = search.finalists(tried, best)
+        best, rules = search.best(finalists), {each.rule for each in finalists}
+        tried = [*(each for each in tried if each.rule not in rules), *finalists]
+    return RuleChoice(
+        rule=best.rule,
+        chosen_by=_chosen_by(users),
+        candidates=tried,
+        warning=""
+        if search.allowed(best)
+        else "; WARNING: the log supports no candidate, this one shows the most different items",
+        details={**users.report(), "least_items": search.least_items},
     )
 
 
-def _simplest_first(candidates: Sequence[Candidate]) -> list[Candidate]:
-    return sorted(candidates, key=_simplicity)
-
-
-def _simplicity(candidate: Candidate) -> tuple[float, ...]:
-    rule = candidate.rule
-    return (
-        rule.tag_run > 0,
-        rule.tag_window > 0,
-        -rule.temperature,
-        rule.reward_weight,
-        -rule.tag_run,
-    )
-
-
-def _filtered(config: RuleConfig, rule: DecisionRule, known: int) -> Iterator[DecisionRule]:
-    """Rules with a tag window of items that are `known`.
+def _with_tag_window(
+    search: RuleSearch, rule: DecisionRule, config: RuleConfig, known: int
+) -> list[SimulatedRule]:
+    """The rule with a tag window of items that are `known`, then with other reward weights.
 
     At all temperatures: at a low one, the log may support what the policy shows only once some
     items are left out.
     """
-    for temperature, window in product(config.temperatures, config.tag_windows):
-        if 0 < window <= known:
-            yield replace(rule, temperature=temperature, tag_window=window)
+    windows = [window for window in config.tag_windows if 0 < window <= known]
+    tried = search.simulate([*_variants(rule, temperature=config.temperatures, tag_window=windows)])
+    if not tried:
+        return []
+    best = search.best(tried).rule
+    weights = [weight for weight in config.reward_weights if weight != best.reward_weight]
+    others = _variants(best, tag_window=sorted({*windows}), reward_weight=weights)
+    return [*tried, *search.simulate([*others])]
 
 
-def _limited(config: RuleConfig, rule: DecisionRule) -> Iterator[DecisionRule]:
-    """Rules with a tag run."""
-    for run in config.tag_runs:
-        if run:
-            yield replace(rule, tag_run=run)
-
-
-def _drawn(config: RuleConfig, rule: DecisionRule) -> Iterator[DecisionRule]:
-    """The rule at every other pair of temperature and reward weight."""
-    for temperature, reward_weight in product(config.temperatures, config.reward_weights):
-        if (temperature, reward_weight) != (rule.temperature, rule.reward_weight):
-            yield replace(rule, temperature=temperature, reward_weight=reward_weight)
+def _with_tag_run(
+    search: RuleSearch, rule: DecisionRule, config: RuleConfig
+) -> list[SimulatedRule]:
+    """The rule with a tag run, if users tire, then at other temperatures and reward weights."""
+    runs = [run for run in config.tag_runs if run] if search.users.fatigue else []
+    tried = search.simulate([*_variants(rule, tag_run=runs)])
+    if not tried:
+        return []
+    best = search.best(tried).rule
+    weights = {"temperature": config.temperatures, "reward_weight": config.reward_weights}
+    return [*tried, *search.simulate([*_variants(best, **weights)])]
 
 
 def _unweighted(
@@ -355,15 +207,31 @@ def _unweighted(
             yield DecisionRule(None, temperature=temperature)
 
 
-def _weighted(config: RuleConfig, rule: DecisionRule) -> Iterator[DecisionRule]:
-    for reward_weight in config.reward_weights:
-        if reward_weight != rule.reward_weight:
-            yield replace(rule, reward_weight=reward_weight)
+def _variants(rule: DecisionRule, **values: Sequence[Any]) -> Iterator[DecisionRule]:
+    """The rule with every combination of other values of its fields."""
+    for combination in product(*values.values()):
+        other = replace(rule, **dict(zip(values, combination, strict=True)))
+        if other != rule:
+            yield other
 
 
-def calibrate(model: ItemRewardModel, rows: RewardRows) -> tuple[float, float]:
-    """Slope and intercept of the model's scores that fit logged rewards best.
+def _simplicity(candidate: SimulatedRule) -> tuple[float, ...]:
+    rule = candidate.rule
+    return (
+        *(rule.tag_run > 0, rule.tag_window > 0, -rule.temperature),
+        *(rule.reward_weight, -rule.tag_run),
+    )
 
-    By logistic regression for rewards of two values, by least squares otherwise.
-    """
-    return fit_line(scores_of(model, rows)[0], model.target(rows.rewards), bool(model.binary))
+
+def _chosen_by(users: UserModel) -> str:
+    if users.training_users is None:
+        return (
+            "mean return of validation users' sessions in the run's reward model, calibrated "
+            "on validation rows; no propensities are used"
+        )
+    report = users.training_users.report
+    weighted = "weighted by their propensities" if report.weighted else "without weights"
+    return (
+        "mean return of sessions of new users, who have the tastes of training users; these "
+        f"are fitted to {report.steps:,} training rows {weighted}"
+    )

@@ -7,7 +7,7 @@ from pydantic import Field
 from ucfrec.settings import Count, Share, settings_table
 
 _Temperature = Annotated[float, Field(ge=0, le=100)]
-_Tilt = Annotated[float, Field(ge=0, le=1000)]
+_RewardWeight = Annotated[float, Field(ge=0, le=1000)]
 _Steps = Annotated[int, Field(ge=0, le=1000)]
 _Runs = Annotated[int, Field(ge=0, le=10)]
 _SOME = Field(strict=False, min_length=1)
@@ -33,7 +33,7 @@ class RuleConfig:
     floor at the same value."""
     temperatures: Annotated[tuple[_Temperature, ...], _SOME] = (0.0, 0.5, 1.0)
     """Candidates for the temperature."""
-    reward_weights: Annotated[tuple[_Tilt, ...], _SOME] = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
+    reward_weights: Annotated[tuple[_RewardWeight, ...], _SOME] = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
     """Candidates for β, the weight of the reward model."""
     tag_windows: Annotated[tuple[_Steps, ...], _SOME] = (0, 3, 10)
     """Candidates for the number of steps whose tags are left out, where items have tags."""
@@ -41,7 +41,7 @@ class RuleConfig:
     """Candidates for how often on end one main tag may be liked, where the log shows that more
     tires users."""
     sessions: Count = 100
-    """Sessions played of each candidate."""
+    """Sessions simulated of each candidate."""
     least_impressions: Count = 10
     """Training impressions from which on the log supports an item."""
     least_support: Share = 0.9
@@ -52,4 +52,4 @@ class RuleConfig:
     tolerance: Annotated[float, Field(ge=0, lt=1)] = 0.02
     """Share of the best estimate by which that of a rule at a higher temperature, or with less
     reward weight, may fall short: the standard error of the sessions, which is allowed in any
-    case, does not count what the model of the users gets wrong."""
+    case, does not count what the user model gets wrong."""

@@ -1,9 +1,8 @@
-"""Several decision rules of one policy, played side by side."""
+"""Several decision rules of one policy, rolled out side by side."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, replace
-from itertools import pairwise
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -11,47 +10,79 @@ from torch import Tensor
 
 from ucfrec.acting.decision import Decider
 from ucfrec.acting.policy_actor import PolicyActor
-from ucfrec.arrays import Array, IntArray
+from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Windows
+from ucfrec.progress import progress
+from ucfrec.schema import USER_IDS
+from ucfrec.user_model.simulator import UserSimulator
 
-_ROWS_AT_ONCE = 256
+_ROWS_AT_ONCE: Final = 256
 """Rows of a forward pass, whose logits then stay in the processor's cache."""
 
 
-class ManyRules(PolicyActor):
-    """Plays C rules at once: rows c·n to (c + 1)·n − 1 of the C·n environments follow rule c.
+def roll_out(
+    simulator: UserSimulator,
+    deciders: Sequence[Decider],
+    sessions: int,
+    states: ItemStates,
+    observation_size: int,
+    seed: int,
+) -> tuple[Float64Array, IntArray, IntArray]:
+    """Simulate sessions by each of C rules of the same policy of items.
 
-    Every rule has a generator of its own, so that it draws what it would draw if it were played
-    alone.
+    Args:
+        simulator: of C · n sessions that have just begun; those from c · n on follow rule c.
+        deciders: C; none leaves out seen items.
+        sessions: n, number of sessions of each rule.
+        states: builds states from items.
+        observation_size: of the simulator's observations.
+        seed: of the draws of each rule.
+
+    Returns:
+        Returns (C · n,), lengths (C · n,), and the session and item of every step, (M, 2).
+    """
+    actor = _ManyRules(deciders, sessions, states, observation_size, seed)
+    live = np.arange(len(deciders) * sessions)
+    returns, lengths = np.zeros(len(live)), np.zeros(len(live), dtype=np.int64)
+    shown = list[IntArray]()
+    with progress(len(live), "choose the rule", "sessions") as bar:
+        while len(live):
+            actor.inform({USER_IDS: simulator.users})
+            items, _ = actor.act(simulator.observations(), np.ones(len(live), dtype=bool))
+            rewards, going = simulator.step(items)
+            actor.observe(items, rewards)
+            returns[live] += rewards
+            lengths[live] += 1
+            shown.append(np.stack([live, items], axis=1))
+            bar.update(len(live) - len(going))
+            if len(going) < len(live):
+                live = live[going]
+                actor.keep(going)
+    return returns, lengths, np.concatenate(shown)
+
+
+class _ManyRules(PolicyActor):
+    """Acts by the rule of each session.
+
+    Every rule has a generator of its own, so that it draws what it would draw alone.
     """
 
     def __init__(
         self,
         deciders: Sequence[Decider],
-        episodes: int,
+        sessions: int,
+        states: ItemStates,
         observation_size: int,
-        item_states: ItemStates,
-        user_ids: Array,
         seed: int,
     ) -> None:
-        """
-        Args:
-            deciders: C rules of the same policy of items; none leaves out seen items.
-            episodes: n, number of episodes of each rule.
-            observation_size: see `PolicyActor`.
-            item_states: see `PolicyActor`.
-            user_ids: see `PolicyActor`.
-            seed: of the draws of each rule.
-        """
-        rows = len(deciders) * episodes
-        super().__init__(deciders[0], rows, observation_size, item_states, None, user_ids, seed)
+        users, rows = np.arange(len(states.user_features)), len(deciders) * sessions
+        super().__init__(deciders[0], rows, observation_size, states, None, users, seed)
         self._deciders = deciders
         self._generators = [torch.Generator().manual_seed(seed) for _ in deciders]
-        self._rule = np.repeat(np.arange(len(deciders)), episodes)
+        self._rule = np.repeat(np.arange(len(deciders)), sessions)
 
     def keep(self, rows: IntArray) -> None:
-        """Forget all episodes but those of `rows`, which become the only environments."""
         super().keep(rows)
         self._rule = self._rule[rows]
 
@@ -59,15 +90,14 @@ class ManyRules(PolicyActor):
         self, rows: Tensor, windows: Windows, collected: Tensor, *given: Any
     ) -> tuple[Tensor, Tensor]:
         decided = []
-        for rules, ends in self._batches(self._rule[rows.numpy()]):
-            parts = [slice(*pair) for pair in pairwise(ends)]
+        for batch in _batches(self._rule[rows.numpy()]):
             asked = [
                 self._deciders[rule].asked(_at(windows, part), collected[part])
-                for rule, part in zip(rules, parts, strict=True)
+                for rule, part in batch
             ]
             logits = self._policy.act(_joined(asked).to(self._policy.state_mean.device)).cpu()
             of_rules = torch.split(logits, [len(each.mask) for each in asked])
-            for rule, part, window, values in zip(rules, parts, asked, of_rules, strict=True):
+            for (rule, part), window, values in zip(batch, asked, of_rules, strict=True):
                 decider, (forbidden, users, shown) = self._deciders[rule], given
                 scores = decider.scores_from(
                     values,
@@ -80,20 +110,22 @@ class ManyRules(PolicyActor):
         items, chances = zip(*decided, strict=True)
         return torch.cat(items), torch.cat(chances)
 
-    @staticmethod
-    def _batches(rules: IntArray) -> Iterator[tuple[list[int], list[int]]]:
-        """Whole rules of about `_ROWS_AT_ONCE` rows: their numbers, and where their rows end.
 
-        `rules` (M,) are the rows' rules, sorted. Before the ends comes the beginning of the first.
-        """
-        numbers, first = np.unique(rules, return_index=True)
-        batch, ends = list[int](), [0]
-        for number, end in zip(numbers.tolist(), [*first[1:].tolist(), len(rules)], strict=True):
-            if batch and end - ends[0] > _ROWS_AT_ONCE:
-                yield batch, ends
-                batch, ends = [], [ends[-1]]
-            batch, ends = [*batch, number], [*ends, end]
-        yield batch, ends
+def _batches(rules: IntArray) -> list[list[tuple[int, slice]]]:
+    """Whole rules of about `_ROWS_AT_ONCE` rows, and where their rows are.
+
+    Args:
+        rules: (M,) the rows' rules, sorted.
+    """
+    numbers, first = np.unique(rules, return_index=True)
+    batches, size = [list[tuple[int, slice]]()], 0
+    for rule, begin, end in zip(numbers, first, [*first[1:], len(rules)], strict=True):
+        if size and size + end - begin > _ROWS_AT_ONCE:
+            batches.append([])
+            size = 0
+        batches[-1].append((int(rule), slice(int(begin), int(end))))
+        size += int(end - begin)
+    return batches
 
 
 def _at(windows: Windows, rows: slice) -> Windows:

@@ -257,7 +257,7 @@ def _write(
     from ucfrec.files.atomic import write_json
     from ucfrec.provenance import config_hash
     from ucfrec.reporting.estimate_rows import estimate_row
-    from ucfrec.runs.trained_policy import read_record
+    from ucfrec.runs.record import read_record
 
     version, written = code_version("ucfrec.off_policy.evaluate"), []
     for name, report in reports.items():
@@ -266,8 +266,8 @@ def _write(
             about = {"checkpoint": options.checkpoint, "candidate": name, **more.get(name, {})}
             found = estimate_row(
                 row | about,
-                training_seed=record["seed"],
-                config_hash=config_hash(record["config"]),
+                training_seed=record.seed,
+                config_hash=config_hash(record.settings),
                 code_version=version,
             )
             written.append(found.to_json())

@@ -87,6 +87,7 @@ def run(options: argparse.Namespace) -> None:
     given = {
         "reward": options.reward and Expression(options.reward, "--reward"),
         "session_by": options.session_by,
+        "dataset": options.dataset,
         "gap_minutes": options.gap_minutes,
         "duplicates": options.duplicates,
         "memory_limit": options.memory_limit,

@@ -83,17 +83,16 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _test_split(trained: "list[TrainedPolicy]", store: "EpisodeStore | None") -> "EpisodeStore":
-    from ucfrec.runs.trained_policy import REFIT_OF
 
     for policy in trained:
-        if REFIT_OF in policy.record:
+        if policy.record.refit_of is not None:
             raise InputError(
                 f"{policy.folder} is a refit, trained on the test split too; name later logs to "
                 "rank"
             )
     if store is None:
         raise InputError(
-            f"{trained[0].folder}: its store {trained[0].record['store']} is gone or has changed; "
+            f"{trained[0].folder}: its store {trained[0].record.store} is gone or has changed; "
             "move the run together with its store, or name the logs to rank"
         )
     test = store.split("test")

@@ -65,7 +65,8 @@ def run(options: argparse.Namespace) -> None:
     import torch
 
     from ucfrec.recommending.server import Server, listening_socket
-    from ucfrec.runs.trained_policy import TrainedPolicy, verified
+    from ucfrec.runs.record import verified
+    from ucfrec.runs.trained_policy import TrainedPolicy
 
     if options.threads is not None:
         if options.threads < 1:

@@ -89,9 +89,8 @@ def _train(options: argparse.Namespace) -> None:
     from ucfrec.fitting.distributed import leads, wait
     from ucfrec.reporting.model_card import write_card
     from ucfrec.runs.config import resolve_config
-    from ucfrec.runs.describe import describe_run
     from ucfrec.runs.refit import refit
-    from ucfrec.runs.screened import describe_screened, train_screened
+    from ucfrec.runs.screened import train_screened
 
     if not leads():
         warnings.simplefilter("ignore", InputNote)  # the leader prints them
@@ -109,7 +108,5 @@ def _train(options: argparse.Namespace) -> None:
     if not leads():
         return
     card = write_card(options.out)
-    print(describe_run(record))
-    if options.screen:
-        print(describe_screened(record))
+    print(record.describe())
     print(f"\nrun: {options.out}; TensorBoard can open it\nmodel card: {card}")

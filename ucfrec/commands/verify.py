@@ -34,38 +34,33 @@ def run(options: argparse.Namespace) -> None:
 
 def _verified(path: Path) -> int:
     """Print what `path` is and its faults; returns their number."""
+    from ucfrec.episodes.record import StoreRecord
     from ucfrec.errors import one_line
-    from ucfrec.files.checksums import sealed_record
+    from ucfrec.runs.record import RunRecord, TrainingRecord, read_training
 
     if path.is_file():
         from ucfrec.reporting.rows_file import read_rows
 
         print(one_line(f"{path}: {len(read_rows(path))} result rows, all readable"))
         return 0
-    record = next((name for name in ("meta.json", "run.json") if (path / name).is_file()), None)
-    if record is None:
+    record: StoreRecord | TrainingRecord
+    if (path / StoreRecord.FILE).is_file():
+        record, unfinished = StoreRecord.read(path), ""
+    elif (path / RunRecord.FILE).is_file():
+        record = read_training(path)
+        unfinished = "" if record.policy is not None else ", training has not ended"
+    else:
         raise InputError(
             f"{path} is neither an episode store (meta.json) nor a run (run.json); check the path"
         )
-    if record == "meta.json":
-        from ucfrec.episodes.record import read_store_record
-
-        value, sealed = read_store_record(path)
-    else:
-        value, sealed = sealed_record(path, record, "train again")
-    if sealed is None:
-        print(one_line(f"{path}: no checksums, an older ucfrec wrote it; nothing can be verified"))
-        return 0
+    sealed = record.checksums(path)
     faults = list(sealed.faults())
     for name, fault in faults:
         print(one_line(f"{path / name} {fault}"))
     for name in sealed.strangers():
-        if name != record:
-            print(one_line(f"{path / name} is not listed in {record}: it was added later"))
+        if name != record.FILE:
+            print(one_line(f"{path / name} is not listed in {record.FILE}: it was added later"))
     size = sum(size for size, _ in sealed.files.values())
-    unfinished = (
-        ", training has not ended" if record == "run.json" and "policy" not in value else ""
-    )
     print(
         one_line(
             f"{path}: {len(sealed.files) - len(faults)} of {len(sealed.files)} files have the "

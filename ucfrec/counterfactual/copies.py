@@ -16,6 +16,7 @@ from ucfrec.counterfactual.augment import (
     candidates,
 )
 from ucfrec.counterfactual.clusters import ActionSupport
+from ucfrec.counterfactual.effects_mean import EffectsMean, EffectTransitions
 from ucfrec.counterfactual.generators import CSGConfig, make_generator, state_clusters
 from ucfrec.counterfactual.reward_model import CRMConfig
 from ucfrec.counterfactual.reward_model_fit import fit_crm
@@ -25,7 +26,6 @@ from ucfrec.episodes.windows import Overlay
 from ucfrec.errors import InputError
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.user_model.reward_fit import fit_item_reward_model
-from ucfrec.user_model.reward_mean import EffectsMean, EffectTransitions
 
 MODELS: Final = ("item-reward", "crm", "csg")
 """Folders of the checkpoints of `counterfactual_copies`; which of them there are depends on the

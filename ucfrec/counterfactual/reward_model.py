@@ -7,6 +7,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
+from ucfrec.counterfactual.effects_mean import EffectsMean
 from ucfrec.settings import (
     BatchSize,
     LearningRate,
@@ -16,7 +17,6 @@ from ucfrec.settings import (
     require,
     settings_table,
 )
-from ucfrec.user_model.reward_mean import EffectsMean
 
 _LOG_2PI = math.log(2 * math.pi)
 

@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 from ucfrec.arrays import Float32Array
+from ucfrec.counterfactual.effects_mean import EffectsMean
 from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, kl_to_prior
 from ucfrec.episodes.windows import Transitions
 from ucfrec.errors import InputError
 from ucfrec.fitting.loop import LoopConfig, fit
 from ucfrec.fitting.random_state import random_state_kept
-from ucfrec.user_model.reward_mean import EffectsMean
 
 _ACTIVE_NATS = 0.01
 _LEAK = 0.1

@@ -7,11 +7,11 @@ import numpy as np
 
 from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
-from ucfrec.episodes.record import REMEDY
+from ucfrec.episodes.record import StoreRecord
 from ucfrec.errors import InputError, one_line
 from ucfrec.files.checksums import Sealed
-from ucfrec.files.remote import fetch
 
+_REMEDY: Final = StoreRecord.REMEDY
 _DTYPES: Final = {
     schema.OFFSETS: "<i8",
     schema.RETURN_TO_GO: "<f4",
@@ -21,7 +21,7 @@ _DTYPES: Final = {
 
 
 def load_column(
-    store: Path, file: str, shape: tuple[int, ...], mmap: bool, sealed: Sealed | None
+    store: Path, file: str, shape: tuple[int, ...], mmap: bool, sealed: Sealed
 ) -> Array:
     """A column of one shard.
 
@@ -30,24 +30,22 @@ def load_column(
         file: of the column, named `SHARD/COLUMN.npy`.
         shape: of each row.
         mmap: whether the file stays mapped instead of being read.
-        sealed: checksums of the store; None if there are none.
+        sealed: checksums of the store.
 
     Raises:
         InputError: the file is missing or damaged, or holds something else.
     """
-    if sealed is not None:
-        sealed.require(file)
+    sealed.require(file)
     path = store / file
-    fetch(path)
     try:
         # Mapping compares the header with the size of the file before it takes memory.
         values: Array = np.load(path, mmap_mode="r")
     except Exception as error:  # numpy parses headers as Python and raises what that raises
         message = one_line(str(error)) or type(error).__name__
-        raise InputError(f"{path} is missing or damaged ({message}); {REMEDY}") from None
+        raise InputError(f"{path} is missing or damaged ({message}); {_REMEDY}") from None
     if values.dtype != _DTYPES[path.stem] or values.shape[1:] != shape or values.ndim == 0:
         raise InputError(
-            f"{path} is damaged: it holds {values.dtype} in the shape {values.shape}; {REMEDY}"
+            f"{path} is damaged: it holds {values.dtype} in the shape {values.shape}; {_REMEDY}"
         )
     return values if mmap else np.array(values)
 

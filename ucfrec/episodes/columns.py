@@ -1,10 +1,8 @@
 """The columns of an episode store: memory-mapped files or arrays in memory."""
 
-import warnings
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -14,11 +12,10 @@ from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.column_files import StepColumn, load_column
 from ucfrec.episodes.item_table import ITEM_STATES
-from ucfrec.episodes.record import REMEDY, read_store_record
+from ucfrec.episodes.record import Source, StoreRecord
 from ucfrec.episodes.returns import ReturnToGo, returns_to_go
 from ucfrec.episodes.states import ItemStates
-from ucfrec.errors import InputError, InputNote
-from ucfrec.files.checksums import Sealed
+from ucfrec.errors import InputError
 
 _IN_MEMORY = Path("<memory>")
 
@@ -32,25 +29,23 @@ class Columns:
     def __init__(
         self,
         path: Path,
-        meta: Mapping[str, Any],
+        record: StoreRecord,
         arrays: Mapping[str, Array] | None = None,
         item_states: ItemStates | None = None,
-        sealed: Sealed | None = None,
         return_to_go: ReturnToGo | None = None,
     ) -> None:
         """
         Args:
             path: folder of the store.
-            meta: contents of its `meta.json`.
+            record: of the store.
             arrays: columns in memory, by name, used instead of the files of the folder.
             item_states: used instead of the file of the folder.
-            sealed: checksums of the files; None if there are none.
             return_to_go: what the returns-to-go count; None for the rest of the session.
         """
         self.return_to_go = return_to_go or ReturnToGo()
-        self.path, self.meta, self._sealed = path, meta, sealed
+        self.path, self.record, self._sealed = path, record, record.checksums(path)
         self._arrays, self._item_states_in_memory = dict(arrays or {}), item_states
-        self._shards = [path / f"shard-{i:05d}" for i in range(meta["n_shards"])]
+        self._shards = [path / f"shard-{i:05d}" for i in range(record.n_shards)]
         self._steps: dict[str, StepColumn] = {}
 
     @classmethod
@@ -60,17 +55,9 @@ class Columns:
         Raises:
             InputError: the folder is not a store, is damaged, or was written by a newer ucfrec.
         """
-        meta, sealed = read_store_record(path)
-        if sealed is None:
-            warnings.warn(
-                f"{path} has no checksums, an older ucfrec wrote it: damage to it would go "
-                "unnoticed; prepare it again",
-                InputNote,
-                stacklevel=3,
-            )
-        else:
-            sealed.require_sizes()
-        return cls(path, meta, sealed=sealed)
+        columns = cls(path, StoreRecord.read(path))
+        columns._sealed.require_sizes()
+        return columns
 
     @classmethod
     def from_arrays(
@@ -97,18 +84,20 @@ class Columns:
                     f"column {name!r} has {len(values)} values instead of {expected}; give one per "
                     f"{'step' if name in steps else 'episode'}"
                 )
-        meta = {
-            "version": schema.STORE_VERSION,
-            "n_steps": int(offsets[-1]),
-            "n_episodes": len(lengths),
-            "n_shards": 0,
-            "columns": {name: list(arrays[name].shape[1:]) for name in steps},
-            "reward": schema.REWARD,
-            "source": {},
-        }
+        record = StoreRecord(
+            files={},
+            version=schema.STORE_VERSION,
+            n_steps=int(offsets[-1]),
+            n_episodes=len(lengths),
+            n_shards=0,
+            columns={name: list(arrays[name].shape[1:]) for name in steps},
+            fingerprint="",
+            reward=schema.REWARD,
+            source=Source(),
+        )
         arrays[schema.OFFSETS] = offsets
         arrays[schema.RETURN_TO_GO] = returns_to_go(arrays[schema.REWARD], offsets)
-        return cls(_IN_MEMORY, meta, arrays, item_states)
+        return cls(_IN_MEMORY, record, arrays, item_states)
 
     def with_step_column(
         self, name: str, values: Array, return_to_go: ReturnToGo | None = None
@@ -135,15 +124,14 @@ class Columns:
         self, name: str, size: tuple[int, ...], return_to_go: ReturnToGo | None = None
     ) -> "Columns":
         """A copy with a step column that is not there yet, of the given size."""
-        sizes = dict(self.meta["columns"])
+        sizes = dict(self.record.columns)
         if name in sizes:
             sizes[name] = list(size)
         copy = Columns(
             self.path,
-            {**self.meta, "columns": sizes},
+            self.record.with_entries(columns=sizes),
             self._arrays,
             self._item_states_in_memory,
-            self._sealed,
             return_to_go or self.return_to_go,
         )
         copy._steps = {other: column for other, column in self._steps.items() if other != name}
@@ -169,7 +157,7 @@ class Columns:
             lengths.append(np.diff(offsets))
             before += int(offsets[-1])
         found = (sum(map(len, starts)), before)
-        expected = (self.meta["n_episodes"], self.meta["n_steps"])
+        expected = (self.record.n_episodes, self.record.n_steps)
         if found != expected:
             raise self._damaged(
                 schema.OFFSETS,
@@ -180,12 +168,12 @@ class Columns:
     @property
     def has_items(self) -> bool:
         """Whether actions are items of a catalogue; otherwise they are vectors."""
-        return schema.ITEM in self.meta["columns"]
+        return schema.ITEM in self.record.columns
 
     @property
     def observation_size(self) -> int:
         """O, size of the logged observation; 0 if none was logged."""
-        return int((self.meta["columns"].get(schema.OBSERVATION) or [0])[0])
+        return int((self.record.columns.get(schema.OBSERVATION) or [0])[0])
 
     @cached_property
     def item_states(self) -> ItemStates:
@@ -196,8 +184,7 @@ class Columns:
         """
         if self._item_states_in_memory is not None:
             return self._item_states_in_memory
-        if self._sealed is not None:
-            self._sealed.require(ITEM_STATES)
+        self._sealed.require(ITEM_STATES)
         return ItemStates.load(self.path / ITEM_STATES)
 
     @property
@@ -209,7 +196,7 @@ class Columns:
     def user_rows(self) -> IntArray:
         """(E,) row of each episode's user in the user features; −1 for an unknown user."""
         if self.item_states.user_features.shape[1] == 0:
-            return np.full(self.meta["n_episodes"], -1)
+            return np.full(self.record.n_episodes, -1)
         return self.episode_column(schema.USER)
 
     def has_episode_column(self, name: str) -> bool:
@@ -227,8 +214,8 @@ class Columns:
         if not parts:
             raise InputError(f"{self.path} has no column {name!r}; write the store with it")
         values = np.concatenate(parts)
-        if len(values) != self.meta["n_episodes"]:
-            raise self._damaged(name, f"has {len(values)} of {self.meta['n_episodes']} episodes")
+        if len(values) != self.record.n_episodes:
+            raise self._damaged(name, f"has {len(values)} of {self.record.n_episodes} episodes")
         if name == schema.SPLIT and np.any(values >= len(schema.SPLITS)):
             raise self._damaged(name, "has numbers that are no split")
         return values
@@ -239,7 +226,7 @@ class Columns:
         Raises:
             InputError: the store has no such column, or its files are damaged.
         """
-        return self._column(name).take(np.arange(self.meta["n_steps"]))
+        return self._column(name).take(np.arange(self.record.n_steps))
 
     def step_values(self, name: str, index: IntArray) -> Array:
         """Values of step column `name` at the step indices `index`.
@@ -290,11 +277,11 @@ class Columns:
 
     def _column(self, name: str) -> StepColumn:
         if name not in self._steps:
-            if name not in (*self.meta["columns"], schema.RETURN_TO_GO):
+            if name not in (*self.record.columns, schema.RETURN_TO_GO):
                 raise InputError(f"{self.path} has no column {name!r}; prepare the logs with it")
             column = StepColumn(self._parts(name, mmap=True))
-            if len(column) != self.meta["n_steps"]:
-                raise self._damaged(name, f"has {len(column)} of {self.meta['n_steps']} steps")
+            if len(column) != self.record.n_steps:
+                raise self._damaged(name, f"has {len(column)} of {self.record.n_steps} steps")
             if name == schema.ITEM and name not in self._arrays:
                 self._require_items(column)
             self._steps[name] = column
@@ -304,7 +291,7 @@ class Columns:
         """A column as one array per shard; a column in memory is a single array."""
         if name in self._arrays:
             return [self._arrays[name]]
-        shape = tuple(self.meta["columns"].get(name, ()))
+        shape = tuple(self.record.columns.get(name, ()))
         return [
             load_column(self.path, f"{shard.name}/{name}.npy", shape, mmap, self._sealed)
             for shard in self._shards
@@ -319,4 +306,4 @@ class Columns:
             raise self._damaged(schema.ITEM, f"has items from {low} to {high}, there are {items}")
 
     def _damaged(self, name: str, fault: str) -> InputError:
-        return InputError(f"{self.path} is damaged: column {name!r} {fault}; {REMEDY}")
+        return InputError(f"{self.path} is damaged: column {name!r} {fault}; {StoreRecord.REMEDY}")

@@ -11,11 +11,10 @@ import numpy as np
 
 from ucfrec import schema
 from ucfrec.arrays import Float32Array
-from ucfrec.episodes.record import RECORD
+from ucfrec.episodes.record import Source
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder
-from ucfrec.files.checksums import FILES, seal
 
 
 def reward_bit(
@@ -78,7 +77,7 @@ def with_observations(
         InputError: `out` exists already.
     """
     values = np.ascontiguousarray(observations, dtype=schema.STEP_DTYPES[schema.OBSERVATION])
-    digest = hashlib.sha256(store.meta["fingerprint"].encode() + values.tobytes()).hexdigest()
+    digest = hashlib.sha256(store.record.fingerprint.encode() + values.tobytes()).hexdigest()
     with atomic_folder(out) as scratch:
         shutil.copytree(store.path, scratch, dirs_exist_ok=True)
         begin = 0
@@ -87,15 +86,13 @@ def with_observations(
             np.save(shard / f"{schema.OBSERVATION}.npy", values[begin:end])
             begin = end
         changed = f"{schema.OBSERVATION}.npy"
-        kept = store.meta.get(FILES, {}).items()
-        meta = {
-            **store.meta,
-            FILES: {name: each for name, each in kept if not name.endswith(f"/{changed}")},
-            "columns": {**store.meta["columns"], schema.OBSERVATION: [values.shape[1]]},
-            "fingerprint": digest,
-            "source": {**store.meta["source"], **source},
-        }
-        seal(scratch, RECORD, meta)
+        kept = store.record.files.items()
+        store.record.with_entries(
+            files={name: each for name, each in kept if not name.endswith(f"/{changed}")},
+            columns={**store.record.columns, schema.OBSERVATION: [values.shape[1]]},
+            fingerprint=digest,
+            source=Source.model_validate({**store.record.source.model_dump(), **source}),
+        ).sealed(scratch)
     return EpisodeStore.open(out)
 
 

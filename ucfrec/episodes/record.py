@@ -2,94 +2,156 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
+from pydantic import AfterValidator, ConfigDict, Field
 
 from ucfrec import schema
 from ucfrec.errors import InputError
-from ucfrec.files.checksums import Sealed, sealed_record
+from ucfrec.files.record import Count, Entry, Number, Record, Text
 
-RECORD: Final = "meta.json"
-"""Name of the file; `ucfrec.files.checksums.seal` adds the checksums of the other files."""
-REMEDY: Final = "prepare it again"
-"""What to do about a damaged store."""
+Milliseconds = Annotated[int, Field(strict=True, ge=-62_135_596_800_000, lt=253_402_300_800_000)]
+"""Since the Unix epoch, in the years 1 to 9999."""
+_Positive = Annotated[int, Field(strict=True, ge=1, lt=2**48)]
+_Width = Annotated[int, Field(strict=True, ge=1, le=2**24)]
 
 
-def read_store_record(path: Path) -> tuple[dict[str, Any], Sealed | None]:
-    """Read and check the record of a store.
+class Distribution(Entry):
+    """A histogram of values of the logs, with quantiles."""
 
-    Args:
-        path: folder of the store.
+    counts: tuple[Count, ...]
+    values: tuple[Number, ...] | None = None
+    """The (N,) values that are counted; None for bins."""
+    edges: tuple[Number, ...] | None = None
+    """(N + 1,) edges of bins, each with its left edge but without its right one."""
+    quantiles: dict[str, Number]
+    """By share, e.g. `{"0.5": 3}`."""
 
-    Returns:
-        The record, and its checksums; None if an older ucfrec wrote none.
 
-    Raises:
-        InputError: the folder is not a store, its record is damaged, or a newer ucfrec wrote it.
+def _consistent(found: Distribution) -> Distribution:
+    ends = (found.values or ()) if found.edges is None else found.edges[1:]
+    if len(ends) != len(found.counts):
+        raise ValueError("it has other numbers of counts and of values or bins")
+    return found
+
+
+class Source(Entry):
+    """What a store was made from, as `ucfrec prepare` or a dataset adapter wrote it.
+
+    Every entry is optional; adapters may add others.
     """
-    if not (path / RECORD).is_file():
-        raise InputError(
-            f"{path} is not an episode store: it has no {RECORD}; give a folder that "
-            "`ucfrec prepare` wrote"
-        )
-    meta, sealed = sealed_record(path, RECORD, REMEDY)
-    version = meta.get("version")
-    if type(version) is not int:
-        raise InputError(f"{path / RECORD} is damaged: it has no store version; {REMEDY}")
-    if version > schema.STORE_VERSION:
-        raise InputError(
-            f"{path} has store version {version}, this ucfrec reads versions up to "
-            f"{schema.STORE_VERSION}; upgrade ucfrec"
-        )
-    _require_entries(path / RECORD, meta)
-    return meta, sealed
+
+    model_config = ConfigDict(extra="allow")
+
+    files: tuple[Text, ...] = ()
+    """The logs."""
+    dataset: Text | None = None
+    """Name of the dataset adapter, or of the dataset."""
+    mapping: dict[Text, Text] = Field(default_factory=dict)
+    """Log column to the column of the files or the SQL expression that it was."""
+    session_by: Text | None = None
+    session_gap_ms: Count | None = None
+    duplicates: Literal["highest", "lowest", "first", "last"] = "highest"
+    """Which of several rows with the same user, item and time was kept."""
+    rows_read: Count | None = None
+    dropped: dict[Text, Count] = Field(default_factory=dict)
+    """Rows dropped, by reason."""
+    unsorted_rows: Count | None = None
+    steps: Count | None = None
+    users: Count | None = None
+    items: Count | None = None
+    sessions: Count | None = None
+    sessions_cut: Count | None = None
+    unknown_propensities: Count | None = None
+    """Steps without a propensity; None if the logs have none at all."""
+    time_range_ms: tuple[Milliseconds, Milliseconds] | None = None
+    """First and last time."""
+    split_times_ms: tuple[Milliseconds, Milliseconds] | None = None
+    """Times at which validation and test begin."""
+    summary: dict[Text, Annotated[Distribution, AfterValidator(_consistent)]] = Field(
+        default_factory=dict
+    )
+
+    @property
+    def others(self) -> Mapping[str, Any]:
+        """The entries that an adapter added."""
+        return self.__pydantic_extra__ or {}
 
 
-def _require_entries(path: Path, meta: Mapping[str, Any]) -> None:
-    """Check the types and ranges of what this module reads of a store's record.
-
-    Raises:
-        InputError: an entry is missing or cannot be that of a store.
-    """
-    counts = {name: meta.get(name) for name in ("n_steps", "n_episodes", "n_shards")}
-    for name, count in counts.items():
-        if type(count) is not int or not 1 <= count < 2**48:
-            raise _bad_meta(path, name, count)
-    shards, columns = meta["n_shards"], meta.get("columns")
-    if shards > meta["n_episodes"] or not (path.parent / f"shard-{shards - 1:05d}").is_dir():
-        raise _bad_meta(path, "n_shards", shards)
-    if not isinstance(columns, dict) or schema.REWARD not in columns:
-        raise _bad_meta(path, "columns", columns)
-    for name, shape in columns.items():
-        sizes = shape if isinstance(shape, list) else [None]
+def _known_columns(columns: dict[str, list[int]]) -> dict[str, list[int]]:
+    if schema.REWARD not in columns:
+        raise ValueError("it has no reward")
+    for name, sizes in columns.items():
         vector = name in (schema.ACTION, schema.OBSERVATION)
-        known = name in schema.STEP_DTYPES and len(sizes) == vector
-        if not known or not all(type(size) is int and 1 <= size <= 2**24 for size in sizes):
-            raise _bad_meta(path, f"columns.{name}", shape)
-    _require_held(path, meta)
-    for name, kind in (("reward", str), ("fingerprint", str), ("source", dict)):
-        if not isinstance(meta.get(name), kind):
-            raise _bad_meta(path, name, meta.get(name))
+        if name not in schema.STEP_DTYPES or len(sizes) != vector:
+            raise ValueError(f"there is no column {name!r:.40} of this shape")
+    return columns
 
 
-def _require_held(path: Path, meta: Mapping[str, Any]) -> None:
-    """Check that the files can hold the steps, before memory for an entry a step is asked for.
+class StoreRecord(Record):
+    """The content of `meta.json`."""
 
-    Raises:
-        InputError: they are too small, or there are fewer steps than episodes.
-    """
-    steps, episodes = meta["n_steps"], meta["n_episodes"]
-    files = [
-        path.parent / f"shard-{n:05d}" / f"{schema.REWARD}.npy" for n in range(meta["n_shards"])
-    ]
-    sizes = [file.stat().st_size for file in files if file.is_file()]
-    held = sum(sizes) // np.dtype(schema.STEP_DTYPES[schema.REWARD]).itemsize
-    if len(sizes) == len(files) and steps > held:
-        raise _bad_meta(path, "n_steps", steps)
-    if episodes > steps:
-        raise _bad_meta(path, "n_episodes", episodes)
+    FILE: ClassVar[str] = "meta.json"
+    KIND: ClassVar[str] = (
+        "an episode store: it has no meta.json; give a folder that `ucfrec prepare` wrote"
+    )
+    REMEDY: ClassVar[str] = "prepare it again"
 
+    version: Annotated[int, Field(strict=True, ge=1)]
+    """Of the format of stores."""
+    n_steps: _Positive
+    n_episodes: _Positive
+    n_shards: Count
+    columns: Annotated[dict[str, list[_Width]], AfterValidator(_known_columns)]
+    """Step columns to their sizes: () for numbers, (size,) for vectors."""
+    fingerprint: Text
+    """SHA-256 of the steps and identifiers; empty for a store in memory."""
+    reward: Text
+    """The expression that computed the rewards."""
+    splits: dict[Text, dict[Text, Count]] = Field(default_factory=dict)
+    """Episodes and steps of each split."""
+    source: Source
 
-def _bad_meta(path: Path, name: str, value: object) -> InputError:
-    return InputError(f"{path} is damaged: its {name} is {value!r:.60}; {REMEDY}")
+    @classmethod
+    def read(cls, folder: Path) -> Self:
+        """Read and check the record of a store.
+
+        Raises:
+            InputError: the folder is not a store, its record is damaged, or a newer ucfrec wrote
+                it.
+        """
+        record, path = super().read(folder), folder / cls.FILE
+        shards = [folder / f"shard-{n:05d}" for n in (0, record.n_shards - 1)]
+        if not 1 <= record.n_shards <= record.n_episodes or not all(s.is_dir() for s in shards):
+            raise record._bad(path, "n_shards", record.n_shards)
+        record._require_held(folder)
+        return record
+
+    @classmethod
+    def of(cls, value: Mapping[str, Any], path: Path) -> Self:
+        """See `Record.of`; entries of a newer version are not looked at."""
+        version = value.get("version")
+        if type(version) is int and version > schema.STORE_VERSION:
+            raise InputError(
+                f"{path} has store version {version}, this ucfrec reads versions up to "
+                f"{schema.STORE_VERSION}; upgrade ucfrec"
+            )
+        return super().of(value, path)
+
+    def _require_held(self, folder: Path) -> None:
+        """Check that the files can hold the steps, before memory for an entry a step is asked for.
+
+        Raises:
+            InputError: they are too small, or there are fewer steps than episodes.
+        """
+        files = [folder / f"shard-{n:05d}" / f"{schema.REWARD}.npy" for n in range(self.n_shards)]
+        sizes = [file.stat().st_size for file in files if file.is_file()]
+        held = sum(sizes) // np.dtype(schema.STEP_DTYPES[schema.REWARD]).itemsize
+        if len(sizes) == len(files) and self.n_steps > held:
+            raise self._bad(folder / self.FILE, "n_steps", self.n_steps)
+        if self.n_episodes > self.n_steps:
+            raise self._bad(folder / self.FILE, "n_episodes", self.n_episodes)
+
+    def _bad(self, path: Path, name: str, value: object) -> InputError:
+        return InputError(f"{path} is damaged: its {name} is {value!r:.60}; {self.REMEDY}")

@@ -290,7 +290,7 @@ def _require_no_copies(store: EpisodeStore, operation: str) -> None:
 def _require_own_copies(store: EpisodeStore, overlay: Overlay) -> None:
     size = overlay.edit_state.shape[1]
     for source in (overlay.copy_source, overlay.action_source):
-        if len(source) and not 0 <= source.min() <= source.max() < store.meta["n_episodes"]:
+        if len(source) and not 0 <= source.min() <= source.max() < store.record.n_episodes:
             raise _of_another_store(
                 overlay, f"has copies of episodes that {store.path} does not have"
             )
@@ -312,7 +312,7 @@ def _require_own_actions(store: EpisodeStore, overlay: Overlay) -> None:
             overlay.action.ndim == 1 and 0 <= overlay.action.min() <= overlay.action.max() < n_items
         )
     else:
-        fits = list(overlay.action.shape[1:]) == store.meta["columns"][schema.ACTION]
+        fits = list(overlay.action.shape[1:]) == store.record.columns[schema.ACTION]
     if not fits:
         raise _of_another_store(overlay, f"has actions that {store.path} does not know")
 

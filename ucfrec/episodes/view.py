@@ -1,9 +1,8 @@
 """Views of a store: the episodes of a view, and access to their columns."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -11,6 +10,7 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.episodes.columns import Columns
+from ucfrec.episodes.record import StoreRecord
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Overlay
 from ucfrec.errors import InputError
@@ -49,7 +49,7 @@ class EpisodeView:
                 facts[1] += f" and {len(self.overlay.action_source):,} action copies"
         if self.has_items and self._columns.has_item_states:
             facts.append(f"{len(self.item_states.embeddings):,} items")
-        facts.append(f"reward={self.meta['reward']}")
+        facts.append(f"reward={self.record.reward}")
         splits = (
             set() if self._selected is None else set(self.episode_values(schema.SPLIT).tolist())
         )
@@ -66,14 +66,14 @@ class EpisodeView:
         return self._columns.path
 
     @property
-    def meta(self) -> Mapping[str, Any]:
-        """Contents of `meta.json`."""
-        return self._columns.meta
+    def record(self) -> StoreRecord:
+        """The content of `meta.json`."""
+        return self._columns.record
 
     @cached_property
     def episode_ids(self) -> IntArray:
         """(E,) numbers in the store of the logged episodes of the view; excludes copies."""
-        return np.arange(self.meta["n_episodes"]) if self._selected is None else self._selected
+        return np.arange(self.record.n_episodes) if self._selected is None else self._selected
 
     @cached_property
     def _sources(self) -> IntArray:

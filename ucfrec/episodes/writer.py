@@ -9,11 +9,10 @@ import numpy as np
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, IntArray
-from ucfrec.episodes.record import RECORD
+from ucfrec.episodes.record import Source, StoreRecord
 from ucfrec.episodes.returns import returns_in_parts
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder
-from ucfrec.files.checksums import seal
 
 _PART_STEPS = 2**20
 
@@ -145,7 +144,7 @@ class StoreWriter:
 
     def finish(
         self, reward: str, source: Mapping[str, Any], ids: Mapping[str, list[Any]] | None = None
-    ) -> dict[str, Any]:
+    ) -> StoreRecord:
         """Close the last shard and write `meta.json`, with the checksums of the files so far.
 
         Args:
@@ -155,7 +154,7 @@ class StoreWriter:
                 them, by name; they enter the fingerprint.
 
         Returns:
-            The contents of `meta.json`.
+            The record of the store.
 
         Raises:
             InputError: no step was appended.
@@ -169,21 +168,22 @@ class StoreWriter:
         for name, values in (ids or {}).items():
             self._hashes[f"ids {name}"] = hashlib.sha256("\n".join(map(str, values)).encode())
         digests = "".join(f"{k}:{h.hexdigest()};" for k, h in sorted(self._hashes.items()))
-        meta = {
-            "version": schema.STORE_VERSION,
-            "n_steps": self._n_steps,
-            "n_episodes": self._n_episodes,
-            "n_shards": self._shards,
-            "columns": self._shapes,
-            "fingerprint": hashlib.sha256(digests.encode()).hexdigest(),
-            "reward": reward,
-            "splits": {
+        record = StoreRecord(
+            files={},
+            version=schema.STORE_VERSION,
+            n_steps=self._n_steps,
+            n_episodes=self._n_episodes,
+            n_shards=self._shards,
+            columns=self._shapes,
+            fingerprint=hashlib.sha256(digests.encode()).hexdigest(),
+            reward=reward,
+            splits={
                 name: {"episodes": int(episodes), "steps": int(steps)}
                 for name, (episodes, steps) in zip(schema.SPLITS, self._split_counts, strict=True)
             },
-            "source": dict(source),
-        }
-        return seal(self._folder, RECORD, meta)
+            source=Source.model_validate(dict(source)),
+        )
+        return record.sealed(self._folder)
 
 
 def write_arrays(

@@ -82,9 +82,9 @@ def evaluate_policy(
         "target_return": rule.target,
         "rule": rule.hash,
         "decision_rule": rule.as_dict(),
-        "train_seed": trained.record["seed"],
-        "fingerprint": trained.record["fingerprint"],
-        "config": config_hash(trained.record["config"]),
+        "train_seed": trained.record.seed,
+        "fingerprint": trained.record.fingerprint,
+        "config": config_hash(trained.record.settings),
     }
 
 
@@ -122,7 +122,7 @@ def _row(
 def _item_numbers(environment: Environment, env: Any, trained: TrainedPolicy) -> IntArray | None:
     """The environment's index of each item of the policy, −1 for items it lacks; None for
     vectors."""
-    space, sizes = env.single_action_space, trained.record["sizes"]
+    space, sizes = env.single_action_space, trained.record.sizes
     provided = int(np.prod(env.single_observation_space.shape))
     expected = trained.logged_observation_size
     if expected > provided:

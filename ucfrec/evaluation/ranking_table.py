@@ -11,7 +11,8 @@ from ucfrec.errors import InputError
 from ucfrec.evaluation.ranking import MEASURES, Period, compare, rank_steps, rankers_named
 from ucfrec.evaluation.ranking_baselines import PolicyRanker, RewardRanker, baselines
 from ucfrec.provenance import provenance
-from ucfrec.runs.trained_policy import TrainedPolicy, store_of
+from ucfrec.runs.record import store_of
+from ucfrec.runs.trained_policy import TrainedPolicy
 
 
 def require_one_catalogue(trained: Sequence[TrainedPolicy]) -> None:
@@ -23,7 +24,7 @@ def require_one_catalogue(trained: Sequence[TrainedPolicy]) -> None:
     for policy in trained:
         if policy.item_states is None or policy.counts is None:
             raise InputError(f"{policy.folder}: this policy has no items to rank")
-        if policy.record["fingerprint"] != trained[0].record["fingerprint"]:
+        if policy.record.fingerprint != trained[0].record.fingerprint:
             raise InputError(
                 f"{policy.folder} was trained on another store than {trained[0].folder}; rank "
                 "them one by one"
@@ -74,8 +75,8 @@ def ranking_rows(
         "users": len(np.unique(period.users)),
         "reference": reference,
         "seed": seed,
-        "fingerprint": later.meta["fingerprint"],
-        "train_fingerprint": trained.record["fingerprint"],
+        "fingerprint": later.record.fingerprint,
+        "train_fingerprint": trained.record.fingerprint,
         **provenance(),
     }
     rules = dict(zip(named, (policy.rule for policy in policies), strict=False))

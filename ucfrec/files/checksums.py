@@ -1,71 +1,41 @@
 """Checksums of the files of a store or a run, recorded in its `meta.json` or `run.json`.
 
-XXH3 (64 bits) runs at the speed of memory, where CRC-32 of zlib has a quarter of it: see
-`benchmarks/checksum_cost.py`. It finds accidents, not forgers: who can change a file can change its
-checksum.
+XXH3 (64 bits) runs at the speed of memory, where CRC-32 of zlib has a quarter of it. It finds
+accidents, not forgers: who can change a file can change its checksum.
 """
 
 import os
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import xxhash
 
 from ucfrec.errors import InputError, explain_os_error
-from ucfrec.files.atomic import CHECKSUM, read_json, write_sealed_json
 from ucfrec.files.locks import is_lock_or_scratch
-from ucfrec.files.remote import fetch
 
-FILES: Final = "files"
-"""Entry of a record with size and checksum of the files beside it: {path: [bytes, hexadecimal]}."""
 CARD, MEASURED = "MODEL_CARD.md", "measured.json"
 """Files of a run that later measurements change; they are never listed."""
 _BLOCK: Final = 2**19
 _THREADS: Final = 2
 
 
-def seal(folder: Path, record: str, value: Mapping[str, Any]) -> dict[str, Any]:
-    """Write the record of a folder with the checksums of the other files in it.
-
-    A file that `value` lists keeps its entry, so that damage since then is not signed off.
+def files_of(
+    folder: Path, record: str, known: Mapping[str, tuple[int, str]]
+) -> dict[str, tuple[int, str]]:
+    """Size and checksum of every file of a complete folder, but its record.
 
     Args:
-        folder: all its files are complete.
-        record: name of the record in the folder, e.g. `meta.json`.
-        value: its content.
-
-    Returns:
-        The content with the list of files.
+        folder: the folder.
+        record: name of the record in it, e.g. `meta.json`.
+        known: files that keep the entry that they have.
     """
-    known = value.get(FILES, {})
-    listed = {
-        name: known.get(name) or [(folder / name).stat().st_size, file_checksum(folder / name)]
+    return {
+        name: known.get(name) or ((folder / name).stat().st_size, file_checksum(folder / name))
         for name in sorted(_names(folder))
         if name != record
     }
-    return _write(folder / record, value, listed)
-
-
-def reopen(folder: Path, record: str, value: Mapping[str, Any], kept: Container[str]) -> None:
-    """Write the record of a folder before files of it change.
-
-    Args:
-        folder: sealed by `seal`, or by nothing if an older ucfrec made it.
-        record: name of the record in the folder.
-        value: its content.
-        kept: files that will not change; the others are no longer listed.
-    """
-    listed = {name: entry for name, entry in value.get(FILES, {}).items() if name in kept}
-    if FILES in value and listed != value[FILES]:
-        _write(folder / record, value, listed)
-
-
-def _write(path: Path, value: Mapping[str, Any], listed: Mapping[str, Any]) -> dict[str, Any]:
-    sealed = {**{k: v for k, v in value.items() if k != CHECKSUM}, FILES: listed}
-    write_sealed_json(path, sealed)
-    return sealed
 
 
 def file_checksum(path: Path) -> str:
@@ -87,20 +57,6 @@ class Sealed:
     """What to do about a damaged file, for messages."""
     files: Mapping[str, tuple[int, str]]
     """Path in the folder to size in bytes and checksum."""
-
-    @classmethod
-    def of(cls, folder: Path, record: Mapping[str, Any], remedy: str) -> "Sealed | None":
-        """The checksums that `seal` recorded; None if an older ucfrec wrote the record.
-
-        Raises:
-            InputError: the list of files is damaged.
-        """
-        if FILES not in record:
-            return None
-        listed = record[FILES]
-        if not isinstance(listed, dict) or not all(map(_is_entry, listed.items())):
-            raise InputError(f"{folder}: its list of files is damaged; {remedy}")
-        return cls(folder, remedy, {name: (size, text) for name, (size, text) in listed.items()})
 
     def require_sizes(self) -> None:
         """Check that every file is there with its size; no file is read.
@@ -151,7 +107,6 @@ class Sealed:
     def _fault(self, name: str) -> str:
         size, stated = self.files[name]
         path = self.folder / name
-        fetch(path)
         try:
             return _size_fault(path, size) or (
                 "" if file_checksum(path) == stated else "has another content than was written"
@@ -161,26 +116,6 @@ class Sealed:
 
     def _error(self, name: str, fault: str) -> InputError:
         return InputError(f"{self.folder / name} {fault}; restore the file, or {self.remedy}")
-
-
-def sealed_record(folder: Path, record: str, remedy: str) -> tuple[dict[str, Any], Sealed | None]:
-    """Read the record of a folder and its checksums; only the record is verified.
-
-    Raises:
-        InputError: the record is missing or damaged.
-    """
-    value = read_json(folder / record)
-    if not isinstance(value, dict):
-        raise InputError(f"{folder / record} is damaged: it is no JSON object; {remedy}")
-    return value, Sealed.of(folder, value, remedy)
-
-
-def _is_entry(entry: tuple[str, object]) -> bool:
-    name, value = entry
-    inside = not Path(name).is_absolute() and ".." not in Path(name).parts
-    if not inside or not isinstance(value, list) or len(value) != 2:
-        return False
-    return type(value[0]) is int and isinstance(value[1], str)
 
 
 def _size_fault(path: Path, size: int) -> str:

@@ -1,8 +1,9 @@
 """Claims: what only one process at a time may write, and the scratch that killed processes left.
 
-A process that writes PATH holds a lock of the operating system on the file `.NAME.ucfrec-lock`
-beside it and writes to the scratch `.NAME.ucfrec-partial`. The system releases the lock when the
-process ends, also when it is killed; whoever gets the lock next knows that the scratch is dead.
+A process that writes PATH holds a lock of the operating system (by `filelock`) on the file
+`.NAME.ucfrec-lock` beside it and writes to the scratch `.NAME.ucfrec-partial`. The system releases
+the lock when the process ends, also when it is killed; whoever gets the lock next knows that the
+scratch is dead.
 """
 
 import json
@@ -11,13 +12,14 @@ import secrets
 import shutil
 import socket
 import sys
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from errno import ENOTDIR
 from pathlib import Path
 from typing import Final
+
+from filelock import BaseFileLock, FileLock, Timeout
 
 from ucfrec.errors import InputError
 
@@ -25,6 +27,7 @@ LOCK: Final = ".ucfrec-lock"
 SCRATCH: Final = ".ucfrec-partial"
 _PATIENCE: Final = 0.5
 """Seconds before a claim is given up: somebody may just be looking whether its owner is dead."""
+_FOREVER: Final = -1.0
 _COMMAND_LENGTH: Final = 160
 
 _held: set[tuple[int, Path]] = set()
@@ -60,13 +63,14 @@ def claim(path: Path, wait: bool = False) -> Iterator[bool]:
     lock = _lock_of(path)
     _make_folder(path.parent)
     opened = None
+    seconds = _FOREVER if wait else _PATIENCE
     try:
         try:
-            opened = _acquire(lock, None if wait else _PATIENCE)
+            opened = _acquire(lock, seconds)
         except FileNotFoundError:
             # Another process that had made the folder for nothing has removed it meanwhile.
             _make_folder(path.parent)
-            opened = _acquire(lock, None if wait else _PATIENCE)
+            opened = _acquire(lock, seconds)
         if opened is not None:
             _held.add(held)
         yield opened is not None
@@ -180,59 +184,31 @@ def _lock_of(path: Path) -> Path:
     return path.with_name(f".{path.name}{LOCK}")
 
 
-def _acquire(lock: Path, seconds: float | None) -> int | None:
-    """Descriptor of the locked file; None if another process holds it for longer than `seconds`."""
-    import fcntl  # not on Windows
-
-    until = time.monotonic() + (seconds or 0.0)
-    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-    while True:
-        opened = os.open(lock, flags, 0o666)
-        try:
-            fcntl.flock(opened, fcntl.LOCK_EX | (0 if seconds is None else fcntl.LOCK_NB))
-            if _same_file(lock, opened):
-                os.truncate(opened, 0)
-                os.write(opened, json.dumps(_this_process()).encode())
-                return opened
-            # Its last holder removed the file between our two calls.
-        except BlockingIOError:
-            if time.monotonic() >= until:
-                os.close(opened)
-                return None
-            time.sleep(0.01)
-        except BaseException:
-            _give_up(lock, opened)
-            raise
-        os.close(opened)
-
-
-def _give_up(lock: Path, opened: int) -> None:
-    """After an interruption: close the file, and remove it if no other process holds its lock."""
-    import fcntl
-
+def _acquire(lock: Path, seconds: float) -> BaseFileLock | None:
+    """The held lock; None if another process holds it for longer than `seconds`."""
+    # A generator that holds a claim may be closed by another thread.
+    opened = FileLock(lock, thread_local=False, poll_interval=0.01)
     try:
-        fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(opened)
-    else:
+        opened.acquire(timeout=seconds)
+        with lock.open("r+b") as file:
+            # On Windows no one else can read the first byte, which is what is locked.
+            file.seek(1)
+            file.write(json.dumps(_this_process()).encode())
+            file.truncate()
+    except Timeout:
+        return None
+    except BaseException:
         _release(lock, opened)
+        raise
+    return opened
 
 
-def _same_file(lock: Path, opened: int) -> bool:
-    try:
-        return os.path.samestat(os.stat(lock, follow_symlinks=False), os.fstat(opened))
-    except FileNotFoundError:
-        return False
-
-
-def _release(lock: Path, opened: int) -> None:
-    try:
-        if _same_file(lock, opened):
+def _release(lock: Path, opened: BaseFileLock) -> None:
+    # Whoever waits finds out that the file is gone. Windows removes it after the release.
+    if opened.is_locked:
+        with suppress(OSError):
             lock.unlink()
-    except OSError:  # on a file system that has become read-only
-        pass
-    finally:
-        os.close(opened)
+    opened.release()
 
 
 def _this_process() -> dict[str, str | int]:
@@ -248,7 +224,9 @@ def _this_process() -> dict[str, str | int]:
 def _holder(lock: Path) -> str:
     """The process that holds a lock, in words."""
     try:
-        stated = json.loads(lock.read_bytes()[:4096])
+        with lock.open("rb") as file:
+            file.seek(1)
+            stated = json.loads(file.read(4096))
         return (
             f"process {stated['pid']} on {stated['host']} ({stated['command']}) since "
             f"{stated['since']}"

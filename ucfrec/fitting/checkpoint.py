@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import atomic_file
+from ucfrec.fitting.average import PREFIX, WeightAverage, averages
 
 REMEDY: Final = "restore it or train again"
 """What to do about a damaged file."""
@@ -58,9 +59,8 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise InputError(f"{path} is damaged ({error}); {REMEDY}") from None
-    # Older versions wrote no checksum.
     about, _, checksum = stated.get("about", "{}").partition("\n")
-    if checksum and checksum != _checksum(tensors, about):
+    if checksum != _checksum(tensors, about):
         raise InputError(f"{path} is damaged (its checksum differs); restore it or train again")
     with damage_explained(path, REMEDY):
         return tensors, dict(json.loads(about))
@@ -78,7 +78,11 @@ def _checksum(tensors: Mapping[str, Tensor], about: str) -> str:
 
 
 def save_training(
-    path: Path, module: nn.Module, optimizer: torch.optim.Optimizer, counters: dict[str, Any]
+    path: Path,
+    module: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    counters: dict[str, Any],
+    average: WeightAverage | None = None,
 ) -> None:
     """Write everything that resuming a training needs: weights, optimizer state and counters.
 
@@ -89,13 +93,19 @@ def save_training(
     for index, moments in optimizer.state_dict()["state"].items():
         for key, value in moments.items():
             tensors[f"{_OPTIMIZER}{index}.{key}"] = value
+    if average is not None:
+        means, steps = average.state()
+        tensors, counters = tensors | means, counters | steps
     save_tensors(path, tensors, counters)
 
 
 def load_training(
-    path: Path, module: nn.Module, optimizer: torch.optim.Optimizer
+    path: Path,
+    module: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    average: WeightAverage | None = None,
 ) -> dict[str, Any]:
-    """Restore `module` and `optimizer`, in place, from a file that `save_training` wrote.
+    """Restore `module`, `optimizer` and `average`, in place, from what `save_training` wrote.
 
     Returns:
         The counters.
@@ -109,12 +119,28 @@ def load_training(
         for name in [name for name in tensors if name.startswith(_OPTIMIZER)]:
             index, key = name.removeprefix(_OPTIMIZER).split(".")
             state.setdefault(int(index), {})[key] = tensors.pop(name)
+    means = {name: tensors.pop(name) for name in [*tensors] if name.startswith(PREFIX)}
     load_weights(path, module, tensors)
     with damage_explained(path, REMEDY):
         _require_shapes(state, optimizer)
         groups = optimizer.state_dict()["param_groups"]
         optimizer.load_state_dict({"state": state, "param_groups": groups})
+        if average is not None:
+            average.restore(means, counters)
     return counters
+
+
+def load_trained(path: Path) -> dict[str, Tensor]:
+    """The trained weights in a file of `save_tensors` or `save_training`: averages where it has
+    them, without what only resuming needs.
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    tensors, counters = load_tensors(path)
+    weights = {n: t for n, t in tensors.items() if not n.startswith((_OPTIMIZER, PREFIX))}
+    with damage_explained(path, REMEDY):
+        return weights | averages(tensors, weights, counters)
 
 
 def _require_shapes(

@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from ucfrec.errors import InputError
 from ucfrec.fitting import distributed
+from ucfrec.fitting.average import WeightAverage
 from ucfrec.fitting.checkpoint import (
     load_tensors,
     load_training,
@@ -63,6 +64,9 @@ class LoopConfig:
     patience: Annotated[int, Field(ge=0, le=10**9)] = 0
     """Number of consecutive validations without improvement after which training stops early; 0
     disables early stopping."""
+    average: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """Decay of an exponential moving average of the weights, which is validated and saved as the
+    trained weights; 0 for the weights of the last step themselves."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +107,7 @@ def fit(
 ) -> Fit:
     """Minimise `loss` over batches from `draw`, resuming from `folder` if it holds a checkpoint.
 
+    With `config.average`, what is validated and saved as the trained weights is their average.
     Writes `last.safetensors` (to resume), `best.safetensors` (weights with the lowest validation
     loss, else the last), `metrics.jsonl` and TensorBoard events to `folder`. A training killed and
     resumed ends with the weights of an uninterrupted one. The global random state is restored.
@@ -123,9 +128,10 @@ def fit(
     folder.mkdir(parents=True, exist_ok=True)
     last, best = folder / "last.safetensors", folder / "best.safetensors"
     optimizer = _optimizer(module, config)
+    average = WeightAverage(module, config.average) if config.average else None
     counters = {"step": 0, "best_step": 0, "best_validation": math.inf, "stale": 0, "seconds": 0.0}
     if last.exists():
-        counters.update(load_training(last, module, optimizer))
+        counters.update(load_training(last, module, optimizer, average))
     step = int(counters["step"])
     clock, log = _Clock(step, counters["seconds"]), _log(folder, step)
     joint = rows if distributed.processes() > 1 else None
@@ -137,19 +143,20 @@ def fit(
         module.train()
         value, scalars = loss(batch)
         count = None if joint is None else joint(batch)
-        norm = _descend(value, module, optimizer, config, step, count)
+        norm = _descend(value, module, optimizer, average, config, step, count)
         if step % config.validate_every and step != config.steps:
             continue
         means = _means({"loss": value, **scalars}, count)
         logged = {"loss": means["loss"], "gradient_norm": norm.item(), **clock.rates(step, config)}
         _require_finite(logged["loss"], f"{describe}: the loss", step)
         _require_finite(logged["gradient_norm"], f"{describe}: the gradient", step)
-        logged |= means | _keep_best(module, validate, counters, step, best, describe)
+        with nullcontext() if average is None else average.applied():
+            logged |= means | _keep_best(module, validate, counters, step, best, describe)
         counters |= {"step": step, "seconds": clock.total()}
         if log is not None:
             log.add(step, logged)
             bar.update(0, loss=logged["loss"])
-            save_training(last, module, optimizer, counters)
+            save_training(last, module, optimizer, counters, average)
         clock.restart(step)
     if log is not None:
         log.close()
@@ -198,6 +205,7 @@ def _descend(
     value: Tensor,
     module: nn.Module,
     optimizer: torch.optim.Optimizer,
+    average: WeightAverage | None,
     config: LoopConfig,
     step: int,
     count: float | None,
@@ -213,7 +221,10 @@ def _descend(
     norm = clip_gradients(module.parameters(), config.clip_norm)
     for group in optimizer.param_groups:
         group["lr"] = _learning_rate(config, step)
+    moved = None if average is None else average.before_step()
     optimizer.step()
+    if average is not None and moved is not None:
+        average.after_step(moved)
     return norm
 
 

@@ -13,7 +13,6 @@ from safetensors import SafetensorError
 
 from ucfrec.errors import InputError
 from ucfrec.files.parquet import require_plausible_rows
-from ucfrec.files.remote import fetch
 from ucfrec.logs.compressed import require_plausible_size
 from ucfrec.logs.expressions import NotScalarError, columns_of, refused
 
@@ -210,7 +209,7 @@ def _of_all_rows(
 def bind(
     connection: duckdb.DuckDBPyConnection, table: Table, what: str, given: str
 ) -> tuple[str, str]:
-    """Resolve a column name or scalar expression against the columns of `table`, and fetch them.
+    """Resolve a column name or scalar expression against the columns of `table`.
 
     Args:
         what: purpose of the expression, for messages.
@@ -225,7 +224,6 @@ def bind(
     names = {name.casefold(): name for name in table.columns}
     if given.casefold() in names:
         name = names[given.casefold()]
-        _fetch(table, [name])
         return quoted(name), table.columns[name]
     if _NAME.fullmatch(given):
         raise InputError(_missing(table, what, given))
@@ -242,13 +240,7 @@ def bind(
         described = connection.sql(f"DESCRIBE SELECT {sql} AS x FROM (SELECT {like})").fetchall()
     except (duckdb.Error, NotScalarError) as error:
         raise refused(what, given, str(table.files[0]), _first_line(error)) from None
-    _fetch(table, [names[name.casefold()] for name in used])
     return sql, str(described[0][1])
-
-
-def _fetch(table: Table, columns: Sequence[str]) -> None:
-    for file in table.files:
-        fetch(file, columns)
 
 
 def _missing(table: Table, what: str, name: str) -> str:
@@ -333,7 +325,6 @@ def _unreadable(
     for table in tables:
         for file in table.files:
             single = Table((file,), table.types)
-            fetch(file)
             try:
                 connection.sql(f"SELECT max(hash(t)) FROM {single.sql} AS t").fetchall()
             except duckdb.Error as error:

@@ -1,21 +1,14 @@
-"""Which rows of a log can be used: the faults, the rule for duplicates, and both in one SQL query.
-
-Logs in files are sorted and gone through in batches (`ucfrec.logs.sorted_rows`); logs in memory
-are checked by one query, `check_rows`. Both keep the same rows.
-"""
+"""Why rows of a log are dropped: the faults that SQL finds, and what must be left."""
 
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-import duckdb
-
 from ucfrec import schema
 from ucfrec.errors import InputError
-from ucfrec.logs.binding import MAX_FLOAT, Table, explained, glob_pattern, text
-from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.typed import ROWS, TypedLog, not_finite, typed_log
+from ucfrec.logs.binding import glob_pattern, text
+from ucfrec.logs.typed import TypedLog, not_finite
 
 EARLIEST_MS: Final = 946_684_800_000
 """2000-01-01 UTC in ms; rows with an earlier time are dropped as clock errors."""
@@ -31,16 +24,6 @@ REASONS: Final = {
     "reward_not_finite": "reward is missing, NaN or infinite",
 }
 """Reason to its description; a row is dropped for the first reason that applies."""
-
-
-DUPLICATES: Final = {
-    "highest": (f"{schema.REWARD} DESC", "has the highest"),
-    "lowest": (f"{schema.REWARD}", "has the lowest"),
-    "first": ("row", "comes first in the files"),
-    "last": ("row DESC", "comes last in the files"),
-}
-"""Which of several rows with the same user, item or action, and time is kept: SQL of the order in
-which the kept row is the first, and its description."""
 
 
 def faults(log: TypedLog, known_items: Path | None = None) -> dict[str, str]:
@@ -84,91 +67,6 @@ def require_rewards_in_range(log: TypedLog, large: int, rows: int, largest: floa
             f"±{schema.LARGEST_REWARD:g} (up to {largest:.3g}), too large to train with in "
             "float32; divide them in the reward expression"
         )
-
-
-def check_rows(
-    connection: duckdb.DuckDBPyConnection,
-    tables: tuple[Table, ...],
-    mapping: LogMapping,
-    reward: str,
-    session_by: str | None,
-    folder: Path,
-    duplicates: str = "highest",
-) -> TypedLog:
-    """Read and check every row of a log by one query.
-
-    Creates the table `rows`, which is `read` with `reason` (key of `REASONS` for dropped rows, NULL
-    for kept rows), and the view `clean` of the kept rows. Of rows with the same key (user, item or
-    action, time) one is kept, by default that with the highest reward, because late feedback is
-    logged as a second row of an impression. Ties are broken by the other columns, so that the order
-    of rows and files does not matter.
-
-    Args:
-        connection: engine that may open the tables.
-        tables: of the log.
-        mapping: log columns to the tables' columns.
-        reward: scalar SQL expression over the tables' columns.
-        session_by: "session_id", "gap" or "user"; None for session_id if the log has it, else gap.
-        folder: folder named when its disk is full.
-        duplicates: key of `DUPLICATES`, which of several rows with the same key is kept.
-
-    Raises:
-        InputError: a file, column or type makes the log unusable, an observation is missing or not
-            finite, a reward is too large to train with.
-    """
-    log = typed_log(connection, tables, mapping, reward, session_by, folder)
-    with explained(connection, tables, folder):
-        connection.execute(_checked(log, duplicates))
-        connection.execute(
-            "CREATE VIEW clean AS SELECT * EXCLUDE (reason) FROM rows WHERE reason IS NULL"
-        )
-        require_rewards_in_range(
-            log,
-            *log.one(
-                f"SELECT count_if(abs({schema.REWARD}) > {schema.LARGEST_REWARD:.0f}), count(*), "
-                f"max(abs({schema.REWARD})) FROM clean"
-            ),
-        )
-    return log
-
-
-def _checked(log: TypedLog, duplicates: str) -> str:
-    cases = " ".join(f"WHEN {sql} THEN '{reason}'" for reason, sql in faults(log).items())
-    order = ", ".join(("good DESC", DUPLICATES[duplicates][0], *log.payload))
-    return f"""
-        CREATE TABLE rows AS
-        WITH faults AS (
-            SELECT *, CASE {cases} END AS fault,
-                coalesce(abs({schema.REWARD}) <= {MAX_FLOAT}, false) AS good
-            FROM {ROWS}
-        ), ranked AS (
-            SELECT *, row_number() OVER (
-                PARTITION BY fault, {schema.USER_ID}, {log.key}, {schema.TIMESTAMP}
-                ORDER BY {order}
-            ) AS rank
-            FROM faults
-        )
-        SELECT * EXCLUDE (fault, good, rank), CASE
-            WHEN fault IS NOT NULL THEN fault
-            WHEN rank > 1 THEN 'duplicate'
-            WHEN NOT good THEN 'reward_not_finite'
-        END AS reason
-        FROM ranked
-    """
-
-
-def drop_counts(log: TypedLog) -> dict[str, int]:
-    """Number of dropped rows of the table `rows` for each of `REASONS`.
-
-    Raises:
-        InputError: every row is dropped.
-    """
-    counts = dict(
-        log.connection.sql("SELECT reason, count(*) FROM rows GROUP BY reason").fetchall()
-    )
-    dropped = {reason: int(counts.get(reason, 0)) for reason in REASONS}
-    require_rows(log, counts.get(None, 0), dropped)
-    return dropped
 
 
 def require_rows(log: TypedLog, kept: int, dropped: Mapping[str, int]) -> None:

@@ -15,8 +15,8 @@ from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.binding import Table, explained, open_tables, quoted
-from ucfrec.logs.clean import REASONS, check_rows, drop_counts, require_rows
-from ucfrec.logs.engine import BATCH_ROWS, as_arrow, engine, engine_in_memory
+from ucfrec.logs.clean import REASONS, require_rows
+from ucfrec.logs.engine import as_arrow, engine, engine_in_memory
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.sessions import end_of_user
 from ucfrec.logs.sorted_rows import CODES, SortedRows, check_sorted, has_codes, sorted_batches
@@ -96,7 +96,7 @@ def frame_histories(
     session_by: str = "user",
     duplicates: str = "highest",
 ) -> Iterator[pa.RecordBatch]:
-    """`read_histories` of a log in memory, by SQL and without using the disk.
+    """`read_histories` of a log in memory, without using the disk.
 
     Of rows with the same user, item and time one is kept, as in `read_histories`; any other row
     that `prepare` would drop is an error.
@@ -122,10 +122,13 @@ def frame_histories(
         described = connection.sql(f"DESCRIBE {HISTORIES}").fetchall()
         table = FrameTable((Path(HISTORIES),), tuple((row[0], row[1]) for row in described))
         source = Path(HISTORIES)
-        log = check_rows(connection, (table,), mapping, reward, session_by, source, duplicates)
-        _require_clean(log)
-        with explained(connection, log.tables, Path(HISTORIES)):
-            yield from _by_user(log, last)
+        log = typed_log(connection, (table,), mapping, reward, session_by, source)
+        _require_items(log)
+        with explained(connection, log.tables, source):
+            rows = check_sorted(log, sorted_batches(log, None, None), duplicates, None)
+            require_rows(log, len(rows.clean), rows.dropped)
+            _require_clean(rows.dropped)
+            yield from _by_users(rows, last)
 
 
 def log_table(frame: "pd.DataFrame", name: str) -> pa.Table:
@@ -167,8 +170,7 @@ def log_table(frame: "pd.DataFrame", name: str) -> pa.Table:
     return pa.table(columns)
 
 
-def _require_clean(log: TypedLog) -> None:
-    dropped = drop_counts(log)
+def _require_clean(dropped: dict[str, int]) -> None:
     faults = {reason: n for reason, n in dropped.items() if n and reason != "duplicate"}
     if faults:
         rows = "; ".join(f"{n:,} rows: {REASONS[reason]}" for reason, n in faults.items())
@@ -246,30 +248,3 @@ def _lists(offsets: IntArray, values: pa.Array) -> pa.ListArray:
 
 def _numbers(values: Array, kind: pa.DataType) -> pa.Array:
     return pa.Array.from_buffers(kind, len(values), [None, pa.py_buffer(values)])
-
-
-def _by_user(log: TypedLog, last: int) -> Iterator[pa.RecordBatch]:
-    _require_items(log)
-    lists = {
-        "item_ids": schema.ITEM_ID,
-        "rewards": f"CAST({schema.REWARD} AS FLOAT)",
-        "timestamps": schema.TIMESTAMP,
-    }
-    if log.session_by == schema.SESSION_ID:
-        lists["session_ids"] = schema.SESSION_ID
-    order = f"ORDER BY {schema.TIMESTAMP}, {schema.ITEM_ID}"
-    gathered = ", ".join(
-        f"list({value} {order}) FILTER (WHERE back <= {last}) AS {name}"
-        for name, value in lists.items()
-    )
-    if schema.OBSERVATION in log.columns:
-        gathered += f", any_value({schema.OBSERVATION}) FILTER (WHERE back = 1) AS observation"
-    backwards = f"{schema.TIMESTAMP} DESC, {schema.ITEM_ID} DESC"
-    query = f"""
-        SELECT {schema.USER_ID}, {gathered}, list_sort(list(DISTINCT {schema.ITEM_ID})) AS seen
-        FROM (SELECT *, row_number() OVER (
-            PARTITION BY {schema.USER_ID} ORDER BY {backwards}
-        ) AS back FROM clean)
-        GROUP BY {schema.USER_ID} ORDER BY {schema.USER_ID}
-    """
-    yield from log.connection.sql(query).to_arrow_reader(BATCH_ROWS)

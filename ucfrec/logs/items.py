@@ -11,7 +11,7 @@ from scipy import sparse
 from ucfrec import schema
 from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
 from ucfrec.episodes.item_table import ITEM_STATES, write_item_table
-from ucfrec.episodes.record import read_store_record
+from ucfrec.episodes.record import StoreRecord
 from ucfrec.errors import InputError
 from ucfrec.logs.moments import Moments
 from ucfrec.logs.spectral import SparseRows, right_singular_vectors
@@ -67,8 +67,7 @@ def training_steps(folder: Path) -> Iterator[TrainingSteps]:
 
 
 def _in_order(folder: Path) -> Iterator[TrainingSteps]:
-    meta, _ = read_store_record(folder)
-    for number in range(meta["n_shards"]):
+    for number in range(StoreRecord.read(folder).n_shards):
         shard = folder / f"shard-{number:05d}"
         columns = {
             name: np.load(shard / f"{name}.npy", mmap_mode="r") for name in (schema.ITEM, "reward")

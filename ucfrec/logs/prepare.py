@@ -18,13 +18,11 @@ from typing import Any, Final
 
 from ucfrec import schema
 from ucfrec.episodes.item_table import ITEM_STATES
-from ucfrec.episodes.record import RECORD
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder
-from ucfrec.files.checksums import seal
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.binding import explained, open_tables
-from ucfrec.logs.clean import DUPLICATES, require_rows
+from ucfrec.logs.clean import require_rows
 from ucfrec.logs.distributions import RewardPasses, distributions
 from ucfrec.logs.engine import engine
 from ucfrec.logs.feature_tables import load_features, require_known_ids
@@ -38,6 +36,7 @@ from ucfrec.logs.ids import (
     write_episode_users,
     write_ids,
 )
+from ucfrec.logs.kept import DUPLICATES
 from ucfrec.logs.mapping import SESSIONS, FeatureTable, LogMapping, log_files
 from ucfrec.logs.measures import Measures, binned_rewards, measure, sampled_rewards
 from ucfrec.logs.order import count_unsorted
@@ -77,7 +76,7 @@ class PrepareOptions:
     embedding_size: int = 32
     """Most dimensions of an item embedding."""
     duplicates: str = "highest"
-    """Key of `ucfrec.logs.clean.DUPLICATES`: which of several rows with the same user, item or
+    """Key of `ucfrec.logs.kept.DUPLICATES`: which of several rows with the same user, item or
     action, and time is kept; with "first" and "last" the order of files and rows matters."""
     memory_limit: str = "2GB"
     """Memory of the process, e.g. "2GB", for logs of any size; rows spill to disk. From "800MB" on
@@ -85,6 +84,8 @@ class PrepareOptions:
     temp_folder: Path | None = None
     """Folder for spilled rows; None for the parent of the store (the system's for `validate`)."""
 
+    dataset: str | None = None
+    """Name of the dataset adapter, for the record."""
     engine: str = "duckdb"
     """What reads and sorts the rows, one of `ENGINES`: DuckDB on this machine, or Spark. The store
     is the same."""
@@ -181,13 +182,13 @@ def prepare(
             numbers = StepNumbers.of(log, found.measures, found.scratch)
             with progress(report["steps"], "write the store", "steps") as bar:
                 writer = write_steps(folder, found.episodes(), found.spool, numbers, bar)
-            meta = writer.finish(report["reward"], report, write_ids(log, folder))
+            record = writer.finish(report["reward"], report, write_ids(log, folder))
             if log.key == schema.ITEM_ID:
                 _write_states(found, folder, options.embedding_size, like)
             if like is not None:
                 users = (each.users for each in found.episodes())
                 write_episode_users(log, folder / EPISODE_USERS, users)
-            seal(folder, RECORD, meta)
+            record.sealed(folder)
     return report
 
 
@@ -289,6 +290,8 @@ def _prepared(
                 _require_known_ids(log, mapping, features)
                 report = _report(rows, spool, cut, measures)
                 report = {"reward": reward, **report, "duplicates": options.duplicates}
+                report["dataset"] = options.dataset
+                report["mapping"] = {name: str(column) for name, column in mapping.columns.items()}
                 stage.update()
         yield _Prepared(rows, spool, cut, measures, features, report, scratch)
 

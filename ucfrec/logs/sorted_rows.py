@@ -14,9 +14,9 @@ import pyarrow as pa
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray
-from ucfrec.logs.binding import MAX_FLOAT
 from ucfrec.logs.clean import REASONS, faults, require_rewards_in_range
 from ucfrec.logs.engine import as_numpy
+from ucfrec.logs.kept import kept_rows, same_key
 from ucfrec.logs.row_vectors import RowVectors
 from ucfrec.logs.spool import Spool
 from ucfrec.logs.typed import ROWS, TypedLog
@@ -72,14 +72,14 @@ class SortedRows:
 
 
 def sorted_batches(
-    log: TypedLog, known_items: Path | None, folder: Path
+    log: TypedLog, known_items: Path | None, folder: Path | None
 ) -> Iterator[pa.RecordBatch]:
     """Sort every row of a log with DuckDB, and make the tables of codes.
 
     Args:
         log: its engine may open `known_items`.
         known_items: `items.parquet` of a store: rows with other items are dropped; None for all.
-        folder: scratch folder, of the observations.
+        folder: scratch folder, of the observations; None for a log in memory.
 
     Returns:
         Rows as of `in_order`.
@@ -87,7 +87,7 @@ def sorted_batches(
     for name, table in code_tables(log):
         log.connection.execute(f"CREATE TABLE {table} AS {coded_ids(name, ROWS)}")
     faulty = f"({with_faults(log, ROWS, faults(log, known_items))})"
-    if schema.OBSERVATION not in log.columns:
+    if schema.OBSERVATION not in log.columns or folder is None:
         return _read(log, in_order(log, faulty))
     vectors = RowVectors(log, folder / "observations.bin")
     return vectors.joined(_read(log, in_order(log, faulty, left_out=schema.OBSERVATION)))
@@ -98,22 +98,21 @@ def _read(log: TypedLog, query: str) -> Iterator[pa.RecordBatch]:
 
 
 def check_sorted(
-    log: TypedLog, batches: Iterator[pa.RecordBatch], duplicates: str, folder: Path
+    log: TypedLog, batches: Iterator[pa.RecordBatch], duplicates: str, folder: Path | None
 ) -> SortedRows:
     """Check every row of a log.
-
-    Of rows with the same user, choice and time one is kept, as `ucfrec.logs.clean.check_rows` does.
 
     Args:
         log: its engine has the tables of `code_tables`.
         batches: all its rows, as `in_order` selects them.
-        duplicates: key of `ucfrec.logs.clean.DUPLICATES`.
-        folder: scratch folder of the spools.
+        duplicates: key of `ucfrec.logs.kept.DUPLICATES`.
+        folder: scratch folder of the spools; None for memory.
 
     Raises:
         InputError: a reward is too large to train with.
     """
-    rows = SortedRows(log, Spool(folder / "clean"), Spool(folder / "placed"))
+    spools = [Spool(folder and folder / name) for name in ("clean", "placed")]
+    rows = SortedRows(log, spools[0], spools[1])
     reasons = list(REASONS)
     large, largest = 0, 0.0
     for batch in _whole_keys(_columns(batch, log) for batch in batches):
@@ -126,8 +125,11 @@ def check_sorted(
             rows.dropped[reason] += int(n)
         usable = batch.pop("fault") == 0
         batch = _where(usable, batch)
-        kept = _kept(batch, log, duplicates, rows)
-        clean = {name: values[kept] for name, values in batch.items() if name in _spooled(log)}
+        kept = kept_rows(batch, duplicates)
+        rows.conflicts += kept.conflicts
+        rows.dropped["duplicate"] += kept.duplicates
+        rows.dropped["reward_not_finite"] += kept.undefined
+        clean = {name: values[kept.rows] for name, values in batch.items() if name in _spooled(log)}
         size = np.abs(clean[schema.REWARD])
         large += int(np.count_nonzero(size > schema.LARGEST_REWARD))
         largest = max(largest, float(size.max(initial=0)))
@@ -247,7 +249,7 @@ def _whole_keys(batches: Iterator[dict[str, Array]]) -> Iterator[dict[str, Array
     for batch in batches:
         if held:
             batch = {name: np.concatenate([held[name], batch[name]]) for name in batch}
-        starts = np.flatnonzero(~_same_key(batch))
+        starts = np.flatnonzero(~same_key(batch))
         if not len(starts):
             held = batch
             continue
@@ -256,65 +258,3 @@ def _whole_keys(batches: Iterator[dict[str, Array]]) -> Iterator[dict[str, Array
         held = {name: values[end:].copy() for name, values in batch.items()}
     if held:
         yield held
-
-
-def _same_key(batch: dict[str, Array]) -> BoolArray:
-    """(M − 1,) whether each row but the first has the user, time and choice of the row before."""
-    user, times = batch["user"], batch["timestamp"]
-    same = (user[1:] == user[:-1]) & (times[1:] == times[:-1])
-    choice = batch[schema.ITEM] if schema.ITEM in batch else batch[schema.ACTION]
-    equal = choice[1:] == choice[:-1]
-    return np.asarray(same & (equal if equal.ndim == 1 else equal.all(axis=1)))
-
-
-def _kept(batch: dict[str, Array], log: TypedLog, duplicates: str, rows: SortedRows) -> Array:
-    """Positions of the rows to keep; the others are counted in `rows`."""
-    rewards = batch[schema.REWARD]
-    good = np.abs(rewards) <= MAX_FLOAT
-    kept = np.ones(len(rewards), dtype=bool)
-    same = _same_key(batch)
-    repeated = np.zeros(len(rewards), dtype=bool)
-    repeated[1:] |= same
-    repeated[:-1] |= same
-    if repeated.any():
-        places = np.flatnonzero(repeated)
-        # Rows that agree with the one before are of its group.
-        groups = np.cumsum(~np.concatenate([[False], same])[places])
-        some = {name: values[places] for name, values in batch.items()}
-        rule = _rule(some, duplicates)
-        order = np.lexsort([*_tie_breakers(some, log), rule, ~good[places], groups])
-        ordered = groups[order]
-        begins = np.concatenate([[True], ordered[1:] != ordered[:-1]])
-        winner = order[begins][np.cumsum(begins) - 1]
-        losers = order[~begins]
-        kept[places[losers]] = False
-        ours, theirs = some["reward"][losers], some["reward"][winner[~begins]]
-        equal = (ours == theirs) | (np.isnan(ours) & np.isnan(theirs))
-        rows.conflicts += int(np.count_nonzero(~equal))
-        rows.dropped["duplicate"] += len(losers)
-    undefined = kept & ~good
-    rows.dropped["reward_not_finite"] += int(np.count_nonzero(undefined))
-    return np.flatnonzero(kept & good)
-
-
-def _rule(some: dict[str, Array], duplicates: str) -> Array:
-    """Sort key by which the row that the rule keeps comes first."""
-    rewards = some[schema.REWARD]
-    if duplicates == "highest":
-        return np.where(np.isnan(rewards), -np.inf, -rewards)
-    if duplicates == "lowest":
-        return rewards
-    return some["row"] if duplicates == "first" else -some["row"]
-
-
-def _tie_breakers(some: dict[str, Array], log: TypedLog) -> list[Array]:
-    """Sort keys of the other columns, the least important first, as `numpy.lexsort` wants them."""
-    keys: list[Array] = []
-    for name in log.payload:
-        if name == schema.OBSERVATION:
-            keys += list(some[name].T)
-        elif name == schema.SESSION_ID:
-            keys += [some["no_session"], some["session"]]
-        else:
-            keys.append(some[name])
-    return keys[::-1]

@@ -1,6 +1,7 @@
 """Rows on disk, column by column: written once in order, then read in slices of bounded size."""
 
 from collections.abc import Mapping
+from io import BytesIO
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -14,18 +15,19 @@ _BLOCK_BYTES: Final = 2**26
 
 
 class Spool:
-    """Columns of equal length as files of raw numbers in a scratch folder.
+    """Columns of equal length as files of raw numbers in a scratch folder, or in memory.
 
     Slices are read into memory, not mapped: pages of a mapped file count as the memory of a process
     that must keep to a limit.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path | None) -> None:
         """
         Args:
-            folder: of the files; it is made, and must not exist.
+            folder: of the files; it is made, and must not exist; None for memory.
         """
-        folder.mkdir()
+        if folder is not None:
+            folder.mkdir()
         self._folder = folder
         self._files: dict[str, IO[bytes]] = {}
         self._rows: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
@@ -53,7 +55,7 @@ class Spool:
         """
         for name, values in columns.items():
             if name not in self._files:
-                self._files[name] = (self._folder / f"{name}.bin").open("w+b")
+                self._files[name] = self._opened(name)
                 self._rows[name] = values.dtype, values.shape[1:]
             self._files[name].write(np.ascontiguousarray(values).data)
         self._length += len(next(iter(columns.values())))
@@ -64,8 +66,15 @@ class Spool:
         size = int(np.prod(shape, dtype=np.int64))
         file = self._files[name]
         file.seek(start * size * dtype.itemsize)
-        values = np.fromfile(file, dtype, (stop - start) * size)
+        count = (stop - start) * size
+        if isinstance(file, BytesIO):
+            values = np.frombuffer(bytearray(file.read(count * dtype.itemsize)), dtype)
+        else:
+            values = np.fromfile(file, dtype, count)
         return values.reshape(-1, *shape)
+
+    def _opened(self, name: str) -> IO[bytes]:
+        return BytesIO() if self._folder is None else (self._folder / f"{name}.bin").open("w+b")
 
     def close(self) -> None:
         """Close the files."""

@@ -10,8 +10,9 @@ import numpy as np
 from ucfrec import schema
 from ucfrec.errors import InputError, one_line
 from ucfrec.files.remote import origin
-from ucfrec.logs.clean import DUPLICATES, REASONS
+from ucfrec.logs.clean import REASONS
 from ucfrec.logs.distributions import Distribution
+from ucfrec.logs.kept import DUPLICATES
 from ucfrec.logs.measures import Measures
 from ucfrec.logs.sessions import Cut
 from ucfrec.logs.sorted_rows import SortedRows
@@ -108,7 +109,7 @@ def format_report(report: Mapping[str, Any]) -> str:
         if rows:
             lines.append((f"  dropped: {reason}", f"{rows:,}  {REASONS.get(reason, '')}"))
     if report["conflicting_duplicates"]:
-        kept = DUPLICATES[report.get("duplicates", "highest")][1]
+        kept = DUPLICATES[report.get("duplicates", "highest")]
         conflicts = f"{report['conflicting_duplicates']:,}  {CONFLICT}, which {kept}"
         lines.append(("  conflicting duplicates", conflicts))
     lines += [

@@ -156,7 +156,7 @@ def _of_the_sessions(
         "steps": len(steps.reward),
         "dropped": logged.report["dropped"],
         "unknown_item_rows": logged.unknown_items,
-        "fingerprint": logged.store.meta["fingerprint"],
+        "fingerprint": logged.store.record.fingerprint,
     }
 
 
@@ -299,7 +299,7 @@ def _unjudged(logged: LoggedSessions, options: EstimateOptions) -> LoggedSteps:
     store = logged.store
     episodes, places = store.all_steps()
     propensity = np.full(len(episodes), np.nan)
-    if schema.PROPENSITY in store.meta["columns"]:
+    if schema.PROPENSITY in store.record.columns:
         propensity = store.step_values(schema.PROPENSITY, episodes, places).astype(np.float64)
     return LoggedSteps(
         session=episodes,

@@ -106,11 +106,9 @@ def logged_sessions(
     record = trained.record
     if not trained.logged_observation_size:
         mapping = LogMapping({schema.OBSERVATION: ""}).over(mapping)
-    gap_ms = record["session_gap_ms"]
-    # Older runs did not record `session_by`, but they did record the gap.
-    session_by = record.get("session_by") or (None if gap_ms is None else "gap")
-    reward = Expression(record["reward"], str(run / RUN))
-    options = PrepareOptions(reward, session_by, memory_limit=memory_limit)
+    gap_ms = record.session_gap_ms
+    reward = Expression(record.reward, str(run / RUN))
+    options = PrepareOptions(reward, record.session_by, memory_limit=memory_limit)
     if gap_ms is not None:
         options = replace(options, gap_minutes=gap_ms / 60_000)
     with scratch_folder(Path(gettempdir()), "logs") as scratch:
@@ -201,7 +199,7 @@ def score(
     store, item_ids = logged.store, trained.item_ids
     assert item_ids is not None
     names = [schema.TIMESTAMP, schema.ITEM_ID, schema.REWARD]
-    names += [schema.PROPENSITY] if schema.PROPENSITY in store.meta["columns"] else []
+    names += [schema.PROPENSITY] if schema.PROPENSITY in store.record.columns else []
     for batch in scored_steps(trained, store, rule):
         items = batch.windows.actions[:, -1:]
         chosen, scored = batch.log_probabilities.gather(1, items), batch.scores.gather(1, items)

@@ -10,7 +10,8 @@ from ucfrec import schema
 from ucfrec.arrays import Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.runs.trained_policy import REFIT_OF, TrainedPolicy, store_of
+from ucfrec.runs.record import store_of
+from ucfrec.runs.trained_policy import TrainedPolicy
 
 MOST_SEEN: Final = 0.05
 """Largest share of rows seen in training with which an estimate is accepted. It is above 0 because
@@ -35,7 +36,7 @@ def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
         The share, from 0 to 1, or None if the run's store has been moved, deleted or changed.
     """
     record = trained.record
-    if record["fingerprint"] == logged.meta["fingerprint"]:
+    if record.fingerprint == logged.record.fingerprint:
         return 1.0
     try:
         store = store_of(trained.folder, record)
@@ -46,7 +47,7 @@ def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
     keys, rows = np.unique(np.concatenate(list(_keys(logged))), return_counts=True)
     seen = np.zeros(len(keys), dtype=bool)
     # The training data may be far larger than the logs.
-    for name in schema.SPLITS if REFIT_OF in record else ("train", "validation"):
+    for name in schema.SPLITS if record.refit_of is not None else ("train", "validation"):
         for learnt in _keys(store.split(name)):
             places = np.minimum(np.searchsorted(keys, learnt), len(keys) - 1)
             seen[places[keys[places] == learnt]] = True

@@ -267,10 +267,10 @@ def _description(graph: RuleGraph, trained: TrainedPolicy, rule: DecisionRule) -
         "with exclude_seen, put the session's items into `excluded`; with a temperature, draw from "
         "`scores`",
         "policy": trained.name,
-        "reward": trained.record["reward"],
-        "session_by": trained.record.get("session_by"),
-        "session_gap_ms": trained.record["session_gap_ms"],
-        "fingerprint": trained.record.get("fingerprint"),
+        "reward": trained.record.reward,
+        "session_by": trained.record.session_by,
+        "session_gap_ms": trained.record.session_gap_ms,
+        "fingerprint": trained.record.fingerprint,
         "item_ids": trained.item_ids.tolist(),
         "user_ids": trained.user_ids.tolist(),
     }

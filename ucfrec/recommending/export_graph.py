@@ -60,7 +60,7 @@ class RuleGraph(nn.Module):
         self.states, self.k = states, k
         self.context, self.observation_size = (
             policy.config.context,
-            trained.record["observation_size"],
+            trained.record.observation_size,
         )
         self.head = _Head(policy.head)
         self.policy = _with_head(policy, self.head)

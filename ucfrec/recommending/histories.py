@@ -15,8 +15,9 @@ from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.logs.clean import EARLIEST_MS
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.histories import frame_histories, read_histories
+from ucfrec.logs.kept import kept_in_order
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.runs.trained_policy import RUN, TrainedPolicy, duplicates_of
+from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 
 _PLAIN = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP)
 _MOST_PLAIN_ROWS = 1_000_000
@@ -72,22 +73,28 @@ class Histories:
         )
 
     @classmethod
-    def from_plain(cls, frame: pd.DataFrame, by_id: bool) -> Self | None:
+    def from_plain(cls, frame: pd.DataFrame, by_id: bool, duplicates: str) -> Self | None:
         """Read a frame that needs no SQL; None for any other frame.
 
         Its columns are `user_id`, `item_id`, `timestamp` (ms), with `by_id` also `session_id`, all
-        int64, and `reward`, a number; no row is out of range or repeats another's user, item and
-        time.
+        int64, and `reward`, a number; no row is out of range.
         """
         columns = _plain_columns(frame, by_id)
         if columns is None:
             return None
         rewards, users, items, times, *sessions = columns
-        order = np.lexsort((items, times, users))
+        table = {
+            "user": users,
+            schema.TIMESTAMP: times,
+            schema.ITEM: items,
+            schema.REWARD: rewards,
+            "row": np.arange(len(users)),
+        }
+        if by_id:
+            table["session"] = sessions[0]
+        order = kept_in_order(table, duplicates)
         rewards, users, items, times, *sessions = (each[order] for each in columns)
         same_user = users[1:] == users[:-1]
-        if (same_user & (items[1:] == items[:-1]) & (times[1:] == times[:-1])).any():
-            return None
         owner = np.concatenate([[0], np.cumsum(~same_user)])
         ends = np.append(np.flatnonzero(~same_user), len(users) - 1)
         recent = ends[owner] - np.arange(len(users)) < LONGEST_HISTORY
@@ -180,7 +187,7 @@ def histories_of_files(
         LONGEST_HISTORY,
         memory_limit,
         session_by=_session_by(trained),
-        duplicates=duplicates_of(trained.record),
+        duplicates=trained.record.data.duplicates,
     )
     return map(Histories.from_batch, batches)
 
@@ -204,8 +211,8 @@ def histories_of_frame(
         InputError: a column is missing, or has values that cannot be used.
     """
     by_id = _session_by(trained) == schema.SESSION_ID
-    if not trained.record["observation_size"] and mapping == LogMapping():
-        plain = Histories.from_plain(frame, by_id)
+    if not trained.record.observation_size and mapping == LogMapping():
+        plain = Histories.from_plain(frame, by_id, trained.record.data.duplicates)
         if plain is not None:
             return iter((plain,))
     has_rewards = schema.REWARD in getattr(frame, "columns", ())
@@ -215,7 +222,7 @@ def histories_of_frame(
         schema.REWARD if has_rewards else _reward(trained),
         LONGEST_HISTORY,
         session_by=_session_by(trained),
-        duplicates=duplicates_of(trained.record),
+        duplicates=trained.record.data.duplicates,
     )
     return map(Histories.from_batch, batches)
 
@@ -249,17 +256,17 @@ def _plain_columns(frame: pd.DataFrame, by_id: bool) -> list[Array] | None:
 
 
 def _reward(trained: TrainedPolicy) -> Expression:
-    return Expression(trained.record["reward"], str(trained.folder / RUN))
+    return Expression(trained.record.reward, str(trained.folder / RUN))
 
 
 def _columns_used(trained: TrainedPolicy, mapping: LogMapping) -> LogMapping:
-    if trained.record["observation_size"]:
+    if trained.record.observation_size:
         return mapping
     return LogMapping({schema.OBSERVATION: ""}).over(mapping)
 
 
 def _session_by(trained: TrainedPolicy) -> str:
-    by_id = trained.record.get("session_by") == schema.SESSION_ID
+    by_id = trained.record.session_by == schema.SESSION_ID
     return schema.SESSION_ID if by_id else "user"
 
 

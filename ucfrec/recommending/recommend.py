@@ -107,9 +107,7 @@ class _Choice:
     def frame(self, batch: Histories) -> pd.DataFrame:
         """Items for the next step of U users whose rows have the policy's numbers of items, −1 for
         unknown ones; those of `seen_ids` are not recommended."""
-        latest = batch.rows(batch.item_ids >= 0).latest_session(
-            self.trained.record["session_gap_ms"]
-        )
+        latest = batch.rows(batch.item_ids >= 0).latest_session(self.trained.record.session_gap_ms)
         # Sessions of about the same length share a pass, which costs as much as the longest.
         lengths = np.bincount(latest.owner, minlength=len(latest.users))
         order = np.argsort(lengths, kind="stable")

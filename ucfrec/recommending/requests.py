@@ -17,9 +17,10 @@ from ucfrec import schema
 from ucfrec.arrays import Array, Float32Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.logs.clean import DAY_MS, EARLIEST_MS
+from ucfrec.logs.kept import kept_in_order
 from ucfrec.recommending.histories import LONGEST_HISTORY
 from ucfrec.recommending.row_rewards import RowRewards
-from ucfrec.runs.trained_policy import TrainedPolicy, duplicates_of
+from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import settings_table
 
 _Integer = Annotated[StrictInt, Field(ge=-(2**63), lt=2**63)]
@@ -192,9 +193,9 @@ class HistoryReader:
     def of(cls, trained: TrainedPolicy) -> "HistoryReader":
         """The reader for a policy; its `rewards` have to be closed."""
         return cls(
-            duplicates_of(trained.record),
-            trained.record.get("session_by") == schema.SESSION_ID,
-            trained.record["observation_size"],
+            trained.record.data.duplicates,
+            trained.record.session_by == schema.SESSION_ID,
+            trained.record.observation_size,
             RowRewards.of(trained),
         )
 
@@ -206,44 +207,35 @@ class HistoryReader:
         """
         if self.observation_size and not rows:
             raise InputError("the policy needs the last observation; give a row of history with it")
-        times = _times(rows)
         ids = _ids([row["item_id"] for row in rows])
+        columns = {
+            "user": np.zeros(len(rows), dtype=np.int64),
+            schema.TIMESTAMP: np.asarray(_times(rows), dtype=np.int64),
+            schema.ITEM: np.asarray(ids, dtype=_type(ids)),
+            "row": np.arange(len(rows)),
+        }
         sessions = None
         if self.by_session_id:
             _require(rows, schema.SESSION_ID)
             sessions = _ids([row["session_id"] for row in rows])
-        rewards = self.rewards.of_rows(rows)
-        order = self._kept_in_order(rows, ids, times, rewards, sessions)[-LONGEST_HISTORY:]
+            columns["session"] = np.unique(sessions, return_inverse=True)[1]
+        if self.observation_size:
+            given = [row.get("observation") or () for row in rows]
+            if {*map(len, given)} == {self.observation_size}:
+                columns[schema.OBSERVATION] = np.asarray(given, dtype=np.float64)
+        columns[schema.REWARD] = np.asarray(self.rewards.of_rows(rows), dtype=np.float64)
+        order = kept_in_order(columns, self.duplicates)[-LONGEST_HISTORY:]
         observation = None
         if self.observation_size:
-            observation = self._observation(rows, order[-1])
+            observation = self._observation(rows, int(order[-1]))
         return UserHistory(
-            np.asarray([ids[n] for n in order], dtype=_type(ids)),
-            np.asarray([rewards[n] for n in order], dtype=np.float32),
-            np.asarray([times[n] for n in order], dtype=np.int64),
+            columns[schema.ITEM][order],
+            columns[schema.REWARD][order].astype(np.float32),
+            columns[schema.TIMESTAMP][order],
             None if sessions is None else [sessions[n] for n in order],
             np.asarray(list(dict.fromkeys(ids)), dtype=_type(ids)),
             observation,
         )
-
-    def _kept_in_order(
-        self,
-        rows: Sequence[Row],
-        ids: Sequence[Any],
-        times: Sequence[int],
-        rewards: Sequence[float],
-        sessions: Sequence[Any] | None,
-    ) -> list[int]:
-        """Numbers of the rows without duplicates, in the order of time and then of the item."""
-        best: dict[tuple[int, Any], tuple[tuple[Any, ...], int]] = {}
-        for n, key in enumerate(zip(times, ids, strict=True)):
-            first = {"highest": -rewards[n], "lowest": rewards[n], "first": n, "last": -n}
-            # Ties are broken by the log's other columns.
-            rest = (rows[n].get("observation") or [], "" if sessions is None else sessions[n])
-            rank = (first[self.duplicates], *rest)
-            if key not in best or rank < best[key][0]:
-                best[key] = (rank, n)
-        return [n for _, (_, n) in sorted(best.items(), key=lambda entry: entry[0])]
 
     def _observation(self, rows: Sequence[Row], last: int) -> list[float]:
         given = rows[last].get("observation")

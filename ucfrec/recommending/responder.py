@@ -190,7 +190,7 @@ class Responder:
         """The latest sessions of the requests, with the policy's numbers of items."""
         histories = [one.history for one in asked]
         observations = None
-        if self.trained.record["observation_size"]:
+        if self.trained.record.observation_size:
             observations = np.asarray([each.observation for each in histories], dtype=np.float32)
         sessions = None
         if histories[0].session_ids is not None:
@@ -209,7 +209,7 @@ class Responder:
         )
         known = batch.item_ids >= 0
         return (batch if known.all() else batch.rows(known)).latest_session(
-            self.trained.record["session_gap_ms"]
+            self.trained.record.session_gap_ms
         )
 
     def _best(self, asked: Sequence[_Asked], scores: Tensor) -> list[Answer]:

@@ -38,7 +38,7 @@ class RowRewards:
     @classmethod
     def of(cls, trained: TrainedPolicy) -> "RowRewards":
         """The rewards of a policy's run."""
-        return cls(Expression(trained.record["reward"], str(trained.folder / RUN)))
+        return cls(Expression(trained.record.reward, str(trained.folder / RUN)))
 
     def close(self) -> None:
         """Close the engine."""

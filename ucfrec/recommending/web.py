@@ -23,7 +23,6 @@ from ucfrec.recommending.batcher import Batcher, QueueFullError
 from ucfrec.recommending.requests import Request, parsed
 from ucfrec.recommending.responder import Answer, Responder
 from ucfrec.recommending.serving_metrics import ServingMetrics
-from ucfrec.runs.trained_policy import describe_trained
 from ucfrec.settings import settings_table
 
 _JSON: Final = "application/json"
@@ -112,7 +111,7 @@ def application(responder: Responder, limits: ServerLimits) -> FastAPI:
 
     described = {
         "status": "ok",
-        "policy": describe_trained(responder.trained.record),
+        "policy": responder.trained.record.summary,
         "rule": str(responder.rule),
         "rule_hash": responder.rule.hash,
         "version": __version__,

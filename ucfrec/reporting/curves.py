@@ -27,7 +27,7 @@ _ACTION_LOSSES = ("validation_loss", "action_loss")
 _SWITCHES = {"mask_loss": "lambda_mask", "reward_loss": "reward_weight"}
 """Loss to the policy setting that is its weight; with weight 0 it is not trained on."""
 REFERENCES = {"uniform": "all items alike", "popularity": "items by popularity"}
-"""Key to display name of the reference losses of `ucfrec.runs.reference_losses`."""
+"""Key to display name of the reference losses of `ucfrec.runs.start.reference_losses`."""
 
 
 def trained_on(logged: Curves, config: Mapping[str, Any]) -> Curves:

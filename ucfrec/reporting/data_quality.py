@@ -2,8 +2,8 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
+from ucfrec.episodes.record import Distribution, Source
 from ucfrec.logs.clean import REASONS
 from ucfrec.reporting import charts
 from ucfrec.reporting.tables import Table, shown
@@ -38,19 +38,20 @@ class DataQuality:
     pictures: list[tuple[charts.Histogram, Table]]
 
 
-def data_quality(record: Mapping[str, Any]) -> DataQuality:
-    """Tables and charts from the record of a run (`read_record`)."""
-    source = record.get("data") or {}
-    if "rows_read" not in source:
+def data_quality(source: Source) -> DataQuality:
+    """Tables and charts of what a store was made from."""
+    if source.rows_read is None:
         return DataQuality(None, None, None, [])
-    rows = [(name, [shown(source[key])]) for key, name in _COUNTS.items() if key in source]
-    summary = source.get("summary") or {}
-    distributions = {name: summary[name] for name in _DISTRIBUTIONS if name in summary}
+    counts = {name: getattr(source, key) for key, name in _COUNTS.items()}
+    rows = [(name, [shown(count)]) for name, count in counts.items() if count is not None]
+    distributions = {
+        name: source.summary[name] for name in _DISTRIBUTIONS if name in source.summary
+    }
     return DataQuality(
         Table("Rows of the logs", "", ["count"], rows),
-        _dropped(source["dropped"], source["rows_read"]),
+        _dropped(source.dropped, source.rows_read),
         _quantiles(distributions),
-        [_picture(name, one) for name, one in distributions.items() if any(one["counts"])],
+        [_picture(name, one) for name, one in distributions.items() if any(one.counts)],
     )
 
 
@@ -69,21 +70,21 @@ def _dropped(dropped: Mapping[str, int], read: int) -> Table:
     return Table("Rows dropped, by reason", "", ["rows", "share of rows read"], body)
 
 
-def _quantiles(distributions: Mapping[str, Mapping[str, Any]]) -> Table | None:
+def _quantiles(distributions: Mapping[str, Distribution]) -> Table | None:
     body = [
-        (_DISTRIBUTIONS[name][0], [shown(one["quantiles"].get(level)) for level in _LEVELS])
+        (_DISTRIBUTIONS[name][0], [shown(one.quantiles.get(level)) for level in _LEVELS])
         for name, one in distributions.items()
     ]
     columns = ["smallest", "25%", "median", "75%", "99%", "largest"]
     return Table("Quantiles", "", columns, body) if body else None
 
 
-def _picture(name: str, one: Mapping[str, Any]) -> tuple[charts.Histogram, Table]:
+def _picture(name: str, one: Distribution) -> tuple[charts.Histogram, Table]:
     title, x_label = _DISTRIBUTIONS[name]
-    chart = charts.histogram(title, x_label, one["counts"], one.get("edges"), one.get("values"))
-    total = sum(one["counts"])
+    chart = charts.histogram(title, x_label, one.counts, one.edges, one.values)
+    total = sum(one.counts)
     body = [
         (column.name, [shown(count), f"{count / total:.2%}"])
-        for column, count in zip(chart.columns, one["counts"], strict=True)
+        for column, count in zip(chart.columns, one.counts, strict=True)
     ]
     return chart, Table(title, x_label, ["count", "share"], body)

@@ -17,7 +17,8 @@ from ucfrec.files.checksums import CARD, MEASURED
 from ucfrec.files.locks import claim
 from ucfrec.provenance import config_hash
 from ucfrec.reporting.tables import markdown_table, shown
-from ucfrec.runs.trained_policy import REFIT_OF, RULE, learner_of, read_record
+from ucfrec.runs.record import RunRecord, read_record
+from ucfrec.runs.trained_policy import RULE
 
 
 def write_card(run: Path) -> Path:
@@ -28,7 +29,7 @@ def write_card(run: Path) -> Path:
     """
     record, card = read_record(run), run / CARD
     parts = [
-        f"# Model card: {learner_of(record)}",
+        f"# Model card: {record.name}",
         _about(record),
         "## Training data",
         _data(record),
@@ -78,48 +79,47 @@ def _plain(value: object) -> object:
     return value if isinstance(value, (int, float, str, bool)) else json.loads(json.dumps(value))
 
 
-def _about(record: Mapping[str, Any]) -> str:
-    policy = record.get("policy", {})
+def _about(record: RunRecord) -> str:
+    fit = record.policy
     rows = {
-        "learner": learner_of(record),
-        "configuration": config_hash(record["config"]),
-        "seed": record["seed"],
-        "training steps of the model": policy.get("steps"),
-        "best validation loss": policy.get("best_validation"),
-        "versions": ", ".join(f"{name} {number}" for name, number in record["versions"].items()),
+        "learner": record.name,
+        "configuration": config_hash(record.settings),
+        "seed": record.seed,
+        "training steps of the model": fit and fit.steps,
+        "best validation loss": fit and fit.best_validation,
+        "versions": ", ".join(f"{name} {number}" for name, number in record.versions.items()),
     }
     return _listed(rows)
 
 
-def _data(record: Mapping[str, Any]) -> str:
-    source = record.get("data") or {}
+def _data(record: RunRecord) -> str:
+    source = record.data
     window = _window(record)
-    files = [PurePath(file).name for file in source.get("files", [])]
+    files = [PurePath(file).name for file in source.files]
     rows = {
         "files": ", ".join(files) or None,
         "training window (UTC)": None if window is None else " to ".join(map(_day, window)),
-        "reward": f"`{record['reward']}`",
-        "sessions by": record.get("session_by"),
-        "training sessions": record.get("train_episodes"),
-        "training steps": record.get("train_steps"),
-        "users": source.get("users"),
-        "items": record["sizes"]["items"] or None,
-        "mean return of a session": record.get("mean_return"),
-        "largest return of a session": record.get("return_quantiles", {}).get("1.0"),
-        "fingerprint": record["fingerprint"][:12],
+        "reward": f"`{record.reward}`",
+        "sessions by": record.session_by,
+        "training sessions": record.train_episodes,
+        "training steps": record.train_steps,
+        "users": source.users,
+        "items": record.sizes["items"] or None,
+        "mean return of a session": record.mean_return,
+        "largest return of a session": record.return_quantiles.get("1.0"),
+        "fingerprint": record.fingerprint[:12],
     }
     return _listed(rows)
 
 
-def _window(record: Mapping[str, Any]) -> tuple[int, int] | None:
+def _window(record: RunRecord) -> tuple[int, int] | None:
     """Times (ms) of the first training row, and from which on rows are no longer trained on."""
-    source = record.get("data") or {}
-    times = source.get("time_range_ms")
+    times, splits = record.data.time_range_ms, record.data.split_times_ms
     if times is None:
         return None
-    splits = () if REFIT_OF in record else source.get("split_times_ms")
-    begins = splits or times[1:]
-    return int(times[0]), min(int(begins[0]), int(times[1]))
+    if splits is None or record.refit_of is not None:
+        return times
+    return times[0], min(splits[0], times[1])
 
 
 def _day(milliseconds: int) -> str:
@@ -136,10 +136,10 @@ def _rule(run: Path) -> str:
     )
 
 
-def _limits(record: Mapping[str, Any]) -> list[str]:
-    source, items = record.get("data") or {}, record["sizes"]["items"]
+def _limits(record: RunRecord) -> list[str]:
+    items = record.sizes["items"]
     limits = []
-    if REFIT_OF in record:
+    if record.refit_of is not None:
         limits.append("It was trained on all rows of its store: only later logs can judge it.")
     if items:
         limits.append(f"It knows {items:,} items and never shows another one.")
@@ -149,7 +149,7 @@ def _limits(record: Mapping[str, Any]) -> list[str]:
             f"It knows nothing of what happened after {_day(window[1])} UTC; tastes and items "
             "change."
         )
-    unknown = source.get("unknown_propensities")
+    unknown = record.data.unknown_propensities
     if items and unknown is None:
         limits.append(
             "Its logs have no propensities: what it would earn cannot be told from them without a "
@@ -157,16 +157,15 @@ def _limits(record: Mapping[str, Any]) -> list[str]:
         )
     elif unknown:
         limits.append(f"{unknown:,} steps of its logs have no propensity.")
-    best = record.get("policy", {}).get("best_validation")
-    popularity = record.get("reference_losses", {}).get("popularity")
+    best = None if record.policy is None else record.policy.best_validation
+    popularity = (record.reference_losses or {}).get("popularity")
     if best is not None and popularity is not None and best >= popularity:
         limits.append(
             f"Its validation loss, {best:.4g}, is not below that of showing items by popularity, "
             f"{popularity:.4g}: it learned nothing about users."
         )
-    copies = record.get("augmentation")
-    if copies is not None:
-        limits.append(f"Counterfactual copies: {copies['verdict']}")
+    if record.augmentation is not None:
+        limits.append(f"Counterfactual augmentation: {record.augmentation.verdict}")
     limits.append(
         "A validation loss says how well logged choices are predicted, not what is earned: see "
         "what was measured."

@@ -13,9 +13,9 @@ import pyarrow as pa
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from ucfrec import __version__
-from ucfrec.counterfactual.reward_model_fit import fit_warning
+from ucfrec.counterfactual.augment import AugmentationReport
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.files.atomic import atomic_file, read_json
+from ucfrec.files.atomic import atomic_file
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.reporting import charts
 from ucfrec.reporting.copies import copies_table, moves_chart
@@ -26,7 +26,8 @@ from ucfrec.reporting.page_results import environments, estimates, read_results
 from ucfrec.reporting.samples import read_features, sample_tables
 from ucfrec.reporting.tables import Table, shown
 from ucfrec.reporting.verdict import verdict
-from ucfrec.runs.trained_policy import AUGMENTATION, RUN, learner_of, read_record
+from ucfrec.runs.record import RUN, RunRecord, read_augmentation, read_record
+from ucfrec.runs.trained_policy import AUGMENTATION
 
 _REMEDY = "restore it or train again"
 
@@ -37,16 +38,16 @@ class _Run:
 
     folder: Path
     name: str
-    record: Mapping[str, Any]
-    copies: Mapping[str, Any] | None
-    """The augmentation report as JSON; None if the run has no edited copies (yet)."""
+    record: RunRecord
+    augmentation: AugmentationReport | None
+    """None if the run has no augmentation (yet)."""
     logged: Curves
 
     @property
     def status(self) -> str:
-        steps = self.record["config"]["train"]["steps"]
-        if fitted := self.record.get("policy"):
-            return f"finished after {fitted['steps']:,} steps"
+        steps = self.record.config.train.steps
+        if self.record.policy is not None:
+            return f"finished after {self.record.policy.steps:,} steps"
         logged = max((step for curve in self.logged.values() for step in curve), default=0)
         return f"not finished: logged up to step {logged:,} of {steps:,}"
 
@@ -54,7 +55,7 @@ class _Run:
     def references(self) -> Mapping[str, float]:
         """Reference losses (nats); none if the run's loss is not the items' log-likelihood."""
         comparable = "action_loss" in self.logged
-        return self.record.get("reference_losses", {}) if comparable else {}
+        return (self.record.reference_losses or {}) if comparable else {}
 
 
 def write_report(
@@ -80,7 +81,7 @@ def write_report(
         raise InputError(f"{out} is a folder; name a file with --out, e.g. {out / 'report.html'}")
     by_data: dict[str, list[_Run]] = {}
     for run in _read_runs(runs):
-        by_data.setdefault(run.record["fingerprint"], []).append(run)
+        by_data.setdefault(run.record.fingerprint, []).append(run)
     evidence = read_results(results)
     with damage_explained(Path(", ".join(map(str, results))), "write its rows again"):
         judged = {
@@ -122,13 +123,13 @@ def _read_runs(folders: Sequence[Path]) -> list[_Run]:
     paths = list(dict.fromkeys(folder.resolve() for folder in folders))
     for path in paths:
         record = read_record(path)
-        copies = record.get("augmentation")
-        if copies is None and (path / AUGMENTATION).exists():
-            copies = read_json(path / AUGMENTATION)
+        augmentation = record.augmentation
+        if augmentation is None and (path / AUGMENTATION).exists():
+            augmentation = read_augmentation(path / AUGMENTATION)
         common = os.path.commonpath([other.parent for other in paths])
         name = str(path.relative_to(common))
-        logged = trained_on(read_metrics(path / "policy"), record["config"])
-        runs.append(_Run(path, name, record, copies, logged))
+        logged = trained_on(read_metrics(path / "policy"), record.settings)
+        runs.append(_Run(path, name, record, augmentation, logged))
     return runs
 
 
@@ -139,16 +140,15 @@ def _warnings(run: _Run) -> list[str]:
 
 
 def _warnings_of(run: _Run) -> list[str]:
-    warnings = [] if "policy" in run.record else [run.status]
-    if run.copies is not None:
-        model = run.copies["reward_model"]
-        # Runs of older versions have no fit warning in their record.
-        warnings += dict.fromkeys([*run.copies["warnings"], fit_warning(model["r2_without_z"])])
-        bound_is_useful = run.copies["bound"] < model["reward_std"]
-        if not (bound_is_useful and run.copies["moves"]["edits"]):
-            warnings.append(run.copies["verdict"])
+    fit, report = run.record.policy, run.augmentation
+    warnings = [run.status] if fit is None else []
+    if report is not None:
+        warnings += report.warnings
+        bound_is_useful = report.bound < report.reward_model.reward_std
+        if not (bound_is_useful and report.moves.edits):
+            warnings.append(report.verdict)
     # A refit has no validation rows, and its loss is not a number.
-    best = run.record.get("policy", {}).get("best_validation", math.nan)
+    best = math.nan if fit is None else fit.best_validation
     popularity = run.references.get("popularity")
     if math.isfinite(best) and popularity is not None and best >= popularity:
         warnings.append(
@@ -166,54 +166,58 @@ def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
 
 def _variables(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
     names = [run.name for run in runs]
-    edited = [(run.name, run.copies) for run in runs if run.copies is not None]
-    item_runs = [run for run in runs if run.record["sizes"]["items"]]
-    styled = [(run.name, style, run.copies) for style, run in enumerate(runs) if run.copies]
+    edited = [(run.name, run.augmentation) for run in runs if run.augmentation is not None]
+    item_runs = [run for run in runs if run.record.sizes["items"]]
+    styled = [
+        (run.name, style, run.augmentation)
+        for style, run in enumerate(runs)
+        if run.augmentation is not None
+    ]
     return {
         "names": names,
-        "store": runs[0].record["store"],
+        "store": runs[0].record.store,
         "data": _data(runs[0].record),
-        "quality": data_quality(runs[0].record),
+        "quality": data_quality(runs[0].record.data),
         "summary": _summary(runs),
         "curves": draw_curves(names, [r.logged for r in runs], [r.references for r in runs]),
         "unlogged": [run.name for run in runs if not run.logged],
-        "finished": any("policy" in run.record for run in runs),
+        "finished": any(run.record.policy is not None for run in runs),
         "references": any(run.references for run in runs),
-        "verdicts": [(name, copies["verdict"]) for name, copies in edited],
+        "verdicts": [(name, report.verdict) for name, report in edited],
         "copies": copies_table(edited) if edited else None,
         "moves": moves_chart(styled),
         "samples": [(run.name, sample_tables(run.folder, features)) for run in item_runs],
         "differences": _differences(runs),
-        "records": [(run.name, json.dumps(run.record, indent=2)) for run in runs],
+        "records": [(run.name, json.dumps(run.record.model_dump(), indent=2)) for run in runs],
     }
 
 
-def _data(record: Mapping[str, Any]) -> Table:
-    sizes = record["sizes"]
+def _data(record: RunRecord) -> Table:
+    sizes = record.sizes
     rows = {
-        "fingerprint": record["fingerprint"][:12],
-        "reward": record["reward"],
-        "training sessions": record.get("train_episodes"),
-        "training steps": record.get("train_steps"),
+        "fingerprint": record.fingerprint[:12],
+        "reward": record.reward,
+        "training sessions": record.train_episodes,
+        "training steps": record.train_steps,
         "actions": f"{sizes['items']:,} items" if sizes["items"] else f"{sizes['action']} numbers",
         "state dimensions": sizes["state"],
-        "mean return of a session": record["mean_return"],
+        "mean return of a session": record.mean_return,
     }
-    for level, value in record["return_quantiles"].items():
+    for level, value in record.return_quantiles.items():
         rows[f"{float(level):.0%} of returns are at most"] = value
     body = [(name, [shown(value)]) for name, value in rows.items()]
     return Table("Training data", "", ["value"], body)
 
 
 def _summary(runs: Sequence[_Run]) -> Table:
-    fitted = [run.record.get("policy", {}) for run in runs]
+    fitted = [run.record.policy for run in runs]
     rows: list[tuple[str, list[Any]]] = [
-        ("learner", [learner_of(run.record) for run in runs]),
-        ("seed", [str(run.record["seed"]) for run in runs]),
+        ("learner", [run.record.name for run in runs]),
+        ("seed", [str(run.record.seed) for run in runs]),
         ("status", [run.status for run in runs]),
-        ("best validation loss", [fit.get("best_validation") for fit in fitted]),
-        ("at step", [fit.get("best_step") for fit in fitted]),
-        ("wall time, s", [run.record["wall_time_s"] if fit else None
+        ("best validation loss", [fit and fit.best_validation for fit in fitted]),
+        ("at step", [fit and fit.best_step for fit in fitted]),
+        ("wall time, s", [run.record.wall_time_s if fit else None
                           for run, fit in zip(runs, fitted, strict=True)]),
     ]  # fmt: skip
     if any(run.references for run in runs):
@@ -229,9 +233,7 @@ def _of_runs(caption: str, runs: Sequence[_Run], rows: Sequence[tuple[str, list[
 
 def _differences(runs: Sequence[_Run]) -> Table | None:
     """Settings and versions that differ between runs; None if there are none."""
-    flat = [
-        _flat(run.record["config"]) | _flat({"version": run.record["versions"]}) for run in runs
-    ]
+    flat = [_flat(run.record.settings) | _flat({"version": run.record.versions}) for run in runs]
     names = dict.fromkeys(name for settings in flat for name in settings)
     rows = [(name, [settings.get(name) for settings in flat]) for name in names]
     rows = [(name, values) for name, values in rows if any(v != values[0] for v in values)]

@@ -79,13 +79,17 @@ def resolve_config(
     return _build(policy_name, settings, seed)
 
 
-def config_from_dict(values: Mapping[str, Any]) -> Config:
+def config_from_dict(values: object) -> Config:
     """Rebuild a configuration from its `dataclasses.asdict`.
 
     Raises:
         InputError: see `resolve_config`.
     """
-    tables = {name: values[name] for name in values if isinstance(values[name], Mapping)}
+    if not isinstance(values, Mapping) or not isinstance(values.get("policy_name"), str):
+        raise InputError("the run's configuration has no policy_name")
+    if "seed" not in values:
+        raise InputError("the run's configuration has no seed")
+    tables = {name: values[name] for name in values if name not in ("policy_name", "seed")}
     settings = _from_mapping(tables, "the run's configuration")
     return _build(values["policy_name"], settings, values["seed"])
 

@@ -1,150 +1,353 @@
-"""`run.json`, the record of a run: the types of its entries."""
+"""`run.json`, the record of a run: provenance, configuration and the report of every stage."""
 
-import math
-from collections.abc import Callable, Mapping
+import os
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, ClassVar, Final, Literal
 
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    TypeAdapter,
+)
+
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.counterfactual.augment import AugmentationReport
+from ucfrec.counterfactual.screening import DimensionReport
 from ucfrec.episodes.item_table import ITEM_STATES
+from ucfrec.episodes.record import Source, StoreRecord
 from ucfrec.episodes.returns import ReturnToGo
-from ucfrec.errors import InputError
-from ucfrec.files.checksums import FILES
-from ucfrec.runs.config import config_from_dict
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError, damage_explained
+from ucfrec.files.atomic import read_json
+from ucfrec.files.record import Count, Entry, Number, Record, Text
+from ucfrec.fitting.loop import Fit
+from ucfrec.policies.registry import policy_class
+from ucfrec.runs.config import Config, config_from_dict
+from ucfrec.user_model.reward_report import ItemRewardReport
 
-_LARGEST: Final = 2**48
-
-
-def is_of_store(record: Mapping[str, Any], meta: Mapping[str, Any]) -> bool:
-    """Whether a run was trained on a store: on the same steps, with the same item states.
-
-    Args:
-        record: of the run.
-        meta: of the store.
-    """
-    states = [each.get(FILES, {}).get(ITEM_STATES) for each in (record, meta)]
-    # Runs and stores that an older ucfrec wrote list no files.
-    same_states = None in states or states[0] == states[1]
-    return bool(record["fingerprint"] == meta["fingerprint"]) and same_states
+RUN: Final = "run.json"
 
 
-def require_run_record(path: Path, record: Mapping[str, Any]) -> None:
-    """Check the entries of a run's record that reading a trained policy and reports rely on.
+def _complete(sizes: dict[str, int]) -> dict[str, int]:
+    of_items = ("users", "tags") if sizes.get("items") else ()
+    for name in ("state", "action", "items", *of_items):
+        if name not in sizes:
+            raise ValueError(f"there is no size {name!r}")
+    return sizes
 
-    Args:
-        path: of the record, for messages.
-        record: its content.
+
+def _whole(value: object) -> object:
+    if isinstance(value, Mapping) and value.keys() != {"definition", "discount", "horizon"}:
+        raise ValueError("it needs definition, discount and horizon")
+    return value
+
+
+def _levels(quantiles: dict[str, float]) -> dict[str, float]:
+    for level in quantiles:
+        if not 0 <= float(level) <= 1:
+            raise ValueError(f"{level:.20} is no share")
+    if not quantiles:
+        raise ValueError("there are none")
+    return quantiles
+
+
+def _named(value: object) -> object:
+    if not isinstance(value, dict) or not isinstance(value.get("policy_name"), str):
+        raise InputError("its config has no policy_name")
+    return value
+
+
+def _config(value: object) -> Config:
+    if isinstance(value, Config):
+        return value
+    return config_from_dict(value)
+
+
+def _rule(value: object) -> DecisionRule:
+    if isinstance(value, DecisionRule):
+        return value
+    if not isinstance(value, Mapping):
+        raise InputError("its rule is no decision rule")
+    return DecisionRule.from_dict(value, "the rule")
+
+
+_Rule = Annotated[DecisionRule, PlainValidator(_rule), PlainSerializer(DecisionRule.as_dict)]
+
+
+class TrainingRecord(Record):
+    """What every training records, of whatever library."""
+
+    FILE: ClassVar[str] = RUN
+    KIND: ClassVar[str] = f"a run folder: it has no {RUN}; train one first"
+    REMEDY: ClassVar[str] = "train it again"
+
+    library: Text = "ucfrec"
+    """What trained the policy."""
+    command: Text
+    config: Annotated[Any, PlainValidator(_named)]
+    """Settings, with the `policy_name`."""
+    policy: Any = None
+    """Report of the training; None until it has ended."""
+    seed: Annotated[int, Field(strict=True, ge=0, lt=2**32)]
+    fingerprint: Text
+    """Of the store."""
+    sizes: Annotated[dict[str, Count], AfterValidator(_complete)]
+    """Of states, actions, the catalogue (0 for vectors), its tags and the users."""
+    data: Source
+    """What the store was made from."""
+    versions: dict[Text, Text]
+    """Of packages."""
+    wall_time_s: Number
+    """Of all stages, resumptions included."""
+
+
+class Screening(Entry):
+    """The report of `ucfrec.counterfactual.screening`, and what was done about it."""
+
+    how: Literal["drop", "copies"]
+    dimensions: tuple[DimensionReport, ...]
+    reward_r2: float | None = None
+    transitions: Count = 0
+
+    @property
+    def flagged(self) -> list[int]:
+        """The observation columns without effect."""
+        return [each.dimension for each in self.dimensions if not each.causes]
+
+
+class Candidate(Entry):
+    """A decision rule that was tried, with what was measured of it."""
+
+    model_config = ConfigDict(extra="allow")
+
+    rule: _Rule
+    value: Number | None = None
+    """Mean return of a session in the user model; None for a rule that was not simulated."""
+    error: Number | None = None
+
+
+class RuleRecord(Entry):
+    """The decision rule that was chosen, and all candidates (see `ucfrec.choosing`)."""
+
+    model_config = ConfigDict(extra="allow")
+
+    rule: _Rule
+    chosen_by: Text
+    warning: Text = ""
+    candidates: tuple[Candidate, ...] = ()
+
+    @property
+    def simulated(self) -> tuple[float, float] | None:
+        """Return of a session under the rule in the user model, with its standard error; None for
+        a rule that was not simulated."""
+        for tried in self.candidates:
+            if tried.rule == self.rule and tried.value is not None and tried.error is not None:
+                return tried.value, tried.error
+        return None
+
+
+class RunRecord(TrainingRecord):
+    """The content of `run.json`; entries of stages that have not ended are None."""
+
+    library: Literal["ucfrec"] = "ucfrec"
+    config: Annotated[Config, PlainValidator(_config), PlainSerializer(asdict)]
+    store: Text
+    """Folder of the store when the run began."""
+    store_from_run: Text | None
+    """The same as seen from the run; None on another drive of Windows."""
+    reward: Text
+    """The expression that computed the rewards."""
+    session_by: Text | None
+    session_gap_ms: Count | None
+    observation_size: Count
+    train_episodes: Count
+    train_steps: Count
+    return_to_go: Annotated[ReturnToGo, BeforeValidator(_whole)]
+    return_quantiles: Annotated[dict[str, Number], AfterValidator(_levels)]
+    """Of the training sessions' returns, by share."""
+    mean_return: Number
+    reference_losses: dict[str, Number] | None = None
+    """See `ucfrec.runs.start.reference_losses`; None if actions are vectors."""
+    dropped_observations: tuple[Count, ...] = ()
+    """Columns of the logged observation that the policy does not see, ascending."""
+    screening: Screening | None = None
+    refit_of: dict[str, Any] | None = None
+    """Configuration and rule of the run that this one repeats on all rows (`ucfrec.runs.refit`)."""
+    augmentation: AugmentationReport | None = None
+    policy: Fit | None = None
+    reward_model: ItemRewardReport | None = None
+    rule: RuleRecord | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the method.
+
+        Followed by `-augmented` or `-no-augmentation` if the run's use of augmentation is not the
+        method's default.
+        """
+        config = self.config
+        augmented = config.augment.makes_copies
+        if augmented == policy_class(config.policy_name).augmented:
+            return config.policy_name
+        return f"{config.policy_name}-{'augmented' if augmented else 'no-augmentation'}"
+
+    @property
+    def summary(self) -> str:
+        """One line: the method and the size of its training data."""
+        facts = [
+            repr(self.name),
+            f"trained on {self.train_steps:,} steps",
+            f"{self.train_episodes:,} episodes",
+        ]
+        if self.sizes["items"]:
+            facts.append(f"{self.sizes['items']:,} items")
+        return ", ".join([*facts, f"reward={self.reward}"])
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The configuration as JSON, for hashes and tables."""
+        return asdict(self.config)
+
+    @property
+    def finished(self) -> Fit:
+        """The report of the policy's training.
+
+        Raises:
+            InputError: the training has not ended.
+        """
+        if self.policy is None:
+            raise InputError("the training of the run has not ended; train it to its end first")
+        return self.policy
+
+    def is_of(self, store: StoreRecord) -> bool:
+        """Whether the run was trained on a store: on the same steps and item states."""
+        states = [each.files.get(ITEM_STATES) for each in (self, store)]
+        return self.fingerprint == store.fingerprint and states[0] == states[1]
+
+    def describe(self) -> str:
+        """What a finished run did, a few lines of text."""
+        lines = [] if self.augmentation is None else _describe_augmentation(self.augmentation)
+        fit = self.finished
+        found = f"best validation loss {fit.best_validation:.4g} at step {fit.best_step}"
+        if self.refit_of is not None:
+            found = f"trained on all rows, up to step {fit.best_step}"
+        lines.append(f"policy        {found} of {fit.steps}, {fit.seconds:.0f} s")
+        if self.rule is not None and self.reward_model is not None:
+            lines.append(_describe_rule(self.rule, self.reward_model))
+        if self.screening is not None:
+            flagged = ", ".join(map(str, self.screening.flagged)) or "none"
+            lines.append(f"screening     observation columns without effect: {flagged}")
+        return "\n".join(lines)
+
+
+def read_record(run: Path) -> RunRecord:
+    """The record of a run, whose small files are compared with their checksums.
 
     Raises:
-        InputError: an entry is missing or cannot be that of a run.
+        InputError: `run` is not a run folder, or is damaged.
     """
-    for name, holds in _REQUIRED.items():
-        if name not in record or not holds(record[name]):
-            raise _bad(path, name, record.get(name))
-    for name, holds in _OPTIONAL.items():
-        if name in record and not holds(record[name]):
-            raise _bad(path, name, record[name])
+    record = RunRecord.read(run)
+    record.checksums(run).require_small()
+    return record
+
+
+def read_training(run: Path) -> TrainingRecord:
+    """The record of a run of whatever library; its other files are not looked at.
+
+    Raises:
+        InputError: `run` is not a run folder, or its record is damaged.
+    """
+    record = TrainingRecord.read(run)
+    return RunRecord.read(run) if record.library == "ucfrec" else record
+
+
+def read_augmentation(path: Path) -> AugmentationReport:
+    """The report of an augmentation that is made, of a run that may still be in training.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    with damage_explained(path, RunRecord.REMEDY):
+        return TypeAdapter(AugmentationReport).validate_python(read_json(path))
+
+
+def store_from(run: Path, store: Path) -> str | None:
+    """The folder of a store as seen from that of a run; None on another drive of Windows."""
     try:
-        config_from_dict(record["config"])
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-
-
-def _bad(path: Path, name: str, value: object) -> InputError:
-    return InputError(f"{path} is damaged: its {name} is {value!r:.60}; restore it or train again")
-
-
-def _text(value: object) -> bool:
-    return isinstance(value, str)
-
-
-def _count(value: object) -> bool:
-    return type(value) is int and 0 <= value < _LARGEST
-
-
-def _counts(value: object) -> bool:
-    return isinstance(value, list) and all(map(_count, value))
-
-
-def _number(value: object) -> bool:
-    if isinstance(value, int) and not isinstance(value, bool):
-        return abs(value) < _LARGEST
-    return isinstance(value, float) and math.isfinite(value)
-
-
-def _object(value: object) -> bool:
-    return isinstance(value, dict)
-
-
-def _screening(value: object) -> bool:
-    dimensions = value.get("dimensions") if isinstance(value, dict) else None
-    return isinstance(dimensions, list) and all(
-        isinstance(each, dict)
-        and _count(each.get("dimension"))
-        and isinstance(each.get("causes"), bool)
-        for each in dimensions
-    )
-
-
-def _config(value: object) -> bool:
-    return isinstance(value, dict) and _text(value.get("policy_name")) and "seed" in value
-
-
-def _sizes(value: object) -> bool:
-    names = ("state", "action", "items")
-    if not isinstance(value, dict) or not all(_count(value.get(name)) for name in names):
-        return False
-    return all(_count(value.get(name, 0)) for name in ("tags", "users"))
-
-
-def _return_to_go(value: object) -> bool:
-    if not isinstance(value, dict) or value.keys() != {"definition", "discount", "horizon"}:
-        return False
-    if not _number(value["discount"]) or not _count(value["horizon"]):
-        return False
-    try:
-        ReturnToGo(**value)
-    except InputError:
-        return False
-    return True
-
-
-def _quantiles(value: object) -> bool:
-    if not isinstance(value, dict) or not value:
-        return False
-    try:
-        return all(0 <= float(name) <= 1 and _number(each) for name, each in value.items())
+        return os.path.relpath(store.resolve(), run.resolve())
     except ValueError:
-        return False
+        return None
 
 
-def _or_none(holds: Callable[[object], bool]) -> Callable[[object], bool]:
-    return lambda value: value is None or holds(value)
+def store_of(run: Path, record: RunRecord) -> EpisodeStore | None:
+    """The store that a run was trained on; None where it is gone or changed.
+
+    It is looked for where it lies as seen from the run, so that both can be moved or copied
+    together, and where it lay when the run was trained.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    places = [Path(record.store)]
+    if record.store_from_run:
+        places.insert(0, Path(os.path.normpath(run.resolve() / record.store_from_run)))
+    for path in places:
+        if (path / StoreRecord.FILE).is_file():
+            store = EpisodeStore.open(path)
+            if record.is_of(store.record):
+                return store
+    return None
 
 
-_REQUIRED: Final[Mapping[str, Callable[[object], bool]]] = {
-    "config": _config,
-    "sizes": _sizes,
-    "fingerprint": _text,
-    "observation_size": _count,
-    "return_quantiles": _quantiles,
-    "return_to_go": _return_to_go,
-    "reward": _text,
-    "train_episodes": _count,
-    "train_steps": _count,
-}
-_OPTIONAL: Final[Mapping[str, Callable[[object], bool]]] = {
-    "command": _text,
-    "store": _text,
-    "store_from_run": _or_none(_text),
-    "seed": _count,
-    "session_by": _or_none(_text),
-    "session_gap_ms": _or_none(_number),
-    "mean_return": _number,
-    "wall_time_s": _number,
-    "data": _object,
-    "versions": _object,
-    "augmentation": _or_none(_object),
-    "dropped_observations": _counts,
-    "screening": _screening,
-    "policy": _object,
-}
+def verified(run: Path) -> None:
+    """Read every file of a run and compare it with its checksum.
+
+    Raises:
+        InputError: `run` is not a finished run, or a file has another content.
+    """
+    record = read_record(run)
+    if record.policy is None:
+        raise InputError(f"{run} cannot be verified: its training has not ended; train it again")
+    for name, fault in record.checksums(run).faults():
+        raise InputError(f"{run / name} {fault}; restore the file, or train again")
+
+
+def _describe_augmentation(report: AugmentationReport) -> list[str]:
+    crm, moves, actions = report.reward_model, report.moves, report.actions
+    lines = [
+        f"reward model  R² {crm.r2:.3f} with z, {crm.r2_without_z:.3f} without; "
+        f"{crm.active_dimensions} of {crm.latent_dim} latent dimensions active",
+    ]
+    if report.proposals:
+        lines.append(
+            f"edits         {report.copies} copies, acceptance {report.acceptance:.1%}, "
+            f"mean-move ratio {moves.mean_move_ratio:.2f}, effective rank "
+            f"{moves.effective_rank:.1f} of {moves.dimensions}"
+        )
+    if actions is not None:
+        lines.append(
+            f"other actions {actions.copies:,} copies of {actions.proposals:,} asked "
+            f"about; their reward differs by {actions.mean_change:+.3g} on average, "
+            f"{actions.earns_more:.0%} of them earn more"
+        )
+    lines.append(
+        f"bound         δ + ε_r = {report.delta:.3g} + {report.epsilon_r:.3g}: {report.verdict}"
+    )
+    return [*lines, *(f"warning       {warning}" for warning in report.warnings)]
+
+
+def _describe_rule(choice: RuleRecord, model: ItemRewardReport) -> str:
+    value = choice.simulated
+    estimate = "" if value is None else f"; return promised by it {value[0]:.4g} ± {value[1]:.2g}"
+    return (
+        f"items         reward model: held-out loss {model.loss:.4f}, "
+        f"{model.item_loss - model.loss:.4f} below that of item effects alone\n"
+        f"decision rule {choice.rule}\n"
+        f"              chosen by {choice.chosen_by}{estimate}{choice.warning}"
+    )

@@ -3,29 +3,18 @@
 import dataclasses
 import shutil
 from pathlib import Path
-from typing import Any
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files.atomic import read_json
-from ucfrec.files.checksums import reopen, seal
 from ucfrec.fitting import distributed
-from ucfrec.runs.config import Config, config_from_dict
-from ucfrec.runs.record import is_of_store
+from ucfrec.runs.config import Config
+from ucfrec.runs.record import RunRecord
 from ucfrec.runs.run import train_run
-from ucfrec.runs.trained_policy import (
-    DROPPED,
-    INPUTS,
-    REFIT_OF,
-    REWARD_MODEL,
-    RULE,
-    RUN,
-    TrainedPolicy,
-)
+from ucfrec.runs.trained_policy import INPUTS, REWARD_MODEL, RULE, TrainedPolicy
 from ucfrec.user_model.reward_fit import refit_item_reward_model
 
 
-def refit(store: EpisodeStore, first: Path, out: Path) -> dict[str, Any]:
+def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
     """Train a policy as the run `first`, but on its validation and test episodes too.
 
     Nothing is chosen again: the settings, the number of steps (those of the best weights of
@@ -39,36 +28,38 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> dict[str, Any]:
         out: run folder, new or interrupted.
 
     Returns:
-        The content of `run.json`.
+        The record of the new run.
 
     Raises:
         InputError: `first` is not a finished run on this store, or `out` is another run.
     """
     trained = TrainedPolicy.load(first)
-    if not is_of_store(trained.record, store.meta):
+    if not trained.record.is_of(store.record):
         raise InputError(
             f"{first} was trained on another store than {store.path}; name the store of the run"
         )
-    if "policy" not in trained.record:
+    if trained.record.policy is None:
         raise InputError(f"{first} is not finished; train it to its end first")
-    about: dict[str, Any] = {REFIT_OF: trained.record["config"] | {"rule": trained.rule.as_dict()}}
+    about = {
+        "refit_of": trained.record.settings | {"rule": trained.rule.as_dict()},
+        "dropped_observations": trained.dropped,
+    }
     if trained.dropped:
         store = store.without_observation_dimensions(trained.dropped)
-        about[DROPPED] = list(trained.dropped)
     record = train_run(store, out, _settings(trained), about, on_all_rows=True)
     if not distributed.leads():
         return record
-    reopen(out, RUN, record, INPUTS)
+    record = record.reopened(out, INPUTS)
     shutil.copyfile(first / RULE, out / RULE)
     if trained.reward_model is not None:
-        refit_item_reward_model(first / REWARD_MODEL, store, out / REWARD_MODEL, record["seed"])
-    return seal(out, RUN, read_json(out / RUN))
+        refit_item_reward_model(first / REWARD_MODEL, store, out / REWARD_MODEL, record.seed)
+    return record.sealed(out)
 
 
 def _settings(trained: TrainedPolicy) -> Config:
     """The settings of a run, for so many steps as its best weights took, and no new choice."""
-    config = config_from_dict(trained.record["config"])
-    steps = max(1, int(trained.record["policy"]["best_step"]))
+    config = trained.record.config
+    steps = max(1, trained.record.finished.best_step)
     return dataclasses.replace(
         config,
         train=dataclasses.replace(config.train, steps=steps, patience=0),

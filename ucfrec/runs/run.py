@@ -1,65 +1,60 @@
 """Train a policy (Algorithm 1) and keep everything it produces in a run folder."""
 
-import dataclasses
-import shutil
 import time
 from collections.abc import Mapping
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
-from ucfrec import schema
-from ucfrec.acting.decision import Decider, DecisionRule
-from ucfrec.arrays import Float32Array
-from ucfrec.choosing.by_ranking import RankedChoice, choose_by_ranking
-from ucfrec.choosing.by_simulation import Choice, choose_rule
-from ucfrec.counterfactual.augment import AugmentConfig
-from ucfrec.counterfactual.copies import MODELS, counterfactual_copies, require_rewards_vary
+from ucfrec.acting.decision import Decider
+from ucfrec.choosing.choose import choose_rule
+from ucfrec.counterfactual.augment import AugmentationReport, AugmentConfig
+from ucfrec.counterfactual.copies import MODELS, counterfactual_copies
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
-from ucfrec.episodes.item_counts import TrainingCounts
-from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.episodes.windows import Overlay
-from ucfrec.errors import InputError
-from ucfrec.files.atomic import atomic_folder, read_json, write_json
-from ucfrec.files.checksums import FILES, reopen, seal
+from ucfrec.files.atomic import write_json
 from ucfrec.files.locks import claimed, remove_leftovers, remove_leftovers_within
 from ucfrec.fitting import distributed
-from ucfrec.fitting.checkpoint import save_tensors
+from ucfrec.fitting.loop import Fit
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
-from ucfrec.policies.heads import ItemHead
-from ucfrec.policies.registry import policy_class
-from ucfrec.provenance import command_line, versions
-from ucfrec.runs.config import Config, config_from_dict
+from ucfrec.runs.config import Config
 from ucfrec.runs.policy_fit import fit_policy
-from ucfrec.runs.record import is_of_store
-from ucfrec.runs.reference_losses import reference_losses
+from ucfrec.runs.record import RUN, RuleRecord, RunRecord, read_augmentation
 from ucfrec.runs.samples import SAMPLES, sample_recommendations
 from ucfrec.runs.shared_stages import OWN, SharedStages
-from ucfrec.runs.trained_policy import (
-    AUGMENTATION,
-    COUNTS,
-    INPUTS,
-    ITEMS,
-    RETURNS,
-    REWARD_MODEL,
-    RULE,
-    RUN,
-    USERS,
-    TrainedPolicy,
-    store_from,
-)
-from ucfrec.user_model.reward_fit import fit_item_reward_model, reward_model_sizes
-from ucfrec.user_model.training_users import TRAINING_USERS, fit_training_users
+from ucfrec.runs.start import begin, new_policy, require_startable, training_views
+from ucfrec.runs.trained_policy import AUGMENTATION, INPUTS, REWARD_MODEL, RULE, TrainedPolicy
+from ucfrec.user_model.model import UserModel
 
-_MOST_RETURNS = 1_000_001
-_QUANTILES = (0.5, 0.75, 0.9, 0.95, 0.99, 1.0)
 _OVERLAY = "overlay.safetensors"
+
+
+@dataclass(frozen=True)
+class _Inputs:
+    """What the first stage prepares, and all later ones need."""
+
+    record: RunRecord
+    out: Path
+    config: Config
+    shared: SharedStages
+    device: torch.device
+    logged: EpisodeStore
+    """The training episodes as they were logged."""
+    held_out: EpisodeStore
+    """The validation episodes as they were logged."""
+    train: EpisodeStore
+    """The training episodes as the policy sees them."""
+    validation: EpisodeStore
+    """The validation episodes as the policy sees them."""
+    policy: SequencePolicy
+    """Untrained, then trained in place."""
 
 
 @random_state_kept()
@@ -68,15 +63,15 @@ def train_run(
     out: Path,
     config: Config,
     about: Mapping[str, Any] | None = None,
-    more_copies: Overlay | None = None,
+    more_augmentation: Overlay | None = None,
     on_all_rows: bool = False,
     shared: SharedStages = OWN,
-) -> dict[str, Any]:
+) -> RunRecord:
     """Train a policy on the training episodes of `store`, or resume the run in `out`.
 
-    The stages are reward model, generator and copies (unless `augment` makes none), then the
-    policy; finished stages are not repeated. `out` is created after all inputs have been checked,
-    so that a rejected run leaves no folder. The global random state is restored on return.
+    The stages are those of Algorithm 1, then the choice of the decision rule; finished stages are
+    not repeated. `out` is created after all inputs have been checked, so that a rejected run leaves
+    no folder. The global random state is restored on return.
 
     Where `torchrun` started several processes, they train the policy together; the leader does
     the rest, and the others return once the policy is trained.
@@ -85,323 +80,160 @@ def train_run(
         store: prepared episodes.
         out: run folder, new or interrupted.
         config: configuration of all stages.
-        about: entries that a dataset adapter adds to the record.
-        more_copies: a dataset adapter's edited copies of training episodes, used in addition to
-            the counterfactual ones.
+        about: entries of `RunRecord` that the caller adds.
+        more_augmentation: augmented training episodes that are used in addition to the
+            counterfactual ones.
         on_all_rows: train on the validation and test episodes too, and keep the last weights; see
             `ucfrec.runs.refit`.
-        shared: reward models and copies that runs on the same store have in common where their
-            settings of these stages and their seeds agree; by default a run makes its own. The
-            time of a stage is in the record of the run that made it.
+        shared: reward models and augmentation that runs on the same store have in common where
+            their settings of these stages and their seeds agree; by default a run makes its own.
+            The time of a stage is in the record of the run that made it.
 
     Returns:
-        The content of `run.json`: provenance, configuration and the report of every stage.
+        The record of the run: provenance, configuration and the report of every stage.
 
     Raises:
         InputError: `out` is a run on another store or with another configuration, the store has
-            too few training episodes or constant rewards, or the learner does not support its
+            too few training episodes or constant rewards, or the policy does not support its
             actions, or another process is training in `out`.
     """
-    if not distributed.leads():
-        return _train(store, out, config, about, more_copies, on_all_rows, shared)
-    with claimed(out, "trained"):
-        remove_leftovers(out.parent)
-        remove_leftovers_within(out)
-        return _train(store, out, config, about, more_copies, on_all_rows, shared)
+    with claimed(out, "trained") if distributed.leads() else nullcontext():
+        if distributed.leads():
+            remove_leftovers(out.parent)
+            remove_leftovers_within(out)
+        begun = time.perf_counter()
+        run = _prepare_inputs(store, out, config, about or {}, on_all_rows, shared)
+        overlay, augmentation = _augment(run)
+        fit = _train_policy(run, overlay, more_augmentation, on_all_rows)
+        if not distributed.leads():
+            return run.record
+        chosen = run.record.rule is not None and run.record.policy == fit
+        record = run.record.with_entries(augmentation=augmentation, policy=fit)
+        if run.logged.has_items and config.rule.choose and not chosen:
+            user_model = _fit_user_model(run)
+            rule = _choose_rule(run, user_model)
+            record = record.with_entries(reward_model=user_model.reward_report, rule=rule)
+        _write_samples(run)
+        seconds = record.wall_time_s + time.perf_counter() - begun
+        return record.with_entries(wall_time_s=seconds).sealed(out)
 
 
-def _train(
+def _prepare_inputs(
     store: EpisodeStore,
     out: Path,
     config: Config,
-    about: Mapping[str, Any] | None,
-    more_copies: Overlay | None,
+    about: Mapping[str, Any],
     on_all_rows: bool,
     shared: SharedStages,
-) -> dict[str, Any]:
-    """`train_run` of a run that no other process trains."""
+) -> _Inputs:
+    """Check all inputs and begin the run or reopen it; views of the episodes, untrained policy."""
     train, validation = logged, held_out = training_views(store)
     if on_all_rows:
         train = logged = store
     if distributed.leads():
-        _require_startable(store, train, out, config)
+        require_startable(store, train, out, config)
     policy = new_policy(train, config)
     if distributed.leads():
         if not (out / RUN).exists():
-            _begin(store, train, validation, out, config, about or {})
-        reopen(out, RUN, read_json(out / RUN), INPUTS)
+            begin(store, train, validation, out, config, about)
+        RunRecord.read(out).reopened(out, INPUTS)
         distributed.wait()  # the others wait at the beginning of the command
-    record: dict[str, Any] = read_json(out / RUN)
-    record["config"] = dataclasses.asdict(config)
-    start = time.perf_counter() - record["wall_time_s"]
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    record = RunRecord.read(out).with_entries(config=config)
     with distributed.leader_first():
         view = policy.training_view(train, config.policy, out / "view", config.seed)
-    returns = ReturnToGo(**record["return_to_go"])
-    if not returns.per_session:
-        view, validation = (each.with_return_to_go(returns) for each in (view, validation))
+    if not record.return_to_go.per_session:
+        view, validation = (
+            each.with_return_to_go(record.return_to_go) for each in (view, validation)
+        )
     if view is not train:
-        train, policy = view, new_policy(view, config)
-    policy = policy.to(device)
-    if config.augment.makes_copies:
-        with distributed.leader_first():
-            overlay, record["augmentation"] = _counterfactuals(
-                *(train, validation, out, config, device),
-                # A learner's own view of the episodes has copies of its own.
-                shared if view is logged and returns.per_session else OWN,
-            )
-        more_copies = overlay if more_copies is None else overlay.joined(more_copies)
-    if more_copies is not None:
-        train = train.with_overlay(more_copies)
-    fitted = fit_policy(policy, train, None if on_all_rows else validation, out, config)
-    if not distributed.leads():
-        return record
-    chosen = "rule" in record and record.get("policy") == dataclasses.asdict(fitted)
-    record["policy"] = dataclasses.asdict(fitted)
-    if logged.has_items and config.rule.choose and not chosen:
-        record["reward_model"], record["rule"] = _rule(
-            policy, logged, held_out, out, config, shared
-        )
-    record["wall_time_s"] = time.perf_counter() - start
-    _write_samples(out, held_out)
-    return seal(out, RUN, record)
-
-
-def _require_startable(store: EpisodeStore, train: EpisodeStore, out: Path, config: Config) -> None:
-    if (out / RUN).exists():
-        _require_same(read_json(out / RUN), store, out, config)
-    elif config.augment.makes_copies:
-        require_rewards_vary(train)
-
-
-def training_views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
-    """The training and the validation episodes of a store.
-
-    Without a validation split, every tenth training episode is held out for validation.
-
-    Raises:
-        InputError: the store has fewer than 2 training episodes.
-    """
-    train, validation = store.split("train"), store.split("validation")
-    if train.n_episodes < 2:
-        raise InputError(
-            f"{store.path} has {train.n_episodes} training episodes, at least 2 are needed; "
-            "prepare it with a larger training share"
-        )
-    if validation.n_episodes:
-        return train, validation
-    held_out = np.arange(train.n_episodes) % 10 == 1
-    return train.select(np.flatnonzero(~held_out)), train.select(np.flatnonzero(held_out))
-
-
-def _begin(
-    store: EpisodeStore,
-    train: EpisodeStore,
-    validation: EpisodeStore,
-    out: Path,
-    config: Config,
-    about: Mapping[str, Any],
-) -> None:
-    record = {
-        "command": command_line(),
-        "config": dataclasses.asdict(config),
-        "seed": config.seed,
-        "store": str(store.path.resolve()),
-        "store_from_run": store_from(out, store.path),
-        "fingerprint": store.meta["fingerprint"],
-        "reward": store.meta["reward"],
-        "session_by": store.meta["source"].get("session_by"),
-        "session_gap_ms": store.meta["source"].get("session_gap_ms"),
-        "sizes": _sizes(store),
-        "observation_size": store.observation_size,
-        "train_episodes": train.n_episodes,
-        "train_steps": train.n_steps,
-        "return_to_go": dataclasses.asdict(_returns(store, config)),
-        "return_quantiles": {str(q): float(np.quantile(train.returns, q)) for q in _QUANTILES},
-        "mean_return": float(train.returns.mean()),
-        "data": store.meta["source"],
-        "versions": versions(),
-        "wall_time_s": 0.0,
-        **about,
-    }
-    returns = _target_returns(train, _returns(store, config))
-    with atomic_folder(out) as scratch:
-        save_tensors(scratch / RETURNS, {"returns": torch.from_numpy(returns)}, {})
-        target = float(np.quantile(returns.astype(np.float64), config.rule.default_quantile))
-        rule = DecisionRule(target, tag_window=config.rule.default_tag_window)
-        write_json(scratch / RULE, rule.as_dict())
-        for name in (ITEM_STATES, ITEMS, USERS):
-            if (store.path / name).exists():
-                shutil.copyfile(store.path / name, scratch / name)
-        if store.has_items:
-            counts = TrainingCounts.of(train)
-            counts.save(scratch / COUNTS)
-            record["reference_losses"] = reference_losses(counts, validation)
-        seal(scratch, RUN, record)
-
-
-def _returns(store: EpisodeStore, config: Config) -> ReturnToGo:
-    return config.policy.returns(store.meta["source"].get("session_by"))
-
-
-def _target_returns(train: EpisodeStore, definition: ReturnToGo) -> Float32Array:
-    """Sorted returns-to-go of sessions, or of steps if targets are set anew at every step.
-
-    Of more than a million, evenly spaced order statistics are kept, the lowest and highest too.
-    """
-    returns = train.returns
-    if not definition.per_session:
-        returns = train.with_return_to_go(definition).column(schema.RETURN_TO_GO)
-    kept = np.linspace(0, len(returns) - 1, min(len(returns), _MOST_RETURNS)).astype(np.int64)
-    return np.asarray(np.sort(returns)[kept], dtype=np.float32)
-
-
-def _require_same(
-    record: Mapping[str, Any], store: EpisodeStore, out: Path, config: Config
-) -> None:
-    if not is_of_store(record, store.meta):
-        raise InputError(
-            f"{out} is a run on another store ({record['store']}, fingerprint "
-            f"{record['fingerprint'][:12]}), not on {store.path} "
-            f"({store.meta['fingerprint'][:12]}), or on other item states than that has; name "
-            "another run folder"
-        )
-    started = config_from_dict(record["config"])
-    if not config.train.cosine and config.train.steps > started.train.steps:
-        # Without a cosine schedule, a run may be resumed with more steps.
-        longer = dataclasses.replace(started.train, steps=config.train.steps)
-        started = dataclasses.replace(started, train=longer)
-    before, now = dataclasses.asdict(started), dataclasses.asdict(config)
-    for table, values in now.items():
-        if before[table] != values:
-            difference = _difference(before[table], values)
-            raise InputError(
-                f"{out} was started with another {table} ({difference}); name another run folder, "
-                "or give the same configuration to resume"
-            )
-
-
-def _difference(before: Any, now: Any) -> str:
-    if not isinstance(now, Mapping):
-        return f"{before} in the run, {now} now"
-    return ", ".join(
-        f"{key} is {before.get(key)} in the run, {value} now"
-        for key, value in now.items()
-        if before.get(key) != value
+        policy = new_policy(view, config)
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    return _Inputs(
+        *(record, out, config, shared, device),
+        *(logged, held_out, view, validation, policy.to(device)),
     )
 
 
-def _counterfactuals(
-    train: EpisodeStore,
-    validation: EpisodeStore,
-    out: Path,
-    config: Config,
-    device: torch.device,
-    shared: SharedStages,
-) -> tuple[Overlay, dict[str, Any]]:
-    """The copies of a run and their report; made once, then read from `out`."""
+def _augment(run: _Inputs) -> tuple[Overlay | None, AugmentationReport | None]:
+    """Causal reward model, generator and acceptance gate (lines 1 to 3 of Algorithm 1).
+
+    Made once, then read from the run folder; (None, None) for a run without augmentation.
+    """
+    config, out = run.config, run.out
+    if not config.augment.makes_copies:
+        return None, run.record.augmentation
     settings = (config.crm, config.csg, config.augment)
+    # A policy's own view of the episodes has augmentation of its own.
+    own = run.train is not run.logged
+    shared = OWN if own or not run.record.return_to_go.per_session else run.shared
 
     def make() -> None:
         overlay, report = counterfactual_copies(
-            train, validation, *settings, out, config.seed, device
+            run.train, run.validation, *settings, out, config.seed, run.device
         )
         overlay.save(out / _OVERLAY)
-        write_json(out / AUGMENTATION, dataclasses.asdict(report))
+        write_json(out / AUGMENTATION, asdict(report))
 
-    if not (out / AUGMENTATION).exists():
-        inputs = _inputs(train, validation, config.seed, device, *settings)
-        module = counterfactual_copies.__module__
-        shared.provide(inputs, module, out, (*MODELS, _OVERLAY, AUGMENTATION), make)
-    return Overlay.load(out / _OVERLAY), read_json(out / AUGMENTATION)
+    with distributed.leader_first():
+        if not (out / AUGMENTATION).exists():
+            inputs = _dependencies(run.train, run.validation, config.seed, run.device, *settings)
+            files = (*MODELS, _OVERLAY, AUGMENTATION)
+            shared.provide(inputs, counterfactual_copies.__module__, out, files, make)
+        return Overlay.load(out / _OVERLAY), read_augmentation(out / AUGMENTATION)
 
 
-def _inputs(
+def _train_policy(
+    run: _Inputs, overlay: Overlay | None, more: Overlay | None, on_all_rows: bool
+) -> Fit:
+    """Fit the policy to logged and augmented episodes (lines 4 and following of Algorithm 1)."""
+    if more is not None:
+        overlay = more if overlay is None else overlay.joined(more)
+    train = run.train if overlay is None else run.train.with_overlay(overlay)
+    validation = None if on_all_rows else run.validation
+    return fit_policy(run.policy, train, validation, run.out, run.config)
+
+
+def _fit_user_model(run: _Inputs) -> UserModel:
+    """Fit what users would do: the reward of every item, session ends and fatigue."""
+    inputs = _dependencies(run.logged, run.held_out, run.config.seed, torch.device("cpu"))
+    folder = run.out / REWARD_MODEL
+    fit = partial(UserModel.fit, run.logged, run.held_out, folder, run.config.seed)
+    run.shared.provide(inputs, UserModel.__module__, run.out, (REWARD_MODEL,), fit)
+    return fit()  # read from the folder
+
+
+def _choose_rule(run: _Inputs, users: UserModel) -> RuleRecord:
+    """Choose the decision rule: by simulation in the user model, or by ranking."""
+    trained = TrainedPolicy.load(run.out, in_training=True)
+    decider = Decider(run.policy, trained.rule, trained.returns, users.reward)
+    config = run.config.rule
+    targets = {quantile: trained.target_return(quantile) for quantile in config.quantiles}
+    choice = choose_rule(decider, users, targets, run.logged, run.held_out, config, run.config.seed)
+    write_json(run.out / RULE, choice.rule.as_dict())
+    return RuleRecord.model_validate(choice.as_dict())
+
+
+def _write_samples(run: _Inputs) -> None:
+    """Save a few recommendations for the report, by the run's decision rule."""
+    if run.held_out.has_items:
+        trained = TrainedPolicy.load(run.out, in_training=True)
+        write_json(run.out / SAMPLES, sample_recommendations(trained.decider(), run.held_out))
+
+
+def _dependencies(
     train: EpisodeStore,
     validation: EpisodeStore,
     seed: int,
     device: torch.device,
     *settings: CRMConfig | CSGConfig | AugmentConfig,
 ) -> dict[str, Any]:
-    """All that a reward model or copies depend on, but the code."""
+    """All that a shared stage depends on, but the code."""
     return {
-        "data": train.meta["fingerprint"],
-        "item_states": train.meta.get(FILES, {}).get(ITEM_STATES),
+        "data": train.record.fingerprint,
+        "item_states": train.record.files.get(ITEM_STATES),
         "steps": [train.n_steps, validation.n_steps],
         "state_size": train.state_size,
         "seed": seed,
         "device": device.type,
-        "settings": [dataclasses.asdict(table) for table in settings],
+        "settings": [asdict(table) for table in settings],
     }
-
-
-def _sizes(store: EpisodeStore) -> dict[str, int]:
-    columns = store.meta["columns"]
-    if store.has_items:
-        return reward_model_sizes(store)
-    return {"state": store.state_size, "action": columns[schema.ACTION][0], "items": 0}
-
-
-@random_state_kept()
-def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
-    """An untrained policy with the normalisation and item embeddings of `train`."""
-    torch.manual_seed(config.seed)
-    policy = policy_class(config.policy_name)(config.policy, _sizes(train))
-    base = train.without_copies()
-    mean, std = base.state_statistics
-    policy.state_mean.copy_(mean)
-    policy.state_std.copy_(torch.where(std > 1e-6, std, 1.0))
-    scale = config.policy.return_scale or float(np.abs(base.returns).max()) or 1.0
-    returns_to_go = base.column(schema.RETURN_TO_GO)
-    if not _returns(base, config).per_session and not config.policy.return_scale:
-        scale = float(np.abs(returns_to_go).max()) or 1.0
-    policy.return_scale.fill_(scale)
-    policy.lowest_return_to_go.fill_(float(returns_to_go.min()))
-    if isinstance(policy.head, ItemHead):
-        counts = torch.from_numpy(base.item_counts()).float()
-        policy.head.start_from(base.item_states.embeddings, counts)
-        if policy.head.exposure is not None:
-            scaled = torch.from_numpy(returns_to_go) / policy.return_scale
-            policy.head.exposure.start_from(base.item_states, scaled)
-    else:
-        actions = base.column(schema.ACTION)
-        policy.head.scale.copy_(torch.from_numpy(np.abs(actions).max(0)).clamp(min=1.0))
-    policy.start_from(base)
-    return policy
-
-
-def _rule(
-    policy: SequencePolicy,
-    train: EpisodeStore,
-    validation: EpisodeStore,
-    out: Path,
-    config: Config,
-    shared: SharedStages,
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Fit the reward model of items and choose the rule; returns the reports of both."""
-    fit = partial(fit_item_reward_model, train, validation, out / REWARD_MODEL, config.seed)
-    inputs = _inputs(train, validation, config.seed, torch.device("cpu"))
-    shared.provide(inputs, fit_item_reward_model.__module__, out, (REWARD_MODEL,), fit)
-    model, report = fit()  # read from the folder
-    trained = TrainedPolicy.load(out, in_training=True)
-    targets = {quantile: trained.target_return(quantile) for quantile in config.rule.quantiles}
-    decider = Decider(policy, trained.rule, trained.returns, model)
-    choice: Choice | RankedChoice
-    if trained.returns.per_session:
-        users = None
-        if report.new_users:
-            like = partial(fit_training_users, train, out / TRAINING_USERS, config.seed)
-            shared.provide(inputs, fit_training_users.__module__, out, (TRAINING_USERS,), like)
-            users = like()  # read from the file
-        choice = choose_rule(decider, targets, train, validation, config.rule, config.seed, users)
-    else:
-        choice = choose_by_ranking(decider, train, validation, config.rule, config.seed)
-    write_json(out / RULE, choice.rule.as_dict())
-    return dataclasses.asdict(report), choice.as_dict()
-
-
-def _write_samples(out: Path, validation: EpisodeStore) -> None:
-    """Save a few recommendations for the report, by the run's decision rule."""
-    if validation.has_items:
-        trained = TrainedPolicy.load(out, in_training=True)
-        write_json(out / SAMPLES, sample_recommendations(trained.decider(), validation))

@@ -12,9 +12,10 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json, write_json
 from ucfrec.runs.config import Config
-from ucfrec.runs.run import train_run, training_views
+from ucfrec.runs.record import RUN, RunRecord, Screening, read_record
+from ucfrec.runs.run import train_run
 from ucfrec.runs.shared_stages import OWN, SharedStages
-from ucfrec.runs.trained_policy import DROPPED, RUN, read_record
+from ucfrec.runs.start import training_views
 
 SCREENINGS: Final = ("drop", "copies")
 """Train without the columns, or add copies of the sessions that intervene on them."""
@@ -41,7 +42,7 @@ def train_screened(
     how: str | None,
     about: Mapping[str, Any] | None = None,
     shared: SharedStages = OWN,
-) -> dict[str, Any]:
+) -> RunRecord:
     """`ucfrec.runs.run.train_run` after screening.
 
     Args:
@@ -61,7 +62,8 @@ def train_screened(
             column of observed states would be left.
     """
     started = read_record(out) if (out / RUN).exists() else None
-    before = None if started is None else started.get(SCREENING, {}).get("how")
+    screening = None if started is None else started.screening
+    before = None if screening is None else screening.how
     if started is not None and before != how:
         raise InputError(
             f"{out} was started with{f' --screen {before}' if before else 'out --screen'}; name "
@@ -69,11 +71,9 @@ def train_screened(
         )
     if how is None:
         return train_run(store, out, config, about, shared=shared)
-    if started is not None:
-        screening = started[SCREENING]
-    else:
-        screening = {"how": how, **_screened(store, shared)}
-    flagged = flagged_columns(screening)
+    if screening is None:
+        screening = Screening.model_validate({"how": how, **_screened(store, shared)})
+    flagged = screening.flagged
     if len(flagged) == store.state_size:
         raise InputError(
             f"{store.path}: screening found no effect of any of the {len(flagged)} state "
@@ -83,16 +83,16 @@ def train_screened(
     entries = {**(about or {}), SCREENING: screening}
     if how == "drop":
         kept = without_columns(store, flagged)
-        return train_run(kept, out, config, {**entries, DROPPED: flagged})
+        return train_run(kept, out, config, {**entries, "dropped_observations": flagged})
     train, first = training_views(store)[0], store.state_size - store.observation_size
     places = [first + column for column in flagged]
-    copies = interventions(train, places, config.seed) if places else None
-    return train_run(store, out, config, entries, copies, shared=shared)
+    more = interventions(train, places, config.seed) if places else None
+    return train_run(store, out, config, entries, more, shared=shared)
 
 
 def _screened(store: EpisodeStore, shared: SharedStages) -> dict[str, Any]:
     """The report of `screen_store`, as a record has it."""
-    inputs = {"screened": store.meta["fingerprint"], "steps": store.n_steps, "seed": SEED}
+    inputs = {"screened": store.record.fingerprint, "steps": store.n_steps, "seed": SEED}
     with TemporaryDirectory() as scratch:
         file = Path(scratch) / "screening.json"
 
@@ -104,17 +104,6 @@ def _screened(store: EpisodeStore, shared: SharedStages) -> dict[str, Any]:
         return report
 
 
-def flagged_columns(screening: Mapping[str, Any]) -> list[int]:
-    """The observation columns without effect of a record's entry `SCREENING`."""
-    return [d["dimension"] for d in screening["dimensions"] if not d["causes"]]
-
-
 def without_columns(store: EpisodeStore, columns: Sequence[int]) -> EpisodeStore:
     """`store` without some columns of its observations; itself if there are none."""
     return store.without_observation_dimensions(columns) if columns else store
-
-
-def describe_screened(record: Mapping[str, Any]) -> str:
-    """One line on the screening of a run's record."""
-    flagged = ", ".join(map(str, flagged_columns(record[SCREENING]))) or "none"
-    return f"screening     observation columns without effect: {flagged}"

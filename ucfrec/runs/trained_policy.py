@@ -1,16 +1,14 @@
 """A trained policy, read back from its run folder."""
 
-import os
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import Decider, DecisionRule
@@ -19,35 +17,29 @@ from ucfrec.acting.session_scorer import SessionScorer
 from ucfrec.arrays import Array, Float32Array, IntArray
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.item_counts import TrainingCounts
-from ucfrec.episodes.main_tags import MainTags
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
+from ucfrec.episodes.store import ITEM_STATES
 from ucfrec.errors import InputError, InputNote, damage_explained
 from ucfrec.files.atomic import read_json
-from ucfrec.files.checksums import sealed_record
 from ucfrec.files.parquet import read_ids
-from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors
+from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors, load_trained
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
-from ucfrec.runs.config import config_from_dict
-from ucfrec.runs.record import is_of_store, require_run_record
+from ucfrec.runs.record import RunRecord, read_record
+from ucfrec.user_model.main_tags import MainTags
 from ucfrec.user_model.reward import FITTED, ItemRewardModel
 
 if TYPE_CHECKING:
     import pandas as pd
 
-RUN, AUGMENTATION = "run.json", "augmentation.json"
+RUN, AUGMENTATION = RunRecord.FILE, "augmentation.json"
 ITEMS, USERS = "items.parquet", "users.parquet"
 COUNTS = "training_counts.safetensors"
 RETURNS = "training_returns.safetensors"
 RULE = "decision_rule.json"
 REWARD_MODEL = "reward_model"
-DROPPED = "dropped_observations"
-"""Entry of a record: columns of the logged observation that the policy does not see."""
-REFIT_OF = "refit_of"
-"""Entry of the record of a run that was trained on all splits (`ucfrec.runs.refit`)."""
 INPUTS = (ITEM_STATES, ITEMS, USERS, COUNTS, RETURNS)
 """Files of a run that training does not change."""
 
@@ -59,8 +51,8 @@ class TrainedPolicy:
     folder: Path
     """The run folder."""
     policy: SequencePolicy
-    record: Mapping[str, Any]
-    """Content of `run.json`."""
+    record: RunRecord
+    """The content of `run.json`."""
     item_states: ItemStates | None
     """Builds states from items; None if the logged observation is the state."""
     item_ids: Array | None
@@ -93,21 +85,17 @@ class TrainedPolicy:
             InputError: `run` is not a run folder, or has no checkpoint yet.
         """
         record = read_record(run)
-        if "policy" not in record and not in_training:
+        if record.policy is None and not in_training:
             warnings.warn(
                 f"the training in {run} has not ended: later weights may be better, and its "
                 "decision rule is not chosen yet; train again with the same command",
                 InputNote,
                 stacklevel=2,
             )
-        config = config_from_dict(record["config"])
-        path, learner = (
-            run / "policy" / f"{checkpoint}.safetensors",
-            policy_class(config.policy_name),
-        )
+        config, path = record.config, run / "policy" / f"{checkpoint}.safetensors"
+        build = partial(policy_class(config.policy_name), config.policy, record.sizes)
         with random_state_kept():
-            build = lambda: learner(config.policy, record["sizes"])  # noqa: E731
-            policy = load_module(path, build, _weights(path))
+            policy = load_module(path, build, load_trained(path))
         policy.eval()
         states = run / ITEM_STATES
         trained = cls(
@@ -119,7 +107,7 @@ class TrainedPolicy:
             _ids(run / USERS, schema.USER_ID),
             _returns(run / RETURNS),
             _rule(run / RULE),
-            _reward_model(run / REWARD_MODEL / FITTED, record["sizes"]),
+            _reward_model(run / REWARD_MODEL / FITTED, record.sizes),
             TrainingCounts.load(run / COUNTS) if (run / COUNTS).exists() else None,
         )
         trained._require_equal_sizes()
@@ -131,14 +119,14 @@ class TrainedPolicy:
         Raises:
             InputError: a file has another size than the run's record states.
         """
-        sizes, states, dropped = self.record["sizes"], self.item_states, self.dropped
-        most = self.record["observation_size"] + len(dropped)
+        sizes, states, dropped = self.record.sizes, self.item_states, self.dropped
+        most = self.record.observation_size + len(dropped)
         if list(dropped) != sorted({*dropped}) or (dropped and dropped[-1] >= most):
             raise InputError(
                 f"{self.folder / RUN} is damaged: of {most} columns of the observations it names "
                 f"{dropped!s:.60} as dropped; {REMEDY}"
             )
-        state = self.record["observation_size"] + (0 if states is None else states.size)
+        state = self.record.observation_size + (0 if states is None else states.size)
         found: dict[str, tuple[Any, Any]] = {}
         if states is not None:
             table = (sizes["items"], sizes["action"])
@@ -161,12 +149,12 @@ class TrainedPolicy:
                 )
 
     def __repr__(self) -> str:
-        return f"TrainedPolicy({describe_trained(self.record)})"
+        return f"TrainedPolicy({self.record.summary})"
 
     @property
     def name(self) -> str:
-        """Name of the learner; see `learner_of`."""
-        return learner_of(self.record)
+        """Name of the method; see `RunRecord.name`."""
+        return self.record.name
 
     @cached_property
     def item_index(self) -> "pd.Index[Any]":
@@ -192,18 +180,18 @@ class TrainedPolicy:
     @property
     def dropped(self) -> tuple[int, ...]:
         """Columns of the logged observation that the policy does not see, ascending."""
-        return tuple(self.record.get(DROPPED, ()))
+        return self.record.dropped_observations
 
     @property
     def logged_observation_size(self) -> int:
         """Columns that observations must have; 0 if the policy sees none."""
-        kept: int = self.record["observation_size"]
+        kept = self.record.observation_size
         return kept + len(self.dropped) if kept else 0
 
     @property
     def returns(self) -> ReturnToGo:
         """What the returns-to-go of the training counted."""
-        return ReturnToGo(**self.record["return_to_go"])
+        return self.record.return_to_go
 
     def target_return(self, quantile: float) -> float:
         """The `quantile` (0 to 1) of `training_returns`, exact, in reward units.
@@ -274,110 +262,13 @@ class TrainedPolicy:
         return PolicyActor(
             self.decider(rule),
             episodes,
-            self.record["observation_size"],
+            self.record.observation_size,
             self.item_states,
             self.item_ids if item_numbers is None else item_numbers,
             self.user_ids,
             seed,
             self.dropped,
         )
-
-
-def read_record(run: Path) -> dict[str, Any]:
-    """The content of a run's `run.json`, complete once the run has finished.
-
-    Raises:
-        InputError: `run` is not a run folder.
-    """
-    if not (run / RUN).exists():
-        raise InputError(f"{run} is not a run folder: it has no {RUN}; train one first")
-    record, sealed = sealed_record(run, RUN, "train again")
-    if sealed is not None:
-        sealed.require_small()
-    require_run_record(run / RUN, record)
-    return record
-
-
-def store_from(run: Path, store: Path) -> str | None:
-    """The folder of a store as seen from that of a run; None on another drive of Windows."""
-    try:
-        return os.path.relpath(store.resolve(), run.resolve())
-    except ValueError:
-        return None
-
-
-def store_of(run: Path, record: Mapping[str, Any]) -> EpisodeStore | None:
-    """The store that a run was trained on; None where it is gone or changed.
-
-    It is looked for where it lies as seen from the run, so that both can be moved or copied
-    together, and where it lay when the run was trained.
-
-    Raises:
-        InputError: it is damaged.
-    """
-    places = [Path(record["store"])]
-    if from_run := record.get("store_from_run"):
-        places.insert(0, Path(os.path.normpath(run.resolve() / from_run)))
-    for path in places:
-        if (path / "meta.json").is_file():
-            store = EpisodeStore.open(path)
-            if is_of_store(record, store.meta):
-                return store
-    return None
-
-
-def verified(run: Path) -> None:
-    """Read every file of a run and compare it with its checksum.
-
-    Raises:
-        InputError: `run` is not a run folder, has no checksums, or a file has another content.
-    """
-    read_record(run)
-    sealed = sealed_record(run, RUN, "train again")[1]
-    if sealed is None or "policy" not in read_json(run / RUN):
-        raise InputError(
-            f"{run} cannot be verified: its training has not ended, or an older ucfrec wrote it; "
-            "train it with this one"
-        )
-    for name, fault in sealed.faults():
-        raise InputError(f"{run / name} {fault}; restore the file, or train again")
-
-
-def duplicates_of(record: Mapping[str, Any]) -> str:
-    """The rule for duplicates that the logs of a run were prepared with."""
-    rule = record.get("data", {}).get("duplicates")
-    # Older stores have no such entry, and a store of somebody else may have any.
-    return rule if rule in ("highest", "lowest", "first", "last") else "highest"
-
-
-def describe_trained(record: Mapping[str, Any]) -> str:
-    """One line on a run's record: the learner and the size of its training data."""
-    facts = [
-        repr(learner_of(record)),
-        f"trained on {record['train_steps']:,} steps",
-        f"{record['train_episodes']:,} episodes",
-    ]
-    if record["sizes"]["items"]:
-        facts.append(f"{record['sizes']['items']:,} items")
-    return ", ".join([*facts, f"reward={record['reward']}"])
-
-
-def learner_of(record: Mapping[str, Any]) -> str:
-    """Name of the learner of a run's record.
-
-    Followed by `-augmented` or `-no-augmentation` if the run's use of copies is not the
-    learner's default.
-    """
-    config = config_from_dict(record["config"])
-    augmented = config.augment.makes_copies
-    if augmented == policy_class(config.policy_name).augmented:
-        return config.policy_name
-    return f"{config.policy_name}-{'augmented' if augmented else 'no-augmentation'}"
-
-
-def _weights(path: Path) -> dict[str, Tensor]:
-    tensors, _ = load_tensors(path)
-    return {name: t for name, t in tensors.items() if not name.startswith("optimizer.")}
 
 
 def _rule(path: Path) -> DecisionRule:

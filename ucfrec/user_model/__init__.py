@@ -1,1 +1,1 @@
-"""What users would do: the reward of every item, session ends, fatigue, simulated sessions."""
+"""What users would do: `UserModel` has the reward of every item, session ends and fatigue."""

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from ucfrec.arrays import BoolArray, IntArray
 from ucfrec.episodes.exposure import Shown
-from ucfrec.episodes.main_tags import MainTags
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.user_model.main_tags import MainTags
 
 LONGEST: Final = 8
 """Largest length of a run, and largest number of steps that it tires, that are tried."""

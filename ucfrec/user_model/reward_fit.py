@@ -2,10 +2,10 @@
 
 import dataclasses
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import torch
@@ -15,14 +15,13 @@ from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.item_counts import LIKED
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.errors import InputError
-from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
+from ucfrec.errors import InputError, damage_explained
+from ucfrec.fitting.checkpoint import REMEDY, load_tensors, load_weights, save_tensors
 from ucfrec.progress import Progress, progress
 from ucfrec.user_model.posterior import MEMORY, root_of_tastes
 from ucfrec.user_model.reward import FITTED, ItemRewardModel
 from ucfrec.user_model.reward_effects import EFFECTS, Design, Effects, fit_effects
 from ucfrec.user_model.reward_report import (
-    Calibration,
     EffectTried,
     ItemRewardReport,
     calibration,
@@ -40,7 +39,7 @@ _CHEAP: Final = ("item", "user", "content")
 _STRIDES: Final = {**dict.fromkeys(_CHEAP, (2, 1)), "tastes": ()}
 """Steps of the search of a spread, (2,) for others; one number alone needs no search."""
 _KNOWN: Final = 0.1
-"""Least share of held-out rows of known users that can judge the effects in `LASTING`."""
+"""Least share of held-out rows of known users that can evaluate the effects in `LASTING`."""
 _SCALES: Final = (0.25, 0.5, 1.0, 2.0, 4.0)
 """Standard deviations of tastes that are tried, relative to the noise of single steps."""
 LASTING: Final = ("item", "user", "content", "affinity")
@@ -103,7 +102,8 @@ def fit_item_reward_model(
     if (folder / FITTED).exists():
         tensors, about = load_tensors(folder / FITTED)
         load_weights(folder / FITTED, model, tensors)
-        return model.eval(), _report_from(about)
+        with damage_explained(folder / FITTED, REMEDY):
+            return model.eval(), ItemRewardReport(**about)
     start = time.process_time()
     rows = RewardRows.of(train, model.lags, max_rows, seed)
     held_out = RewardRows.of(validation, model.lags, max_rows, seed)
@@ -135,7 +135,7 @@ def refit_item_reward_model(
         max_rows: most rows that are used.
     """
     tensors, about = load_tensors(first / FITTED)
-    report = _report_from(about)
+    report = ItemRewardReport(**about)
     model = ItemRewardModel(reward_model_sizes(store))
     lags = MEMORY if "tastes" in report.kept else model.lags
     rows = RewardRows.of(store, lags, max_rows, seed)
@@ -229,16 +229,16 @@ class EffectSearch:
 
     def add_all(self, bar: Progress, effects: Collection[str]) -> None:
         """Add every one of `effects` that lowers the held-out loss."""
-        judge = self.of_training() if self.of_new_users else self
+        search = self.of_training() if self.of_new_users else self
         for name in EFFECTS:
-            if judge is not self and name not in LASTING:
-                self._take(judge)
+            if search is not self and name not in LASTING:
+                self._take(search)
                 self._forget_users()
-                judge = self
+                search = self
             if name in effects:
-                judge.add(name)
+                search.add(name)
             if name == _CHEAP[-1]:
-                judge.adjust()
+                search.adjust()
             bar.update()
 
     @property
@@ -254,14 +254,14 @@ class EffectSearch:
         return seen
 
     def of_training(self) -> "EffectSearch":
-        """A search that is judged on a fifth of the training rows."""
+        """A search that is evaluated on a fifth of the training rows."""
         rows = len(self.design.items)
         held_back = torch.arange(rows) % 5 == min(4, rows - 1)
         return EffectSearch(self.design.select(~held_back), self.design.select(held_back))
 
-    def _take(self, judge: "EffectSearch") -> None:
-        """Fit the effects that `judge` keeps, with its spreads, to all training rows."""
-        self.tried, at = list(judge.tried), judge.kept
+    def _take(self, search: "EffectSearch") -> None:
+        """Fit the effects that `search` keeps, with its spreads, to all training rows."""
+        self.tried, at = list(search.tried), search.kept
         if "item" in at:
             _, (_, losses) = self._best("item", at["item"], ())
             self.item_loss = float(losses.mean())
@@ -409,21 +409,4 @@ def _report(
         calibration=calibration(predicted, observed),
         seconds=time.process_time() - start,
         **ranking,
-    )
-
-
-def _report_from(values: Mapping[str, Any]) -> ItemRewardReport:
-    """The report as it was before `dataclasses.asdict` and JSON."""
-    curve = values["calibration"]
-    return ItemRewardReport(
-        **{
-            **values,
-            "effects": tuple(EffectTried(**tried) for tried in values["effects"]),
-            "calibration": Calibration(
-                predicted=tuple(curve["predicted"]),
-                observed=tuple(curve["observed"]),
-                count=tuple(curve["count"]),
-                error=curve["error"],
-            ),
-        }
     )

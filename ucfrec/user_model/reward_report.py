@@ -1,11 +1,12 @@
 """How good the reward model of items is on held-out steps."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import torch
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from ucfrec.arrays import Float64Array
@@ -17,9 +18,11 @@ _BINS: Final = 10
 _PRIOR: Final = 10.0
 """Impressions at the mean rate that are added to an item's counts in `item_rates`."""
 _CHUNK: Final = 16_384
+SAVED: Final = ConfigDict(extra="forbid")
+"""Of reports that are saved beside what they are of, and read again."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=SAVED)
 class EffectTried:
     """One effect, with the spread that predicts held-out rewards best."""
 
@@ -35,7 +38,7 @@ class EffectTried:
     """Whether it is part of the model: the gain is above its standard error."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=SAVED)
 class Calibration:
     """Held-out rows in 10 bins of equal size by predicted reward, in ascending order."""
 
@@ -49,7 +52,7 @@ class Calibration:
     """Expected calibration error: mean over rows of |predicted − observed| of their bins."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=SAVED)
 class ItemRewardReport:
     """Quality of the reward model of items, on held-out rows."""
 
@@ -142,6 +145,11 @@ def fit_line(
         return 1.0, 0.0
     fitted = LinearRegression().fit(inputs, outcomes, counts)
     return float(fitted.coef_[0]), float(fitted.intercept_)
+
+
+def calibrate(model: ItemRewardModel, rows: RewardRows) -> tuple[float, float]:
+    """`fit_line` of the model's scores to logged rewards."""
+    return fit_line(scores_of(model, rows)[0], model.target(rows.rewards), bool(model.binary))
 
 
 def item_rates(rows: RewardRows, liked: Tensor, n_items: int) -> Tensor:

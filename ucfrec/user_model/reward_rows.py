@@ -1,4 +1,4 @@
-"""The logged steps that the reward model of items is fitted to and judged on."""
+"""The logged steps that the reward model of items is fitted to and evaluated on."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""The users of a training log, as the users whose sessions a decision rule is tried in.
+"""The users of a training log, as those whose sessions a decision rule is tried in.
 
 For new users, policy and reward model learn tastes from the session. In sessions whose rewards are
 drawn from that reward model, a policy is paid for its own guesses: an item that pays once, by luck,
@@ -14,12 +14,12 @@ each user's rows are scaled to add up to their effective number (Pfeffermann et 
 """
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
+import pydantic
 import torch
 from torch import Tensor
 
@@ -31,19 +31,30 @@ from ucfrec.fitting.checkpoint import REMEDY, load_tensors, load_weights, save_t
 from ucfrec.progress import progress
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_effects import EFFECTS, Design, fit_effects
-from ucfrec.user_model.reward_fit import (
-    EffectSearch,
-    reward_model_sizes,
-    set_statistics,
-)
-from ucfrec.user_model.reward_report import EffectTried, fit_line
+from ucfrec.user_model.reward_fit import EffectSearch, reward_model_sizes, set_statistics
+from ucfrec.user_model.reward_report import SAVED, EffectTried, fit_line
 from ucfrec.user_model.reward_rows import RewardRows
 
-TRAINING_USERS: Final = "training_users.safetensors"
-"""File of the fitted users in a run folder."""
+_FITTED: Final = "training_users.safetensors"
 _MAX_STEPS: Final = 100_000
 _LARGEST_WEIGHT: Final = 10.0
 """Larger weights are cut off, so that no single row decides."""
+
+
+@pydantic.dataclasses.dataclass(frozen=True, config=SAVED)
+class TrainingUsersReport:
+    """How the tastes of training users were found."""
+
+    calibration: tuple[float, float]
+    """Slope and intercept of the model's scores on training rows that were held back."""
+    effects: tuple[EffectTried, ...]
+    """The effects that were tried, evaluated on these rows."""
+    steps: int
+    """Logged steps that the effects are fitted to."""
+    effective_steps: float
+    """As many steps of equal weight tell as much; `steps` without propensities."""
+    weighted: bool
+    """Whether rows were weighted by propensities."""
 
 
 @dataclass(frozen=True)
@@ -52,43 +63,28 @@ class TrainingUsers:
 
     model: ItemRewardModel
     """Rewards of items for them."""
-    calibration: tuple[float, float]
-    """Slope and intercept of its scores on training rows that were held back."""
-    effects: tuple[EffectTried, ...]
-    """The effects that were tried, judged on these rows."""
-    steps: int
-    """Logged steps that the effects are fitted to."""
-    effective_steps: float
-    """As many steps of equal weight tell as much; `steps` without propensities."""
-    weighted: bool
-    """Whether rows were weighted by propensities."""
-
-    def report(self) -> dict[str, Any]:
-        """All but the model, as a JSON object."""
-        fields = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
-        del fields["model"]
-        return {**fields, "effects": [dataclasses.asdict(tried) for tried in self.effects]}
+    report: TrainingUsersReport
 
 
-def fit_training_users(train: EpisodeStore, path: Path, seed: int) -> TrainingUsers:
-    """Fit the effects of training users, or read them from the file `path`.
+def fit_training_users(train: EpisodeStore, folder: Path, seed: int) -> TrainingUsers:
+    """Fit the effects of training users, or read them from `folder` if they were fitted before.
 
     Effects are chosen as in `ucfrec.user_model.reward_fit`, on a fifth of the rows.
 
     Args:
         train: view of a store of items whose episodes name their users.
-        path: receives the fitted effects.
+        folder: receives the fitted effects.
         seed: of the sessions drawn by `sessions_of`.
 
     Raises:
         InputError: all training rewards are equal, or the file is damaged.
     """
-    model = ItemRewardModel(reward_model_sizes(train))
+    model, path = ItemRewardModel(reward_model_sizes(train)), folder / _FITTED
     if path.exists():
         tensors, about = load_tensors(path)
         load_weights(path, model, tensors)
         with damage_explained(path, REMEDY):
-            return _read(model.eval(), about)
+            return TrainingUsers(model.eval(), TrainingUsersReport(**about))
     sessions = sessions_of(train, seed)
     episodes, steps = sessions.all_steps()
     rows = RewardRows.at(sessions, episodes, steps, model.lags)
@@ -98,26 +94,20 @@ def fit_training_users(train: EpisodeStore, path: Path, seed: int) -> TrainingUs
     model.state_std[:of_session] = torch.inf
     weights = propensity_weights(sessions, episodes, steps, len(model.item))
     design = Design.of(model, rows, weights)
-    judge = EffectSearch(design, design).of_training()
+    search = EffectSearch(design, design).of_training()
     with progress(len(EFFECTS), "training users", "effects") as bar:
         for name in EFFECTS:
-            judge.add(name)
+            search.add(name)
             bar.update()
-    tried = judge.report()
+    tried, held_back = search.report(), search.held_out
     spreads = {each.effect: each.spread for each in tried if each.kept}
     model.set_effects(fit_effects(design, design.mean_effect(), spreads), design.of_content)
-    held_back = judge.held_out
-    scores = held_back.predictor(judge.effects)
-    fitted = TrainingUsers(
-        model=model.eval(),
-        calibration=fit_line(scores, held_back.target, held_back.binary, held_back.weights),
-        effects=tried,
-        steps=len(rows),
-        effective_steps=design.count,
-        weighted=weights is not None,
-    )
-    save_tensors(path, model.state_dict(), fitted.report())
-    return fitted
+    scores = held_back.predictor(search.effects)
+    line = fit_line(scores, held_back.target, held_back.binary, held_back.weights)
+    report = TrainingUsersReport(line, tried, len(rows), design.count, weights is not None)
+    folder.mkdir(parents=True, exist_ok=True)
+    save_tensors(path, model.state_dict(), dataclasses.asdict(report))
+    return TrainingUsers(model.eval(), report)
 
 
 def sessions_of(train: EpisodeStore, seed: int) -> EpisodeStore:
@@ -136,7 +126,7 @@ def propensity_weights(
     user's steps of equal weight that tell as much, (Σ w)² / Σ w² (Kish). None if the log does not
     have every p.
     """
-    if schema.PROPENSITY not in view.meta["columns"]:
+    if schema.PROPENSITY not in view.record.columns:
         return None
     propensities = view.step_values(schema.PROPENSITY, episodes, steps).astype(np.float64)
     if not (propensities > 0).all():
@@ -145,10 +135,3 @@ def propensity_weights(
     users = np.unique(view.episode_values(schema.USER), return_inverse=True)[1][episodes]
     sums, squares = (np.bincount(users, weights=each) for each in (shares, np.square(shares)))
     return torch.from_numpy(shares * (sums / squares)[users]).float()
-
-
-def _read(model: ItemRewardModel, about: Mapping[str, Any]) -> TrainingUsers:
-    slope, intercept = about["calibration"]
-    tried = tuple(EffectTried(**each) for each in about["effects"])
-    values = {**about, "calibration": (slope, intercept), "effects": tried}
-    return TrainingUsers(model=model, **values)

@@ -39,11 +39,11 @@ OF_ITEMS: Final = (
     *("ucfrec.acting.logged_decisions", "ucfrec.choosing.many_rules"),
     *("ucfrec.acting.session_scorer", "ucfrec.counterfactual.action_copies"),
     *("ucfrec.user_model.reward_effects", "ucfrec.user_model.reward_fit"),
-    *("ucfrec.user_model.reward_mean", "ucfrec.user_model.reward"),
+    *("ucfrec.counterfactual.effects_mean", "ucfrec.user_model.reward"),
     *("ucfrec.user_model.reward_report", "ucfrec.user_model.reward_rows"),
     *("ucfrec.user_model.posterior", "ucfrec.user_model.training_users"),
     *("ucfrec.episodes.exposure", "ucfrec.episodes.item_counts", "ucfrec.episodes.item_table"),
-    *("ucfrec.episodes.main_tags", "ucfrec.episodes.states", "ucfrec.policies.item_sampling"),
+    *("ucfrec.user_model.main_tags", "ucfrec.episodes.states", "ucfrec.policies.item_sampling"),
     *("ucfrec.choosing.by_ranking", "ucfrec.choosing.by_simulation"),
 )
 """Modules that control imports but does not run, because its actions are vectors: changes to them
@@ -132,7 +132,7 @@ def key(cell: Cell) -> RowKey:
         evaluation_seed=cell.evaluation_seed,
         conditions=conditions,
         code_version=cell.code_version,
-        data_fingerprint=EpisodeStore.open(cell.store).meta["fingerprint"],
+        data_fingerprint=EpisodeStore.open(cell.store).record.fingerprint,
     )
 
 
@@ -183,7 +183,8 @@ def measure_robustness(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     ]
     losses = held_out_losses(TrainedPolicy.load(cell.run, "last"), store)
     metrics = {"score_at_one": evaluations[-1]["score"], **losses}
-    details = {SCREENING: verdicts(record[SCREENING], store)} if cell.screening else {}
+    screening = record.screening
+    details = {} if screening is None else {SCREENING: verdicts(screening.dimensions, store)}
     fields = {"metrics": metrics, "details": details}
     return [score_row(evaluations[0], row_key, **fields, **provenance(PACKAGES))]
 

@@ -9,7 +9,7 @@ import torch
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.fitting.random_state import random_state_kept
-from ucfrec.runs.run import new_policy, training_views
+from ucfrec.runs.start import new_policy, training_views
 from ucfrec_control.benchmark.cells import Cell
 from ucfrec_control.environments.environments import SIDE_BY_SIDE, environment_of_data, make_env
 from ucfrec_control.learners.rl_baselines import ALGORITHMS, timed_updates

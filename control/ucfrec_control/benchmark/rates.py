@@ -234,16 +234,18 @@ def _cells(
 def _measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     store = EpisodeStore.open(cell.store)
     if cell.learner in ALGORITHMS:
-        record, rate = train_rl(store, cell.run, cell.rl_config, cell.seed), cell.rl[RATE]
-        loss = action_loss(cell.run, store)
+        rl = train_rl(store, cell.run, cell.rl_config, cell.seed)
+        rate, loss = cell.rl[RATE], action_loss(cell.run, store)
+        steps, seconds = rl.finished.steps, rl.wall_time_s
     else:
         record = train_control(store, cell.run, cell.config)
-        loss, rate = record["policy"]["best_validation"], cell.config.train.learning_rate
+        loss, rate = record.finished.best_validation, cell.config.train.learning_rate
+        steps, seconds = record.finished.steps, record.wall_time_s
     row = ResultRow(
         **vars(row_key) | {"conditions": {**row_key.conditions, RATE: rate}},
         metric="validation_loss",
-        metrics={"validation_loss": loss, "steps": float(record["policy"]["steps"])},
-        wall_time_s=record["wall_time_s"],
+        metrics={"validation_loss": loss, "steps": float(steps)},
+        wall_time_s=seconds,
         **provenance(PACKAGES),
     )
     return [row]

@@ -1,19 +1,20 @@
 """Screening of every file: are distractors flagged, and only these? (resumable)"""
 
+import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from ucfrec.code_version import code_version
-from ucfrec.counterfactual.screening import ScreeningConfig, screen
+from ucfrec.counterfactual.screening import DimensionReport, ScreeningConfig, screen
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.provenance import provenance
 from ucfrec.reporting.grid import Measurement, run_grid
 from ucfrec.reporting.result_row import ResultRow, RowKey
 from ucfrec.reporting.tables import NONE
-from ucfrec.runs.run import training_views
+from ucfrec.runs.start import training_views
 from ucfrec_control.data.distractor import DISTRACTORS, zoo_store
 from ucfrec_control.data.trajectories import PACKAGES
 
@@ -72,7 +73,7 @@ def _key(cell: Cell) -> RowKey:
         training_seed=SEED,
         conditions={"distractor": cell.distractor},
         code_version=code_version(__name__),
-        data_fingerprint=EpisodeStore.open(cell.store).meta["fingerprint"],
+        data_fingerprint=EpisodeStore.open(cell.store).record.fingerprint,
     )
 
 
@@ -83,16 +84,16 @@ def _config(cell: Cell) -> dict[str, Any]:
 def _measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     store = EpisodeStore.open(cell.store)
     began = time.perf_counter()
-    report = asdict(screen(training_views(store)[0], cell.config, SEED))
-    dimensions = verdicts(report, store)
+    report = screen(training_views(store)[0], cell.config, SEED)
+    dimensions = verdicts(report.dimensions, store)
     wrong = sum(each["flagged"] and not each["distractor"] for each in dimensions)
     row = ResultRow(
         **vars(row_key),
         metric="true_flagged",
         metrics={
             "true_flagged": float(wrong),
-            "reward_r2": report["reward_r2"],
-            "transitions": float(report["transitions"]),
+            "reward_r2": math.nan if report.reward_r2 is None else report.reward_r2,
+            "transitions": float(report.transitions),
         },
         details={"screening": dimensions},
         wall_time_s=time.perf_counter() - began,
@@ -104,17 +105,20 @@ def _measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
 _MEASUREMENT: Final = Measurement(_key, _config, _measure)
 
 
-def verdicts(report: Mapping[str, Any], store: EpisodeStore) -> list[dict[str, Any]]:
-    """The verdict of a screening report (as a mapping) on each state dimension of `store`."""
-    added = {each["dimension"] for each in store.meta["source"].get("distractors", [])}
+def verdicts(dimensions: Sequence[DimensionReport], store: EpisodeStore) -> list[dict[str, Any]]:
+    """The verdict of a screening report on each state dimension of `store`."""
+    added = {each["dimension"] for each in store.record.source.others.get("distractors", [])}
     return [
         {
-            "dimension": d["dimension"],
-            "distractor": d["dimension"] in added,
-            "flagged": not d["causes"],
-            **{k: d[k] for k in ("effect", "p_value", "reward_effect", "reward_p_value")},
+            "dimension": d.dimension,
+            "distractor": d.dimension in added,
+            "flagged": not d.causes,
+            "effect": d.effect,
+            "p_value": d.p_value,
+            "reward_effect": d.reward_effect,
+            "reward_p_value": d.reward_p_value,
         }
-        for d in report["dimensions"]
+        for d in dimensions
     ]
 
 

@@ -7,8 +7,6 @@ import torch
 from ucfrec.commands.train import training_options
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.runs.config import resolve_config
-from ucfrec.runs.describe import describe_run
-from ucfrec.runs.screened import describe_screened
 from ucfrec_control.learners.train import dataset_of, preset_of, train_control
 
 
@@ -27,7 +25,5 @@ def run(options: argparse.Namespace) -> None:
         options.policy, options.config, options.set, options.seed, preset.tables
     )
     record = train_control(store, options.out, config, screening=options.screen)
-    print(describe_run(record))
-    if options.screen:
-        print(describe_screened(record))
+    print(record.describe())
     print(f"\nrun: {options.out}; TensorBoard can open it")

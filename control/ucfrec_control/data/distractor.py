@@ -51,7 +51,7 @@ def add_distractor(
         store,
         out,
         np.column_stack([logged_observations(store), bit]),
-        {"distractors": [*store.meta["source"].get("distractors", []), added]},
+        {"distractors": [*store.record.source.others.get("distractors", []), added]},
     )
 
 
@@ -92,9 +92,9 @@ def _is_of(folder: Path, path: Path) -> bool:
     """Whether the store in `folder` holds the data of the HDF5 file at `path`."""
     store = EpisodeStore.open(folder)
     unchanged = path.stat().st_mtime <= folder.stat().st_mtime
-    if unchanged and store.meta["source"].get("where") == str(path):
+    if unchanged and store.record.source.others.get("where") == str(path):
         return True
     with TemporaryDirectory() as scratch:
         made = read_d4rl(path).write_store(Path(scratch) / folder.name)
-    same: bool = made.meta["fingerprint"] == store.meta["fingerprint"]
+    same: bool = made.record.fingerprint == store.record.fingerprint
     return same

@@ -6,11 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ConfigDict, Field, ValidationError
 
 from ucfrec import schema
 from ucfrec.arrays import BoolArray, Float32Array, Float64Array, IntArray
+from ucfrec.episodes.record import Source
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.files.record import Count, Entry
 
 VALIDATION_EVERY = 20
 """One trajectory in this many belongs to the validation split."""
@@ -18,36 +21,50 @@ PACKAGES = ("gymnasium", "mujoco", "gymnasium-robotics", "minari", "h5py")
 """Packages, besides those of the core, whose versions affect numerical results."""
 
 
-def require_source(source: object, where: Path) -> None:
-    """Check what a store or a run says of its data: it may be somebody else's.
+class Distractor(Entry):
+    """A column that was appended to the observations."""
+
+    model_config = ConfigDict(extra="allow")
+
+    dimension: Count
+
+
+class ControlSource(Entry):
+    """What every control store and every run on one says of its data."""
+
+    model_config = ConfigDict(extra="allow")
+
+    dataset: str
+    env_id: str | None
+    versions: dict[str, str]
+    """Of the packages that generated the data."""
+    env_settings: dict[str, Any] = Field(default_factory=dict)
+    distractors: tuple[Distractor, ...] = ()
+
+
+def control_source(source: Source, where: Path) -> dict[str, Any]:
+    """Check what a store or a run says of its data: it may be an untrusted one.
 
     Args:
-        source: as `Trajectories.source`, which a store's and a run's JSON files repeat.
+        source: of its record.
         where: file or folder that holds it, for the message.
+
+    Returns:
+        The entries of `ControlSource`, and all others.
 
     Raises:
         InputError: an entry is missing or has another type.
     """
-    found: Mapping[str, Any] = source if isinstance(source, Mapping) else {}
-    for name, kind in (("dataset", str), ("env_id", str | None), ("versions", Mapping)):
-        if name not in found or not isinstance(found[name], kind):
-            raise _bad_source(where, name, found.get(name))
-    for name, value in found["versions"].items():
-        if not isinstance(value, str):
-            raise _bad_source(where, f"version of {name}", value)
-    if not isinstance(settings := found.get("env_settings", {}), Mapping):
-        raise _bad_source(where, "env_settings", settings)
-    added = found.get("distractors", [])
-    for each in added if isinstance(added, list) else [added]:
-        if not isinstance(each, Mapping) or type(each.get("dimension")) is not int:
-            raise _bad_source(where, "distractors", added)
-
-
-def _bad_source(where: Path, name: str, value: object) -> InputError:
-    return InputError(
-        f"{where} does not describe control data: its {name} is {value!r:.60}; restore it, or "
-        "prepare the data again"
-    )
+    try:
+        return ControlSource.model_validate(source.model_dump()).model_dump()
+    except ValidationError as error:
+        fault = error.errors(include_url=False)[0]
+        name, value = ".".join(map(str, fault["loc"])), fault["input"]
+        raise InputError(
+            f"{where} does not describe control data: its {name} is "
+            f"{'missing' if fault['type'] == 'missing' else repr(value)[:60]}; restore it, or "
+            "prepare the data again"
+        ) from None
 
 
 @dataclass(frozen=True)

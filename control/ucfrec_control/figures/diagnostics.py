@@ -1,16 +1,15 @@
 """Edits and attention of a finished run, read from its folder without any training."""
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
 from ucfrec.arrays import Float64Array
-from ucfrec.counterfactual.augment import accept
+from ucfrec.counterfactual.augment import AugmentationReport, accept
 from ucfrec.counterfactual.generators import (
     CounterfactualStateGenerator,
     TangentGenerator,
@@ -21,14 +20,14 @@ from ucfrec.counterfactual.transitions import sample_transitions
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay, Transitions
 from ucfrec.errors import InputError
-from ucfrec.files.atomic import read_json
 from ucfrec.fitting.checkpoint import load_tensors, load_weights
 from ucfrec.policies.ucf import UCFPolicy
-from ucfrec.runs.config import Config, config_from_dict
-from ucfrec.runs.run import training_views
+from ucfrec.runs.config import Config
+from ucfrec.runs.record import RunRecord, read_augmentation
+from ucfrec.runs.record import store_of as trained_store
 from ucfrec.runs.screened import without_columns
-from ucfrec.runs.trained_policy import DROPPED, RUN, TrainedPolicy
-from ucfrec.runs.trained_policy import store_of as trained_store
+from ucfrec.runs.start import training_views
+from ucfrec.runs.trained_policy import TrainedPolicy
 
 _REPORT = "augmentation.json"
 _PROPOSALS = 4096
@@ -44,19 +43,19 @@ def store_of(run: Path) -> EpisodeStore:
     Raises:
         InputError: the store was moved, removed or changed.
     """
-    record = read_json(run / RUN)
+    record = RunRecord.read(run)
     store = trained_store(run, record)
     if store is None:
         raise InputError(
-            f"{run} was trained on {record['store']}, which is gone or has changed; move the run "
+            f"{run} was trained on {record.store}, which is gone or has changed; move the run "
             "together with its store, or train again"
         )
-    return without_columns(store, record.get(DROPPED, ()))
+    return without_columns(store, record.dropped_observations)
 
 
 def has_copies(run: Path) -> bool:
     """Whether edited copies were made for a run."""
-    return (run / _REPORT).exists() and read_json(run / _REPORT)["proposals"] > 0
+    return (run / _REPORT).exists() and read_augmentation(run / _REPORT).proposals > 0
 
 
 def edited_states(run: Path, seed: int = 0) -> tuple[Float64Array, Float64Array]:
@@ -99,10 +98,9 @@ class Editing:
         Raises:
             InputError: the run made no copies, or its models or its store are gone.
         """
-        record = read_json(run / RUN)
-        report, config = _augmentation(run), config_from_dict(record["config"])
+        record, report = RunRecord.read(run), _augmentation(run)
+        config, sizes = record.config, record.sizes
         train = training_views(store_of(run))[0]
-        sizes = record["sizes"]
         crm = CausalRewardModel(sizes["state"], sizes["action"], config.crm)
         weights = run / "crm" / "cvae" / "best.safetensors"
         load_weights(weights, crm, load_tensors(weights)[0])
@@ -113,7 +111,7 @@ class Editing:
         high = fitted.rewards >= fitted.rewards.quantile(config.augment.reward_quantile)
         rows = np.random.default_rng(seed).permutation(np.flatnonzero(high.numpy()))[:_PROPOSALS]
         factual = _at(fitted, torch.from_numpy(rows))
-        return cls(crm, _generator(run, fitted, crm, config), factual, report["epsilon_r"])
+        return cls(crm, _generator(run, fitted, crm, config), factual, report.epsilon_r)
 
     def acceptance(self, band: tuple[float, float], seed: int = 0) -> float:
         """Share of proposals under `band` (ρ_low, ρ_high) that pass both gates of Eq. 4 and move
@@ -148,15 +146,14 @@ def acceptance_grid(run: Path, lows: Sequence[float], highs: Sequence[float]) ->
     )
 
 
-def move_histogram(run: Path) -> tuple[list[float], list[int], tuple[float, float]]:
+def move_histogram(run: Path) -> tuple[tuple[float, ...], tuple[int, ...], tuple[float, float]]:
     """Edges, counts and the band (ρ_low, ρ_high) of a run's accepted edits, by ‖Δ‖₂.
 
     Raises:
         InputError: the run made no copies.
     """
-    moves = _augmentation(run)["moves"]
-    low, high = read_json(run / RUN)["config"]["csg"]["band"]
-    return moves["histogram_edges"], moves["histogram_counts"], (low, high)
+    moves = _augmentation(run).moves
+    return moves.histogram_edges, moves.histogram_counts, RunRecord.read(run).config.csg.band
 
 
 def attention(run: Path, seed: int = 0) -> Float64Array:
@@ -184,11 +181,10 @@ def attention(run: Path, seed: int = 0) -> Float64Array:
     return np.asarray(mean)
 
 
-def _augmentation(run: Path) -> Mapping[str, Any]:
+def _augmentation(run: Path) -> AugmentationReport:
     if not has_copies(run):
         raise InputError(f"{run} has no edited copies; train it with augment.copies of 1 or more")
-    found: Mapping[str, Any] = read_json(run / _REPORT)
-    return found
+    return read_augmentation(run / _REPORT)
 
 
 def _generator(

@@ -10,20 +10,20 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.files.atomic import read_json
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.provenance import config_hash
 from ucfrec.reporting.plot_style import label, save
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.statistics import grouped
-from ucfrec.runs.trained_policy import RUN
+from ucfrec.runs.record import RUN, RunRecord
 from ucfrec_control.benchmark.cells import ROBUSTNESS, SCORES
 from ucfrec_control.benchmark.robustness import drops, loss_rises
 from ucfrec_control.benchmark.score_rows import EVALUATE, read_scores
 from ucfrec_control.benchmark.tables import of_best_target
-from ucfrec_control.data.trajectories import require_source
+from ucfrec_control.data.trajectories import control_source
 from ucfrec_control.figures import diagnostics, plots
 from ucfrec_control.learners.evaluate import method_of
+from ucfrec_control.learners.rl_baselines import RLRecord, read_run
 
 LOWS = (0.0, 0.1, 0.2, 0.3, 0.4)
 HIGHS = (0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
@@ -133,25 +133,21 @@ def _runs(folder: Path) -> Iterator[_Run]:
     if not folder.is_dir():
         raise InputError(f"{folder} is no folder of runs; check the path")
     for file in sorted(folder.rglob(RUN)):
-        record, path = read_json(file), file.parent
-        if not isinstance(record, Mapping) or "dataset" not in record:
-            continue
-        require_source(record["dataset"], file)
-        with damage_explained(file, "restore it, or train again"):
-            found = _run_of(record, path, path.relative_to(folder))
-        yield found
+        record = read_run(file.parent)
+        if "env_id" in record.data.others:
+            yield _run_of(record, file, file.parent.relative_to(folder))
 
 
-def _run_of(record: Mapping[str, Any], path: Path, below: Path) -> _Run:
-    dataset, config = record["dataset"], record["config"]
+def _run_of(record: RunRecord | RLRecord, file: Path, below: Path) -> _Run:
+    dataset, path = control_source(record.data, file), file.parent
     distracted = " with a distractor" if dataset.get("distractors") else ""
     return _Run(
         path=path,
         name="-".join(below.parts) or path.resolve().name,
         group="-".join(below.parent.parts) or dataset["dataset"],
         method=method_of(record),
-        policy=config["policy_name"],
-        settings=config_hash({**config, "seed": None, "data": record["fingerprint"]}),
+        policy=record.config.policy_name,
+        settings=config_hash({**record.settings, "seed": None, "data": record.fingerprint}),
         about=f"{dataset['dataset']}{distracted}",
     )
 

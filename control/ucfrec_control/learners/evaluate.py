@@ -1,7 +1,7 @@
 """Evaluation of trained policies in their environment, with D4RL's normalised scores."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +10,13 @@ from gymnasium.vector import VectorEnv
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import rollout
-from ucfrec.errors import InputError, damage_explained
+from ucfrec.errors import InputError
 from ucfrec.evaluation.metrics import bootstrap_interval
-from ucfrec.files.atomic import read_json
 from ucfrec.provenance import config_hash, without_folders
 from ucfrec.reporting.statistics import summary
-from ucfrec.runs.screened import SCREENING, flagged_columns
-from ucfrec.runs.trained_policy import DROPPED, RUN, TrainedPolicy, learner_of
-from ucfrec_control.data.trajectories import require_source
+from ucfrec.runs.record import RUN, RunRecord
+from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec_control.data.trajectories import control_source
 from ucfrec_control.environments.environments import (
     SIDE_BY_SIDE,
     Wrap,
@@ -27,7 +26,7 @@ from ucfrec_control.environments.environments import (
 )
 from ucfrec_control.environments.scores import find_kind, require_task
 from ucfrec_control.learners.presets import find_preset
-from ucfrec_control.learners.rl_baselines import RLPolicy, is_rl
+from ucfrec_control.learners.rl_baselines import RLPolicy, RLRecord, is_rl, read_run
 
 Trained = TrainedPolicy | RLPolicy
 CHECKPOINTS = ("last", "best")
@@ -73,8 +72,8 @@ def evaluate_run(
     rows: list[dict[str, Any]] = []
     for checkpoint in _kept(run, checkpoints):
         trained = load_run(run, checkpoint)
-        training = trained.record["policy"]
-        if rows and training["best_step"] == training["steps"]:
+        training = trained.record.finished
+        if rows and training.best_step == training.steps:
             # The best checkpoint is the last: the same weights would play the same episodes.
             rows += [{**row, "checkpoint": checkpoint} for row in rows]
             continue
@@ -88,15 +87,7 @@ def evaluate_run(
 
 
 def _kept(run: Path, checkpoints: Sequence[str]) -> Sequence[str]:
-    return ("last",) if _is_rl_run(run) and "last" in checkpoints else checkpoints
-
-
-def _is_rl_run(run: Path) -> bool:
-    if not (run / RUN).exists():
-        return False
-    record = read_json(run / RUN)
-    with damage_explained(run / RUN, "restore it, or train again"):
-        return is_rl(record)
+    return ("last",) if is_rl(read_run(run)) and "last" in checkpoints else checkpoints
 
 
 def load_run(run: Path, checkpoint: str) -> Trained:
@@ -106,21 +97,23 @@ def load_run(run: Path, checkpoint: str) -> Trained:
         InputError: `run` is not on a control store, is damaged or not finished, or has no such
             checkpoint.
     """
-    rl = _is_rl_run(run)
-    if (run / RUN).exists() and "policy" not in read_json(run / RUN):
+    record = read_run(run)
+    rl = is_rl(record)
+    if record.policy is None:
         raise InputError(f"the training in {run} has not ended; train with the same command first")
     if rl and checkpoint != "last":
         raise InputError(
             f"{run} is of IQL or CQL, which keep their last checkpoint only; give --checkpoint last"
         )
     trained = RLPolicy(run) if rl else TrainedPolicy.load(run, checkpoint)
-    if trained.record.get("dataset") is None:
+    if "env_id" not in trained.record.data.others:
         raise InputError(f"{run} is not a run of `ucfrec-control train`; evaluate it with `ucfrec`")
-    require_source(trained.record["dataset"], run / RUN)
-    training = trained.record["policy"]
-    if not isinstance(training, Mapping) or not {"steps", "best_step"} <= training.keys():
-        raise InputError(f"{run / RUN} is damaged: its policy is {training!r:.60}; train again")
+    control_source(trained.record.data, run / RUN)
     return trained
+
+
+def _dataset(trained: Trained) -> dict[str, Any]:
+    return control_source(trained.record.data, Path(RUN))
 
 
 def environment_of(trained: Trained, env_id: str | None) -> str:
@@ -129,7 +122,7 @@ def environment_of(trained: Trained, env_id: str | None) -> str:
     Raises:
         InputError: the environment of the data cannot be used; see `environment_of_data`.
     """
-    return env_id or environment_of_data(trained.record["dataset"])
+    return env_id or environment_of_data(_dataset(trained))
 
 
 def open_environment(
@@ -155,14 +148,14 @@ def open_environment(
     Raises:
         InputError: `env_id` cannot be made, or its sizes are not those of the training.
     """
-    record, dataset = trained.record, trained.record["dataset"]
+    record, dataset = trained.record, _dataset(trained)
     data_settings = dataset.get("env_settings", {}) if env_id == dataset["env_id"] else {}
     appended = [distractor] * len(dataset.get("distractors", []))
     env = make_env(env_id, count, appended, {**data_settings, **settings}, wrappers)
     observation_size = int(np.prod(env.single_observation_space.shape or ()))
     sizes = (observation_size, *(env.single_action_space.shape or ()))
-    logged = record["sizes"]["state"] + len(record.get(DROPPED, ()))
-    wanted = (logged, record["sizes"]["action"])
+    logged = record.sizes["state"] + len(record.dropped_observations)
+    wanted = (logged, record.sizes["action"])
     if sizes != wanted:
         env.close()
         raise InputError(
@@ -172,13 +165,11 @@ def open_environment(
     return env
 
 
-def method_of(record: Mapping[str, Any]) -> str:
+def method_of(record: RunRecord | RLRecord) -> str:
     """Name of the method of a run, with a suffix for how screening treated what it flagged."""
-    name = record["config"]["policy_name"] if is_rl(record) else learner_of(record)
-    screening = record.get(SCREENING)
-    if screening is None or not flagged_columns(screening):
-        return name
-    return name + _SUFFIXES[screening["how"]]
+    if record.screening is None or not record.screening.flagged:
+        return record.name
+    return record.name + _SUFFIXES[record.screening.how]
 
 
 def rules_of(
@@ -186,7 +177,7 @@ def rules_of(
 ) -> Sequence[DecisionRule | None]:
     """The target returns given, else those of the preset, as rules; (None,) for learners without a
     target return."""
-    dataset, learner = trained.record["dataset"], trained.record["config"]["policy_name"]
+    dataset, learner = _dataset(trained), trained.record.config.policy_name
     if isinstance(trained, RLPolicy) or learner == "bc":
         return (None,)
     task = require_task(env_id, dataset["dataset"])
@@ -203,7 +194,7 @@ def _row(
     seed: int,
     distractor: float,
 ) -> dict[str, Any]:
-    record, dataset = trained.record, trained.record["dataset"]
+    record, dataset = trained.record, _dataset(trained)
     task = require_task(env_id, dataset["dataset"])
     began = time.perf_counter()
     env = open_environment(trained, env_id, min(episodes, SIDE_BY_SIDE), distractor=distractor)
@@ -217,7 +208,7 @@ def _row(
     return {
         "dataset": dataset["dataset"],
         "method": method_of(record),
-        "seed": record["seed"],
+        "seed": record.seed,
         "target_return": rule and rule.target,
         "rule": NO_TARGET if rule is None else str(rule),
         "score": float(task.score(played.returns.mean())),
@@ -229,18 +220,18 @@ def _row(
         "episodes": episodes,
         "evaluation_seed": seed,
         "env_id": env_id,
-        "steps": record["policy"]["steps"],
-        "best_step": record["policy"]["best_step"],
-        "validation_loss": record["policy"].get("best_validation"),
-        "acceptance": record.get("augmentation", {}).get("acceptance"),
+        "steps": record.finished.steps,
+        "best_step": record.finished.best_step,
+        "validation_loss": record.finished.best_validation,
+        "acceptance": record.augmentation and record.augmentation.acceptance,
         "distractors": dataset.get("distractors", []),
         "distractor_fixed_to": distractor,
-        "lambda_mask": record["config"]["policy"].get("lambda_mask"),
-        "config": record["config"],
-        "config_hash": config_hash(record["config"]),
-        "fingerprint": record["fingerprint"],
+        "lambda_mask": record.settings["policy"].get("lambda_mask"),
+        "config": record.settings,
+        "config_hash": config_hash(record.settings),
+        "fingerprint": record.fingerprint,
         "dataset_versions": dataset["versions"],
         "warnings": mismatches(dataset, env_id),
-        "train_wall_time_s": record.get("wall_time_s"),
+        "train_wall_time_s": record.wall_time_s,
         "wall_time_s": seconds,
     }

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.runs.run import training_views
 from ucfrec.runs.screened import without_columns
+from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 _BATCHES, _BATCH = 8, 512
@@ -22,11 +22,10 @@ def held_out_losses(trained: TrainedPolicy, store: EpisodeStore) -> dict[str, fl
     Returns:
         `loss` with the logged states, and `loss_at_zero` with every distractor fixed to 0.
     """
-    dataset = trained.record["dataset"]
     dropped = trained.dropped
     _, validation = training_views(without_columns(store, dropped))
     generator = np.random.default_rng(0)
-    added = [each["dimension"] for each in dataset.get("distractors", [])]
+    added = [each["dimension"] for each in trained.record.data.others.get("distractors", [])]
     dimensions = [d - sum(other < d for other in dropped) for d in added if d not in dropped]
     losses = []
     for _ in range(_BATCHES):

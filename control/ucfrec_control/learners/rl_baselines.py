@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
-from pydantic import Field
+from pydantic import Field, PlainSerializer, PlainValidator
 from torch import Tensor
 
 from ucfrec import schema
@@ -18,15 +18,16 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.files.atomic import atomic_file, atomic_folder, read_json, write_json
-from ucfrec.files.checksums import seal
+from ucfrec.files.atomic import atomic_file, atomic_folder
 from ucfrec.files.locks import claimed, remove_leftovers_within
+from ucfrec.files.record import Count as Steps
+from ucfrec.files.record import Entry
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
 from ucfrec.fitting.metrics_log import MetricsLog
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.progress import progress
 from ucfrec.provenance import command_line, versions
-from ucfrec.runs.trained_policy import RUN
+from ucfrec.runs.record import RUN, RunRecord, TrainingRecord
 from ucfrec.settings import BatchSize, Count, settings_table
 from ucfrec_control.data.trajectories import PACKAGES
 from ucfrec_control.environments.scores import find_kind, find_task
@@ -58,6 +59,73 @@ class RLConfig:
     """Of the critics; CORL's by default. All other rates keep CORL's proportion to it."""
 
 
+def _rl_config(value: object) -> RLConfig:
+    if isinstance(value, RLConfig):
+        return value
+    if not isinstance(value, dict):
+        raise InputError("its settings are no table")
+    return RLConfig(**value)
+
+
+class RLRun(Entry):
+    """Settings and seed of a run."""
+
+    policy_name: Literal["iql", "cql"]
+    policy: Annotated[RLConfig, PlainValidator(_rl_config), PlainSerializer(asdict)]
+    seed: int
+
+
+class RLFit(Entry):
+    """The outcome of a training; no checkpoint but the last is kept."""
+
+    steps: Steps
+    best_step: None = None
+    best_validation: None = None
+
+
+class RLRecord(TrainingRecord):
+    """The content of `run.json` of a run of `train_rl`."""
+
+    library: Literal["d3rlpy"]
+    config: RLRun
+    policy: RLFit | None = None
+    threads: int
+    dropped_observations: tuple[int, ...] = ()
+    augmentation: None = None
+    screening: None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the method."""
+        return self.config.policy_name
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The configuration as JSON."""
+        return self.config.model_dump()
+
+    @property
+    def finished(self) -> RLFit:
+        """The report of the training.
+
+        Raises:
+            InputError: the training has not ended.
+        """
+        if self.policy is None:
+            raise InputError("the training of the run has not ended; train it to its end first")
+        return self.policy
+
+
+def read_run(run: Path) -> RunRecord | RLRecord:
+    """The record of a run of ucfrec or of d3rlpy.
+
+    Raises:
+        InputError: `run` is not a run folder, or is damaged.
+    """
+    rl = TrainingRecord.read(run).library == "d3rlpy"
+    return RLRecord.read(run) if rl else RunRecord.read(run)
+
+
 class RLPolicy:
     """The trained actor of a run folder; it takes no target return."""
 
@@ -65,17 +133,17 @@ class RLPolicy:
         """Raises:
         InputError: `run` is unfinished, or d3rlpy is not installed.
         """
-        self.record: dict[str, Any] = read_json(run / RUN)
-        self.name: str = self.record["config"]["policy_name"]
+        self.record = RLRecord.read(run)
+        self.name: str = self.record.name
         tensors, _ = load_tensors(run / _ACTOR)
         with damage_explained(run, "train it again"):
             mean, std = (tensors.pop(f"state.{name}") for name in ("mean", "std"))
-            sizes = self.record["sizes"]
+            sizes = self.record.sizes
             if not mean.shape == std.shape == (sizes["state"],):
                 raise ValueError(f"statistics of {tuple(mean.shape)} states")
             self._mean, self._std = mean.numpy(), std.numpy()
             with random_state_kept():
-                self._learner = _learner(RLConfig(**self.record["config"]["policy"]))
+                self._learner = _learner(self.record.config.policy)
                 self._learner.create_impl((sizes["state"],), sizes["action"])
         load_weights(run / _ACTOR, self._learner.impl.modules.policy, tensors)
 
@@ -94,9 +162,9 @@ class RLPolicy:
         """See `ucfrec.acting.rollout.Actor`."""
 
 
-def is_rl(record: Mapping[str, Any]) -> bool:
+def is_rl(record: RunRecord | RLRecord) -> bool:
     """Whether `record` is of a run of `train_rl`."""
-    return record["config"]["policy_name"] in ALGORITHMS
+    return isinstance(record, RLRecord)
 
 
 def rl_config(dataset: Mapping[str, Any], algorithm: Any, **settings: Any) -> RLConfig:
@@ -129,7 +197,7 @@ def plain_config(config: RLConfig, seed: int) -> dict[str, Any]:
 
 
 @random_state_kept()
-def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dict[str, Any]:
+def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLRecord:
     """Train on the training trajectories, or go on from the checkpoint in `out`; returns the record
     of the run.
 
@@ -146,17 +214,17 @@ def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dic
         return _train(store, out, config, seed)
 
 
-def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dict[str, Any]:
+def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLRecord:
     """`train_rl` of a run that no other process trains."""
     d3rlpy = _d3rlpy()
     if (out / RUN).exists():
-        existing: dict[str, Any] = read_json(out / RUN)
-        wanted = (plain_config(config, seed), store.meta["fingerprint"])
-        if (existing["config"], existing["fingerprint"]) != wanted:
+        existing = RLRecord.read(out)
+        wanted = (plain_config(config, seed), store.record.fingerprint)
+        if (existing.settings, existing.fingerprint) != wanted:
             raise InputError(
                 f"{out} has a run with other settings or data; remove it or name another folder"
             )
-        if "policy" in existing:
+        if existing.policy is not None:
             return existing
     started = perf_counter()
     d3rlpy.seed(seed)
@@ -170,7 +238,7 @@ def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dict[
     learner = _learner(config, "cuda:0" if torch.cuda.is_available() else "cpu:0")
     if not (out / RUN).exists():
         _begin(store, out, config, seed)
-    record: dict[str, Any] = read_json(out / RUN)
+    record = RLRecord.read(out)
     step, seconds = _resume(out / _CHECKPOINT, learner, dataset)
     log = MetricsLog(out, step)
     with progress(config.steps, config.algorithm, "steps", done=step) as bar:
@@ -192,12 +260,13 @@ def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> dict[
     log.close()
     actor = learner.impl.modules.policy.state_dict()
     save_tensors(out / _ACTOR, {**actor, "state.mean": mean, "state.std": std}, {})
-    record["policy"] = {"steps": config.steps, "best_step": None}
-    record["wall_time_s"] = seconds + perf_counter() - started
+    record = record.with_entries(
+        policy=RLFit(steps=config.steps), wall_time_s=seconds + perf_counter() - started
+    )
     if (out / _CHECKPOINT).exists():
-        write_json(out / RUN, record)
+        record.written(out)
         (out / _CHECKPOINT).unlink()
-    return seal(out, RUN, record)
+    return record.sealed(out)
 
 
 @random_state_kept()
@@ -223,19 +292,25 @@ def timed_updates(store: EpisodeStore, config: RLConfig, updates: int) -> float:
 
 
 def _begin(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> None:
-    record = {
+    entries = {
+        "files": {},
+        "library": "d3rlpy",
         "command": command_line(),
         "config": plain_config(config, seed),
         "seed": seed,
-        "sizes": {"state": store.state_size, "action": store.meta["columns"][schema.ACTION][0]},
-        "fingerprint": store.meta["fingerprint"],
-        "dataset": dict(store.meta["source"]),
+        "sizes": {
+            "state": store.state_size,
+            "action": store.record.columns[schema.ACTION][0],
+            "items": 0,
+        },
+        "fingerprint": store.record.fingerprint,
+        "data": store.record.source,
         "versions": versions((*PACKAGES, "d3rlpy")),
         "threads": torch.get_num_threads(),
         "wall_time_s": 0.0,
     }
     with atomic_folder(out) as scratch:
-        write_json(scratch / RUN, record)
+        RLRecord.of(entries, out / RUN).sealed(scratch)
 
 
 def _resume(path: Path, learner: Any, dataset: Any) -> tuple[int, float]:

@@ -8,9 +8,10 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.provenance import versions
 from ucfrec.runs.config import Config
+from ucfrec.runs.record import RunRecord
 from ucfrec.runs.screened import train_screened
 from ucfrec.runs.shared_stages import OWN, SharedStages
-from ucfrec_control.data.trajectories import PACKAGES, require_source
+from ucfrec_control.data.trajectories import PACKAGES, control_source
 from ucfrec_control.environments.scores import find_kind, find_task
 from ucfrec_control.learners.presets import Preset, find_preset
 
@@ -21,13 +22,12 @@ def dataset_of(store: EpisodeStore) -> Mapping[str, Any]:
     Raises:
         InputError: `store` is not a control store.
     """
-    source: Mapping[str, Any] = store.meta["source"]
-    if "env_id" not in source:
+    source = store.record.source
+    if "env_id" not in source.others:
         raise InputError(
             f"{store.path} is not a control store; write one with `ucfrec-control prepare`"
         )
-    require_source(source, store.path)
-    return source
+    return control_source(source, store.path)
 
 
 def preset_of(dataset: Mapping[str, Any], policy: str) -> Preset:
@@ -43,7 +43,7 @@ def train_control(
     *,
     screening: str | None = None,
     shared: SharedStages = OWN,
-) -> dict[str, Any]:
+) -> RunRecord:
     """`ucfrec.runs.screened.train_screened` on a control store.
 
     Args:
@@ -59,5 +59,6 @@ def train_control(
     Raises:
         InputError: as `train_screened`, or the store is not a control store.
     """
-    about = {"dataset": dict(dataset_of(store)), "versions": versions(PACKAGES)}
+    dataset_of(store)
+    about = {"versions": versions(PACKAGES)}
     return train_screened(store, out, config, screening, about, shared)

@@ -14,8 +14,8 @@ from ucfrec.reporting.evaluation_rows import evaluation_row
 from ucfrec.reporting.grid import Measurement
 from ucfrec.reporting.result_row import ResultRow, RowKey
 from ucfrec.runs.config import Config, resolve_config
-from ucfrec.runs.describe import promised
-from ucfrec.runs.screened import SCREENING, flagged_columns, train_screened
+from ucfrec.runs.record import RunRecord
+from ucfrec.runs.screened import SCREENING, train_screened
 from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_simulators.distractor import DistractorEnvironment
@@ -84,7 +84,7 @@ def key(cell: Cell) -> RowKey:
     if cell.store is not None:
         quantile = cell.evaluation.target_quantile
         conditions["quantiles"] = "rule" if quantile is None else f"{quantile:g}"
-        fingerprint = EpisodeStore.open(cell.store).meta["fingerprint"]
+        fingerprint = EpisodeStore.open(cell.store).record.fingerprint
     return RowKey(
         suite=SUITE,
         table=cell.table,
@@ -124,7 +124,7 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
         store = EpisodeStore.open(cell.store)
         record = train_screened(store, cell.run, cell.config, cell.screening, shared=cell.shared)
     training_metrics, rows = _training_metrics(record), []
-    details = {} if cell.screening is None else {SCREENING: flagged_columns(record[SCREENING])}
+    details = {} if record.screening is None else {SCREENING: record.screening.flagged}
     trained = TrainedPolicy.load(cell.run, CHECKPOINT)
     rule = _rule(cell, trained)
     for environment in cell.environments:
@@ -145,22 +145,21 @@ def _row(
     return ResultRow(**vars(row) | {"conditions": {**row.conditions, "distractor": distractor}})
 
 
-def _training_metrics(record: Mapping[str, Any]) -> dict[str, float]:
+def _training_metrics(record: RunRecord) -> dict[str, float]:
     """Metrics that the run's record holds about its training."""
     metrics = {
-        "train_wall_time_s": record["wall_time_s"],
-        "validation_loss": record["policy"]["best_validation"],
+        "train_wall_time_s": record.wall_time_s,
+        "validation_loss": record.finished.best_validation,
     }
-    if (value := promised(record.get("rule", {}))) is not None:
+    if record.rule is not None and (value := record.rule.simulated) is not None:
         metrics |= {"promised": value[0], "promised_error": value[1]}
-    if "augmentation" not in record:
+    if (augmentation := record.augmentation) is None:
         return metrics
-    augmentation = record["augmentation"]
-    model = augmentation["reward_model"]
+    model = augmentation.reward_model
     return metrics | {
-        "acceptance": augmentation["acceptance"],
-        "crm_r2": model["r2"],
-        "crm_r2_without_z": model["r2_without_z"],
+        "acceptance": augmentation.acceptance,
+        "crm_r2": model.r2,
+        "crm_r2_without_z": model.r2_without_z,
     }
 
 

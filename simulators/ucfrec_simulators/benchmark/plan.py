@@ -279,7 +279,7 @@ class Plan:
         screening = method.screening if store.observation_size else None
         identity = {"policy": method.policy, "settings": settings, "code": code}
         identity |= {} if screening is None else {"screening": screening}
-        run_hash = config_hash(identity | {"data": store.meta["fingerprint"]})
+        run_hash = config_hash(identity | {"data": store.record.fingerprint})
         yield Cell(
             table=table,
             budget=self._name,

@@ -178,7 +178,7 @@ def complete(
             fit(model, draw, loss, loop, Path(work), seed=seed, validate=validate, describe="fill")
         report = _evaluate(model, fitted[2], test)
         _write(store, model, tags, folder)
-        origin = {"fingerprint": store.meta["fingerprint"], "seed": seed, "config": asdict(config)}
+        origin = {"fingerprint": store.record.fingerprint, "seed": seed, "config": asdict(config)}
         write_json(folder / REPORT_FILE, asdict(report) | origin)
     return report
 

@@ -36,7 +36,7 @@ def test_an_early_distractor_tells_of_the_next_reward(tmp_path: Path) -> None:
     file = write_hdf5(tmp_path / f"{FILE}.hdf5", hopper_like((30, 8, 25, 1, 2)))
     store = read_d4rl(file).write_store(tmp_path / "store")
     seen = add_distractor(store, tmp_path / "early", early=True)
-    assert seen.meta["source"]["distractors"][0]["early"]
+    assert seen.record.source.others["distractors"][0]["early"]
     every = store.step_values(schema.REWARD, *store.all_steps())
     for episode, length in enumerate(store.lengths):
         steps = np.arange(length)

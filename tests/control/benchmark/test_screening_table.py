@@ -14,13 +14,12 @@ from ucfrec.counterfactual.screening import ScreeningConfig, screen
 from ucfrec.episodes.distractor import with_observations
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files.atomic import read_json
 from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.reporting.rows_file import read_rows
 from ucfrec.reporting.tables import NONE
 from ucfrec.runs.config import resolve_config
-from ucfrec.runs.run import training_views
-from ucfrec.runs.screened import flagged_columns
+from ucfrec.runs.record import RunRecord
+from ucfrec.runs.start import training_views
 from ucfrec_control.benchmark import screening_table
 from ucfrec_control.benchmark.budgets import Budget
 from ucfrec_control.benchmark.folders import stores_of
@@ -52,14 +51,15 @@ def test_training_with_screening_records_and_resumes(
     arguments = ["train", store, "--out", run, "--policy", "bc", "--screen", "copies"]
     arguments += ["--set", "train.steps=2", "--set", "policy.dim=8"]
     assert main(arguments) == 0
-    record = read_json(Path(run) / "run.json")
-    flagged = flagged_columns(record["screening"])
+    screening = RunRecord.read(Path(run)).screening
+    assert screening is not None
+    flagged = screening.flagged
     assert 4 in flagged
     said = ", ".join(map(str, flagged))
     assert f"columns without effect: {said}\n" in capsys.readouterr().out
-    assert len(record["screening"]["dimensions"]) == 11
+    assert len(screening.dimensions) == 11
     assert main(arguments) == 0
-    assert read_json(Path(run) / "run.json")["screening"] == record["screening"]
+    assert RunRecord.read(Path(run)).screening == screening
 
 
 def test_screening_that_finds_no_cause_at_all_is_refused(
@@ -84,8 +84,8 @@ def test_what_is_dropped_might_never_have_been_logged(
     never = with_observations(store, tmp_path / "never", logged, {})
     config = resolve_config("ucf", None, ["train.steps=4", "policy.dim=8", "crm.epochs=1"])
     record = train_control(store, tmp_path / "dropped", config, screening="drop")
-    assert record["dropped_observations"] == [3, 4]
-    assert record["sizes"]["state"] == 3
+    assert record.dropped_observations == (3, 4)
+    assert record.sizes["state"] == 3
     train_control(never, tmp_path / "plain", config)
     for name in ("crm/cvae/last", "overlay", "policy/last"):
         kept, other = (tmp_path / run / f"{name}.safetensors" for run in ("dropped", "plain"))
@@ -93,7 +93,7 @@ def test_what_is_dropped_might_never_have_been_logged(
         for key, value in load_tensors(kept)[0].items():
             assert torch.equal(value, load_tensors(other)[0][key]), (name, key)
     again = train_control(store, tmp_path / "dropped", config, screening="drop")
-    assert (again["dataset"], again["policy"]) == (record["dataset"], record["policy"])
+    assert (again.data, again.policy) == (record.data, record.policy)
     with pytest.raises(InputError, match="was started with --screen drop"):
         train_control(store, tmp_path / "dropped", config, screening="copies")
     assert store_of(tmp_path / "dropped").state_size == 3
@@ -136,4 +136,4 @@ def test_the_distractor_is_flagged_and_no_true_dimension(tmp_path: Path) -> None
     config = ScreeningConfig(hidden=128, shared_steps=700, own_steps=250, max_transitions=50_000)
     report = screen(training_views(store)[0], config, seed=0)
     assert report.flagged == (11,)
-    assert store.meta["columns"][schema.OBSERVATION] == [12]
+    assert store.record.columns[schema.OBSERVATION] == [12]

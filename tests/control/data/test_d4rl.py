@@ -48,7 +48,7 @@ def test_trajectories_become_episodes(tmp_path: Path) -> None:
     np.testing.assert_array_equal(window.actions[0], columns["actions"][5:9])
     np.testing.assert_array_equal(window.rewards[0], columns["rewards"][5:9])
     np.testing.assert_allclose(store.returns[2], columns["rewards"][5:11].sum(), rtol=1e-5)
-    assert store.meta["source"]["env_id"] == "Hopper-v5"
+    assert store.record.source.others["env_id"] == "Hopper-v5"
 
 
 def test_doubles_and_float_flags_read_as_singles_and_bools(tmp_path: Path) -> None:
@@ -60,7 +60,7 @@ def test_doubles_and_float_flags_read_as_singles_and_bools(tmp_path: Path) -> No
     assert read.observations.dtype == read.rewards.dtype == np.float32
     assert read.terminated.dtype == bool
     first, second = (t.write_store(tmp_path / f"s{i}") for i, t in enumerate((plain, read)))
-    assert first.meta["fingerprint"] == second.meta["fingerprint"]
+    assert first.record.fingerprint == second.record.fingerprint
 
 
 def test_an_unfinished_last_trajectory_is_dropped_and_counted(tmp_path: Path) -> None:
@@ -207,9 +207,9 @@ def test_both_formats_make_equal_stores(tmp_path: Path, minari_folder: Path) -> 
     for number, source in enumerate(sources):
         assert main(["prepare", source, "--out", str(tmp_path / f"store{number}")]) == 0
         stores.append(EpisodeStore.open(tmp_path / f"store{number}"))
-    assert len({store.meta["fingerprint"] for store in stores}) == 1
-    assert {store.meta["source"]["env_id"] for store in stores} == {"Hopper-v5"}
-    assert [store.meta["source"]["format"] for store in stores] == ["d4rl", "minari"] * 2
+    assert len({store.record.fingerprint for store in stores}) == 1
+    assert {store.record.source.others["env_id"] for store in stores} == {"Hopper-v5"}
+    assert [store.record.source.others["format"] for store in stores] == ["d4rl", "minari"] * 2
     first, last = read_d4rl(file), read_d4rl(tmp_path / "back.hdf5")
     np.testing.assert_array_equal(first.final_observations, last.final_observations)
 

@@ -3,6 +3,7 @@
 import json
 import sys
 import warnings
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -16,7 +17,9 @@ from minari.data_collector import EpisodeBuffer
 from tests.support.control_files import hopper_like, write_hdf5
 from ucfrec.acting.rollout import rollout
 from ucfrec.arrays import Float32Array, Float64Array
+from ucfrec.episodes.record import Source
 from ucfrec.errors import InputError
+from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.minari import read_minari
@@ -219,7 +222,9 @@ def test_minari_mazes_are_those_of_the_data(
     assert (source["env_id"], source["env_settings"]["maze_map"]) == ("AntMaze_UMaze-v4", maze)
     assert any("gymnasium-robotics 1.2.0" in text for text in mismatches(source, source["env_id"]))
     policy = load_run(run, "last")
-    policy.record["dataset"].update(source)
+    assert isinstance(policy, TrainedPolicy)
+    data = Source.model_validate(source)
+    policy = replace(policy, record=policy.record.with_entries(data=data))
     environment = open_environment(policy, source["env_id"], 1)
     starts = [environment.reset(seed=seed)[0][0] for seed in range(5)]
     np.testing.assert_array_equal(starts[0], trajectories.observations[0])

@@ -278,8 +278,11 @@ def test_runs_with_other_settings_are_no_seeds_of_one_another(runs: Path, tmp_pa
             record = read_json(runs / kind / "run.json") | {"store": str(tmp_path / "gone")}
             (folder / f"{kind}-{seed}" / "run.json").write_text(json.dumps(record))
     (folder / "iql-0").mkdir()
-    config = {"policy_name": "iql", "policy": {}, "seed": 0}
-    (folder / "iql-0" / "run.json").write_text(json.dumps(record | {"config": config}))
+    settings = {"algorithm": "iql", "steps": 4, "task": "", "kind": "medium"}
+    config = {"policy_name": "iql", "policy": settings, "seed": 0}
+    of_iql = {"config": config, "library": "d3rlpy", "threads": 1}
+    own = {name: value for name, value in record.items() if name not in ("policy", "augmentation")}
+    (folder / "iql-0" / "run.json").write_text(json.dumps(own | of_iql))
     made, missing = make_figures([tmp_path], [], tmp_path / "figures")
     first = {f"gate-hopper-{kind}-0" for kind in KINDS}
     assert {path.stem for path in made} == {

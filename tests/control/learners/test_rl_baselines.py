@@ -12,7 +12,6 @@ import torch
 from tests.support.control_files import hopper_like, write_hdf5
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files.atomic import read_json
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.reporting.rows_file import read_rows
@@ -24,7 +23,7 @@ from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.learners import rl_baselines
 from ucfrec_control.learners.evaluate import evaluate_run
-from ucfrec_control.learners.rl_baselines import RLConfig, rl_config, train_rl
+from ucfrec_control.learners.rl_baselines import RLConfig, RLRecord, rl_config, train_rl
 from ucfrec_control.learners.train import dataset_of
 
 pytest.importorskip("d3rlpy", reason="the extra rl is not installed")
@@ -89,7 +88,7 @@ def test_equal_seeds_train_equal_actors_that_are_judged_as_others_are(
     assert a == b != c
     (row,) = evaluate_run(tmp_path / "a", episodes=2, seed=0)
     assert (row["method"], row["checkpoint"], row["target_return"]) == (algorithm, "last", None)
-    assert row["fingerprint"] == store.meta["fingerprint"]
+    assert row["fingerprint"] == store.record.fingerprint
     capsys.readouterr()
     asked = ["evaluate", str(tmp_path / "a"), "--episodes", "2"]
     assert main(asked) == 0
@@ -178,7 +177,7 @@ def test_a_finished_run_is_read_and_another_configuration_refused(
     config = rl_config(dataset_of(store), "iql", steps=2)
     record = train_rl(store, tmp_path / "run", config, 0)
     assert train_rl(store, tmp_path / "run", config, 0) == record
-    assert read_json(tmp_path / "run" / "run.json") == record
+    assert RLRecord.read(tmp_path / "run") == record
     with pytest.raises(InputError, match="other settings or data"):
         train_rl(store, tmp_path / "run", config, 1)
 

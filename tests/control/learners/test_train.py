@@ -110,7 +110,7 @@ def test_data_does_not_choose_what_is_imported(
     monkeypatch.syspath_prepend(tmp_path)
     run = shutil.copytree(folder / "store-run", tmp_path / "run")
     record = read_json(run / "run.json")
-    record["dataset"]["env_id"] = "theirs:Hopper-v5"
+    record["data"]["env_id"] = "theirs:Hopper-v5"
     (run / "run.json").write_text(json.dumps(record))
     assert main(["evaluate", str(run), "--episodes", "1"]) == 2
     said = capsys.readouterr().err
@@ -135,7 +135,7 @@ def test_a_distractor_is_the_reward_bit_and_nothing_else_changes(
             np.testing.assert_array_equal(other.episode_values(name), store.episode_values(name))
         np.testing.assert_array_equal(other.returns, store.returns)
         again = add_distractor(store, tmp_path / f"{flip}-again", flip, seed=1)
-        assert again.meta["fingerprint"] == other.meta["fingerprint"]
+        assert again.record.fingerprint == other.record.fingerprint
     with pytest.raises(InputError, match=r"must be in \[0, 1\]"):
         add_distractor(store, tmp_path / "x", flip=1.5)
 
@@ -179,7 +179,7 @@ def test_policies_that_know_their_largest_return_are_asked_for_it(
         record = train_control(store, run, resolve_config(learner, None, settings))
         losses = read_metrics(run / "policy")
         assert losses["value_loss"]
-        assert record["policy"]["steps"] == 4
+        assert record.finished.steps == 4
         (row,) = evaluate_run(run, episodes=1, seed=0, checkpoints=("last",))
         assert row["target_return"] is None
         assert "largest return expected" in row["rule"]
@@ -248,7 +248,7 @@ def test_settings_win_over_presets(tmp_path: Path) -> None:
 
 def test_a_run_records_where_its_data_is_from(folder: Path) -> None:
     record = read_json(folder / "store-run" / "run.json")
-    assert record["dataset"]["env_id"] == "Hopper-v5"
+    assert record["data"]["env_id"] == "Hopper-v5"
     assert record["config"]["train"]["warmup_steps"] == 10_000
     assert "mujoco" in record["versions"]
 
@@ -430,18 +430,18 @@ def test_a_run_that_has_not_ended_is_not_evaluated(
     [
         (("config",), "text"),
         (("config",), None),
-        (("dataset",), "text"),
-        (("dataset",), {}),
-        (("dataset", "dataset"), 5),
-        (("dataset", "env_id"), 5),
-        (("dataset", "versions"), "text"),
-        (("dataset", "versions"), {"mujoco": 3}),
-        (("dataset", "distractors"), 5),
-        (("dataset", "distractors"), [1]),
-        (("dataset", "env_settings"), [1]),
-        (("dataset", "env_settings"), {"xml_file": "/etc/passwd"}),
-        (("dataset", "env_settings"), {"frame_skip": 10**9}),
-        (("dataset", "env_settings"), {"frame_skip": 0}),
+        (("data",), "text"),
+        (("data",), {}),
+        (("data", "dataset"), 5),
+        (("data", "env_id"), 5),
+        (("data", "versions"), "text"),
+        (("data", "versions"), {"mujoco": 3}),
+        (("data", "distractors"), 5),
+        (("data", "distractors"), [1]),
+        (("data", "env_settings"), [1]),
+        (("data", "env_settings"), {"xml_file": "/etc/passwd"}),
+        (("data", "env_settings"), {"frame_skip": 10**9}),
+        (("data", "env_settings"), {"frame_skip": 0}),
         (("policy",), {}),
     ],
 )

@@ -33,7 +33,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     where = ["--out", str(folder / "run"), "--policy", "dt"]
     assert main(["train", str(folder / "store"), *where, *settings]) == 0
     record = read_json(folder / "run" / "run.json")
-    record["dataset"]["env_settings"] = SMALL
+    record["data"]["env_settings"] = SMALL
     (folder / "run" / "run.json").write_text(json.dumps(record))
     return folder / "run"
 

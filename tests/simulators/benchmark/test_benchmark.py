@@ -21,8 +21,8 @@ from ucfrec.files.atomic import read_json
 from ucfrec.plugins import Benchmark, BenchmarkRequest, load_plugin
 from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.rows_file import append_rows, read_configurations, read_rows
-from ucfrec.runs.screened import flagged_columns
-from ucfrec.runs.trained_policy import RUN, TrainedPolicy, read_record
+from ucfrec.runs.record import read_record
+from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 from ucfrec_simulators.benchmark import plan, plots
 from ucfrec_simulators.benchmark.cells import EvaluationPlan, config, key, measure
 from ucfrec_simulators.benchmark.estimate import announcement, estimated_hours
@@ -222,7 +222,9 @@ def test_screened_methods_are_rows_of_the_distractor_table(
         assert {row.target_return is None for row in own} == {name == "bc"}
     run = found["ucf-dropped"].run
     assert run is not None
-    flagged = flagged_columns(read_record(run)["screening"])
+    screening = read_record(run).screening
+    assert screening is not None
+    flagged = screening.flagged
     assert {tuple(row.details["screening"]) for row in rows["ucf-dropped"]} == {tuple(flagged)}
     assert TrainedPolicy.load(run).dropped == tuple(flagged)
 

@@ -213,7 +213,7 @@ def test_thousands_of_users_cost_a_small_fraction_of_a_python_loop() -> None:
 
     fast, slow = min(cost(many, 20) for _ in range(4)), min(cost(one, 1000) for _ in range(3))
     print(f"{fast * 1e6:.2f} µs against {slow * 1e6:.2f} µs a user-step: 1/{slow / fast:.0f}")
-    # The bar leaves room for a busy machine; `benchmarks/kuai_speed.py` measures.
+    # The bar leaves room for a busy machine.
     assert fast < slow / 30
 
 

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ucfrec.episodes.exposure import Shown
-from ucfrec.episodes.main_tags import MainTags
 from ucfrec.episodes.states import ItemStates
+from ucfrec.user_model.main_tags import MainTags
 
 TAGS = MainTags(torch.tensor([0, 0, 1, 1, 2, -1]), 0.0, 2.0)
 steps = st.lists(st.tuples(st.integers(0, 5), st.sampled_from([0.0, 1.0, 1.2, 2.0])), max_size=9)

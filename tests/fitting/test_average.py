@@ -1,0 +1,131 @@
+"""Averaged weights: the formula, tables whose rows rest, resuming, what is saved."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from ucfrec.fitting.average import WeightAverage
+from ucfrec.fitting.checkpoint import load_tensors, load_trained
+from ucfrec.fitting.loop import LoopConfig, fit
+
+AVERAGED = LoopConfig(
+    steps=40, batch_size=4, learning_rate=0.1, warmup_steps=0, validate_every=8, average=0.9
+)
+ROWS = 30
+
+
+class Lookup(nn.Module):
+    """A table of which a batch moves a few rows, and a dense layer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.table = nn.Embedding(ROWS, 3, sparse=True)
+        self.layer = nn.Linear(3, 1)
+
+    def forward(self, rows: Tensor) -> Tensor:
+        out: Tensor = self.layer(self.table(rows))
+        return out
+
+
+def draw(generator: np.random.Generator) -> Tensor:
+    return torch.from_numpy(generator.integers(ROWS - 5, size=4))  # the last five rows never move
+
+
+def train(
+    folder: Path, config: LoopConfig = AVERAGED, stop_at: int | None = None, validated: bool = True
+) -> tuple[Lookup, list[list[Tensor]]]:
+    """The trained module, and its weights after every step."""
+    module, seen, drawn = Lookup(), [], 0
+
+    def stopping(generator: np.random.Generator) -> Tensor:
+        nonlocal drawn
+        seen.append([p.detach().clone() for p in module.parameters()])
+        drawn += 1
+        if stop_at is not None and drawn == stop_at:
+            raise KeyboardInterrupt
+        return draw(generator)
+
+    def loss(rows: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        return (module(rows) - rows.float().unsqueeze(1) / ROWS).square().mean(), {}
+
+    def validate() -> float:
+        return float(loss(torch.arange(ROWS))[0])
+
+    fit(module, stopping, loss, config, folder, seed=0, validate=validate if validated else None)
+    return module, seen
+
+
+def test_averages_are_those_of_the_formula_for_rows_that_rest_too(tmp_path: Path) -> None:
+    module, seen = train(tmp_path, validated=False)
+    raw, _ = load_tensors(tmp_path / "last.safetensors")
+    names = [name for name, _ in module.named_parameters()]
+    steps = [*seen[1:], [raw[name] for name in names]]
+    expected = [each.double() for each in seen[0]]
+    for t, weights in enumerate(steps, start=1):
+        d = min(AVERAGED.average, t / (9 + t))
+        expected = [
+            d * mean + (1 - d) * w.double() for mean, w in zip(expected, weights, strict=True)
+        ]
+    for name, parameter, mean in zip(names, module.parameters(), expected, strict=True):
+        torch.testing.assert_close(parameter.detach().double(), mean, rtol=1e-5, atol=1e-6)
+        assert not torch.equal(parameter.detach(), raw[name])
+
+
+def test_an_interrupted_training_ends_with_the_same_bits(tmp_path: Path) -> None:
+    whole, _ = train(tmp_path / "whole")
+    for stop in (11, 13, 9):
+        with pytest.raises(KeyboardInterrupt):
+            train(tmp_path / "parts", stop_at=stop)
+    resumed, _ = train(tmp_path / "parts")
+    for one, other in zip(whole.parameters(), resumed.parameters(), strict=True):
+        assert torch.equal(one, other)
+    for name in ("best.safetensors", "last.safetensors"):
+        one, _ = load_tensors(tmp_path / "whole" / name)
+        other, _ = load_tensors(tmp_path / "parts" / name)
+        assert one.keys() == other.keys()
+        assert all(torch.equal(one[key], other[key]) for key in one)
+
+
+def test_averaging_does_not_change_the_training_itself(tmp_path: Path) -> None:
+    train(tmp_path / "averaged")
+    train(tmp_path / "raw", replace(AVERAGED, average=0.0))
+    averaged, _ = load_tensors(tmp_path / "averaged" / "last.safetensors")
+    raw, _ = load_tensors(tmp_path / "raw" / "last.safetensors")
+    assert all(torch.equal(averaged[name], raw[name]) for name in raw)
+
+
+def test_the_averages_are_what_is_loaded_from_either_file(tmp_path: Path) -> None:
+    module, _ = train(tmp_path, validated=False)
+    for name in ("best.safetensors", "last.safetensors"):
+        loaded = load_trained(tmp_path / name)
+        assert loaded.keys() == module.state_dict().keys()
+        for key, value in module.state_dict().items():
+            assert torch.equal(loaded[key], value)
+
+
+def test_reading_an_average_changes_nothing() -> None:
+    module = Lookup()
+    average = WeightAverage(module, 0.99)
+    for step in range(5):
+        module(torch.tensor([step, 0])).sum().backward()
+        moved = average.before_step()
+        with torch.no_grad():
+            for parameter in module.parameters():
+                assert parameter.grad is not None
+                parameter.sub_(0.1 * parameter.grad.to_dense())
+                parameter.grad = None
+        average.after_step(moved)
+        weights = [p.detach().clone() for p in module.parameters()]
+        stored = {name: tensor.clone() for name, tensor in average.state()[0].items()}
+        with average.applied():
+            assert not torch.equal(module.layer.weight, weights[1])
+        assert all(torch.equal(stored[k], v) for k, v in average.state()[0].items())
+        assert all(
+            torch.equal(one, two.detach())
+            for one, two in zip(weights, module.parameters(), strict=True)
+        )

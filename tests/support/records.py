@@ -1,0 +1,55 @@
+"""A small record, and values that no entry of a record should have."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+from ucfrec.files.atomic import write_json
+from ucfrec.files.record import Record
+
+
+class Example(Record):
+    FILE: ClassVar[str] = "record.json"
+    KIND: ClassVar[str] = "an example: it has no record.json; make one"
+    REMEDY: ClassVar[str] = "make it again"
+
+    version: int
+    numbers: tuple[float, ...]
+    note: str | None = None
+    needed: str | None = "x"
+
+
+MISSING = object()
+DAMAGE: dict[str, Any] = {
+    "missing": MISSING,
+    "null": None,
+    "true": True,
+    "text": "soon",
+    "NaN": float("nan"),
+    "huge": 10**400,
+    "beyond 64 bits": 1e300,
+    "negative": -1,
+    "list": [[]],
+    "object": {"?": 0},
+}
+"""Kind of damage to the value that an entry gets."""
+
+
+def paths(value: Mapping[str, Any], depth: int = 2) -> Iterator[tuple[str, ...]]:
+    """Paths of all entries of a JSON object, down to `depth` objects below it."""
+    for name, inner in value.items():
+        yield (name,)
+        if depth and isinstance(inner, Mapping) and name != "files":
+            yield from ((name, *rest) for rest in paths(inner, depth - 1))
+
+
+def damaged(file: Path, value: Mapping[str, Any], path: tuple[str, ...], damage: Any) -> None:
+    """Write `value` with the entry at `path` replaced, or taken away if `damage` is `MISSING`."""
+
+    def inner(here: Mapping[str, Any], rest: tuple[str, ...]) -> dict[str, Any]:
+        name, *more = rest
+        changed = inner(here[name], tuple(more)) if more else damage
+        others = {key: each for key, each in here.items() if key != name}
+        return others if changed is MISSING else {**others, name: changed}
+
+    write_json(file, inner(value, path))

@@ -1,0 +1,75 @@
+"""Session ends: what the log says of them, and what a model of them finds."""
+
+import numpy as np
+import pytest
+import torch
+
+from ucfrec.episodes.exposure import Likeness, Shown
+from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.user_model.session_end import LoggedEnds, SessionEnd
+
+ITEMS = 12
+
+
+def planted_ends(rows: int = 6000) -> tuple[Likeness, LoggedEnds]:
+    """Sessions that end with a step, mostly if its item repeats the one before."""
+    rng = np.random.default_rng(0)
+    shown, items = rng.integers(-1, ITEMS, (rows, 4)), rng.integers(ITEMS, size=rows)
+    repeats = rng.random(rows) < 0.3
+    items = np.where(repeats & (shown[:, 0] >= 0), shown[:, 0], items)
+    again = items == shown[:, 0]
+    states = ItemStates(torch.eye(ITEMS), torch.zeros(0, 0), 0.0, 1.0)
+    before = Shown(torch.from_numpy(shown), torch.zeros(rows, 4))
+    steps = rng.integers(8, size=rows)
+    ended = rng.random(rows) < np.where(again, 0.8, 0.1)
+    rewards = rng.random(rows).round()
+    return Likeness.of(states), LoggedEnds(before, torch.from_numpy(items), rewards, steps, ended)
+
+
+def test_the_model_of_ends_finds_that_repetition_ends_sessions() -> None:
+    likeness, logged = planted_ends()
+    end = SessionEnd.fit(likeness, logged)
+    found = end.probabilities(logged.shown, logged.items, logged.rewards, logged.steps)
+    again = (logged.items == logged.shown.items[:, 0]).numpy()
+    assert found[again].mean() == pytest.approx(0.8, abs=0.05)
+    assert found[~again].mean() == pytest.approx(0.1, abs=0.03)
+
+
+def test_the_last_step_of_a_users_last_session_tells_nothing() -> None:
+    columns = {
+        "item": np.zeros(9, dtype=np.int64),
+        "reward": np.arange(9, dtype=np.float32),
+    }
+    states = ItemStates(torch.eye(2), torch.zeros(2, 0), 0.0, 1.0)
+    episodes = {
+        "user": np.array([0, 0, 1, 1]),
+        "terminated": np.array([True, True, False, True]),
+    }
+    lengths = np.array([2, 3, 2, 2])
+    store = EpisodeStore.from_arrays(columns, lengths, episodes, states)
+    logged = LoggedEnds.of(store, 2, 100, 0)
+    # Left out: step 4 (user 0's last session), 6 (cut, not terminated) and 8 (user 1's last).
+    assert logged.rewards.tolist() == [0, 1, 2, 3, 5, 7]
+    assert logged.ended.tolist() == [False, True, False, False, False, False]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_drawn_ends_are_a_sample_of_all(seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    lengths = generator.integers(1, 4, 60)
+    n = int(lengths.sum())
+    columns = {"item": np.zeros(n, dtype=np.int64), "reward": np.arange(n, dtype=np.float32)}
+    states = ItemStates(torch.eye(2), torch.zeros(2, 0), 0.0, 1.0)
+    episodes = {
+        "user": np.sort(generator.integers(9, size=60)),
+        "terminated": generator.random(60) < 0.5,
+    }
+    store = EpisodeStore.from_arrays(columns, lengths, episodes, states)
+    known = LoggedEnds.of(store, 2, n, seed)
+    drawn = LoggedEnds.of(store, 2, 20, seed)
+    chosen = np.sort(np.random.default_rng(seed).choice(len(known.rewards), 20, replace=False))
+    for name in ("rewards", "steps", "ended"):
+        np.testing.assert_array_equal(getattr(drawn, name), getattr(known, name)[chosen])
+    episode = np.searchsorted(np.cumsum(lengths), known.rewards, side="right")
+    np.testing.assert_array_equal(known.ended, known.steps == lengths[episode] - 1)

@@ -1,0 +1,36 @@
+"""Choose the decision rule of a run on its log, never in an environment."""
+
+from collections.abc import Mapping
+
+from ucfrec.acting.decision import Decider
+from ucfrec.choosing.by_ranking import choose_by_ranking
+from ucfrec.choosing.by_simulation import choose_by_simulation
+from ucfrec.choosing.choice import RuleChoice
+from ucfrec.choosing.config import RuleConfig
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.user_model.model import UserModel
+
+
+def choose_rule(
+    decider: Decider,
+    users: UserModel,
+    targets: Mapping[float, float],
+    train: EpisodeStore,
+    validation: EpisodeStore,
+    config: RuleConfig,
+    seed: int,
+) -> RuleChoice:
+    """Choose the rule of a policy: in simulated sessions, or where the log has none, by ranking.
+
+    Args:
+        decider: the policy under its default rule, with the reward model of `users`.
+        users: the user model.
+        targets: return (reward units) of each quantile in `config.quantiles`.
+        train: training episodes.
+        validation: validation episodes.
+        config: candidates and conditions.
+        seed: of everything random.
+    """
+    if decider.returns.per_session:
+        return choose_by_simulation(decider, users, targets, train, validation, config, seed)
+    return choose_by_ranking(decider, train, validation, config, seed)

@@ -3,7 +3,7 @@
     python docs/charts.py           # draw into docs/assets
     python docs/charts.py --check   # fail if a picture is not what its table says
 
-A table is drawn if the line above it is a comment such as
+A table is drawn if the line above it is a comment like
 
     <!-- chart: catalogue; Return per session; own, shared -->
 

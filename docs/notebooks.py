@@ -1,7 +1,12 @@
-"""MkDocs hook: the executed notebooks of `examples/` become the pages `tutorials/NAME.md`."""
+"""MkDocs hook: the executed notebooks of `examples/` become the pages `tutorials/NAME.md`.
+
+python docs/notebooks.py [NAME ...]    # execute notebooks and write their outputs into them
+"""
 
 import base64
 import json
+import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -54,3 +59,31 @@ def on_files(files: Any, config: Any) -> Any:
         for file, content in pictures.items():
             files.append(File.generated(config, f"tutorials/{file}", content=content))
     return files
+
+
+def execute(name: str) -> None:
+    """Execute a notebook with this Python, and keep its outputs but for what goes to stderr."""
+    import nbformat
+    from nbclient import NotebookClient
+
+    path = ROOT / "examples" / f"{name}.ipynb"
+    notebook = nbformat.read(path, as_version=4)
+    NotebookClient(
+        notebook,
+        timeout=1800,
+        kernel_name="python3",
+        coalesce_streams=True,
+        resources={"metadata": {"path": str(path.parent)}},
+    ).execute()
+    for cell in notebook.cells:
+        cell.metadata.pop("execution", None)
+        if cell.cell_type == "code":
+            cell.outputs = [each for each in cell.outputs if each.get("name") != "stderr"]
+    nbformat.write(notebook, path)
+
+
+if __name__ == "__main__":
+    # The commands of the notebooks are those of this Python.
+    os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    for chosen in sys.argv[1:] or NOTEBOOKS:
+        execute(chosen)

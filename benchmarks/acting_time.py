@@ -3,10 +3,10 @@
     python benchmarks/acting_time.py RUN STORE
 
 `one user`: a line of JSON to the line that answers it, as `ucfrec recommend --stream` and `serve`
-do; beside it the way of before, which made a store of every request and read the item vectors of
-policy and reward model one after the other. With `--items 1000000` also for a catalogue of random
+do; beside it, a store of every request. With `--items 1000000` also for a catalogue of random
 copies of the run's items. `one user's frame`: `Recommender.recommend`, beside reading the frame by
-SQL. `all users`: `ucfrec recommend` without its start, beside the way of before. `choose the rule`:
+SQL. `all users`: `ucfrec recommend` without its start, beside a store of all requests.
+`choose the rule`:
 decision rules played side by side, and one after the other. `VirtualTaobao`: pages of 4,096
 sessions, beside the authors' environment (--original, their repository) page by page.
 
@@ -31,7 +31,7 @@ import torch
 
 from ucfrec import Recommender, schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.logged_decisions import session_scores
+from ucfrec.acting.scorer import logged_history
 from ucfrec.choosing.by_simulation import RuleSearch
 from ucfrec.choosing.config import RuleConfig
 from ucfrec.episodes.store import EpisodeStore
@@ -39,13 +39,13 @@ from ucfrec.logs.mapping import LogMapping
 from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import provenance
 from ucfrec.recommending.histories import Histories, histories_of_files
-from ucfrec.recommending.recommend import positions, recommend
+from ucfrec.recommending.recommend import recommend
 from ucfrec.recommending.requests import Limits
 from ucfrec.recommending.responder import ENGINES, TORCH, Responder
 from ucfrec.recommending.stream import answer_stream
-from ucfrec.reporting.result_row import ResultRow
-from ucfrec.reporting.rows_file import append_rows
 from ucfrec.reporting.tables import markdown_table
+from ucfrec.results.row import ResultRow
+from ucfrec.results.rows_file import append_rows
 from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import REWARD_MODEL, TrainedPolicy
 from ucfrec.user_model.model import UserModel
@@ -110,17 +110,18 @@ def line_ways(trained: TrainedPolicy, engine: str) -> tuple[Way, Way]:
         for n, item in enumerate(rng.choice(trained.item_ids, size=HISTORY).tolist())
     ]
     line = json.dumps({"user_id": "someone", "history": rows, "k": 10}).encode() + b"\n"
-    responder, decider = Responder(trained, Limits(), engine=engine), trained.decider()
+    responder, scorer = Responder(trained, Limits(), engine=engine), trained.scorer()
 
     def before() -> str:
         request = json.loads(line)
         history = responder._reader.read(request["history"])
-        known = positions(trained.item_index, history.item_ids)
-        store = _next_steps(trained, known, history.rewards, np.array([HISTORY]), np.array([-1]))
-        left_out = torch.zeros(1, len(trained.item_index), dtype=torch.bool)
-        left_out[0, known] = True
+        items = trained.items.numbers(history.item_ids)
+        store = _next_steps(trained, items, history.rewards, np.array([HISTORY]), np.array([-1]))
+        left_out = torch.zeros(1, len(trained.items), dtype=torch.bool)
+        left_out[0, items] = True
         last = store.lengths - 1
-        scores = session_scores(decider, store, np.arange(1), last, left_out).log_softmax(-1)
+        known, _ = logged_history(scorer, store, np.arange(1), last)
+        scores = scorer.scores(known, excluded=left_out).log_softmax(-1)
         best = scores.topk(request["k"])
         pairs = zip(trained.item_ids[best.indices[0]].tolist(), best.values[0].tolist())  # type: ignore[index]  # noqa: B905
         return json.dumps({"items": [{"item_id": item, "score": score} for item, score in pairs]})
@@ -144,8 +145,8 @@ def _next_steps(
 def frame_ways(run: Path) -> tuple[Way, Way]:
     """Recommend to one user whose frame is read directly, and by SQL."""
     policy, rng = Recommender.load(run), np.random.default_rng(0)
-    items = policy.trained.item_index
-    frame = pd.DataFrame({schema.USER_ID: np.full(10, 1), schema.ITEM_ID: items[:10].to_numpy()})
+    items = policy.trained.items.ids
+    frame = pd.DataFrame({schema.USER_ID: np.full(10, 1), schema.ITEM_ID: items[:10]})
     frame[schema.TIMESTAMP] = BEGAN + np.cumsum(rng.integers(1, 60_000, 10))
     frame[schema.REWARD] = rng.random(10).round()
     if policy.trained.record.session_by == schema.SESSION_ID:
@@ -170,25 +171,26 @@ def log_ways(trained: TrainedPolicy, store: EpisodeStore, folder: Path) -> tuple
     # The way of the run's reward to its column is not what is measured.
     log = folder / "log.parquet"
     frame.assign(**{trained.record.reward: frame[schema.REWARD]}).to_parquet(log)
-    decider = trained.decider()
+    scorer = trained.scorer()
 
     def batches() -> Iterator[Histories]:
         return histories_of_files(trained, [log], LogMapping())
 
     def before() -> None:
         for batch in batches():
-            known = positions(trained.item_index, batch.item_ids)
+            items = trained.items.numbers(batch.item_ids)
             for first in range(0, len(batch.users), 1024):
                 users = np.arange(first, min(first + 1024, len(batch.users)))
                 at = slice(*np.searchsorted(batch.owner, [first, users[-1] + 1]))
                 owner = batch.owner[at] - first
                 counts = np.bincount(owner, minlength=len(users))
                 nobody = np.full(len(users), -1)
-                steps = _next_steps(trained, known[at], batch.rewards[at], counts, nobody)
-                left_out = torch.zeros(len(users), len(trained.item_index), dtype=torch.bool)
-                left_out[owner, known[at]] = True
+                steps = _next_steps(trained, items[at], batch.rewards[at], counts, nobody)
+                left_out = torch.zeros(len(users), len(trained.items), dtype=torch.bool)
+                left_out[owner, items[at]] = True
                 rows = np.arange(len(users))
-                scores = session_scores(decider, steps, rows, counts, left_out)
+                known, _ = logged_history(scorer, steps, rows, counts)
+                scores = scorer.scores(known, excluded=left_out)
                 scores.topk(10), scores.log_softmax(-1)
 
     return (lambda: list(recommend(trained, batches(), 10))), before, len(store)
@@ -198,12 +200,12 @@ def rule_ways(run: Path, store: EpisodeStore, sessions: int) -> tuple[Way, Way]:
     """Simulate 8 rules side by side, and one after the other."""
     trained, views = TrainedPolicy.load(run), training_views(store)
     target, config = trained.target_return(1.0), RuleConfig(sessions=sessions)
-    decider = trained.decider(DecisionRule(target))
+    scorer = trained.scorer(DecisionRule(target))
     users = UserModel.fit(*views, run / REWARD_MODEL, 0)
-    search = RuleSearch(decider, users, *views, config, seed=0)
+    search = RuleSearch(scorer, users, *views, config, seed=0)
     rules = [
-        DecisionRule(target, floor=floor, reward_weight=reward_weight, temperature=temperature)
-        for floor in (None, target)
+        DecisionRule(target, minimum, reward_weight=reward_weight, temperature=temperature)
+        for minimum in (None, target)
         for reward_weight in (0.0, 4.0)
         for temperature in (0.0, 0.5)
     ]
@@ -259,7 +261,7 @@ def seconds(case: Case) -> tuple[np.ndarray, np.ndarray]:
 def cases(options: argparse.Namespace, folder: Path) -> Iterator[tuple[Case, int]]:
     """The cases, and the number of items of each."""
     trained, store = TrainedPolicy.load(options.run), EpisodeStore.open(options.store)
-    items, rounds, wanted = len(trained.item_index), options.rounds, options.only or TASKS
+    items, rounds, wanted = len(trained.items), options.rounds, options.only or TASKS
     if "one user" in wanted:
         yield Case("one user", line_ways(trained, options.engine), options.users), items
     if "one user, large catalogue" in wanted and options.items:

@@ -10,20 +10,14 @@ also ranks a policy that learned from the validation day, too. Appends rows to r
 """
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
-from ucfrec.acting.decision import DecisionRule
 from ucfrec.commands.cli import main as ucfrec
-from ucfrec.episodes.store import EpisodeStore
-from ucfrec.evaluation.ranking import MEASURES
-from ucfrec.files.atomic import read_json
 from ucfrec.logs.mapping import log_files
-from ucfrec.provenance import config_hash, provenance
-from ucfrec.reporting.result_row import ResultRow
-from ucfrec.reporting.rows_file import append_rows
+from ucfrec.results.rows_file import append_rows, read_results
 from ucfrec.runs.record import read_record
 from ucfrec_simulators.folders import data_folder
 
@@ -62,36 +56,6 @@ def logs(out: Path, until: int | None) -> list[Path]:
     return given
 
 
-def result_row(row: dict[str, Any], store: Path, folder: Path, days: str) -> ResultRow:
-    """The result row of one row of `ucfrec rank --json`."""
-    record = read_record(folder)
-    own = "decision_rule" in row
-    learner = record.config.policy_name if own else row["policy"]
-    return ResultRow(
-        suite="next-period",
-        table="next-period",
-        task="kuairand",
-        method=row["policy"],
-        policy=learner,
-        training_seed=record.seed if own else None,
-        evaluation_seed=row["seed"],
-        conditions={"days": days, "k": row["k"]},
-        config_hash=config_hash(record.settings) if own else None,
-        data_fingerprint=EpisodeStore.open(store).record.fingerprint,
-        metric="hit_rate_liked",
-        metrics={name: row[name] for name in (*MEASURES, "coverage") if row[name] is not None},
-        interval=tuple(row["hit_rate_liked_interval"]),
-        rule=str(DecisionRule.from_dict(row["decision_rule"], "the row")) if own else None,
-        details={
-            f"{name}_{kind}": row[f"{name}_{kind}"]
-            for name in MEASURES
-            for kind in ("interval", "difference")
-            if f"{name}_{kind}" in row
-        },
-        **provenance(),
-    )
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder of store and runs; resumed")
@@ -120,8 +84,11 @@ def main() -> None:
     results = options.results or options.out / "results.jsonl"
     for folder in runs:
         run("rank", folder, "--json", folder.with_suffix(".json"))
-        ranked = read_json(folder.with_suffix(".json"))
-        rows = [result_row(row, store, folder, days) for row in ranked]
+        about = {"suite": "next-period", "table": "next-period", "task": "kuairand"}
+        rows = [
+            replace(row, **about, conditions={"days": days, "k": row["k"]})
+            for row in read_results(folder.with_suffix(".json"))
+        ]
         append_rows(results, [row for row in rows if row.config_hash is None])
         config = read_record(folder).settings
         append_rows(results, [row for row in rows if row.config_hash], config)

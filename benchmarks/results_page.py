@@ -10,7 +10,7 @@ import argparse
 import math
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,10 +19,10 @@ from typing import Final
 
 import numpy as np
 
-from ucfrec.reporting.result_row import ResultRow
-from ucfrec.reporting.rows_file import latest, read_rows
 from ucfrec.reporting.statistics import Summary, grouped, summary
 from ucfrec.reporting.tables import NONE, markdown_table
+from ucfrec.results.row import ResultRow
+from ucfrec.results.rows_file import latest, read_rows
 
 ROOT = Path(__file__).parents[1]
 RESULTS, PAGE = ROOT / "benchmarks" / "results", ROOT / "docs" / "tables.md"
@@ -123,17 +123,6 @@ def difference(sample: Summary, over_logs: Summary | None = None, unit: str = ""
     return text
 
 
-def named_apart(rows: Sequence[ResultRow]) -> list[ResultRow]:
-    """Rows in which a simulator's behavior and a trained method of one name have two names."""
-    trained = {row.method for row in rows if row.training_seed is not None}
-    return [
-        replace(row, method=f"{row.method} (of the simulator)")
-        if row.training_seed is None and row.method in trained
-        else row
-        for row in rows
-    ]
-
-
 def by_seeds(rows: Iterable[ResultRow]) -> dict[_Seeds, float]:
     """The value of each (log seed, training seed)."""
     return {(row.log_seed, row.training_seed): row.value for row in rows}
@@ -225,18 +214,20 @@ def components(rows: Sequence[ResultRow]) -> str:
 
 def estimated(files: _Files) -> Sequence[ResultRow]:
     """Rows of the main table whose decision rule was chosen in the user model."""
-    return [row for row in of("recommendation", "main")(files) if "promised" in row.metrics]
+    return [row for row in of("recommendation", "main")(files) if "estimated_value" in row.metrics]
 
 
 def estimates(rows: Sequence[ResultRow]) -> str:
     """Estimated and actual returns of the chosen rules, and the mean absolute error."""
 
     def cell(_: str, __: str, group: Sequence[ResultRow]) -> str:
-        estimate = summary(row.metrics["promised"] for row in group).mean
+        estimate = summary(row.metrics["estimated_value"] for row in group).mean
         return f"{rounded(estimate)} → {rounded(summary(row.value for row in group).mean)}"
 
     def off(own: Sequence[ResultRow]) -> str:
-        return rounded(summary(abs(row.metrics["promised"] - row.value) for row in own).mean, 2)
+        return rounded(
+            summary(abs(row.metrics["estimated_value"] - row.value) for row in own).mean, 2
+        )
 
     lines = []
     for environment, own in grouped(rows, lambda row: str(row.environment)).items():
@@ -460,8 +451,8 @@ SECTIONS = (
         "The return of UCF, and the difference without one component, or with one more. Exposure "
         "features are worth 6.6 of 8.8 in the catalogue and cost 2.2 in SARDINE; the chosen "
         "decision rule is worth most of the return in KuaiRand and SARDINE.",
-        f"`{RUN} additions`",
-        of("recommendation", "additions"),
+        f"`{RUN} shared`",
+        of("recommendation", "shared"),
         components,
     ),
     Section(
@@ -582,7 +573,7 @@ def main() -> None:
     )
     parser.add_argument("--check", action="store_true", help="compare instead of writing")
     options = parser.parse_args()
-    files = {name: named_apart(latest(read_rows(RESULTS / f"{name}.jsonl"))) for name in FILES}
+    files = {name: latest(read_rows(RESULTS / f"{name}.jsonl")) for name in FILES}
     if not options.check and find_spec("matplotlib") is not None:
         from results_pictures import draw
 

@@ -25,9 +25,9 @@ import httpx
 import numpy as np
 
 from ucfrec.provenance import provenance
-from ucfrec.reporting.result_row import ResultRow
-from ucfrec.reporting.rows_file import append_rows
 from ucfrec.reporting.tables import markdown_table
+from ucfrec.results.row import ResultRow
+from ucfrec.results.rows_file import append_rows
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 RESULTS = Path("runs/serve_load/results.jsonl")

@@ -24,9 +24,9 @@ from ucfrec.fitting.row_optimizer import RowAdamW
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import provenance
-from ucfrec.reporting.result_row import ResultRow
-from ucfrec.reporting.rows_file import append_rows
 from ucfrec.reporting.tables import markdown_table
+from ucfrec.results.row import ResultRow
+from ucfrec.results.rows_file import append_rows
 from ucfrec.runs.config import resolve_config
 
 RESULTS = Path("runs/step_time/results.jsonl")

@@ -4,7 +4,6 @@ import ast
 import dataclasses
 import importlib.util
 import re
-import runpy
 import subprocess
 import sys
 import tomllib
@@ -17,7 +16,6 @@ from xml.etree import ElementTree
 import pytest
 
 from tests.support.markdown import ROOT, Page, anchors, parse, run_python
-from ucfrec.reporting.result_row import ResultRow
 from ucfrec.runs.config import resolve_config
 
 SITE = [Page(str(path.relative_to(ROOT))) for path in sorted((ROOT / "docs").rglob("*.md"))]
@@ -199,20 +197,6 @@ def test_the_page_of_tables_rounds_to_three_digits() -> None:
     numbers = re.findall(r"(?<![\w.])\d+\.\d+(?:e[-+]\d+)?", cells)
     assert len(numbers) > 1000
     assert [each for each in numbers if len(re.sub(r"^[0.]+|\.", "", each)) > 3] == []
-
-
-def test_a_simulators_policy_and_a_method_of_its_name_have_lines_of_their_own() -> None:
-    page = runpy.run_path(str(ROOT / "benchmarks" / "results_page.py"))
-    named = {"suite": "recommendation", "table": "main", "task": "a", "environment": "a"}
-
-    def row(method: str, value: float, seed: int | None) -> ResultRow:
-        of = {"method": method, "policy": method, "training_seed": seed, "metric": "R_cum"}
-        return ResultRow(**named, **of, metrics={"R_cum": value, "R_avg_episode": value})
-
-    rows = [row("popular", 7.0, None), row("popular", 1.0, 0), row("ucf", 9.0, 0)]
-    table = page["returns"](page["named_apart"](rows))
-    assert "| popular | 1.00 |" in table
-    assert "| popular (of the simulator) | 7.00 |" in table
 
 
 def test_the_dockerfile_is_sound() -> None:

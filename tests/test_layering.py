@@ -17,8 +17,8 @@ PACKAGES = {
 }
 ORDER = (
     {"arrays", "schema", "errors", "processes"},
-    {"files", "progress", "plugins", "provenance", "settings", "code_version"},
-    {"fitting"},
+    {"files", "progress", "plugins", "provenance", "settings"},
+    {"results", "fitting"},
     {"episodes"},
     {"logs", "user_model"},
     {"counterfactual"},
@@ -29,6 +29,7 @@ ORDER = (
     {"evaluation", "recommending"},
     {"off_policy"},
     {"reporting"},
+    {"benchmark"},
     {"recommender"},
     {"commands"},
     {"__init__", "__main__"},

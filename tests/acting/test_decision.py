@@ -1,4 +1,4 @@
-"""The decision rule: probabilities by hand, what it leaves out, and what it asks for."""
+"""The decision rule: probabilities by hand, the best items, and target returns."""
 
 import json
 import math
@@ -10,23 +10,16 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
-from tests.policies.test_ucf import CATALOG, ITEMS, VECTORS, B, K, build, other, random_windows
-from ucfrec.acting.decision import Decider, DecisionRule
-from ucfrec.episodes.exposure import Likeness, Shown
+from ucfrec.acting.decision import DecisionRule, best_items
 from ucfrec.episodes.returns import ReturnToGo
-from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
-from ucfrec.policies.dt import DTConfig, DTPolicy
-from ucfrec.user_model.main_tags import MainTags
 
 SCORES = torch.tensor([[1.0, 3.0, -math.inf, 2.0], [0.0, 0.0, 5.0, -1.0]])
 rules = st.builds(
     DecisionRule,
     target=st.one_of(st.none(), st.floats(-1e6, 1e6)),
-    floor=st.one_of(st.none(), st.floats(-1e6, 1e6)),
+    minimum_target=st.one_of(st.none(), st.floats(-1e6, 1e6)),
     reward_weight=st.floats(0, 100),
     temperature=st.floats(0, 100),
     top_k=st.one_of(st.none(), st.integers(1, 99)),
@@ -48,7 +41,7 @@ def test_a_rule_read_back_from_json_is_the_same_rule(rule: DecisionRule) -> None
 
 
 def test_the_hash_is_that_of_the_values_alone() -> None:
-    assert DecisionRule(5.0).hash == "537dff980f53"
+    assert DecisionRule(5.0).hash == "50ff5c6a6b52"
     for same in (
         DecisionRule(5),
         DecisionRule(np.float32(5)),
@@ -57,7 +50,7 @@ def test_the_hash_is_that_of_the_values_alone() -> None:
         assert (same, same.hash) == (DecisionRule(5.0), DecisionRule(5.0).hash)
     others = [
         DecisionRule(None),
-        DecisionRule(5.0, floor=5.0),
+        DecisionRule(5.0, minimum_target=5.0),
         DecisionRule(5.0, reward_weight=1.0),
         DecisionRule(5.0, temperature=1.0),
         DecisionRule(5.0, top_k=1),
@@ -78,7 +71,7 @@ HOSTILE: dict[str, Any] = {
     "huge": {"target": 10**400},
     "no target": {"reward_weight": 1.0},
     "unknown": {"target": 1.0, "__class__": "x"},
-    "nan floor": {"target": 1.0, "floor": math.nan},
+    "nan minimum": {"target": 1.0, "minimum_target": math.nan},
     "negative reward weight": {"target": 1.0, "reward_weight": -1.0},
     "no reward weight": {"target": 1.0, "reward_weight": None},
     "huge reward weight": {"target": 1.0, "reward_weight": 1e300},
@@ -193,205 +186,44 @@ def test_items_left_out_are_ranked_last_and_good_ones_first(rule: DecisionRule) 
     assert (len(found.unique(dim=0)) > 1) == (rule.temperature > 0)
 
 
-# What is asked for.
+# Target returns.
 
 
 def test_a_target_is_of_a_session_or_of_every_step() -> None:
     collected = torch.tensor([0.0, 3.0, 9.0]).double()
     session, step = ReturnToGo(), ReturnToGo("horizon", horizon=2)
-    rule = DecisionRule(5.0)
-    assert rule.asked(session, collected, None).tolist() == [5, 2, -4]
-    assert rule.asked(step, collected, None).tolist() == [5, 5, 5]
-    floored = replace(rule, floor=1.5)
-    assert floored.asked(session, collected, None).tolist() == [5, 2, 1.5]
-    assert floored.asked(step, collected, None).tolist() == [5, 5, 5]
     best = torch.tensor([0.5, 1.0, 2.0])
+
+    def targets(returns: ReturnToGo, *rule: float | None) -> list[float]:
+        found: list[float] = DecisionRule(*rule).target_returns(returns, collected, best).tolist()
+        return found
+
+    assert targets(session, 5.0) == [5, 2, -4]
+    assert targets(session, 5.0, 1.5) == [5, 2, 1.5]
+    assert targets(step, 5.0) == targets(step, 5.0, 1.5) == [5, 5, 5]
     for returns in (session, step):
-        assert DecisionRule(None).asked(returns, collected, best).tolist() == [0.5, 1, 2]
-        assert DecisionRule(None, floor=1.0).asked(returns, collected, best).tolist() == [1, 1, 2]
+        assert targets(returns, None) == [0.5, 1, 2]
+        assert targets(returns, None, 1.0) == [1, 1, 2]
 
 
-@pytest.mark.parametrize("definition", ["session", "discounted", "horizon"])
-def test_windows_show_what_is_asked_for_after_what_was_earned(definition: Any) -> None:
-    returns = ReturnToGo(definition, 0.5, 2)
-    windows, collected = random_windows(CATALOG), torch.tensor([1.0, 2.0, 3.0]).double()
-    decider = Decider(build("dt", CATALOG), DecisionRule(4.0), returns)
-    asked = decider.asked(windows, collected)
-    last = returns.asked(4.0, collected)
-    expected = returns.before(last, windows.rewards).masked_fill(~windows.mask, 0.0)
-    torch.testing.assert_close(asked.returns_to_go, expected)
-    torch.testing.assert_close(asked.returns_to_go[:, -1], last.float())
-    if definition == "session":
-        # Each reward earned lowers what is asked for from the next step on.
-        fall = -asked.returns_to_go.diff(dim=1)
-        there = windows.mask[:, :-1]
-        torch.testing.assert_close(fall[there], windows.rewards[:, :-1][there])
+# The best items.
 
 
-def test_the_largest_return_must_have_been_learned() -> None:
-    windows, collected = random_windows(CATALOG), torch.zeros(B).double()
-    with pytest.raises(InputError, match=r"--set policy\.max_return=true"):
-        Decider(build("dt", CATALOG), DecisionRule(None)).asked(windows, collected)
-    torch.manual_seed(0)
-    policy = DTPolicy(DTConfig(context=K, dim=16, max_return=True), CATALOG).eval()
-    policy.return_scale.fill_(8.0)
-    asked = Decider(policy, DecisionRule(None)).asked(windows, collected)
-    assert policy.values is not None
-    with torch.no_grad():
-        actions = policy.head.embed(windows.actions)
-        best = 8 * policy.values(policy.normalized(windows), actions)[:, -1, 1]
-    torch.testing.assert_close(asked.returns_to_go[:, -1], best)
-
-
-# What is decided, from what.
-
-
-class KnownRewards:
-    """A reward model that anyone can compute: of states, items shown before, and users."""
-
-    lags = 2
-
-    def scores(self, states: Tensor, shown: Shown, users: Tensor | None) -> Tensor:
-        items = torch.arange(ITEMS)
-        of_user = torch.zeros(len(states)) if users is None else users.float()
-        repeated = (shown.items[:, : self.lags].unsqueeze(2) == items).any(1)
-        return states[:, :1] * items / 10 + of_user.unsqueeze(1) * items - 3.0 * repeated
-
-
-TAGS = torch.tensor([[0], [0], [1], [1], [2], [2], [3], [3], [4], [4], [4]])
-
-
-def decider_of(name: str = "dt", **parts: Any) -> Decider:
-    states = replace(ItemStates(torch.eye(ITEMS), torch.zeros(0, 0), 0.0, 1.0), tags=TAGS)
-    rule = DecisionRule(3.0, **parts)
-    model: Any = KnownRewards()
-    return Decider(
-        build(name, CATALOG), rule, ReturnToGo(), model, Likeness.of(states), MainTags.of(states)
-    )
-
-
-def shown_in(windows: Windows, row: int, last: int) -> list[int]:
-    """Items of the last steps before the one to decide, most recent first."""
-    steps = [t for t in range(K - 2, -1, -1) if windows.mask[row, t]][:last]
-    return [int(windows.actions[row, t]) for t in steps]
-
-
-def test_scores_are_the_policys_plus_the_reward_weight() -> None:
-    windows, collected = random_windows(CATALOG), torch.tensor([0.0, 1.0, 2.5]).double()
-    users = torch.tensor([2, 0, -1])
-    plain, weighted = decider_of(), decider_of(reward_weight=0.5)
-    logits = plain.scores(windows, collected)
-    torch.testing.assert_close(logits, plain.policy.act(plain.asked(windows, collected)).detach())
-    found = weighted.scores(windows, collected, users=users)
-    for row in range(B):
-        shown = shown_in(windows, row, KnownRewards.lags)
-        for item in range(ITEMS):
-            reward = float(windows.states[row, -1, 0]) * item / 10 + float(users[row]) * item
-            reward -= 3.0 * (item in shown)
-            expected = float(logits[row, item]) + 0.5 * reward
-            assert float(found[row, item]) == pytest.approx(expected, abs=1e-4)
-
-
-@pytest.mark.parametrize("window", [1, 2, K - 1])
-def test_items_that_share_a_recent_tag_are_left_out(window: int) -> None:
-    windows, collected = random_windows(CATALOG), torch.zeros(B).double()
-    scores = decider_of(tag_window=window).scores(windows, collected)
-    plain = decider_of().scores(windows, collected)
-    for row in range(B):
-        recent = {int(TAGS[item, 0]) for item in shown_in(windows, row, window)}
-        left = {item for item in range(ITEMS) if int(TAGS[item, 0]) not in recent}
-        assert left, "the windows are too long for this test"
-        assert set(torch.isfinite(scores[row]).nonzero()[:, 0].tolist()) == left
-        kept = torch.isfinite(scores[row])
-        torch.testing.assert_close(scores[row][kept], plain[row][kept])
-
-
-def test_the_tag_window_gives_way_where_nothing_would_be_left() -> None:
-    windows, collected = random_windows(CATALOG), torch.zeros(B).double()
-    windows = replace(windows, actions=torch.zeros_like(windows.actions))
-    windows.actions[0, -2] = 4
-    forbidden = torch.ones(ITEMS, dtype=torch.bool)
-    forbidden[:2] = False
-    decider = decider_of(tag_window=1)
-    found = torch.isfinite(decider.scores(windows, collected, forbidden))
-    assert found[0].nonzero()[:, 0].tolist() == [0, 1], "their tag was not shown last"
-    assert found[1].nonzero()[:, 0].tolist() == [0, 1], "all that is allowed has the tag"
-    first = torch.isfinite(decider.scores(windows, collected))
-    assert first[0].nonzero()[:, 0].tolist() == [0, 1, 2, 3, 6, 7, 8, 9, 10]
-
-
-@pytest.mark.parametrize("run", [1, 2, 3])
-def test_items_of_a_main_tag_that_was_liked_on_end_are_left_out(run: int) -> None:
-    windows, collected = random_windows(CATALOG), torch.zeros(B).double()
-    items, tag = torch.arange(ITEMS), TAGS[:, 0]
-    same, other_tag = items[tag == tag[4]], int(items[tag != tag[4]][0])
-    shown = Shown(same[torch.zeros(B, 10, dtype=torch.int64)], torch.ones(B, 10))
-    shown.rewards[1, run - 1] = 0.0
-    shown.items[2, run - 1] = other_tag
-    found = torch.isfinite(decider_of(tag_run=run).scores(windows, collected, shown=shown))
-    assert found[0].tolist() == (tag != tag[4]).tolist()
-    assert found[1].all(), "one of them was not liked"
-    if run > 1:
-        assert found[2].all(), "one of them had another tag"
-    # Of what went before it does not matter, nor where nothing else is allowed.
-    shown.items[0, run:], shown.rewards[0, run:] = -1, 0.0
-    again = torch.isfinite(decider_of(tag_run=run).scores(windows, collected, shown=shown))
-    assert torch.equal(again, found)
-    given = decider_of(tag_run=run).scores(windows, collected, tag != tag[4], shown=shown)
-    assert torch.isfinite(given[0]).tolist() == (tag == tag[4]).tolist()
-
-
-def test_everything_left_out_is_an_error() -> None:
-    windows, collected = random_windows(CATALOG), torch.zeros(B).double()
-    forbidden = torch.zeros(B, ITEMS, dtype=torch.bool)
-    forbidden[1] = True
-    with pytest.raises(InputError, match="in 1 of 3 decisions every item is left out"):
-        decider_of().scores(windows, collected, forbidden)
-    forbidden[1, 4] = False
-    assert decider_of().scores(windows, collected, forbidden)[1].argmax() == 4
-
-
-@pytest.mark.parametrize("name", ["ucf", "dt", "dc", "lsdt"])
-def test_the_steps_own_action_and_reward_are_not_read(name: str) -> None:
-    windows, collected = random_windows(CATALOG), torch.tensor([0.0, 1.0, 2.0]).double()
-    actions, rewards = windows.actions.clone(), windows.rewards.clone()
-    actions[:, -1], rewards[:, -1] = other(actions[:, -1]), math.nan
-    logged = torch.rand(windows.mask.shape)
-    changed = replace(windows, actions=actions, rewards=rewards, returns_to_go=logged)
-    decider = decider_of(name, reward_weight=1.0, tag_window=2, tag_run=1)
-    before, after = (decider.scores(each, collected) for each in (windows, changed))
-    assert torch.equal(before, after)
-    earlier = windows.actions.clone()
-    earlier[:, -2] = other(earlier[:, -2])
-    assert not torch.equal(before, decider.scores(replace(windows, actions=earlier), collected))
-
-
-def test_vectors_are_predicted_at_the_target() -> None:
-    windows, collected = random_windows(VECTORS), torch.tensor([0.0, 1.0, 2.0]).double()
-    policy = build("dt", VECTORS)
-    found = Decider(policy, DecisionRule(2.0)).act(windows, collected)
-    asked = replace(
-        windows,
-        returns_to_go=ReturnToGo().before(2.0 - collected, windows.rewards) * windows.mask,
-    )
-    with torch.no_grad():
-        torch.testing.assert_close(found, policy.act(asked))
-
-
-def test_a_rule_needs_what_it_uses() -> None:
-    policy, states = build("dt", CATALOG), ItemStates(torch.eye(ITEMS), torch.zeros(0, 0), 0, 1)
-    with pytest.raises(InputError, match="no reward model of items"):
-        Decider(policy, DecisionRule(1.0, reward_weight=0.5))
-    for likeness in (None, Likeness.of(states)):
-        with pytest.raises(InputError, match="the store has none"):
-            Decider(policy, DecisionRule(1.0, tag_window=2), likeness=likeness)
-    for tags in (None, MainTags.of(states)):
-        with pytest.raises(InputError, match="by their main tag, but the store has none"):
-            Decider(policy, DecisionRule(1.0, tag_run=2), main_tags=tags)
-    with pytest.raises(InputError, match="tag_run 11; give a whole number from 0 to 10"):
-        DecisionRule(1.0, tag_run=11)
-    tagged = Likeness.of(replace(states, tags=TAGS))
-    assert K < 10  # items further back than the policy sees are known from the session
-    Decider(policy, DecisionRule(1.0, tag_window=10), likeness=tagged)
-    with pytest.raises(InputError, match="of a session 10 are known"):
-        Decider(policy, DecisionRule(1.0, tag_window=11), likeness=tagged)
+@pytest.mark.parametrize("k", [1, 10, 300])
+@pytest.mark.parametrize(
+    ("rows", "n"), [(1, 50), (1, 1000), (3, 70_001), (1, 200_000), (40, 4_099)]
+)
+def test_the_best_are_found_wherever_they_lie(rows: int, n: int, k: int) -> None:
+    generator = torch.Generator().manual_seed(n + k)
+    k = min(k, n)
+    for scores in (
+        torch.randn(rows, n, generator=generator),
+        torch.arange(n).float().repeat(rows, 1),  # all in the last block, and what is left over
+        torch.randn(rows, n, generator=generator).masked_fill(torch.arange(n) > k, -torch.inf),
+        torch.randint(3, (rows, n), generator=generator).float(),  # most are equal
+    ):
+        found = best_items(scores, k)
+        expected = scores.sort(dim=1, descending=True).values[:, :k]
+        assert torch.equal(scores.gather(1, found), expected)
+        assert torch.equal(found[:, 0], scores.argmax(1))
+        assert all(len(set(row)) == k for row in found.tolist())

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from ucfrec.acting.decision import Decider, DecisionRule
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.rollout import Step, rollout
+from ucfrec.acting.scorer import Scorer
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.plugins import load_plugin
@@ -86,7 +87,8 @@ def test_logged_windows_give_the_actions_played(
         policy = build(name, {"state": observed, "action": 27, "items": 0})
         ids = None
     randomised(policy)
-    actor = PolicyActor(Decider(policy, DecisionRule(TARGET)), SIDE_BY_SIDE, observed, states, ids)
+    scorer = Scorer(policy, DecisionRule(TARGET), states)
+    actor = PolicyActor(scorer, SIDE_BY_SIDE, observed, states, ids)
     steps: list[Step] = []
     played = rollout(env, actor, EPISODES, seed=4, on_step=steps.append)
     assert played.lengths.max() > K, "some session must outgrow the context"

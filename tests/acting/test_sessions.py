@@ -33,7 +33,7 @@ def test_windows_are_those_of_a_store(context: int, observation: int) -> None:
     observations = torch.from_numpy(seen).unsqueeze(1).expand(-1, 25, -1) if observation else None
     for length in (context - 1 + states.window, 60):
         sessions = Sessions.of_rows(owner, items, rewards, users, length, observations)
-        found = sessions.windows(states, context)
+        found = sessions.history(states, context).windows
         for field in fields(expected):
             if field.name != "returns_to_go":
                 assert torch.equal(getattr(found, field.name), getattr(expected, field.name))

@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from tests.support.tagged import tagged_log, tagged_mapping
-from ucfrec.acting.decision import Decider
-from ucfrec.acting.logged_decisions import session_scores
+from ucfrec.acting.scorer import logged_scores
 from ucfrec.choosing.by_ranking import SHOWN, choose_by_ranking
 from ucfrec.choosing.choice import RankedRule, RuleChoice
 from ucfrec.choosing.config import RuleConfig
@@ -42,13 +41,13 @@ def chosen(folder: Path, liked_bias: float, *weights: float) -> RuleChoice:
     """The choice for a policy that shows the ten most liked items by their bias."""
     views = training_views(EpisodeStore.open(folder / "store"))
     liked = TrainingCounts.of(views[0]).liked.topk(10).indices
-    decider: Decider = TrainedPolicy.load(folder / "run").decider()
-    policy = copy.deepcopy(decider.policy)
+    trained = TrainedPolicy.load(folder / "run")
+    policy = copy.deepcopy(trained.policy)
     assert isinstance(policy.head, ItemHead)
     with torch.no_grad():
         policy.head.bias.copy_(torch.zeros(24).index_fill(0, liked, liked_bias))
     config = RuleConfig(reward_weights=weights)
-    return choose_by_ranking(replace(decider, policy=policy), *views, config, 0)
+    return choose_by_ranking(replace(trained, policy=policy).scorer(), *views, config, 0)
 
 
 def test_all_reward_weights_at_once_are_judged_as_each_rule_alone(folder: Path) -> None:
@@ -60,10 +59,8 @@ def test_all_reward_weights_at_once_are_judged_as_each_rule_alone(folder: Path) 
     candidates = read_json(folder / "run" / "run.json")["rule"]["candidates"]
     assert len({each["rule"]["reward_weight"] for each in candidates}) == len(candidates) > 2
     for each in candidates:
-        decider = trained.decider(
-            replace(trained.rule, reward_weight=each["rule"]["reward_weight"])
-        )
-        scores = session_scores(decider, validation, episodes, steps)
+        scorer = trained.scorer(replace(trained.rule, reward_weight=each["rule"]["reward_weight"]))
+        scores = logged_scores(scorer, validation, episodes, steps)
         top = scores.topk(SHOWN).indices.numpy()
         hits = (top == items[:, None]).any(1)[liked].mean()
         assert each["hits"] == pytest.approx(float(np.asarray(hits)), abs=1e-9)

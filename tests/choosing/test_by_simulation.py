@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from tests.support.tagged import tagged_store
-from ucfrec.acting.decision import Decider, DecisionRule
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.scorer import Scorer
 from ucfrec.choosing.by_simulation import RuleSearch, choose_by_simulation
 from ucfrec.choosing.choice import RuleChoice
 from ucfrec.choosing.config import RuleConfig
@@ -47,14 +48,13 @@ def trained(folder: Path) -> TrainedPolicy:
     return TrainedPolicy.load(folder / "run")
 
 
-def with_bias(trained: TrainedPolicy, bias: torch.Tensor) -> Decider:
+def with_bias(trained: TrainedPolicy, bias: torch.Tensor) -> Scorer:
     """A policy that shows items, (24,), by another bias; its run is not changed."""
-    decider = trained.decider(DecisionRule(2.0))
-    policy = copy.deepcopy(decider.policy)
+    policy = copy.deepcopy(trained.policy)
     with torch.no_grad():
         assert isinstance(policy.head, ItemHead)
         policy.head.bias.copy_(bias)
-    return replace(decider, policy=policy)
+    return replace(trained, policy=policy).scorer(DecisionRule(2.0))
 
 
 def users_of(run: Path, store: EpisodeStore) -> UserModel:
@@ -63,18 +63,19 @@ def users_of(run: Path, store: EpisodeStore) -> UserModel:
 
 
 def search_of(folder: Path, trained: TrainedPolicy, config: RuleConfig = FEW) -> RuleSearch:
-    store, decider = EpisodeStore.open(folder / "store"), trained.decider(DecisionRule(2.0))
+    store, scorer = EpisodeStore.open(folder / "store"), trained.scorer(DecisionRule(2.0))
     users = users_of(folder / "run", store)
-    return RuleSearch(decider, users, *training_views(store), config, seed=0)
+    return RuleSearch(scorer, users, *training_views(store), config, seed=0)
 
 
 def chosen(
-    decider: Decider, store: EpisodeStore, run: Path, config: RuleConfig, *targets: float
+    scorer: Scorer, store: EpisodeStore, run: Path, config: RuleConfig, *targets: float
 ) -> RuleChoice:
     users = users_of(run, store)
-    decider = replace(decider, reward_model=users.reward)
+    states = store.item_states
+    scorer = Scorer(scorer.policy, scorer.rule, states, scorer.returns, users.reward)
     given = dict(zip((0.9, 1.0), targets, strict=True))
-    return choose_by_simulation(decider, users, given, *training_views(store), config, 0)
+    return choose_by_simulation(scorer, users, given, *training_views(store), config, 0)
 
 
 def test_a_run_acts_by_the_rule_that_it_chose_and_says_how(
@@ -120,7 +121,7 @@ def test_rules_side_by_side_do_what_each_does_alone(folder: Path, trained: Train
     search = search_of(folder, trained)
     rules = [
         DecisionRule(2.0, temperature=1.0),
-        DecisionRule(1.0, floor=1.0, reward_weight=2.0, temperature=0.5),
+        DecisionRule(1.0, minimum_target=1.0, reward_weight=2.0, temperature=0.5),
         DecisionRule(3.0, tag_window=3),
         DecisionRule(3.0, reward_weight=4.0, tag_window=2, temperature=2.0),
     ]
@@ -148,15 +149,15 @@ def test_unsupported_and_narrow_rules_are_not_allowed(folder: Path, trained: Tra
 
 def test_every_kind_of_candidate_is_simulated(folder: Path, trained: TrainedPolicy) -> None:
     targets = (trained.target_return(quantile) for quantile in FEW.quantiles)
-    store, decider = EpisodeStore.open(folder / "store"), trained.decider(DecisionRule(2.0))
-    found = chosen(decider, store, folder / "run", FEW, *targets)
+    store, scorer = EpisodeStore.open(folder / "store"), trained.scorer(DecisionRule(2.0))
+    found = chosen(scorer, store, folder / "run", FEW, *targets)
     rules = [candidate.rule for candidate in found.candidates]
     assert len(set(rules)) == len(rules)
     assert {rule.temperature for rule in rules} == set(FEW.temperatures)
     assert {rule.reward_weight for rule in rules} == set(FEW.reward_weights)
     together = {(rule.tag_window, rule.reward_weight) for rule in rules}
     assert together == set(product((0, 3, 10), FEW.reward_weights))
-    assert {rule.floor is None for rule in rules} == {True, False}
+    assert {rule.minimum_target is None for rule in rules} == {True, False}
 
 
 def test_what_the_log_supports_only_without_recent_tags_is_found(
@@ -180,16 +181,16 @@ def test_what_the_log_supports_only_without_recent_tags_is_found(
 
 def test_users_who_tire_are_shown_no_longer_runs(tmp_path: Path, trained: TrainedPolicy) -> None:
     store = tiring_store(tmp_path)
-    decider = with_bias(trained, torch.where(torch.arange(24) % 4 == 0, 9.0, 0.0))
+    scorer = with_bias(trained, torch.where(torch.arange(24) % 4 == 0, 9.0, 0.0))
     config = replace(FEW, tag_windows=(0,), temperatures=(1.0,), reward_weights=(0.0,))
-    found = chosen(decider, store, tmp_path, config, 2.0, 3.0)
+    found = chosen(scorer, store, tmp_path, config, 2.0, 3.0)
     fatigue = found.as_dict()["fatigue"]
     assert (fatigue["length"], fatigue["steps"]) == (3, 4)
     assert found.rule.tag_run == 2
     runs = {candidate.rule.tag_run for candidate in found.candidates}
     assert runs == set(FEW.tag_runs)
     none = replace(config, tag_runs=(0,))
-    unlimited = chosen(decider, store, tmp_path, none, 2.0, 3.0)
+    unlimited = chosen(scorer, store, tmp_path, none, 2.0, 3.0)
     assert {candidate.rule.tag_run for candidate in unlimited.candidates} == {0}
 
 
@@ -239,7 +240,7 @@ def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_pat
     assert not model.affinity.any()
     assert not model.user.any()
     # The chosen rule was simulated again in four times the sessions.
-    given = (trained.decider(DecisionRule(2.0)), users_of(tmp_path / "run", store))
+    given = (trained.scorer(DecisionRule(2.0)), users_of(tmp_path / "run", store))
     four_times = replace(config.rule, sessions=160)
     more = RuleSearch(*given, *training_views(store), four_times, config.seed)
     (simulated,) = more.simulate([trained.rule])
@@ -250,9 +251,9 @@ def test_of_rules_that_the_model_cannot_tell_apart_the_widest_draws_are_taken(
     tmp_path: Path, trained: TrainedPolicy
 ) -> None:
     store = tiring_store(tmp_path)
-    decider = with_bias(trained, torch.where(torch.arange(24) % 4 == 0, 9.0, 0.0))
+    scorer = with_bias(trained, torch.where(torch.arange(24) % 4 == 0, 9.0, 0.0))
     config = replace(FEW, tag_windows=(0,), tolerance=0.1)
-    found = chosen(decider, store, tmp_path, config, 2.0, 3.0)
+    found = chosen(scorer, store, tmp_path, config, 2.0, 3.0)
     rule = found.rule
     assert rule.tag_run > 0
     same_run = [each for each in found.candidates if each.rule.tag_run == rule.tag_run]

@@ -1,6 +1,5 @@
 """The command line as a stranger meets it: small logs, real commands, clear refusals."""
 
-import json
 import os
 import re
 import shutil
@@ -8,7 +7,6 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -18,7 +16,8 @@ from ucfrec.acting.rollout import rollout
 from ucfrec.commands.cli import UCFREC, build_parser, main
 from ucfrec.evaluation.environment import Environment
 from ucfrec.plugins import load_plugin
-from ucfrec.reporting.evaluation_rows import read_evaluations
+from ucfrec.results.row import ResultRow
+from ucfrec.results.rows_file import read_results
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 TINY = [
@@ -82,18 +81,16 @@ def test_evaluate_writes_the_rows_it_prints(
     arguments = ["evaluate", run, "--env", environment, "--episodes", "40", "--seed", "7"]
     arguments += ["--behavior", "random", "--json", str(out)]
     assert main(arguments) == 0
-    rows = json.loads(out.read_text())
-    assert [row["policy"] for row in rows] == ["ucf", "random"]
+    rows = read_results(out)
+    assert [row.method for row in rows] == ["ucf", "random"]
     for row in rows:
-        assert row["environment"] == environment
-        assert (row["episodes"], row["seed"]) == (40, 7)
+        assert row.environment == environment
+        assert (row["episodes"], row.evaluation_seed) == (40, 7)
         assert row["R_cum_low"] <= row["R_cum"] <= row["R_cum_high"]
         assert row["R_avg_pooled"] * row["length"] == pytest.approx(row["R_cum"])
     assert "R_avg_episode" in capsys.readouterr().out
-    first = out.read_text()
     assert main(arguments) == 0
-    again = json.loads(out.read_text())
-    assert [r["R_cum"] for r in again] == [r["R_cum"] for r in json.loads(first)]
+    assert [row.metrics for row in read_results(out)] == [row.metrics for row in rows]
 
 
 @pytest.mark.parametrize(
@@ -201,10 +198,9 @@ def test_score_tells_the_probability_of_every_choice(
     pd.testing.assert_frame_equal(own, pd.read_parquet(out))
 
 
-def estimates_in(out: Path) -> dict[str, dict[str, Any]]:
-    """Rows of `ope --json` by estimator; each is a result row."""
-    assert all("suite" in row for row in json.loads(out.read_text()))
-    return {row["estimator"]: row for row in read_evaluations(out)}
+def estimates_in(out: Path) -> dict[str, ResultRow]:
+    """Rows of `ope --json` by estimator."""
+    return {row.method: row for row in read_results(out)}
 
 
 @pytest.mark.parametrize("choice", [["--temperature", "1"], ["--temperature", "0"]])
@@ -229,18 +225,20 @@ def test_ope_writes_the_rows_it_prints(
             assert re.search(rf"^{name} .*\[–, –\]", printed, re.MULTILINE)
         else:
             assert row["R_cum_low"] <= row["R_cum"] <= row["R_cum_high"]
-        assert (row["sessions"], row["steps"], row["seed"]) == (300, len(log), 3)
+        assert (row["sessions"], row["steps"], row.evaluation_seed) == (300, len(log), 3)
         assert (row["run"], row["checkpoint"]) == (Path(run).name, "best")
-        assert row["fingerprint"]
-        assert row["command"]
+        assert row.data_fingerprint
+        assert row.command
     # These are the logs that the run was trained on, and it says so.
-    assert all(f"warning: {line}" in printed for line in rows["logged"]["warnings"])
+    assert all(f"warning: {line}" in printed for line in rows["logged"].details["warnings"])
     assert rows["logged"]["seen_in_training"] > 0.8
-    assert "of the rows were seen in training" in rows["logged"]["warnings"][0]
-    assert rows["logged"]["reliable"] is False
+    assert "of the rows were seen in training" in rows["logged"].details["warnings"][0]
+    assert rows["logged"].details["reliable"] is False
     assert "verdict: Do not rely on this estimate" in printed
     assert main(arguments) == 0
-    assert estimates_in(out) == rows
+    assert {name: row.metrics for name, row in estimates_in(out).items()} == {
+        name: row.metrics for name, row in rows.items()
+    }
 
 
 def test_ope_tells_from_uniform_logs_what_playing_tells(
@@ -262,12 +260,14 @@ def test_ope_tells_from_uniform_logs_what_playing_tells(
     for name in ("IPS", "SNIPS", "PDIS", "DR"):
         row = rows[name]
         assert row["R_cum_low"] - 2 * error < truth < row["R_cum_high"] + 2 * error, name
-    errors = {name: row["R_cum_error"] for name, row in rows.items() if row.get("R_cum_error")}
+    errors = {
+        name: error for name, row in rows.items() if (error := row.metrics.get("R_cum_error"))
+    }
     assert errors["DR"] < errors["PDIS"] < errors["IPS"]
     assert rows["DR"]["overlap"] == pytest.approx(1, abs=0.05)
     # Simulated clocks are coarse: a few users are shown the same item at the same time.
     assert 0 < rows["DR"]["seen_in_training"] < 0.05
-    assert rows["DR"]["reliable"]
+    assert rows["DR"].details["reliable"]
 
 
 def test_a_model_card_lies_beside_every_run_with_what_was_measured(
@@ -313,17 +313,17 @@ def test_ope_ranks_targets_and_rules_and_says_which_it_cannot_judge(
     ]
     assert main(["ope", run, fresh, *asked]) == 0
     printed = capsys.readouterr().out
-    rows = read_evaluations(out)
-    names = list(dict.fromkeys(row["candidate"] for row in rows))
+    rows = read_results(out)
+    names = list(dict.fromkeys(row.details["candidate"] for row in rows))
     assert len(names) == 4
     assert names[-1] == "target return 6, temperature 0"
-    ranked = {row["candidate"]: row for row in rows if "rank" in row}
+    ranked = {row.details["candidate"]: row for row in rows if "rank" in row.metrics}
     assert ranked
     # A policy that always shows one item agrees with hardly any whole random session.
     assert not any("temperature 0" in name for name in ranked)
     assert "not ranked: target return 6, temperature 0: " in printed
     first = min(ranked.values(), key=lambda row: row["rank"])
-    assert f"choice: {first['selection']}" in printed
+    assert f"choice: {first.details['selection']}" in printed
     assert sum(row["probability_best"] for row in ranked.values()) == pytest.approx(1)
     for row in ranked.values():
         assert row["band_low"] < row["band_high"]
@@ -350,13 +350,13 @@ def test_ope_without_propensities_has_only_models_and_without_one_leaves_a_sessi
         rows = list(estimates_in(out).values())
         printed = capsys.readouterr().out
         if name == "without":
-            assert [row["estimator"] for row in rows] == ["logged", "DM", "FQE"]
-            assert "overlap" not in rows[0]
+            assert [row.method for row in rows] == ["logged", "DM", "FQE"]
+            assert "overlap" not in rows[0].metrics
             assert "no session has all its propensities" in printed
             assert "warning: 2 rows show items" in printed
             assert rows[0]["unknown_item_rows"] == 2
         else:
-            assert {"DR", "SNPDIS"} <= {row["estimator"] for row in rows}
+            assert {"DR", "SNPDIS"} <= {row.method for row in rows}
             assert rows[0]["sessions_without_propensity"] == 1
             assert "warning: 1 of 300 sessions have a step without propensity" in printed
 
@@ -375,7 +375,7 @@ def test_ope_estimates_propensities_if_asked_and_says_so(
     printed = capsys.readouterr().out
     assert {"IPS", "DR"} <= set(rows)
     assert f"with the propensities of {len(log):,} steps estimated (held-out loss" in printed
-    assert rows["DR"]["declared"].startswith("with the propensities of")
+    assert rows["DR"].details["declared"].startswith("with the propensities of")
     assert rows["DR"]["wanted_lift"] == 0.5
     assert "name the least one first" in refused([*arguments, "--reward-range", "1", "0"], capsys)
 

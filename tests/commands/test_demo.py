@@ -1,11 +1,11 @@
 """The demo, made small: every row there, in order, and resumed rather than repeated."""
 
-import json
 from pathlib import Path
 
 import pytest
 
 from ucfrec.commands.demo import BEHAVIORS, ENVIRONMENTS, LEARNERS, DemoConfig, demo
+from ucfrec.results.rows_file import read_results
 
 TINY = DemoConfig(
     sessions=400,
@@ -19,19 +19,20 @@ TINY = DemoConfig(
 @pytest.mark.slow
 def test_the_demo_writes_every_row_and_goes_on_where_it_was(tmp_path: Path) -> None:
     rows = demo(tmp_path / "demo", seed=0, config=TINY)
-    written = json.loads((tmp_path / "demo" / "results.json").read_text())
+    written = read_results(tmp_path / "demo" / "results.json")
+    assert written == rows
     names = {*LEARNERS, *BEHAVIORS}
     assert names == {"logging", "random", "bc", "dt", "ucf-no-augmentation", "ucf", "optimal"}
     for environment in ENVIRONMENTS:
-        of_environment = {
-            row["policy"]: row for row in written if row["environment"] == environment
-        }
+        of_environment = {row.method: row for row in written if row.environment == environment}
         assert of_environment.keys() == names
-        assert max(of_environment.values(), key=lambda row: row["R_cum"])["policy"] == "optimal"
+        assert max(of_environment.values(), key=lambda row: row.value).method == "optimal"
         for row in of_environment.values():
             assert row["R_cum_low"] <= row["R_cum"] <= row["R_cum_high"]
             assert row["R_avg_pooled"] == pytest.approx(row["R_cum"] / row["length"])
-            assert {"command", "versions", "fingerprint", "config"} <= row.keys()
+            assert (row.config_hash is None) == (row.training_seed is None)
+            assert row.command
+            assert row.versions
     page = (tmp_path / "demo" / "report.html").read_text()
     for environment in ENVIRONMENTS:
         assert f"R_cum in {environment}" in page
@@ -40,4 +41,4 @@ def test_the_demo_writes_every_row_and_goes_on_where_it_was(tmp_path: Path) -> N
     written_at = weights.stat().st_mtime_ns
     again = demo(tmp_path / "demo", seed=0, config=TINY)
     assert weights.stat().st_mtime_ns == written_at
-    assert [row["R_cum"] for row in again] == [row["R_cum"] for row in rows]
+    assert [row.metrics for row in again] == [row.metrics for row in rows]

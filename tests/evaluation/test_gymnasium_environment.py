@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 from gymnasium import spaces
@@ -17,6 +16,7 @@ from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import environment_items
 from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.gymnasium_environment import GymnasiumEnvironment
+from ucfrec.results.rows_file import read_results
 from ucfrec.schema import USER_IDS
 
 MODULE = "tests.support.gymnasium_environments"
@@ -161,10 +161,10 @@ def test_from_the_environment_to_an_evaluation_on_the_command_line(
     rows = tmp_path / "rows.json"
     judged = ["--episodes", "8", "--behavior", "random", "--json", str(rows)]
     assert main(["evaluate", run, *env, *judged]) == 0
-    frame = pd.read_json(rows)
-    assert frame["policy"].tolist() == ["bc", "random"]
-    assert (frame["length"] == LENGTH).all()
-    assert set(frame["environment"]) == {f"{name} --observe secret"}
+    found = read_results(rows)
+    assert [row.method for row in found] == ["bc", "random"]
+    assert {row.metrics["length"] for row in found} == {LENGTH}
+    assert {row.environment for row in found} == {f"{name} --observe secret"}
     capsys.readouterr()
     assert main(["evaluate", run, "--env", name, "--episodes", "8"]) == 2
     assert "collected with the same --observe" in capsys.readouterr().err

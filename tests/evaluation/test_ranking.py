@@ -19,6 +19,7 @@ from ucfrec.evaluation.ranking import MEASURES, Period, Ranked, Steps, compare, 
 from ucfrec.evaluation.ranking_baselines import baselines
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
+from ucfrec.results.rows_file import read_results
 
 N_ITEMS, K = 12, 3
 
@@ -146,7 +147,7 @@ def test_the_command_ranks_the_test_split_and_later_logs(
     sets = [word for setting in tiny for word in ("--set", setting)]
     assert main(["train", str(store.path), "--out", run, "--policy", "dt", *sets]) == 0
     assert main(["rank", run, "--k", "5", "--json", str(out)]) == 0
-    rows = pd.read_json(out)
+    rows = read_results(out)
     names = [
         "dt",
         "reward model",
@@ -157,8 +158,12 @@ def test_the_command_ranks_the_test_split_and_later_logs(
         "item-knn",
         "als",
     ]
-    assert rows.policy.tolist() == names
-    assert (rows.steps == store.split("test").n_steps).all()
+    assert [row.method for row in rows] == names
+    assert {row["steps"] for row in rows} == {store.split("test").n_steps}
+    for row in rows:
+        low, high = row.interval or (0.0, 0.0)
+        assert low <= row.value <= high
+        assert row.details["intervals"].keys() == set(MEASURES)
     log = pd.read_parquet(store.path.parent / "log.parquet").tail(600)
     log.to_parquet(tmp_path / "later.parquet")
     assert main(["rank", run, str(tmp_path / "later.parquet"), "--k", "5"]) == 0

@@ -31,7 +31,7 @@ def logged(folder: Path, trained: TrainedPolicy) -> Iterator[LoggedSessions]:
 RULES = {
     "drawn": RULE,
     "best": DecisionRule(7.5),
-    "floor": DecisionRule(1.5, floor=1.0, temperature=0.5),
+    "minimum": DecisionRule(1.5, minimum_target=1.0, temperature=0.5),
     "unseen": DecisionRule(7.5, temperature=2.0, top_k=4, exclude_seen=True),
 }
 

@@ -1,6 +1,7 @@
 """Invariants of the architectures: what must never move a prediction, and what must."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ from ucfrec.policies.dt import DTConfig, DTPolicy
 from ucfrec.policies.losses import parent_targets
 from ucfrec.policies.lsdt import LSDTConfig, LSDTPolicy
 from ucfrec.policies.registry import policy_class
-from ucfrec.policies.ucf import UCFConfig, UCFPolicy
+from ucfrec.policies.ucf import _FEW, StackedStreams, UCFConfig, UCFPolicy
 
 B, K, S, A, ITEMS = 3, 7, 5, 2, 11
 VECTORS = {"state": S, "action": A, "items": 0}
@@ -22,11 +23,11 @@ CATALOG = {"state": S, "action": 4, "items": ITEMS}
 SMALL = {"context": K, "dim": 16}
 
 
-def build(name: str, sizes: dict[str, int]) -> SequencePolicy:
+def build(name: str, sizes: dict[str, int], **settings: Any) -> SequencePolicy:
     torch.manual_seed(0)
     learner = policy_class(name)
     own = {"kernel_groups": 4} if name == "lsdt" else {}
-    policy = learner(learner.Config(**SMALL, **own), sizes)
+    policy = learner(learner.Config(**SMALL, **own, **settings), sizes)
     if sizes["items"]:
         policy.head.start_from(torch.randn(ITEMS, 4), torch.rand(ITEMS))
     for parameter in policy.parameters():
@@ -281,3 +282,44 @@ def test_a_change_at_step_ten_shows_where_the_official_code_shows_it(
     changed = predictions(policy, replace(windows, **{field: values}))
     moved = (changed != predictions(policy, windows)).any(-1)[0].nonzero()
     assert int(moved[0]) == first
+
+
+# The last step of a few windows, by stacked streams.
+
+
+@pytest.mark.parametrize("sizes", [VECTORS, CATALOG], ids=["vectors", "items"])
+@pytest.mark.parametrize("padding", [(0, 0, 0), (0, 2, 5), (5, 4, 3)])
+@pytest.mark.parametrize("cropped", [0, 3])
+def test_stacked_streams_are_the_streams(
+    sizes: dict[str, int], padding: tuple[int, ...], cropped: int
+) -> None:
+    policy = build("ucf", sizes)
+    assert isinstance(policy, UCFPolicy)
+    windows = policy.normalized(random_windows(sizes, padding))
+    with torch.no_grad():
+        expected = policy.last_features(windows)
+        found = policy.acting_features()(windows)
+        torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+        # Padding that all windows share can be left out.
+        if min(padding) >= cropped:
+            short = policy.acting_features()(windows.last(windows.mask.shape[1] - cropped))
+            torch.testing.assert_close(short, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_many_windows_take_the_way_of_training() -> None:
+    policy = build("ucf", CATALOG)
+    windows = policy.normalized(random_windows(CATALOG))
+    many = Windows(*(getattr(windows, name).repeat_interleave(_FEW, 0) for name in vars(windows)))
+    with torch.no_grad():
+        assert torch.equal(policy.acting_features()(many), policy.last_features(many))
+
+
+def test_a_learner_with_its_own_last_step_keeps_it() -> None:
+    class Own(UCFPolicy):
+        def last_features(self, windows: Windows) -> torch.Tensor:
+            return super().last_features(windows) + 1
+
+    policy = build("ucf", CATALOG)
+    assert isinstance(policy.acting_features(), StackedStreams)  # type: ignore[unreachable]
+    policy.__class__ = Own
+    assert not isinstance(policy.acting_features(), StackedStreams)

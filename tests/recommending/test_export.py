@@ -1,6 +1,8 @@
 """The exported graph gives torch's scores, and what `recommend` shows."""
 
+import copy
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +11,15 @@ import pandas as pd
 import pytest
 import torch
 
-from tests.support.served import FULL, histories, learn_tastes, trained_run
+from tests.support.served import FULL, SETTINGS, histories, learn_tastes, trained_run
+from tests.support.tagged import tagged_log
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.commands.cli import main
+from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.recommending.export import DESCRIPTION, GRAPH, export
 from ucfrec.recommending.export_graph import _CHUNK, OUTPUTS, _best
 from ucfrec.recommending.histories import histories_of_frame
@@ -25,22 +30,53 @@ onnxruntime = pytest.importorskip("onnxruntime")
 pytest.importorskip("onnxscript")
 
 
+MAPPING = {
+    "tags": LogMapping(),
+    "no tags": LogMapping(),
+    "observations": LogMapping({"observation": "observation"}),
+}
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
-    trained = trained_run(tmp_path_factory.mktemp("export"))
-    learn_tastes(trained)
-    return trained
+    return trained_run(tmp_path_factory.mktemp("export"))
 
 
-def ranked(folder: Path, trained: TrainedPolicy, log: pd.DataFrame) -> pd.DataFrame:
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
+    """A run whose items have no tags."""
+    return fitted(tmp_path_factory.mktemp("plain"), tagged_log(), MAPPING["no tags"])
+
+
+@pytest.fixture(scope="module")
+def observed(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
+    """A run with logged observations."""
+    log = tagged_log()
+    log["observation"] = [[user % 3 / 2, user % 2] for user in log.user_id]
+    return fitted(tmp_path_factory.mktemp("observed"), log, MAPPING["observations"])
+
+
+def fitted(folder: Path, log: pd.DataFrame, mapping: LogMapping) -> TrainedPolicy:
+    log.to_parquet(folder / "log.parquet")
+    options = PrepareOptions(reward="reward", session_by="gap", gap_minutes=120, embedding_size=6)
+    prepare([folder / "log.parquet"], mapping, folder / "store", options)
+    store = EpisodeStore.open(folder / "store")
+    Recommender("dt", settings=SETTINGS).fit(store, folder / "run")
+    return TrainedPolicy.load(folder / "run")
+
+
+def ranked(
+    folder: Path, trained: TrainedPolicy, log: pd.DataFrame, mapping: LogMapping
+) -> pd.DataFrame:
     """What the graph recommends, from the log and the description alone."""
     description = json.loads((folder / DESCRIPTION).read_text())
     length = next(i["shape"][1] for i in description["inputs"] if i["name"] == "items")
+    context = trained.policy.config.context
     item_of = {item: n for n, item in enumerate(description["item_ids"])}
     user_of = {user: n for n, user in enumerate(description["user_ids"])}
     rows: dict[str, list[Any]] = {entry["name"]: [] for entry in description["inputs"]}
     users = []
-    for batch in histories_of_frame(trained, log, LogMapping()):
+    for batch in histories_of_frame(trained, log, mapping):
         latest = batch.latest_session(description["session_gap_ms"])
         for number, user in enumerate(batch.users):
             own = latest.owner == number
@@ -54,6 +90,9 @@ def ranked(folder: Path, trained: TrainedPolicy, log: pd.DataFrame) -> pd.DataFr
             rows["users"].append(user_of.get(user, -1))
             seen = [item_of[item] for item in batch.seen_ids[batch.seen_owner == number].tolist()]
             rows["excluded"].append(seen + [-1] * (60 - len(seen)))
+            if "observations" in rows:
+                assert batch.observations is not None
+                rows["observations"].append([batch.observations[number]] * context)
             users.append(user)
     dtypes = {entry["name"]: entry["dtype"] for entry in description["inputs"]}
     given = {name: np.asarray(values, dtypes[name]) for name, values in rows.items()}
@@ -68,22 +107,51 @@ def ranked(folder: Path, trained: TrainedPolicy, log: pd.DataFrame) -> pd.DataFr
     return pd.concat(frames, ignore_index=True)
 
 
-@pytest.mark.parametrize(
-    "rule",
-    [
-        pytest.param(DecisionRule(3.0, tag_run=1), marks=pytest.mark.slow, id="run"),
-        FULL,
-    ],
-)
+RULES = {
+    "target": DecisionRule(3.0, 1.0),
+    "weighted": DecisionRule(3.0, reward_weight=0.7),
+    "run": DecisionRule(3.0, tag_run=1),
+    "full": FULL,
+    "everything": replace(FULL, tag_run=2),
+}
+TAGGED = ("run", "full", "everything")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("tastes", [False, True])
+@pytest.mark.parametrize("run", ["tags", "no tags", "observations"])
 def test_the_graph_recommends_what_the_policy_does(
-    trained: TrainedPolicy, tmp_path: Path, rule: DecisionRule
-) -> None:
-    assert export(trained, tmp_path / "out", rule=rule, k=24).difference <= 1e-5
+    trained: TrainedPolicy, plain: TrainedPolicy, observed: TrainedPolicy, tmp_path: Path,
+    run: str, tastes: bool, rule: str,
+) -> None:  # fmt: skip
+    given = {"tags": trained, "no tags": plain, "observations": observed}[run]
+    if run != "tags" and rule in TAGGED:
+        with pytest.raises(InputError, match="the store has none"):
+            export(given, tmp_path / "out", rule=RULES[rule])
+        return
+    if tastes:
+        given = replace(given, reward_model=copy.deepcopy(given.reward_model))
+        learn_tastes(given)
+    # Several sessions and one are compared with torch in there.
+    assert export(given, tmp_path / "out", rule=RULES[rule], k=20).difference <= 1e-5
     log = histories()
-    batches = histories_of_frame(trained, log, LogMapping())
-    expected = pd.concat(recommend(trained, batches, 24, rule=rule), ignore_index=True)
-    found = ranked(tmp_path / "out", trained, log)
-    pd.testing.assert_frame_equal(found, expected, check_dtype=False, rtol=1e-5, atol=1e-5)
+    if run == "observations":
+        log["observation"] = [[user % 3 / 2, user % 2] for user in log.user_id]
+    for some in (log, log[log.user_id == log.user_id.min()]):
+        batches = histories_of_frame(given, some, MAPPING[run])
+        expected = pd.concat(recommend(given, batches, 20, rule=RULES[rule]), ignore_index=True)
+        found = ranked(tmp_path / "out", given, some, MAPPING[run])
+        pd.testing.assert_frame_equal(found, expected, check_dtype=False, rtol=1e-4, atol=1e-4)
+
+
+def test_a_graph_of_a_reward_weight_takes_any_number_of_sessions(
+    trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    model = trained.reward_model
+    assert model is not None
+    assert not model.tastes.known
+    assert export(trained, tmp_path / "out", rule=RULES["weighted"], k=5).difference <= 1e-5
 
 
 def test_the_command_writes_it_whole_or_not_at_all(

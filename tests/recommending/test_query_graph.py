@@ -41,14 +41,14 @@ def test_answers_are_those_of_torch(
     trained: TrainedPolicy, fast: Responder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = [*requests_of(histories()), {"user_id": "new"}]
-    graph, alone = fast._scorer._of_one, []
+    graph, alone = fast._scorer._engine, []
 
     def counted(sessions: Sessions) -> Any:
         alone.append(len(sessions.users))
         assert graph is not None
         return graph(sessions)
 
-    monkeypatch.setattr(fast._scorer, "_of_one", counted)
+    monkeypatch.setattr(fast._scorer, "_engine", counted)
     expected = answered(responder(trained, rule=FULL, k=24), asked)
     one_by_one = pd.concat([answered(fast, [each]) for each in asked], ignore_index=True)
     pd.testing.assert_frame_equal(one_by_one, expected, rtol=1e-5, atol=1e-5)
@@ -59,7 +59,7 @@ def test_answers_are_those_of_torch(
 
 @pytest.mark.slow
 def test_the_run_s_own_scorer_stays_as_it_is(trained: TrainedPolicy, fast: Responder) -> None:
-    assert trained.scorer(FULL)._of_one is None
+    assert trained.scorer(FULL)._engine is None
 
 
 def test_policies_that_score_in_their_own_way_are_refused(tmp_path: Path) -> None:

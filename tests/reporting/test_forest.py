@@ -1,20 +1,14 @@
 """The forest plot draws what each verdict is of, and whether it stands."""
 
-import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from tests.support.report_page import Page, row
+from tests.support.report_page import Page, estimate
 from ucfrec.off_policy.estimators import LOGGED
 from ucfrec.reporting.forest import forest, quoted
 from ucfrec.reporting.page_results import Estimates, Results
-
-
-def estimate(name: str, value: float | None, **more: Any) -> dict[str, Any]:
-    found = row("", "ucf", value or 0.0, estimator=name, **more)
-    return found | ({} if value is not None else {"R_cum_low": None, "R_cum_high": None})
+from ucfrec.results.rows_file import write_results
 
 
 def of(*estimates: Estimates) -> Results:
@@ -22,8 +16,11 @@ def of(*estimates: Estimates) -> Results:
 
 
 def test_a_line_a_policy_hollow_where_the_verdict_forbids() -> None:
-    good = [estimate("IPS", 3.0), estimate("DR", 4.0, verdict_of="DR", reliable=True)]
-    bad = [estimate("DR", 9.0, verdict_of="DR", reliable=False)]
+    good = [
+        estimate("IPS", 3.0),
+        estimate("DR", 4.0, details={"verdict_of": "DR", "reliable": True}),
+    ]
+    bad = [estimate("DR", 9.0, details={"verdict_of": "DR", "reliable": False})]
     logged = estimate(LOGGED, 2.0)
     drawn = forest(of(Estimates("good", logged, good, ()), Estimates("bad", logged, bad, ())))
     assert drawn is not None
@@ -40,10 +37,11 @@ def test_a_line_a_policy_hollow_where_the_verdict_forbids() -> None:
 
 
 def test_without_an_interval_there_is_no_line() -> None:
-    models = [estimate("DM", None), estimate("FQE", None)]
+    models = [estimate("DM", 1.0, interval=None), estimate("FQE", 2.0, interval=None)]
     assert forest(of(Estimates("ucf", estimate(LOGGED, 2.0), models, ()))) is None
     assert forest(of()) is None
-    assert quoted([*models, estimate("SNIPS", 1.0)])["estimator"] == "SNIPS"
+    snips = estimate("SNIPS", 1.0)
+    assert quoted([*models, snips]) == snips
 
 
 def test_logs_that_differ_have_no_common_reference() -> None:
@@ -56,28 +54,22 @@ def test_logs_that_differ_have_no_common_reference() -> None:
     )
     assert drawn is not None
     assert drawn.logged is None
-    assert not any(point.stands for point in drawn.points)  # rows of before had no verdict
+    assert not any(point.stands for point in drawn.points)
 
 
 def test_rows_of_ope_are_drawn_in_the_report(folder: Path, tmp_path: Path) -> None:
-    from ucfrec.reporting.estimate_rows import estimate_row
     from ucfrec.reporting.page import write_report
 
+    said = "The policy earns more than the logged one: +2"
     about = {
-        "choice": "softmax", "seed": 0, "fingerprint": "f", "checkpoint": "best", "command": "",
-        "commit": None, "versions": {}, "target_return": 5.0, "rule": "r",
-        "sessions": 10, "warnings": [],
-        "verdict": "The policy earns more than the logged one: +2", "verdict_of": "DR",
-        "reliable": True, "run": "runs/ucf",
-    }  # fmt: skip
+        "conditions": {"choice": "softmax", "run": "runs/ucf", "sessions": 10},
+        "details": {"warnings": [], "verdict": said, "verdict_of": "DR", "reliable": True},
+    }
     rows = [
-        estimate_row(
-            estimate(name, value) | about | {"policy": policy},
-            training_seed=0, config_hash="c", code_version="v",
-        ).to_json()
+        estimate(name, value, policy, **about)
         for name, policy, value in ((LOGGED, "behavior", 2.0), ("DR", "ucf", 4.0))
-    ]  # fmt: skip
-    (tmp_path / "ope.json").write_text(json.dumps(rows))
+    ]
+    write_results(tmp_path / "ope.json", rows)
     write_report(tmp_path / "report.html", [folder / "ucf"], [tmp_path / "ope.json"])
     page = Page(tmp_path / "report.html")
     assert "For ucf (softmax) of runs/ucf: The policy earns more than the logged one" in page.text

@@ -13,6 +13,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.fitting.metrics_log import METRICS, MetricsLog, read_metrics
 from ucfrec.reporting.page import write_report
+from ucfrec.results.rows_file import append_rows, write_results
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 
@@ -118,7 +119,7 @@ def test_runs_on_other_data_are_not_compared(runs: Path, tmp_path: Path) -> None
 
 def test_the_page_stands_alone(runs: Path, tmp_path: Path) -> None:
     results = tmp_path / "rows.json"
-    results.write_text(json.dumps([row("taobao", "ucf", 3.0)]))
+    write_results(results, [row("taobao", "ucf", 3.0)])
     page = page_of(tmp_path / "report.html", runs / "ucf", results=(results,))
     assert not [given for _, given in page.elements if given.keys() & {"src", "href", "xlink:href"}]
     assert not {tag for tag, _ in page.elements} & {"script", "link", "iframe", "object", "img"}
@@ -140,7 +141,7 @@ def test_names_from_outside_are_shown_and_never_run(runs: Path, tmp_path: Path) 
     record["reward"] = HOSTILE
     (hostile / "run.json").write_text(json.dumps(record))
     results = tmp_path / "rows.jsonl"
-    results.write_text(json.dumps(row(HOSTILE, HOSTILE, 1.0)) + "\n")
+    append_rows(results, [row(HOSTILE, HOSTILE, 1.0)])
     page = page_of(tmp_path / "report.html", hostile, results=(results,))
     tags = {tag for tag, _ in page.elements}
     assert not tags & {"script", "img"}
@@ -192,13 +193,17 @@ def test_long_curves_are_thinned_to_their_end(runs: Path, tmp_path: Path) -> Non
 
 
 def test_what_policies_earn_comes_by_environment_with_intervals(runs: Path, tmp_path: Path) -> None:
+    episodes = {"episodes": 2000}
     rows = [
-        row("a", "ucf", 3.25, train_seed=1000, length=7.5, episodes=2000),
-        row("a", "ucf", 2.25, train_seed=1001, length=6.5, episodes=2000),
-        row("a", "random", -1.0, train_seed=None, length=5.5, episodes=2000),
+        row("a", name, value, training_seed=seed, metrics={"length": length}, conditions=episodes)
+        for name, value, seed, length in (
+            ("ucf", 3.25, 1000, 7.5),
+            ("ucf", 2.25, 1001, 6.5),
+            ("random", -1.0, None, 5.5),
+        )
     ]
-    (tmp_path / "rows.json").write_text(json.dumps(rows))
-    (tmp_path / "more.jsonl").write_text(json.dumps(row("b", "ucf", 8.0)) + "\n")
+    write_results(tmp_path / "rows.json", rows)
+    append_rows(tmp_path / "more.jsonl", [row("b", "ucf", 8.0)])
     results = (tmp_path / "rows.json", tmp_path / "more.jsonl")
     page = page_of(tmp_path / "report.html", runs / "dt", results=results)
     table = page.tables["a: means of episodes"]
@@ -217,8 +222,9 @@ def test_what_policies_earn_comes_by_environment_with_intervals(runs: Path, tmp_
     [
         (None, "does not exist"),
         ("{}", "holds no list of result rows"),
-        ("[1]", "row 1, has no usable environment, policy, R_cum"),
-        (json.dumps([row("a", "ucf", 1.0), row("a", "ucf", float("nan"))]), "row 2, has no usable"),
+        ("[1]", "row 1 is no result row"),
+        (json.dumps([row("a", "ucf", 1.0).to_json(), {}]), "row 2 is no result row"),
+        (json.dumps([row("a", "ucf", 1.0, interval=None).to_json()]), "row 1, has no R_cum with"),
     ],
 )
 def test_other_files_are_refused(

@@ -19,12 +19,21 @@ from tests.support.episodes import (
     some_states,
     step_columns,
 )
-from tests.support.report_page import HOSTILE, SOURCE, number, page_of, record_of, rewritten, row
-from ucfrec.acting.logged_decisions import session_scores
+from tests.support.report_page import (
+    HOSTILE,
+    SOURCE,
+    estimate,
+    number,
+    page_of,
+    record_of,
+    rewritten,
+)
+from ucfrec.acting.scorer import logged_scores
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.reporting.page import write_report
+from ucfrec.results.rows_file import write_results
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -121,7 +130,7 @@ def test_samples_are_what_the_policy_shows(folder: Path, tmp_path: Path) -> None
     held_out = held_out.split("validation")
     first = held_out.windows(np.array([0]), held_out.lengths[:1] - 1, 5)
     assert samples["rule"] == str(trained.rule)
-    scores = session_scores(trained.decider(), held_out, np.array([0]), held_out.lengths[:1] - 1)
+    scores = logged_scores(trained.scorer(), held_out, np.array([0]), held_out.lengths[:1] - 1)
     best = scores[0].topk(5).indices
     session = samples["sessions"][0]
     assert session["recommended"] == best.tolist()
@@ -171,17 +180,21 @@ def test_a_run_is_shown_with_what_it_recorded(folder: Path, tmp_path: Path) -> N
 
 
 def test_estimates_from_logs_are_shown_with_their_warnings(folder: Path, tmp_path: Path) -> None:
-    about = {
-        "effective_sessions": 33.25, "largest_weight": 0.5, "sessions": 600, "overlap": 1.01,
-        "warnings": [HOSTILE], "run": "runs/ucf",
-    }  # fmt: skip
     rows = [
-        row("", "behavior", 2.0, estimator="logged", choice="as logged", **about),
-        row("", "ucf", 3.0, estimator="DR", choice="softmax", **about),
+        estimate(
+            name,
+            value,
+            policy,
+            metrics={"effective_sessions": 33.25, "largest_weight": 0.5, "overlap": 1.01},
+            conditions={"sessions": 600, "run": "runs/ucf", "choice": choice},
+            details={"warnings": [HOSTILE]},
+        )
+        for name, policy, value, choice in (
+            ("logged", "behavior", 2.0, "as logged"),
+            ("DR", "ucf", 3.0, "softmax"),
+        )
     ]
-    for one in rows:
-        del one["environment"]
-    (tmp_path / "ope.json").write_text(json.dumps([*rows, *rows]))
+    write_results(tmp_path / "ope.json", [*rows, *rows])
     page = page_of(tmp_path / "report.html", folder / "ucf", results=(tmp_path / "ope.json",))
     table = page.tables["Estimates for ucf (softmax) of runs/ucf"]
     assert table["DR"] == {
@@ -197,26 +210,26 @@ def test_estimates_from_logs_are_shown_with_their_warnings(folder: Path, tmp_pat
 def test_models_have_no_interval_and_the_verdict_of_ope_is_quoted(
     folder: Path, tmp_path: Path
 ) -> None:
-    none = {"R_cum_low": None, "R_cum_high": None, "verdict": f"Do not rely on it: {HOSTILE}"}
+    details = {"verdict": f"Do not rely on it: {HOSTILE}"}
     rows = [
-        row("", "behavior", 2.0, estimator="logged"),
-        row("", "ucf", 3.0, estimator="FQE") | none,
+        estimate("logged", 2.0, "behavior"),
+        estimate("FQE", 3.0, interval=None, details=details),
     ]
-    (tmp_path / "ope.json").write_text(json.dumps(rows))
+    write_results(tmp_path / "ope.json", rows)
     page = page_of(tmp_path / "report.html", folder / "ucf", results=(tmp_path / "ope.json",))
     assert page.tables["Estimates for ucf"]["FQE"]["mean return of a session"] == "3 [–]"
     assert "For ucf: Do not rely on it" in page.text
-    (tmp_path / "ope.json").write_text(json.dumps(rows[1:]))
+    write_results(tmp_path / "ope.json", rows[1:])
     page_of(tmp_path / "report.html", folder / "ucf", results=(tmp_path / "ope.json",))
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"effective_sessions": "many"}, {"warnings": "one"}, {"R_cum": None}, {"policy": 3}]
+    "wrong", [{"metrics": {"R_cum": "many"}}, {"details": 3}, {"metrics": {}}, {"policy": 3}]
 )
 def test_estimates_of_another_kind_are_refused(
     folder: Path, tmp_path: Path, wrong: dict[str, object]
 ) -> None:
-    good = row("", "ucf", 1.0, estimator="DR")
+    good = estimate("DR", 1.0).to_json()
     (tmp_path / "ope.json").write_text(json.dumps([good, good | wrong]))
-    with pytest.raises(InputError, match=f"row 2, has no usable {next(iter(wrong))}"):
+    with pytest.raises(InputError, match=f"row 2 is no result row: .*{next(iter(wrong))}"):
         write_report(tmp_path / "out.html", [folder / "ucf"], [tmp_path / "ope.json"])

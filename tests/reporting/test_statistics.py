@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from ucfrec.reporting.statistics import grouped, paired_differences, summary
+from ucfrec.reporting.statistics import grouped, summary
 
 
 def test_the_spread_is_that_of_a_sample() -> None:
@@ -20,10 +20,6 @@ def test_too_few_values_have_no_spread() -> None:
     assert (none.count, math.isnan(none.mean), math.isnan(none.standard_error)) == (0, True, True)
     assert math.isnan(one.sd)
     assert math.isnan(one.standard_error)
-
-
-def test_pairs_are_of_keys_that_both_have() -> None:
-    assert paired_differences({0: 5.0, 2: 1.0, 1: 7.0}, {1: 3.0, 0: 4.5, 3: 9.0}) == [0.5, 4.0]
 
 
 def test_groups_keep_the_order_in_which_they_come() -> None:

@@ -4,26 +4,26 @@ from typing import Any
 
 import pytest
 
-from tests.support.report_page import row
+from tests.support.report_page import estimate, row
 from ucfrec.reporting.page_results import Estimates, Results
 from ucfrec.reporting.verdict import NO_RESULTS, verdict
+from ucfrec.results.row import ResultRow
 
 
-def earned(policy: str, value: float, wide: float = 0.1, **more: Any) -> dict[str, Any]:
-    interval = {"R_cum_low": value - wide, "R_cum_high": value + wide}
-    return row("a", policy, value, **more) | interval
+def earned(policy: str, value: float, **more: Any) -> ResultRow:
+    return row("a", policy, value, interval=(value - 0.1, value + 0.1), **more)
 
 
-def of_environment(*rows: dict[str, Any]) -> str:
+def of_environment(*rows: ResultRow) -> str:
     (said,) = verdict(Results({"a": rows}, ()))
     return said
 
 
-def estimated(name: str, value: float, wide: float = 0.1) -> dict[str, Any]:
-    return {**earned("ucf", value, wide), "estimator": name}
+def estimated(name: str, value: float) -> ResultRow:
+    return estimate(name, value, interval=(value - 0.1, value + 0.1))
 
 
-def of_logs(*rows: dict[str, Any], warnings: tuple[str, ...] = (), logged: bool = True) -> str:
+def of_logs(*rows: ResultRow, warnings: tuple[str, ...] = (), logged: bool = True) -> str:
     of_logged = estimated("logged", 1.0) if logged else None
     (said,) = verdict(Results({}, [Estimates("ucf", of_logged, rows, warnings)]))
     return said
@@ -36,8 +36,8 @@ def test_without_results_nothing_is_said_of_earnings() -> None:
 
 def test_the_best_is_named_with_its_interval_and_what_it_lies_above() -> None:
     said = of_environment(
-        earned("random", 1.0), earned("dt", 2.0, train_seed=0), earned("ucf", 3.0, train_seed=0),
-        earned("optimal", 9.0), earned("logging", 2.95),
+        earned("random", 1.0), earned("optimal", 9.0), earned("logging", 2.95),
+        earned("dt", 2.0, training_seed=0), earned("ucf", 3.0, training_seed=0),
     )  # fmt: skip
     assert "ucf earned most of 2 trained policies: 3 (95% interval 2.9 to 3.1)" in said
     assert "lies above those of the others, the next being dt (2)" in said
@@ -47,13 +47,13 @@ def test_the_best_is_named_with_its_interval_and_what_it_lies_above() -> None:
 
 
 def test_intervals_that_overlap_leave_it_open() -> None:
-    said = of_environment(earned("dt", 2.9, train_seed=0), earned("ucf", 3.0, train_seed=0))
+    said = of_environment(earned("dt", 2.9, training_seed=0), earned("ucf", 3.0, training_seed=0))
     assert "overlaps that of dt (2.9): which of them earns more is open" in said
     assert "to compare it with" in said
 
 
 def test_seeds_of_training_are_taken_together() -> None:
-    rows = [earned("ucf", value, train_seed=seed) for seed, value in enumerate((3.0, 4.0, 5.0))]
+    rows = [earned("ucf", value, training_seed=seed) for seed, value in enumerate((3.0, 4.0, 5.0))]
     said = of_environment(*rows, earned("random", 3.5), earned("bad", 1.0))
     assert "4 in the mean of 3 trainings (their 95% intervals span 2.9 to 5.1)" in said
     assert "more than bad (1)" in said
@@ -62,8 +62,8 @@ def test_seeds_of_training_are_taken_together() -> None:
 
 
 def test_checkpoints_of_one_run_are_no_seeds() -> None:
-    rows = [earned("ucf", 3.0, train_seed=0, checkpoint="best"),
-            earned("ucf", 2.0, train_seed=0, checkpoint="last")]  # fmt: skip
+    rows = [earned("ucf", 3.0, training_seed=0, checkpoint="best"),
+            earned("ucf", 2.0, training_seed=0, checkpoint="last")]  # fmt: skip
     said = of_environment(*rows)
     assert "ucf, checkpoint best earned most of 2 trained policies: 3 (" in said
     assert "trained once" in said

@@ -6,8 +6,11 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+from tests.support.result_rows import result_row
 from ucfrec.files.atomic import read_json
+from ucfrec.off_policy.columns import SUITE
 from ucfrec.reporting.page import write_report
+from ucfrec.results.row import ResultRow
 
 VOID = {"meta", "br", "img", "link", "input", "hr"}
 HOSTILE = "</title><script>alert('1')</script><img src=x onerror=\"alert(2)\">&amp;"
@@ -95,9 +98,17 @@ def rewritten(run: Path, to: Path, **changes: Any) -> Path:
     return to
 
 
-def row(environment: str, policy: str, value: float, **more: Any) -> dict[str, Any]:
-    interval = {"R_cum": value, "R_cum_low": value - 0.5, "R_cum_high": value + 1.5}
-    return {"environment": environment, "policy": policy, **interval, **more}
+def row(environment: str, name: str, value: float, **more: Any) -> ResultRow:
+    """A row of `ucfrec evaluate`: of a built-in policy without `training_seed`."""
+    given = {"suite": "evaluate", "table": "evaluate", "training_seed": None, "checkpoint": None}
+    given |= {"task": environment, "environment": environment, "method": name, "policy": name}
+    return result_row(value, **given | {"interval": (value - 0.5, value + 1.5)} | more)
+
+
+def estimate(name: str, value: float, policy: str = "ucf", **more: Any) -> ResultRow:
+    """A row of `ucfrec ope`; `more` are metrics, conditions, details and other fields."""
+    given = {"suite": SUITE, "task": "logs", "policy": policy}
+    return row("logs", name, value, **given | more)
 
 
 def number(cell: str) -> float:

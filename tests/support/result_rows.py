@@ -1,8 +1,9 @@
 """Result rows made by hand."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ucfrec.reporting.result_row import ResultRow
+from ucfrec.results.row import ResultRow
 
 
 def result_row(value: float = 1.0, **fields: Any) -> ResultRow:
@@ -24,3 +25,20 @@ def result_row(value: float = 1.0, **fields: Any) -> ResultRow:
     metric = fields.get("metric", given["metric"])
     metrics = {metric: value, **fields.pop("metrics", {})}
     return ResultRow(**given | {"metrics": metrics} | fields)
+
+
+def distractor_rows(values: Mapping[float | None, Sequence[float]]) -> list[ResultRow]:
+    """Rows of a method without a distractor, with it off and on: a value a seed."""
+    metrics = {"R_avg_pooled": 0.5, "R_avg_episode": 0.5, "length": 2.0}
+    return [
+        result_row(
+            value,
+            metrics=metrics,
+            training_seed=seed,
+            target_return=3.0,
+            conditions={"distractor": rate, "quantiles": quantile},
+        )
+        for quantile in ("0.99", "1")
+        for rate, own in values.items()
+        for seed, value in enumerate(own)
+    ]

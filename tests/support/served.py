@@ -25,7 +25,7 @@ SETTINGS = [
     ),
     *("rule.quantiles=[1.0]", "rule.tag_windows=[0]"),
 ]
-FULL = DecisionRule(None, floor=0.1, reward_weight=0.7, exclude_seen=True, tag_window=2)
+FULL = DecisionRule(None, minimum_target=0.1, reward_weight=0.7, exclude_seen=True, tag_window=2)
 """A rule that uses every part of a policy."""
 
 

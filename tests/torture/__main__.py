@@ -3,12 +3,12 @@
 python -m tests.torture --scale 0.01 --results rows.jsonl
 
 Every check has parts (a command, a reader), each with a row of its own, which is written as soon as
-it is measured. A part that the file of rows has, of the same code and size, is not measured again.
+it is measured. A part that the file of rows has, of the same size, is measured again only with
+--again.
 """
 
 import argparse
 import gc
-import hashlib
 import os
 import sys
 import tempfile
@@ -27,8 +27,8 @@ from tests.torture import damage, fuzz, limits
 from tests.torture.ends import Ends
 from tests.torture.made import Inputs, temporary
 from ucfrec.provenance import provenance
-from ucfrec.reporting.result_row import ResultRow, RowKey
-from ucfrec.reporting.rows_file import append_rows, read_rows
+from ucfrec.results.row import ResultRow, RowKey
+from ucfrec.results.rows_file import append_rows, read_rows, remove_rows
 
 FULL = {
     "kills": 500,
@@ -45,7 +45,6 @@ COUNTED = (
     "ended by a library",
 )
 """Entries of a check that are no faults."""
-_PACKAGES = ("ucfrec", "control", "simulators", "datasets", "tests/torture")
 
 
 @dataclass(frozen=True)
@@ -65,10 +64,11 @@ def main() -> int:
     parser.add_argument("--only", action="append", default=[], choices=[*FULL])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--results", type=Path, help="file of result rows to append to")
+    parser.add_argument("--again", action="store_true", help="measure all parts, with a row or not")
     parser.add_argument("--scratch", type=Path, help="folder for files (default: memory, if any)")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    measured = read_rows(options.results) if options.results else []
+    measured = read_rows(options.results) if options.results and not options.again else []
     shared = Path("/dev/shm")
     scratch = options.scratch or (shared if os.access(shared, os.W_OK) else None)
     total = Counter[str]()
@@ -85,6 +85,7 @@ def main() -> int:
             if row is None:
                 row, faults = _measured(part, key)
                 if options.results is not None:
+                    remove_rows(options.results, [key])
                     append_rows(options.results, [row])
             else:
                 faults = row.details
@@ -163,19 +164,7 @@ def _key(part: Part, seed: int) -> RowKey:
         policy="none",
         evaluation_seed=seed,
         conditions={"cases": part.cases},
-        code_version=_code_version(),
     )
-
-
-@cache
-def _code_version() -> str:
-    """A hash of every source file of the packages, as every one may be at fault."""
-    root = Path(__file__).parents[2]
-    files = sorted(path for each in _PACKAGES for path in (root / each).rglob("*.py"))
-    digest = hashlib.sha256()
-    for path in files:
-        digest.update(f"{path.relative_to(root).as_posix()}\n".encode() + path.read_bytes())
-    return digest.hexdigest()[:12]
 
 
 def _show(row: ResultRow, faults: object) -> None:

@@ -256,8 +256,7 @@ def _targets(inputs: Inputs) -> dict[str, tuple[Path, str, Reader]]:
     from ucfrec.fitting.checkpoint import load_tensors
     from ucfrec.fitting.metrics_log import read_metrics
     from ucfrec.logs.mapping import read_mapping
-    from ucfrec.reporting.evaluation_rows import read_evaluations
-    from ucfrec.reporting.rows_file import read_configurations, read_rows
+    from ucfrec.results.rows_file import read_configurations, read_results, read_rows
     from ucfrec.runs.config import resolve_config
 
     texts = _texts(inputs)
@@ -334,7 +333,7 @@ def _targets(inputs: Inputs) -> dict[str, tuple[Path, str, Reader]]:
             *(texts / "configurations.jsonl", "configurations.jsonl"),
             lambda path: read_configurations(path.parent),
         ),
-        "evaluations": (texts / "evaluations.json", "evaluations.json", read_evaluations),
+        "evaluations": (texts / "evaluations.json", "evaluations.json", read_results),
         "evaluations in a report": (
             texts / "evaluations.json",
             "evaluations.json",

@@ -1,30 +1,21 @@
 """The decision rule: what turns a trained policy into what is shown, the same wherever it acts."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, Final, Self
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Final, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ucfrec.acting.best_items import best_items
-from ucfrec.episodes.exposure import Likeness, Shown
 from ucfrec.episodes.item_table import WINDOW
 from ucfrec.episodes.returns import ReturnToGo
-from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
-from ucfrec.policies.base import SequencePolicy
 from ucfrec.provenance import config_hash
-from ucfrec.user_model.main_tags import MainTags
-
-if TYPE_CHECKING:
-    from ucfrec.user_model.reward import ItemRewardModel
-
 
 _RANGES: Final = {
     "target": (-1e12, 1e12),
-    "floor": (-1e12, 1e12),
+    "minimum_target": (-1e12, 1e12),
     "reward_weight": (0.0, 1e6),
     "temperature": (0.0, 1e6),
     "top_k": (1, 10**9),
@@ -33,8 +24,12 @@ _RANGES: Final = {
 }
 _COLDEST: Final = 1e-30
 """Temperature below which dividing by it would leave the range of float32."""
-_OPTIONAL: Final = ("target", "floor", "top_k")
+_OPTIONAL: Final = ("target", "minimum_target", "top_k")
 _WHOLE: Final = ("top_k", "tag_window", "tag_run")
+_FEW: Final = 2**16
+"""Scores up to which looking for blocks first costs more."""
+_BLOCK: Final = 128
+"""Items of the smallest block; maxima of fewer cost more."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +46,9 @@ class DecisionRule:
     target: float | None
     """Target return in units of the training reward, of a session or of every step (`ReturnToGo`);
     None for the largest return that the policy expects in each state."""
-    floor: float | None = None
-    """Returns-to-go asked for are held above this, also once a session has reached its target; None
-    for no floor."""
+    minimum_target: float | None = None
+    """Target returns are at least this, also once a session has reached its target; None for no
+    minimum."""
     reward_weight: float = 0.0
     """β, weight of the reward model, whose predictions are log-odds of a reward, or rewards in
     standard deviations; 0 for none."""
@@ -118,7 +113,8 @@ class DecisionRule:
     def __str__(self) -> str:
         target = "the largest return expected" if self.target is None else f"{self.target:g}"
         parts = [f"target {target}"]
-        parts += [] if self.floor is None else [f"at least {self.floor:g} at every step"]
+        if self.minimum_target is not None:
+            parts.append(f"at least {self.minimum_target:g} at every step")
         parts += [f"reward weight {self.reward_weight:g}"] if self.reward_weight else []
         parts += [f"the {self.top_k} best"] if self.top_k else []
         parts += ["unseen items"] if self.exclude_seen else []
@@ -132,14 +128,10 @@ class DecisionRule:
     @property
     def hash(self) -> str:
         """12 hexadecimal digits that tell rules apart, for results."""
-        values = self.as_dict()
-        if not self.tag_run:
-            # Rows measured before there were tag runs keep their hash.
-            del values["tag_run"]
-        return config_hash(values)
+        return config_hash(self.as_dict())
 
-    def asked(self, returns: ReturnToGo, collected: Tensor, best: Tensor | None) -> Tensor:
-        """What is asked for at the next step, (B,) float64, in reward units.
+    def target_returns(self, returns: ReturnToGo, collected: Tensor, best: Tensor | None) -> Tensor:
+        """Target returns at the next step, (B,) float64, in reward units.
 
         Args:
             returns: what returns-to-go count.
@@ -148,16 +140,16 @@ class DecisionRule:
         """
         if self.target is None:
             assert best is not None
-            asked = best.double()
+            targets = best.double()
         else:
-            asked = returns.asked(self.target, collected)
-        return asked if self.floor is None else asked.clamp(min=self.floor)
+            targets = returns.target_returns(self.target, collected)
+        return targets if self.minimum_target is None else targets.clamp(min=self.minimum_target)
 
     def log_probabilities(self, scores: Tensor) -> Tensor:
         """Log-probabilities (nats) with which items are shown, (B, n_items).
 
         Args:
-            scores: (B, n_items) of `Decider.scores`.
+            scores: (B, n_items) of `Scorer.scores`.
         """
         if self.temperature == 0:
             best = scores.argmax(-1, keepdim=True)
@@ -173,7 +165,7 @@ class DecisionRule:
         """Items (B,) and the probabilities (B,) with which they were chosen.
 
         Args:
-            scores: (B, n_items) of `Decider.scores`.
+            scores: (B, n_items) of `Scorer.scores`.
             generator: of the draws.
         """
         if self.temperature == 0:
@@ -188,7 +180,7 @@ class DecisionRule:
         Once all of the `top_k` items have been drawn, the others follow, best first.
 
         Args:
-            scores: (B, n_items) of `Decider.scores`; k at most n_items.
+            scores: (B, n_items) of `Scorer.scores`; k at most n_items.
             k: number of items.
             uniforms: (B, n_items) draws from [0, 1); needed at a temperature above 0.
         """
@@ -206,200 +198,39 @@ class DecisionRule:
         return best_items(scores, k)
 
 
-@dataclass(frozen=True)
-class Decider:
-    """A trained policy under a decision rule."""
+def best_items(scores: Tensor, k: int) -> Tensor:
+    """Numbers (B, k) of the k highest scores (B, n), best first; k at most n.
 
-    policy: SequencePolicy
-    """In evaluation mode."""
-    rule: DecisionRule
-    returns: ReturnToGo = field(default_factory=ReturnToGo)
-    """What the returns-to-go of the training counted."""
-    reward_model: "ItemRewardModel | None" = None
-    """f̂_r; needed for a reward weight."""
-    likeness: Likeness | None = None
-    """Tags of the items; needed for a tag window."""
-    main_tags: MainTags | None = None
-    """Main tags of the items; needed for a tag run."""
-
-    def __post_init__(self) -> None:
-        if self.rule.reward_weight and self.reward_model is None:
-            raise InputError(
-                f"the rule has reward weight {self.rule.reward_weight:g}, but the run has no "
-                "reward model of items; train it with --set rule.choose=true, or set the reward "
-                "weight to 0"
-            )
-        if self.rule.tag_window and (self.likeness is None or not self.likeness.tags.shape[1]):
-            raise InputError(
-                "the rule leaves out items by their tags, but the store has none; give the items a "
-                "column of lists, or set the tag window to 0"
-            )
-        if self.rule.tag_run and (self.main_tags is None or not (self.main_tags.tags >= 0).any()):
-            raise InputError(
-                "the rule leaves out items by their main tag, but the store has none; give the "
-                "items a column of lists, or set the tag run to 0"
-            )
-        if self.rule.tag_window > self.known:
-            raise InputError(
-                f"the rule looks at the tags of the last {self.rule.tag_window} items, but of a "
-                f"session {self.known} are known ({WINDOW}, or policy.context less 1 if that is "
-                f"more); set the tag window to at most {self.known}"
-            )
-
-    @property
-    def known(self) -> int:
-        """The number of items of a session that are known at least, once it has shown them."""
-        return max(self.policy.config.context - 1, WINDOW)
-
-    @property
-    def reach(self) -> int:
-        """Items shown before a step that the reward model and the rule read."""
-        of_model = 0 if self.reward_model is None else self.reward_model.reach
-        return max(of_model, self.rule.tag_window, self.rule.tag_run)
-
-    @torch.no_grad()
-    def asked(self, windows: Windows, collected: Tensor) -> Windows:
-        """The windows with the returns-to-go that the rule asks for.
-
-        Args:
-            windows: B windows that end with the step to decide.
-            collected: (B,) float64 rewards earlier in the session, also before the window.
-        """
-        best = None
-        if self.rule.target is None:
-            best = self.policy.max_return(windows.to(self.policy.state_mean.device)).cpu()
-        asked = self.rule.asked(self.returns, collected, best)
-        returns_to_go = self.returns.before(asked, windows.rewards.cpu())
-        mask = windows.mask
-        return replace(windows, returns_to_go=returns_to_go.to(mask.device).masked_fill(~mask, 0.0))
-
-    @torch.no_grad()
-    def act(self, windows: Windows, collected: Tensor) -> Tensor:
-        """The policy's outputs at the last step, on the CPU: see `SequencePolicy.act`."""
-        return self.act_and_features(self.asked(windows, collected))[0]
-
-    @torch.no_grad()
-    def act_and_features(self, asked: Windows) -> tuple[Tensor, Tensor | None]:
-        """The policy's outputs at the last step of windows of `asked`, and the features (B, d) that
-        they are made from, on the CPU; None of a learner that is no network of features (item-knn,
-        crm-greedy)."""
-        policy, moved = self.policy, asked.to(self.policy.state_mean.device)
-        if type(policy).act is not SequencePolicy.act:
-            return policy.act(moved).cpu(), None
-        outputs, features = policy.act_and_features(moved)
-        return outputs.cpu(), features.cpu()
-
-    def scores(
-        self,
-        windows: Windows,
-        collected: Tensor,
-        forbidden: Tensor | None = None,
-        users: Tensor | None = None,
-        shown: Shown | None = None,
-    ) -> Tensor:
-        """log π(i | s, Ĝ) + β f̂_r(s, i), up to a constant per row, −∞ for items left out.
-
-        Args:
-            windows: B windows of items that end with the step to decide; its own action and reward
-                are not read.
-            collected: (B,) float64 rewards earlier in the session, also before the window.
-            forbidden: (B, n_items) or (n_items,) bool, items that may not be shown.
-            users: (B,) rows of the training store's users, −1 for others; None for unknown ones.
-            shown: what the sessions showed before, further back than the windows may reach; None
-                for what the windows have.
-
-        Returns:
-            (B, n_items).
-
-        Raises:
-            InputError: no item is left in some row, or the scores of some row are NaN.
-        """
-        logits = self.act(windows, collected)
-        return self.scores_from(logits, windows, forbidden, users, shown)
-
-    @torch.no_grad()
-    def scores_from(
-        self,
-        logits: Tensor,
-        windows: Windows,
-        forbidden: Tensor | None = None,
-        users: Tensor | None = None,
-        shown: Shown | None = None,
-    ) -> Tensor:
-        """`scores` from the policy's outputs (B, n_items)."""
-        scores = self.weighted(logits, windows, users, shown)
-        self.require_numbers(scores)
-        if forbidden is not None:
-            scores = scores.masked_fill(forbidden, -torch.inf)
-        before = Shown.before_last(windows)
-        earlier = shown or before
-        recent = before if self.rule.tag_window < windows.mask.shape[1] else earlier
-        scores = self.without_tired_tags(self.without_recent_tags(scores, recent), earlier)
-        none = torch.isneginf(scores.amax(1))
-        if none.any():
-            raise InputError(
-                f"in {int(none.sum())} of {len(none)} decisions every item is left out; allow more "
-                "candidates, or keep seen items"
-            )
-        return scores
-
-    @torch.no_grad()
-    def weighted(
-        self, logits: Tensor, windows: Windows, users: Tensor | None, shown: Shown | None
-    ) -> Tensor:
-        """The policy's outputs (B, n_items) plus β f̂_r; the arguments are those of `scores`."""
-        if not self.rule.reward_weight:
-            return logits
-        return self.rewards(windows, users, shown).mul_(self.rule.reward_weight).add_(logits)
-
-    @staticmethod
-    def require_numbers(scores: Tensor) -> None:
-        """Check scores (B, n_items).
-
-        Raises:
-            InputError: those of some row are NaN, or infinitely high.
-        """
-        undefined = ~(scores.amax(1) < torch.inf)
-        if undefined.any():
-            raise InputError(
-                f"in {int(undefined.sum())} of {len(scores)} decisions scores are no numbers, as "
-                "weights of the policy or the reward model are NaN or infinite; train again, with "
-                "a lower train.learning_rate if the training diverged"
-            )
-
-    @torch.no_grad()
-    def rewards(
-        self, windows: Windows, users: Tensor | None = None, shown: Shown | None = None
-    ) -> Tensor:
-        """f̂_r (B, n_items) at the last step of the windows, in the reward model's units."""
-        assert self.reward_model is not None
-        shown = shown or Shown.before_last(windows)
-        scores: Tensor = self.reward_model.scores(windows.states[:, -1], shown, users)
-        return scores
-
-    def without_recent_tags(self, scores: Tensor, shown: Shown) -> Tensor:
-        """Scores (B, n_items), −∞ for items that share a tag with one of the last that sessions
-        have shown, if the rule says so and other items remain."""
-        if not self.rule.tag_window:
-            return scores
-        assert self.likeness is not None
-        recent = shown.items[:, : self.rule.tag_window]
-        alike = self.likeness.to_all(self.likeness.profile(recent, torch.ones(recent.shape)))
-        return _left(scores, alike > 0)
-
-    def without_tired_tags(self, scores: Tensor, shown: Shown) -> Tensor:
-        """Scores (B, n_items), −∞ for items with the main tag of the last that sessions have shown,
-        if the rule says so, users liked enough of them on end, and other items remain."""
-        if not self.rule.tag_run:
-            return scores
-        assert self.main_tags is not None
-        tired = self.main_tags.tired(shown, self.rule.tag_run).unsqueeze(1)
-        return _left(scores, (self.main_tags.tags == tired) & (tired >= 0))
+    The k best of all lie in the k blocks of items with the highest maxima, so a pass that finds the
+    maxima is all that reads every score. Among equal scores any may be chosen, but a row's first is
+    `argmax`'s, so that the best item is the same however many are shown.
+    """
+    if k == 1:
+        return scores.argmax(-1, keepdim=True)
+    highest, found = _some_best(scores, k)
+    tied = highest[:, 0] == highest[:, 1]
+    if tied.any():
+        first = scores[tied].argmax(-1, keepdim=True)
+        # The first comes in front, and leaves out itself further back or else the last.
+        joined = torch.cat([first, found[tied]], dim=1)
+        again = (joined == first).index_fill(1, torch.tensor([0]), False)
+        found[tied] = joined.gather(1, again.int().argsort(dim=1, stable=True)[:, :k])
+    return found
 
 
-def _left(scores: Tensor, without: Tensor) -> Tensor:
-    """Scores (B, n_items) with −∞ where `without`, but in rows where nothing would remain."""
-    left = scores.masked_fill(without, -torch.inf)
-    none = torch.isneginf(left.amax(1))
-    left[none] = scores[none]
-    return left
+def _some_best(scores: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """The highest scores (B, k) and their numbers; any of equal scores may be the first."""
+    n = scores.shape[1]
+    # Both searches that follow the pass are of about the same size.
+    size = max(_BLOCK, round((n / k) ** 0.5))
+    blocks = n // size
+    if scores.numel() < _FEW or 3 * k > blocks:
+        values, numbers = scores.topk(k, dim=-1)
+        return values, numbers
+    maxima = scores[:, : blocks * size].view(len(scores), blocks, size).amax(-1)
+    first = maxima.topk(k, dim=-1, sorted=False).indices * size
+    numbers = (first.unsqueeze(-1) + torch.arange(size)).flatten(1)
+    rest = torch.arange(blocks * size, n).expand(len(scores), -1)
+    numbers = torch.cat([numbers, rest], dim=1)
+    values, places = scores.gather(1, numbers).topk(k, dim=-1)
+    return values, numbers.gather(1, places)

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.session_scorer import SessionScorer
+from ucfrec.acting.item_product import multipliers
+from ucfrec.acting.scorer import Scorer
 from ucfrec.acting.sessions import Sessions
 from ucfrec.errors import InputError
 
@@ -32,11 +32,10 @@ class ItemIndex:
     which too few candidates are left are scored exactly.
     """
 
-    def __init__(self, scorer: SessionScorer, rule: DecisionRule, kind: str, seed: int = 0) -> None:
+    def __init__(self, scorer: Scorer, kind: str, seed: int = 0) -> None:
         """
         Args:
-            scorer: of a policy; its weights must not change afterwards.
-            rule: its decision rule.
+            scorer: of a policy of items; its weights must not change afterwards.
             kind: of the policy, for messages.
             seed: of the lists and of the sessions on which the recall is measured.
 
@@ -49,12 +48,12 @@ class ItemIndex:
             raise InputError(
                 "the approximate search needs faiss, which is not installed; install ucfrec[faiss]"
             ) from None
-        if rule.temperature > 0:
+        if scorer.rule.temperature > 0:
             raise InputError(
-                f"the rule draws items at temperature {rule.temperature:g}, which needs the scores "
-                "of all of them; leave --approximate out, or give --temperature 0"
+                f"the rule draws items at temperature {scorer.rule.temperature:g}, which needs the "
+                "scores of all of them; leave --approximate out, or give --temperature 0"
             )
-        if not scorer.has_query:
+        if not scorer.has_factors:
             raise InputError(
                 f"policies of kind {kind!r} score items in a way of their own; leave --approximate "
                 "out"
@@ -87,7 +86,7 @@ class ItemIndex:
         where fewer are left.
 
         Args:
-            sessions: B sessions; see `SessionScorer.scores`.
+            sessions: B sessions; see `Scorer.scores`.
             left_out: rows (N,) and items (N,) of what may not be recommended.
             excluded: (n_items,) bool, what nobody is recommended.
             k: at most the number of items.
@@ -102,7 +101,7 @@ class ItemIndex:
             of_row = torch.tensor([row])
             own = left_out[1][left_out[0] == row]
             exact = self._scorer.scores(
-                sessions.rows(of_row), (torch.zeros_like(own), own), excluded
+                sessions.rows(of_row), (torch.zeros_like(own), own), excluded, empty=True
             ).topk(k)
             if sampled[row]:
                 self._compare(items[row], scores[row], exact.indices[0], exact.values[0])
@@ -128,16 +127,16 @@ class ItemIndex:
         k: int,
     ) -> tuple[Tensor, Tensor]:
         """The best k of the candidates and their scores, (B, k) each."""
-        scorer, query = self._scorer, self._scorer.query(sessions)
-        many = min(scorer.n_items, 4 * k + _MORE)
-        products, found = self._index.search(scorer.asked(query), many)
+        scorer, factors, n_items = self._scorer, self._scorer.factors(sessions), self._index.ntotal
+        many = min(n_items, 4 * k + _MORE)
+        products, found = self._index.search(multipliers(factors), many)
         items, missing = torch.from_numpy(found), torch.from_numpy(found < 0)
         items = items.clamp(min=0)
-        scores = scorer.of_items(sessions, query, items, torch.from_numpy(products))
+        scores = scorer.of_items(sessions, factors, items, torch.from_numpy(products))
         if excluded is not None:
             missing |= excluded[items]
         # Pairs of a row and an item are single numbers.
-        rows = torch.arange(len(items)).unsqueeze(1) * scorer.n_items
-        missing |= torch.isin(rows + items, left_out[0] * scorer.n_items + left_out[1])
+        rows = torch.arange(len(items)).unsqueeze(1) * n_items
+        missing |= torch.isin(rows + items, left_out[0] * n_items + left_out[1])
         best = scores.masked_fill(missing, -torch.inf).topk(k)
         return items.gather(1, best.indices), best.values

@@ -7,9 +7,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ucfrec.acting.decision import Decider
+from ucfrec.acting.scorer import Scorer
+from ucfrec.acting.sessions import History
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.episodes.exposure import Shown
+from ucfrec.episodes.ids import IdLookup
 from ucfrec.episodes.states import ItemStates, SessionStates
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
@@ -26,7 +28,7 @@ class PolicyActor:
 
     def __init__(
         self,
-        decider: Decider,
+        scorer: Scorer,
         episodes: int,
         observation_size: int,
         item_states: ItemStates | None = None,
@@ -37,7 +39,7 @@ class PolicyActor:
     ) -> None:
         """
         Args:
-            decider: the policy and its decision rule.
+            scorer: the policy under its decision rule.
             episodes: N, number of episodes played in parallel.
             observation_size: leading entries of the environment's observation that the logs
                 contain, less those in `dropped`; 0 ignores the observation.
@@ -49,23 +51,23 @@ class PolicyActor:
             seed: of the draws of a rule with a temperature.
             dropped: entries before those that the policy does not see.
         """
-        policy = decider.policy
+        policy = scorer.policy
         n, k = episodes, policy.config.context
-        self._decider, self._policy = decider, policy
+        self._scorer, self._policy = scorer, policy
         self._generator = torch.Generator().manual_seed(seed)
         places = np.arange(observation_size + len(dropped))
         self._observed = torch.from_numpy(np.setdiff1d(places, dropped)[:observation_size])
         self._item_ids = item_ids
         kept = item_states is not None and len(item_states.user_features) > 0
         known = kept and user_ids is not None and user_ids.dtype.kind in "iu"
-        self._user_ids = user_ids if known else None
+        self._user_ids = IdLookup(user_ids) if known and user_ids is not None else None
         self._absent = None if item_ids is None else torch.from_numpy(item_ids < 0)
         self._forbidden: Tensor | None = None
         self._sessions = None
         if item_states is not None:
-            self._sessions = SessionStates(item_states, n, decider.reach)
+            self._sessions = SessionStates(item_states, n, scorer.reach)
         self._shown: Tensor | None = None
-        if isinstance(policy.head, ItemHead) and decider.rule.exclude_seen:
+        if isinstance(policy.head, ItemHead) and scorer.rule.exclude_seen:
             self._shown = torch.zeros(n, len(policy.head.bias), dtype=torch.bool)
         self._actions = (
             torch.zeros(n, k, dtype=torch.int64)
@@ -74,13 +76,11 @@ class PolicyActor:
         )
         self._states = torch.zeros(n, k, len(policy.state_mean))
         self._rewards = torch.zeros(n, k)
-        self._mask = torch.zeros(n, k, dtype=torch.bool)
         self._steps = torch.zeros(n, dtype=torch.int64)
         self._reward_sums = torch.zeros(n, dtype=torch.float64)
 
     def begin(self, rows: IntArray) -> None:
         """Start a new episode in each of `rows`, (M,) environment indices from 0 to N − 1."""
-        self._mask[rows] = False
         self._steps[rows] = 0
         self._reward_sums[rows] = 0.0
         if self._sessions is not None:
@@ -94,7 +94,7 @@ class PolicyActor:
             self._sessions.keep(rows)
         if self._shown is not None:
             self._shown = self._shown[rows]
-        for name in ("_actions", "_states", "_rewards", "_mask", "_steps", "_reward_sums"):
+        for name in ("_actions", "_states", "_rewards", "_steps", "_reward_sums"):
             setattr(self, name, getattr(self, name)[rows])
 
     def inform(self, info: Mapping[str, Any]) -> None:
@@ -105,8 +105,7 @@ class PolicyActor:
         """
         users, known = info.get(USER_IDS), self._user_ids
         if users is not None and self._sessions is not None and known is not None:
-            at = np.minimum(np.searchsorted(known, users), len(known) - 1)
-            self._sessions.users = torch.from_numpy(np.where(known[at] == users, at, -1))
+            self._sessions.users = torch.from_numpy(known.numbers(users))
         forbidden = info.get(FORBIDDEN)
         self._forbidden = None if forbidden is None else self._in_store(forbidden)
 
@@ -128,31 +127,24 @@ class PolicyActor:
         observed = torch.as_tensor(observations, dtype=torch.float32)[:, self._observed]
         states = observed if self._sessions is None else self._sessions.current(observed)
         self._states = _appended(self._states, states)
-        self._mask = _appended(self._mask, torch.ones_like(self._mask[:, 0]))
         self._actions = _appended(self._actions, torch.zeros_like(self._actions[:, 0]))
         self._rewards = _appended(self._rewards, torch.zeros_like(self._rewards[:, 0]))
         rows = torch.from_numpy(np.flatnonzero(live))
         if isinstance(self._policy.head, ItemHead):
             return self._items(rows)
-        predicted = self._decider.act(self._windows(rows), self._reward_sums[rows])
-        self._actions[rows, -1] = predicted
+        self._actions[rows, -1] = self._scorer.act(self._history(rows))
         self._actions[torch.from_numpy(~live), -1] = 0.0
         return self._actions[:, -1].numpy(), None
 
     def _items(self, rows: Tensor) -> tuple[Array, Float32Array]:
         """The environment's items (N,) and their probabilities (N,); live are the `rows`."""
         forbidden = self._left_out()
-        chances = torch.ones(len(self._mask))
+        chances = torch.ones(len(self._steps))
         # The environment steps rows that are not live too, so they also need an allowed action.
         allowed = None if forbidden is None else (~forbidden).int().argmax(1)
         actions = torch.zeros_like(self._actions[:, -1]) if allowed is None else allowed
-        users = shown = None
-        if self._sessions is not None:
-            users, shown = self._sessions.users[rows], Shown(*self._sessions.shown).at(rows)
         of_rows = None if forbidden is None else forbidden[rows]
-        windows, sums = self._windows(rows), self._reward_sums[rows]
-        decided = self._decided(rows, windows, sums, of_rows, users, shown)
-        actions[rows], chances[rows] = decided
+        actions[rows], chances[rows] = self._decided(rows, self._history(rows), of_rows)
         self._actions[:, -1] = actions
         if self._shown is not None:
             self._shown[rows, actions[rows]] = True
@@ -161,11 +153,11 @@ class PolicyActor:
         return indices, chances.numpy().astype(np.float32)
 
     def _decided(
-        self, rows: Tensor, windows: Windows, collected: Tensor, *given: Any
+        self, rows: Tensor, history: History, excluded: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Items and their probabilities, (M,) each, of the `rows` (M,); see `Decider.scores`."""
-        scores = self._decider.scores(windows, collected, *given)
-        return self._decider.rule.choose(scores, self._generator)
+        """Items and their probabilities, (M,) each, of the `rows` (M,); see `Scorer.scores`."""
+        scores = self._scorer.scores(history, excluded=excluded)
+        return self._scorer.rule.choose(scores, self._generator)
 
     def observe(self, actions: Array, rewards: Float32Array) -> None:
         """Subtract the rewards (N,) from the returns-to-go and advance by one step.
@@ -182,7 +174,7 @@ class PolicyActor:
     def _left_out(self) -> Tensor | None:
         """(N, n_items) items that the environment lacks or forbids, or that were shown; None for
         none."""
-        n, n_items = len(self._mask), len(self._policy.head.bias)  # type: ignore[arg-type]
+        n, n_items = len(self._steps), len(self._policy.head.bias)  # type: ignore[arg-type]
         parts = [] if self._absent is None else [self._absent.expand(n, n_items)]
         parts += [] if self._shown is None else [self._shown]
         if self._forbidden is not None:
@@ -205,20 +197,20 @@ class PolicyActor:
         numbers[-1] = len(ids)
         return torch.from_numpy(numbers[items])
 
-    def _windows(self, rows: Tensor) -> Windows:
-        mask = self._mask[rows]
-        k = mask.shape[1]
-        steps = self._steps[rows].unsqueeze(1) + torch.arange(1 - k, 1)
-        actions = self._actions[rows]
-        keep = mask if actions.ndim == 2 else mask.unsqueeze(-1)
-        return Windows(
-            states=self._states[rows].masked_fill(~mask.unsqueeze(-1), 0.0),
-            actions=actions.masked_fill(~keep, 0),
-            rewards=self._rewards[rows].masked_fill(~mask, 0.0),
-            returns_to_go=torch.zeros(mask.shape),
-            timesteps=steps.clamp(min=0),
-            mask=mask,
+    def _history(self, rows: Tensor) -> History:
+        """What is known in the `rows` (M,)."""
+        k, steps = self._states.shape[1], self._steps[rows]
+        users = torch.full_like(steps, -1)
+        shown = Shown(users.new_zeros(len(rows), 0), torch.zeros(len(rows), 0))
+        if self._sessions is not None:
+            users, shown = self._sessions.users[rows], Shown(*self._sessions.shown).at(rows)
+            # No policy's outputs depend on how much padding is before a session.
+            k = min(k, int(steps.max()) + 1)
+        windows = Windows.of(
+            steps.unsqueeze(1) + torch.arange(1 - k, 1),
+            *(each[rows, -k:] for each in (self._states, self._actions, self._rewards)),
         )
+        return History(windows, self._reward_sums[rows], users, shown)
 
 
 def _appended(history: Tensor, latest: Tensor) -> Tensor:

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.acting.decision import Decider, DecisionRule
-from ucfrec.acting.logged_decisions import LoggedDecisions
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.scorer import Scorer, logged_history
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.choosing.choice import RankedRule, RuleChoice
 from ucfrec.choosing.config import RuleConfig
@@ -33,9 +33,9 @@ _AT_ONCE = 256
 
 
 def choose_by_ranking(
-    decider: Decider, train: EpisodeStore, validation: EpisodeStore, config: RuleConfig, seed: int
+    scorer: Scorer, train: EpisodeStore, validation: EpisodeStore, config: RuleConfig, seed: int
 ) -> RuleChoice:
-    """Choose the reward weight of the rule of `decider`; its other parts stay.
+    """Choose the reward weight of the rule of `scorer`; its other parts stay.
 
     Of those with enough overlap, the one with the highest rate is chosen; without any, none. If
     the next larger of the candidates overlaps too little, reward weights between the two are tried.
@@ -46,8 +46,8 @@ def choose_by_ranking(
     candidates: list[RankedRule] = []
 
     def rank(weights: Sequence[float]) -> RankedRule:
-        for weight, top in zip(weights, _tops(decider, weights, rows), strict=True):
-            rule = replace(decider.rule, reward_weight=weight)
+        for weight, top in zip(weights, _tops(scorer, weights, rows), strict=True):
+            rule = replace(scorer.rule, reward_weight=weight)
             candidates.append(_ranked(rule, top, rows))
         allowed = [each for each in candidates if each.gain >= 0]
         return max(allowed, key=lambda each: each.item_rate) if allowed else candidates[0]
@@ -105,26 +105,23 @@ class _Rows:
 
 
 @torch.no_grad()
-def _tops(decider: Decider, reward_weights: Sequence[float], rows: _Rows) -> list[IntArray]:
+def _tops(scorer: Scorer, reward_weights: Sequence[float], rows: _Rows) -> list[IntArray]:
     """The items (M, `SHOWN`) that are shown with each reward weight.
 
     Policy and reward model are computed once for all reward weights.
     """
-    plain = replace(decider, rule=replace(decider.rule, reward_weight=0.0))
+    scorers = [scorer.under(replace(scorer.rule, reward_weight=each)) for each in reward_weights]
     tops = list[list[Tensor]]()
     with progress(len(rows.steps), "choose the rule", "rows") as bar:
         for first in range(0, len(rows.steps), _AT_ONCE):
             part = slice(first, first + _AT_ONCE)
-            known = LoggedDecisions.at(plain, rows.store, rows.episodes[part], rows.steps[part])
-            windows, of_users = known.windows, (known.users, known.shown)
-            logits = plain.act(windows, known.collected)
-            rewards = plain.rewards(windows, *of_users) if any(reward_weights) else 0.0
-            weighted = (logits + weight * rewards for weight in reward_weights)
-            scores = (
-                plain.scores_from(each, windows, known.forbidden, *of_users) for each in weighted
-            )
+            episodes, steps = rows.episodes[part], rows.steps[part]
+            known, seen = logged_history(scorer, rows.store, episodes, steps)
+            history = scorer.with_target(known)
+            query = scorer.query(history, rewards=any(reward_weights))
+            scores = (each.scores_of(query, history, excluded=seen) for each in scorers)
             tops.append([each.topk(min(SHOWN, each.shape[1])).indices for each in scores])
-            bar.update(len(logits))
+            bar.update(len(steps))
     return [torch.cat(parts).numpy() for parts in zip(*tops, strict=True)]
 
 

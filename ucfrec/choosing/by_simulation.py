@@ -13,7 +13,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from ucfrec.acting.decision import Decider, DecisionRule
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.choosing.choice import RuleChoice, SimulatedRule
 from ucfrec.choosing.config import RuleConfig
@@ -34,7 +35,7 @@ class RuleSearch:
 
     def __init__(
         self,
-        decider: Decider,
+        scorer: Scorer,
         users: UserModel,
         train: EpisodeStore,
         validation: EpisodeStore,
@@ -43,7 +44,7 @@ class RuleSearch:
     ) -> None:
         """
         Args:
-            decider: the policy under its default rule, with the reward model of `users`.
+            scorer: the policy under its default rule, with the reward model of `users`.
             users: the user model; where it has training users, their sessions are begun, otherwise
                 validation sessions.
             train: training episodes.
@@ -52,7 +53,7 @@ class RuleSearch:
             seed: of the sessions and the draws.
         """
         self.users, self._config, self._seed = users, config, seed
-        self._decider = replace(decider, likeness=users.reward.likeness, main_tags=users.main_tags)
+        self._scorer = scorer
         self._store = validation if users.training_users is None else sessions_of(train, seed)
         self._longest = int(train.lengths.max())
         self._supported = train.item_counts() >= config.least_impressions
@@ -71,9 +72,9 @@ class RuleSearch:
         simulator = UserSimulator(
             self.users, self._store, n, self._longest, self._seed, times=len(rules)
         )
-        deciders = [replace(self._decider, rule=rule) for rule in rules]
+        scorers = [self._scorer.under(rule) for rule in rules]
         states, size = self._store.item_states, self._store.observation_size
-        returns, lengths, shown = roll_out(simulator, deciders, n, states, size, self._seed)
+        returns, lengths, shown = roll_out(simulator, scorers, n, states, size, self._seed)
         numbers = np.arange(len(returns)).reshape(len(rules), n)
         return [
             self._simulated(rule, returns[own], lengths[own], shown[shown[:, 0] // n == i, 1])
@@ -123,7 +124,7 @@ class RuleSearch:
 
 
 def choose_by_simulation(
-    decider: Decider,
+    scorer: Scorer,
     users: UserModel,
     targets: Mapping[float, float],
     train: EpisodeStore,
@@ -139,14 +140,14 @@ def choose_by_simulation(
     the model cannot tell apart, the one at the highest temperature is taken, which stays nearest to
     the log. The arguments are those of `choose_rule`.
     """
-    search = RuleSearch(decider, users, train, validation, config, seed)
-    learned = decider.policy.values is not None and bool(decider.policy.config.max_return)
+    search = RuleSearch(scorer, users, train, validation, config, seed)
+    learned = scorer.policy.values is not None and bool(scorer.policy.config.max_return)
     tried = search.simulate([*_unweighted(config, targets, learned)])
     first = search.best(tried).rule
     tried += search.simulate([*_variants(first, reward_weight=config.reward_weights)])
     second = search.best(tried).rule
     if validation.item_states.tags.shape[1]:
-        tried += _with_tag_window(search, second, config, decider.known)
+        tried += _with_tag_window(search, second, config, scorer.known)
         # Without a tag window, which may only have served to tire no one.
         tried += _with_tag_run(search, second, config)
     best = search.best(tried)
@@ -202,7 +203,7 @@ def _unweighted(
     for temperature in sorted(config.temperatures, reverse=True):
         for target in dict.fromkeys(targets[quantile] for quantile in config.quantiles):
             yield DecisionRule(target, temperature=temperature)
-            yield DecisionRule(target, floor=target, temperature=temperature)
+            yield DecisionRule(target, minimum_target=target, temperature=temperature)
         if learned:
             yield DecisionRule(None, temperature=temperature)
 

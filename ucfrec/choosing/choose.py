@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from ucfrec.acting.decision import Decider
+from ucfrec.acting.scorer import Scorer
 from ucfrec.choosing.by_ranking import choose_by_ranking
 from ucfrec.choosing.by_simulation import choose_by_simulation
 from ucfrec.choosing.choice import RuleChoice
@@ -12,7 +12,7 @@ from ucfrec.user_model.model import UserModel
 
 
 def choose_rule(
-    decider: Decider,
+    scorer: Scorer,
     users: UserModel,
     targets: Mapping[float, float],
     train: EpisodeStore,
@@ -23,7 +23,7 @@ def choose_rule(
     """Choose the rule of a policy: in simulated sessions, or where the log has none, by ranking.
 
     Args:
-        decider: the policy under its default rule, with the reward model of `users`.
+        scorer: the policy under its default rule, with the reward model of `users`.
         users: the user model.
         targets: return (reward units) of each quantile in `config.quantiles`.
         train: training episodes.
@@ -31,6 +31,6 @@ def choose_rule(
         config: candidates and conditions.
         seed: of everything random.
     """
-    if decider.returns.per_session:
-        return choose_by_simulation(decider, users, targets, train, validation, config, seed)
-    return choose_by_ranking(decider, train, validation, config, seed)
+    if scorer.returns.per_session:
+        return choose_by_simulation(scorer, users, targets, train, validation, config, seed)
+    return choose_by_ranking(scorer, train, validation, config, seed)

@@ -30,7 +30,7 @@ class RuleConfig:
     """Number of steps whose tags the default rule leaves out."""
     quantiles: Annotated[tuple[Share, ...], _SOME] = (0.9, 1.0)
     """Candidates for the target, as quantiles of the training returns; each with and without a
-    floor at the same value."""
+    minimum target at the same value."""
     temperatures: Annotated[tuple[_Temperature, ...], _SOME] = (0.0, 0.5, 1.0)
     """Candidates for the temperature."""
     reward_weights: Annotated[tuple[_RewardWeight, ...], _SOME] = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)

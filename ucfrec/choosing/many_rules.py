@@ -1,15 +1,16 @@
 """Several decision rules of one policy, rolled out side by side."""
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
-from typing import Any, Final
+from dataclasses import replace
+from typing import Final
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ucfrec.acting.decision import Decider
 from ucfrec.acting.policy_actor import PolicyActor
+from ucfrec.acting.scorer import Scorer
+from ucfrec.acting.sessions import History
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Windows
@@ -23,7 +24,7 @@ _ROWS_AT_ONCE: Final = 256
 
 def roll_out(
     simulator: UserSimulator,
-    deciders: Sequence[Decider],
+    scorers: Sequence[Scorer],
     sessions: int,
     states: ItemStates,
     observation_size: int,
@@ -33,7 +34,7 @@ def roll_out(
 
     Args:
         simulator: of C · n sessions that have just begun; those from c · n on follow rule c.
-        deciders: C; none leaves out seen items.
+        scorers: C; none leaves out seen items.
         sessions: n, number of sessions of each rule.
         states: builds states from items.
         observation_size: of the simulator's observations.
@@ -42,8 +43,8 @@ def roll_out(
     Returns:
         Returns (C · n,), lengths (C · n,), and the session and item of every step, (M, 2).
     """
-    actor = _ManyRules(deciders, sessions, states, observation_size, seed)
-    live = np.arange(len(deciders) * sessions)
+    actor = _ManyRules(scorers, sessions, states, observation_size, seed)
+    live = np.arange(len(scorers) * sessions)
     returns, lengths = np.zeros(len(live)), np.zeros(len(live), dtype=np.int64)
     shown = list[IntArray]()
     with progress(len(live), "choose the rule", "sessions") as bar:
@@ -70,43 +71,41 @@ class _ManyRules(PolicyActor):
 
     def __init__(
         self,
-        deciders: Sequence[Decider],
+        scorers: Sequence[Scorer],
         sessions: int,
         states: ItemStates,
         observation_size: int,
         seed: int,
     ) -> None:
-        users, rows = np.arange(len(states.user_features)), len(deciders) * sessions
-        super().__init__(deciders[0], rows, observation_size, states, None, users, seed)
-        self._deciders = deciders
-        self._generators = [torch.Generator().manual_seed(seed) for _ in deciders]
-        self._rule = np.repeat(np.arange(len(deciders)), sessions)
+        users, rows = np.arange(len(states.user_features)), len(scorers) * sessions
+        super().__init__(scorers[0], rows, observation_size, states, None, users, seed)
+        self._scorers = scorers
+        self._generators = [torch.Generator().manual_seed(seed) for _ in scorers]
+        self._rule = np.repeat(np.arange(len(scorers)), sessions)
 
     def keep(self, rows: IntArray) -> None:
         super().keep(rows)
         self._rule = self._rule[rows]
 
     def _decided(
-        self, rows: Tensor, windows: Windows, collected: Tensor, *given: Any
+        self, rows: Tensor, history: History, excluded: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         decided = []
         for batch in _batches(self._rule[rows.numpy()]):
-            asked = [
-                self._deciders[rule].asked(_at(windows, part), collected[part])
-                for rule, part in batch
+            parts = [history.at(part) for _, part in batch]
+            aimed = [
+                self._scorers[rule].with_target(known).windows
+                for (rule, _), known in zip(batch, parts, strict=True)
             ]
-            logits = self._policy.act(_joined(asked).to(self._policy.state_mean.device)).cpu()
-            of_rules = torch.split(logits, [len(each.mask) for each in asked])
-            for (rule, part), window, values in zip(batch, asked, of_rules, strict=True):
-                decider, (forbidden, users, shown) = self._deciders[rule], given
-                scores = decider.scores_from(
-                    values,
-                    window,
-                    None if forbidden is None else forbidden[part],
-                    None if users is None else users[part],
-                    None if shown is None else shown.at(part),
-                )
-                decided.append(decider.rule.choose(scores, self._generators[rule]))
+            begin, end = batch[0][1].start, batch[-1][1].stop
+            together = replace(history.at(slice(begin, end)), windows=Windows.joined(aimed))
+            weighted = any(self._scorers[rule].rule.reward_weight for rule, _ in batch)
+            query = self._scorer.query(together, rewards=weighted)
+            for (rule, part), known in zip(batch, parts, strict=True):
+                scorer, own = self._scorers[rule], slice(part.start - begin, part.stop - begin)
+                of_rule = None if excluded is None else excluded[part]
+                scores = scorer.scores_of(query.at(own), known, excluded=of_rule)
+                decided.append(scorer.rule.choose(scores, self._generators[rule]))
         items, chances = zip(*decided, strict=True)
         return torch.cat(items), torch.cat(chances)
 
@@ -126,14 +125,3 @@ def _batches(rules: IntArray) -> list[list[tuple[int, slice]]]:
         batches[-1].append((int(rule), slice(int(begin), int(end))))
         size += int(end - begin)
     return batches
-
-
-def _at(windows: Windows, rows: slice) -> Windows:
-    columns = {each.name: getattr(windows, each.name)[rows] for each in fields(windows)}
-    return replace(windows, **columns)
-
-
-def _joined(parts: Sequence[Windows]) -> Windows:
-    return Windows(
-        *(torch.cat([getattr(part, each.name) for part in parts]) for each in fields(Windows))
-    )

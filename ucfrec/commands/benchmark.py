@@ -3,17 +3,18 @@
 import argparse
 import os
 
+from ucfrec.benchmark.grid import chosen
+from ucfrec.benchmark.suite import Benchmark, BenchmarkRequest, measure, show
 from ucfrec.commands.grid_options import (
-    evaluation_seed_option,
+    budget_options,
     grid_options,
     results_given,
     rows_explained,
     rows_given,
 )
 from ucfrec.commands.options import env_options, environment_given
-from ucfrec.plugins import Benchmark, BenchmarkRequest, load_plugin
-from ucfrec.reporting.grid import chosen
-from ucfrec.reporting.rows_file import benchmarking
+from ucfrec.plugins import load_plugin
+from ucfrec.results.rows_file import benchmarking
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -25,29 +26,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "ucfrec.benchmarks)",
     )
     parser.add_argument(
-        "--budget",
-        choices=["small", "full"],
-        default="small",
-        help="small (for two CPU cores) or full (larger logs, more seeds and training steps) "
-        "(default: small)",
-    )
-    parser.add_argument(
         "--table",
         action="append",
         default=[],
         help="measure and print only this table; repeatable (default: all tables)",
     )
-    for name in ("task", "method"):
-        parser.add_argument(
-            f"--{name}",
-            action="append",
-            default=[],
-            metavar="NAME",
-            help=f"measure only this {name}; repeatable (default: all {name}s)",
-        )
-    parser.add_argument(
-        "--training-seeds", type=int, metavar="N", help="training seeds (default: set by --budget)"
-    )
+    budget_options(parser)
     parser.add_argument(
         "--logs",
         type=int,
@@ -61,7 +45,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         default=0,
         help="seed of the first simulated log; the others have the seeds after it (default: 0)",
     )
-    evaluation_seed_option(parser)
     env_options(
         parser,
         required=False,
@@ -77,7 +60,7 @@ def run(options: argparse.Namespace) -> None:
     tables, results = chosen(suite.tables, options.table, "table"), results_given(options)
     if options.show_only:
         with rows_explained(options):
-            print(suite.show(tables, rows_given(options, options.suite, tables)))
+            print(show(suite, tables, rows_given(options, options.suite, tables)))
         return
     request = BenchmarkRequest(
         budget=options.budget,
@@ -89,10 +72,11 @@ def run(options: argparse.Namespace) -> None:
         logs=options.logs,
         evaluation_seed=options.evaluation_seed,
         environment=environment_given(options) if options.env else None,
-        tasks=options.task,
-        methods=options.method,
+        tasks=options.tasks,
+        methods=options.methods,
         training_seeds=options.training_seeds,
+        again=options.again,
     )
     with benchmarking(results):
-        print(suite.run(request))
+        print(measure(suite, request))
     print(f"\nrows: {results}")

@@ -1,20 +1,22 @@
 """What the commands add to the model cards of the runs that they measure."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ucfrec.off_policy.evaluate import OffPolicyReport
+    from ucfrec.results.row import ResultRow
 
 
-def card_of_evaluation(run: Path, row: Mapping[str, Any]) -> None:
+def card_of_evaluation(run: Path, row: "ResultRow") -> None:
     """Add a row of `ucfrec evaluate` to the card of its run."""
     from ucfrec.reporting.model_card import add_measurement
 
-    names = ("R_cum", "R_avg_pooled", "length", "episodes", "coverage", "diversity", "seed")
-    of = f"{row['environment']}, {_rule(row)}, checkpoint {row['checkpoint']}"
-    add_measurement(run, "ucfrec evaluate", of, _values(row, "R_cum", names))
+    names = ("R_cum", "R_avg_pooled", "length", "episodes", "coverage", "diversity")
+    of = f"{row.environment}, {_rule(row)}, checkpoint {row.checkpoint}"
+    values = {**_values(row, "R_cum", names), "seed": row.evaluation_seed}
+    add_measurement(run, "ucfrec evaluate", of, values)
 
 
 def card_of_estimates(run: Path, logs: Iterable[str], report: "OffPolicyReport") -> None:
@@ -23,44 +25,47 @@ def card_of_estimates(run: Path, logs: Iterable[str], report: "OffPolicyReport")
     from ucfrec.provenance import without_folders
     from ucfrec.reporting.model_card import add_measurement
 
-    rows = {row["estimator"]: row for row in report.rows}
+    rows = {row.method: row for row in report.rows}
     row = rows.get(report.verdict.estimator or LOGGED, rows[LOGGED])
     names = ("R_cum", "effective_sessions", "sessions", "lift", "probability_better", "overlap")
     files = ", ".join(map(without_folders, logs))
-    of = f"{row['estimator']} on {files}, {_rule(row)}"
-    of += ", pages" if row["pages"] else ""
-    of += f", discount {row['discount']:g}" if row["discount"] != 1 else ""
-    values = _values(row, "R_cum", names) | {"logged": rows[LOGGED]["R_cum"]}
+    of = f"{row.method} on {files}, {_rule(row)}"
+    of += ", pages" if row.conditions["pages"] else ""
+    discount = row.conditions["discount"]
+    of += f", discount {discount:g}" if discount != 1 else ""
+    values = _values(row, "R_cum", names) | {"logged": rows[LOGGED].value}
     said = (str(report.verdict), *(w for w in report.warnings if w not in report.verdict.reasons))
     add_measurement(run, "ucfrec ope", of, values, said)
 
 
 def card_of_ranking(
-    run: Path, row: Mapping[str, Any], measures: Iterable[str], on: str, said: Sequence[str] = ()
+    run: Path, row: "ResultRow", measures: Iterable[str], on: str, said: Sequence[str] = ()
 ) -> None:
     """Add a row of `ucfrec rank` on the logs `on`, and its warnings, to the card of its run."""
     from ucfrec.reporting.model_card import add_measurement
 
+    intervals = row.details["intervals"]
     values: dict[str, object] = {}
     for name in (*measures, "coverage"):
-        values[name] = row.get(name)
-        if values[name] is not None and (interval := row.get(f"{name}_interval")) is not None:
-            low, high = interval
-            values[name] = f"{row[name]:.4g} [{low:.4g}, {high:.4g}]"
-    of = f"{on}, {_rule(row)}, k {row['k']}, checkpoint {row['checkpoint']}"
+        values[name] = row.metrics.get(name)
+        if name in row.metrics and name in intervals:
+            low, high = intervals[name]
+            values[name] = f"{row.metrics[name]:.4g} [{low:.4g}, {high:.4g}]"
+    of = f"{on}, {_rule(row)}, k {row.conditions['k']}, checkpoint {row.checkpoint}"
     add_measurement(run, "ucfrec rank", of, values, said)
 
 
-def _rule(row: Mapping[str, Any]) -> str:
+def _rule(row: "ResultRow") -> str:
     from ucfrec.acting.decision import DecisionRule
 
-    return str(DecisionRule.from_dict(row["decision_rule"], "a result row"))
+    return str(DecisionRule.from_dict(row.details["decision_rule"], "a result row"))
 
 
-def _values(row: Mapping[str, Any], main: str, names: Iterable[str]) -> dict[str, object]:
+def _values(row: "ResultRow", main: str, names: Iterable[str]) -> dict[str, object]:
     """The named values, `main` with its interval."""
-    found = {name: row[name] for name in names if row.get(name) is not None}
-    low, high = row.get(f"{main}_low"), row.get(f"{main}_high")
-    if main in found and low is not None and high is not None:
+    line = row.as_line()
+    found = {name: line[name] for name in names if line.get(name) is not None}
+    if row.interval is not None and main in found:
+        low, high = row.interval
         found[main] = f"{found[main]:.4g} [{low:.4g}, {high:.4g}]"
     return found

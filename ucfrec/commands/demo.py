@@ -5,12 +5,15 @@ import argparse
 import os
 from collections.abc import Sequence
 from concurrent.futures import as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from ucfrec.processes import pool_of_processes, without_ctrl_c
 from ucfrec.progress import progress
+
+if TYPE_CHECKING:
+    from ucfrec.results.row import ResultRow
 
 ENVIRONMENTS = ("synthetic-taobao", "synthetic-catalog")
 LEARNERS: dict[str, tuple[str, ...]] = {
@@ -59,15 +62,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec demo` and print its result table."""
     from ucfrec.files.locks import claimed, remove_leftovers
-    from ucfrec.reporting.tables import format_rows
+    from ucfrec.reporting.tables import evaluation_table
 
     with claimed(options.out, "filled"):
         remove_leftovers(options.out.parent)
-        print(format_rows(demo(options.out, options.seed, DemoConfig())))
+        print(evaluation_table(demo(options.out, options.seed, DemoConfig())))
     print(f"\nreport: {options.out / 'report.html'}; its folder has results, logs and runs")
 
 
-def demo(out: Path, seed: int, config: DemoConfig) -> list[dict[str, Any]]:
+def demo(out: Path, seed: int, config: DemoConfig) -> "list[ResultRow]":
     """Run the demo in the folder `out`; an interrupted demo that is run again resumes.
 
     Writes `out/results.json`, `out/report.html` and, in `out/<environment>`, the logs, store and
@@ -76,13 +79,13 @@ def demo(out: Path, seed: int, config: DemoConfig) -> list[dict[str, Any]]:
 
     Returns:
         The rows of `out/results.json`: one per environment and policy, environments in the order
-        of `WORLDS`.
+        of `ENVIRONMENTS`.
     """
     from ucfrec.evaluation.environment import Environment
     from ucfrec.evaluation.evaluate import evaluate_behavior
     from ucfrec.evaluation.simulated_store import simulated_store
-    from ucfrec.files.atomic import write_json
     from ucfrec.reporting.page import write_report
+    from ucfrec.results.rows_file import write_results
 
     for environment in ENVIRONMENTS:
         simulated_store(Environment(environment), out / environment, config.sessions, seed)
@@ -106,17 +109,17 @@ def demo(out: Path, seed: int, config: DemoConfig) -> list[dict[str, Any]]:
             row = evaluate_behavior(
                 Environment(environment), behavior, config.episodes, EVALUATION_SEED + seed
             )
-            learned[environment, name] = row | {"policy": name}
+            learned[environment, name] = replace(row, method=name)
         order = ("random", "logging", *LEARNERS, "optimal")
         rows += [learned[environment, name] for name in order]
-    write_json(out / "results.json", rows)
+    write_results(out / "results.json", rows)
     runs = [out / environment / name for environment in ENVIRONMENTS for name in LEARNERS]
     items = out / "synthetic-catalog" / "logs" / "items.parquet"
     write_report(out / "report.html", runs, [out / "results.json"], items)
     return rows
 
 
-def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> dict[str, Any]:
+def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> "ResultRow":
     """Train and evaluate the learner `name` in the environment `folder.name`, in a worker
     process."""
     import torch

@@ -1,6 +1,7 @@
 """`ucfrec evaluate`: measure the return of policies in a simulated environment."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from ucfrec.commands.cards import card_of_evaluation
@@ -35,9 +36,9 @@ def run(options: argparse.Namespace) -> None:
         InputError: neither a run nor a built-in policy is named, or one of them cannot be used.
     """
     from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
-    from ucfrec.files.atomic import write_json
     from ucfrec.provenance import without_folders
-    from ucfrec.reporting.tables import format_rows
+    from ucfrec.reporting.tables import evaluation_table
+    from ucfrec.results.rows_file import write_results
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     environment = environment_given(options)
@@ -50,12 +51,13 @@ def run(options: argparse.Namespace) -> None:
         row = evaluate_policy(
             environment, trained, trained.name, options.episodes, options.seed, rule
         )
-        rows.append(row | {"run": without_folders(str(run)), "checkpoint": options.checkpoint})
+        conditions = {**row.conditions, "run": without_folders(str(run))}
+        rows.append(replace(row, conditions=conditions, checkpoint=options.checkpoint))
         card_of_evaluation(run, rows[-1])
     rows += [
         evaluate_behavior(environment, behavior, options.episodes, options.seed)
         for behavior in options.behavior
     ]
-    print(format_rows(rows))
+    print(evaluation_table(rows))
     if options.json is not None:
-        write_json(options.json, rows)
+        write_results(options.json, rows)

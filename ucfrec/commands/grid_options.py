@@ -1,17 +1,20 @@
 """Options shared by the benchmark commands of `ucfrec` and `ucfrec-control`."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
+from ucfrec.benchmark.cells import Cell
+from ucfrec.benchmark.estimate import Costs, announcement
+from ucfrec.benchmark.grid import Measurement, run_grid
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.reporting.result_row import ResultRow
-from ucfrec.reporting.rows_file import latest, read_rows
+from ucfrec.results.row import ResultRow
+from ucfrec.results.rows_file import benchmarking, latest, read_rows
 
 
 def grid_options(parser: argparse.ArgumentParser, out: str, workers: int) -> None:
-    """Add --out, --results, --workers and --show-only.
+    """Add --out, --results, --workers, --again and --show-only.
 
     Args:
         out: default of --out.
@@ -37,9 +40,56 @@ def grid_options(parser: argparse.ArgumentParser, out: str, workers: int) -> Non
         help=f"parallel processes, one thread each (default: {workers})",
     )
     parser.add_argument(
+        "--again",
+        action="store_true",
+        help="remove the rows and runs of the chosen cells first; resume without it",
+    )
+    parser.add_argument(
         "--show-only",
         action="store_true",
         help="print the tables from the rows in --results without measuring anything",
+    )
+
+
+def budget_options(
+    parser: argparse.ArgumentParser, task: str = "--task", seeds: str = "--training-seeds"
+) -> None:
+    """Add the options that select what a benchmark measures, and how much of it.
+
+    Args:
+        task: name of the option for tasks, kept as `tasks`.
+        seeds: name of the option for the number of training seeds, kept as `training_seeds`.
+    """
+    parser.add_argument(
+        "--budget",
+        choices=["small", "full"],
+        default="small",
+        help="small (for two CPU cores) or full (larger logs, more seeds and training steps) "
+        "(default: small)",
+    )
+    for name, kept in ((task, "tasks"), ("--method", "methods")):
+        parser.add_argument(
+            name,
+            dest=kept,
+            action="append",
+            default=[],
+            metavar="NAME",
+            help=f"measure only this {name.removeprefix('--')}; repeatable (default: all of the "
+            "budget)",
+        )
+    parser.add_argument(
+        seeds,
+        dest="training_seeds",
+        type=int,
+        metavar="N",
+        help="training seeds of every method, from 0 (default: set by --budget)",
+    )
+    parser.add_argument(
+        "--evaluation-seed",
+        type=seed_given,
+        metavar="SEED",
+        help="seed of the evaluated episodes, the same for every training seed (default: set by "
+        "--budget)",
     )
 
 
@@ -52,17 +102,6 @@ def seed_given(text: str) -> int:
     if not text.isdecimal() or len(text) > 10 or int(text) >= 2**32:
         raise argparse.ArgumentTypeError(f"{text:.40} is no whole number from 0 to {2**32 - 1}")
     return int(text)
-
-
-def evaluation_seed_option(parser: argparse.ArgumentParser) -> None:
-    """Add --evaluation-seed."""
-    parser.add_argument(
-        "--evaluation-seed",
-        type=seed_given,
-        metavar="SEED",
-        help="seed of the evaluated episodes, the same for every training seed (default: set by "
-        "--budget)",
-    )
 
 
 def results_given(options: argparse.Namespace) -> Path:
@@ -98,3 +137,37 @@ def rows_given(
         return rows
     wanted = ", ".join([suite, *tables])
     raise InputError(f"{path} has no rows of {wanted}; name a file that has them with --results")
+
+
+def rows_of(
+    options: argparse.Namespace,
+    suite: str,
+    tables: Sequence[str],
+    cells: Callable[[], Iterable[Cell]],
+    how: Measurement[Cell],
+    costs: Callable[[], Costs] | None = None,
+    describe: str = "",
+) -> list[ResultRow]:
+    """The rows that a command shows: with --show-only those of --results, else those of `cells`,
+    which are measured where they have none.
+
+    Args:
+        options: of `grid_options`.
+        suite: suite of the rows.
+        tables: tables of the suite; empty for all.
+        cells: lists what to measure; writes the stores that it needs.
+        how: how cells are measured.
+        costs: for the announcement of how long it takes; None for none.
+        describe: name of the benchmark in progress output; "" for `suite`.
+
+    Raises:
+        InputError: as `rows_given`, as `cells`, or as `run_grid`.
+    """
+    if options.show_only:
+        return rows_given(options, suite, tables)
+    results = results_given(options)
+    with benchmarking(results):
+        announce = None if costs is None else announcement(costs(), options.workers)
+        return run_grid(
+            list(cells()), how, results, options.workers, describe or suite, announce, options.again
+        )

@@ -194,7 +194,8 @@ def _judged(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicyRep
             options=estimates_asked(options),
         )
     shown = ("estimator", "policy", "choice", "R_cum", "effective_sessions", "sessions")
-    print(f"\n{format_rows(found.rows, shown)}")
+    lines = [{**dict.fromkeys(shown), **r.as_line(), "estimator": r.method} for r in found.rows]
+    print(f"\n{format_rows(lines, shown)}")
     print(f"models: {found.models}")
     for warning in found.warnings:
         print(f"warning: {warning}")
@@ -253,22 +254,11 @@ def _write(
     """Write the rows of all candidates, if asked to."""
     if options.json is None:
         return
-    from ucfrec.code_version import code_version
-    from ucfrec.files.atomic import write_json
-    from ucfrec.provenance import config_hash
-    from ucfrec.reporting.estimate_rows import estimate_row
-    from ucfrec.runs.record import read_record
+    from ucfrec.results.rows_file import write_results
 
-    version, written = code_version("ucfrec.off_policy.evaluate"), []
-    for name, report in reports.items():
-        for row in report.rows:
-            record = read_record(Path(row["run"]))
-            about = {"checkpoint": options.checkpoint, "candidate": name, **more.get(name, {})}
-            found = estimate_row(
-                row | about,
-                training_seed=record.seed,
-                config_hash=config_hash(record.settings),
-                code_version=version,
-            )
-            written.append(found.to_json())
-    write_json(options.json, written)
+    rows = [
+        row.extended({"candidate": name, **more.get(name, {})}, checkpoint=options.checkpoint)
+        for name, report in reports.items()
+        for row in report.rows
+    ]
+    write_results(options.json, rows)

@@ -133,10 +133,10 @@ def rule_options(parser: argparse.ArgumentParser) -> None:
         help="target return: the largest that the policy expects in each state",
     )
     rule.add_argument(
-        "--target-floor",
+        "--minimum-target",
         type=float,
         metavar="RETURN",
-        help="never ask for less, also once a session has reached its target",
+        help="the least target return, also once a session has reached its target",
     )
     rule.add_argument(
         "--reward-weight", type=float, metavar="BETA", help="weight of the reward model; 0 for none"
@@ -251,7 +251,7 @@ def rule_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "Decisi
         target = trained.target_return(options.target_quantile)
     parts = {
         "target": target,
-        "floor": options.target_floor,
+        "minimum_target": options.minimum_target,
         "reward_weight": options.reward_weight,
         "temperature": options.temperature,
         "top_k": options.top_k,

@@ -1,6 +1,7 @@
 """`ucfrec rank`: how policies rank what users were shown and clicked later."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ from ucfrec.errors import InputError
 
 if TYPE_CHECKING:
     from ucfrec.episodes.store import EpisodeStore
+    from ucfrec.results.row import ResultRow
     from ucfrec.runs.trained_policy import TrainedPolicy
 
 _SHOWN = ("hit_rate_shown", "hit_rate_liked", "ndcg_liked", "recall_liked", "gauc", "item_rate")
@@ -44,12 +46,12 @@ def run(options: argparse.Namespace) -> None:
     """
     from ucfrec.evaluation.ranking import MEASURES
     from ucfrec.evaluation.ranking_table import require_one_catalogue, training_store
-    from ucfrec.files.atomic import write_json
     from ucfrec.logs.summary import format_report
     from ucfrec.off_policy.score import logged_sessions
     from ucfrec.off_policy.training_rows import seen_too_often, share_seen
     from ucfrec.provenance import without_folders
     from ucfrec.reporting.tables import format_rows
+    from ucfrec.results.rows_file import write_results
     from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 
     runs = [Path(path) for path in options.logs if (Path(path) / RUN).is_file()]
@@ -70,16 +72,20 @@ def run(options: argparse.Namespace) -> None:
     else:
         test, warnings = _test_split(trained, train), [[] for _ in trained]
         rows = _rows(options, trained, train, test, test.episode_values("user"))
-    print(format_rows(rows, ("policy", *_SHOWN, "coverage")))
+    columns = (*_SHOWN, "coverage")
+    lines = [dict.fromkeys(columns) | {"policy": row.method} | dict(row.metrics) for row in rows]
+    print(format_rows(lines, ("policy", *columns)))
     print("\n" + "\n".join(f"{name:<16}{MEASURES[name]}" for name in _SHOWN))
-    print(f"k is {rows[0]['k']}; --json has 95% intervals and paired differences by user")
+    print(
+        f"k is {rows[0].conditions['k']}; --json has 95% intervals and paired differences by user"
+    )
     on = ", ".join(map(without_folders, options.logs)) or "the test split"
     for policy, row, said in zip(trained, rows, warnings, strict=False):
         for warning in said:
             print(f"warning: {policy.folder}: {warning}")
         card_of_ranking(policy.folder, row, _SHOWN, on, said)
     if options.json is not None:
-        write_json(options.json, rows)
+        write_results(options.json, rows)
 
 
 def _test_split(trained: "list[TrainedPolicy]", store: "EpisodeStore | None") -> "EpisodeStore":
@@ -107,7 +113,7 @@ def _rows(
     train: "EpisodeStore | None",
     later: "EpisodeStore",
     users: Any,
-) -> list[dict[str, Any]]:
+) -> "list[ResultRow]":
     from ucfrec.evaluation.ranking_baselines import PolicyRanker
     from ucfrec.evaluation.ranking_table import ranking_rows
 
@@ -115,4 +121,4 @@ def _rows(
         PolicyRanker(policy, rule_given(options, policy), policy.name) for policy in trained
     ]
     rows = ranking_rows(policies, trained[0], train, later, users, options.k, options.seed)
-    return [row | {"checkpoint": options.checkpoint} for row in rows]
+    return [replace(row, checkpoint=options.checkpoint) for row in rows]

@@ -92,7 +92,7 @@ def run(options: argparse.Namespace) -> None:
     if options.approximate:
         from ucfrec.acting.item_index import ItemIndex
 
-        index = ItemIndex(trained.scorer(rule), rule, trained.name)
+        index = ItemIndex(trained.item_scorer(rule), trained.name)
     with progress(None, "recommend", "users") as bar:
         frames = recommend(
             trained,

@@ -39,7 +39,7 @@ def _verified(path: Path) -> int:
     from ucfrec.runs.record import RunRecord, TrainingRecord, read_training
 
     if path.is_file():
-        from ucfrec.reporting.rows_file import read_rows
+        from ucfrec.results.rows_file import read_rows
 
         print(one_line(f"{path}: {len(read_rows(path))} result rows, all readable"))
         return 0

@@ -1,15 +1,19 @@
 """What a session was shown lately, as additions to the logits of the items that resemble it."""
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ucfrec.arrays import Float32Array, Float64Array
+from ucfrec import schema
+from ucfrec.arrays import Float32Array, Float64Array, IntArray
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Windows
+
+if TYPE_CHECKING:
+    from ucfrec.episodes.store import EpisodeStore
 
 GAIN = 10.0
 """Factor on the learned weights: thousands of small updates must be able to rule an item out."""
@@ -32,6 +36,27 @@ class Shown(NamedTuple):
         """What windows of K steps show before their last one, N = K − 1."""
         items = windows.actions.masked_fill(~windows.mask, -1)
         return cls(items[:, :-1].flip(1), windows.rewards[:, :-1].flip(1))
+
+    @classmethod
+    def before(
+        cls, store: "EpisodeStore", episodes: IntArray, steps: IntArray, length: int
+    ) -> "Shown":
+        """What sessions of a store showed in the `length` steps before the given ones.
+
+        Args:
+            store: of items; an unknown item (−1) counts as the first.
+            episodes: (B,) sessions.
+            steps: (B,) steps of them, from 0.
+            length: N.
+        """
+        earlier = steps[:, None] - np.arange(1, length + 1)
+        before, places = earlier < 0, (episodes[:, None], np.maximum(earlier, 0))
+        items = store.step_values(schema.ITEM, *places).clip(min=0).astype(np.int64)
+        rewards = store.step_values(schema.REWARD, *places)
+        return cls(
+            torch.from_numpy(np.where(before, -1, items)),
+            torch.from_numpy(np.where(before, np.float32(0), rewards)),
+        )
 
     def at(self, rows: slice | int | Tensor) -> "Shown":
         """The sessions with the given numbers."""
@@ -103,6 +128,7 @@ class Likeness(nn.Module):
         size = 0 if tags_per_item else embedding_size
         self.register_buffer("directions", torch.zeros(n_items, size))
         self._matrix: Tensor | None = None
+        self._n_tags: int | None = None
 
     @classmethod
     def of(cls, states: ItemStates) -> "Likeness":
@@ -119,11 +145,17 @@ class Likeness(nn.Module):
             self.n_tags.fill_(int(states.tags.max()) + 1)
         else:
             self.directions.copy_(nn.functional.normalize(states.embeddings, dim=1))
-        self._matrix = None
+        self._matrix = self._n_tags = None
 
     def _load_from_state_dict(self, *arguments: Any, **named: Any) -> None:
         super()._load_from_state_dict(*arguments, **named)
-        self._matrix = None
+        self._matrix = self._n_tags = None
+
+    def _count(self) -> int:
+        """The number of tags, read once: a graph that is exported cannot read it."""
+        if self._n_tags is None:
+            self._n_tags = int(self.n_tags)
+        return self._n_tags
 
     def profile(self, items: Tensor, weights: Tensor) -> Tensor:
         """The weighted sum (M, F) of the tags or directions of items (M, N), −1 for none.
@@ -136,10 +168,12 @@ class Likeness(nn.Module):
         if not self.tags.shape[1]:
             profile = torch.einsum("mn,mnf->mf", weights, self.directions[items])
             return profile.to(weights.dtype)
-        tags, padding = self.tags[items], int(self.n_tags)
+        tags, padding = self.tags[items], self._count()
         places = torch.where(tags < 0, padding, tags).flatten(1)
         spread = weights.unsqueeze(-1).expand(tags.shape).flatten(1)
-        return spread.new_zeros(len(items), padding + 1).scatter_add(1, places, spread)[:, :-1]
+        # The length of a tensor would be that of one batch in a graph that is exported.
+        empty = spread.new_zeros(items.shape[0], padding + 1)
+        return empty.scatter_add(1, places, spread)[:, :-1]
 
     def to_all(self, profile: Tensor) -> Tensor:
         """Likeness (M, n_items) of all items to profiles (M, F)."""
@@ -177,7 +211,7 @@ class Likeness(nn.Module):
 
     def _tags_of(self, items: Tensor) -> Tensor:
         """The rows (L, n_tags) of `_tag_matrix`; sparse if a product with them is then cheaper."""
-        tags, n_tags = self.tags[items], int(self.n_tags)
+        tags, n_tags = self.tags[items], self._count()
         rows, columns = torch.nonzero(tags >= 0, as_tuple=True)
         places, shape = torch.stack([rows, tags[rows, columns]]), (len(items), n_tags)
         ones = torch.ones_like(rows, dtype=self.directions.dtype)
@@ -189,7 +223,7 @@ class Likeness(nn.Module):
         if self._matrix is None or self._matrix.device != self.tags.device:
             rows, columns = torch.nonzero(self.tags >= 0, as_tuple=True)
             places = torch.stack([rows, self.tags[rows, columns]])
-            shape = (len(self.tags), int(self.n_tags))
+            shape = (len(self.tags), self._count())
             ones = torch.ones_like(rows, dtype=self.directions.dtype)
             matrix = torch.sparse_coo_tensor(places, ones, shape, check_invariants=True).coalesce()
             small = shape[0] * shape[1] <= _DENSE

@@ -82,8 +82,8 @@ class ReturnToGo:
             )
         return _rest(before, offsets)
 
-    def asked(self, target: float, collected: "Tensor") -> "Tensor":
-        """What is asked for at the next step, (B,) float64, in reward units.
+    def target_returns(self, target: float, collected: "Tensor") -> "Tensor":
+        """Target returns at the next step, (B,) float64, in reward units.
 
         Args:
             target: of the session if `per_session`, otherwise of every step.
@@ -95,14 +95,14 @@ class ReturnToGo:
         whole = torch.full_like(collected, target, dtype=torch.float64)
         return whole - collected if self.per_session else whole
 
-    def before(self, asked: "Tensor", rewards: "Tensor") -> "Tensor":
-        """Returns-to-go of all steps of a window, given what is asked for at its last step.
+    def before(self, targets: "Tensor", rewards: "Tensor") -> "Tensor":
+        """Returns-to-go of all steps of a window, given the target return at its last step.
 
-        Earlier steps count the rewards that followed them, then what is asked for: the numbers that
-        training would show if the future earned exactly that.
+        Earlier steps count the rewards that followed them, then the target return: the numbers that
+        training would show if the rest of the session returned exactly that.
 
         Args:
-            asked: (B,) at the last step.
+            targets: (B,) at the last step.
             rewards: (B, K) of the windows' steps, 0 at padding; the last column is not used.
 
         Returns:
@@ -111,7 +111,7 @@ class ReturnToGo:
         import torch
 
         earlier = rewards[:, :-1].double()
-        last = asked.double().unsqueeze(1)
+        last = targets.double().unsqueeze(1)
         if self.definition == "session":
             returns = last + earlier.flip(1).cumsum(1).flip(1)
         elif self.definition == "discounted":

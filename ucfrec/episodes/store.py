@@ -209,23 +209,17 @@ class EpisodeStore(EpisodeView):
         """
         self._require_steps(episodes, ends, length)
         steps = ends[:, None] + np.arange(1 - length, 1)  # (B, K)
-        mask = steps >= 0
-        valid = torch.from_numpy(mask)
+        places = episodes[:, None], np.maximum(steps, 0)
 
         def gather(name: str) -> Tensor:
-            values = torch.from_numpy(
-                self.step_values(name, episodes[:, None], np.maximum(steps, 0))
-            )
-            shape = (*valid.shape, *([1] * (values.ndim - valid.ndim)))
-            return values.masked_fill(~valid.view(shape), 0)
+            return torch.from_numpy(self.step_values(name, *places))
 
-        return Windows(
-            states=self._edited_states(episodes, steps).masked_fill(~valid.unsqueeze(-1), 0.0),
-            actions=gather(schema.ITEM).long() if self.has_items else gather(schema.ACTION),
-            rewards=gather(schema.REWARD),
-            returns_to_go=gather(schema.RETURN_TO_GO),
-            timesteps=torch.from_numpy(np.maximum(steps, 0)),
-            mask=valid,
+        return Windows.of(
+            torch.from_numpy(steps),
+            self._edited_states(episodes, steps),
+            gather(schema.ITEM).long() if self.has_items else gather(schema.ACTION),
+            gather(schema.REWARD),
+            gather(schema.RETURN_TO_GO),
         )
 
     def transitions(self, episodes: IntArray, steps: IntArray) -> Transitions:

@@ -1,5 +1,6 @@
 """Batches gathered from a store (windows, transitions) and overlays of copies."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -48,6 +49,49 @@ class Windows:
         (windows, steps, size), items = self.states.shape, self.actions.ndim == 2
         actions = "items" if items else f"vectors of {self.actions.shape[2]}"
         return f"Windows({windows:,} of {steps} steps, states of {size}, actions are {actions})"
+
+    @classmethod
+    def of(
+        cls,
+        numbers: Tensor,
+        states: Tensor,
+        actions: Tensor,
+        rewards: Tensor,
+        returns_to_go: Tensor | None = None,
+    ) -> "Windows":
+        """Windows of the given steps; what they have at padding becomes 0.
+
+        Args:
+            numbers: (B, K) int64 number of each step in its episode; below 0 at padding.
+            states: (B, K, S).
+            actions: (B, K, A) vectors or (B, K) items.
+            rewards: (B, K).
+            returns_to_go: (B, K); None for zeros, where a decision sets them.
+        """
+        mask = numbers >= 0
+        padding = ~mask
+
+        def kept(values: Tensor) -> Tensor:
+            return values.masked_fill(padding if values.ndim == 2 else padding.unsqueeze(-1), 0)
+
+        return cls(
+            kept(states),
+            kept(actions),
+            kept(rewards),
+            torch.zeros_like(rewards) if returns_to_go is None else kept(returns_to_go),
+            numbers.clamp(min=0),
+            mask,
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence["Windows"]) -> "Windows":
+        """The windows of all parts, one part after the other."""
+        names = [f.name for f in fields(cls)]
+        return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+
+    def at(self, rows: slice | Tensor) -> "Windows":
+        """The windows with the given numbers."""
+        return Windows(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     def last(self, steps: int) -> "Windows":
         """The windows of the last so many steps."""

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from gymnasium import spaces
@@ -16,13 +16,16 @@ from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import environment_items
 from ucfrec.evaluation.diversity import Recommended
-from ucfrec.evaluation.diversity_columns import COLUMNS, variety_columns
+from ucfrec.evaluation.diversity_columns import variety_columns
 from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.metrics import session_metrics
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.provenance import config_hash, provenance
+from ucfrec.results.row import ResultRow
 from ucfrec.runs.trained_policy import TrainedPolicy
 
+SUITE: Final = "evaluate"
+"""Suite of the rows."""
 SIDE_BY_SIDE = 512
 """Largest number of episodes played in parallel."""
 
@@ -30,7 +33,7 @@ SIDE_BY_SIDE = 512
 @random_state_kept()
 def evaluate_behavior(
     environment: Environment, behavior: str, episodes: int, seed: int
-) -> dict[str, Any]:
+) -> ResultRow:
     """Result row of an environment's built-in policy (`random`, `optimal`, …).
 
     Args:
@@ -48,7 +51,8 @@ def evaluate_behavior(
         raise InputError(f"{environment.name} has no behavior {behavior!r}; it has {known}")
     env = simulator.make(min(episodes, SIDE_BY_SIDE), environment.folder)
     actor = simulator.behaviors[behavior](env, seed)
-    return _row(environment, behavior, env, actor, episodes, seed)
+    name = {"method": behavior, "policy": behavior}
+    return _row(environment, name, env, actor, episodes, seed)
 
 
 @random_state_kept()
@@ -59,7 +63,7 @@ def evaluate_policy(
     episodes: int,
     seed: int,
     rule: DecisionRule | None = None,
-) -> dict[str, Any]:
+) -> ResultRow:
     """Result row of a trained policy.
 
     Args:
@@ -77,46 +81,55 @@ def evaluate_policy(
     numbers = _item_numbers(environment, env, trained)
     rule = rule or trained.rule
     actor = trained.actor(env.num_envs, rule, numbers, seed)
-    row = _row(environment, name, env, actor, episodes, seed, trained.counts, numbers)
-    return row | {
+    record = trained.record
+    about = {
+        "method": name,
+        "policy": record.config.policy_name,
+        "training_seed": record.seed,
+        "config_hash": config_hash(record.settings),
+        "data_fingerprint": record.fingerprint,
         "target_return": rule.target,
         "rule": rule.hash,
-        "decision_rule": rule.as_dict(),
-        "train_seed": trained.record.seed,
-        "fingerprint": trained.record.fingerprint,
-        "config": config_hash(trained.record.settings),
+        "details": {"decision_rule": rule.as_dict()},
     }
+    return _row(environment, about, env, actor, episodes, seed, trained.counts, numbers)
 
 
 def _row(
     environment: Environment,
-    name: str,
+    about: dict[str, Any],
     env: Any,
     actor: Actor,
     episodes: int,
     seed: int,
     counts: TrainingCounts | None = None,
     numbers: IntArray | None = None,
-) -> dict[str, Any]:
+) -> ResultRow:
     start = time.perf_counter()
-    recommended, describe = Recommended(), f"{name} in {environment.name}"
+    recommended, describe = Recommended(), f"{about['method']} in {environment.name}"
     played = rollout(env, actor, episodes, seed, recommended.record, describe)
     seconds = time.perf_counter() - start
-    variety: Mapping[str, float | None] = dict.fromkeys(COLUMNS)
+    variety: Mapping[str, float | None] = {}
     if isinstance(env.single_action_space, spaces.Discrete):
         variety = variety_columns(env, recommended, counts, numbers)
     env.close()
-    return {
-        "environment": environment.title,
-        "policy": name,
-        **asdict(session_metrics(played, seed)),
-        **variety,
-        "seed": seed,
-        "wall_time_s": seconds,
-        "fingerprint": None,
-        "config": None,
+    found = asdict(session_metrics(played, seed))
+    low, high, count = (found.pop(name) for name in ("R_cum_low", "R_cum_high", "episodes"))
+    row = ResultRow(
+        suite=SUITE,
+        table=SUITE,
+        task=environment.title,
+        environment=environment.title,
+        evaluation_seed=seed,
+        conditions={"episodes": count},
+        metric="R_cum",
+        metrics={},
+        interval=(low, high),
+        wall_time_s=seconds,
+        **about,
         **provenance(),
-    }
+    )
+    return row.extended({**found, **variety})
 
 
 def _item_numbers(environment: Environment, env: Any, trained: TrainedPolicy) -> IntArray | None:

@@ -1,6 +1,6 @@
 """Trained policies as rankers, and simple baselines fitted on the same training rows."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import Final
 
@@ -10,8 +10,8 @@ from scipy import sparse
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.acting.decision import Decider, DecisionRule
-from ucfrec.acting.logged_decisions import session_scores
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.scorer import Scorer, logged_history, logged_scores
 from ucfrec.episodes.item_counts import TrainingCounts, liked_steps
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.ranking import Ranker, Steps
@@ -28,28 +28,26 @@ class PolicyRanker:
     """Ranks items as a trained policy does under its decision rule, before anything is drawn."""
 
     def __init__(self, trained: TrainedPolicy, rule: DecisionRule | None, name: str) -> None:
-        self.name, self._decider = name, trained.decider(rule)
-        self.rule = self._decider.rule
+        self.name, self.trained, self._scorer = name, trained, trained.scorer(rule)
+        self.rule = self._scorer.rule
 
     def scores(self, steps: Steps) -> Tensor:
-        """Log-probabilities at temperature 1 (B, n_items); see `Decider.scores`."""
-        return session_scores(self._decider, steps.store, steps.episodes, steps.steps).log_softmax(
-            -1
-        )
+        """Log-probabilities at temperature 1 (B, n_items); see `Scorer.scores`."""
+        scores = logged_scores(self._scorer, steps.store, steps.episodes, steps.steps)
+        return scores.log_softmax(-1)
 
 
 @dataclass(frozen=True)
 class RewardRanker:
     """Ranks items by the reward model that the run's decision rules reward weight by."""
 
-    decider: Decider
+    scorer: Scorer
     name: str = "reward model"
 
     def scores(self, steps: Steps) -> Tensor:
-        """Predicted rewards (B, n_items), in the model's units."""
-        assert self.decider.reward_model is not None
-        windows = steps.windows(self.decider.reward_model.reach + 1)
-        return self.decider.rewards(windows, torch.from_numpy(steps.users))
+        """Predicted rewards (B, n_items), in the model's units, up to a constant per step."""
+        history, _ = logged_history(self.scorer, steps.store, steps.episodes, steps.steps)
+        return self.scorer.rewards(replace(history, users=torch.from_numpy(steps.users)))
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
 """The table of `ucfrec rank`: policies of one store and baselines, on the same later steps."""
 
+import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -10,9 +11,14 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.ranking import MEASURES, Period, compare, rank_steps, rankers_named
 from ucfrec.evaluation.ranking_baselines import PolicyRanker, RewardRanker, baselines
-from ucfrec.provenance import provenance
+from ucfrec.provenance import config_hash, provenance
+from ucfrec.results.row import ResultRow
 from ucfrec.runs.record import store_of
 from ucfrec.runs.trained_policy import TrainedPolicy
+
+SUITE: Final = "rank"
+"""Suite of the rows."""
+METRIC: Final = "hit_rate_liked"
 
 
 def require_one_catalogue(trained: Sequence[TrainedPolicy]) -> None:
@@ -44,12 +50,12 @@ def ranking_rows(
     users: Array,
     k: int,
     seed: int,
-) -> list[dict[str, Any]]:
+) -> list[ResultRow]:
     """One row for every policy and baseline.
 
-    Each measure of `ucfrec.evaluation.ranking.MEASURES` has beside it `<measure>_interval` and
-    `<measure>_difference`: the value less the first policy's, with its interval. Rows of policies
-    have their `decision_rule`, and its hash as `rule`.
+    The details have, by measure of `ucfrec.evaluation.ranking.MEASURES`, `intervals` and
+    `differences`: the value less the first policy's, with its interval. Rows of policies have
+    their `decision_rule`, and its hash as `rule`.
 
     Args:
         policies: at least one; the first is the reference of the differences.
@@ -63,31 +69,49 @@ def ranking_rows(
     counts = trained.counts
     assert counts is not None
     fitted_on = None if train is None else train.split("train")
-    model = [] if trained.reward_model is None else [RewardRanker(trained.decider())]
+    model = [] if trained.reward_model is None else [RewardRanker(trained.scorer())]
     named = rankers_named([*policies, *model, *baselines(counts, fitted_on, seed)])
     k = min(k, len(counts.shown))
     period = Period.of(later, np.asarray(users))
     ranked = {name: rank_steps(ranker, later, k, period.users) for name, ranker in named.items()}
     reference = next(iter(named))
-    shared = {
-        "k": k,
-        "steps": len(period.items),
-        "users": len(np.unique(period.users)),
-        "reference": reference,
-        "seed": seed,
-        "fingerprint": later.record.fingerprint,
-        "train_fingerprint": trained.record.fingerprint,
+    own = dict(zip(named, policies, strict=False))
+    shared: dict[str, Any] = {
+        "suite": SUITE,
+        "table": SUITE,
+        "task": "logs",
+        "evaluation_seed": seed,
+        "metric": METRIC,
+        "metrics": {},
+        "data_fingerprint": later.record.fingerprint,
+        "conditions": {
+            "k": k,
+            "steps": len(period.items),
+            "users": len(np.unique(period.users)),
+            "reference": reference,
+        },
+        "details": {"train_fingerprint": trained.record.fingerprint},
         **provenance(),
     }
-    rules = dict(zip(named, (policy.rule for policy in policies), strict=False))
     rows = []
     for one in compare(period, ranked, k, reference, seed):
-        row: dict[str, Any] = {"policy": one.name, "coverage": one.coverage}
-        if rule := rules.get(one.name):
-            row |= {"rule": rule.hash, "decision_rule": rule.as_dict()}
-        for name in MEASURES:
-            row[name] = one.values[name]
-            row[f"{name}_interval"] = list(one.intervals[name])
-            row[f"{name}_difference"] = list(one.differences[name])
-        rows.append(row | shared)
+        row = ResultRow(method=one.name, policy=one.name, **shared)
+        if one.name in own:
+            rule, record = own[one.name].rule, own[one.name].trained.record
+            row = row.extended(
+                {"decision_rule": rule.as_dict()},
+                rule=rule.hash,
+                policy=record.config.policy_name,
+                training_seed=record.seed,
+                config_hash=config_hash(record.settings),
+            )
+        low, high = one.intervals[METRIC]
+        interval = (low, high) if math.isfinite(low) and math.isfinite(high) else None
+        measured = {
+            **{name: one.values[name] for name in MEASURES},
+            "coverage": one.coverage,
+            "intervals": one.intervals,
+            "differences": one.differences,
+        }
+        rows.append(row.extended(measured, interval=interval))
     return rows

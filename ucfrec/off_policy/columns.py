@@ -1,35 +1,72 @@
-"""Estimates, verdict and diagnosis as columns of result rows."""
+"""Result rows of estimates, and the verdict and diagnosis as their columns."""
 
-import math
+from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Any
+from typing import Any, Final
 
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.off_policy.diagnostics import Diagnosis
-from ucfrec.off_policy.estimators import Estimate
+from ucfrec.off_policy.estimators import LOGGED, Estimate
 from ucfrec.off_policy.verdict import Verdict
+from ucfrec.provenance import config_hash, provenance
+from ucfrec.results.row import ResultRow, Scalar
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+SUITE: Final = "off-policy"
+"""Suite of the rows."""
 
 
-def as_row(name: str, found: Estimate) -> dict[str, Any]:
-    """Turn an estimate into a result row.
+def estimate_row(
+    name: str,
+    found: Estimate,
+    trained: TrainedPolicy,
+    rule: DecisionRule,
+    seed: int,
+    conditions: Mapping[str, Scalar],
+    about: Mapping[str, Any],
+) -> ResultRow:
+    """The result row of an estimate.
 
     Args:
-        name: name of the estimator.
+        name: name of the estimator, which is the row's method.
         found: its estimate.
+        trained: the evaluated policy.
+        rule: the decision rule by which it would act.
+        seed: seed of the estimate.
+        conditions: how the logs were read.
+        about: what all estimates of the policy share, e.g. the verdict.
 
     Returns:
-        The row. `R_cum` is the mean return, as in `ucfrec.evaluation.metrics`; the ends of its
-        interval are None if there is no interval.
+        The row. `R_cum` is the mean return, as in `ucfrec.evaluation.metrics`; it may have no
+        interval.
     """
-    return {
-        "estimator": name,
-        "R_cum": found.value,
-        "R_cum_low": found.low,
-        "R_cum_high": found.high,
+    choice = "softmax" if rule.temperature else "greedy"
+    logged, record = name == LOGGED, trained.record
+    row = ResultRow(
+        suite=SUITE,
+        table="estimates",
+        task="logs",
+        method=name,
+        policy="behavior" if logged else trained.name,
+        training_seed=record.seed,
+        evaluation_seed=seed,
+        conditions={**conditions, "choice": "as logged" if logged else choice},
+        config_hash=config_hash(record.settings),
+        metric="R_cum",
+        metrics={"R_cum": found.value},
+        interval=None if found.low is None or found.high is None else (found.low, found.high),
+        target_return=rule.target,
+        rule=rule.hash,
+        **provenance(),
+    )
+    own = {
         "R_cum_error": found.error,
         "effective_sessions": found.effective_sessions,
         "largest_weight": found.largest_weight,
-        "parameter": found.parameter if found.parameter != math.inf else None,
+        "parameter": found.parameter,
+        "decision_rule": rule.as_dict(),
     }
+    return row.extended({**own, **about})
 
 
 def verdict_columns(verdict: Verdict) -> dict[str, Any]:

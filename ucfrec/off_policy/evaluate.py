@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,9 +12,9 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Array, Float64Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.off_policy.behavior_model import BehaviorModel, fit_behavior
-from ucfrec.off_policy.columns import as_row, diagnosis_columns, verdict_columns
+from ucfrec.off_policy.columns import diagnosis_columns, estimate_row, verdict_columns
 from ucfrec.off_policy.diagnostics import diagnose, implied_items
-from ucfrec.off_policy.estimators import LOGGED, estimate, session_terms
+from ucfrec.off_policy.estimators import estimate, session_terms
 from ucfrec.off_policy.features import InputsFile, StepInputs, context_of, scores_of
 from ucfrec.off_policy.fqe import ModelReport, fit_models
 from ucfrec.off_policy.item_groups import default_groups, group_items
@@ -26,7 +25,8 @@ from ucfrec.off_policy.pages import as_pages, pages_of
 from ucfrec.off_policy.score import LoggedSessions, ScoredSteps, scored_steps
 from ucfrec.off_policy.training_rows import seen_too_often, share_seen
 from ucfrec.off_policy.verdict import FAR_OFF, Verdict, cautions, influences, judge
-from ucfrec.provenance import provenance
+from ucfrec.provenance import without_folders
+from ucfrec.results.row import ResultRow, Scalar
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 DEFAULTS = EstimateOptions()
@@ -36,7 +36,7 @@ DEFAULTS = EstimateOptions()
 class OffPolicyReport:
     """The estimates, and whether to believe them."""
 
-    rows: list[dict[str, Any]]
+    rows: list[ResultRow]
     """One result row for each estimator."""
     warnings: list[str]
     """The verdict's reasons, cautions, and remarks on the logs."""
@@ -111,19 +111,22 @@ def evaluate_off_policy(
     said = [*verdict.reasons, *cautions(diagnosis, found), *_of_the_logs(seen, logged), *of_groups]
     said += _of_the_models(judged)
     about = {
-        **_of_the_rule(rule),
-        **_of_the_sessions(steps, logged, options),
         "seen_in_training": seen,
         "warnings": said,
+        "dropped": logged.report["dropped"],
+        "unknown_item_rows": logged.unknown_items,
         **verdict_columns(verdict),
         **diagnosis_columns(diagnosis),
         **judged.models.columns(),
-        "run": str(run),
-        "seed": seed,
-        **provenance(),
     }
+    conditions = {"run": without_folders(str(run)), **_conditions(steps, options)}
+    fingerprint = logged.store.record.fingerprint
     rows = [
-        as_row(name, one) | _of_whom(name, trained, rule) | about for name, one in found.items()
+        replace(
+            estimate_row(name, one, trained, rule, seed, conditions, about),
+            data_fingerprint=fingerprint,
+        )
+        for name, one in found.items()
     ]
     if diagnosis.left_out == diagnosis.sessions:
         return OffPolicyReport(rows, said, verdict, judged.models, np.empty(0), None, None)
@@ -132,31 +135,14 @@ def evaluate_off_policy(
     return OffPolicyReport(rows, said, verdict, judged.models, known.returns, known.user, terms)
 
 
-def _of_whom(estimator: str, trained: TrainedPolicy, rule: DecisionRule) -> dict[str, Any]:
-    """What a row tells of the policy whose return it estimates."""
-    if estimator == LOGGED:
-        return {"policy": "behavior", "choice": "as logged"}
-    return {"policy": trained.name, "choice": "softmax" if rule.temperature else "greedy"}
-
-
-def _of_the_rule(rule: DecisionRule) -> dict[str, Any]:
-    """What rows tell of the rule that is judged."""
-    return {"target_return": rule.target, "rule": rule.hash, "decision_rule": rule.as_dict()}
-
-
-def _of_the_sessions(
-    steps: LoggedSteps, logged: LoggedSessions, options: EstimateOptions
-) -> dict[str, Any]:
-    """What rows tell of the logs, and of how they were taken."""
+def _conditions(steps: LoggedSteps, options: EstimateOptions) -> dict[str, Scalar]:
+    """How the logs were read, and their size."""
     return {
         "discount": options.discount,
-        "sessions": len(steps.first),
         "pages": options.pages,
         "anonymous": not options.users_known,
+        "sessions": len(steps.first),
         "steps": len(steps.reward),
-        "dropped": logged.report["dropped"],
-        "unknown_item_rows": logged.unknown_items,
-        "fingerprint": logged.store.record.fingerprint,
     }
 
 
@@ -351,7 +337,7 @@ def step_features(trained: TrainedPolicy, batch: ScoredSteps) -> tuple[Array, Te
     """
     assert trained.item_states is not None
     embeddings = trained.item_states.embeddings
-    items = batch.windows.actions[:, -1]
+    items = batch.items
     known = items >= 0
     probabilities = batch.log_probabilities.exp()
     target = probabilities.gather(1, items[:, None].clamp(min=0))[:, 0].double() * known
@@ -359,7 +345,7 @@ def step_features(trained: TrainedPolicy, batch: ScoredSteps) -> tuple[Array, Te
     of_chosen, of_shown = scores_of(batch.scores.log_softmax(-1), items, probabilities)
     seen = StepInputs(
         context=context_of(batch),
-        state_size=batch.windows.states.shape[2],
+        state_size=batch.states.shape[1],
         chosen=embeddings[items] * known[:, None],
         shown=probabilities @ embeddings,
         scores=torch.stack([of_chosen, of_shown], dim=1),

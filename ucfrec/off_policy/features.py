@@ -56,7 +56,7 @@ def context_of(batch: ScoredSteps) -> Tensor:
 
     A learner that is no network of features (item-knn, crm-greedy) has the first two only.
     """
-    parts = [batch.windows.states[:, -1], batch.returns_left[:, None]]
+    parts = [batch.states, batch.returns_left[:, None]]
     parts += [] if batch.features is None else [batch.features]
     return torch.cat([part.float() for part in parts], dim=1)
 

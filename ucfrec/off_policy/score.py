@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
+import torch
 from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.logged_decisions import session_decisions
+from ucfrec.acting.scorer import logged_history
 from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.engine import BATCH_ROWS
@@ -54,10 +54,12 @@ class ScoredSteps:
     """(B,): number of each step's session."""
     steps: IntArray
     """(B,): position of each step in its session, from 0."""
-    windows: Windows
-    """Each step, last in its window, with the steps before it that the policy sees."""
+    items: Tensor
+    """(B,) int64: the logged items; −1 where the run does not know them."""
+    states: Tensor
+    """(B, S): states before the steps."""
     scores: Tensor
-    """(B, n_items): what the rule decides by, see `ucfrec.acting.decision.Decider.scores`."""
+    """(B, n_items): what the rule decides by, see `ucfrec.acting.scorer.Scorer.scores`."""
     log_probabilities: Tensor
     """(B, n_items): natural logarithm of the probability that the policy shows each item."""
     returns_left: Tensor
@@ -163,19 +165,24 @@ def scored_steps(
     """
     assert trained.item_ids is not None
     at_once = max(1, min(_STEPS_AT_ONCE, _LOGITS_AT_ONCE // len(trained.item_ids)))
-    total, decider = store.n_steps, trained.decider(rule)
+    total, scorer = store.n_steps, trained.scorer(rule)
     with progress(total, "score", "steps") as bar:
         for begin in range(0, total, at_once):
             episodes, steps = store.locate(np.arange(begin, min(begin + at_once, total)))
-            found = session_decisions(decider, store, episodes, steps)
+            known, seen = logged_history(scorer, store, episodes, steps)
+            history = scorer.with_target(known)
+            query = scorer.query(history)
+            scores = scorer.scores_of(query, history, excluded=seen)
+            items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
             yield ScoredSteps(
                 episodes,
                 steps,
-                found.windows,
-                found.scores,
-                decider.rule.log_probabilities(found.scores),
-                found.asked.returns_to_go[:, -1],
-                found.features,
+                torch.from_numpy(items),
+                history.windows.states[:, -1],
+                scores,
+                scorer.rule.log_probabilities(scores),
+                history.windows.returns_to_go[:, -1],
+                query.features,
             )
             bar.update(len(steps))
 
@@ -201,7 +208,7 @@ def score(
     names = [schema.TIMESTAMP, schema.ITEM_ID, schema.REWARD]
     names += [schema.PROPENSITY] if schema.PROPENSITY in store.record.columns else []
     for batch in scored_steps(trained, store, rule):
-        items = batch.windows.actions[:, -1:]
+        items = batch.items.unsqueeze(1)
         chosen, scored = batch.log_probabilities.gather(1, items), batch.scores.gather(1, items)
         columns = {schema.USER_ID: logged.users[batch.episodes], SESSION: batch.episodes}
         for name in names:

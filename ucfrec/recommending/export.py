@@ -1,33 +1,35 @@
 """Write a trained policy under its rule as an ONNX graph that other runtimes can run."""
 
-import contextlib
-import io
-import logging
-import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ucfrec import __version__
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.arrays import Array
-from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder, write_json
-from ucfrec.recommending.export_graph import INPUTS, OUTPUTS, RuleGraph
+from ucfrec.recommending.export_graph import (
+    EXCLUDED,
+    GRAPH,
+    INPUTS,
+    OUTPUTS,
+    RuleGraph,
+    inputs_of,
+    random_sessions,
+    require_close,
+    require_installed,
+    run_graph,
+    write_graph,
+)
 from ucfrec.runs.trained_policy import TrainedPolicy
 
-GRAPH: Final = "model.onnx"
 DESCRIPTION: Final = "model.json"
-TOLERANCE: Final = 1e-5
-"""Largest difference of a score to torch's, relative to the larger of 1 and the score."""
-_OPSET: Final = 20
 _SESSIONS: Final = 16
 """Random sessions on which the graph is compared with torch."""
+_REMEDY: Final = "use `ucfrec serve` or `recommend --stream`"
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ def export(
 ) -> Exported:
     """Write a folder with the graph (`model.onnx`, its weights beside it) and `model.json`.
 
-    The graph is compared with torch on random sessions before the folder appears.
+    The graph is compared with torch on random sessions, several and one, before the folder appears.
 
     Args:
         trained: a policy of items.
@@ -58,162 +60,56 @@ def export(
             scores differ from torch's, or `out` exists.
     """
     require_installed()
-    graph = RuleGraph(trained, rule or trained.rule, k).eval()
-    arguments = random_sessions(graph, trained, 3, seed=0)
+    graph = RuleGraph(trained.scorer(rule), trained.name, k).eval()
     with atomic_folder(out) as scratch:
-        _write(graph, arguments, scratch / GRAPH, trained.name)
-        compared = random_sessions(graph, trained, _SESSIONS, seed=1)
-        difference = _difference(graph, compared, scratch / GRAPH)
-        write_json(scratch / DESCRIPTION, _description(graph, trained, rule or trained.rule))
+        _write(graph, scratch / GRAPH, trained.name)
+        difference = max(_difference(graph, scratch / GRAPH, n) for n in (_SESSIONS, 1))
+        write_json(scratch / DESCRIPTION, _description(graph, trained))
         size = sum(file.stat().st_size for file in scratch.iterdir() if file.name != DESCRIPTION)
     return Exported(size, difference)
 
 
-def require_installed() -> None:
-    """Check that the extra `export` is installed.
-
-    Raises:
-        InputError: it is not.
-    """
-    try:
-        import onnx  # noqa: F401
-        import onnxruntime  # noqa: F401
-        import onnxscript  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"ONNX needs {error.name}, which is not installed; install ucfrec[export]"
-        ) from None
-
-
-def random_sessions(
-    graph: RuleGraph, trained: TrainedPolicy, sessions: int, seed: int
-) -> dict[str, Tensor]:
-    """Inputs of the graph for random sessions of all lengths, by name."""
-    rng = np.random.default_rng(seed)
-    states, n = trained.item_states, graph.n_items
+def _arguments(graph: RuleGraph, sessions: int, seed: int) -> dict[str, Tensor]:
+    """Random inputs of the graph, in the order of its arguments."""
+    states = graph.scorer.states
     assert states is not None
-    steps = rng.integers(0, 2 * graph.length + 1, size=sessions)
-    places = np.arange(graph.length) >= graph.length - steps[:, None]
-    items = np.where(places, rng.integers(n, size=places.shape), -1)
-    rewards = rng.choice([states.reward_low, states.reward_high], size=places.shape)
-    rewards = np.where(places, rewards, 0.0).astype(np.float32)
-    values: dict[str, Array] = {
-        "items": items,
-        "rewards": rewards,
-        "steps": steps,
-        "collected": rewards.sum(1, dtype=np.float64),
-        "users": rng.integers(-1, max(1, len(trained.user_ids)), size=sessions),
-        "excluded": rng.integers(-1, n, size=(sessions, min(5, n // 2 + 1))),
-    }
-    if graph.observation_size:
-        size = (sessions, graph.context, graph.observation_size)
-        values["observations"] = rng.normal(size=size).astype(np.float32)
-    return {name: torch.from_numpy(values[name]) for name in INPUTS if name in values}
+    n, rng = len(states.embeddings), np.random.default_rng(seed)
+    values = inputs_of(random_sessions(graph.scorer, sessions, seed))
+    left_out = rng.integers(-1, n, size=(sessions, min(5, n // 2 + 1)))
+    values[EXCLUDED] = torch.from_numpy(left_out)
+    names = (*INPUTS[:-1], EXCLUDED, INPUTS[-1])
+    return {name: values[name] for name in names if name in values}
 
 
-def _write(graph: RuleGraph, arguments: Mapping[str, Tensor], path: Path, name: str) -> None:
+def _write(graph: RuleGraph, path: Path, kind: str) -> None:
+    arguments = _arguments(graph, 3, seed=0)
     batch = torch.export.Dim("batch", min=1, max=2**20)
     shapes: dict[str, Any] = {each: {0: batch} for each in arguments}
-    shapes["excluded"] = {0: batch, 1: torch.export.Dim("excluded_items", min=1, max=2**24)}
-    if graph.observation_size == 0:
-        shapes["observations"] = None
-    given = tuple(arguments.values())
-    if graph.observation_size == 0:
-        given = (*given, None)  # type: ignore[arg-type]
-    remedy = "use `ucfrec serve` or `recommend --stream`"
-    write_graph(graph, given, path, (list(arguments), list(OUTPUTS)), name, remedy, shapes)
+    shapes[EXCLUDED] = {0: batch, 1: torch.export.Dim("excluded_items", min=1, max=2**24)}
+    given: tuple[Any, ...] = tuple(arguments.values())
+    if INPUTS[-1] not in arguments:
+        shapes[INPUTS[-1]] = None
+        given = (*given, None)
+    write_graph(graph, given, path, (list(arguments), list(OUTPUTS)), kind, _REMEDY, shapes)
 
 
-def write_graph(
-    module: nn.Module,
-    arguments: tuple[Tensor, ...],
-    path: Path,
-    names: tuple[list[str], list[str]],
-    kind: str,
-    remedy: str,
-    shapes: dict[str, Any] | None = None,
-) -> None:
-    """Write a module as an ONNX graph, its weights beside it.
-
-    Args:
-        module: in evaluation mode.
-        arguments: an example.
-        path: file to write.
-        names: of the inputs and of the outputs.
-        kind: of the policy, for messages.
-        remedy: what to do where it cannot be exported.
-        shapes: sizes that may vary; None for those of the example alone.
-
-    Raises:
-        InputError: torch cannot export it.
-    """
-    try:
-        with _quiet(), torch.no_grad():
-            torch.onnx.export(
-                module,
-                arguments,
-                path,
-                input_names=names[0],
-                output_names=names[1],
-                dynamic_shapes=shapes,
-                opset_version=_OPSET,
-                dynamo=True,
-                external_data=True,
-                verbose=False,
-            )
-    except (InputError, OSError, MemoryError):
-        raise
-    except Exception as error:  # torch's exporter has no class of errors of its own for all of them
-        reason = str(error).strip().splitlines() or [type(error).__name__]
-        raise InputError(
-            f"torch cannot export policies of kind {kind!r} ({reason[0]:.160}); {remedy}"
-        ) from None
-
-
-@contextlib.contextmanager
-def _quiet() -> Any:
-    """Keep the exporter from printing."""
-    before = logging.root.manager.disable
-    logging.disable(logging.ERROR)
-    try:
-        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logging.disable(before)
-
-
-def _difference(graph: RuleGraph, arguments: Mapping[str, Tensor], path: Path) -> float:
-    """Largest difference of the graph's scores to torch's, relative to max(1, |score|).
-
-    Raises:
-        InputError: it is beyond the tolerance.
-    """
+def _difference(graph: RuleGraph, path: Path, sessions: int) -> float:
+    """Largest difference of the graph's scores to torch's; see `require_close`."""
     import onnxruntime
 
-    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    found = session.run(list(OUTPUTS), {name: each.numpy() for name, each in arguments.items()})
+    arguments = _arguments(graph, sessions, seed=sessions)
+    runner = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    scores, _, top_scores = run_graph(runner, arguments)
     with torch.no_grad():
-        expected = [each.numpy() for each in graph(*arguments.values())]
-    largest = 0.0
-    for name, ours, theirs in zip(OUTPUTS, expected, found, strict=True):
-        if name == "top_items":
-            continue
-        same = np.where(np.isneginf(ours), np.isneginf(theirs), np.isfinite(theirs))
-        finite = np.isfinite(ours) & np.isfinite(theirs)
-        apart = np.abs(ours[finite] - theirs[finite]) / np.maximum(1.0, np.abs(ours[finite]))
-        largest = max(largest, float(apart.max(initial=0.0)), 0.0 if same.all() else np.inf)
-    if not largest <= TOLERANCE:
-        raise InputError(
-            f"the graph's scores differ from torch's by {largest:.2g}, more than {TOLERANCE:g}; "
-            "use `ucfrec serve`, and report this"
-        )
-    return largest
+        expected, _, top_expected = graph(*arguments.values())
+    return require_close((scores, top_scores), (expected, top_expected), _REMEDY)
 
 
-def _description(graph: RuleGraph, trained: TrainedPolicy, rule: DecisionRule) -> dict[str, Any]:
+def _description(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
     """What a program needs to know to use the graph."""
-    b, length, k = "batch", graph.length, graph.k
+    scorer, rule = graph.scorer, graph.scorer.rule
+    b, length, k = "batch", scorer.length, graph.k
+    assert trained.item_ids is not None
     inputs = [
         _entry(
             "items",
@@ -233,12 +129,12 @@ def _description(graph: RuleGraph, trained: TrainedPolicy, rule: DecisionRule) -
             "already seen; padded with -1, at least one column",
         ),
     ]
-    if graph.observation_size:
+    if observed := trained.record.observation_size:
         inputs.append(
             _entry(
                 "observations",
                 "float32",
-                [b, graph.context, graph.observation_size],
+                [b, scorer.policy.config.context, observed],
                 "of the "
                 "last steps, the one to decide included; `ucfrec recommend` repeats the last",
             )
@@ -247,14 +143,13 @@ def _description(graph: RuleGraph, trained: TrainedPolicy, rule: DecisionRule) -
         _entry(
             "scores",
             "float32",
-            [b, graph.n_items],
+            [b, len(trained.item_ids)],
             "log-probability of the policy plus the "
             "reward weight, up to a constant; -inf for items left out",
         ),
         _entry("top_items", "int64", [b, k], "index of the best items; -1 if fewer are left"),
         _entry("top_scores", "float32", [b, k], "their log-probabilities at temperature 1, nats"),
     ]
-    assert trained.item_ids is not None
     return {
         "format": 1,
         "ucfrec": __version__,
@@ -263,9 +158,9 @@ def _description(graph: RuleGraph, trained: TrainedPolicy, rule: DecisionRule) -
         "outputs": outputs,
         "rule": rule.as_dict(),
         "rule_hash": rule.hash,
-        "rule_notes": "the graph applies target, floor, reward_weight, tag_window and tag_run; "
-        "with exclude_seen, put the session's items into `excluded`; with a temperature, draw from "
-        "`scores`",
+        "rule_notes": "the graph applies target, minimum_target, reward_weight, tag_window and "
+        "tag_run; with exclude_seen, put the session's items into `excluded`; with a temperature, "
+        "draw from `scores`",
         "policy": trained.name,
         "reward": trained.record.reward,
         "session_by": trained.record.session_by,

@@ -12,9 +12,10 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.item_index import ItemIndex
-from ucfrec.acting.session_scorer import SessionScorer
+from ucfrec.acting.scorer import Scorer
 from ucfrec.acting.sessions import Sessions
 from ucfrec.arrays import Array, IntArray
+from ucfrec.episodes.ids import IdLookup
 from ucfrec.errors import InputError
 from ucfrec.recommending.histories import Histories
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -66,22 +67,22 @@ def recommend(
             or of the candidates is not in the training data. Items of the logs are checked when
             their batch is read.
     """
-    scorer, asked = trained.scorer(rule), rule or trained.rule
+    scorer = trained.item_scorer(rule)
     _require_whole(k)
-    known_ids = trained.item_index
+    known_ids = trained.items
     excluded = None if candidates is None else _all_but(known_ids, candidates)
 
     def frames() -> Iterator[pd.DataFrame]:
         remaining = iter(batches)
         for batch in remaining:
-            known = positions(known_ids, batch.item_ids)
+            known = known_ids.numbers(batch.item_ids)
             if not ((known >= 0).all() or skip_unknown):
                 raise _unknown(known_ids, [batch, *remaining])
             seen = np.full(len(batch.seen_ids), -1)
             if filter_seen:
-                seen = positions(known_ids, batch.seen_ids)
+                seen = known_ids.numbers(batch.seen_ids)
             numbered = replace(batch, item_ids=known, seen_ids=seen)
-            yield _Choice(trained, scorer, asked, k, excluded, seed, index).frame(numbered)
+            yield _Choice(trained, scorer, k, excluded, seed, index).frame(numbered)
 
     return frames()
 
@@ -96,8 +97,7 @@ class _Choice:
     """How items are chosen."""
 
     trained: TrainedPolicy
-    scorer: SessionScorer
-    rule: DecisionRule
+    scorer: Scorer
     k: int
     excluded: Tensor | None
     """(n_items,) true for items that no user is recommended."""
@@ -129,28 +129,29 @@ class _Choice:
 
     def _parts(self, latest: Histories, order: IntArray) -> Iterator[tuple[Array, Array]]:
         """Items and their log-probabilities, (M, k) each, of some users after the other."""
-        at_once = users_at_once(len(self.trained.item_index))
+        rule = self.scorer.rule
+        at_once = users_at_once(len(self.trained.items))
         if self.index is not None:
             at_once = _USERS_AT_ONCE
         for first in range(0, len(order), at_once):
             part = latest.of_users(order[first : first + at_once])
-            users = positions(self.trained.user_index, part.users)
+            users = self.trained.users.numbers(part.users)
             sessions = sessions_of(self.trained, part, users, self.scorer.length)
             known = part.seen_ids >= 0
             left_out = [part.seen_owner[known]], [part.seen_ids[known]]
-            if self.rule.exclude_seen:
+            if rule.exclude_seen:
                 left_out[0].append(part.owner)
                 left_out[1].append(part.item_ids)
             rows, items = (torch.from_numpy(np.concatenate(each)) for each in left_out)
             if self.index is not None:
-                k = min(self.k, len(self.trained.item_index))
+                k = min(self.k, len(self.trained.items))
                 found = self.index.best(sessions, (rows, items), self.excluded, k)
                 yield found[0].numpy(), found[1].numpy()
                 continue
-            scores = self.scorer.scores(sessions, (rows, items), self.excluded)
+            scores = self.scorer.scores(sessions, (rows, items), self.excluded, empty=True)
             n_items = scores.shape[1]
-            drawn = uniforms(part.users, n_items, self.seed) if self.rule.temperature > 0 else None
-            best = best_of(self.rule, scores, min(self.k, n_items), drawn)
+            drawn = uniforms(part.users, n_items, self.seed) if rule.temperature > 0 else None
+            best = best_of(rule, scores, min(self.k, n_items), drawn)
             yield best[0].numpy(), best[1].numpy()
 
 
@@ -168,7 +169,7 @@ def best_of(
 
     Args:
         rule: the decision rule.
-        scores: (B, n_items) of `SessionScorer.scores`; may be overwritten.
+        scores: (B, n_items) of `Scorer.scores`; may be overwritten.
         k: number of items, at most n_items.
         drawn: (B, n_items) of `uniforms`; needed at a temperature above 0.
     """
@@ -181,23 +182,14 @@ def best_of(
     return items, values.masked_fill(none.unsqueeze(1), -torch.inf)
 
 
-def positions(index: "pd.Index[Any]", ids: Array) -> IntArray:
-    """Position of each of `ids` (N,) in `index`, −1 for ids that it lacks."""
-    wanted = pd.Index(ids)
-    if pd.api.types.is_integer_dtype(index.dtype) != pd.api.types.is_integer_dtype(wanted.dtype):
-        # Integers of one log may be text in another, as for `prepare(like=...)`.
-        index, wanted = index.astype(str), wanted.astype(str)
-    return np.asarray(index.get_indexer(wanted), dtype=np.int64)
-
-
-def _all_but(index: "pd.Index[Any]", candidates: Sequence[Any]) -> Tensor:
+def _all_but(index: IdLookup, candidates: Sequence[Any]) -> Tensor:
     """(n_items,) true for the items that are not among the candidates."""
     if isinstance(candidates, str) or not pd.api.types.is_list_like(candidates):
         raise InputError(f"candidates is {candidates!r}; give a list of item_ids")
     ids = np.asarray(list(candidates))
     if ids.ndim != 1 or len(ids) == 0:
         raise InputError("candidates is empty or nested; give a list of item_ids, or None for all")
-    numbers = positions(index, ids)
+    numbers = index.numbers(ids)
     if (numbers < 0).any():
         unknown = ids[numbers < 0].tolist()
         raise InputError(
@@ -209,10 +201,10 @@ def _all_but(index: "pd.Index[Any]", candidates: Sequence[Any]) -> Tensor:
     return excluded
 
 
-def _unknown(index: "pd.Index[Any]", batches: Iterable[Histories]) -> InputError:
+def _unknown(index: IdLookup, batches: Iterable[Histories]) -> InputError:
     rows, items = 0, set[Any]()
     for batch in batches:
-        unknown = batch.item_ids[positions(index, batch.item_ids) < 0]
+        unknown = batch.item_ids[index.numbers(batch.item_ids) < 0]
         rows += len(unknown)
         items |= set(unknown.tolist())
     return InputError(

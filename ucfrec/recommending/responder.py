@@ -84,8 +84,7 @@ class Responder:
             InputError: the policy's actions are vectors, the rule does not fit the policy, `k` is
                 beyond the limits, or the engine is not installed or cannot compute the policy.
         """
-        self._scorer = trained.scorer(rule)
-        assert trained.item_ids is not None
+        self._scorer = trained.item_scorer(rule)
         if not 1 <= k <= limits.k:
             raise InputError(f"k is {k}; give a whole number from 1 to {limits.k:,}")
         if engine not in ENGINES:
@@ -102,9 +101,8 @@ class Responder:
             skip_unknown,
             seed,
         )
-        self.rule = rule or trained.rule
-        self._item_ids = trained.item_ids
-        self._items, self._users = _Lookup(trained.item_ids), _Lookup(trained.user_ids)
+        self.rule = self._scorer.rule
+        self._items, self._users = trained.items, trained.users
         self._reader = HistoryReader.of(trained)
         self._busy = threading.Lock()
 
@@ -126,7 +124,7 @@ class Responder:
                     asked.append(self._asked(number, request))
                 except InputError as error:
                     outcomes[number] = error
-            at_once = users_at_once(len(self._item_ids))
+            at_once = users_at_once(len(self._items))
             for first in range(0, len(asked), at_once):
                 batch = asked[first : first + at_once]
                 for one, answer in zip(batch, self._scored(batch), strict=True):
@@ -135,7 +133,7 @@ class Responder:
 
     def _asked(self, number: int, request: Request) -> _Asked:
         history = self._reader.read(request.history)
-        known = self._items.positions(history.item_ids)
+        known = self._items.numbers(history.item_ids)
         if (known < 0).any() and not self._skip_unknown:
             unknown = sorted(set(history.item_ids[known < 0].tolist()))
             shown = ", ".join(map(str, unknown[:3])) + (", …" if len(unknown) > 3 else "")
@@ -143,13 +141,13 @@ class Responder:
                 f"{int((known < 0).sum())} rows of the history have an item_id that the policy "
                 f"does not know ({shown}); leave them out"
             )
-        seen = self._items.positions(history.seen) if self._filter_seen else np.empty(0, np.int64)
+        seen = self._items.numbers(history.seen) if self._filter_seen else np.empty(0, np.int64)
         allowed = None if request.candidates is None else self._candidates(request.candidates)
         k = self._k if request.k is None else request.k
         return _Asked(number, request.user_id, k, history, known, seen[seen >= 0], allowed)
 
     def _candidates(self, candidates: Sequence[int | str]) -> IntArray:
-        numbers = self._items.positions(_array(candidates))
+        numbers = self._items.numbers(_array(candidates))
         if (numbers < 0).any():
             unknown = [candidates[n] for n in np.flatnonzero(numbers < 0).tolist()]
             shown = ", ".join(map(str, unknown[:3])) + (", …" if len(unknown) > 3 else "")
@@ -161,7 +159,7 @@ class Responder:
 
     def _scored(self, asked: Sequence[_Asked]) -> list[Answer]:
         latest = self._latest(asked)
-        users = self._users.positions(latest.users)
+        users = self._users.numbers(latest.users)
         sessions = sessions_of(self.trained, latest, users, self._scorer.length)
         left_out = [one.left_out for one in asked]
         rows = [np.repeat(np.arange(len(asked)), [len(each) for each in left_out])]
@@ -172,6 +170,7 @@ class Responder:
             sessions,
             (torch.from_numpy(np.concatenate(rows)), torch.from_numpy(np.concatenate(left_out))),
             self._excluded(asked),
+            empty=True,
         )
         return self._best(asked, scores)
 
@@ -179,7 +178,7 @@ class Responder:
         """(B, n_items) true for items that are no candidates; None if all may be recommended."""
         if all(one.allowed is None for one in asked):
             return None
-        excluded = torch.zeros(len(asked), len(self._item_ids), dtype=torch.bool)
+        excluded = torch.zeros(len(asked), len(self._items), dtype=torch.bool)
         for row, one in enumerate(asked):
             if one.allowed is not None:
                 excluded[row] = True
@@ -226,33 +225,9 @@ class Responder:
             items, values = (each.numpy() for each in best_of(self.rule, of_rows, k, draws))
             for row, numbers, value in zip(rows, items, values, strict=True):
                 kept = np.isfinite(value)
-                ids = self._item_ids[numbers[kept]]
+                ids = self._items.ids[numbers[kept]]
                 answers[row] = Answer(ids.tolist(), value[kept].tolist())
         return answers
-
-
-class _Lookup:
-    """Finds identifiers among those of a run, whether they are integers or text."""
-
-    def __init__(self, ids: Array) -> None:
-        self._whole = ids.dtype.kind == "i"
-        self._ids = ids
-        self._order = np.argsort(ids, kind="stable") if self._whole else np.empty(0, np.int64)
-        self._sorted = ids[self._order] if self._whole else ids
-        self._text: dict[str, int] | None = None
-
-    def positions(self, ids: Array) -> IntArray:
-        """Index of each of `ids` (N,), −1 for ids that the run lacks."""
-        if not (len(ids) and len(self._ids)):
-            return np.full(len(ids), -1)
-        if self._whole and ids.dtype.kind == "i":
-            # One search costs less than a table for as few as a request has.
-            places = np.minimum(np.searchsorted(self._sorted, ids), len(self._sorted) - 1)
-            found: IntArray = np.where(self._sorted[places] == ids, self._order[places], -1)
-            return found
-        if self._text is None:
-            self._text = {str(each): n for n, each in enumerate(self._ids.tolist())}
-        return np.array([self._text.get(str(each), -1) for each in ids.tolist()], dtype=np.int64)
 
 
 def _array(ids: Sequence[Any]) -> Array:

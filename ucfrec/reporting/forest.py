@@ -3,7 +3,6 @@
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from ucfrec.off_policy.estimators import LOGGED
 from ucfrec.reporting.charts import (
@@ -16,7 +15,8 @@ from ucfrec.reporting.charts import (
     Scale,
     Tick,
 )
-from ucfrec.reporting.page_results import Results, Row
+from ucfrec.reporting.page_results import Results
+from ucfrec.results.row import ResultRow
 
 _LINE = 18
 """Height of an interval and the gap below it."""
@@ -54,24 +54,24 @@ class Forest:
 
 def forest(results: Results) -> Forest | None:
     """Draw the estimate that each verdict is of; None if no policy has one with an interval."""
-    drawn: list[tuple[str, Row, bool]] = []
+    drawn: list[tuple[str, ResultRow, tuple[float, float]]] = []
     logged: list[float] = []
     for one in results.estimates:
         row = quoted(one.rows)
         if one.logged is not None:
-            logged.append(float(one.logged["R_cum"]))
-        if row is not None:
-            drawn.append((f"{one.name}: {row['estimator']}", row, row.get("reliable") is True))
+            logged.append(one.logged.value)
+        if row is not None and row.interval is not None:
+            drawn.append((f"{one.name}: {row.method}", row, row.interval))
     if not drawn:
         return None
     # The line is of one set of logs; several have a line each in their own charts.
     reference = logged[0] if len(set(logged)) == 1 else None
-    ends = [float(row[f"R_cum_{end}"]) for _, row, _ in drawn for end in ("low", "high")]
+    ends = [end for _, _, interval in drawn for end in interval]
     x = Scale([*ends, *([] if reference is None else [reference])], LEFT_OF_BARS, WIDTH - 14)
     points, top = [], float(TOP)
-    for name, row, stands in drawn:
+    for name, row, (low, high) in drawn:
         lines = tuple(textwrap.wrap(name, NAME_CHARACTERS))
-        value, low, high = (float(row[key]) for key in ("R_cum", "R_cum_low", "R_cum_high"))
+        value, stands = row.value, row.details.get("reliable") is True
         summary = f"{name} {value:.4g}, 95% interval {low:.4g} to {high:.4g}, "
         summary += _STANDS if stands else _FORBIDDEN
         y = top + NAME * len(lines) + _LINE / 2
@@ -82,15 +82,11 @@ def forest(results: Results) -> Forest | None:
     return Forest(title, top + BAR_BOTTOM, x.ticks(), at, tuple(points))
 
 
-def quoted(rows: Sequence[Row]) -> Row | None:
+def quoted(rows: Sequence[ResultRow]) -> ResultRow | None:
     """The row that the verdict is of, if it has an interval; else the first weighted one."""
-    with_interval = [row for row in rows if _has_interval(row) and row["estimator"] != LOGGED]
+    with_interval = [row for row in rows if row.interval is not None and row.method != LOGGED]
     for row in with_interval:
-        if row["estimator"] == row.get("verdict_of"):
+        if row.method == row.details.get("verdict_of"):
             return row
-    preferred = {row["estimator"]: row for row in with_interval}
+    preferred = {row.method: row for row in with_interval}
     return next((preferred[name] for name in ("DR", "SNPDIS", "SNIPS") if name in preferred), None)
-
-
-def _has_interval(row: dict[str, Any]) -> bool:
-    return row.get("R_cum_low") is not None and row.get("R_cum_high") is not None

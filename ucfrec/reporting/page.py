@@ -22,7 +22,7 @@ from ucfrec.reporting.copies import copies_table, moves_chart
 from ucfrec.reporting.curves import POINTS, REFERENCES, Curves, draw_curves, trained_on
 from ucfrec.reporting.data_quality import data_quality
 from ucfrec.reporting.forest import forest
-from ucfrec.reporting.page_results import environments, estimates, read_results
+from ucfrec.reporting.page_results import environments, estimates, results_of
 from ucfrec.reporting.samples import read_features, sample_tables
 from ucfrec.reporting.tables import Table, shown
 from ucfrec.reporting.verdict import verdict
@@ -82,7 +82,7 @@ def write_report(
     by_data: dict[str, list[_Run]] = {}
     for run in _read_runs(runs):
         by_data.setdefault(run.record.fingerprint, []).append(run)
-    evidence = read_results(results)
+    evidence = results_of(results)
     with damage_explained(Path(", ".join(map(str, results))), "write its rows again"):
         judged = {
             "verdict": verdict(evidence),

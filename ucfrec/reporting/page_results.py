@@ -1,6 +1,5 @@
 """Results of `ucfrec evaluate` and `ucfrec ope` in the report."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,14 +7,13 @@ from typing import Any
 
 from ucfrec.errors import InputError
 from ucfrec.evaluation.diversity_columns import COLUMNS
+from ucfrec.off_policy.columns import SUITE
 from ucfrec.off_policy.estimators import LOGGED
 from ucfrec.reporting import charts
-from ucfrec.reporting.evaluation_rows import read_evaluations
-from ucfrec.reporting.tables import Table, shown
+from ucfrec.reporting.tables import Table, evaluation_line, shown
+from ucfrec.results.row import ResultRow
+from ucfrec.results.rows_file import read_results
 
-Row = dict[str, Any]
-
-_INTERVAL = ("R_cum", "R_cum_low", "R_cum_high")
 _METRICS = ("R_avg_pooled", "R_avg_episode", "length", *COLUMNS, "target_return", "episodes")
 _SEEDS = ("seed", "train_seed")
 _WEIGHTS = ("effective_sessions", "largest_weight", "sessions", "overlap")
@@ -26,9 +24,9 @@ class Estimates:
     """The estimates of one `ucfrec ope` for one policy."""
 
     name: str
-    logged: Row | None
+    logged: ResultRow | None
     """Row of the logged sessions' own return."""
-    rows: Sequence[Row]
+    rows: Sequence[ResultRow]
     """One row per estimator, without `logged`."""
     warnings: tuple[str, ...]
 
@@ -37,79 +35,56 @@ class Estimates:
 class Results:
     """The result rows of a report."""
 
-    environments: Mapping[str, Sequence[Row]]
+    environments: Mapping[str, Sequence[ResultRow]]
     """Environment to its rows of `ucfrec evaluate` or `ucfrec demo`."""
     estimates: Sequence[Estimates]
 
 
-def read_results(paths: Sequence[Path]) -> Results:
+def results_of(paths: Sequence[Path]) -> Results:
     """Read result rows from JSON lines (files named `.jsonl`) or JSON.
 
     Raises:
         InputError: a file is missing or has a row without the required fields.
     """
-    environments: dict[str, list[Row]] = {}
+    environments: dict[str, list[ResultRow]] = {}
     estimates: list[Estimates] = []
     for path in paths:
-        rows = _rows_of(path)
-        for row in rows:
-            if "estimator" not in row:
-                environments.setdefault(row["environment"], []).append(row)
-        estimates += _estimates([row for row in rows if "estimator" in row])
+        rows = read_results(path)
+        for number, row in enumerate(rows, start=1):
+            if row.metric != "R_cum" or (row.interval is None and row.suite != SUITE):
+                raise InputError(
+                    f"{path}, row {number}, has no R_cum with an interval; give rows that `ucfrec "
+                    "evaluate --json`, `ucfrec ope --json` or `ucfrec demo` wrote"
+                )
+            if row.suite != SUITE:
+                environments.setdefault(row.environment or row.task, []).append(row)
+        estimates += _estimates([row for row in rows if row.suite == SUITE])
     return Results(environments, estimates)
 
 
-def _rows_of(path: Path) -> list[Row]:
-    rows = read_evaluations(path)
-    for number, row in enumerate(rows, start=1):
-        known = row if isinstance(row, dict) else {}
-        texts = ("estimator" if "estimator" in known else "environment", "policy")
-        lacking = [name for name in texts if not isinstance(known.get(name), str)]
-        # An estimate that nothing but a model stands behind has no interval.
-        open_ended = "estimator" in known and known.get("R_cum_low") is None
-        needed = _INTERVAL[:1] if open_ended else _INTERVAL
-        lacking += [name for name in needed if not _finite(known.get(name))]
-        lacking += [
-            name
-            for name in (*_METRICS, *_WEIGHTS)
-            if known.get(name) is not None and not isinstance(known[name], (int, float))
-        ]
-        if not isinstance(known.get("warnings", []), list):
-            lacking.append("warnings")
-        if lacking:
-            raise InputError(
-                f"{path}, row {number}, has no usable {', '.join(lacking)}; give rows that "
-                "`ucfrec evaluate --json`, `ucfrec ope --json` or `ucfrec demo` wrote"
-            )
-    return rows
-
-
-def _finite(value: Any) -> bool:
-    return isinstance(value, (int, float)) and math.isfinite(value)
-
-
-def _estimates(rows: Sequence[Row]) -> list[Estimates]:
+def _estimates(rows: Sequence[ResultRow]) -> list[Estimates]:
     """Group the rows of one file by `ucfrec ope` call; the rows of a call begin with `logged`."""
-    groups: list[list[Row]] = []
+    groups: list[list[ResultRow]] = []
     for row in rows:
-        if row["estimator"] == LOGGED or not groups:
+        if row.method == LOGGED or not groups:
             groups.append([])
         groups[-1].append(row)
     return [_policy_estimates(group) for group in groups]
 
 
-def _policy_estimates(group: Sequence[Row]) -> Estimates:
-    logged = next((row for row in group if row["estimator"] == LOGGED), None)
+def _policy_estimates(group: Sequence[ResultRow]) -> Estimates:
+    logged = next((row for row in group if row.method == LOGGED), None)
     rows = [row for row in group if row is not logged]
-    policy = rows[0] if rows else group[0]
-    run, choice = policy.get("run"), policy.get("choice")
-    name = policy["policy"]
+    first = rows[0] if rows else group[0]
+    run, choice = first.conditions.get("run"), first.conditions.get("choice")
+    name = first.policy
     name += "" if choice is None else f" ({choice})"
     name += "" if run is None else f" of {run}"
-    if policy.get("selection") is not None:
-        name = f"{policy['policy']} ({policy['candidate']})"
-    warnings = dict.fromkeys(str(text) for row in group for text in row.get("warnings", []))
-    return Estimates(name, logged, rows, tuple(warnings))
+    if first.details.get("selection") is not None:
+        name = f"{first.policy} ({first.details.get('candidate')})"
+    warnings = (row.details.get("warnings") for row in group)
+    said = (str(text) for texts in warnings if isinstance(texts, list) for text in texts)
+    return Estimates(name, logged, rows, tuple(dict.fromkeys(said)))
 
 
 def environments(results: Results) -> list[tuple[charts.BarChart, Table]]:
@@ -117,12 +92,12 @@ def environments(results: Results) -> list[tuple[charts.BarChart, Table]]:
     return [_environment(environment, rows) for environment, rows in results.environments.items()]
 
 
-def _environment(environment: str, rows: Sequence[Row]) -> tuple[charts.BarChart, Table]:
-    names = _row_names(rows)
-    columns = [c for c in (*_METRICS, *_SEEDS) if any(row.get(c) is not None for row in rows)]
+def _environment(environment: str, rows: Sequence[ResultRow]) -> tuple[charts.BarChart, Table]:
+    names, lines = _row_names(rows), [evaluation_line(row) for row in rows]
+    columns = [c for c in (*_METRICS, *_SEEDS) if any(line.get(c) is not None for line in lines)]
     body = [
-        (name, [interval(row), *(_cell(row, column) for column in columns)])
-        for name, row in zip(names, rows, strict=True)
+        (name, [interval(row), *(_cell(line, column) for column in columns)])
+        for name, row, line in zip(names, rows, lines, strict=True)
     ]
     table = Table(f"{environment}: means of episodes", "policy", ["R_cum", *columns], body)
     return _bars(f"R_cum in {environment}, with 95% intervals", names, rows), table
@@ -135,7 +110,7 @@ def estimates(results: Results) -> list[tuple[Estimates, charts.BarChart, Table]
         rows = [*([one.logged] if one.logged else []), *one.rows]
         names = [_estimator(row) for row in rows]
         body = [
-            (name, [interval(row), *(shown(row.get(column)) for column in _WEIGHTS)])
+            (name, [interval(row), *(shown(row.as_line().get(column)) for column in _WEIGHTS)])
             for name, row in zip(names, rows, strict=True)
         ]
         columns = ["mean return of a session", "effective sample", "share of the largest weight"]
@@ -145,37 +120,39 @@ def estimates(results: Results) -> list[tuple[Estimates, charts.BarChart, Table]
     return drawn
 
 
-def _estimator(row: Row) -> str:
-    return "logged sessions" if row["estimator"] == LOGGED else str(row["estimator"])
+def _estimator(row: ResultRow) -> str:
+    return "logged sessions" if row.method == LOGGED else row.method
 
 
-def _bars(title: str, names: Sequence[str], rows: Sequence[Row]) -> charts.BarChart:
+def _bars(title: str, names: Sequence[str], rows: Sequence[ResultRow]) -> charts.BarChart:
     bars = [
-        (name, float(row["R_cum"]), float(row["R_cum_low"]), float(row["R_cum_high"]))
+        (name, row.value, row.interval[0], row.interval[1])
         for name, row in zip(names, rows, strict=True)
-        if row["R_cum_low"] is not None
+        if row.interval is not None
     ]
     return charts.bar_chart(title, bars)
 
 
-def interval(row: Row) -> str:
+def interval(row: ResultRow) -> str:
     """R_cum with its 95% interval, if it has one."""
-    if row["R_cum_low"] is None:
-        return f"{shown(row['R_cum'])} [–]"
-    return f"{shown(row['R_cum'])} [{shown(row['R_cum_low'])}, {shown(row['R_cum_high'])}]"
+    if row.interval is None:
+        return f"{shown(row.value)} [–]"
+    low, high = row.interval
+    return f"{shown(row.value)} [{shown(low)}, {shown(high)}]"
 
 
-def _row_names(rows: Sequence[Row]) -> list[str]:
+def _row_names(rows: Sequence[ResultRow]) -> list[str]:
     """Policy of each row, with the fields that differ if a policy has several rows."""
-    names = []
-    for row in rows:
-        same = [other for other in rows if other["policy"] == row["policy"]]
+    names, lines = [], [evaluation_line(row) for row in rows]
+    for line in lines:
+        same = [other for other in lines if other["policy"] == line["policy"]]
         fields = ("run", "checkpoint", *_SEEDS)
-        differing = [key for key in fields if any(o.get(key) != row.get(key) for o in same)]
-        names.append(", ".join([row["policy"], *(f"{key} {_cell(row, key)}" for key in differing)]))
+        differing = [key for key in fields if any(o.get(key) != line.get(key) for o in same)]
+        parts = [line["policy"], *(f"{key} {_cell(line, key)}" for key in differing)]
+        names.append(", ".join(parts))
     return names
 
 
-def _cell(row: Row, column: str) -> str:
-    value = row.get(column)
+def _cell(line: Mapping[str, Any], column: str) -> str:
+    value = line.get(column)
     return str(value) if column in _SEEDS and value is not None else shown(value)

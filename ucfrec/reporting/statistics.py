@@ -1,6 +1,6 @@
 """Mean and standard deviation over seeds, defined once for all tables and figures."""
 
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -33,11 +33,6 @@ def summary(values: Iterable[float]) -> Summary:
     mean = float(sample.mean()) if len(sample) else float("nan")
     sd = float(sample.std(ddof=1)) if len(sample) > 1 else float("nan")
     return Summary(mean, sd, len(sample))
-
-
-def paired_differences(values: Mapping[Key, float], others: Mapping[Key, float]) -> list[float]:
-    """`values[k]` − `others[k]` for the keys (seeds) in both, in the order of `values`."""
-    return [value - others[key] for key, value in values.items() if key in others]
 
 
 def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, Sequence[Item]]:

@@ -7,20 +7,13 @@ from typing import Any
 
 from ucfrec.errors import one_line
 from ucfrec.reporting.statistics import Summary, summary
+from ucfrec.results.row import ResultRow
 
 NONE = "–"
 """Cell of a missing value."""
 _EVALUATION = (
-    *(
-        "environment",
-        "policy",
-        "R_cum",
-        "R_avg_pooled",
-        "R_avg_episode",
-        "length",
-        "episodes",
-        "seed",
-    ),
+    *("environment", "policy", "R_cum", "R_avg_pooled", "R_avg_episode", "length", "episodes"),
+    "seed",
 )
 
 
@@ -54,7 +47,22 @@ def markdown_table(head: Sequence[str], lines: Iterable[Sequence[object]]) -> st
     return "\n".join("| " + " | ".join(line) + " |" for line in body)
 
 
-def format_rows(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = _EVALUATION) -> str:
+def evaluation_line(row: ResultRow) -> dict[str, Any]:
+    """A row with its values by the column names of tables of evaluations."""
+    return {
+        **row.as_line(),
+        "policy": row.method,
+        "seed": row.evaluation_seed,
+        "train_seed": row.training_seed,
+    }
+
+
+def evaluation_table(rows: Iterable[ResultRow]) -> str:
+    """Rows of evaluations as an aligned text table."""
+    return format_rows([evaluation_line(row) for row in rows], _EVALUATION)
+
+
+def format_rows(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> str:
     """The `columns` of rows as an aligned text table.
 
     A value `x` of a row that also has `x_low` and `x_high`, such as R_cum, gets its interval.

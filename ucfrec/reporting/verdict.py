@@ -4,12 +4,14 @@ Two results count as different only if their 95% intervals do not overlap, which
 test of the difference at 5%.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from ucfrec.off_policy.estimators import WEIGHTED
-from ucfrec.reporting.page_results import Estimates, Results, Row, interval
+from ucfrec.reporting.page_results import Estimates, Results, interval
 from ucfrec.reporting.tables import shown
+from ucfrec.results.row import ResultRow
 
 NO_RESULTS = (
     "No results are given, so the returns of these policies are unknown. A validation loss "
@@ -52,7 +54,7 @@ def verdict(results: Results) -> list[str]:
     return paragraphs or [NO_RESULTS]
 
 
-def _of_environment(environment: str, rows: Sequence[Row]) -> str:
+def _of_environment(environment: str, rows: Sequence[ResultRow]) -> str:
     earned = _earned(rows)
     trained = sorted((one for one in earned if one.trained), key=lambda one: -one.value)
     references = [one for one in earned if not one.trained]
@@ -72,21 +74,21 @@ def _of_environment(environment: str, rows: Sequence[Row]) -> str:
     return " ".join(sentences)
 
 
-def _earned(rows: Sequence[Row]) -> list[_Earned]:
+def _earned(rows: Sequence[ResultRow]) -> list[_Earned]:
     """One summary per policy and checkpoint, in order of first appearance."""
-    groups: dict[tuple[str, str | None], list[Row]] = {}
+    groups: dict[tuple[str, str | None], list[ResultRow]] = {}
     for row in rows:
-        groups.setdefault((row["policy"], row.get("checkpoint")), []).append(row)
+        groups.setdefault((row.method, row.checkpoint), []).append(row)
     several = {policy for policy, _ in groups if sum(key[0] == policy for key in groups) > 1}
     return [
         _Earned(
             f"{policy}, checkpoint {checkpoint}" if policy in several else policy,
-            any(row.get("train_seed") is not None for row in group),
+            any(row.training_seed is not None for row in group),
             len(group),
-            len({row.get("train_seed") for row in group}),
-            sum(row["R_cum"] for row in group) / len(group),
-            min(row["R_cum_low"] for row in group),
-            max(row["R_cum_high"] for row in group),
+            len({row.training_seed for row in group}),
+            sum(row.value for row in group) / len(group),
+            min(row.interval[0] for row in group if row.interval),
+            max(row.interval[1] for row in group if row.interval),
         )
         for (policy, checkpoint), group in groups.items()
     ]
@@ -130,19 +132,21 @@ def _against(best: _Earned, references: Sequence[_Earned]) -> str:
 
 
 def _of_estimates(one: Estimates) -> str:
-    computed = next((row["verdict"] for row in one.rows if row.get("verdict")), None)
+    computed = next(
+        (row.details["verdict"] for row in one.rows if row.details.get("verdict")), None
+    )
     if computed is not None:
         return f"For {one.name}: {computed}."
-    weighted = [row for row in one.rows if row["estimator"] in WEIGHTED]
+    weighted = [row for row in one.rows if row.method in WEIGHTED]
     warnings = "; ".join(one.warnings)
     if not weighted:
-        models = _listed([f"{row['estimator']} {interval(row)}" for row in one.rows])
+        models = _listed([f"{row.method} {interval(row)}" for row in one.rows])
         because = f" ({warnings})" if warnings else ""
         text = f"For {one.name}, these logs allow no weighted estimate{because}."
         return f"{text} Models alone (no conclusion): {models}." if models else text
-    named = {row["estimator"]: row for row in weighted}
+    named = {row.method: row for row in weighted}
     quoted = named.get("DR") or named.get("SNIPS") or weighted[0]
-    figure = f"{quoted['estimator']} estimates {interval(quoted)} per session"
+    figure = f"{quoted.method} estimates {interval(quoted)} per session"
     if warnings:
         return f"For {one.name}, {figure}, which is not reliable: {warnings}."
     if one.logged is None:
@@ -152,10 +156,12 @@ def _of_estimates(one: Estimates) -> str:
     )
 
 
-def _compared(weighted: Sequence[Row], logged: Row) -> str:
-    above = [row["estimator"] for row in weighted if row["R_cum_low"] > logged["R_cum_high"]]
-    below = [row["estimator"] for row in weighted if row["R_cum_high"] < logged["R_cum_low"]]
-    everyone = _listed([row["estimator"] for row in weighted])
+def _compared(weighted: Sequence[ResultRow], logged: ResultRow) -> str:
+    low, high = logged.interval or (logged.value, logged.value)
+    ends = {row.method: row.interval or (-math.inf, math.inf) for row in weighted}
+    above = [name for name, own in ends.items() if own[0] > high]
+    below = [name for name, own in ends.items() if own[1] < low]
+    everyone = _listed(list(ends))
     for names, more in ((above, "more"), (below, "less")):
         if len(names) == len(weighted):
             return (

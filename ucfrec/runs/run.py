@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from ucfrec.acting.decision import Decider
+from ucfrec.acting.scorer import Scorer
 from ucfrec.choosing.choose import choose_rule
 from ucfrec.counterfactual.augment import AugmentationReport, AugmentConfig
 from ucfrec.counterfactual.copies import MODELS, counterfactual_copies
@@ -205,10 +205,11 @@ def _fit_user_model(run: _Inputs) -> UserModel:
 def _choose_rule(run: _Inputs, users: UserModel) -> RuleRecord:
     """Choose the decision rule: by simulation in the user model, or by ranking."""
     trained = TrainedPolicy.load(run.out, in_training=True)
-    decider = Decider(run.policy, trained.rule, trained.returns, users.reward)
+    parts = trained.item_states, trained.returns, users.reward
+    scorer = Scorer(run.policy, trained.rule, *parts)
     config = run.config.rule
     targets = {quantile: trained.target_return(quantile) for quantile in config.quantiles}
-    choice = choose_rule(decider, users, targets, run.logged, run.held_out, config, run.config.seed)
+    choice = choose_rule(scorer, users, targets, run.logged, run.held_out, config, run.config.seed)
     write_json(run.out / RULE, choice.rule.as_dict())
     return RuleRecord.model_validate(choice.as_dict())
 
@@ -217,7 +218,7 @@ def _write_samples(run: _Inputs) -> None:
     """Save a few recommendations for the report, by the run's decision rule."""
     if run.held_out.has_items:
         trained = TrainedPolicy.load(run.out, in_training=True)
-        write_json(run.out / SAMPLES, sample_recommendations(trained.decider(), run.held_out))
+        write_json(run.out / SAMPLES, sample_recommendations(trained.scorer(), run.held_out))
 
 
 def _dependencies(
@@ -227,7 +228,7 @@ def _dependencies(
     device: torch.device,
     *settings: CRMConfig | CSGConfig | AugmentConfig,
 ) -> dict[str, Any]:
-    """All that a shared stage depends on, but the code."""
+    """All that a reward model or copies depend on."""
     return {
         "data": train.record.fingerprint,
         "item_states": train.record.files.get(ITEM_STATES),

@@ -6,8 +6,7 @@ import numpy as np
 import torch
 
 from ucfrec import schema
-from ucfrec.acting.decision import Decider
-from ucfrec.acting.logged_decisions import session_scores
+from ucfrec.acting.scorer import Scorer, logged_scores
 from ucfrec.episodes.store import EpisodeStore
 
 SAMPLES = "samples.json"
@@ -15,11 +14,11 @@ _SESSIONS, _HISTORY, _ITEMS = 3, 5, 5
 
 
 @torch.no_grad()
-def sample_recommendations(decider: Decider, validation: EpisodeStore) -> dict[str, Any]:
+def sample_recommendations(scorer: Scorer, validation: EpisodeStore) -> dict[str, Any]:
     """Recommendations of a policy at the last step of a few validation sessions.
 
     Args:
-        decider: a policy of items and its rule.
+        scorer: a policy of items under its rule.
         validation: validation episodes of items.
 
     Returns:
@@ -31,7 +30,7 @@ def sample_recommendations(decider: Decider, validation: EpisodeStore) -> dict[s
     places = np.linspace(0, len(long_enough) - 1, min(_SESSIONS, len(long_enough)))
     episodes = long_enough[places.astype(np.int64)]
     last = validation.lengths[episodes] - 1
-    scores = session_scores(decider, validation, episodes, last)
+    scores = logged_scores(scorer, validation, episodes, last)
     best = scores.topk(min(_ITEMS, len(validation.item_states.embeddings)))
     sessions = []
     for place, episode in enumerate(episodes):
@@ -47,4 +46,4 @@ def sample_recommendations(decider: Decider, validation: EpisodeStore) -> dict[s
                 "recommended": best.indices[place].tolist(),
             }
         )
-    return {"rule": str(decider.rule), "sessions": sessions}
+    return {"rule": str(scorer.rule), "sessions": sessions}

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from ucfrec.code_version import code_version
+from ucfrec import __version__
 from ucfrec.files.atomic import atomic_file, atomic_folder
 from ucfrec.files.locks import claim
 from ucfrec.provenance import config_hash
@@ -21,7 +21,7 @@ class SharedStages:
     def provide(
         self,
         inputs: Mapping[str, Any],
-        module: str,
+        stage: str,
         out: Path,
         names: Sequence[str],
         make: Callable[[], object],
@@ -31,8 +31,9 @@ class SharedStages:
         Another process that needs the same stage waits until it is made.
 
         Args:
-            inputs: all that the stage depends on but its code: data, settings, seed.
-            module: of the code of the stage; another version of it makes the stage anew.
+            inputs: all that the stage depends on: data, settings, seed. Another version of the
+                package makes its own.
+            stage: name of the stage.
             out: run folder.
             names: files and folders of the stage in `out`, those that are made; the last one marks
                 the stage as finished, and is copied last. No file is ever there in part.
@@ -41,13 +42,13 @@ class SharedStages:
         if self.folder is None:
             make()
             return
-        stage = self.folder / config_hash({**inputs, "code": code_version(module)})
-        with claim(stage, wait=True):
-            if stage.exists():
-                _copy(stage, out, names)
+        kept = self.folder / config_hash({**inputs, "stage": stage, "version": __version__})
+        with claim(kept, wait=True):
+            if kept.exists():
+                _copy(kept, out, names)
                 return
             make()
-            with atomic_folder(stage) as scratch:
+            with atomic_folder(kept) as scratch:
                 _copy(out, scratch, names)
 
 

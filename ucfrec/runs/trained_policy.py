@@ -5,17 +5,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 
 from ucfrec import schema
-from ucfrec.acting.decision import Decider, DecisionRule
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
-from ucfrec.acting.session_scorer import SessionScorer
+from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import Array, Float32Array, IntArray
-from ucfrec.episodes.exposure import Likeness
+from ucfrec.episodes.ids import IdLookup
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
@@ -28,11 +28,7 @@ from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
 from ucfrec.runs.record import RunRecord, read_record
-from ucfrec.user_model.main_tags import MainTags
 from ucfrec.user_model.reward import FITTED, ItemRewardModel
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 RUN, AUGMENTATION = RunRecord.FILE, "augmentation.json"
 ITEMS, USERS = "items.parquet", "users.parquet"
@@ -157,25 +153,15 @@ class TrainedPolicy:
         return self.record.name
 
     @cached_property
-    def item_index(self) -> "pd.Index[Any]":
+    def items(self) -> IdLookup:
         """Looks up `item_ids`."""
-        import pandas as pd  # takes longer than the rest of this module
-
-        index: pd.Index[Any] = pd.Index(self.item_ids)  # type: ignore[arg-type]
-        return index
+        assert self.item_ids is not None
+        return IdLookup(self.item_ids)
 
     @cached_property
-    def user_index(self) -> "pd.Index[Any]":
+    def users(self) -> IdLookup:
         """Looks up `user_ids`."""
-        import pandas as pd
-
-        index: pd.Index[Any] = pd.Index(self.user_ids)
-        return index
-
-    @cached_property
-    def likeness(self) -> Likeness | None:
-        """How alike the items are; None if actions are vectors."""
-        return None if self.item_states is None else Likeness.of(self.item_states)
+        return IdLookup(self.user_ids)
 
     @property
     def dropped(self) -> tuple[int, ...]:
@@ -203,19 +189,33 @@ class TrainedPolicy:
             raise InputError(f"the target quantile is {quantile}; give a number from 0 to 1")
         return float(np.quantile(self.training_returns.astype(np.float64), quantile))
 
-    def decider(self, rule: DecisionRule | None = None) -> Decider:
-        """The policy under `rule`, by default the run's own."""
-        rule = rule or self.rule
-        likeness = self.likeness if rule.tag_window else None
-        tags = None
-        if rule.tag_run and self.item_states is not None:
-            tags = MainTags.of(self.item_states)
-        return Decider(self.policy, rule, self.returns, self.reward_model, likeness, tags)
+    def scorer(self, rule: DecisionRule | None = None) -> Scorer:
+        """The policy under `rule`, by default the run's own.
 
-    def scorer(self, rule: DecisionRule | None = None) -> SessionScorer:
-        """Scores items for sessions under `rule`, by default the run's own.
+        What it computes once is kept for the next call with the same weights.
 
-        It is kept for the next call with the same rule and weights.
+        Raises:
+            InputError: the rule does not fit the policy.
+        """
+        models = (self.policy, self.reward_model)
+        weights = [
+            (id(each), each.data_ptr(), each._version)
+            for model in models
+            if model is not None
+            for each in model.state_dict(keep_vars=True).values()
+        ]
+        if self._kept.get("weights") != weights:
+            # The one before goes first, for its memory.
+            self._kept.clear()
+            self._kept["scorer"] = Scorer(
+                self.policy, rule or self.rule, self.item_states, self.returns, self.reward_model
+            )
+            self._kept["weights"] = weights
+        kept: Scorer = self._kept["scorer"]
+        return kept.under(rule or self.rule)
+
+    def item_scorer(self, rule: DecisionRule | None = None) -> Scorer:
+        """`scorer` of a policy of items.
 
         Raises:
             InputError: the policy's actions are vectors, or the rule does not fit the policy.
@@ -224,20 +224,7 @@ class TrainedPolicy:
             raise InputError(
                 "this policy's actions are vectors; recommending needs a policy trained on items"
             )
-        rule, models = rule or self.rule, (self.policy, self.reward_model)
-        weights = [
-            (id(each), each.data_ptr(), each._version)
-            for model in models
-            if model is not None
-            for each in model.state_dict(keep_vars=True).values()
-        ]
-        if self._kept.get("state") != (rule, weights):
-            # The one before goes first, for its memory.
-            self._kept.clear()
-            self._kept["scorer"] = SessionScorer(self.decider(rule), self.item_states)
-            self._kept["state"] = rule, weights
-        scorer: SessionScorer = self._kept["scorer"]
-        return scorer
+        return self.scorer(rule)
 
     @cached_property
     def _kept(self) -> dict[str, Any]:
@@ -260,7 +247,7 @@ class TrainedPolicy:
             seed: of the draws of a rule with a temperature.
         """
         return PolicyActor(
-            self.decider(rule),
+            self.scorer(rule),
             episodes,
             self.record.observation_size,
             self.item_states,

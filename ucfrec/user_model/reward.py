@@ -130,7 +130,9 @@ class ItemRewardModel(nn.Module):
     def tastes_after(self, shown: Shown) -> Tensor:
         """What sessions told of their users' level and affinity, (B, D + 1)."""
         if not self.tastes.known:
-            return torch.zeros(len(shown.items), self.vectors.shape[1] + 1, device=self.item.device)
+            # The length of a tensor would be that of one batch in a graph that is exported.
+            size = shown.items.shape[0], self.vectors.shape[1] + 1
+            return torch.zeros(size, device=self.item.device)
         items, rewards = shown.latest(MEMORY)
         tastes: Tensor = self.tastes(items, self.vectors, self.target(rewards))
         return tastes
@@ -172,7 +174,7 @@ class ItemRewardModel(nn.Module):
         """Rows (B,) of the users in the effects of users, B being the length of `like`."""
         last = len(self.user) - 1
         if users is None:
-            return torch.full((len(like),), last, device=like.device)
+            return torch.full(like.shape[:1], last, device=like.device)
         return torch.where((users >= 0) & (users < last), users, last)
 
     def query(self, states: Tensor, users: Tensor | None, tastes: Tensor) -> Tensor:

@@ -1,34 +1,39 @@
-"""Rows of the control tables: learners and their settings, by the name of the row."""
+"""Rows of the control tables: policies and their settings, by the name of the row."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 
-Methods = dict[str, tuple[str, tuple[str, ...]]]
+from ucfrec.benchmark.cells import Method
+
+SCORES, ROBUSTNESS, RATES = "control", "robustness", "rates"
+"""Suites of the rows."""
+Methods = dict[str, Method]
 _NO_TIME = "policy.max_timestep=1"
 _ALGORITHM_5 = ("augment.copies=3", "augment.edits_per_copy=1", "augment.reward_quantile=0.0")
 PAPER: Methods = {
-    "ucf-paper": ("ucf-paper", ()),
-    "ucf-paper-algorithm-5": ("ucf-paper", _ALGORITHM_5),
+    "ucf-paper": Method("ucf-paper"),
+    "ucf-paper-algorithm-5": Method("ucf-paper", _ALGORITHM_5),
 }
 """UCF as the paper has it, with Appendix H's copies and with Algorithm 5's."""
 METHODS: Methods = {
-    "bc": ("bc", ()),
-    "bc-10": ("bc", ("policy.best_share=0.1",)),
-    "bc-25": ("bc", ("policy.best_share=0.25",)),
-    "iql": ("iql", ()),
-    "cql": ("cql", ()),
-    "dt": ("dt", ()),
-    "dt-wo-time": ("dt", (_NO_TIME,)),
-    "dc": ("dc", ()),
-    "dc-wo-time": ("dc", (_NO_TIME,)),
-    "lsdt": ("lsdt", ()),
-    "lsdt-wo-time": ("lsdt", (_NO_TIME,)),
-    "ucf": ("ucf", ()),
-    "ucf-w-time": ("ucf", ("policy.max_timestep=1000",)),
+    "bc": Method("bc"),
+    "bc-10": Method("bc", ("policy.best_share=0.1",)),
+    "bc-25": Method("bc", ("policy.best_share=0.25",)),
+    "iql": Method("iql"),
+    "cql": Method("cql"),
+    "dt": Method("dt"),
+    "dt-wo-time": Method("dt", (_NO_TIME,)),
+    "dc": Method("dc"),
+    "dc-wo-time": Method("dc", (_NO_TIME,)),
+    "lsdt": Method("lsdt"),
+    "lsdt-wo-time": Method("lsdt", (_NO_TIME,)),
+    "ucf": Method("ucf"),
+    "ucf-w-time": Method("ucf", ("policy.max_timestep=1000",)),
     **PAPER,
-    "ucf-wo-count": ("ucf", ("augment.copies=0",)),
-    "ucf-wo-arch": ("dt", (_NO_TIME, "augment.copies=1")),
+    "ucf-wo-count": Method("ucf", ("augment.copies=0",)),
+    "ucf-wo-arch": Method("dt", (_NO_TIME, "augment.copies=1")),
 }
-"""Learner and settings by the name of the table's row; the last two are Table 3's ablations.
+"""Methods by the name of the table's row; the last two are Table 3's ablations.
 
 UCF's preset has no embedding of time steps, the presets of DT, DC and LSDT have one; `ucf-w-time`
 and `…-wo-time` are the reverse. `ucf-wo-arch` has none, as UCF.
@@ -40,7 +45,7 @@ _FAITHFUL, _NOISE = "csg.kind=faithful", "csg.kind=noise"
 _NO_GATE = "augment.epsilon_r=1e9"
 """Disables the gate on the change of the reward; the limit on a move's length stays."""
 METHODS_WO_TIME = {"dt": "dt-wo-time", "dc": "dc-wo-time", "lsdt": "lsdt-wo-time", "ucf": "ucf"}
-"""The method without embeddings of time steps, by learner."""
+"""The method without embeddings of time steps, by policy."""
 _PURSUITS = {
     "": (),
     "-weights": ("policy.advantage_weights=true",),
@@ -57,7 +62,9 @@ _BASELINES = ("dt-wo-time", "dc-wo-time", "lsdt-wo-time")
 def _rows(names: Iterable[str], ways: Iterable[str], more: str = "") -> Methods:
     """Rows of `METHODS` in each of the ways of `_PURSUITS`, called by row, way and `more`."""
     return {
-        f"{name}{way}{more}": (METHODS[name][0], (*METHODS[name][1], *_PURSUITS[way]))
+        f"{name}{way}{more}": replace(
+            METHODS[name], settings=(*METHODS[name].settings, *_PURSUITS[way])
+        )
         for name in names
         for way in ways
     }
@@ -77,30 +84,30 @@ _TABLES: dict[str, Methods] = {
     PURSUING: _rows((*_BASELINES, *_UCF), _PURSUITS),
     # Figure 2.
     LAMBDA: {
-        f"ucf-lambda-{weight:g}": ("ucf", (f"policy.lambda_mask={weight}",))
+        f"ucf-lambda-{weight:g}": Method("ucf", (f"policy.lambda_mask={weight}",))
         for weight in (0.0, 0.05, 0.1, 0.25, 0.5, 1.0)
     },
     # Table 9, with each generator.
     "gate": {
-        "ucf": ("ucf", ()),
-        "ucf-wo-gate": ("ucf", (_NO_GATE,)),
-        "faithful": ("ucf", (_FAITHFUL,)),
-        "faithful-wo-gate": ("ucf", (_FAITHFUL, _NO_GATE)),
+        "ucf": Method("ucf"),
+        "ucf-wo-gate": Method("ucf", (_NO_GATE,)),
+        "faithful": Method("ucf", (_FAITHFUL,)),
+        "faithful-wo-gate": Method("ucf", (_FAITHFUL, _NO_GATE)),
     },
     # Table 10: λ_band exists for the paper's network only; for tangent moves the band is widened.
     "band": {
-        "ucf": ("ucf", ()),
-        "ucf-wide": ("ucf", ("csg.band=[0.2, 2.0]",)),
-        "ucf-wo-lower": ("ucf", ("csg.band=[0.0, 0.5]",)),
-        "faithful": ("ucf", (_FAITHFUL,)),
-        "faithful-wo-band": ("ucf", (_FAITHFUL, "csg.lambda_band=0.0")),
-        "faithful-wo-lower": ("ucf", (_FAITHFUL, "csg.band=[0.0, 0.5]")),
+        "ucf": Method("ucf"),
+        "ucf-wide": Method("ucf", ("csg.band=[0.2, 2.0]",)),
+        "ucf-wo-lower": Method("ucf", ("csg.band=[0.0, 0.5]",)),
+        "faithful": Method("ucf", (_FAITHFUL,)),
+        "faithful-wo-band": Method("ucf", (_FAITHFUL, "csg.lambda_band=0.0")),
+        "faithful-wo-lower": Method("ucf", (_FAITHFUL, "csg.band=[0.0, 0.5]")),
     },
     # Does augmentation help? Each generator and variant of the copies, with and without gate.
     "augmentation": {
-        "ucf-wo-count": ("ucf", ("augment.copies=0",)),
+        "ucf-wo-count": Method("ucf", ("augment.copies=0",)),
         **{
-            f"{name}{variant}{gate}": ("ucf", (*kind, *copies, *gate_settings))
+            f"{name}{variant}{gate}": Method("ucf", (*kind, *copies, *gate_settings))
             for name, kind, gates in (
                 ("ucf", (), (("", ()), ("-wo-gate", (_NO_GATE,)))),
                 ("faithful", (_FAITHFUL,), (("", ()), ("-wo-gate", (_NO_GATE,)))),
@@ -119,3 +126,16 @@ LONGER = {
 """How many times the budget's steps, by method."""
 TABLES = {MAIN: METHODS, **{name: rows | PAPER for name, rows in _TABLES.items()}}
 """Rows of each table, as in `METHODS`."""
+SCREENED = {
+    "ucf-screened": replace(METHODS["ucf"], screening="copies"),
+    "ucf-dropped": replace(METHODS["ucf"], screening="drop"),
+}
+"""UCF with augmentation that intervenes on flagged dimensions, and UCF trained without them."""
+ROBUST: Methods = {
+    **{
+        name: METHODS[name]
+        for name in (*METHODS_WO_TIME.values(), "ucf-paper", "ucf-wo-count", "ucf-wo-arch")
+    },
+    **SCREENED,
+}
+"""Rows of the robustness table."""

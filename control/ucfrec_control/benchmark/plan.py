@@ -1,78 +1,123 @@
-"""Every learner on the zoo files (Tables 1 and 3), and sweeps over UCF's settings (resumable)."""
+"""Which cells the control tables have: scores, learning rates and robustness to distractors."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
-from ucfrec.reporting.grid import chosen
-from ucfrec.reporting.result_row import ResultRow
-from ucfrec_control.benchmark.budgets import Budget
-from ucfrec_control.benchmark.cells import SCORE_MEASUREMENT, SCORES, Cell, code_of
-from ucfrec_control.benchmark.folders import run_name, stages_of, stores_of
-from ucfrec_control.benchmark.methods import MAIN, TABLES
-from ucfrec_control.benchmark.rates import rl_settings_of, settings_of
-from ucfrec_control.benchmark.run_cells import run_cells
-from ucfrec_control.data.distractor import zoo_store
+from ucfrec.benchmark.cells import Budget, Cell, Method, Task
+from ucfrec.benchmark.grid import chosen
+from ucfrec.benchmark.plan import Plan, Presets
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec_control.benchmark.budgets import TRIED_RATES
+from ucfrec_control.benchmark.measure import DISTRACTOR, RATE
+from ucfrec_control.benchmark.methods import RATES, ROBUST, ROBUSTNESS, SCORES, TABLES
+from ucfrec_control.benchmark.rates import SEARCHED, settings_of
+from ucfrec_control.data.distractor import DISTRACTORS, zoo_store
+from ucfrec_control.learners.rl_baselines import ALGORITHMS
+from ucfrec_control.learners.train import dataset_of, preset_of
 
 
-def benchmark(
-    data: Path,
-    folder: Path,
-    results: Path,
-    budget: Budget,
-    name: str,
-    workers: int,
-    table: str = MAIN,
-    methods: Sequence[str] = (),
-) -> list[ResultRow]:
-    """Train and evaluate the cells without a row in `results`; returns the rows of all cells.
+def stores_of(folder: Path) -> Path:
+    """The folder of the stores."""
+    return folder / "stores"
+
+
+def score_cells(
+    data: Path, folder: Path, budget: Budget, table: str, methods: Sequence[str] = ()
+) -> Iterator[Cell]:
+    """The cells of a table of scores; writes the stores that they need.
 
     Args:
         data: folder of the HDF5 files.
         folder: where stores and runs are kept.
-        results: file of JSON lines.
-        budget: size of the benchmark.
-        name: name of the budget, for the rows.
-        workers: number of processes, of one thread each.
+        budget: as `budget_of` returns it.
         table: a key of `TABLES`.
         methods: rows of the table; empty for all.
 
     Raises:
-        InputError: a file is missing, a method is not in the table, `results` has other content,
-            or cells failed.
+        InputError: a file is missing, or a method is not in the table.
     """
-    selected = chosen(TABLES[table], methods, "method")
-    cells = cells_of(data, folder, budget, name, table, selected)
-    return run_cells(cells, SCORE_MEASUREMENT, results, workers, f"benchmark {table}")
+    selected = _selected(TABLES[table], methods)
+    plan = _plan(SCORES, folder, budget)
+    for file in budget.tasks:
+        if file not in budget.optional or (data / f"{file}.hdf5").exists():
+            store = zoo_store(data, stores_of(folder), file)
+            yield from plan.trained(table, Task(file, store), selected)
 
 
-def cells_of(
-    data: Path, folder: Path, budget: Budget, name: str, table: str, methods: Sequence[str]
+def robustness_cells(
+    data: Path,
+    folder: Path,
+    budget: Budget,
+    methods: Sequence[str] = (),
+    distractors: Sequence[str] = (),
 ) -> Iterator[Cell]:
-    """The cells of some rows of a table; arguments as of `benchmark`."""
-    # A method of two tables shares one run: trained once, evaluated for the rows of both.
-    runs = folder / name
-    for file in budget.files_in(data):
+    """The cells of some methods of `ROBUST` and distractors (empty for all); arguments and errors
+    as of `score_cells`."""
+    selected = _selected(ROBUST, methods)
+    plan = _plan(ROBUSTNESS, folder, budget)
+    for file in budget.tasks:
+        for distractor in distractors or DISTRACTORS:
+            store = zoo_store(data, stores_of(folder), file, distractor)
+            task = Task(file, store, conditions={DISTRACTOR: distractor})
+            yield from plan.trained(ROBUSTNESS, task, selected)
+
+
+def rate_cells(
+    data: Path,
+    folder: Path,
+    budget: Budget,
+    methods: Sequence[str] = (),
+    steps: int | None = None,
+) -> Iterator[Cell]:
+    """The cells of every method at every rate, without augmentation and evaluation.
+
+    Args:
+        data, folder, budget: as of `score_cells`.
+        methods: some of `SEARCHED`; empty for all.
+        steps: updates of a training; None for the budget's.
+
+    Raises:
+        InputError: a file is missing or has no validation trajectories, or a method is unknown.
+    """
+    selected = _selected(SEARCHED, methods)
+    budget = replace(budget, evaluation=replace(budget.evaluation, episodes=0))
+    for file in budget.tasks:
         store = zoo_store(data, stores_of(folder), file)
-        for method in methods:
-            learner, method_settings = TABLES[table][method]
-            settings = (*method_settings, *budget.of_methods.get(method, ()))
-            code = code_of(learner)
-            for seed in range(budget.seeds_of(file, method)):
-                yield Cell(
-                    suite=SCORES,
-                    table=table,
-                    budget=name,
-                    file=file,
-                    method=method,
-                    learner=learner,
-                    settings=settings_of(budget, name, learner, settings),
-                    store=store,
-                    run=runs / file / run_name(method, code, seed),
-                    seed=seed,
-                    episodes=budget.episodes,
-                    evaluation_seed=budget.evaluation_seed,
-                    code_version=code,
-                    rl=rl_settings_of(budget, name, learner),
-                    all_targets=budget.all_targets,
-                    shared=stages_of(folder),
-                )
+        if not EpisodeStore.open(store).split("validation").n_episodes:
+            raise InputError(
+                f"{file} has too few trajectories for validation, by which rates are chosen; name "
+                "a larger file with --file"
+            )
+        for rate in TRIED_RATES[budget.name]:
+            plan = replace(
+                _plan(RATES, folder, budget), settings=partial(_at_rate, budget, rate, steps)
+            )
+            task = Task(file, store, conditions={RATE: rate})
+            yield from plan.trained(f"{rate:g}", task, selected)
+
+
+def _plan(suite: str, folder: Path, budget: Budget) -> Plan:
+    return Plan(suite, folder / budget.name, budget, partial(settings_of, budget), _presets)
+
+
+def _presets(store: EpisodeStore, policy: str) -> Presets:
+    return {} if policy in ALGORITHMS else preset_of(dataset_of(store), policy).tables
+
+
+def _at_rate(
+    budget: Budget, rate: float, steps: int | None, name: str, method: Method
+) -> tuple[str, ...]:
+    """Settings of a training without augmentation at a rate."""
+    own = budget.of_policies.get(method.policy, ())
+    if method.policy in ALGORITHMS:
+        return (*own, *([] if steps is None else [f"steps={steps}"]), f"{RATE}={rate:g}")
+    shorter = [] if steps is None else [f"train.steps={steps}", f"train.validate_every={steps}"]
+    searched = ("augment.copies=0", *shorter, f"train.{RATE}={rate:g}")
+    return (*budget.settings, *own, *searched, *method.settings)
+
+
+def _selected(methods: Mapping[str, Method], names: Sequence[str]) -> dict[str, Method]:
+    return {name: methods[name] for name in chosen(methods, names, "method")}

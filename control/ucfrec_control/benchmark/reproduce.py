@@ -5,12 +5,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from ucfrec.reporting.result_row import ResultRow
-from ucfrec_control.benchmark.budgets import Budget
-from ucfrec_control.benchmark.cells import ROBUSTNESS, SCORES, Cell
-from ucfrec_control.benchmark.methods import MAIN, TABLES
-from ucfrec_control.benchmark.plan import cells_of
-from ucfrec_control.benchmark.robustness import robustness_cells
+from ucfrec.benchmark.cells import Budget, Cell
+from ucfrec.results.row import ResultRow
+from ucfrec_control.benchmark.budgets import budget_of
+from ucfrec_control.benchmark.methods import MAIN, ROBUSTNESS, SCORES
+from ucfrec_control.benchmark.plan import robustness_cells, score_cells
 from ucfrec_control.data.distractor import CLEAN
 
 
@@ -32,15 +31,15 @@ class Part:
 
 _BASELINES = ("dt", "dt-wo-time", "dc", "dc-wo-time", "lsdt", "lsdt-wo-time")
 _DETERMINISTIC = (CLEAN, "deterministic")
-_JUDGED = ("dt-wo-time", "dc-wo-time", "ucf", "ucf-dropped")
+_EVALUATED = ("dt-wo-time", "dc-wo-time", "ucf", "ucf-dropped")
 PARTS: Final[Mapping[str, Part]] = {
     "table-1": Part(MAIN, ("iql", "cql", *_BASELINES, "ucf-paper", "ucf")),
     "table-3": Part(MAIN, ("ucf", "ucf-wo-count", "ucf-wo-arch", *_BASELINES)),
     "table-9": Part("gate"),
     "table-10": Part("band"),
     "figure-2": Part("lambda"),
-    "figure-3": Part(ROBUSTNESS, _JUDGED, distractors=_DETERMINISTIC),
-    "figure-4": Part(ROBUSTNESS, _JUDGED, distractors=(*_DETERMINISTIC, "stochastic")),
+    "figure-3": Part(ROBUSTNESS, _EVALUATED, distractors=_DETERMINISTIC),
+    "figure-4": Part(ROBUSTNESS, _EVALUATED, distractors=(*_DETERMINISTIC, "stochastic")),
     "figure-5": Part(MAIN, ("ucf",), ("hopper_medium-zoo",), of_runs=True),
     "figure-6": Part(MAIN, ("ucf",), ("halfcheetah_medium-zoo",), of_runs=True),
 }
@@ -48,30 +47,27 @@ PARTS: Final[Mapping[str, Part]] = {
 is a diagram of the method."""
 
 
-def budget_of(part: Part, budget: Budget) -> Budget:
-    """`budget` with the files of the part."""
-    return replace(budget, files=part.files, where_present=()) if part.files else budget
+def budget_of_part(part: Part, name: str) -> Budget:
+    """The budget `name` with the files of the part."""
+    budget = budget_of(part.table, name)
+    return replace(budget, tasks=part.files) if part.files else budget
 
 
-def cells_of_part(
-    part: Part, data: Path, folder: Path, budget: Budget, name: str
-) -> Iterator[Cell]:
+def cells_of_part(part: Part, data: Path, folder: Path, budget: Budget) -> Iterator[Cell]:
     """The cells of a part; writes the stores that they need.
 
     Args:
         part: of `PARTS`.
         data: folder of the HDF5 files.
         folder: where stores and runs are kept.
-        budget: of `budget_of`.
-        name: its name.
+        budget: of `budget_of_part`.
 
     Raises:
         InputError: a file is missing.
     """
     if part.table == ROBUSTNESS:
-        return robustness_cells(data, folder, budget, name, part.methods, part.distractors)
-    methods = part.methods or tuple(TABLES[part.table])
-    return cells_of(data, folder, budget, name, part.table, methods)
+        return robustness_cells(data, folder, budget, part.methods, part.distractors)
+    return score_cells(data, folder, budget, part.table, part.methods)
 
 
 def rows_of_part(part: Part, rows: Sequence[ResultRow], name: str) -> list[ResultRow]:

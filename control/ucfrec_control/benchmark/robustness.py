@@ -5,104 +5,16 @@ evaluated with the distractor fixed to 0. Two trainings also differ by chance. E
 policy with the distractor fixed to 1 instead isolates the effect of the distractor.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ucfrec.reporting.grid import chosen
-from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.statistics import grouped, summary
-from ucfrec_control.benchmark.budgets import BUDGETS as SCORE_BUDGETS
-from ucfrec_control.benchmark.budgets import MEDIUM, Budget
-from ucfrec_control.benchmark.cells import ROBUSTNESS, ROBUSTNESS_MEASUREMENT, Cell, code_of
-from ucfrec_control.benchmark.folders import run_name, stages_of, stores_of
-from ucfrec_control.benchmark.methods import METHODS as LEARNERS
-from ucfrec_control.benchmark.methods import METHODS_WO_TIME
-from ucfrec_control.benchmark.rates import settings_of
-from ucfrec_control.benchmark.run_cells import run_cells
-from ucfrec_control.data.distractor import CLEAN, DISTRACTORS, zoo_store
+from ucfrec.results.row import ResultRow
+from ucfrec_control.data.distractor import CLEAN
 
-SCREENED = {"ucf-screened": "copies", "ucf-dropped": "drop"}
-"""UCF with copies that intervene on flagged dimensions, and UCF trained without them."""
-METHODS = (*METHODS_WO_TIME.values(), "ucf-paper", "ucf-wo-count", "ucf-wo-arch", *SCREENED)
-"""Methods of `ucfrec_control.benchmark.plan`, and `SCREENED`."""
-
-BUDGETS = {
-    # The medium files, as in the paper.
-    "small": replace(SCORE_BUDGETS["small"], files=MEDIUM, seeds=2),
-    "full": replace(SCORE_BUDGETS["full"], files=MEDIUM, where_present=(), all_targets=False),
-}
 SHOWN = ("clean", "score", "drop", "score_at_one", "drop_at_one")
 SHOWN_LARGEST = ("method", "at 0", "at 1")
 SHOWN_LOSSES = ("loss", "loss_at_zero", "rise")
-_CODE = (zoo_store.__module__, "ucfrec_control.learners.held_out_losses")
-"""Further modules that the cells depend on."""
-
-
-def robustness(
-    data: Path,
-    folder: Path,
-    results: Path,
-    budget: Budget,
-    name: str,
-    workers: int,
-    methods: Sequence[str] = (),
-) -> list[ResultRow]:
-    """Train and evaluate the cells without a row in `results`; returns the rows of all cells.
-
-    Args:
-        data: folder of the HDF5 files.
-        folder: where stores and runs are kept.
-        results: file of JSON lines.
-        budget: size of the benchmark.
-        name: name of the budget, for the rows.
-        workers: number of processes, of one thread each.
-        methods: some of `METHODS`; empty for all.
-
-    Raises:
-        InputError: a file is missing, a method is unknown, `results` has other content, or cells
-            failed.
-    """
-    cells = robustness_cells(data, folder, budget, name, chosen(METHODS, methods, "method"))
-    return run_cells(cells, ROBUSTNESS_MEASUREMENT, results, workers, ROBUSTNESS)
-
-
-def robustness_cells(
-    data: Path,
-    folder: Path,
-    budget: Budget,
-    name: str,
-    methods: Sequence[str],
-    distractors: Sequence[str] = (),
-) -> Iterator[Cell]:
-    """The cells of some methods and distractors (empty for all); arguments as of `robustness`."""
-    for file in budget.files:
-        for distractor in distractors or DISTRACTORS:
-            store = zoo_store(data, stores_of(folder), file, distractor)
-            runs = folder / f"robustness-{name}" / file / distractor
-            for method in methods:
-                learner, method_settings = LEARNERS["ucf" if method in SCREENED else method]
-                code = code_of(learner, *_CODE)
-                for seed in range(budget.seeds):
-                    yield Cell(
-                        suite=ROBUSTNESS,
-                        table=ROBUSTNESS,
-                        budget=name,
-                        file=file,
-                        method=method,
-                        learner=learner,
-                        settings=settings_of(budget, name, learner, method_settings),
-                        store=store,
-                        run=runs / run_name(method, code, seed),
-                        seed=seed,
-                        episodes=budget.episodes,
-                        evaluation_seed=budget.evaluation_seed,
-                        code_version=code,
-                        distractor=distractor,
-                        screening=SCREENED.get(method),
-                        shared=stages_of(folder),
-                    )
 
 
 def drops(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
@@ -114,7 +26,7 @@ def drops(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
     the same initial states, with the distractor fixed to 1. The last of several equal keys counts.
 
     Args:
-        rows: of one budget, as returned by `robustness`.
+        rows: of one budget.
 
     Returns:
         One mapping per dataset, method, seed and distractor, with these and the values of `SHOWN`.

@@ -2,89 +2,59 @@
 
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
-from ucfrec.code_version import code_version
+from ucfrec.benchmark.cells import Cell, Evaluation, measured_by, opened
 from ucfrec.counterfactual.screening import DimensionReport, ScreeningConfig, screen
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.provenance import provenance
-from ucfrec.reporting.grid import Measurement, run_grid
-from ucfrec.reporting.result_row import ResultRow, RowKey
 from ucfrec.reporting.tables import NONE
+from ucfrec.results.row import ResultRow, RowKey
 from ucfrec.runs.start import training_views
 from ucfrec_control.data.distractor import DISTRACTORS, zoo_store
 from ucfrec_control.data.trajectories import PACKAGES
 
-SHOWN = (
+SHOWN: Final = (
     *("task", "distractor", "training_seed", "flagged", "effect", "reward_effect"),
     *("true_flagged", "weakest_true"),
 )
-SEED = 0
+SEED: Final = 0
 SCREENING: Final = "screening"
 """Suite of the rows."""
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One screening of one store."""
-
-    file: str
-    distractor: str
-    store: Path
-    config: ScreeningConfig
-
-
-def screening_table(
-    data: Path, stores: Path, files: Sequence[str], results: Path, workers: int
-) -> list[ResultRow]:
-    """Screen every file, clean and with each distractor, that has no row in `results` yet.
+def screening_cells(data: Path, stores: Path, files: Sequence[str]) -> Iterator[Cell]:
+    """A cell for each file, clean and with each distractor.
 
     Args:
         data: folder of the HDF5 files.
         stores: where stores are kept.
         files: names of files in `data`, without their ending.
-        results: file of JSON lines.
-        workers: number of processes, of one thread each.
-
-    Returns:
-        The rows of all screenings.
 
     Raises:
-        InputError: a file is missing, `results` has other content, or cells failed.
+        InputError: a file is missing.
     """
-    cells = [
-        Cell(file, distractor, zoo_store(data, stores, file, distractor), ScreeningConfig())
-        for file in files
-        for distractor in DISTRACTORS
-    ]
-    return run_grid(cells, _MEASUREMENT, results, workers, SCREENING)
-
-
-def _key(cell: Cell) -> RowKey:
-    return RowKey(
-        suite=SCREENING,
-        table=SCREENING,
-        task=cell.file,
-        method=SCREENING,
-        policy=SCREENING,
-        training_seed=SEED,
-        conditions={"distractor": cell.distractor},
-        code_version=code_version(__name__),
-        data_fingerprint=EpisodeStore.open(cell.store).record.fingerprint,
-    )
+    for file, distractor in product(files, DISTRACTORS):
+        yield Cell(
+            *(SCREENING, SCREENING, file, SCREENING, SCREENING, Evaluation(0, SEED)),
+            training_seed=SEED,
+            store=zoo_store(data, stores, file, distractor),
+            conditions={"distractor": distractor},
+        )
 
 
 def _config(cell: Cell) -> dict[str, Any]:
-    return asdict(cell.config)
+    return asdict(ScreeningConfig())
 
 
 def _measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
-    store = EpisodeStore.open(cell.store)
+    store = opened(cell)
     began = time.perf_counter()
-    report = screen(training_views(store)[0], cell.config, SEED)
+    report = screen(training_views(store)[0], ScreeningConfig(), SEED)
     dimensions = verdicts(report.dimensions, store)
     wrong = sum(each["flagged"] and not each["distractor"] for each in dimensions)
     row = ResultRow(
@@ -102,7 +72,7 @@ def _measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     return [row]
 
 
-_MEASUREMENT: Final = Measurement(_key, _config, _measure)
+SCREENING_MEASUREMENT: Final = measured_by(_measure, _config)
 
 
 def verdicts(dimensions: Sequence[DimensionReport], store: EpisodeStore) -> list[dict[str, Any]]:
@@ -129,7 +99,7 @@ def screening_rows(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
     `weakest_true` is the smallest effect among the true dimensions, of each the larger one of the
     two; dimensions that were not tested are left out.
     """
-    lines = []
+    lines: list[dict[str, Any]] = []
     for row in rows:
         verdicts = row.details.get("screening")
         if verdicts is None:

@@ -1,29 +1,24 @@
-"""`ucfrec-control benchmark`: every learner on the zoo files; resumes."""
+"""`ucfrec-control benchmark`: every method on the zoo files; resumes."""
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from ucfrec.commands.grid_options import results_given, rows_explained, rows_given
-from ucfrec.reporting.result_row import ResultRow
-from ucfrec.reporting.rows_file import benchmarking
+from ucfrec.benchmark.cells import Cell
+from ucfrec.benchmark.tables import difference_table, of_best_target, over_seeds, score_table
+from ucfrec.commands.grid_options import results_given, rows_explained, rows_of
 from ucfrec.reporting.tables import format_rows
-from ucfrec_control.benchmark.budgets import BUDGETS, SWEEPS, WEIGHTS, Budget
-from ucfrec_control.benchmark.cells import SCORES
-from ucfrec_control.benchmark.methods import EQUAL_TIME, LAMBDA, MAIN, PURSUING, TABLES
-from ucfrec_control.benchmark.plan import benchmark
+from ucfrec.results.row import ResultRow
+from ucfrec_control.benchmark.budgets import budget_of
+from ucfrec_control.benchmark.costs import costs
+from ucfrec_control.benchmark.measure import SCORE_MEASUREMENT
+from ucfrec_control.benchmark.methods import MAIN, SCORES, TABLES
+from ucfrec_control.benchmark.plan import score_cells
 from ucfrec_control.benchmark.rates import chosen_rates
-from ucfrec_control.benchmark.tables import (
-    difference_table,
-    of_best_target,
-    over_seeds,
-    score_table,
-)
 from ucfrec_control.commands.options import (
-    budget_given,
-    budget_options,
     control_grid_options,
     data_given,
+    narrowed,
     rates_option,
 )
 from ucfrec_control.learners.evaluate import CHECKPOINTS
@@ -38,41 +33,25 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--table",
         default=MAIN,
         choices=list(TABLES),
-        help="every learner (main), ways to pursue reward, all trained for as long as DT or "
+        help="every method (main), ways to pursue reward, all trained for as long as DT or "
         "LSDT (equal-time), or a sweep over UCF's settings",
     )
-    budget_options(parser)
     rates_option(parser)
     control_grid_options(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec-control benchmark`."""
-    budget = budget_given(budgets_of(options.table), options)
-    if options.show_only:
-        rows = rows_given(options, SCORES, [options.table])
-    else:
-        with benchmarking(results_given(options)):
-            rows = benchmark(
-                data_given(options),
-                options.out,
-                results_given(options),
-                budget,
-                options.budget,
-                options.workers,
-                options.table,
-                options.method,
-            )
+    table = options.table
+    budget = narrowed(budget_of(table, options.budget), options)
+
+    def cells() -> Iterator[Cell]:
+        return score_cells(data_given(options), options.out, budget, table, options.methods)
+
+    rows = rows_of(options, SCORES, [table], cells, SCORE_MEASUREMENT, costs, f"benchmark {table}")
     with rows_explained(options):
-        print_scores(rows, options.table, budget.rates)
+        print_scores(rows, table, budget.rates)
     print(f"\nrows: {results_given(options)}")
-
-
-def budgets_of(table: str) -> Mapping[str, Budget]:
-    """The budgets of a table, by name."""
-    if table == LAMBDA:
-        return WEIGHTS
-    return BUDGETS if table in (MAIN, PURSUING, EQUAL_TIME) else SWEEPS
 
 
 def print_scores(

@@ -2,18 +2,23 @@
 
 import argparse
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from ucfrec.commands.grid_options import seed_given
 from ucfrec.errors import InputError
-from ucfrec.files.atomic import write_json
-from ucfrec.provenance import provenance
 from ucfrec.reporting.tables import format_rows
-from ucfrec_control.commands.options import shown_score, target_given
-from ucfrec_control.data.trajectories import PACKAGES
-from ucfrec_control.learners.evaluate import CHECKPOINTS, SHOWN, evaluate_run
+from ucfrec.results.row import ResultRow
+from ucfrec.results.rows_file import write_results
+from ucfrec_control.commands.options import MAX_RETURN, target_given
+from ucfrec_control.learners.evaluate import CHECKPOINTS, NO_TARGET, evaluate_run
 from ucfrec_control.learners.video import record_episode
+
+SHOWN = (
+    *("dataset", "method", "seed", "checkpoint", "target_return", "score", "return", "episodes"),
+    "validation_loss",
+)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -47,7 +52,7 @@ def run(options: argparse.Namespace) -> None:
     """Run `ucfrec-control evaluate`."""
     if options.video is not None:
         _record(options)
-    rows: list[dict[str, Any]] = []
+    rows: list[ResultRow] = []
     for run in options.runs:
         rows += evaluate_run(
             run,
@@ -58,11 +63,29 @@ def run(options: argparse.Namespace) -> None:
             checkpoints=CHECKPOINTS if options.checkpoint == "both" else (options.checkpoint,),
             distractor=options.distractor,
         )
-    print(format_rows([shown_score(row) for row in rows], SHOWN))
-    for warning in dict.fromkeys(text for row in rows for text in row["warnings"]):
+    print(format_rows([_shown(row) for row in rows], SHOWN))
+    warnings: Iterable[Any] = (row.details.get("warnings", ()) for row in rows)
+    for warning in dict.fromkeys(text for texts in warnings for text in texts):
         print(f"warning: {warning}", file=sys.stderr)
     if options.json is not None:
-        write_json(options.json, [row | provenance(PACKAGES) for row in rows])
+        write_results(options.json, rows)
+
+
+def _shown(row: ResultRow) -> dict[str, Any]:
+    """A row with its score, interval and target as text."""
+    low, high = row.interval or (row.value, row.value)
+    target = "none" if row.rule == NO_TARGET else MAX_RETURN
+    if row.target_return is not None:
+        target = f"{row.target_return:g}"
+    return {
+        **dict.fromkeys(SHOWN),
+        **row.as_line(),
+        "dataset": row.task,
+        "seed": row.training_seed,
+        "score": f"{row.value:.1f} [{low:.1f}, {high:.1f}]",
+        "target_return": target,
+        "return": f"{row.metrics['return']:.1f}",
+    }
 
 
 def _record(options: argparse.Namespace) -> None:

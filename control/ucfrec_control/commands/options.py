@@ -4,17 +4,15 @@ import argparse
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-from ucfrec.commands.grid_options import evaluation_seed_option, grid_options
+from ucfrec.benchmark.cells import Budget
+from ucfrec.commands.grid_options import budget_options, grid_options
 from ucfrec.errors import InputError, one_line
-from ucfrec_control.benchmark.budgets import Budget
 from ucfrec_control.benchmark.rates import read_rates
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.minari import is_minari, read_minari
 from ucfrec_control.data.trajectories import Trajectories
 from ucfrec_control.environments.scores import find_task
-from ucfrec_control.learners.evaluate import NO_TARGET
 
 MAX_RETURN = "max"
 """`--target` for the largest return that the policy expects in each state."""
@@ -32,24 +30,6 @@ def source_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--env", help="environment of the data, if the file does not name it")
     parser.add_argument("--download", action="store_true", help="let Minari fetch the dataset")
-
-
-def budget_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that select what a benchmark measures."""
-    parser.add_argument("--budget", default="small", choices=["small", "full"])
-    parser.add_argument(
-        "--file",
-        action="append",
-        default=[],
-        help="file of the data folder, without its ending; repeatable (the budget's)",
-    )
-    parser.add_argument(
-        "--method", action="append", default=[], help="row of the table; repeatable (all)"
-    )
-    parser.add_argument(
-        "--seeds", type=int, help="training seeds of every method, from 0 (the budget's)"
-    )
-    evaluation_seed_option(parser)
 
 
 def rates_option(parser: argparse.ArgumentParser) -> None:
@@ -79,8 +59,10 @@ def data_given(options: argparse.Namespace) -> Path:
     return folder
 
 
-def control_grid_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options for where a benchmark keeps its runs and rows."""
+def control_grid_options(parser: argparse.ArgumentParser, budget: bool = True) -> None:
+    """Add the options for what a benchmark measures, and where it keeps its runs and rows."""
+    if budget:
+        budget_options(parser, "--file", "--seeds")
     grid_options(parser, "runs/control", 1)
 
 
@@ -109,27 +91,16 @@ def describe_source(trajectories: Trajectories) -> str:
     )
 
 
-def budget_given(known: Mapping[str, Budget], options: argparse.Namespace) -> Budget:
-    """The budget named by the options, with their files and seeds.
+def narrowed(budget: Budget, options: argparse.Namespace) -> Budget:
+    """`budget` with the files, seeds and rates of the options.
 
     Raises:
         InputError: `--seeds` is below 1, or the file of `--rates` has none of the budget.
     """
-    budget = known[options.budget]
-    seeds = budget.seeds if options.seeds is None else options.seeds
-    if seeds < 1:
-        raise InputError(f"--seeds is {seeds}; at least one is needed")
-    evaluation_seed = options.evaluation_seed
-    return dataclasses.replace(
-        budget,
-        files=tuple(options.file) or budget.files,
-        where_present=() if options.file else budget.where_present,
-        seeds=seeds,
-        antmaze_seeds=budget.antmaze_seeds if options.seeds is None else seeds,
-        fewer_seeds=budget.fewer_seeds if options.seeds is None else {},
-        evaluation_seed=budget.evaluation_seed if evaluation_seed is None else evaluation_seed,
-        rates=_rates_given(options),
+    found = budget.narrowed(
+        options.tasks, options.training_seeds, evaluation_seed=options.evaluation_seed
     )
+    return dataclasses.replace(found, rates=_rates_given(options))
 
 
 def _rates_given(options: argparse.Namespace) -> Mapping[str, float] | None:
@@ -139,13 +110,3 @@ def _rates_given(options: argparse.Namespace) -> Mapping[str, float] | None:
     if not found:
         raise InputError(f"{options.rates} has no rates of budget {options.budget}")
     return found
-
-
-def shown_score(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A row of `evaluate_run` with its score, interval and target as text."""
-    interval = f"{row['score']:.1f} [{row['score_low']:.1f}, {row['score_high']:.1f}]"
-    target = "none" if row["rule"] == NO_TARGET else MAX_RETURN
-    if row["target_return"] is not None:
-        target = f"{row['target_return']:g}"
-    mean_return = f"{row['return']:.1f}"
-    return {**row, "score": interval, "target_return": target, "return": mean_return}

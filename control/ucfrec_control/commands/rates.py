@@ -1,37 +1,32 @@
-"""`ucfrec-control rates`: learning rates of all learners, by validation loss; resumes."""
+"""`ucfrec-control rates`: learning rates of all policies, by validation loss; resumes."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from ucfrec.commands.grid_options import results_given, rows_explained, rows_given
-from ucfrec.reporting.result_row import ResultRow
-from ucfrec.reporting.rows_file import benchmarking
+from ucfrec.benchmark.cells import Cell
+from ucfrec.benchmark.tables import over_seeds
+from ucfrec.commands.grid_options import results_given, rows_explained, rows_of
 from ucfrec.reporting.statistics import grouped
 from ucfrec.reporting.tables import format_rows
-from ucfrec_control.benchmark.budgets import SEARCHES
-from ucfrec_control.benchmark.rates import (
-    RATE,
-    SUITE,
-    best_rates,
-    format_rates,
-    search_rates,
-    write_rates,
-)
-from ucfrec_control.benchmark.tables import over_seeds
+from ucfrec.results.row import ResultRow
+from ucfrec_control.benchmark.budgets import budget_of
+from ucfrec_control.benchmark.costs import costs
+from ucfrec_control.benchmark.measure import RATE, RATE_MEASUREMENT
+from ucfrec_control.benchmark.methods import RATES
+from ucfrec_control.benchmark.plan import rate_cells
+from ucfrec_control.benchmark.rates import best_rates, format_rates, write_rates
 from ucfrec_control.commands.options import (
-    budget_given,
-    budget_options,
     control_grid_options,
     data_given,
     data_option,
+    narrowed,
 )
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `rates`."""
     data_option(parser)
-    budget_options(parser)
     parser.add_argument("--steps", type=int, help="updates of a training (the budget's)")
     parser.add_argument("--toml", type=Path, metavar="FILE", help="write the choice here")
     control_grid_options(parser)
@@ -40,21 +35,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec-control rates`."""
+    budget = narrowed(budget_of(RATES, options.budget), options)
+
+    def cells() -> Iterator[Cell]:
+        given = data_given(options), options.out, budget
+        return rate_cells(*given, options.methods, options.steps)
+
+    rows = rows_of(options, RATES, (), cells, RATE_MEASUREMENT, costs)
     if options.show_only:
         with rows_explained(options):
-            rows = _longest(rows_given(options, SUITE), options.budget)
-    else:
-        with benchmarking(results_given(options)):
-            rows = search_rates(
-                data_given(options),
-                options.out,
-                results_given(options),
-                budget_given(SEARCHES, options),
-                options.budget,
-                options.workers,
-                options.method,
-                options.steps,
-            )
+            rows = _longest(rows, options.budget)
     by, values = ("task", "method", RATE), ("validation_loss",)
     with rows_explained(options):
         print(format_rows(over_seeds([row.as_line() for row in rows], by, values), (*by, *values)))

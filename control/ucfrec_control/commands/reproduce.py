@@ -2,24 +2,25 @@
 
 import argparse
 
-from ucfrec.commands.grid_options import results_given, rows_explained
+from ucfrec.benchmark.cells import Cell
+from ucfrec.commands.grid_options import results_given, rows_explained, rows_of
 from ucfrec.errors import InputError
-from ucfrec.reporting.rows_file import benchmarking, latest, read_rows
-from ucfrec_control.benchmark.cells import (
-    ROBUSTNESS,
-    ROBUSTNESS_MEASUREMENT,
-    SCORE_MEASUREMENT,
-    Cell,
+from ucfrec.results.rows_file import latest, read_rows
+from ucfrec_control.benchmark.costs import costs
+from ucfrec_control.benchmark.measure import ROBUSTNESS_MEASUREMENT, SCORE_MEASUREMENT
+from ucfrec_control.benchmark.methods import ROBUSTNESS
+from ucfrec_control.benchmark.reproduce import (
+    PARTS,
+    budget_of_part,
+    cells_of_part,
+    rows_of_part,
 )
-from ucfrec_control.benchmark.reproduce import PARTS, budget_of, cells_of_part, rows_of_part
-from ucfrec_control.benchmark.robustness import BUDGETS as ROBUSTNESS_BUDGETS
-from ucfrec_control.benchmark.run_cells import run_cells
-from ucfrec_control.commands.benchmark import budgets_of, print_scores
+from ucfrec_control.commands.benchmark import print_scores
 from ucfrec_control.commands.options import (
-    budget_given,
     control_grid_options,
     data_given,
     data_option,
+    narrowed,
     rates_option,
 )
 from ucfrec_control.commands.robustness import print_robustness
@@ -30,10 +31,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("part", choices=list(PARTS), help="table or figure of the paper")
     data_option(parser)
     parser.add_argument("--budget", default="small", choices=["small", "full"])
-    parser.add_argument("--seeds", type=int, help="number of training seeds (the budget's)")
+    parser.add_argument(
+        "--seeds",
+        dest="training_seeds",
+        type=int,
+        help="number of training seeds (default: set by --budget)",
+    )
     rates_option(parser)
-    control_grid_options(parser)
-    parser.set_defaults(file=[], evaluation_seed=None)
+    control_grid_options(parser, budget=False)
+    parser.set_defaults(tasks=[], evaluation_seed=None)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -45,8 +51,7 @@ def run(options: argparse.Namespace) -> None:
     if options.show_only and part.of_runs:
         raise InputError(f"{options.part} is drawn from its runs; leave --show-only out")
     robust = part.table == ROBUSTNESS
-    known = ROBUSTNESS_BUDGETS if robust else budgets_of(part.table)
-    budget = budget_of(part, budget_given(known, options))
+    budget = narrowed(budget_of_part(part, options.budget), options)
     cells: list[Cell] = []
     if options.show_only:
         rows = rows_of_part(part, latest(read_rows(results)), options.budget)
@@ -56,10 +61,9 @@ def run(options: argparse.Namespace) -> None:
                 "file that has them with --results"
             )
     else:
-        cells += cells_of_part(part, data_given(options), options.out, budget, options.budget)
-        with benchmarking(results):
-            how = ROBUSTNESS_MEASUREMENT if robust else SCORE_MEASUREMENT
-            rows = run_cells(cells, how, results, options.workers, f"reproduce {options.part}")
+        cells += cells_of_part(part, data_given(options), options.out, budget)
+        how = ROBUSTNESS_MEASUREMENT if robust else SCORE_MEASUREMENT
+        rows = rows_of(options, "", (), lambda: cells, how, costs, f"reproduce {options.part}")
     pictures = options.out / options.part
     with rows_explained(options):
         if robust:
@@ -67,7 +71,9 @@ def run(options: argparse.Namespace) -> None:
         else:
             print_scores(rows, part.table, budget.rates)
         if part.of_runs:
-            made, _ = make_figures([cell.run for cell in cells], [], pictures)
+            made, _ = make_figures(
+                [cell.run for cell in cells if cell.run is not None], [], pictures
+            )
         else:
             made = make_row_figures(rows, pictures)
     print("\n".join(["", *map(str, made)]))

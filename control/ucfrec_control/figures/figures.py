@@ -9,20 +9,20 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from ucfrec.benchmark.tables import of_best_target
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.provenance import config_hash
 from ucfrec.reporting.plot_style import label, save
-from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.statistics import grouped
+from ucfrec.results.row import ResultRow
+from ucfrec.results.rows_file import read_results
 from ucfrec.runs.record import RUN, RunRecord
-from ucfrec_control.benchmark.cells import ROBUSTNESS, SCORES
+from ucfrec_control.benchmark.methods import ROBUSTNESS, SCORES
 from ucfrec_control.benchmark.robustness import drops, loss_rises
-from ucfrec_control.benchmark.score_rows import EVALUATE, read_scores
-from ucfrec_control.benchmark.tables import of_best_target
 from ucfrec_control.data.trajectories import control_source
 from ucfrec_control.figures import diagnostics, plots
-from ucfrec_control.learners.evaluate import method_of
+from ucfrec_control.learners.evaluate import EVALUATE, method_of
 from ucfrec_control.learners.rl_baselines import RLRecord, read_run
 
 LOWS = (0.0, 0.1, 0.2, 0.3, 0.4)
@@ -95,7 +95,7 @@ def make_figures(
         InputError: a folder or file is missing, or holds something else.
     """
     found = _distinguished([run for folder in runs for run in _runs(folder)])
-    rows = [row for path in results for row in read_scores(path)]
+    rows = [row for path in results for row in read_results(path)]
     plans = list(_of_runs(found))
     with damage_explained(", ".join(map(str, results)), _REMEDY):
         plans += _of_rows(rows)

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,12 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import rollout
 from ucfrec.errors import InputError
 from ucfrec.evaluation.metrics import bootstrap_interval
-from ucfrec.provenance import config_hash, without_folders
+from ucfrec.provenance import config_hash, provenance
 from ucfrec.reporting.statistics import summary
+from ucfrec.results.row import ResultRow
 from ucfrec.runs.record import RUN, RunRecord
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec_control.data.trajectories import control_source
+from ucfrec_control.data.trajectories import PACKAGES, control_source
 from ucfrec_control.environments.environments import (
     SIDE_BY_SIDE,
     Wrap,
@@ -32,10 +34,8 @@ Trained = TrainedPolicy | RLPolicy
 CHECKPOINTS = ("last", "best")
 NO_TARGET = "no target return"
 _SUFFIXES = {"copies": "-screened", "drop": "-dropped"}
-SHOWN = (
-    *("dataset", "method", "seed", "checkpoint", "target_return", "score", "return", "episodes"),
-    "validation_loss",
-)
+EVALUATE = "evaluate"
+"""Suite of the rows."""
 
 
 def evaluate_run(
@@ -47,7 +47,7 @@ def evaluate_run(
     targets: Sequence[float | None] = (),
     checkpoints: Sequence[str] = CHECKPOINTS,
     distractor: float = 0.0,
-) -> list[dict[str, Any]]:
+) -> list[ResultRow]:
     """One result row for each checkpoint and target return.
 
     All rows have the same initial states. Distractors are fixed. IQL and CQL keep only their last
@@ -69,21 +69,22 @@ def evaluate_run(
     """
     if episodes < 1:
         raise InputError(f"--episodes is {episodes}; at least one is needed")
-    rows: list[dict[str, Any]] = []
+    rows: list[ResultRow] = []
     for checkpoint in _kept(run, checkpoints):
         trained = load_run(run, checkpoint)
         training = trained.record.finished
         if rows and training.best_step == training.steps:
             # The best checkpoint is the last: the same weights would play the same episodes.
-            rows += [{**row, "checkpoint": checkpoint} for row in rows]
+            rows += [replace(row, checkpoint=checkpoint) for row in rows]
             continue
         environment = environment_of(trained, env_id)
         rows += [
-            _row(trained, environment, rule, episodes, seed, distractor)
-            | {"checkpoint": checkpoint}
+            replace(
+                _row(trained, environment, rule, episodes, seed, distractor), checkpoint=checkpoint
+            )
             for rule in rules_of(trained, environment, targets)
         ]
-    return [row | {"run": without_folders(str(run))} for row in rows]
+    return rows
 
 
 def _kept(run: Path, checkpoints: Sequence[str]) -> Sequence[str]:
@@ -193,7 +194,7 @@ def _row(
     episodes: int,
     seed: int,
     distractor: float,
-) -> dict[str, Any]:
+) -> ResultRow:
     record, dataset = trained.record, _dataset(trained)
     task = require_task(env_id, dataset["dataset"])
     began = time.perf_counter()
@@ -205,33 +206,42 @@ def _row(
         env.close()
     seconds = time.perf_counter() - began
     low, high = task.score(bootstrap_interval(played.returns, seed))
-    return {
-        "dataset": dataset["dataset"],
-        "method": method_of(record),
-        "seed": record.seed,
-        "target_return": rule and rule.target,
-        "rule": NO_TARGET if rule is None else str(rule),
+    row = ResultRow(
+        suite=EVALUATE,
+        table=EVALUATE,
+        task=dataset["dataset"],
+        method=method_of(record),
+        policy=record.config.policy_name,
+        training_seed=record.seed,
+        evaluation_seed=seed,
+        conditions={
+            "episodes": episodes,
+            "distractor_fixed_to": distractor,
+            "lambda_mask": record.settings["policy"].get("lambda_mask"),
+        },
+        config_hash=config_hash(record.settings),
+        data_fingerprint=record.fingerprint,
+        metric="score",
+        metrics={},
+        interval=(float(low), float(high)),
+        environment=env_id,
+        target_return=None if rule is None else rule.target,
+        rule=NO_TARGET if rule is None else str(rule),
+        wall_time_s=seconds,
+        **provenance(PACKAGES),
+    )
+    found = {
         "score": float(task.score(played.returns.mean())),
-        "score_low": float(low),
-        "score_high": float(high),
         "score_std": summary(task.score(played.returns)).sd if episodes > 1 else None,
         "return": float(played.returns.mean()),
         "length": float(played.lengths.mean()),
-        "episodes": episodes,
-        "evaluation_seed": seed,
-        "env_id": env_id,
         "steps": record.finished.steps,
         "best_step": record.finished.best_step,
         "validation_loss": record.finished.best_validation,
         "acceptance": record.augmentation and record.augmentation.acceptance,
-        "distractors": dataset.get("distractors", []),
-        "distractor_fixed_to": distractor,
-        "lambda_mask": record.settings["policy"].get("lambda_mask"),
-        "config": record.settings,
-        "config_hash": config_hash(record.settings),
-        "fingerprint": record.fingerprint,
-        "dataset_versions": dataset["versions"],
-        "warnings": mismatches(dataset, env_id),
         "train_wall_time_s": record.wall_time_s,
-        "wall_time_s": seconds,
+        "distractors": dataset.get("distractors") or None,
+        "dataset_versions": dataset["versions"],
+        "warnings": mismatches(dataset, env_id) or None,
     }
+    return row.extended(found)

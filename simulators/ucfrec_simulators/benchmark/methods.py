@@ -1,35 +1,18 @@
 """The methods of the tables."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
-
-@dataclass(frozen=True)
-class Method:
-    """A policy and its settings: one line of a table."""
-
-    policy: str
-    """One of `ucfrec.policies.registry.policy_names`."""
-    settings: tuple[str, ...] = ()
-    """Settings over the defaults, as for `--set`."""
-    conditioned: bool = True
-    """Whether it takes a target return."""
-    vectors: bool = True
-    """Whether it also supports action vectors; False for policies of items only."""
-    tags: bool = False
-    """Whether it supports only items with tags."""
-    screening: str | None = None
-    """One of `ucfrec.runs.screened.SCREENINGS` for logs with observations; None for none."""
-
+from ucfrec.benchmark.cells import Method
 
 PLAIN: Final = ("policy.exposure=false", "rule.choose=false")
-"""Settings of a learner without this project's additions: the best item at the largest training
+"""Settings of a policy without the shared components: the best item at the largest training
 return."""
-PLUS: Final = ("policy.exposure=true", "rule.choose=true")
-"""The additions that UCF has, for any learner of items: exposure features, and the decision rule
-chosen on the log, with the reward weight by the reward model."""
-LEARNERS: Final[Mapping[str, Method]] = {
+SHARED: Final = ("policy.exposure=true", "rule.choose=true")
+"""The shared components, which UCF has by default, for any policy of items: exposure features, and
+the decision rule chosen on the log, with the reward weight by the reward model."""
+BASELINES: Final[Mapping[str, Method]] = {
     "sasrec": Method("sasrec", conditioned=False),
     "bc": Method("bc", conditioned=False),
     "bc-10": Method("bc", ("policy.best_share=0.1",), conditioned=False),
@@ -38,7 +21,7 @@ LEARNERS: Final[Mapping[str, Method]] = {
     "cdt4rec": Method("cdt4rec"),
     "edt4rec": Method("edt4rec"),
 }
-"""The learners of Table 2 beside UCF."""
+"""The methods of Table 2 beside UCF."""
 
 
 def _with(method: Method, settings: tuple[str, ...], vectors: bool) -> Method:
@@ -65,31 +48,31 @@ METHODS: Final[Mapping[str, Method]] = {
     ),
     "item-knn": Method("item-knn", ("rule.choose=false",), conditioned=False, vectors=False),
     "crm-greedy": Method("crm-greedy", ("rule.choose=false",), conditioned=False),
-    **{name: _with(learner, PLAIN, True) for name, learner in LEARNERS.items()},
-    **{f"{name}+": _with(learner, PLUS, False) for name, learner in LEARNERS.items()},
+    **{name: _with(method, PLAIN, True) for name, method in BASELINES.items()},
+    **{f"{name}+shared": _with(method, SHARED, False) for name, method in BASELINES.items()},
     **PAPER,
     "ucf-plain": Method("ucf", PLAIN, vectors=False),
     "ucf-wo-count": Method("ucf", ("augment.copies=0",)),
-    "ucf-wo-arch": Method("dt", ("augment.copies=1", *PLUS)),
+    "ucf-wo-arch": Method("dt", ("augment.copies=1", *SHARED)),
     "ucf": Method("ucf"),
 }
-"""Methods by their name in the tables. A learner's name stands for it as its authors have it, `+`
-for it with `PLUS`. UCF has these additions by default, `ucf-plain` lacks them. `ucf-wo-count` and
-`ucf-wo-arch` are Table 3's ablations of `ucf`."""
-ADDITIONS: Final[Mapping[str, Method]] = {
+"""Methods by their name in the tables. A policy's name stands for it as its authors have it,
+`+shared` for it with `SHARED`. UCF has these components by default, `ucf-plain` lacks them.
+`ucf-wo-count` and `ucf-wo-arch` are Table 3's ablations of `ucf`."""
+COMPONENTS: Final[Mapping[str, Method]] = {
     "ucf-wo-exposure": Method("ucf", ("policy.exposure=false",), vectors=False),
-    "ucf-wo-reward_weight": Method("ucf", ("rule.reward_weights=[0]",), vectors=False),
+    "ucf-wo-reward-weight": Method("ucf", ("rule.reward_weights=[0]",), vectors=False),
     "ucf-wo-rule": Method("ucf", ("rule.choose=false",), vectors=False),
     "ucf-weights": Method("ucf", ("policy.advantage_weights=true",)),
     "ucf-max-return": Method("ucf", ("policy.max_return=true",)),
     "ucf-actions": Method("ucf", ("augment.copies=0", "augment.actions=2"), vectors=False),
     "ucf-both": Method("ucf", ("augment.actions=2",), vectors=False),
 }
-"""UCF without one of what this project added to the paper, or with something more, by their name in
-the table of additions."""
+"""UCF without one of the shared components, or with another one, by their name in the table
+`shared`."""
 SCREENED: Final[Mapping[str, Method]] = {
     "ucf-screened": Method("ucf", screening="copies"),
     "ucf-dropped": Method("ucf", screening="drop"),
 }
-"""UCF with copies that intervene on the observation columns that screening flags, and UCF without
-these columns, by their name in the distractor table."""
+"""UCF with augmentation that intervenes on the observation columns that screening flags, and UCF
+without these columns, by their name in the distractor table."""

@@ -8,6 +8,7 @@ from typing import Final
 
 import pyarrow as pa
 
+from ucfrec.benchmark.cells import Task
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.simulated_store import simulated_store
@@ -28,7 +29,7 @@ EXIT_PRESETS: Final = ("", "-nx0", "-nx10", "-n4", "-n4-nx0", "-n1", "-n1-nx0")
 exit, and exit rules that look back four items and one instead of ten."""
 KUAIRAND: Final = tuple(f"kuairand{preset}" for preset in EXIT_PRESETS)
 KUAIREC: Final = tuple(f"kuairec{preset}" for preset in EXIT_PRESETS)
-FLOORS: Final = tuple(BEHAVIORS)
+REFERENCES: Final = tuple(BEHAVIORS)
 # Midnight in China (ms). The column `date` changes up to an hour too early, so it is not used.
 _APRIL_22, _APRIL_28 = 1_650_556_800_000, 1_651_075_200_000
 
@@ -47,40 +48,30 @@ class Log:
     """Number of parts of a given log; 1 for all of it."""
 
 
-@dataclass(frozen=True)
-class BenchmarkTask:
-    """One benchmark task."""
-
-    store: Path
-    """Episode store that methods are trained on."""
-    environments: tuple[Environment, ...]
-    """Environments that policies are evaluated in; the first is the one of the sweeps."""
-    behaviors: tuple[str, ...]
-    """Built-in policies of the environments that are evaluated as references."""
-
-
-def virtual_taobao(folder: Path, log: Log) -> BenchmarkTask:
+def virtual_taobao(folder: Path, log: Log) -> Task:
     """VirtualTaobao's published networks, with logs of the mixture of behaviors."""
     environment = Environment("virtual-taobao")
     store = simulated_store(environment, folder, log.sessions, log.seed)
-    return BenchmarkTask(store, (environment,), ("random", "mixture", "best-constant"))
+    return Task(environment.title, store, (environment,), ("random", "mixture", "best-constant"))
 
 
-def synthetic_taobao(folder: Path, log: Log) -> BenchmarkTask:
+def synthetic_taobao(folder: Path, log: Log) -> Task:
     """SyntheticTaobao, with logs of the mixture of behaviors; the optimal policy is known."""
     environment = Environment("synthetic-taobao")
     store = simulated_store(environment, folder, log.sessions, log.seed)
-    return BenchmarkTask(store, (environment,), ("random", "mixture", "best-constant", "optimal"))
+    return Task(
+        environment.title, store, (environment,), ("random", "mixture", "best-constant", "optimal")
+    )
 
 
-def synthetic_catalog(folder: Path, log: Log) -> BenchmarkTask:
+def synthetic_catalog(folder: Path, log: Log) -> Task:
     """SyntheticCatalog, with logs of the mixture of behaviors; the optimal policy is known."""
     environment = Environment("synthetic-catalog")
     store = simulated_store(environment, folder, log.sessions, log.seed)
-    return BenchmarkTask(store, (environment,), ("random", "mixture", "optimal"))
+    return Task(environment.title, store, (environment,), ("random", "mixture", "optimal"))
 
 
-def sardine(name: str, folder: Path, log: Log) -> BenchmarkTask:
+def sardine(name: str, folder: Path, log: Log) -> Task:
     """An environment of SARDINE, with logs of its mixture of oracles.
 
     A twelfth of the sessions are collected, because they have 100 steps.
@@ -95,7 +86,7 @@ def sardine(name: str, folder: Path, log: Log) -> BenchmarkTask:
     return simulated(Environment(name), folder, replace(log, sessions=max(1, log.sessions // 12)))
 
 
-def simulated(environment: Environment, folder: Path, log: Log) -> BenchmarkTask:
+def simulated(environment: Environment, folder: Path, log: Log) -> Task:
     """Any environment that needs no files, with logs of its mixture or, without one, of random
     actions.
 
@@ -104,10 +95,10 @@ def simulated(environment: Environment, folder: Path, log: Log) -> BenchmarkTask
     """
     behaviors = tuple(environment.simulator().behaviors)
     store = simulated_store(environment, folder, log.sessions, log.seed)
-    return BenchmarkTask(store, (environment,), behaviors)
+    return Task(environment.title, store, (environment,), behaviors)
 
 
-def kuairand(folder: Path, log: Log) -> BenchmarkTask:
+def kuairand(folder: Path, log: Log) -> Task:
     """KuaiRand: trained on the earlier logs, evaluated in environments completed from the later
     logs.
 
@@ -122,29 +113,31 @@ def kuairand(folder: Path, log: Log) -> BenchmarkTask:
     files = log_files([source])
     logs = [file for file in files if file.name.startswith("log_")]
     if any(file.name.startswith("log_random_") for file in logs):
-        learn, play = f"is_rand = 0 AND time_ms < {_APRIL_22}", "is_rand = 1"
+        training, later = f"is_rand = 0 AND time_ms < {_APRIL_22}", "is_rand = 1"
     else:
-        learn, play = f"time_ms < {_APRIL_28}", f"time_ms >= {_APRIL_28}"
+        training, later = f"time_ms < {_APRIL_28}", f"time_ms >= {_APRIL_28}"
     basic = [file for file in files if file.name.startswith("video_features_basic_")]
     features = [*basic, *(file for file in files if file.name.startswith("user_features_"))]
     tags = {video: tag for file in basic for video, tag in read_tags(file).items()}
     store, filled = folder / "store", folder / "environment"
     if not store.exists():
-        rows = cut_by_exit(window(logs, "time_ms", learn), tags, EXITS["easyrl4rec-kuairand"])
+        rows = cut_by_exit(window(logs, "time_ms", training), tags, EXITS["easyrl4rec-kuairand"])
         rows = part_of(rows, log.part, log.parts)
         _prepare("kuairand", rows, folder / "log_standard_learn.parquet", features, store)
     if not filled.exists():
         played = folder / "environment-store"
         if not played.exists():
-            rows = window(logs, "time_ms", play)
+            rows = window(logs, "time_ms", later)
             _prepare(
                 "kuairand", rows, folder / "log_standard_environment.parquet", features, played
             )
         complete(EpisodeStore.open(played), tags, filled)
-    return BenchmarkTask(store, tuple(Environment(name, filled) for name in KUAIRAND), FLOORS)
+    return Task(
+        "kuairand", store, tuple(Environment(name, filled) for name in KUAIRAND), REFERENCES
+    )
 
 
-def kuairec(folder: Path, log: Log) -> BenchmarkTask:
+def kuairec(folder: Path, log: Log) -> Task:
     """KuaiRec: trained on the big matrix, cut by the exit rule; evaluated on the small matrix.
 
     Raises:
@@ -160,7 +153,7 @@ def kuairec(folder: Path, log: Log) -> BenchmarkTask:
         rows = cut_by_exit(rows, read_categories(source), EXITS["easyrl4rec-kuairec"])
         rows = part_of(rows, log.part, log.parts)
         _prepare("kuairec", rows, folder / "big_matrix_cut.parquet", features, store)
-    return BenchmarkTask(store, tuple(Environment(name, source) for name in KUAIREC), FLOORS)
+    return Task("kuairec", store, tuple(Environment(name, source) for name in KUAIREC), REFERENCES)
 
 
 def _prepare(dataset: str, rows: pa.Table, log: Path, features: list[Path], store: Path) -> None:
@@ -172,7 +165,7 @@ def _prepare(dataset: str, rows: pa.Table, log: Path, features: list[Path], stor
     prepare(files, mapping, store, PrepareOptions())
 
 
-TASKS: Final[Mapping[str, Callable[[Path, Log], BenchmarkTask]]] = {
+TASKS: Final[Mapping[str, Callable[[Path, Log], Task]]] = {
     "kuairand": kuairand,
     "kuairec": kuairec,
     "virtual-taobao": virtual_taobao,

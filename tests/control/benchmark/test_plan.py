@@ -1,34 +1,34 @@
 """Every table's cells are what their names say, and %BC goes through the benchmark."""
 
-import sys
 from dataclasses import replace
-from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
-from types import FrameType
 
 import numpy as np
 import pytest
 
 from tests.support.control_files import hopper_like, write_hdf5
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.benchmark.cells import Budget, Evaluation
+from ucfrec.benchmark.grid import run_grid
 from ucfrec.errors import InputError
+from ucfrec.results.rows_file import read_rows
 from ucfrec.runs.config import Config, resolve_config
-from ucfrec_control.benchmark import robustness
-from ucfrec_control.benchmark.budgets import BUDGETS, SWEEPS, Budget
-from ucfrec_control.benchmark.cells import (
-    OF_ITEMS,
+from ucfrec_control.benchmark.budgets import ANTMAZE, BUDGETS, budget_of
+from ucfrec_control.benchmark.measure import SCORE_MEASUREMENT
+from ucfrec_control.benchmark.methods import (
+    EQUAL_TIME,
+    MAIN,
+    METHODS,
+    PAPER,
+    PURSUING,
+    ROBUST,
     ROBUSTNESS,
-    code_of,
-    key,
-    measure_robustness,
-    measure_scores,
+    SCREENED,
+    TABLES,
 )
-from ucfrec_control.benchmark.folders import run_name
-from ucfrec_control.benchmark.methods import EQUAL_TIME, MAIN, METHODS, PAPER, PURSUING, TABLES
-from ucfrec_control.benchmark.plan import benchmark, cells_of
+from ucfrec_control.benchmark.plan import score_cells
 from ucfrec_control.benchmark.rates import settings_of
-from ucfrec_control.commands.benchmark import budgets_of
 from ucfrec_control.data.distractor import zoo_store
 from ucfrec_control.environments.scores import find_kind, require_task
 from ucfrec_control.learners.evaluate import load_run
@@ -40,23 +40,23 @@ def resolved(table: str, budget: Budget, file: str) -> dict[str, Config]:
     """Configuration of every row of a table that the core trains."""
     task, kind = require_task(file).name, find_kind(file)
     return {
-        method: resolve_config(
-            learner,
+        name: resolve_config(
+            method.policy,
             None,
-            settings_of(budget, "small", learner, (*own, *budget.of_methods.get(method, ()))),
+            settings_of(budget, name, method),
             0,
-            find_preset(task, kind, learner).tables,
+            find_preset(task, kind, method.policy).tables,
         )
-        for method, (learner, own) in TABLES[table].items()
-        if learner not in ALGORITHMS
+        for name, method in TABLES[table].items()
+        if method.policy not in ALGORITHMS
     }
 
 
 @pytest.mark.parametrize("size", ["small", "full"])
 @pytest.mark.parametrize("table", TABLES)
 def test_every_row_of_every_table_is_a_configuration_of_its_own(table: str, size: str) -> None:
-    budget = budgets_of(table)[size]
-    for file in budget.files:
+    budget = budget_of(table, size)
+    for file in budget.tasks:
         configs = resolved(table, budget, file)
         assert len(set(map(repr, configs.values()))) == len(configs)
         for config in configs.values():
@@ -64,8 +64,8 @@ def test_every_row_of_every_table_is_a_configuration_of_its_own(table: str, size
 
 
 def test_rows_have_the_settings_that_they_are_named_after() -> None:
-    budget = SWEEPS["full"]
-    file = budget.files[0]
+    budget = budget_of("gate", "full")
+    file = budget.tasks[0]
     for name, config in resolved("lambda", budget, file).items():
         if name in PAPER:
             continue
@@ -82,7 +82,7 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
             assert (config.csg.lambda_band == 0) == name.endswith("wo-band")
             assert (config.augment.edits_per_copy == 1) == ("algorithm-5" in name)
     for table in TABLES:
-        paper = [resolved(table, budgets_of(table)["full"], file)[name] for name in PAPER]
+        paper = [resolved(table, budget_of(table, "full"), file)[name] for name in PAPER]
         assert [config.policy_name for config in paper] == ["ucf-paper", "ucf-paper"]
         assert [config.augment.edits_per_copy for config in paper] == [0, 1]
         assert {(c.crm.learning_rate, c.crm.epochs) for c in paper} == {(3e-4, 40)}  # Table 4
@@ -111,16 +111,16 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
 @pytest.mark.parametrize("size", ["small", "full"])
 def test_a_method_of_two_tables_is_one_configuration(size: str) -> None:
     """They share their runs."""
-    for file in SWEEPS[size].files:
+    for file in budget_of("gate", size).tasks:
         named: dict[str, Config] = {}
         for table in TABLES:
-            for method, config in resolved(table, budgets_of(table)[size], file).items():
+            for method, config in resolved(table, budget_of(table, size), file).items():
                 assert named.setdefault(method, config) == config
 
 
 def test_seeds_are_fewer_for_some_methods_and_for_antmaze() -> None:
     small, full = BUDGETS["small"], BUDGETS["full"]
-    files = ("hopper_medium-zoo", "antmaze-umaze-v2")
+    files = ("hopper_medium-zoo", ANTMAZE[0])
     assert small.fewer_seeds.keys() <= METHODS.keys()
     assert [small.seeds_of(file, "cql") for file in files] == [1, 1]
     assert [small.seeds_of(files[0], f"dt{time}") for time in ("", "-wo-time")] == [1, 4]
@@ -129,16 +129,15 @@ def test_seeds_are_fewer_for_some_methods_and_for_antmaze() -> None:
 
 
 def test_robustness_trains_rows_of_the_benchmark() -> None:
-    learners = {"ucf" if m in robustness.SCREENED else m for m in robustness.METHODS}
-    assert learners <= METHODS.keys()
-    for budget in robustness.BUDGETS.values():
-        for file in budget.files:
-            assert learners <= resolved(MAIN, budget, file).keys()
+    trained = {name: method for name, method in ROBUST.items() if name not in SCREENED}
+    assert trained.items() <= METHODS.items()
+    assert {replace(method, screening=None) for method in SCREENED.values()} == {METHODS["ucf"]}
+    assert len(budget_of(ROBUSTNESS, "full").tasks) == 3, "Appendix G.4"
 
 
 @pytest.mark.slow
 def test_the_best_trajectories_are_cloned_and_evaluated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Good trajectories act one way and the others the other way: who clones which is seen."""
     columns = hopper_like((30, 8, 25, 20) * 10)
@@ -152,74 +151,25 @@ def test_the_best_trajectories_are_cloned_and_evaluated(
     monkeypatch.setitem(TABLES, MAIN, rows)
     settings = ("train.steps=50", "train.warmup_steps=5", "train.learning_rate=1e-2")
     settings += ("train.validate_every=25", "policy.dim=16")
-    budget = Budget(("hopper_medium-made",), 2, 2, settings)
+    budget = Budget("tiny", ("hopper_medium-made",), 2, Evaluation(2, 1000), settings)
     results = tmp_path / "rows.jsonl"
-    found = benchmark(tmp_path, tmp_path / "runs", results, budget, "tiny", 1)
+    cells = list(score_cells(tmp_path, tmp_path / "runs", budget, MAIN))
+    run_grid(cells, SCORE_MEASUREMENT, results, 1)
     checkpoints = ("last", "best")
+    found = read_rows(results)
     assert [(row.training_seed, row.method, row.checkpoint) for row in found] == list(
         product(range(2), rows, checkpoints)
     )
-    assert "benchmark main: 6 cells, 6 of them left to measure" in capfd.readouterr().err
     seen = np.random.default_rng(0).normal(size=(20, 11)).astype(np.float32)
     chosen = {}
     for method in rows:
-        runs = tmp_path / "runs" / "tiny" / "hopper_medium-made"
-        run = runs / run_name(method, code_of(METHODS[method][0]), 0)
+        (run,) = (cell.run for cell in cells if (cell.method, cell.training_seed) == (method, 0))
+        assert run is not None
         actor = load_run(run, "last").actor(len(seen), DecisionRule(1.0))
         actor.begin(np.arange(len(seen)))
         chosen[method] = actor.act(seen, np.ones(len(seen), dtype=bool))[0].mean()
     # One in five is good: all of the best 10%, four fifths of the best 25%.
     assert chosen["bc"] < -0.2 < 0.2 < chosen["bc-25"] < chosen["bc-10"]
-
-
-IMPORTED_BY_THEM_ALONE = (
-    *("ucfrec.acting.sessions", "ucfrec.episodes.group_auc", "ucfrec.processes"),
-)
-"""Modules that `code_version` leaves out together with `OF_ITEMS`."""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("table", [MAIN, ROBUSTNESS])
-def test_no_cell_runs_code_of_items(table: str, tmp_path: Path) -> None:
-    """Rows stay valid when that code changes, so they must not depend on it."""
-    write_hdf5(tmp_path / "hopper_medium-zoo.hdf5", hopper_like((30, 8, 25) * 8))
-    settings = ("train.steps=2", "train.warmup_steps=1", "train.validate_every=2", "crm.epochs=1")
-    small = replace(BUDGETS["small"], files=("hopper_medium-zoo",), seeds=1, episodes=1)
-    budget = replace(small, settings=(*small.settings, *settings, "csg.epochs=1"))
-    given = tmp_path, tmp_path / "runs", budget, "small"
-    if table == MAIN:
-        (cell,) = cells_of(*given, MAIN, ["ucf"])
-    else:
-        (cell,) = robustness.robustness_cells(*given, ["ucf"], ["deterministic"])
-    called: set[str] = set()
-
-    def remember(frame: FrameType, event: str, argument: object) -> None:
-        if frame.f_code.co_name != "<module>":
-            called.add(frame.f_code.co_filename)
-
-    measure = measure_scores if table == MAIN else measure_robustness
-    before = sys.gettrace()
-    sys.settrace(remember)
-    try:
-        measure(cell, key(cell))
-    finally:
-        sys.settrace(before)
-    assert str(source_of("ucfrec.policies.ucf")) in called
-    left_out = (*OF_ITEMS, *IMPORTED_BY_THEM_ALONE)
-    assert [name for name in left_out if str(source_of(name)) in called] == []
-
-
-def source_of(module: str) -> Path:
-    spec = find_spec(module)
-    assert spec is not None
-    assert spec.origin is not None
-    return Path(spec.origin)
-
-
-def test_cells_of_one_learner_run_through_the_same_code() -> None:
-    codes = {learner: code_of(learner) for learner in ("ucf", "dt", "iql", "cql")}
-    assert codes["ucf"] != codes["dt"]
-    assert codes["iql"] == codes["cql"] != codes["dt"]
 
 
 def test_a_store_of_other_data_of_the_same_name_is_refused(tmp_path: Path) -> None:

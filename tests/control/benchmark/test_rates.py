@@ -7,18 +7,18 @@ import pytest
 
 from tests.support.control_files import hopper_like, write_hdf5
 from tests.support.result_rows import result_row
+from ucfrec.benchmark.cells import Budget, Evaluation
 from ucfrec.errors import InputError
-from ucfrec.reporting.result_row import ResultRow
-from ucfrec.reporting.rows_file import read_configurations, read_rows
+from ucfrec.results.row import ResultRow
+from ucfrec.results.rows_file import read_configurations, read_rows
 from ucfrec_control.benchmark import rates
-from ucfrec_control.benchmark.budgets import BUDGETS, RATES, Budget
+from ucfrec_control.benchmark.budgets import BUDGETS, TRIED_RATES
 from ucfrec_control.benchmark.methods import METHODS, TABLES, WITH_TIME
 from ucfrec_control.benchmark.rates import (
     SEARCHED,
     best_rates,
     chosen_rates,
     read_rates,
-    rl_settings_of,
     settings_of,
     write_rates,
 )
@@ -49,40 +49,39 @@ def test_a_file_with_larger_losses_weighs_no_more() -> None:
     assert best_rates(rows) == {"dt": 0.2, "dc": 0.1}
 
 
-def test_every_learner_has_a_rate() -> None:
+def test_every_policy_has_a_rate() -> None:
     assert {name: METHODS[name] for name in SEARCHED} == SEARCHED
-    learners = {learner for learner, _ in METHODS.values()}
-    assert sorted(learner for learner, _ in SEARCHED.values()) == sorted(learners)
+    policies = {method.policy for method in METHODS.values()}
+    assert sorted(method.policy for method in SEARCHED.values()) == sorted(policies)
     assert not SEARCHED.keys() & set(WITH_TIME)
     assert chosen_rates("small").keys() <= SEARCHED.keys()
-    assert set(chosen_rates("small").values()) <= set(RATES["small"])
+    assert set(chosen_rates("small").values()) <= set(TRIED_RATES["small"])
     assert chosen_rates("unknown") == {}
 
 
 @pytest.mark.parametrize("table", TABLES)
-def test_every_row_is_trained_at_the_rate_of_its_learner(
+def test_every_row_is_trained_at_the_rate_of_its_policy(
     table: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     numbers = {name: float(number) for number, name in enumerate(SEARCHED, start=1)}
     monkeypatch.setattr(rates, "chosen_rates", lambda budget: numbers)
-    for name, (learner, settings) in TABLES[table].items():
-        found = settings_of(BUDGETS["full"], "full", learner, settings)
-        rl = rl_settings_of(BUDGETS["full"], "full", learner)
-        tried = next(m for m, (each, _) in SEARCHED.items() if each == learner)
-        if learner in ALGORITHMS:
-            assert (found, rl["learning_rate"]) == ((), numbers[tried])
+    for name, method in TABLES[table].items():
+        found = settings_of(BUDGETS["full"], name, method)
+        tried = next(m for m, each in SEARCHED.items() if each.policy == method.policy)
+        if method.policy in ALGORITHMS:
+            assert found == ("steps=1000000", f"learning_rate={numbers[tried]:g}")
             continue
-        assert not rl
         assert f"train.learning_rate={numbers[tried]:g}" in found, name
-        assert found[-len(settings) :] == settings if settings else True
+        own = (*method.settings, *BUDGETS["full"].of_methods.get(name, ()))
+        assert found[-len(own) :] == own if own else True
 
 
 def test_a_method_with_a_rate_of_its_own_is_trained_at_it() -> None:
     budget = replace(BUDGETS["small"], rates={"dt": 0.5, "dt-wo-time": 0.25, "ucf": 0.125})
     for name, rate in (("dt", 0.5), ("dt-wo-time", 0.25), ("ucf-w-time", 0.125)):
-        assert f"train.learning_rate={rate:g}" in settings_of(budget, "small", *METHODS[name])
+        assert f"train.learning_rate={rate:g}" in settings_of(budget, name, METHODS[name])
     given = [each for each in budget.settings if each.startswith("train.learning_rate")]
-    found = settings_of(budget, "small", *METHODS["dc"])
+    found = settings_of(budget, "dc", METHODS["dc"])
     assert [each for each in found if each.startswith("train.learning_rate")] == given
 
 
@@ -91,9 +90,9 @@ def test_the_search_writes_rows_and_a_choice_once(
 ) -> None:
     write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
     settings = ("train.batch_size=4", "train.warmup_steps=0", "policy.dim=16", "policy.context=3")
-    tiny = {"small": Budget(("hopper_medium-made",), 1, 1, settings)}
-    monkeypatch.setattr("ucfrec_control.commands.rates.SEARCHES", tiny)
-    monkeypatch.setitem(RATES, "small", (1e-9, 1e-2))
+    tiny = Budget("small", ("hopper_medium-made",), 1, Evaluation(1, 1000), settings)
+    monkeypatch.setitem(BUDGETS, "small", tiny)
+    monkeypatch.setitem(TRIED_RATES, "small", (1e-9, 1e-2))
     out, toml = tmp_path / "out", tmp_path / "rates.toml"
     arguments = ["rates", "--data", str(tmp_path), "--out", str(out), "--toml", str(toml)]
     arguments += ["--method", "dt-wo-time", "--steps", "30"]
@@ -111,10 +110,9 @@ def test_the_search_writes_rows_and_a_choice_once(
     assert "2 of them left" in (printed := capsys.readouterr()).err
     assert "dt-wo-time = 0.01" in printed.out.split("[small]")[-1]
     # The choice is what the benchmark trains with.
-    monkeypatch.setattr("ucfrec_control.commands.benchmark.BUDGETS", tiny)
     given = ["benchmark", str(tmp_path), "--out", str(out), "--method", "dt-wo-time"]
     given += ["--rates", str(toml)]
-    monkeypatch.setitem(tiny, "small", replace(tiny["small"], settings=(*settings, *SHORT)))
+    monkeypatch.setitem(BUDGETS, "small", replace(tiny, settings=(*settings, *SHORT)))
     assert main(given) == 0
     assert "chosen on validation loss: dt-wo-time 0.01" in capsys.readouterr().out
     trained = [row for row in read_rows(out / "results.jsonl") if row.suite == "control"]
@@ -174,4 +172,4 @@ def test_a_file_without_validation_trajectories_is_refused_before_a_training(
     asked = ["rates", "--data", str(tmp_path), "--out", str(tmp_path / "out")]
     assert main([*asked, "--file", "hopper_medium-made"]) == 2
     assert "too few trajectories for validation" in capsys.readouterr().err
-    assert not (tmp_path / "out" / "rates").exists()
+    assert not list((tmp_path / "out").rglob("run.json"))

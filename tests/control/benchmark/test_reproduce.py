@@ -7,14 +7,14 @@ import pytest
 
 from tests.support.control_files import hopper_like, write_hdf5
 from tests.support.result_rows import result_row
-from ucfrec.reporting.rows_file import append_rows, read_rows
-from ucfrec_control.benchmark.budgets import BUDGETS, Budget
-from ucfrec_control.benchmark.cells import ROBUSTNESS, SCORES
-from ucfrec_control.benchmark.estimate import estimated_hours
-from ucfrec_control.benchmark.methods import MAIN, TABLES
-from ucfrec_control.benchmark.plan import cells_of
-from ucfrec_control.benchmark.reproduce import PARTS, budget_of
-from ucfrec_control.benchmark.robustness import METHODS
+from ucfrec.benchmark.cells import Budget, Evaluation
+from ucfrec.benchmark.estimate import estimated_hours
+from ucfrec.results.rows_file import append_rows, read_rows
+from ucfrec_control.benchmark.budgets import BUDGETS, budget_of
+from ucfrec_control.benchmark.costs import costs
+from ucfrec_control.benchmark.methods import MAIN, ROBUST, ROBUSTNESS, SCORES, TABLES
+from ucfrec_control.benchmark.plan import score_cells
+from ucfrec_control.benchmark.reproduce import PARTS, budget_of_part
 from ucfrec_control.cli import main
 from ucfrec_control.data.distractor import DISTRACTORS
 from ucfrec_control.figures.figures import make_row_figures
@@ -25,24 +25,30 @@ TINY = ("train.steps=4", "train.validate_every=2", "policy.dim=16", "policy.cont
 @pytest.mark.parametrize("name", PARTS)
 def test_a_part_has_rows_and_files_of_its_tables(name: str) -> None:
     part = PARTS[name]
-    assert set(part.methods) <= set(METHODS if part.table == ROBUSTNESS else TABLES[part.table])
-    for budget in BUDGETS.values():
-        own = budget_of(part, budget)
-        assert own.files == (part.files or budget.files)
+    assert set(part.methods) <= set(ROBUST if part.table == ROBUSTNESS else TABLES[part.table])
+    for size in BUDGETS:
+        own = budget_of_part(part, size)
+        assert own.tasks == (part.files or budget_of(part.table, size).tasks)
     assert set(part.distractors) <= set(DISTRACTORS)
     assert part.of_runs == (name in ("figure-5", "figure-6"))
 
 
-def test_the_estimate_grows_with_steps_and_shrinks_with_workers(tmp_path: Path) -> None:
+def test_the_estimate_grows_with_steps(tmp_path: Path) -> None:
     write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
     hours = {}
     for steps in (1_000, 1_000_000):
         settings = (*TINY, f"train.steps={steps}")
-        budget = Budget(("hopper_medium-made",), 2, 1, settings, rl={"iql": {"steps": steps}})
+        budget = Budget(
+            "tiny",
+            ("hopper_medium-made",),
+            2,
+            Evaluation(1, 1000),
+            settings,
+            of_policies={"iql": (f"steps={steps}",)},
+        )
         for method in ("dt", "iql"):
-            cells = list(cells_of(tmp_path, tmp_path / "out", budget, "tiny", MAIN, (method,)))
-            hours[method, steps] = estimated_hours(cells, 1)
-            assert estimated_hours(cells, 4) < hours[method, steps]
+            cells = list(score_cells(tmp_path, tmp_path / "out", budget, MAIN, (method,)))
+            hours[method, steps] = estimated_hours(cells, costs())
     for method in ("dt", "iql"):
         assert 0 < 10 * hours[method, 1_000] < hours[method, 1_000_000]
 
@@ -52,13 +58,13 @@ def test_one_command_makes_a_figure_and_says_beforehand_how_long(
 ) -> None:
     write_hdf5(tmp_path / "hopper_medium-zoo.hdf5", hopper_like((30, 8, 25) * 8))
     settings = (*TINY, "crm.epochs=1", "csg.epochs=1")
-    budgets = {"small": Budget(("unused",), 1, 1, settings)}
-    monkeypatch.setattr("ucfrec_control.commands.benchmark.BUDGETS", budgets)
+    tiny = Budget("small", ("unused",), 1, Evaluation(1, 1000), settings)
+    monkeypatch.setitem(BUDGETS, "small", tiny)
     arguments = ["reproduce", "figure-5", "--data", str(tmp_path), "--out", str(tmp_path / "out")]
     assert main(arguments) == 0
     said = capsys.readouterr().err
     assert "reproduce figure-5: 1 cells, 1 of them left to measure" in said
-    assert "reproduce figure-5: about 0.0 hours here with --workers 1" in said
+    assert "reproduce figure-5: about 0.0 hours with --workers 1" in said
     assert {row.method for row in read_rows(tmp_path / "out" / "results.jsonl")} == {"ucf"}
     assert list((tmp_path / "out" / "figure-5").glob("moves-*.png"))
 

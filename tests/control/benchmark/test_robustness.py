@@ -9,24 +9,23 @@ import pytest
 from tests.support.control_files import hopper_like, write_hdf5
 from tests.support.result_rows import result_row
 from ucfrec import schema
+from ucfrec.benchmark.cells import Budget, Evaluation, opened
 from ucfrec.counterfactual.measured_reward import MeasurementConfig
 from ucfrec.counterfactual.screening import ScreeningConfig
-from ucfrec.reporting.result_row import ResultRow
-from ucfrec.reporting.rows_file import read_rows
 from ucfrec.reporting.tables import NONE
-from ucfrec.runs.config import resolve_config
-from ucfrec_control.benchmark import robustness
-from ucfrec_control.benchmark.budgets import Budget
-from ucfrec_control.benchmark.folders import run_name, stores_of
-from ucfrec_control.benchmark.rates import settings_of
+from ucfrec.results.row import ResultRow
+from ucfrec.results.rows_file import read_rows
+from ucfrec_control.benchmark import plan
+from ucfrec_control.benchmark.budgets import BUDGETS
+from ucfrec_control.benchmark.methods import METHODS, SCREENED
 from ucfrec_control.benchmark.robustness import drops, largest_drops, loss_rises
 from ucfrec_control.benchmark.screening_table import screening_rows
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
-from ucfrec_control.data.distractor import add_distractor
+from ucfrec_control.data.distractor import DISTRACTORS, add_distractor
 from ucfrec_control.figures.figures import make_figures
 from ucfrec_control.learners.evaluate import evaluate_run
-from ucfrec_control.learners.train import dataset_of, preset_of, train_control
+from ucfrec_control.learners.train import train_control
 
 TINY = ("train.steps=4", "train.validate_every=2", "policy.dim=16", "policy.context=5")
 FILE = "hopper_medium-made"
@@ -83,46 +82,45 @@ def test_drops_compare_with_the_same_seed_without_distractor() -> None:
     assert math.isnan(found["early", 1]["drop"])
 
 
-def begin(tmp_path: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A small table of one file and one distractor, its screened runs begun in `out`."""
-    settings = (*TINY, "crm.epochs=1")
-    budget = Budget((FILE,), 1, 2, settings)
-    monkeypatch.setattr(robustness, "BUDGETS", {"small": budget})
-    monkeypatch.setattr("ucfrec_control.commands.robustness.ROBUSTNESS_BUDGETS", robustness.BUDGETS)
-    monkeypatch.setattr(robustness, "METHODS", ("dt", *robustness.SCREENED))
-    kinds = {kind: robustness.DISTRACTORS[kind] for kind in ("none", "deterministic")}
-    monkeypatch.setattr(robustness, "DISTRACTORS", kinds)
+def begin(
+    tmp_path: Path, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> dict[tuple[str, str], Path]:
+    """A small table of one file and one distractor, its screened runs begun in `out`; returns the
+    run of each distractor and method."""
+    budget = Budget("small", (FILE,), 1, Evaluation(2, 1000), (*TINY, "crm.epochs=1"))
+    monkeypatch.setitem(BUDGETS, "small", budget)
+    monkeypatch.setattr(plan, "ROBUST", {"dt": METHODS["dt"], **SCREENED})
+    kinds = {kind: DISTRACTORS[kind] for kind in ("none", "deterministic")}
+    monkeypatch.setattr(plan, "DISTRACTORS", kinds)
     columns = hopper_like((30, 8, 25) * 8)
     columns["observations"][:, 4] = 0.0  # a constant causes nothing
     columns["rewards"] = columns["observations"][:, 0]
-    file = write_hdf5(tmp_path / f"{FILE}.hdf5", columns)
+    write_hdf5(tmp_path / f"{FILE}.hdf5", columns)
     # Begun here, where screening may be made quick, and gone on with by the command.
     few = MeasurementConfig(trees=5)
     quickest = ScreeningConfig(hidden=16, shared_steps=100, own_steps=50, measurement=few)
     monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: quickest)
-    clean = read_d4rl(file).write_store(stores_of(out) / FILE)
-    distracted = add_distractor(clean, stores_of(out) / f"{FILE}-deterministic")
-    tables = preset_of(dataset_of(clean), "ucf").tables
-    for kind, store in (("none", clean), ("deterministic", distracted)):
-        chosen = settings_of(budget, "small", "ucf", ())
-        config = resolve_config("ucf", None, chosen, 0, tables)
-        for method, screening in robustness.SCREENED.items():
-            train_control(store, run_of(out, kind, method), config, screening=screening)
+    runs = {}
+    for cell in plan.robustness_cells(tmp_path, out, budget):
+        assert cell.run is not None
+        runs[str(cell.conditions["distractor"]), cell.method] = cell.run
+        if cell.screening is not None:
+            train_control(opened(cell), cell.run, cell.config, screening=cell.screening)
+    return runs
 
 
 def test_cells_are_measured_once_and_screening_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    begin(tmp_path, out, monkeypatch)
-    methods, kinds = robustness.METHODS, robustness.DISTRACTORS
+    runs = begin(tmp_path, out, monkeypatch)
     results = tmp_path / "rows.jsonl"
     arguments = ["robustness", "--data", str(tmp_path), "--out", str(out)]
     arguments += ["--results", str(results)]
     assert main(arguments) == 0
     rows = read_rows(results)
     kinds_of = {(r.method, r.conditions["distractor"]): r.details.get("distractors") for r in rows}
-    assert kinds_of.keys() == {(method, kind) for method in methods for kind in kinds}
+    assert kinds_of.keys() == {(method, kind) for kind, method in runs}
     assert all(bool(added) == (kind != "none") for (_, kind), added in kinds_of.items())
     assert {r.checkpoint for r in rows} == {"last"}
     for r in rows:
@@ -131,7 +129,7 @@ def test_cells_are_measured_once_and_screening_is_reported(
             fixed = value if kind != "none" else 0.0
             assert r.target_return is not None
             (again,) = evaluate_run(
-                run_of(out, kind, r.method),
+                runs[kind, r.method],
                 episodes=2, seed=1000, targets=[r.target_return], checkpoints=("last",),
                 distractor=fixed,
             )  # fmt: skip
@@ -165,19 +163,3 @@ def test_cells_are_measured_once_and_screening_is_reported(
     capsys.readouterr()
     assert main(["robustness", "--show-only", "--results", str(results)]) == 0
     assert capsys.readouterr().out == printed
-
-
-def run_of(out: Path, kind: str, method: str) -> Path:
-    """The folder of a run of the command."""
-    learner = "ucf" if method in robustness.SCREENED else method
-    code = robustness.code_of(learner, *robustness._CODE)
-    return out / "robustness-small" / FILE / kind / run_name(method, code, 0)
-
-
-def test_every_budget_is_a_configuration_of_every_method() -> None:
-    assert set(robustness.BUDGETS) == {"small", "full"}
-    assert len(robustness.BUDGETS["full"].files) == 3, "Appendix G.4"
-    for budget in robustness.BUDGETS.values():
-        for method in robustness.METHODS:
-            policy, own = robustness.LEARNERS["ucf" if method in robustness.SCREENED else method]
-            resolve_config(policy, None, [*budget.settings, *own])

@@ -15,14 +15,13 @@ from ucfrec.episodes.distractor import with_observations
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors
-from ucfrec.reporting.rows_file import read_rows
 from ucfrec.reporting.tables import NONE
+from ucfrec.results.rows_file import read_rows
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.start import training_views
 from ucfrec_control.benchmark import screening_table
-from ucfrec_control.benchmark.budgets import Budget
-from ucfrec_control.benchmark.folders import stores_of
+from ucfrec_control.benchmark.plan import stores_of
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.distractor import add_distractor
@@ -103,8 +102,7 @@ def test_every_file_is_screened_plain_and_distracted_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(screening_table, "ScreeningConfig", lambda: QUICKEST)
-    budget = {"full": Budget(("hopper_medium-made",), 1, 1, ())}
-    monkeypatch.setattr("ucfrec_control.commands.screen_all.BUDGETS", budget)
+    monkeypatch.setattr("ucfrec_control.commands.screen_all.ZOO", ("hopper_medium-made",))
     write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((20, 30) * 12))
     results = tmp_path / "rows.jsonl"
     arguments = ["screen-all", "--data", str(tmp_path), "--out", str(tmp_path / "out")]

@@ -10,15 +10,19 @@ import pytest
 import torch
 
 from tests.support.control_files import hopper_like, write_hdf5
+from ucfrec.benchmark.cells import Budget, Evaluation, Method
+from ucfrec.benchmark.grid import run_grid
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.fitting.random_state import random_state_kept
-from ucfrec.reporting.rows_file import read_rows
-from ucfrec_control.benchmark.budgets import RATES, Budget
+from ucfrec.results.row import ResultRow
+from ucfrec.results.rows_file import read_rows
+from ucfrec_control.benchmark.budgets import TRIED_RATES
+from ucfrec_control.benchmark.measure import RATE_MEASUREMENT, SCORE_MEASUREMENT
 from ucfrec_control.benchmark.methods import TABLES
-from ucfrec_control.benchmark.plan import benchmark
-from ucfrec_control.benchmark.rates import best_rates, search_rates
+from ucfrec_control.benchmark.plan import rate_cells, score_cells
+from ucfrec_control.benchmark.rates import best_rates
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.learners import rl_baselines
@@ -88,7 +92,7 @@ def test_equal_seeds_train_equal_actors_that_are_judged_as_others_are(
     assert a == b != c
     (row,) = evaluate_run(tmp_path / "a", episodes=2, seed=0)
     assert (row["method"], row["checkpoint"], row["target_return"]) == (algorithm, "last", None)
-    assert row["fingerprint"] == store.record.fingerprint
+    assert row.data_fingerprint == store.record.fingerprint
     capsys.readouterr()
     asked = ["evaluate", str(tmp_path / "a"), "--episodes", "2"]
     assert main(asked) == 0
@@ -186,12 +190,17 @@ def test_the_benchmark_finds_its_rl_rows_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
-    monkeypatch.setitem(TABLES, "main", {"iql": ("iql", ())})
-    budget = Budget(("hopper_medium-made",), 1, 2, (), rl={"iql": {"steps": 2}})
+    monkeypatch.setitem(TABLES, "main", {"iql": Method("iql")})
+    budget = made(2, "steps=2")
     results = tmp_path / "rows.jsonl"
-    (row,) = benchmark(tmp_path, tmp_path / "runs", results, budget, "tiny", 1)
+
+    def measured() -> list[ResultRow]:
+        cells = list(score_cells(tmp_path, tmp_path / "runs", budget, "main"))
+        return run_grid(cells, SCORE_MEASUREMENT, results, 1)
+
+    (row,) = measured()
     assert (row.table, row.method, row.checkpoint) == ("main", "iql", "last")
-    assert benchmark(tmp_path, tmp_path / "runs", results, budget, "tiny", 1) == [row]
+    assert measured() == [row]
     assert len(results.read_text().splitlines()) == 1
     assert read_rows(results) == [row]
     printed = capfd.readouterr()
@@ -201,17 +210,21 @@ def test_the_benchmark_finds_its_rl_rows_again(
     assert "[info" not in re.sub(r"\x1b\[[\d;]*m", "", printed.out)
 
 
+def made(episodes: int, *settings: str) -> Budget:
+    """A budget of one file with settings of IQL."""
+    evaluation = Evaluation(episodes, 1000)
+    return Budget("full", ("hopper_medium-made",), 1, evaluation, of_policies={"iql": settings})
+
+
 def test_rates_of_rl_are_searched_on_held_out_actions(tmp_path: Path) -> None:
     columns = hopper_like((30, 8, 25) * 8)
     columns["actions"] = np.tanh(columns["observations"][:, :3])
     write_hdf5(tmp_path / "hopper_medium-made.hdf5", columns)
-    settings = {"steps": 99, "batch_size": 64}
-    budget = Budget(("hopper_medium-made",), 1, 1, (), rl={"iql": settings})
-    rows = search_rates(
-        tmp_path, tmp_path / "runs", tmp_path / "rows.jsonl", budget, "full", 1, ("iql",), 60
-    )
-    assert [row.conditions["learning_rate"] for row in rows] == list(RATES["full"])
+    budget = made(1, "steps=99", "batch_size=64")
+    cells = list(rate_cells(tmp_path, tmp_path / "runs", budget, ("iql",), 60))
+    rows = run_grid(cells, RATE_MEASUREMENT, tmp_path / "rows.jsonl", 1)
+    assert [row.conditions["learning_rate"] for row in rows] == list(TRIED_RATES["full"])
     assert {row.metrics["steps"] for row in rows} == {60}
     of_no_action = np.mean(columns["actions"] ** 2)
     assert rows[-1].value < 0.8 * rows[0].value < 0.8 * of_no_action
-    assert best_rates(rows) == {"iql": RATES["full"][-1]}
+    assert best_rates(rows) == {"iql": TRIED_RATES["full"][-1]}

@@ -13,13 +13,15 @@ from tests.support.control_files import hopper_like, write_hdf5
 from tests.support.real_data import data_folder
 from ucfrec import schema
 from ucfrec.acting.rollout import rollout
+from ucfrec.benchmark.cells import Budget, Evaluation
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.policies.registry import BUILT_IN
+from ucfrec.results.rows_file import read_results
 from ucfrec.runs.config import resolve_config
-from ucfrec_control.benchmark.budgets import BUDGETS, Budget
+from ucfrec_control.benchmark.budgets import BUDGETS, ZOO
 from ucfrec_control.benchmark.methods import METHODS, TABLES
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
@@ -59,21 +61,21 @@ def test_evaluate_writes_last_and_best_apart(
     out = tmp_path / "rows.json"
     arguments = ["evaluate", str(folder / "store-run"), "--episodes", "3", "--json", str(out)]
     assert main(arguments) == 0
-    rows = json.loads(out.read_text())
-    assert [(r["checkpoint"], r["target_return"]) for r in rows] == [
+    rows = read_results(out)
+    assert [(r.checkpoint, r.target_return) for r in rows] == [
         (checkpoint, target) for checkpoint in ("last", "best") for target in (3600, 1800)
     ]
     for row in rows:
-        assert (row["dataset"], row["method"], row["seed"]) == ("hopper_medium-made", "dt", 3)
-        assert (row["episodes"], row["env_id"]) == (3, "Hopper-v5")
+        assert (row.task, row.method, row.training_seed) == ("hopper_medium-made", "dt", 3)
+        assert (row["episodes"], row.environment) == (3, "Hopper-v5")
         scored = 100 * (row["return"] + 20.272305) / (3234.3 + 20.272305)
         assert row["score"] == pytest.approx(scored)
         assert row["score_low"] <= row["score"] <= row["score_high"]
-        assert {"mujoco", "gymnasium", "torch"} <= row["versions"].keys()
+        assert {"mujoco", "gymnasium", "torch"} <= row.versions.keys()
         trained = read_json(folder / "store-run" / "run.json")["policy"]
         assert row["validation_loss"] == trained["best_validation"] > 0
         assert min(row["wall_time_s"], row["train_wall_time_s"]) > 0
-        assert row["config"]["policy_name"] == "dt"
+        assert row.policy == "dt"
     printed = capsys.readouterr()
     assert "hopper_medium-made" in printed.out
     assert "warning" not in printed.err
@@ -145,8 +147,10 @@ def test_a_policy_with_a_distractor_is_judged_at_zero(folder: Path, tmp_path: Pa
     run = str(folder / "distracted-run")
     arguments = ["evaluate", run, "--checkpoint", "last", "--episodes", "2", "--target", "900"]
     assert main([*arguments, "--json", str(out)]) == 0
-    (row,) = json.loads(out.read_text())
-    assert row["distractors"] == [{"dimension": 11, "flip": 0.15, "seed": 0, "early": False}]
+    (row,) = read_results(out)
+    assert row.details["distractors"] == [
+        {"dimension": 11, "flip": 0.15, "seed": 0, "early": False}
+    ]
     env = make_env("Hopper-v5", 2, [0.0])
     seen = []
 
@@ -307,14 +311,14 @@ def test_a_clone_of_a_zoo_file_hops(tmp_path: Path) -> None:
     assert main(["train", str(tmp_path / "store"), "--out", run, "--policy", "bc", *options]) == 0
     out = tmp_path / "rows.json"
     assert main(["evaluate", run, "--checkpoint", "last", "--json", str(out)]) == 0
-    (row,) = json.loads(out.read_text())
+    (row,) = read_results(out)
     assert row["episodes"] == 20
     assert row["score"] > 15
 
 
 @pytest.mark.slow
 @pytest.mark.realdata
-@pytest.mark.parametrize("file", BUDGETS["full"].files)
+@pytest.mark.parametrize("file", ZOO)
 def test_each_zoo_file_trains_ucf_that_its_environment_judges(tmp_path: Path, file: str) -> None:
     data, store, run = data_folder("control") / f"{file}.hdf5", tmp_path / "store", tmp_path / "run"
     assert main(["prepare", str(data), "--out", str(store)]) == 0
@@ -326,10 +330,11 @@ def test_each_zoo_file_trains_ucf_that_its_environment_judges(tmp_path: Path, fi
     out = tmp_path / "rows.json"
     asked = ["--episodes", "2", "--checkpoint", "last", "--json", str(out)]
     assert main(["evaluate", str(run), *asked]) == 0
-    rows = json.loads(out.read_text())
+    rows = read_results(out)
     assert len(rows) == 2  # one for each of the preset's targets
     for row in rows:
-        assert (row["dataset"], row["warnings"]) == (file, [])
+        assert row.task == file
+        assert "warnings" not in row.details
         assert row["score_low"] <= row["score"] <= row["score_high"] < 20  # it has learned nothing
 
 
@@ -338,7 +343,9 @@ def test_a_benchmark_goes_on_where_it_was(
 ) -> None:
     write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
     settings = (*TINY, "policy.dim=32", "crm.epochs=1", "csg.epochs=1")
-    monkeypatch.setitem(BUDGETS, "small", Budget(("hopper_medium-made",), 1, 2, settings))
+    monkeypatch.setitem(
+        BUDGETS, "small", Budget("small", ("hopper_medium-made",), 1, Evaluation(2, 1000), settings)
+    )
     monkeypatch.setitem(TABLES, "main", {m: METHODS[m] for m in ("lsdt", "ucf")})
     results = tmp_path / "control.jsonl"
     arguments = ["benchmark", str(tmp_path), "--out", str(tmp_path / "runs")]
@@ -357,7 +364,7 @@ def test_a_benchmark_goes_on_where_it_was(
         assert row["conditions"].items() >= {"budget": "small", "episodes": 2}.items()
         assert row["metrics"].keys() >= {"score", "return", "length", "validation_loss"}
         assert (row["training_seed"], row["evaluation_seed"]) == (0, 1000)
-        assert {"environment", "versions", "commit", "command", "code_version"} <= row.keys()
+        assert {"environment", "versions", "commit", "command"} <= row.keys()
     assert str(tmp_path) not in results.read_text()
     before = results.read_text()
     assert main(arguments) == 0
@@ -385,7 +392,7 @@ def test_a_benchmark_goes_on_where_it_was(
     ("options", "says"),
     [
         (["--method", "nope"], "no method is called nope; there are bc, bc-10"),
-        (["--seeds", "0"], "--seeds is 0"),
+        (["--seeds", "0"], "0 training seeds are requested"),
         (["--file", "nowhere"], "nowhere.hdf5 does not exist"),
         (["--results", "{rows}"], "rows.jsonl, line 1 is no result row"),
     ],

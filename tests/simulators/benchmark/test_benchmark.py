@@ -1,6 +1,5 @@
 """The recommendation benchmark: what it measures, what it reuses, and what its tables say."""
 
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,27 +11,35 @@ import pytest
 from tests.support.causes import QUICK
 from tests.support.real_data import data_folder
 from tests.support.result_rows import result_row
+from ucfrec.benchmark.cells import Budget, Evaluation, key, training_config
+from ucfrec.benchmark.estimate import announcement, estimated_hours
+from ucfrec.benchmark.suite import Benchmark, BenchmarkRequest, show
+from ucfrec.benchmark.suite import measure as measured
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior
 from ucfrec.files.atomic import read_json
-from ucfrec.plugins import Benchmark, BenchmarkRequest, load_plugin
-from ucfrec.reporting.result_row import ResultRow
-from ucfrec.reporting.rows_file import append_rows, read_configurations, read_rows
+from ucfrec.plugins import load_plugin
+from ucfrec.results.rows_file import append_rows, read_configurations, read_rows
 from ucfrec.runs.record import read_record
 from ucfrec.runs.trained_policy import RUN, TrainedPolicy
-from ucfrec_simulators.benchmark import plan, plots
-from ucfrec_simulators.benchmark.cells import EvaluationPlan, config, key, measure
-from ucfrec_simulators.benchmark.estimate import announcement, estimated_hours
+from ucfrec_simulators.benchmark import plan
+from ucfrec_simulators.benchmark.budgets import BUDGETS
+from ucfrec_simulators.benchmark.costs import COSTS
+from ucfrec_simulators.benchmark.measure import measure
 from ucfrec_simulators.benchmark.methods import METHODS, SCREENED
-from ucfrec_simulators.benchmark.plan import BUDGETS, Plan
-from ucfrec_simulators.benchmark.plots import plot_distractor, plot_methods
-from ucfrec_simulators.benchmark.tables import distractor_table, method_table
+from ucfrec_simulators.benchmark.plan import RecommendationCells
 from ucfrec_simulators.benchmark.tasks import Log, kuairand
 from ucfrec_simulators.kuai.environment import EXITS
 from ucfrec_simulators.kuai.logs import cut_by_exit, part_of, window
+
+
+def planned(folder: Path, budget: Budget, **request: Any) -> RecommendationCells:
+    given = BenchmarkRequest(budget.name, [], folder, folder / "rows.jsonl", 1, **request)
+    return RecommendationCells(given, budget)
+
 
 TINY = replace(
     BUDGETS["small"],
@@ -40,7 +47,7 @@ TINY = replace(
     logs=1,
     sessions=60,
     settings=("policy.dim=8", "train.steps=2", "train.validate_every=2", "crm.epochs=1"),
-    evaluation=EvaluationPlan(episodes=8),
+    evaluation=Evaluation(episodes=8, seed=1_000_000),
 )
 
 
@@ -56,16 +63,17 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
 ) -> None:
     tiny = replace(TINY, logs=2, tasks=("kuairand", "synthetic-catalog"))
     monkeypatch.setitem(BUDGETS, "small", tiny)
-    some = {name: METHODS[name] for name in ("popular", "dt+")}
+    some = {name: METHODS[name] for name in ("popular", "dt+shared")}
     monkeypatch.setattr(plan, "METHODS", some)
     suite: Benchmark = load_plugin("benchmarks", "recommendation")
     results = tmp_path / "rows.jsonl"
     request = BenchmarkRequest("small", ["main"], tmp_path / "out", results, 1)
-    said = suite.run(request)
+    said = measured(suite, request)
     assert "kuairand is left out" in said
     rows = read_rows(results)
     built_in = [(name, None, None) for name in ("random", "mixture", "optimal")]
-    trained = [(n, log, s) for log in (0, 1) for s in (0, 1) for n in some]
+    # Seed by seed, so that an interrupted table is one of fewer seeds.
+    trained = [(n, log, s) for s in (0, 1) for log in (0, 1) for n in some]
     assert [(r.method, r.log_seed, r.training_seed) for r in rows] == [*built_in, *trained]
     assert {(r.suite, r.table, r.environment) for r in rows} == {
         ("recommendation", "main", "synthetic-catalog")
@@ -74,42 +82,48 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     assert len({r.data_fingerprint for r in rows if r.training_seed is not None}) == 2
     played = evaluate_behavior(Environment("synthetic-catalog"), "optimal", 8, 1_000_000)
     found = next(row for row in rows if row.method == "optimal")
-    assert found.value == played["R_cum"]
-    assert found.interval == (played["R_cum_low"], played["R_cum_high"])
+    assert (found.value, found.interval) == (played.value, played.interval)
     # Whatever the training seed, the same episodes are reported.
     assert {row.evaluation_seed for row in rows} == {1_000_000}
     # Each run acts by its own rule.
     runs = {TrainedPolicy.load(path.parent).rule for path in (tmp_path / "out").rglob(RUN)}
     told = {f"{rule} ({rule.hash})" for rule in runs}
     assert {row.rule for row in rows if row.training_seed is not None} == told
-    assert {row.target_return for row in rows if row.method == "dt+"} <= {r.target for r in runs}
+    assert {row.target_return for row in rows if row.method == "dt+shared"} <= {
+        r.target for r in runs
+    }
     assert {r.conditions.get("quantiles") for r in rows if r.training_seed is not None} == {"rule"}
     records = [read_json(path) for path in (tmp_path / "out").rglob(RUN)]
     choices = [record["rule"] for record in records if "rule" in record]
     own = [each for one in choices for each in one["candidates"] if each["rule"] == one["rule"]]
-    of_dt = [row.metrics for row in rows if row.method == "dt+"]
+    of_dt = [row.metrics for row in rows if row.method == "dt+shared"]
     assert len(own) == len(choices) == len(of_dt)
-    assert {each["promised"] for each in of_dt} == {each["value"] for each in own}
-    assert {each["promised_error"] for each in of_dt} == {each["error"] for each in own}
-    assert not any("promised" in row.metrics for row in rows if row.method != "dt+")
+    assert {each["estimated_value"] for each in of_dt} == {each["value"] for each in own}
+    assert {each["estimated_value_error"] for each in of_dt} == {each["error"] for each in own}
+    assert not any("estimated_value" in row.metrics for row in rows if row.method != "dt+shared")
     configurations = read_configurations(tmp_path)
     dims = {configurations[str(r.config_hash)]["policy"]["dim"] for r in rows if r.config_hash}
     assert dims == {8}
     assert str(tmp_path) not in results.read_text()
     pictures = tmp_path / "out" / "small" / "plots"
     assert pictures.exists() == ("pictures:" in said)
-    assert suite.run(request) == said
+    assert measured(suite, request) == said
     assert len(read_rows(results)) == len(rows)
-    assert suite.show(["main", "sweeps"], rows) in said
-    # Code that a row runs through has changed: trained and played again.
+    assert show(suite, ["main", "sweeps"], rows) in said
+    # Trained and played again: the same numbers.
     monkeypatch.setattr(plan, "METHODS", {"popular": METHODS["popular"]})
-    monkeypatch.setattr(plan, "code_version", lambda *roots, exclude=(): "other")
-    suite.run(request)
-    again = read_rows(results)[len(rows) :]
-    assert {row.code_version for row in again} == {"other"}
-    assert {row.method for row in again} == {"random", "mixture", "optimal", "popular"}
+    weights = [path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("best.safetensors")]
+    measured(suite, replace(request, again=True))
+    again = read_rows(results)
+    assert len(again) == len(rows)
+    methods = [row.method for row in again]
+    assert methods == [*4 * ["dt+shared"], "random", "mixture", "optimal", *4 * ["popular"]]
+    first, second = (sorted((r.method, str(r.log_seed), r.value) for r in x) for x in (rows, again))
+    assert first == second
+    left = [path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("best.safetensors")]
+    assert len(set(left) - set(weights)) == 4
     seeds = replace(request, evaluation_seed=5, log_seed=3, logs=1)
-    suite.run(seeds)
+    measured(suite, seeds)
     last = read_rows(results)[-1]
     assert (last.evaluation_seed, last.log_seed) == (5, 3)
     assert {row.log_seed for row in read_rows(results)} == {None, 0, 1, 3}
@@ -145,16 +159,7 @@ def test_sardine_is_left_out_where_it_is_not_installed(
 ) -> None:
     monkeypatch.setitem(plan._PACKAGES, "sardine-static", "not_installed")
     budget = replace(TINY, tasks=("sardine-static", "synthetic-catalog"))
-    assert Plan(tmp_path, budget).missing() == ["sardine-static"]
-
-
-@pytest.mark.usefixtures("no_data")
-def test_a_environment_has_the_code_version_of_what_it_runs_through() -> None:
-    def code(name: str) -> str:
-        return plan._code((Environment(name),))
-
-    assert code("sardine-static") == code("sardine-boredinf")
-    assert len({code(name) for name in ("sardine-static", "gymnasium:x", "synthetic-catalog")}) == 3
+    assert planned(tmp_path, budget).missing() == ["sardine-static"]
 
 
 @pytest.mark.usefixtures("no_data")
@@ -162,43 +167,57 @@ def test_every_cell_of_every_table_has_a_configuration(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     budget = replace(TINY, seeds=1, tasks=("synthetic-taobao", "synthetic-catalog"))
-    budget = replace(budget, swept=("synthetic-taobao",), distracted=("synthetic-taobao",))
-    monkeypatch.setattr(plan, "PURSUED", ("synthetic-catalog",))
-    given = Plan(tmp_path, budget)
-    every = [*given.main(), *given.additions(), *given.sweeps(), *given.distractor()]
+    budget = replace(
+        budget,
+        tasks_of={
+            "shared": ("synthetic-catalog",),
+            "sweeps": ("synthetic-taobao",),
+            "distractor": ("synthetic-taobao",),
+        },
+    )
+    given = planned(tmp_path, budget)
+    every = [
+        *given.cells("main"),
+        *given.cells("shared"),
+        *given.cells("sweeps"),
+        *given.cells("distractor"),
+    ]
     trained = [cell for cell in every if cell.store is not None]
     folders = {(cell.run, cell.config) for cell in trained}
     assert len({run for run, _ in folders}) == len(folders), "a folder for every configuration"
     assert {cell.method for cell in trained} >= {"ucf", "ucf, λ = 0", "ucf, band 1–2"}
     assert not [c for c in trained if c.task == "synthetic-taobao" and c.method == "item-knn"]
-    assert not [c for c in trained if c.task == "synthetic-taobao" and c.method == "dt+"]
+    assert not [c for c in trained if c.task == "synthetic-taobao" and c.method == "dt+shared"]
     plain, plus = (
         next(c.config for c in trained if c.method == method and c.task == "synthetic-catalog")
-        for method in ("dt", "dt+")
+        for method in ("dt", "dt+shared")
     )
     assert (plain.policy.exposure, plain.rule.choose) == (False, False)
     assert (plus.policy.exposure, plus.rule.choose) == (True, True)
-    swept = {cell.method: cell.config for cell in given.sweeps()}
+    swept = {cell.method: cell.config for cell in given.cells("sweeps")}
     smallest = swept["ucf, ε_r = 0.02 σ"].augment.epsilon_r
     rewards = EpisodeStore.open(trained[0].store)  # type: ignore[arg-type]
     catalog = rewards.step_values("reward", *rewards.all_steps())
     assert smallest == pytest.approx(0.02 * catalog.std())
-    distractors = [cell for cell in given.distractor() if cell.task.endswith("distractor")]
+    distractors = [cell for cell in given.cells("distractor") if cell.task.endswith("distractor")]
     planted = EpisodeStore.open(distractors[0].store)  # type: ignore[arg-type]
     assert planted.observation_size == 92
     assert [environment.rate for environment in distractors[0].environments] == [0.0, 1.0]  # type: ignore[attr-defined]
-    assert {cell.evaluation.target_quantile for cell in given.distractor()} == {1.0, 0.99}
-    for table in (given.main, given.additions, given.sweeps, given.distractor):
-        paper = [cell for cell in table() if cell.method == "ucf-paper"]
-        assert {cell.task for cell in paper} == {cell.task for cell in table()}
+    assert {cell.evaluation.target_quantile for cell in given.cells("distractor")} == {1.0, 0.99}
+    for table in ("main", "shared", "sweeps", "distractor"):
+        cells = list(given.cells(table))
+        paper = [cell for cell in cells if cell.method == "ucf-paper"]
+        assert {cell.task for cell in paper} == {cell.task for cell in cells}
 
 
 @pytest.mark.usefixtures("no_data")
 def test_a_task_that_the_budget_leaves_out_is_swept_if_it_is_named(tmp_path: Path) -> None:
     budget = replace(TINY, seeds=1)
-    assert {cell.task for cell in Plan(tmp_path, budget).sweeps()} == {"synthetic-catalog"}
-    named = Plan(tmp_path, budget, tasks=["synthetic-taobao"])
-    assert {cell.task for cell in named.sweeps()} == {"synthetic-taobao"}
+    assert {cell.task for cell in planned(tmp_path, budget).cells("sweeps")} == {
+        "synthetic-catalog"
+    }
+    named = planned(tmp_path, budget, tasks=["synthetic-taobao"])
+    assert {cell.task for cell in named.cells("sweeps")} == {"synthetic-taobao"}
 
 
 @pytest.mark.usefixtures("no_data")
@@ -206,15 +225,15 @@ def test_screened_methods_are_rows_of_the_distractor_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: QUICK)
-    given = Plan(tmp_path, replace(TINY, sessions=300), tasks=["synthetic-catalog"])
+    given = planned(tmp_path, replace(TINY, sessions=300), tasks=["synthetic-catalog"])
     wanted = ("bc", *SCREENED)
     found = {
         cell.method: cell
-        for cell in given.distractor()
+        for cell in given.cells("distractor")
         if cell.method in wanted and cell.task.endswith("distractor")
     }
     assert found.keys() == set(wanted)
-    assert len({(cell.run, str(config(cell))) for cell in found.values()}) == 3
+    assert len({(cell.run, str(training_config(cell))) for cell in found.values()}) == 3
     rows = {name: measure(cell, key(cell)) for name, cell in found.items()}
     for name, own in rows.items():
         assert {row.conditions["distractor"] for row in own} == {0.0, 1.0}
@@ -235,12 +254,11 @@ def test_unknown_tables_and_budgets_are_named(
     arguments = ["benchmark", "recommendation", "--out", str(tmp_path / "out")]
     assert main([*arguments, "--table", "table-2"]) == 2
     assert (
-        "no table is called table-2; there are main, additions, distractor"
-        in capsys.readouterr().err
+        "no table is called table-2; there are main, shared, distractor" in capsys.readouterr().err
     )
     suite: Benchmark = load_plugin("benchmarks", "recommendation")
     with pytest.raises(InputError, match="unknown budget huge"):
-        suite.run(BenchmarkRequest("huge", ["main"], tmp_path, tmp_path / "rows.jsonl", 1))
+        measured(suite, BenchmarkRequest("huge", ["main"], tmp_path, tmp_path / "rows.jsonl", 1))
     assert not (tmp_path / "out").exists()
 
 
@@ -258,84 +276,29 @@ def test_tables_of_rows_at_hand_are_shown_without_measuring(
     assert "has no rows of recommendation, sweeps" in capsys.readouterr().err
 
 
-RATES = (None, 0.0, 1.0)
-
-
-def distractor_rows(values: Mapping[float | None, Sequence[float]]) -> list[ResultRow]:
-    """Rows of a method without a distractor, with it off and on: a value a seed."""
-    metrics = {"R_avg_pooled": 0.5, "R_avg_episode": 0.5, "length": 2.0}
-    return [
-        result_row(
-            value,
-            metrics=metrics,
-            training_seed=seed,
-            target_return=3.0,
-            conditions={"distractor": rate, "quantiles": quantile},
-        )
-        for quantile in ("0.99", "1")
-        for rate, own in values.items()
-        for seed, value in enumerate(own)
-    ]
-
-
-def test_tables_give_means_spreads_and_paired_drops() -> None:
-    every = distractor_rows({None: (10.0, 20.0), 0.0: (5.0, 15.0), 1.0: (8.0, 16.0)})
-    clean = [r for r in every if r.conditions == {"distractor": None, "quantiles": "1"}]
-    last = replace(clean[0], checkpoint="last", metrics={"R_cum": 99.0})
-    assert method_table([*clean, last]).splitlines()[2] == (
-        "| w | m | 2 | 15 ± 7.1 | 0.5 ± 0 | 0.5 ± 0 | 2 ± 0 | – | 3 | – | – |"
-    )
-    line, less = distractor_table(every).splitlines()[2:]
-    assert less == line.replace("| 1 |", "| 0.99 |")
-    assert line == "| w | 1 | m | 2 | 15 ± 7.1 | 10 ± 7.1 | 12 ± 5.7 | 37.5 ± 18 |"
-    # Seed 0 of another log is another pair: drops of 50, 25 and −100%.
-    other = distractor_rows({None: (30.0,), 0.0: (60.0,), 1.0: (40.0,)})
-    both = [*every, *(replace(row, log_seed=1) for row in other)]
-    assert (
-        distractor_table(both)
-        .splitlines()[2]
-        .endswith("| 3 | 20 ± 10 | 26.67 ± 29 | 21.33 ± 17 | -8.333 ± 80 |")
-    )
-
-
-def test_methods_are_compared_with_ucf_by_log_and_seed() -> None:
-    def rows(method: str, values: Mapping[tuple[int | None, int | None], float]) -> list[ResultRow]:
-        return [
-            result_row(value, method=method, log_seed=log, training_seed=seed)
-            for (log, seed), value in values.items()
-        ]
-
-    ours = {(0, 0): 10.0, (0, 1): 12.0, (1, 0): 20.0, (1, 1): 22.0}
-    other = {(0, 0): 9.0, (0, 1): 10.0, (1, 0): 15.0, (1, 1): 16.0, (1, 2): 99.0}
-    given = [*rows("random", {(None, None): 1.0}), *rows("dt", other), *rows("ucf", ours)]
-    random, dt, ucf = (line.split(" | ")[-1] for line in method_table(given).splitlines()[2:])
-    # −1, −2, −5, −6; of the logs −1.5 and −5.5.
-    assert dt == "-3.5 ± 1.2 (2) |"
-    # UCF's values less 1: ± their standard error.
-    assert random == "-15 ± 2.9 (5) |"
-    assert ucf == "– |"
-    one = method_table([*rows("dt", {(0, 0): 9.0}), *rows("ucf", ours)]).splitlines()[2]
-    assert one.endswith("| -1 |")
-    assert method_table(rows("dt", other)).endswith("| – |")
-
-
 def test_time_is_told_of_runs_once(tmp_path: Path) -> None:
     budget = replace(TINY, seeds=1, tasks=("synthetic-catalog",))
-    cells = [cell for cell in Plan(tmp_path, budget).main() if cell.method in ("dt", "ucf")]
-    dt, ucf = (estimated_hours([cell]) for cell in cells)
+    cells = [
+        cell for cell in planned(tmp_path, budget).cells("main") if cell.method in ("dt", "ucf")
+    ]
+    dt, ucf = (estimated_hours([cell], COSTS) for cell in cells)
     assert 0 < dt < ucf
-    again = [replace(cell, table="additions") for cell in cells]
-    shared = estimated_hours([*cells, *again]) - dt - ucf
+    again = [replace(cell, table="shared") for cell in cells]
+    shared = estimated_hours([*cells, *again], COSTS) - dt - ucf
     assert 0 < shared < ucf
     other = replace(cells[1], run=tmp_path / "other", settings=(*cells[1].settings, "policy.dim=8"))
-    assert ucf < estimated_hours([cells[1], other]) < 2 * ucf - 20 / 3600  # copies are made once
-    assert "about 0.0 hours with --workers 2" in announcement(2)(cells)
+    assert (
+        ucf < estimated_hours([cells[1], other], COSTS) < 2 * ucf - 20 / 3600
+    )  # copies are made once
+    assert "about 0.0 hours with --workers 2" in announcement(COSTS, 2)(cells)
     assert cells[1].run is not None
     cells[1].run.mkdir(parents=True)
     (cells[1].run / "run.json").write_text('{"config": {}}')
-    assert estimated_hours([cells[1]]) == ucf, "a training that was interrupted counts"
+    assert estimated_hours([cells[1]], COSTS) == ucf, "a training that was interrupted counts"
     (cells[1].run / "run.json").write_text('{"config": {}, "policy": {}}')
-    assert 0 < estimated_hours([cells[1]]) < dt, "only the evaluation is left of a finished run"
+    assert 0 < estimated_hours([cells[1]], COSTS) < dt, (
+        "only the evaluation is left of a finished run"
+    )
 
 
 def test_a_given_log_is_dealt_out_by_session() -> None:
@@ -346,34 +309,6 @@ def test_a_given_log_is_dealt_out_by_session() -> None:
     assert sorted(row for part in parts for row in part["row"].to_pylist()) == list(range(1500))
     assert min(map(len, sessions)) > 200
     assert part_of(log, 0, 1).equals(log)
-
-
-def test_pictures_show_the_means_and_the_spread_of_the_tables(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    values = dict.fromkeys(RATES, (1.0, 2.0))
-    rows = [replace(r, method=m) for m in ("dt", "ucf") for r in distractor_rows(values)]
-    clean = [row for row in rows if row.conditions["distractor"] is None]
-    for plot, given, name in (
-        (plot_methods, clean, "methods-w"),
-        (plot_distractor, rows, "distractor-w"),
-    ):
-        made = plot(given, tmp_path)
-        assert made == [tmp_path / f"{name}.png", tmp_path / f"{name}.svg"]
-        drawn = made[1].read_text()
-        assert ">ucf<" in drawn
-        assert ">dt<" in drawn
-        plot(given, tmp_path)
-        assert made[1].read_text() == drawn
-    assert plot_distractor(clean, tmp_path) == []
-
-
-def test_error_bars_are_those_of_the_tables() -> None:
-    figure = pytest.importorskip("matplotlib.figure").Figure()
-    axes = figure.add_subplot()
-    plots._bars(axes, [result_row(value, training_seed=s) for s, value in enumerate((1.0, 3.0))])
-    (spread,) = (c.errorbar[2][0] for c in axes.containers if getattr(c, "errorbar", None))
-    ((left, right),) = (segment[:, 0] for segment in spread.get_segments())
-    assert (right - left) / 2 == pytest.approx(2**0.5)
 
 
 def test_windows_drop_repeats_and_are_cut(tmp_path: Path) -> None:
@@ -417,15 +352,16 @@ def test_kuairand_learns_from_what_came_before_its_environments(tmp_path: Path) 
     [
         ({"methods": ["dt", "nothing"]}, "no method is called 'nothing'"),
         ({"tasks": ["nowhere"]}, "no task is called 'nowhere'"),
-        ({"training_seeds": 0}, "--training-seeds is 0"),
-        ({"logs": 0}, "--logs is 0"),
+        ({"training_seeds": 0}, "0 training seeds are requested"),
+        ({"logs": 0}, "0 logs are requested"),
     ],
 )
 def test_unknown_cells_are_refused(given: dict[str, Any], message: str, tmp_path: Path) -> None:
     suite = load_plugin("benchmarks", "recommendation")
     with pytest.raises(InputError, match=message):
-        suite.run(
-            BenchmarkRequest("small", ["main"], tmp_path, tmp_path / "rows.jsonl", 1, **given)
+        measured(
+            suite,
+            BenchmarkRequest("small", ["main"], tmp_path, tmp_path / "rows.jsonl", 1, **given),
         )
 
 
@@ -433,6 +369,6 @@ def test_one_task_has_the_cells_of_its_methods_alone(tmp_path: Path) -> None:
     budget = replace(BUDGETS["small"], seeds=1, logs=1, sessions=60)
     # The second is no task of the budget, but was asked for.
     for task in ("synthetic-catalog", "synthetic-taobao"):
-        plan = Plan(tmp_path, budget, tasks=[task])
-        assert {cell.task for cell in plan.main()} == {task}
+        plan = planned(tmp_path, budget, tasks=[task])
+        assert {cell.task for cell in plan.cells("main")} == {task}
         assert plan.missing() == []

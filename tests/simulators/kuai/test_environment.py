@@ -16,9 +16,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.support.kuai_reference import OneUser, Plain
-from ucfrec.acting.decision import Decider, DecisionRule
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.rollout import Step, rollout
+from ucfrec.acting.scorer import Scorer
 from ucfrec.acting.uniform import Uniform
 from ucfrec.episodes.states import ItemStates
 from ucfrec.errors import InputError
@@ -185,7 +186,7 @@ def test_a_policy_plays_what_is_there_and_allowed(regime: str) -> None:
     policy = DTPolicy(DTConfig(context=3, dim=8), sizes).eval()
     with torch.no_grad():
         policy.head.bias[-6:] = 100.0  # what it would most like to play is not there
-    actor = PolicyActor(Decider(policy, DecisionRule(5.0)), 4, 0, states, numbers, user_ids)
+    actor = PolicyActor(Scorer(policy, DecisionRule(5.0), states), 4, 0, states, numbers, user_ids)
     played = rollout(env, actor, 9, seed=0)
     assert len(played.lengths) == 9
     assert (played.lengths == 10).all() == (regime == "NX_10")

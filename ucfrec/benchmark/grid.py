@@ -1,6 +1,7 @@
 """Run the measurements of a benchmark, here or in parallel processes, resumably."""
 
 import json
+import shutil
 import sys
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
@@ -15,10 +16,14 @@ from ucfrec.errors import InputError
 from ucfrec.processes import interruptions_raised, pool_of_processes, without_ctrl_c
 from ucfrec.progress import progress
 from ucfrec.provenance import config_hash, peak_memory_mib, reset_peak_memory
-from ucfrec.reporting.result_row import ResultRow, RowKey
-from ucfrec.reporting.rows_file import append_rows, measuring, read_rows
+from ucfrec.results.row import ResultRow, RowKey
+from ucfrec.results.rows_file import append_rows, measuring, read_rows, remove_rows
 
 Cell = TypeVar("Cell")
+
+
+def _nothing(cell: object) -> Sequence[Path]:
+    return ()
 
 
 @dataclass(frozen=True)
@@ -31,6 +36,8 @@ class Measurement(Generic[Cell]):
     """Training configuration of the cell; None if nothing is trained."""
     measure: Callable[[Cell, RowKey], list[ResultRow]]
     """Measures the cell; returns its rows, all with the given key. Runs with one thread."""
+    made: Callable[[Cell], Sequence[Path]] = _nothing
+    """Folders of what a measurement makes and finds again: runs and shared stages."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +63,7 @@ def run_grid(
     workers: int,
     describe: str = "benchmark",
     announce: Callable[[Sequence[Cell]], str] | None = None,
+    again: bool = False,
 ) -> list[ResultRow]:
     """Measure every cell that has no row in `results` yet.
 
@@ -73,6 +81,8 @@ def run_grid(
         workers: number of cells that are measured at a time, each in a process of its own.
         describe: name of the benchmark in progress output.
         announce: what to say of the cells that are left before they are measured.
+        again: remove the rows, runs and shared stages of `cells` first. An interrupted call is
+            resumed without it.
 
     Returns:
         The rows of all cells, in the order of `cells`.
@@ -89,9 +99,15 @@ def run_grid(
         named = None if config is None else config_hash(config)
         key = replace(how.key(cell), config_hash=named)
         tasks.setdefault(str(key), _Task(cell, key, config, how, results, wait=False))
+    if again:
+        remove_rows(results, [task.key for task in tasks.values()])
+        for made in {folder for task in tasks.values() for folder in how.made(task.cell)}:
+            shutil.rmtree(made, ignore_errors=True)
     known = read_rows(results)
     found = {name: [row for row in known if t.key.covers(row)] for name, t in tasks.items()}
     missing = [name for name, rows in found.items() if not rows]
+    # Seed by seed: when it is interrupted, its rows are whole tables of fewer seeds.
+    missing.sort(key=lambda name: -1 if (seed := tasks[name].key.training_seed) is None else seed)
     counted = f"{len(tasks)} cells, {len(missing)} of them left to measure"
     print(f"{describe}: {counted}", file=sys.stderr)
     if missing:

@@ -11,8 +11,8 @@ import pytest
 from tests.support.result_rows import result_row
 from ucfrec.errors import InputError
 from ucfrec.provenance import config_hash
-from ucfrec.reporting.result_row import RowKey
-from ucfrec.reporting.rows_file import (
+from ucfrec.results.row import RowKey
+from ucfrec.results.rows_file import (
     CONFIGURATIONS,
     append_rows,
     benchmarking,
@@ -87,7 +87,7 @@ _FULL_DISK = """
 import resource, signal, sys
 from pathlib import Path
 from tests.support.result_rows import result_row
-from ucfrec.reporting.rows_file import append_rows
+from ucfrec.results.rows_file import append_rows
 signal.signal(signal.SIGXFSZ, signal.SIG_DFL if sys.argv[2] == "kill" else signal.SIG_IGN)
 path = Path(sys.argv[1])
 limit = path.stat().st_size + 100
@@ -114,7 +114,7 @@ _APPEND = """
 import sys
 from pathlib import Path
 from tests.support.result_rows import result_row
-from ucfrec.reporting.rows_file import append_rows
+from ucfrec.results.rows_file import append_rows
 for n in range(30):
     rows = [result_row(float(n), method=sys.argv[2], training_seed=n, table=t) for t in "ab"]
     append_rows(Path(sys.argv[1]), rows)
@@ -136,8 +136,8 @@ def test_processes_that_append_at_once_lose_no_row(tmp_path: Path) -> None:
 _HOLD = """
 import sys, time
 from pathlib import Path
-from tests.reporting.test_rows_file import KEY
-from ucfrec.reporting.rows_file import measuring
+from tests.results.test_rows_file import KEY
+from ucfrec.results.rows_file import measuring
 with measuring(Path(sys.argv[1]), KEY, wait=True):
     print("held", flush=True)
     time.sleep(600)
@@ -165,11 +165,11 @@ def test_a_measurement_is_claimed_until_its_process_dies(tmp_path: Path) -> None
 
 
 def test_of_rows_that_measure_the_same_the_last_counts() -> None:
-    old = result_row(1.0, code_version=None)
+    old = result_row(1.0)
     rows = [
         old,
         result_row(2.0, training_seed=1),
-        result_row(3.0, code_version="b", conditions={}),
+        result_row(3.0, data_fingerprint="b", conditions={}),
         result_row(4.0, conditions={"budget": "full"}),
     ]
     assert sorted(row.value for row in latest(rows)) == [2.0, 3.0, 4.0]
@@ -178,7 +178,7 @@ def test_of_rows_that_measure_the_same_the_last_counts() -> None:
 _BENCHMARK = """
 import sys
 from pathlib import Path
-from ucfrec.reporting.rows_file import benchmarking
+from ucfrec.results.rows_file import benchmarking
 with benchmarking(Path(sys.argv[1])):
     print("measuring", flush=True)
     sys.stdin.read()

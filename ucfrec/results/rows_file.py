@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 from ucfrec.errors import InputError
-from ucfrec.files.atomic import atomic_file
+from ucfrec.files.atomic import atomic_file, read_json, write_json
 from ucfrec.files.locks import claim, claimed, remove_leftovers
 from ucfrec.provenance import config_hash
-from ucfrec.reporting.result_row import ResultRow, RowKey, row_from_json
+from ucfrec.results.row import ResultRow, RowKey, row_from_json
 
 CONFIGURATIONS: Final = "configurations.jsonl"
 """File next to the rows with each of their configurations, by hash."""
@@ -25,6 +25,27 @@ def read_rows(path: Path) -> list[ResultRow]:
         InputError: a line is no result row, or the file is not UTF-8 text.
     """
     return [row_from_json(value, f"{path}, line {n}") for n, value in read_lines(path)]
+
+
+def read_results(path: Path) -> list[ResultRow]:
+    """Read the rows of JSON lines, or of a JSON list (`.json`) as commands write with `--json`.
+
+    Raises:
+        InputError: the file is missing or has other content.
+    """
+    if path.suffix != ".json":
+        if not path.exists():
+            raise InputError(f"{path} does not exist; check the path")
+        return read_rows(path)
+    rows = read_json(path)
+    if not isinstance(rows, list):
+        raise InputError(f"{path} holds no list of result rows; name a file that --json wrote")
+    return [row_from_json(row, f"{path}, row {n}") for n, row in enumerate(rows, start=1)]
+
+
+def write_results(path: Path, rows: Sequence[ResultRow]) -> None:
+    """Write rows as a JSON list, for `read_results`."""
+    write_json(path, [row.to_json() for row in rows])
 
 
 def read_lines(path: Path) -> list[tuple[int, object]]:
@@ -81,6 +102,15 @@ def append_rows(
         _append(path, [row.to_json() for row in rows])
 
 
+def remove_rows(path: Path, keys: Sequence[RowKey]) -> None:
+    """Remove the rows of some measurements from a file; atomic, other rows stay as they are."""
+    with claim(path, wait=True):
+        rows = read_rows(path)
+        kept = [row for row in rows if not any(key.covers(row) for key in keys)]
+        if len(kept) < len(rows):
+            _write(path, b"", [row.to_json() for row in kept])
+
+
 def read_configurations(folder: Path) -> dict[str, Mapping[str, Any]]:
     """Read the configurations of the rows in `folder`: hash to configuration.
 
@@ -100,7 +130,7 @@ def read_configurations(folder: Path) -> dict[str, Mapping[str, Any]]:
 
 
 def latest(rows: Sequence[ResultRow]) -> list[ResultRow]:
-    """The last row of each measurement, regardless of code version, data and configuration."""
+    """The last row of each measurement, regardless of data and configuration."""
     last = {
         (*(getattr(row, name) for name in _SAME), str(sorted(row.conditions.items()))): row
         for row in rows
@@ -151,6 +181,10 @@ def _append(path: Path, values: Sequence[Mapping[str, Any]]) -> None:
     before = path.read_bytes() if path.exists() else b""
     if before and not before.endswith(b"\n"):
         before += b"\n"
+    _write(path, before, values)
+
+
+def _write(path: Path, before: bytes, values: Sequence[Mapping[str, Any]]) -> None:
     with atomic_file(path) as scratch, scratch.open("wb") as file:
         file.write(before)
         for value in values:

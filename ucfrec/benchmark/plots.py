@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from ucfrec.benchmark.tables import DISTRACTOR_RATES, of_checkpoint
 from ucfrec.reporting.plot_style import LIGHT, OURS, PLAIN, save, styled
-from ucfrec.reporting.result_row import ResultRow
 from ucfrec.reporting.statistics import grouped, summary
-from ucfrec_simulators.benchmark.tables import DISTRACTOR_RATES, of_checkpoint
+from ucfrec.results.row import ResultRow
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,20 +18,15 @@ DISTRACTOR_NAMES: Final = ("no distractor", "distractor off", "distractor on")
 _Rows = Sequence[ResultRow]
 
 
-def plot_methods(rows: _Rows, folder: Path) -> list[Path]:
-    """One plot per environment: return of every method, mean and standard deviation over seeds."""
-    return _by_environment("methods", _bars, rows, folder)
+def plot_methods(rows: _Rows, folder: Path, kind: str = "methods") -> list[Path]:
+    """One plot per environment: return of every method, mean and standard deviation over seeds.
 
-
-def plot_additions(rows: _Rows, folder: Path) -> list[Path]:
-    """One plot per environment: return of UCF with and without each addition, as in
-    `plot_methods`."""
-    return _by_environment("additions", _bars, rows, folder)
-
-
-def plot_sweeps(rows: _Rows, folder: Path) -> list[Path]:
-    """One plot per environment: return of UCF with each setting, as in `plot_methods`."""
-    return _by_environment("sweeps", _bars, rows, folder)
+    Args:
+        rows: of one table.
+        folder: of the files.
+        kind: what the files are called, before the environment.
+    """
+    return _by_environment(kind, _bars, rows, folder)
 
 
 def plot_distractor(rows: _Rows, folder: Path) -> list[Path]:
@@ -52,7 +47,7 @@ def _bars(axes: "Axes", rows: _Rows) -> None:
     colors = [OURS if name == "ucf" else PLAIN for name, _ in by_method]
     means, spreads = [each.mean for each in returns], [each.sd for each in returns]
     axes.barh([name for name, _ in by_method], means, xerr=spreads, color=colors, height=0.7)
-    axes.set_xlabel("return of a session (mean ± sd over training seeds)")
+    axes.set_xlabel("return per session (mean ± sd over training seeds)")
 
 
 def _triples(axes: "Axes", rows: _Rows) -> None:
@@ -67,7 +62,7 @@ def _triples(axes: "Axes", rows: _Rows) -> None:
         means = [each.mean for each in returns]
         axes.barh(positions, means, height=0.25, color=color, label=label)
     axes.set_yticks(range(len(by_method)), [name for name, _ in by_method])
-    axes.set_xlabel("return of a session (mean over training seeds)")
+    axes.set_xlabel("return per session (mean over training seeds)")
     axes.legend()
 
 

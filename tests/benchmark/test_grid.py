@@ -13,13 +13,13 @@ from typing import Any
 
 import pytest
 
+from ucfrec.benchmark.grid import Measurement, chosen, run_grid
 from ucfrec.errors import InputError
-from ucfrec.reporting.grid import Measurement, chosen, run_grid
-from ucfrec.reporting.result_row import ResultRow, RowKey
-from ucfrec.reporting.rows_file import read_configurations, read_rows
+from ucfrec.results.row import ResultRow, RowKey
+from ucfrec.results.rows_file import read_configurations, read_rows
 
-Cell = tuple[str, int, str]
-"""A folder for marks, a number, the version of the code."""
+Cell = tuple[str, int]
+"""A folder for marks, and a number."""
 
 
 def _key(cell: Cell) -> RowKey:
@@ -29,7 +29,6 @@ def _key(cell: Cell) -> RowKey:
         task=str(cell[1]),
         method="m",
         policy="p",
-        code_version=cell[2],
     )
 
 
@@ -38,7 +37,7 @@ def _config(cell: Cell) -> dict[str, Any] | None:
 
 
 def _square(cell: Cell, key: RowKey) -> list[ResultRow]:
-    folder, number, _ = cell
+    folder, number = cell
     with (Path(folder) / "marks").open("a") as file:
         file.write(f"{number}\n")
     if number < 0:
@@ -59,8 +58,8 @@ def _threads() -> int:
 HOW = Measurement(_key, _config, _square)
 
 
-def _cells(folder: Path, *numbers: int, code: str = "1") -> list[Cell]:
-    return [(str(folder), number, code) for number in numbers]
+def _cells(folder: Path, *numbers: int) -> list[Cell]:
+    return [(str(folder), number) for number in numbers]
 
 
 def _marks(folder: Path) -> list[str]:
@@ -101,13 +100,18 @@ def test_measures_once_and_returns_rows_in_the_order_of_cells(tmp_path: Path) ->
 
 
 @pytest.mark.usefixtures("two_threads")
-def test_rows_of_other_code_are_measured_again(tmp_path: Path) -> None:
+def test_rows_and_folders_of_a_cell_are_replaced_when_it_is_measured_again(tmp_path: Path) -> None:
     results = tmp_path / "rows.jsonl"
-    run_grid(_cells(tmp_path, 2), HOW, results, 1)
-    rows = run_grid(_cells(tmp_path, 2, code="2"), HOW, results, 1)
-    assert {row.code_version for row in rows} == {"2"}
+    how = replace(HOW, made=lambda cell: [Path(cell[0]) / f"run-{cell[1]}"])
+    first = run_grid(_cells(tmp_path, 2, 3), how, results, 1)
+    for number in (2, 3):
+        (tmp_path / f"run-{number}" / "policy").mkdir(parents=True)
+    rows = run_grid(_cells(tmp_path, 2), how, results, 1, again=True)
     assert _measured_by(rows) == {os.getpid()}, "one worker needs no process of its own"
-    assert _marks(tmp_path) == ["2", "2"]
+    assert _marks(tmp_path) == ["2", "2", "3"]
+    assert read_rows(results) == [*first[2:], *rows], "rows of other cells stay"
+    assert not (tmp_path / "run-2").exists()
+    assert (tmp_path / "run-3" / "policy").exists()
 
 
 def test_a_failed_cell_costs_only_itself(tmp_path: Path) -> None:
@@ -144,11 +148,11 @@ def test_a_line_that_is_no_row_is_named_before_anything_is_measured(tmp_path: Pa
 _RUN = """
 import json, sys
 from pathlib import Path
-from tests.reporting.test_grid import HOW
-from ucfrec.reporting.grid import run_grid
+from tests.benchmark.test_grid import HOW
+from ucfrec.benchmark.grid import run_grid
 if __name__ == "__main__":
     folder, workers, *numbers = sys.argv[1:]
-    cells = [(folder, int(number), "1") for number in numbers]
+    cells = [(folder, int(number)) for number in numbers]
     rows = run_grid(cells, HOW, Path(folder) / "rows.jsonl", int(workers))
     print(json.dumps([row.task for row in rows]))
 """

@@ -1,17 +1,21 @@
-"""Printed tables of the control benchmarks are what their rows say."""
+"""Printed tables of the benchmarks are what their rows say."""
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
-from tests.support.result_rows import result_row
-from ucfrec.reporting.result_row import ResultRow
-from ucfrec_control.benchmark.tables import (
+from tests.support.result_rows import distractor_rows, result_row
+from ucfrec.benchmark.tables import (
     difference_table,
+    distractor_table,
+    method_table,
     of_best_target,
     over_seeds,
     score_table,
 )
+from ucfrec.results.row import ResultRow
 
 
 def scored(task: str, method: str, seed: int, score: float, **more: Any) -> ResultRow:
@@ -103,3 +107,44 @@ def test_methods_are_compared_seed_by_seed() -> None:
     assert found["mean"] == "+2.83", "no error where datasets differ in their seeds"
     assert difference_table(rows, "none", "unknown") == []
     assert difference_table(rows, "missing") == []
+
+
+def test_tables_give_means_spreads_and_paired_drops() -> None:
+    every = distractor_rows({None: (10.0, 20.0), 0.0: (5.0, 15.0), 1.0: (8.0, 16.0)})
+    clean = [r for r in every if r.conditions == {"distractor": None, "quantiles": "1"}]
+    last = replace(clean[0], checkpoint="last", metrics={"R_cum": 99.0})
+    assert method_table([*clean, last]).splitlines()[2] == (
+        "| w | m | 2 | 15 ± 7.1 | 0.5 ± 0 | 0.5 ± 0 | 2 ± 0 | – | 3 | – | – |"
+    )
+    line, less = distractor_table(every).splitlines()[2:]
+    assert less == line.replace("| 1 |", "| 0.99 |")
+    assert line == "| w | 1 | m | 2 | 15 ± 7.1 | 10 ± 7.1 | 12 ± 5.7 | 37.5 ± 18 |"
+    # Seed 0 of another log is another pair: drops of 50, 25 and −100%.
+    other = distractor_rows({None: (30.0,), 0.0: (60.0,), 1.0: (40.0,)})
+    both = [*every, *(replace(row, log_seed=1) for row in other)]
+    assert (
+        distractor_table(both)
+        .splitlines()[2]
+        .endswith("| 3 | 20 ± 10 | 26.67 ± 29 | 21.33 ± 17 | -8.333 ± 80 |")
+    )
+
+
+def test_methods_are_compared_with_ucf_by_log_and_seed() -> None:
+    def rows(method: str, values: Mapping[tuple[int | None, int | None], float]) -> list[ResultRow]:
+        return [
+            result_row(value, method=method, log_seed=log, training_seed=seed)
+            for (log, seed), value in values.items()
+        ]
+
+    ours = {(0, 0): 10.0, (0, 1): 12.0, (1, 0): 20.0, (1, 1): 22.0}
+    other = {(0, 0): 9.0, (0, 1): 10.0, (1, 0): 15.0, (1, 1): 16.0, (1, 2): 99.0}
+    given = [*rows("random", {(None, None): 1.0}), *rows("dt", other), *rows("ucf", ours)]
+    random, dt, ucf = (line.split(" | ")[-1] for line in method_table(given).splitlines()[2:])
+    # −1, −2, −5, −6; of the logs −1.5 and −5.5.
+    assert dt == "-3.5 ± 1.2 (2) |"
+    # UCF's values less 1: ± their standard error.
+    assert random == "-15 ± 2.9 (5) |"
+    assert ucf == "– |"
+    one = method_table([*rows("dt", {(0, 0): 9.0}), *rows("ucf", ours)]).splitlines()[2]
+    assert one.endswith("| -1 |")
+    assert method_table(rows("dt", other)).endswith("| – |")

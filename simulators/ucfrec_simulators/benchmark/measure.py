@@ -1,0 +1,95 @@
+"""Result rows of a cell: a trained method or a built-in policy in the environments of its task."""
+
+from dataclasses import replace
+from typing import Any, Final
+
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.benchmark.cells import Cell, measured_by, opened
+from ucfrec.evaluation.environment import Environment
+from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
+from ucfrec.files.locks import claim
+from ucfrec.results.row import ResultRow, RowKey
+from ucfrec.runs.record import RunRecord
+from ucfrec.runs.screened import SCREENING, train_screened
+from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec_simulators.distractor import DistractorEnvironment
+
+CHECKPOINT: Final = "best"
+
+
+def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
+    """Train the method, unless it is a built-in policy, and evaluate it in every environment of
+    the task.
+
+    It acts by its run's own decision rule, which was chosen on its log, not in an environment.
+
+    Args:
+        cell: what to train and evaluate.
+        row_key: key of the rows.
+
+    Returns:
+        One row for each environment, of trained methods with the best validation loss.
+    """
+    episodes, seed = cell.evaluation.episodes, cell.evaluation.seed
+    if cell.run is None:
+        return [
+            _row(evaluate_behavior(environment, cell.policy, episodes, seed), row_key, environment)
+            for environment in cell.environments
+        ]
+    # Cells that differ only in their evaluation share a run.
+    with claim(cell.run, wait=True):
+        record = train_screened(
+            opened(cell), cell.run, cell.config, cell.screening, shared=cell.shared
+        )
+    about, rows = _training_metrics(record), []
+    if record.screening is not None:
+        about[SCREENING] = list(record.screening.flagged)
+    trained = TrainedPolicy.load(cell.run, CHECKPOINT)
+    rule = _rule(cell, trained)
+    for environment in cell.environments:
+        found = evaluate_policy(environment, trained, cell.method, episodes, seed, rule)
+        # Other methods are given a rule, but do not look at its target.
+        target = found.target_return if cell.conditioned else None
+        row = replace(
+            _row(found, row_key, environment),
+            checkpoint=CHECKPOINT,
+            rule=f"{rule} ({rule.hash})",
+            target_return=target,
+            details={},
+        )
+        rows.append(row.extended(about))
+    return rows
+
+
+def _row(found: ResultRow, row_key: RowKey, environment: Environment) -> ResultRow:
+    rate = environment.rate if isinstance(environment, DistractorEnvironment) else None
+    row = found.of(row_key)
+    return replace(row, conditions={**row.conditions, "distractor": rate})
+
+
+def _training_metrics(record: RunRecord) -> dict[str, Any]:
+    """Metrics that the run's record holds about its training."""
+    metrics: dict[str, Any] = {
+        "train_wall_time_s": record.wall_time_s,
+        "validation_loss": record.finished.best_validation,
+    }
+    if record.rule is not None and (value := record.rule.simulated) is not None:
+        metrics |= {"estimated_value": value[0], "estimated_value_error": value[1]}
+    if (augmentation := record.augmentation) is None:
+        return metrics
+    return metrics | {
+        "acceptance": augmentation.acceptance,
+        "crm_r2": augmentation.reward_model.r2,
+        "crm_r2_without_z": augmentation.reward_model.r2_without_z,
+    }
+
+
+def _rule(cell: Cell, trained: TrainedPolicy) -> DecisionRule:
+    """The run's own rule, or with the plan's target."""
+    quantile = cell.evaluation.target_quantile
+    if quantile is None or not cell.conditioned:
+        return trained.rule
+    return replace(trained.rule, target=trained.target_return(quantile))
+
+
+MEASUREMENT: Final = measured_by(measure)

@@ -1,0 +1,395 @@
+"""Scores are those of a naive computation, wherever the rule acts: played, scored, ranked and
+recommended."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from torch import Tensor
+
+from tests.policies.test_ucf import CATALOG, ITEMS, VECTORS, B, K, build, random_windows
+from tests.support.replay import replayed
+from tests.support.served import learn_tastes
+from tests.support.tagged import ITEMS as MANY
+from tests.support.tagged import tagged_log, tagged_store
+from ucfrec import EpisodeStore, Recommender
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.scorer import Scorer, logged_history, logged_scores
+from ucfrec.acting.sessions import History, seen_before
+from ucfrec.episodes.exposure import Shown
+from ucfrec.episodes.returns import ReturnToGo
+from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.windows import Windows
+from ucfrec.errors import InputError
+from ucfrec.evaluation.ranking import Steps
+from ucfrec.evaluation.ranking_baselines import PolicyRanker
+from ucfrec.logs import LogMapping
+from ucfrec.off_policy.score import logged_sessions, scored_steps
+from ucfrec.policies.item_knn import ItemKNNPolicy
+from ucfrec.recommending.histories import histories_of_frame
+from ucfrec.recommending.recommend import recommend
+from ucfrec.runs.start import training_views
+from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.user_model.posterior import MEMORY
+from ucfrec.user_model.reward import ItemRewardModel
+from ucfrec.user_model.reward_fit import fit_item_reward_model
+
+SETTINGS = {
+    "train.steps": 30, "train.learning_rate": 3e-3, "policy.dim": 16, "policy.context": 6,
+    "policy.exposure": True, "policy.exposure_window": 4, "policy.advantage_weights": True,
+    "policy.max_return": True, "augment.copies": 0, "rule.choose": False,
+}  # fmt: skip
+RULES = {
+    "target": DecisionRule(3.0, temperature=1.0),
+    "minimum": DecisionRule(1.0, minimum_target=0.5, temperature=0.7),
+    "best": DecisionRule(3.0),
+    "learned": DecisionRule(None, temperature=1.0),
+    "filters": DecisionRule(3.0, temperature=2.0, top_k=9, exclude_seen=True, tag_window=2),
+    "run": DecisionRule(3.0, temperature=1.0, tag_run=2),
+    "far": DecisionRule(3.0, temperature=1.0, tag_window=8),  # further than the policy sees
+    "weighted": DecisionRule(
+        3.0, temperature=1.0, reward_weight=1.0
+    ),  # by tastes learned in the session
+}
+EXPOSURE = {"exposure": True, "exposure_window": 3}
+TAGS = torch.tensor(
+    [[0, -1], [0, 5], [1, -1], [1, -1], [2, -1], [2, 5], [3, -1], [3, -1], [4, 1], [4, -1], [4, 0]]
+)
+MORE = {"session": {}, "horizon": {"policy.return_to_go": "horizon", "policy.horizon": 2}}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store, and a run on it for each definition of the return-to-go."""
+    folder = tmp_path_factory.mktemp("decisions")
+    store = tagged_store(folder)
+    fit_item_reward_model(*training_views(store), folder / "rewards", seed=0)
+    for name, more in MORE.items():
+        Recommender("ucf", settings=SETTINGS | more).fit(store, folder / name)
+    return folder
+
+
+@pytest.fixture(params=MORE)
+def trained(folder: Path, request: pytest.FixtureRequest) -> TrainedPolicy:
+    trained = TrainedPolicy.load(folder / request.param)
+    # After 30 updates the term is small: with larger weights, a wrong lag would show.
+    term = trained.policy.head.exposure  # type: ignore[union-attr]
+    assert term is not None
+    for parameter in term.parameters():
+        parameter.data += 0.05 * (parameter.data + 1e-9).sign()
+    views = training_views(EpisodeStore.open(folder / "store"))
+    model, _ = fit_item_reward_model(*views, folder / "rewards", seed=0)
+    trained = replace(trained, reward_model=model)
+    learn_tastes(trained)
+    return trained
+
+
+# Against a naive computation, session by session and item by item.
+
+
+def history_of(windows: Windows, **parts: Any) -> History:
+    """What is known of sessions whose windows show all of it."""
+    shown = Shown.before_last(windows)
+    collected = torch.tensor([0.0, 1.0, 2.5]).double()
+    return replace(History(windows, collected, torch.tensor([2, 0, -1]), shown), **parts)
+
+
+def scorer_of(name: str, tagged: bool, rule: DecisionRule) -> Scorer:
+    """A policy of random weights with a reward model of random effects."""
+    torch.manual_seed(4)
+    states = ItemStates(torch.randn(ITEMS, 4), torch.zeros(0, 0), 0.0, 1.0)
+    states = replace(states, tags=TAGS) if tagged else states
+    sizes = CATALOG | {"users": 3, "tags": 2 if tagged else 0}
+    policy = build(name, sizes, **({} if name == "item-knn" else EXPOSURE))
+    model = ItemRewardModel(sizes)
+    for each in ("vectors", "item", "user", "affinity", "state", "interaction", "exposure"):
+        model.get_buffer(each).normal_()
+    model.likeness.start_from(states)
+    model.tastes.root.copy_(torch.randn(5, 5).tril())
+    model.tastes.weigh(0.7)
+    if isinstance(policy, ItemKNNPolicy):
+        policy.cosines.uniform_(0.1, 1)
+        policy.neighbors.random_(0, ITEMS)
+    else:
+        policy.head.start_from(states.embeddings, torch.rand(ITEMS))
+        policy.head.exposure.start_from(states, torch.rand(50))  # type: ignore[union-attr]
+        for parameter in policy.parameters():
+            parameter.data += 0.1 * torch.randn_like(parameter)
+    return Scorer(policy.eval(), rule, states, ReturnToGo(), model)
+
+
+def naive_scores(scorer: Scorer, history: History, excluded: Tensor) -> Tensor:
+    """What `Scorer.scores` should be, without a product over all items."""
+    rule, windows, shown = scorer.rule, history.windows, history.shown
+    assert scorer.reward_model is not None
+    assert rule.target is not None
+    targets = (rule.target - history.collected).clamp(min=rule.minimum_target)
+    returns_to_go = ReturnToGo().before(targets, windows.rewards).masked_fill(~windows.mask, 0.0)
+    with torch.no_grad():
+        scores = scorer.policy.act(replace(windows, returns_to_go=returns_to_go)).clone()
+        for item in range(ITEMS):
+            known = windows.states[:, -1], shown, history.users, torch.full((B,), item)
+            scores[:, item] += rule.reward_weight * scorer.reward_model.score(*known)
+    scores = scores.masked_fill(excluded, -torch.inf)
+    for row in range(B):
+        items = [int(item) for item in shown.items[row] if item >= 0]
+        recent = {int(tag) for item in items[: rule.tag_window] for tag in TAGS[item]} - {-1}
+        main = [int(TAGS[item, 0]) for item in items[: rule.tag_run]]
+        liked = shown.rewards[row, : rule.tag_run] >= 0.5
+        tired = len(main) == rule.tag_run > 0 and len({*main}) == 1 and bool(liked.all())
+        for without in (
+            [bool(recent & {int(tag) for tag in tags}) for tags in TAGS],
+            [tired and int(tags[0]) == main[0] for tags in TAGS],
+        ):
+            left = scores[row].masked_fill(torch.tensor(without), -torch.inf)
+            scores[row] = left if (left > -torch.inf).any() else scores[row]
+    return scores
+
+
+NAIVE = {
+    "plain": DecisionRule(3.0, minimum_target=1.5),
+    "weighted": DecisionRule(3.0, minimum_target=1.5, reward_weight=0.7),
+    "window": DecisionRule(3.0, minimum_target=1.5, reward_weight=0.7, tag_window=1),
+    "filters": DecisionRule(3.0, minimum_target=1.5, tag_window=2, tag_run=1),
+}
+
+
+@pytest.mark.parametrize("rule", NAIVE)
+@pytest.mark.parametrize("tagged", [True, False])
+@pytest.mark.parametrize("name", ["ucf", "dt", "item-knn"])
+def test_scores_are_those_of_a_naive_computation(name: str, tagged: bool, rule: str) -> None:
+    if not tagged and (NAIVE[rule].tag_window or NAIVE[rule].tag_run):
+        with pytest.raises(InputError, match="but the store has none"):
+            scorer_of(name, tagged, NAIVE[rule])
+        return
+    scorer, windows = scorer_of(name, tagged, NAIVE[rule]), random_windows(CATALOG)
+    history = history_of(windows)
+    # The first session was shown and liked one tag only, and may only be shown this one.
+    shown = Shown(history.shown.items.clone(), history.shown.rewards.clone())
+    shown.items[0, :2], shown.rewards[0, :2] = 4, 1.0
+    excluded = torch.zeros(B, ITEMS, dtype=torch.bool)
+    excluded[2, 3], excluded[0] = True, TAGS[:, 0] != TAGS[4, 0]
+    windows = replace(windows, actions=windows.actions.clone(), rewards=windows.rewards.clone())
+    windows.actions[0, -3:-1], windows.rewards[0, -3:-1] = 4, 1.0
+    history = history_of(windows, shown=shown)
+    before = {key: value.clone() for key, value in scorer.policy.state_dict().items()}
+    found = scorer.scores(history, excluded=excluded)
+    expected = naive_scores(scorer, history, excluded)
+    assert torch.equal(found.isneginf(), expected.isneginf())
+    torch.testing.assert_close(
+        found.log_softmax(-1), expected.log_softmax(-1), rtol=1e-4, atol=1e-4
+    )
+    # One session alone, and some items alone, have the same scores.
+    alone = scorer.scores(history.at(slice(1, 2)), excluded=excluded[1:2])
+    torch.testing.assert_close(alone[0], found[1], rtol=1e-4, atol=1e-4)
+    for key, value in scorer.policy.state_dict().items():
+        assert torch.equal(value, before[key])
+
+
+@pytest.mark.parametrize("name", ["ucf", "dt", "dc", "lsdt"])
+def test_the_steps_own_action_and_reward_are_not_read(name: str) -> None:
+    scorer = scorer_of(name, True, DecisionRule(3.0, reward_weight=1.0, tag_window=2, tag_run=1))
+    windows = random_windows(CATALOG)
+    actions, rewards = windows.actions.clone(), windows.rewards.clone()
+    actions[:, -1], rewards[:, -1] = (actions[:, -1] + 1) % ITEMS, torch.nan
+    logged = torch.rand(windows.mask.shape)
+    changed = replace(windows, actions=actions, rewards=rewards, returns_to_go=logged)
+    before, after = (scorer.scores(history_of(each)) for each in (windows, changed))
+    assert torch.equal(before, after)
+    earlier = windows.actions.clone()
+    earlier[:, -2] = (earlier[:, -2] + 1) % ITEMS
+    assert not torch.equal(before, scorer.scores(history_of(replace(windows, actions=earlier))))
+
+
+def test_all_may_be_left_out_where_it_is_said_and_no_score_may_be_nan() -> None:
+    scorer, history = scorer_of("dt", True, DecisionRule(3.0)), history_of(random_windows(CATALOG))
+    excluded = torch.zeros(B, ITEMS, dtype=torch.bool)
+    excluded[1] = True
+    with pytest.raises(InputError, match="in 1 of 3 decisions every item is left out"):
+        scorer.scores(history, excluded=excluded)
+    assert scorer.scores(history, excluded=excluded, empty=True)[1].isneginf().all()
+    excluded[1, 4] = False
+    assert scorer.scores(history, excluded=excluded)[1].argmax() == 4
+    scorer.policy.head.bias.data[0] = torch.nan  # type: ignore[union-attr,index]
+    with pytest.raises(InputError, match="in 3 of 3 decisions scores are no numbers"):
+        Scorer(scorer.policy, scorer.rule, scorer.states).scores(history)
+
+
+def test_vectors_are_predicted_at_the_target() -> None:
+    windows, policy = random_windows(VECTORS), build("dt", VECTORS)
+    nothing = Shown(torch.empty(B, 0, dtype=torch.int64), torch.empty(B, 0))
+    history = replace(history_of(random_windows(CATALOG)), windows=windows, shown=nothing)
+    found = Scorer(policy, DecisionRule(2.0)).act(history)
+    targets = ReturnToGo().before(2.0 - history.collected, windows.rewards) * windows.mask
+    with torch.no_grad():
+        torch.testing.assert_close(found, policy.act(replace(windows, returns_to_go=targets)))
+        with pytest.raises(InputError, match=r"--set policy\.max_return=true"):
+            Scorer(policy, DecisionRule(None)).act(history)
+
+
+def test_a_rule_needs_what_it_uses() -> None:
+    policy, states = build("dt", CATALOG), ItemStates(torch.eye(ITEMS), torch.zeros(0, 0), 0, 1)
+    with pytest.raises(InputError, match="no reward model of items"):
+        Scorer(policy, DecisionRule(1.0, reward_weight=0.5), states)
+    for rule in (DecisionRule(1.0, tag_window=2), DecisionRule(1.0, tag_run=2)):
+        for given in (None, states):
+            with pytest.raises(InputError, match="the store has none"):
+                Scorer(policy, rule, given)
+    with pytest.raises(InputError, match="tag_run 11; give a whole number from 0 to 10"):
+        DecisionRule(1.0, tag_run=11)
+    tagged = Scorer(policy, DecisionRule(1.0), replace(states, tags=TAGS))
+    assert K < 10  # items further back than the policy sees are known from the session
+    tagged.under(DecisionRule(1.0, tag_window=10))
+    with pytest.raises(InputError, match="of a session 10 are known"):
+        tagged.under(DecisionRule(1.0, tag_window=11))
+
+
+def test_what_is_kept_of_a_run_changes_with_its_weights(trained: TrainedPolicy) -> None:
+    history = logged_history(trained.scorer(), *some_steps(trained))[0]
+    before = trained.scorer().scores(history)
+    with torch.no_grad():
+        trained.policy.head.bias[4] += 1.5  # type: ignore[index,operator]
+    after = trained.scorer().scores(history)
+    torch.testing.assert_close(after[:, 4] - before[:, 4], torch.full((3,), 1.5))
+
+
+def some_steps(trained: TrainedPolicy) -> tuple[EpisodeStore, Any, Any]:
+    store = EpisodeStore.open(trained.folder.parent / "store")
+    return store, np.arange(3), store.lengths[:3] - 1
+
+
+# Wherever it acts.
+
+
+def last_sessions(log: pd.DataFrame) -> Iterator[tuple[Any, list[int], list[float]]]:
+    """Users with the items and rewards of their last sessions, which are long enough to matter."""
+    for user, rows in log.sort_values("timestamp").groupby("user_id"):
+        pauses = rows.timestamp.diff() > 120 * 60_000
+        latest = rows[pauses.cumsum() == pauses.sum()]
+        if len(latest) > 3:
+            yield user, latest.item_id.tolist(), latest.reward.tolist()
+
+
+def test_logged_sessions_are_read_as_far_back_as_a_rule_looks(
+    folder: Path, trained: TrainedPolicy
+) -> None:
+    for rule in (DecisionRule(3.0, tag_run=10), DecisionRule(3.0, tag_window=10)):
+        scorer = replace(trained, reward_model=None).scorer(rule)
+        assert scorer.policy.config.context < 10
+        logged = EpisodeStore.open(folder / "store")
+        at = logged, np.array([0]), logged.lengths[:1] - 1
+        assert logged_history(scorer, *at)[0].shown.items.shape == (1, 10)
+        assert logged_history(trained.scorer(rule), *at)[0].shown.items.shape == (1, MEMORY)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_played_scored_ranked_and_recommended_alike(
+    folder: Path, trained: TrainedPolicy, rule: str, tmp_path: Path
+) -> None:
+    log, given = tagged_log(), RULES[rule]
+    sessions = list(last_sessions(log))[:6]
+    log = log[log.user_id.isin([user for user, *_ in sessions])]
+    assert trained.item_ids is not None
+    numbers = {item: number for number, item in enumerate(trained.item_ids.tolist())}
+    expected = {}
+    for user, items, rewards in sessions:
+        known = [numbers[item] for item in items]
+        expected[user] = replayed(trained, given, known, rewards, user).numpy()
+    assert max(len(found) for found in expected.values()) > trained.policy.config.context + 1
+
+    # One more row for each user: the step to decide, with an arbitrary item and reward.
+    latest = log.sort_values("timestamp").groupby("user_id").tail(1)
+    more = latest.assign(timestamp=latest.timestamp + 1000, item_id=5, reward=1.0)
+    pd.concat([log, more]).to_parquet(tmp_path / "log.parquet")
+    with logged_sessions(
+        trained.folder, trained, [tmp_path / "log.parquet"], LogMapping()
+    ) as logged:
+        store, ranker = logged.store, PolicyRanker(trained, given, "ucf")
+        batches = list(scored_steps(trained, store, given))
+        (batch,) = batches
+        ends = np.flatnonzero(np.append(np.diff(batch.episodes) > 0, True))
+        for user, found in expected.items():
+            last = max(end for end in ends if logged.users[batch.episodes[end]] == user)
+            rows = np.arange(last - len(found) + 1, last + 1)
+            scored = batch.log_probabilities[rows].exp().numpy()
+            np.testing.assert_allclose(scored, found, rtol=1e-3, atol=1e-6)
+            steps = (batch.episodes[rows], batch.steps[rows])
+            ranked = ranker.scores(Steps(store, *steps, np.full(len(rows), -1)))
+            again = given.log_probabilities(ranked).exp().numpy()
+            np.testing.assert_allclose(again, found, rtol=1e-3, atol=1e-6)
+
+    histories = histories_of_frame(trained, log, LogMapping())
+    (frame,) = recommend(trained, histories, MANY, rule=given, filter_seen=False)
+    for user, found in expected.items():
+        rows = frame[frame.user_id == user]
+        listed = [numbers[item] for item in rows.item_id]
+        chances = np.zeros(len(numbers))
+        if given.temperature == 0:
+            chances[listed[0]] = 1
+        else:
+            kept = np.sort(rows.score)[::-1][: given.top_k]
+            left = rows.score.to_numpy() >= kept[-1]
+            shares = np.exp(rows.score.to_numpy() / given.temperature) * left
+            chances[listed] = shares / shares.sum()
+        np.testing.assert_allclose(chances, found[-1], rtol=1e-3, atol=1e-6)
+
+
+def test_rewards_of_the_session_lower_the_target_of_recommendations(trained: TrainedPolicy) -> None:
+    """A session that has earned r with target T is recommended as one that has not, with T − r."""
+    log = tagged_log()
+    user, items, _ = max(last_sessions(log), key=lambda session: len(session[1]))
+    window = trained.policy.config.context
+    assert len(items) > window + trained.returns.horizon
+    rows = log[log.user_id == user].tail(len(items))
+
+    def scores(rewards: float, target: float) -> pd.Series:
+        # Rewards change the state too, so only one before the policy's memory is changed.
+        first = np.arange(len(rows)) == 0
+        given = rows.assign(reward=np.where(first, rewards, 0.0))
+        histories = histories_of_frame(trained, given, LogMapping())
+        rule = DecisionRule(target)
+        (frame,) = recommend(trained, histories, MANY, rule=rule, filter_seen=False)
+        return frame.sort_values("item_id").score.reset_index(drop=True)
+
+    # Liking is clipped: any reward of 1 or more makes the same states.
+    low, high, same = scores(1.0, 4.0), scores(3.0, 4.0), scores(3.0, 6.0)
+    if trained.returns.per_session:
+        np.testing.assert_allclose(low, same, atol=1e-5)
+        assert not np.allclose(low, high, atol=1e-6)
+    else:
+        np.testing.assert_allclose(low, high, atol=1e-5)
+
+
+def test_items_of_a_session_count_as_seen_from_the_next_step(folder: Path) -> None:
+    store = EpisodeStore.open(folder / "store")
+    trained = TrainedPolicy.load(folder / "session")
+    episodes, steps = (each[:200] for each in store.all_steps())
+    seen = seen_before(store, episodes, steps)
+    items = store.step_values("item", episodes, steps)
+    starts = np.maximum.accumulate(np.where(steps == 0, np.arange(200), 0))
+    for row in range(200):
+        assert set(seen[row].nonzero()[:, 0].tolist()) == set(items[starts[row] : row].tolist())
+    scorer = trained.scorer(replace(trained.rule, exclude_seen=True))
+    left_out = np.isneginf(logged_scores(scorer, store, episodes, steps).numpy())
+    np.testing.assert_array_equal(left_out, seen.numpy())
+
+
+def test_a_user_who_has_seen_all_candidates_gets_no_row(folder: Path) -> None:
+    trained, log = TrainedPolicy.load(folder / "session"), tagged_log()
+    (user, items, _), (other, *_) = list(last_sessions(log))[:2]
+    log = log[log.user_id.isin([user, other])]
+    rule = replace(trained.rule, exclude_seen=True)
+    (frame,) = recommend(
+        trained,
+        histories_of_frame(trained, log, LogMapping()),
+        3,
+        rule=rule,
+        filter_seen=False,
+        candidates=items[:1],
+    )
+    assert user not in set(frame.user_id)

@@ -1,0 +1,344 @@
+"""One scorer: what turns the histories of sessions into scores of items under a decision rule.
+
+Acting, off-policy estimates, rankings, recommendations and exported graphs all decide by these
+scores. All operations can be exported to ONNX.
+"""
+
+import copy
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.item_product import Factors, ItemProduct, Part
+from ucfrec.acting.sessions import History, Sessions, seen_before
+from ucfrec.arrays import Float32Array, IntArray
+from ucfrec.episodes.exposure import Shown
+from ucfrec.episodes.item_table import WINDOW
+from ucfrec.episodes.returns import ReturnToGo
+from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.policies.base import SequencePolicy
+from ucfrec.user_model.reward import ItemRewardModel
+
+
+class Query(NamedTuple):
+    """What B sessions ask of all items; the rule's weights do not matter yet."""
+
+    items: Tensor
+    """(B, N) int64 items shown before, −1 for none."""
+    policy: Part | None
+    """log π; None for a policy that scores items in a way of its own."""
+    outputs: Tensor | None
+    """(B, n_items) of such a policy."""
+    features: Tensor | None
+    """(B, D) that the policy predicts from; None for such a policy."""
+    model: Part | None
+    """f̂_r; None if nobody asks for it."""
+
+    def at(self, rows: slice) -> "Query":
+        """The sessions with the given numbers."""
+        items, policy, outputs, features, model = self
+        return Query(
+            items[rows],
+            None if policy is None else Part(*(each[rows] for each in policy)),
+            None if outputs is None else outputs[rows],
+            None if features is None else features[rows],
+            None if model is None else Part(*(each[rows] for each in model)),
+        )
+
+
+class Scorer:
+    """A trained policy under a decision rule: log π(i | s, Ĝ) + β f̂_r(s, i) of every item.
+
+    The item vectors of the policy and of the reward model are one matrix, so that a single product
+    gives both. Policies that score items in a way of their own do so, and the rest is added.
+    """
+
+    def __init__(
+        self,
+        policy: SequencePolicy,
+        rule: DecisionRule,
+        states: ItemStates | None = None,
+        returns: ReturnToGo | None = None,
+        reward_model: ItemRewardModel | None = None,
+    ) -> None:
+        """
+        Args:
+            policy: in evaluation mode; its weights must not change after the first scores.
+            rule: how it decides.
+            states: of the run's items; None if actions are vectors.
+            returns: what the returns-to-go of the training counted; None for whole sessions.
+            reward_model: f̂_r; needed for a reward weight.
+
+        Raises:
+            InputError: the rule needs what the run lacks.
+        """
+        self.policy, self.rule, self.states = policy, rule, states
+        self.returns, self.reward_model = returns or ReturnToGo(), reward_model
+        self._items = ItemProduct(policy, reward_model, states)
+        self._engine: Callable[[Sessions], Factors] | None = None
+        self._require_parts()
+
+    def under(self, rule: DecisionRule) -> "Scorer":
+        """The same policy under another rule; what is computed once is shared.
+
+        Raises:
+            InputError: the rule needs what the run lacks.
+        """
+        other = copy.copy(self)
+        other.rule, other._engine = rule, None
+        other._require_parts()
+        return other
+
+    def answering_one_with(self, engine: Callable[[Sessions], Factors]) -> "Scorer":
+        """The same, but the factors of a single session are computed by `engine`."""
+        other = copy.copy(self)
+        other._engine = engine
+        return other
+
+    def _require_parts(self) -> None:
+        rule, tags = self.rule, None if self.states is None else self.states.tags
+        if rule.reward_weight and self.reward_model is None:
+            raise InputError(
+                f"the rule has reward weight {rule.reward_weight:g}, but the run has no "
+                "reward model of items; train it with --set rule.choose=true, or set the reward "
+                "weight to 0"
+            )
+        for name, value in (("tag window", rule.tag_window), ("tag run", rule.tag_run)):
+            if value and (tags is None or not bool((tags >= 0).any())):
+                raise InputError(
+                    f"the rule has a {name}, which leaves out items by their tags, but the store "
+                    f"has none; give the items a column of lists, or set the {name} to 0"
+                )
+        if rule.tag_window > self.known:
+            raise InputError(
+                f"the rule looks at the tags of the last {rule.tag_window} items, but of a "
+                f"session {self.known} are known ({WINDOW}, or policy.context less 1 if that is "
+                f"more); set the tag window to at most {self.known}"
+            )
+
+    @property
+    def known(self) -> int:
+        """The number of items of a session that are known at least, once it has shown them."""
+        return max(self.policy.config.context - 1, WINDOW)
+
+    @property
+    def reach(self) -> int:
+        """Items shown before a step that are read one by one."""
+        of_model = 0 if self.reward_model is None else self.reward_model.reach
+        return max(of_model, self._items.lags, self.rule.tag_window, self.rule.tag_run)
+
+    @property
+    def length(self) -> int:
+        """Items of a session that are read, also those that make its states."""
+        assert self.states is not None
+        return max(self.policy.config.context - 1 + self.states.window, self.reach)
+
+    @property
+    def has_factors(self) -> bool:
+        """Whether the policy scores items by a product with their vectors."""
+        return not self._items.own
+
+    def vectors(self) -> Float32Array:
+        """(n_items, d + 1) vectors of all items; their products with `multipliers` of factors are
+        most of the scores."""
+        return self._items.vectors(bool(self.rule.reward_weight))
+
+    @torch.no_grad()
+    def with_target(self, history: History) -> History:
+        """The history with the returns-to-go that the rule sets as target."""
+        windows, best = history.windows, None
+        if self.rule.target is None:
+            best = self.policy.max_return(windows.to(self.policy.state_mean.device)).cpu()
+        targets = self.rule.target_returns(self.returns, history.collected, best)
+        returns_to_go = self.returns.before(targets, windows.rewards)
+        returns_to_go = returns_to_go.masked_fill(~windows.mask, 0.0)
+        return replace(history, windows=replace(windows, returns_to_go=returns_to_go))
+
+    @torch.no_grad()
+    def act(self, history: History) -> Tensor:
+        """The policy's outputs at the last step, on the CPU: see `SequencePolicy.act`."""
+        windows = self.with_target(history).windows
+        return self.policy.act(windows.to(self.policy.state_mean.device)).cpu()
+
+    @torch.no_grad()
+    def query(self, history: History, rewards: bool | None = None) -> Query:
+        """All of the scores that does not grow with the items, before it is weighted.
+
+        Args:
+            history: of `with_target`.
+            rewards: whether it is also used under rules with a reward weight; None if this one
+                has one.
+        """
+        rewards = bool(self.rule.reward_weight) if rewards is None else rewards
+        outputs = features = policy = None
+        if self._items.own:
+            windows = history.windows.to(self.policy.state_mean.device)
+            outputs = self.policy.act(windows).cpu()
+        else:
+            features, policy = self._items.of_policy(history)
+        model = self._items.of_model(history) if rewards else None
+        return Query(self._items.shown(history.shown), policy, outputs, features, model)
+
+    def weighted(self, query: Query) -> Factors:
+        """The parts of a query, weighted as the rule says."""
+        model = query.model if self.rule.reward_weight else None
+        return self._items.factors(query.items, query.policy, model, self.rule.reward_weight)
+
+    @torch.no_grad()
+    def factors(self, sessions: Sessions) -> Factors:
+        """What sessions multiply the items' vectors with; see `scores`."""
+        assert self.states is not None
+        history = sessions.history(self.states, self.policy.config.context)
+        return self.weighted(self.query(self.with_target(history)))
+
+    def scores(
+        self,
+        given: History | Sessions,
+        left_out: tuple[Tensor, Tensor] | None = None,
+        excluded: Tensor | None = None,
+        *,
+        empty: bool = False,
+    ) -> Tensor:
+        """(B, n_items) log π(i | s, Ĝ) + β f̂_r(s, i), up to a constant per row; −∞ for items left
+        out.
+
+        Args:
+            given: B sessions, of at least `reach` items or `length` items each.
+            left_out: rows (N,) and items (N,) of what may not be shown.
+            excluded: (B, n_items) or (n_items,) bool, what may not be shown.
+            empty: whether all items of a row may be left out.
+
+        Raises:
+            InputError: no item is left in some row, or the scores of some row are NaN.
+        """
+        serving = isinstance(given, Sessions) and self.has_factors
+        # Policies and fits may keep tensors, which those of inference mode would spoil for them.
+        with (
+            torch.inference_mode()
+            if serving and not torch.compiler.is_exporting()
+            else torch.no_grad()
+        ):
+            if self._engine is not None and isinstance(given, Sessions) and len(given.users) == 1:
+                scores = self._products(self._engine(given))
+                return self._left(scores, given.shown, left_out, excluded, empty)
+            if isinstance(given, Sessions):
+                assert self.states is not None
+                given = given.history(self.states, self.policy.config.context)
+            query = self.query(self.with_target(given))
+            return self.scores_of(query, given, left_out, excluded, empty=empty)
+
+    @torch.no_grad()
+    def scores_of(
+        self,
+        query: Query,
+        history: History,
+        left_out: tuple[Tensor, Tensor] | None = None,
+        excluded: Tensor | None = None,
+        *,
+        empty: bool = False,
+    ) -> Tensor:
+        """`scores` of a query of the history."""
+        scores = self._products(self.weighted(query), query.outputs)
+        return self._left(scores, history.shown, left_out, excluded, empty)
+
+    @torch.no_grad()
+    def rewards(self, history: History) -> Tensor:
+        """f̂_r (B, n_items), in the reward model's units, up to a constant per row."""
+        model, items = self._items.of_model(history), self._items.shown(history.shown)
+        factors = self._items.factors(items, None, model, 1.0)
+        return self._items.scores(factors, None, policy=False, rewards=True)
+
+    @torch.inference_mode()
+    def of_items(
+        self, sessions: Sessions, factors: Factors, items: Tensor, products: Tensor
+    ) -> Tensor:
+        """Scores (B, C) of some items; −∞ for those that the rule's tags leave out, even if no
+        others remain.
+
+        Args:
+            sessions: as for `scores`.
+            factors: of the sessions.
+            items: (B, C) int64.
+            products: (B, C) of `multipliers` of the factors and the items' `vectors`.
+        """
+        scores = products + self._items.added(factors, items, bool(self.rule.reward_weight))
+        for without in self._items.without_tags(self.rule, sessions.shown, items):
+            scores = scores.masked_fill(without, -torch.inf)
+        return scores
+
+    def _products(self, factors: Factors, outputs: Tensor | None = None) -> Tensor:
+        weighted = bool(self.rule.reward_weight)
+        return self._items.scores(factors, outputs, self.has_factors, weighted)
+
+    def _left(
+        self,
+        scores: Tensor,
+        shown: Shown,
+        left_out: tuple[Tensor, Tensor] | None,
+        excluded: Tensor | None,
+        empty: bool,
+    ) -> Tensor:
+        """The scores with −∞ for what is left out; the given ones are overwritten."""
+        if not torch.compiler.is_exporting():
+            _require_numbers(scores)
+        if left_out is not None:
+            scores[left_out] = -torch.inf
+        if excluded is not None:
+            scores = scores.masked_fill_(excluded, -torch.inf)
+        for without in self._items.without_tags(self.rule, shown):
+            left = scores.masked_fill(without, -torch.inf)
+            # A filter gives way where nothing would remain.
+            scores = torch.where(left.amax(1, keepdim=True) > -torch.inf, left, scores)
+        if not empty:
+            none = torch.isneginf(scores.amax(1))
+            if none.any():
+                raise InputError(
+                    f"in {int(none.sum())} of {len(none)} decisions every item is left out; allow "
+                    "more candidates, or keep seen items"
+                )
+        return scores
+
+
+def logged_history(
+    scorer: Scorer, store: EpisodeStore, episodes: IntArray, steps: IntArray
+) -> tuple[History, Tensor | None]:
+    """What was known before logged steps, and what the rule leaves out because it was shown.
+
+    Args:
+        scorer: the policy under its rule.
+        store: the logs, with the training's items.
+        episodes: (B,) sessions.
+        steps: (B,) steps of those sessions, from 0.
+    """
+    history = History.logged(store, episodes, steps, scorer.policy.config.context, scorer.reach)
+    seen = seen_before(store, episodes, steps) if scorer.rule.exclude_seen else None
+    return history, seen
+
+
+def logged_scores(
+    scorer: Scorer, store: EpisodeStore, episodes: IntArray, steps: IntArray
+) -> Tensor:
+    """`Scorer.scores` (B, n_items) at logged steps, from what was known before each."""
+    history, seen = logged_history(scorer, store, episodes, steps)
+    return scorer.scores(history, excluded=seen)
+
+
+def _require_numbers(scores: Tensor) -> None:
+    """Check scores (B, n_items).
+
+    Raises:
+        InputError: those of some row are NaN, or infinitely high.
+    """
+    undefined = ~(scores.amax(1) < torch.inf)
+    if undefined.any():
+        raise InputError(
+            f"in {int(undefined.sum())} of {len(scores)} decisions scores are no numbers, as "
+            "weights of the policy or the reward model are NaN or infinite; train again, with "
+            "a lower train.learning_rate if the training diverged"
+        )

@@ -1,0 +1,1 @@
+"""Result rows: what was measured, its numbers and their origin, and files of such rows."""

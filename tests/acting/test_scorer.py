@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tests.policies.test_ucf import CATALOG, ITEMS, VECTORS, B, K, build, random_windows
 from tests.support.replay import replayed
-from tests.support.served import learn_tastes
+from tests.support.served import boredom, learn_tastes
 from tests.support.tagged import ITEMS as MANY
 from tests.support.tagged import tagged_log, tagged_store
 from ucfrec import EpisodeStore, Recommender
@@ -36,7 +36,7 @@ from ucfrec.recommending.recommend import recommend
 from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.user_model.posterior import MEMORY
-from ucfrec.user_model.reward import ItemRewardModel
+from ucfrec.user_model.reward import LAGS, ItemRewardModel
 from ucfrec.user_model.reward_fit import fit_item_reward_model
 
 SETTINGS = {
@@ -112,6 +112,7 @@ def scorer_of(name: str, tagged: bool, rule: DecisionRule) -> Scorer:
     model.likeness.start_from(states)
     model.tastes.root.copy_(torch.randn(5, 5).tril())
     model.tastes.weigh(0.7)
+    model.binary.fill_(True)
     if isinstance(policy, ItemKNNPolicy):
         policy.cosines.uniform_(0.1, 1)
         policy.neighbors.random_(0, ITEMS)
@@ -120,7 +121,7 @@ def scorer_of(name: str, tagged: bool, rule: DecisionRule) -> Scorer:
         policy.head.exposure.start_from(states, torch.rand(50))  # type: ignore[union-attr]
         for parameter in policy.parameters():
             parameter.data += 0.1 * torch.randn_like(parameter)
-    return Scorer(policy.eval(), rule, states, ReturnToGo(), model)
+    return Scorer(policy.eval(), rule, states, ReturnToGo(), model, boredom(model.likeness))
 
 
 def naive_scores(scorer: Scorer, history: History, excluded: Tensor) -> Tensor:
@@ -131,10 +132,24 @@ def naive_scores(scorer: Scorer, history: History, excluded: Tensor) -> Tensor:
     targets = (rule.target - history.collected).clamp(min=rule.minimum_target)
     returns_to_go = ReturnToGo().before(targets, windows.rewards).masked_fill(~windows.mask, 0.0)
     with torch.no_grad():
-        scores = scorer.policy.act(replace(windows, returns_to_go=returns_to_go)).clone()
+        outputs = scorer.policy.act(replace(windows, returns_to_go=returns_to_go))
+        scores = rule.policy_weight * outputs
         for item in range(ITEMS):
-            known = windows.states[:, -1], shown, history.users, torch.full((B,), item)
-            scores[:, item] += rule.reward_weight * scorer.reward_model.score(*known)
+            every = torch.full((B,), item)
+            score = scorer.reward_model.score(windows.states[:, -1], shown, history.users, every)
+            if rule.lookahead:
+                assert scorer.session_end is not None
+                score = scorer.reward_model.expected(score)
+                steps, recent = windows.timesteps[:, -1].numpy(), shown.latest(LAGS)
+                ends = [
+                    torch.from_numpy(
+                        scorer.session_end.probabilities(recent, every, np.full(B, paid), steps)
+                    )
+                    for paid in (0.0, 1.0)
+                ]
+                end = ends[0] * (1 - score) + ends[1] * score
+                score = (score + (1 - end) * rule.lookahead).float()
+            scores[:, item] += rule.reward_weight * score
     scores = scores.masked_fill(excluded, -torch.inf)
     for row in range(B):
         items = [int(item) for item in shown.items[row] if item >= 0]
@@ -154,6 +169,11 @@ def naive_scores(scorer: Scorer, history: History, excluded: Tensor) -> Tensor:
 NAIVE = {
     "plain": DecisionRule(3.0, minimum_target=1.5),
     "weighted": DecisionRule(3.0, minimum_target=1.5, reward_weight=0.7),
+    "half": DecisionRule(3.0, minimum_target=1.5, reward_weight=0.7, policy_weight=0.5),
+    "rewards": DecisionRule(3.0, minimum_target=1.5, reward_weight=0.7, policy_weight=0.0),
+    "ahead": DecisionRule(
+        3.0, minimum_target=1.5, reward_weight=2.0, policy_weight=0.5, lookahead=3
+    ),
     "window": DecisionRule(3.0, minimum_target=1.5, reward_weight=0.7, tag_window=1),
     "filters": DecisionRule(3.0, minimum_target=1.5, tag_window=2, tag_run=1),
 }

@@ -73,7 +73,8 @@ def chosen(
 ) -> RuleChoice:
     users = users_of(run, store)
     states = store.item_states
-    scorer = Scorer(scorer.policy, scorer.rule, states, scorer.returns, users.reward)
+    parts = scorer.returns, users.reward, users.session_end
+    scorer = Scorer(scorer.policy, scorer.rule, states, *parts)
     given = dict(zip((0.9, 1.0), targets, strict=True))
     return choose_by_simulation(scorer, users, given, *training_views(store), config, 0)
 

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 import torch
 
-from tests.support.served import FULL, SETTINGS, histories, learn_tastes, trained_run
+from tests.support.served import FULL, SETTINGS, boredom, histories, learn_tastes, trained_run
 from tests.support.tagged import tagged_log
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
@@ -110,6 +110,7 @@ def ranked(
 RULES = {
     "target": DecisionRule(3.0, 1.0),
     "weighted": DecisionRule(3.0, reward_weight=0.7),
+    "ahead": DecisionRule(3.0, reward_weight=4.0, policy_weight=0.5, lookahead=2.0),
     "run": DecisionRule(3.0, tag_run=1),
     "full": FULL,
     "everything": replace(FULL, tag_run=2),
@@ -130,6 +131,8 @@ def test_the_graph_recommends_what_the_policy_does(
         with pytest.raises(InputError, match="the store has none"):
             export(given, tmp_path / "out", rule=RULES[rule])
         return
+    assert given.reward_model is not None
+    given = replace(given, session_end=boredom(given.reward_model.likeness))
     if tastes:
         given = replace(given, reward_model=copy.deepcopy(given.reward_model))
         learn_tastes(given)

@@ -5,15 +5,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import torch
 
 from tests.support.tagged import tagged_log, tagged_store
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.episodes.exposure import Likeness, Shown
 from ucfrec.recommending.requests import Limits
 from ucfrec.recommending.responder import Responder
 from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.user_model.session_end import LoggedEnds, SessionEnd
 
 SETTINGS = [
     *("train.steps=20", "policy.dim=8", "policy.context=4", "augment.copies=0"),
@@ -42,6 +45,27 @@ def learn_tastes(trained: TrainedPolicy) -> None:
     tastes.root.copy_(torch.randn(tastes.root.shape, generator=random).tril())
     tastes.usual.fill_(0.4)
     tastes.weigh(1.5)
+
+
+def boredom(likeness: Likeness) -> SessionEnd:
+    """Sessions end, mostly, with a liked item that is like the last one."""
+    rng, items = np.random.default_rng(0), len(likeness.tags)
+    shown, item = rng.integers(-1, items, (4000, 10)), rng.integers(items, size=4000)
+    rewards = rng.integers(2, size=4000).astype(np.float64)
+    before = Shown(torch.from_numpy(shown), torch.zeros(4000, 10))
+    logged = LoggedEnds(
+        *(before, torch.from_numpy(item), rewards, rng.integers(9, size=4000)),
+        ended=np.zeros(4000, dtype=bool),
+    )
+    alike = likeness.to_candidates(
+        likeness.profile(before.items[:, :1], torch.ones(4000, 1)), logged.items.unsqueeze(1)
+    )
+    bored = (alike[:, 0] > 0.3).numpy() & (rewards > 0)
+    logged.ended[:] = rng.random(4000) < np.where(bored, 0.9, 0.02)
+    end, report = SessionEnd.fit(likeness, logged, logged, 0)
+    assert report.kept == "boosted"
+    assert end.uses_rewards
+    return end
 
 
 def responder(trained: TrainedPolicy, **named: Any) -> Responder:

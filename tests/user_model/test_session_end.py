@@ -1,5 +1,7 @@
 """Session ends: what the log says of them, and what a model of them finds."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -27,13 +29,68 @@ def planted_ends(rows: int = 6000) -> tuple[Likeness, LoggedEnds]:
     return Likeness.of(states), LoggedEnds(before, torch.from_numpy(items), rewards, steps, ended)
 
 
-def test_the_model_of_ends_finds_that_repetition_ends_sessions() -> None:
+def part_of(logged: LoggedEnds, rows: slice) -> LoggedEnds:
+    """Some of the steps."""
+    shown, items = logged.shown.at(rows), logged.items[rows]
+    return LoggedEnds(shown, items, logged.rewards[rows], logged.steps[rows], logged.ended[rows])
+
+
+@pytest.mark.parametrize("last", [4000, 4010])
+def test_that_repetition_ends_sessions_is_found_if_there_are_steps_to_show_it(last: int) -> None:
     likeness, logged = planted_ends()
-    end = SessionEnd.fit(likeness, logged)
-    found = end.probabilities(logged.shown, logged.items, logged.rewards, logged.steps)
+    held_out = part_of(logged, slice(4000, last + 2000 * (last == 4000)))
+    end, report = SessionEnd.fit(likeness, part_of(logged, slice(4000)), held_out, 0)
     again = (logged.items == logged.shown.items[:, 0]).numpy()
-    assert found[again].mean() == pytest.approx(0.8, abs=0.05)
-    assert found[~again].mean() == pytest.approx(0.1, abs=0.03)
+    found = end.probabilities(logged.shown, logged.items, logged.rewards, logged.steps)
+    if last == 4000:
+        assert report.kept in ("logistic", "boosted")
+        assert report.loss[report.kept] < report.loss["constant"] - 0.1
+        assert found[again].mean() == pytest.approx(0.8, abs=0.05)
+        assert found[~again].mean() == pytest.approx(0.1, abs=0.03)
+    for kind, (gain, error) in report.gain.items():
+        assert (gain > error) or kind != report.kept or kind == "constant"
+
+
+def test_what_a_regression_cannot_say_is_boosted_saved_and_read() -> None:
+    """Sessions end with the second of two alike items, but not with the third."""
+    likeness, logged = planted_ends()
+    items, shown = logged.items, logged.shown.items
+    ended = ((items == shown[:, 0]) != (items == shown[:, 1])).numpy()
+    parts = [
+        part_of(replace(logged, ended=ended), rows) for rows in (slice(4000), slice(4000, 6000))
+    ]
+    end, report = SessionEnd.fit(likeness, *parts, 0)
+    assert report.kept == "boosted"
+    assert report.loss["boosted"] < 0.1 * report.loss["logistic"]
+    inputs = logged.shown, items, logged.rewards, logged.steps
+    again = SessionEnd.of(likeness, {**end.tensors})
+    np.testing.assert_array_equal(again.probabilities(*inputs), end.probabilities(*inputs))
+    with pytest.raises(ValueError, match="beyond the trees"):
+        SessionEnd.of(likeness, {**end.tensors, "left": end.tensors["left"] + 99})
+
+
+def test_all_items_at_once_end_sessions_as_each_alone() -> None:
+    likeness, logged = planted_ends(400)
+    end, _ = SessionEnd.fit(likeness, logged, logged, 0)
+    steps, rewards = torch.from_numpy(logged.steps), torch.from_numpy(logged.rewards)
+    every = torch.arange(ITEMS).expand(400, -1)
+    rewards = rewards.unsqueeze(1).expand(-1, ITEMS)
+    together = end.of_items(logged.shown, every, rewards, steps)
+    for item in range(ITEMS):
+        alone = end.probabilities(
+            *(logged.shown, torch.full((400,), item), logged.rewards, logged.steps)
+        )
+        np.testing.assert_allclose(together[:, item].numpy(), alone, atol=1e-6)
+
+
+def test_sessions_that_all_end_or_never_do_are_a_constant() -> None:
+    likeness, logged = planted_ends(50)
+    for ends in (False, True):
+        given = replace(logged, ended=np.full(50, ends))
+        end, report = SessionEnd.fit(likeness, given, given, 0)
+        found = end.probabilities(logged.shown, logged.items, logged.rewards, logged.steps)
+        assert found.tolist() == [float(ends)] * 50
+        assert (report.kept, report.loss) == ("constant", {"constant": 0.0})
 
 
 def test_the_last_step_of_a_users_last_session_tells_nothing() -> None:

@@ -36,9 +36,10 @@ def users_of(
     model.item.copy_(torch.as_tensor(effects))
     logged = LoggedEnds.of(store, 10, 10_000, 0)
     logged.ended[:] = np.random.default_rng(0).random(len(logged.ended)) < ends
-    tags, end = MainTags.of(store.item_states), SessionEnd.fit(model.likeness, logged)
+    tags = MainTags.of(store.item_states)
+    end, of_end = SessionEnd.fit(model.likeness, logged, logged, 0)
     report: Any = None
-    return UserModel(model, report, None, calibration, end, fatigue, tags)
+    return UserModel(model, report, None, calibration, end, of_end, fatigue, tags)
 
 
 def test_rewards_are_drawn_with_the_models_calibrated_probabilities(store: EpisodeStore) -> None:

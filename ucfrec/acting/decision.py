@@ -17,6 +17,8 @@ _RANGES: Final = {
     "target": (-1e12, 1e12),
     "minimum_target": (-1e12, 1e12),
     "reward_weight": (0.0, 1e6),
+    "policy_weight": (0.0, 1e6),
+    "lookahead": (0.0, 1e12),
     "temperature": (0.0, 1e6),
     "top_k": (1, 10**9),
     "tag_window": (0, 10**4),
@@ -34,9 +36,11 @@ _BLOCK: Final = 128
 
 @dataclass(frozen=True)
 class DecisionRule:
-    """How a trained policy decides: π(i) ∝ [π(i | s, Ĝ) · exp(β · f̂_r(s, i))]^(1/T) over what is
+    """How a trained policy decides: π(i) ∝ [π(i | s, Ĝ)^w · exp(β · f̂_r(s, i))]^(1/T) over what is
     allowed.
 
+    With a lookahead V, f̂_r is instead r̂ + (1 − p_end) · V, in units of the range of rewards: what
+    showing the item is expected to be rewarded with, and what follows if the session goes on.
     Policies with vector actions use the target alone.
 
     Raises:
@@ -52,6 +56,11 @@ class DecisionRule:
     reward_weight: float = 0.0
     """β, weight of the reward model, whose predictions are log-odds of a reward, or rewards in
     standard deviations; 0 for none."""
+    policy_weight: float = 1.0
+    """w, weight of the policy; 0 for none."""
+    lookahead: float = 0.0
+    """V, expected return after the step, in reward units, of a session that it does not end; 0 for
+    none."""
     temperature: float = 0.0
     """T; items are drawn, or, at 0, the best is taken."""
     top_k: int | None = None
@@ -116,6 +125,8 @@ class DecisionRule:
         if self.minimum_target is not None:
             parts.append(f"at least {self.minimum_target:g} at every step")
         parts += [f"reward weight {self.reward_weight:g}"] if self.reward_weight else []
+        parts += [f"lookahead {self.lookahead:g}"] if self.lookahead else []
+        parts += [f"policy weight {self.policy_weight:g}"] if self.policy_weight != 1 else []
         parts += [f"the {self.top_k} best"] if self.top_k else []
         parts += ["unseen items"] if self.exclude_seen else []
         parts += [f"no tag of the last {self.tag_window}"] if self.tag_window else []
@@ -124,6 +135,11 @@ class DecisionRule:
         )
         how = f"drawn at temperature {self.temperature:g}" if self.temperature else "argmax"
         return ", ".join([*parts, how])
+
+    @property
+    def looks_ahead(self) -> bool:
+        """Whether scores count that a step may end the session."""
+        return bool(self.reward_weight and self.lookahead)
 
     @property
     def hash(self) -> str:

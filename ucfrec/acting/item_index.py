@@ -53,10 +53,10 @@ class ItemIndex:
                 f"the rule draws items at temperature {scorer.rule.temperature:g}, which needs the "
                 "scores of all of them; leave --approximate out, or give --temperature 0"
             )
-        if not scorer.has_factors:
+        if not scorer.is_product:
             raise InputError(
-                f"policies of kind {kind!r} score items in a way of their own; leave --approximate "
-                "out"
+                f"policies of kind {kind!r} score items in a way of their own under this rule; "
+                "leave --approximate out"
             )
         self._scorer, self._rng = scorer, np.random.default_rng(seed)
         vectors = scorer.vectors()

@@ -82,6 +82,12 @@ class ItemProduct:
         self._likeness = likeness[0] if likeness else None
         self._columns = max(self.lags, 0 if model is None else model.lags)
 
+    @property
+    def count(self) -> int:
+        """n_items."""
+        assert self._states is not None
+        return len(self._states.embeddings)
+
     @cached_property
     def _features(self) -> Callable[[Windows], Tensor]:
         return self._policy.acting_features()

@@ -7,7 +7,7 @@ scores. All operations can be exported to ONNX.
 import copy
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,6 +24,10 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.user_model.reward import ItemRewardModel
+from ucfrec.user_model.session_end import SessionEnd
+
+_LOOKED_AT: Final = 64
+"""Items of a decision that a lookahead asks about."""
 
 
 class Query(NamedTuple):
@@ -53,7 +57,7 @@ class Query(NamedTuple):
 
 
 class Scorer:
-    """A trained policy under a decision rule: log π(i | s, Ĝ) + β f̂_r(s, i) of every item.
+    """A trained policy under a decision rule: w log π(i | s, Ĝ) + β f̂_r(s, i) of every item.
 
     The item vectors of the policy and of the reward model are one matrix, so that a single product
     gives both. Policies that score items in a way of their own do so, and the rest is added.
@@ -66,6 +70,7 @@ class Scorer:
         states: ItemStates | None = None,
         returns: ReturnToGo | None = None,
         reward_model: ItemRewardModel | None = None,
+        session_end: SessionEnd | None = None,
     ) -> None:
         """
         Args:
@@ -74,12 +79,17 @@ class Scorer:
             states: of the run's items; None if actions are vectors.
             returns: what the returns-to-go of the training counted; None for whole sessions.
             reward_model: f̂_r; needed for a reward weight.
+            session_end: of the user model; needed for a lookahead.
 
         Raises:
             InputError: the rule needs what the run lacks.
         """
         self.policy, self.rule, self.states = policy, rule, states
         self.returns, self.reward_model = returns or ReturnToGo(), reward_model
+        self.session_end = session_end
+        self._outcomes: tuple[float, float] | None = None
+        if session_end is not None and reward_model is not None and bool(reward_model.binary):
+            self._outcomes = float(reward_model.reward_low), float(reward_model.reward_high)
         self._items = ItemProduct(policy, reward_model, states)
         self._engine: Callable[[Sessions], Factors] | None = None
         self._require_parts()
@@ -108,6 +118,11 @@ class Scorer:
                 f"the rule has reward weight {rule.reward_weight:g}, but the run has no "
                 "reward model of items; train it with --set rule.choose=true, or set the reward "
                 "weight to 0"
+            )
+        if rule.looks_ahead and self.session_end is None:
+            raise InputError(
+                f"the rule has lookahead {rule.lookahead:g}, but the run has no model of session "
+                "ends; train it on a log with sessions, or set the lookahead to 0"
             )
         for name, value in (("tag window", rule.tag_window), ("tag run", rule.tag_run)):
             if value and (tags is None or not bool((tags >= 0).any())):
@@ -143,6 +158,12 @@ class Scorer:
     def has_factors(self) -> bool:
         """Whether the policy scores items by a product with their vectors."""
         return not self._items.own
+
+    @property
+    def is_product(self) -> bool:
+        """Whether the scores are a product with vectors of the items, but for tags and repetition:
+        of a policy that has factors, under a rule without lookahead or policy weight."""
+        return self.has_factors and self.rule.policy_weight == 1 and not self.rule.looks_ahead
 
     def vectors(self) -> Float32Array:
         """(n_items, d + 1) vectors of all items; their products with `multipliers` of factors are
@@ -217,7 +238,7 @@ class Scorer:
         Raises:
             InputError: no item is left in some row, or the scores of some row are NaN.
         """
-        serving = isinstance(given, Sessions) and self.has_factors
+        serving = isinstance(given, Sessions) and self.is_product
         # Policies and fits may keep tensors, which those of inference mode would spoil for them.
         with (
             torch.inference_mode()
@@ -244,7 +265,10 @@ class Scorer:
         empty: bool = False,
     ) -> Tensor:
         """`scores` of a query of the history."""
-        scores = self._products(self.weighted(query), query.outputs)
+        if self.rule.policy_weight == 1 and not self.rule.looks_ahead:
+            scores = self._products(self.weighted(query), query.outputs)
+        else:
+            scores = self._composed(query, history)
         return self._left(scores, history.shown, left_out, excluded, empty)
 
     @torch.no_grad()
@@ -271,6 +295,51 @@ class Scorer:
         for without in self._items.without_tags(self.rule, sessions.shown, items):
             scores = scores.masked_fill(without, -torch.inf)
         return scores
+
+    def _composed(self, query: Query, history: History) -> Tensor:
+        """w log π + β f̂_r, or with a lookahead w log π + β (r̂ + (1 − p_end) V), (B, n_items)."""
+        rule, items, scores = self.rule, self._items, torch.zeros(())
+        if rule.policy_weight:
+            factors = items.factors(query.items, query.policy, None, 0.0)
+            of_policy = items.scores(factors, query.outputs, self.has_factors, rewards=False)
+            scores = rule.policy_weight * of_policy
+        if query.model is not None and rule.reward_weight:
+            factors = items.factors(query.items, None, query.model, 1.0)
+            odds = items.scores(factors, None, policy=False, rewards=True)
+            if rule.looks_ahead:
+                return self._ahead(scores, odds, history)
+            scores = scores + rule.reward_weight * odds
+        return scores.expand(history.shown.items.shape[0], self._items.count).clone()
+
+    def _ahead(self, scores: Tensor, odds: Tensor, history: History) -> Tensor:
+        """Scores of the policy plus expected reward and lookahead, (B, n_items).
+
+        Only the best items by policy and reward are asked whether they end the session; others
+        count like the worst of these.
+        """
+        model, end = self.reward_model, self.session_end
+        assert model is not None
+        assert end is not None
+        states, shown = history.windows.states[:, -1], history.shown.latest(model.reach)
+        odds = odds + model.level(states, history.users, model.tastes_after(shown)).unsqueeze(1)
+        span = model.reward_high - model.reward_low
+        weight, ahead = self.rule.reward_weight / span, self.rule.lookahead
+        rewards = model.expected(odds)
+        scores = scores + weight * rewards
+        best = scores.topk(min(_LOOKED_AT, self._items.count), dim=1).indices
+        steps = history.windows.timesteps[:, -1]
+        some, recent = rewards.gather(1, best), history.shown.latest(model.lags)
+        if self._outcomes is not None and end.uses_rewards:
+            low, high = (
+                end.of_items(recent, best, torch.full_like(some, reward), steps)
+                for reward in self._outcomes
+            )
+            ends = low + (high - low) * (some - model.reward_low) / span
+        else:
+            ends = end.of_items(recent, best, some, steps)
+        added = (weight * ahead * (1 - ends)).to(scores.dtype)
+        worst = added.amin(1, keepdim=True)
+        return (scores + worst).scatter_add(1, best, added - worst)
 
     def _products(self, factors: Factors, outputs: Tensor | None = None) -> Tensor:
         weighted = bool(self.rule.reward_weight)

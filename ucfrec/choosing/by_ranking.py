@@ -1,13 +1,14 @@
 """Choose the reward weight of a run by how it ranks the validation rows of its log.
 
 Where the log has no true sessions there is nothing to simulate, but every row tells what a user
-liked.
-A candidate is worth the mean rate, in the validation period, of the ten items that it would show,
-and overlaps with the log enough if it finds liked items no worse than the ten most liked ones do.
+liked. A candidate is worth the mean rate, in the validation period, of the ten items that it would
+show, and overlaps with the log enough if it finds liked items better than the ten most liked ones
+do, by a standard error. The choice is repeated on two halves of the users.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -29,6 +30,8 @@ _MOST_STEPS = 4000
 """Validation rows that are ranked at most."""
 _HALVINGS = 3
 """How often the interval between the best reward weight and the next larger one is halved."""
+_PRIOR = 10.0
+"""Impressions at the mean rate that are added to those of an item."""
 _AT_ONCE = 256
 
 
@@ -37,38 +40,107 @@ def choose_by_ranking(
 ) -> RuleChoice:
     """Choose the reward weight of the rule of `scorer`; its other parts stay.
 
-    Of those with enough overlap, the one with the highest rate is chosen; without any, none. If
-    the next larger of the candidates overlaps too little, reward weights between the two are tried.
-    The arguments are those of `ucfrec.choosing.choose.choose_rule`; `config.reward_weights` are the
+    Of those with enough overlap, the one with the highest rate is chosen, and of those whose rates
+    cannot be told apart the one with the most hits; without any, no reward weight. If the next
+    larger of the candidates overlaps too little, reward weights between the two are tried. The
+    arguments are those of `ucfrec.choosing.choose.choose_rule`; `config.reward_weights` are the
     first candidates, and `seed` is of the validation rows that are drawn from more than 4,000.
     """
-    rows = _Rows.of(train, validation, seed)
-    candidates: list[RankedRule] = []
+    rows, tried = _Rows.of(train, validation, seed), list[_Tried]()
 
-    def rank(weights: Sequence[float]) -> RankedRule:
+    def rank(weights: Sequence[float]) -> _Tried:
         for weight, top in zip(weights, _tops(scorer, weights, rows), strict=True):
-            rule = replace(scorer.rule, reward_weight=weight)
-            candidates.append(_ranked(rule, top, rows))
-        allowed = [each for each in candidates if each.gain >= 0]
-        return max(allowed, key=lambda each: each.item_rate) if allowed else candidates[0]
+            tried.append(_Tried.of(replace(scorer.rule, reward_weight=weight), top, rows))
+        return _best(tried)
 
     best = rank(sorted({0.0, *config.reward_weights}))
     for _ in range(_HALVINGS):
         weight = best.rule.reward_weight
-        larger = [each for each in candidates if each.rule.reward_weight > weight]
+        larger = [each for each in tried if each.rule.reward_weight > weight]
         nearest = min(larger, key=lambda each: each.rule.reward_weight, default=best)
-        if nearest.gain >= 0:
+        if nearest.overlaps:
             break
         best = rank([(weight + nearest.rule.reward_weight) / 2])
+    halves = [
+        _best([each.select(rows.users % 2 == half) for each in tried]).rule.reward_weight
+        for half in (0, 1)
+    ]
     return RuleChoice(
         rule=best.rule,
         chosen_by="mean rate, on validation rows, of the ten items shown, among rules that find "
-        "liked items no worse than the ten most liked ones do; no propensities are used",
-        candidates=candidates,
+        "liked items better than the ten most liked ones do, by a standard error; no propensities "
+        f"are used; halves of the users choose reward weights {halves[0]:g} and {halves[1]:g}",
+        candidates=[each.summary for each in tried],
         warning=""
-        if best.gain >= 0
+        if best.overlaps
         else "; WARNING: no candidate does, this one has no reward weight",
+        details={"reward_weights_of_halves": halves},
     )
+
+
+@dataclass(frozen=True)
+class _Tried:
+    """A rule, and what it would have shown in M rows."""
+
+    rule: DecisionRule
+    users: IntArray
+    """(M,) whose rows they are."""
+    rates: Float64Array
+    """(M,) mean rate of the items shown."""
+    liked: BoolArray
+    """(M,)."""
+    hits: BoolArray
+    """(M,) whether the row's item is among those shown."""
+    ahead: Float64Array
+    """(M,) 1 for a liked item that only the rule shows, −1 for one that only the baseline does."""
+
+    @classmethod
+    def of(cls, rule: DecisionRule, top: IntArray, rows: "_Rows") -> "_Tried":
+        hits = (top == rows.items[:, None]).any(1)
+        ahead = (hits.astype(np.float64) - rows.baseline) * rows.liked
+        return cls(rule, rows.users, rows.rates[top].mean(1), rows.liked, hits, ahead)
+
+    def select(self, rows: BoolArray) -> "_Tried":
+        names = ("users", "rates", "liked", "hits", "ahead")
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
+
+    @cached_property
+    def summary(self) -> RankedRule:
+        count = max(1, int(self.liked.sum()))
+        gain = float(self.ahead.sum()) / count
+        off = self.ahead - gain * self.liked
+        return RankedRule(
+            rule=self.rule,
+            item_rate=float(self.rates.mean()) if len(self.rates) else 0.0,
+            hits=float(self.hits[self.liked].sum()) / count,
+            gain=gain,
+            gain_error=_error_of_sum(off, self.users) / count,
+        )
+
+    @property
+    def overlaps(self) -> bool:
+        """Whether it finds liked items better than the baseline."""
+        return self.summary.gain >= self.summary.gain_error
+
+    def levels_with(self, other: "_Tried") -> bool:
+        """Whether the rate is not below that of another rule by more than a standard error."""
+        below = other.rates - self.rates
+        return bool(below.sum() <= _error_of_sum(below - below.mean(), self.users))
+
+
+def _error_of_sum(values: Float64Array, users: IntArray) -> float:
+    """Standard error of the sum of values (M,) of mean 0, whose rows depend within users."""
+    return float(np.sqrt(np.square(np.bincount(users, values)).sum())) if len(users) else 0.0
+
+
+def _best(tried: Sequence[_Tried]) -> _Tried:
+    """The rule to choose; the first if none overlaps enough."""
+    allowed = [each for each in tried if each.overlaps]
+    if not allowed:
+        return tried[0]
+    top = max(allowed, key=lambda each: each.summary.item_rate)
+    level = [each for each in allowed if each.levels_with(top)]
+    return max(level, key=lambda each: each.summary.hits)
 
 
 @dataclass(frozen=True)
@@ -76,6 +148,8 @@ class _Rows:
     """M validation rows: where they are, what was shown and liked, what the baseline hits."""
 
     store: EpisodeStore
+    users: IntArray
+    """(M,) numbers of their users, or sessions where users are not named."""
     episodes: IntArray
     steps: IntArray
     items: IntArray
@@ -83,7 +157,7 @@ class _Rows:
     baseline: BoolArray
     """Whether the item is one of the most liked training items."""
     rates: Float64Array
-    """(n_items,) share of liked impressions of every item in the period; NaN if never shown."""
+    """(n_items,) share of liked impressions of every item in the period, with ten at the mean."""
 
     @classmethod
     def of(cls, train: EpisodeStore, validation: EpisodeStore, seed: int) -> "_Rows":
@@ -94,13 +168,15 @@ class _Rows:
         episodes, steps = validation.locate(numbers)
         items = validation.step_values(schema.ITEM, episodes, steps).astype(np.int64)
         counts = TrainingCounts.of(validation)
-        shown, liked = counts.shown.double().numpy(), counts.liked.double().numpy()
-        with np.errstate(invalid="ignore"):
-            rates = liked / np.where(shown > 0, shown, np.nan)
+        shown, likes = counts.shown.double().numpy(), counts.liked.double().numpy()
+        rates = (likes + _PRIOR * likes.sum() / shown.sum()) / (shown + _PRIOR)
+        users = episodes
+        if validation.has_users:
+            users = validation.episode_values(schema.USER).astype(np.int64)[episodes]
         most_liked = TrainingCounts.of(train).liked.topk(min(SHOWN, len(rates))).indices.numpy()
         return cls(
-            *(validation, episodes, steps, items, liked_steps(validation, episodes, steps)),
-            *(np.isin(items, most_liked), rates),
+            *(validation, users, episodes, steps, items),
+            *(liked_steps(validation, episodes, steps), np.isin(items, most_liked), rates),
         )
 
 
@@ -123,17 +199,3 @@ def _tops(scorer: Scorer, reward_weights: Sequence[float], rows: _Rows) -> list[
             tops.append([each.topk(min(SHOWN, each.shape[1])).indices for each in scores])
             bar.update(len(steps))
     return [torch.cat(parts).numpy() for parts in zip(*tops, strict=True)]
-
-
-def _ranked(rule: DecisionRule, top: IntArray, rows: _Rows) -> RankedRule:
-    hit = (top == rows.items[:, None]).any(1)[rows.liked].astype(np.float64)
-    ahead = hit - rows.baseline[rows.liked]
-    shown = rows.rates[top]
-    some = len(hit) > 0
-    return RankedRule(
-        rule=rule,
-        item_rate=float(np.nanmean(shown)) if np.isfinite(shown).any() else 0.0,
-        hits=float(hit.mean()) if some else 0.0,
-        gain=float(ahead.mean()) if some else 0.0,
-        gain_error=float(ahead.std() / len(ahead) ** 0.5) if some else 0.0,
-    )

@@ -1,9 +1,10 @@
 """Choose the decision rule in sessions simulated in the user model.
 
-Rewards come from the run's reward model, calibrated on validation rows, or for new users from the
-tastes of training users, which the policy does not know (`ucfrec.user_model.training_users`). What
-a model says of a policy holds only where the log supports it, so a candidate must keep to items
-that the training log shows often enough, and to more than a handful of them.
+Simulated users have the fixed tastes of training users, which the policy does not know
+(`ucfrec.user_model.training_users`): rewards of the model that acts, which learns from the session,
+would pay a policy for its own guesses. What a model says of a policy holds only where the log
+supports it, so a candidate must keep to items that the training log shows often enough, and to more
+than a handful of them.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -45,7 +46,7 @@ class RuleSearch:
         """
         Args:
             scorer: the policy under its default rule, with the reward model of `users`.
-            users: the user model; where it has training users, their sessions are begun, otherwise
+            users: the user model; where users are new, training sessions are begun, otherwise
                 validation sessions.
             train: training episodes.
             validation: validation episodes.
@@ -54,7 +55,8 @@ class RuleSearch:
         """
         self.users, self._config, self._seed = users, config, seed
         self._scorer = scorer
-        self._store = validation if users.training_users is None else sessions_of(train, seed)
+        new = users.reward_report.new_users
+        self._store = sessions_of(train, seed) if new else validation
         self._longest = int(train.lengths.max())
         self._supported = train.item_counts() >= config.least_impressions
         self.least_items = float(min(config.least_items, self._supported.sum() / 4))
@@ -146,12 +148,13 @@ def choose_by_simulation(
     first = search.best(tried).rule
     tried += search.simulate([*_variants(first, reward_weight=config.reward_weights)])
     second = search.best(tried).rule
+    tried += _with_lookahead(search, second, config, train)
     if validation.item_states.tags.shape[1]:
         tried += _with_tag_window(search, second, config, scorer.known)
         # Without a tag window, which may only have served to tire no one.
         tried += _with_tag_run(search, second, config)
     best = search.best(tried)
-    if users.training_users is not None:
+    if users.reward_report.new_users:
         finalists = search.finalists(tried, best)
         best, rules = search.best(finalists), {each.rule for each in finalists}
         tried = [*(each for each in tried if each.rule not in rules), *finalists]
@@ -164,6 +167,18 @@ def choose_by_simulation(
         else "; WARNING: the log supports no candidate, this one shows the most different items",
         details={**users.report(), "least_items": search.least_items},
     )
+
+
+def _with_lookahead(
+    search: RuleSearch, rule: DecisionRule, config: RuleConfig, train: EpisodeStore
+) -> list[SimulatedRule]:
+    """The rule with a lookahead, if more than chance ends sessions."""
+    mean = float(train.returns.sum(dtype=np.float64)) / train.n_steps
+    lookaheads = [each * mean for each in config.lookaheads if each * mean > 0]
+    if search.users.session_end_report.kept == "constant":
+        return []
+    weights = {"reward_weight": config.lookahead_weights, "policy_weight": config.policy_weights}
+    return search.simulate([*_variants(rule, lookahead=lookaheads, **weights)])
 
 
 def _with_tag_window(
@@ -219,20 +234,21 @@ def _variants(rule: DecisionRule, **values: Sequence[Any]) -> Iterator[DecisionR
 def _simplicity(candidate: SimulatedRule) -> tuple[float, ...]:
     rule = candidate.rule
     return (
-        *(rule.tag_run > 0, rule.tag_window > 0, -rule.temperature),
-        *(rule.reward_weight, -rule.tag_run),
+        *(rule.tag_run > 0, rule.tag_window > 0, rule.lookahead > 0, -rule.temperature),
+        *(rule.reward_weight, rule.lookahead, -rule.policy_weight, -rule.tag_run),
     )
 
 
 def _chosen_by(users: UserModel) -> str:
     if users.training_users is None:
         return (
-            "mean return of validation users' sessions in the run's reward model, calibrated "
-            "on validation rows; no propensities are used"
+            "mean return of sessions in the run's reward model, calibrated on validation rows; no "
+            "propensities are used"
         )
     report = users.training_users.report
+    whose = "new users" if users.reward_report.new_users else "validation users"
     weighted = "weighted by their propensities" if report.weighted else "without weights"
     return (
-        "mean return of sessions of new users, who have the tastes of training users; these "
+        f"mean return of sessions of {whose}, who have the fixed tastes of training users; these "
         f"are fitted to {report.steps:,} training rows {weighted}"
     )

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from ucfrec.settings import Count, Share, settings_table
+from ucfrec.settings import Count, Share, Weight, settings_table
 
 _Temperature = Annotated[float, Field(ge=0, le=100)]
 _RewardWeight = Annotated[float, Field(ge=0, le=1000)]
@@ -35,6 +35,12 @@ class RuleConfig:
     """Candidates for the temperature."""
     reward_weights: Annotated[tuple[_RewardWeight, ...], _SOME] = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
     """Candidates for β, the weight of the reward model."""
+    lookaheads: Annotated[tuple[Weight, ...], _SOME] = (0.0, 4.0, 16.0)
+    """Candidates for the lookahead, in mean rewards, where the log tells what ends sessions."""
+    lookahead_weights: Annotated[tuple[_RewardWeight, ...], _SOME] = (8.0, 32.0)
+    """Candidates for β with a lookahead, where it is the weight of rewards scaled to [0, 1]."""
+    policy_weights: Annotated[tuple[Weight, ...], _SOME] = (0.0, 0.5, 1.0)
+    """Candidates for the policy's weight with a lookahead."""
     tag_windows: Annotated[tuple[_Steps, ...], _SOME] = (0, 3, 10)
     """Candidates for the number of steps whose tags are left out, where items have tags."""
     tag_runs: Annotated[tuple[_Runs, ...], _SOME] = (0, 2, 3, 4, 6, 8)

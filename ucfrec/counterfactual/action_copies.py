@@ -14,6 +14,7 @@ from ucfrec.counterfactual.reward_model import CausalRewardModel
 from ucfrec.counterfactual.transitions import Read
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay
+from ucfrec.files.record import Undefinable
 
 _CHUNK = 4096
 _STREAM = 1
@@ -30,9 +31,9 @@ class ActionReport:
     """Share of them at steps whose logged reward the reward model reproduces within ε_r."""
     copies: int
     """Number of action copies: those that, at such steps, change the reward by more than δ."""
-    mean_change: float
+    mean_change: Undefinable
     """Mean change of the reward in the copies, in reward units; 0 without copies."""
-    earns_more: float
+    earns_more: Undefinable
     """Share of the copies that earn more than the logged action did; 0 without copies."""
 
 

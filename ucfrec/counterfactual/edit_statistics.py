@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ucfrec.arrays import Float64Array
+from ucfrec.files.record import Undefinable
 
 _QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 _BINS = 20
@@ -25,7 +26,7 @@ class MoveReport:
     """Edges of the bins of ‖Δ‖₂, from 0 to ρ_high."""
     histogram_counts: tuple[int, ...]
     """Number of edits in each bin."""
-    mean_move_ratio: float
+    mean_move_ratio: Undefinable
     """‖mean Δ‖ / mean ‖Δ‖: 1 if all edits are the same shift, near 0 if they are varied."""
     effective_rank: float
     """exp of the entropy of the spectrum of E[ΔΔᵀ]: effective number of directions of the moves."""

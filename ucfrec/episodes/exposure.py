@@ -209,6 +209,15 @@ class Likeness(nn.Module):
         # Index −1 reads the column of zeros.
         return _read(nn.functional.pad(profile, (0, 1)), self.tags[items[:, 0]]).sum(1)
 
+    def to_candidates(self, profile: Tensor, items: Tensor) -> Tensor:
+        """Likeness (M, C) to profiles (M, F) of items (M, C)."""
+        if not self.tags.shape[1]:
+            return torch.einsum("mf,mcf->mc", profile, self.directions[items])
+        tags = self.tags[items]
+        places = torch.where(tags < 0, self._count(), tags)
+        read = nn.functional.pad(profile, (0, 1)).gather(1, places.flatten(1))
+        return read.view(tags.shape).sum(2)
+
     def _tags_of(self, items: Tensor) -> Tensor:
         """The rows (L, n_tags) of `_tag_matrix`; sparse if a product with them is then cheaper."""
         tags, n_tags = self.tags[items], self._count()

@@ -37,7 +37,10 @@ def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
     """
     record = trained.record
     if record.fingerprint == logged.record.fingerprint:
-        return 1.0
+        held_out = np.zeros(logged.n_episodes, dtype=bool)
+        if record.refit_of is None:
+            held_out = logged.episode_values(schema.SPLIT) == schema.SPLITS.index("test")
+        return float(logged.lengths[~held_out].sum() / logged.n_steps)
     try:
         store = store_of(trained.folder, record)
     except InputError:

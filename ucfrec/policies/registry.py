@@ -57,13 +57,19 @@ def policy_class(name: str) -> "type[SequencePolicy]":
 
 
 def _checked(name: str, learner: object) -> "type[SequencePolicy]":
-    from ucfrec.policies.base import PolicyConfig, SequencePolicy
+    from ucfrec.policies.base import RESERVED, PolicyConfig, SequencePolicy
     from ucfrec.settings import is_table
 
     if not (isinstance(learner, type) and issubclass(learner, SequencePolicy)):
         raise InputError(
             f"the policy {name!r} is installed as {learner!r}, which is not a class derived from "
             "ucfrec.policies.base.SequencePolicy"
+        )
+    own = learner.__mro__[: learner.__mro__.index(SequencePolicy)]
+    if taken := sorted(RESERVED.intersection(n for each in own for n in vars(each))):
+        raise InputError(
+            f"the policy {name!r} defines {', '.join(taken)}, which "
+            "ucfrec.policies.base.SequencePolicy keeps for itself; choose another name"
         )
     if not (issubclass(learner.Config, PolicyConfig) and is_table(learner.Config)):
         raise InputError(

@@ -44,7 +44,7 @@ class QueryGraph:
                 own or cannot be exported, or what the graph gives differs from torch's.
         """
         require_installed()
-        if not scorer.has_factors:
+        if not scorer.is_product:
             raise InputError(
                 f"policies of kind {kind!r} score items in a way of their own, which onnxruntime "
                 f"cannot compute; {_REMEDY}"

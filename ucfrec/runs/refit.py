@@ -11,6 +11,7 @@ from ucfrec.runs.config import Config
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import INPUTS, REWARD_MODEL, RULE, TrainedPolicy
+from ucfrec.user_model.model import SESSIONS
 from ucfrec.user_model.reward_fit import refit_item_reward_model
 
 
@@ -53,6 +54,8 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
     shutil.copyfile(first / RULE, out / RULE)
     if trained.reward_model is not None:
         refit_item_reward_model(first / REWARD_MODEL, store, out / REWARD_MODEL, record.seed)
+        if (first / REWARD_MODEL / SESSIONS).exists():
+            shutil.copyfile(first / REWARD_MODEL / SESSIONS, out / REWARD_MODEL / SESSIONS)
     return record.sealed(out)
 
 

@@ -24,6 +24,7 @@ from ucfrec.fitting import distributed
 from ucfrec.fitting.loop import Fit
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
+from ucfrec.policies.checks import require_sound
 from ucfrec.runs.config import Config
 from ucfrec.runs.policy_fit import fit_policy
 from ucfrec.runs.record import RUN, RuleRecord, RunRecord, read_augmentation
@@ -134,6 +135,7 @@ def _prepare_inputs(
         require_startable(store, train, out, config)
     policy = new_policy(train, config)
     if distributed.leads():
+        require_sound(policy, train, config.policy_name)
         if not (out / RUN).exists():
             begin(store, train, validation, out, config, about)
         RunRecord.read(out).reopened(out, INPUTS)
@@ -196,8 +198,9 @@ def _train_policy(
 def _fit_user_model(run: _Inputs) -> UserModel:
     """Fit what users would do: the reward of every item, session ends and fatigue."""
     inputs = _dependencies(run.logged, run.held_out, run.config.seed, torch.device("cpu"))
-    folder = run.out / REWARD_MODEL
-    fit = partial(UserModel.fit, run.logged, run.held_out, folder, run.config.seed)
+    inputs["simulated"] = simulated = run.record.return_to_go.per_session
+    given = run.logged, run.held_out, run.out / REWARD_MODEL, run.config.seed
+    fit = partial(UserModel.fit, *given, simulated)
     run.shared.provide(inputs, UserModel.__module__, run.out, (REWARD_MODEL,), fit)
     return fit()  # read from the folder
 
@@ -205,7 +208,7 @@ def _fit_user_model(run: _Inputs) -> UserModel:
 def _choose_rule(run: _Inputs, users: UserModel) -> RuleRecord:
     """Choose the decision rule: by simulation in the user model, or by ranking."""
     trained = TrainedPolicy.load(run.out, in_training=True)
-    parts = trained.item_states, trained.returns, users.reward
+    parts = trained.item_states, trained.returns, users.reward, users.session_end
     scorer = Scorer(run.policy, trained.rule, *parts)
     config = run.config.rule
     targets = {quantile: trained.target_return(quantile) for quantile in config.quantiles}

@@ -28,7 +28,9 @@ from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
 from ucfrec.runs.record import RunRecord, read_record
+from ucfrec.user_model.model import load_session_end
 from ucfrec.user_model.reward import FITTED, ItemRewardModel
+from ucfrec.user_model.session_end import SessionEnd
 
 RUN, AUGMENTATION = RunRecord.FILE, "augmentation.json"
 ITEMS, USERS = "items.parquet", "users.parquet"
@@ -65,6 +67,8 @@ class TrainedPolicy:
     none."""
     counts: TrainingCounts | None = None
     """Item counts of the training steps; None if actions are vectors or the run lacks the file."""
+    session_end: SessionEnd | None = None
+    """When users leave, for decision rules with a lookahead; None if the run fitted none."""
 
     @classmethod
     def load(
@@ -93,7 +97,8 @@ class TrainedPolicy:
         with random_state_kept():
             policy = load_module(path, build, load_trained(path))
         policy.eval()
-        states = run / ITEM_STATES
+        states, folder = run / ITEM_STATES, run / REWARD_MODEL
+        reward_model = _reward_model(folder / FITTED, record.sizes)
         trained = cls(
             run,
             policy,
@@ -103,8 +108,9 @@ class TrainedPolicy:
             _ids(run / USERS, schema.USER_ID),
             _returns(run / RETURNS),
             _rule(run / RULE),
-            _reward_model(run / REWARD_MODEL / FITTED, record.sizes),
+            reward_model,
             TrainingCounts.load(run / COUNTS) if (run / COUNTS).exists() else None,
+            load_session_end(folder, reward_model),
         )
         trained._require_equal_sizes()
         return trained
@@ -208,7 +214,8 @@ class TrainedPolicy:
             # The one before goes first, for its memory.
             self._kept.clear()
             self._kept["scorer"] = Scorer(
-                self.policy, rule or self.rule, self.item_states, self.returns, self.reward_model
+                *(self.policy, rule or self.rule, self.item_states, self.returns),
+                *(self.reward_model, self.session_end),
             )
             self._kept["weights"] = weights
         kept: Scorer = self._kept["scorer"]

@@ -20,10 +20,10 @@ from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_fit import fit_item_reward_model
 from ucfrec.user_model.reward_report import ItemRewardReport, calibrate
 from ucfrec.user_model.reward_rows import RewardRows
-from ucfrec.user_model.session_end import LoggedEnds, SessionEnd
+from ucfrec.user_model.session_end import LoggedEnds, SessionEnd, SessionEndReport
 from ucfrec.user_model.training_users import TrainingUsers, fit_training_users
 
-_SESSIONS: Final = "sessions.safetensors"
+SESSIONS: Final = "sessions.safetensors"
 """File of session ends, fatigue and calibration in the model's folder."""
 _MOST_STEPS: Final = 100_000
 """Logged steps that session ends, fatigue and calibration are fitted to at most."""
@@ -38,18 +38,24 @@ class UserModel:
     reward_report: ItemRewardReport
     """Its quality on validation rows."""
     training_users: TrainingUsers | None
-    """Where users are new: training users, whose tastes give the rewards of simulated sessions, and
-    nothing that acts knows them."""
+    """Users with fixed tastes, who reward what simulated sessions show; nothing that acts learns of
+    them but by their rewards. None where no sessions are simulated."""
     calibration: tuple[float, float]
     """Slope and intercept of the scores that rewards are drawn from, on held-out rows."""
     session_end: SessionEnd
+    session_end_report: SessionEndReport
     fatigue: Fatigue | None
     """None if the log shows none."""
     main_tags: MainTags
 
     @classmethod
     def fit(
-        cls, train: EpisodeStore, validation: EpisodeStore, folder: Path, seed: int
+        cls,
+        train: EpisodeStore,
+        validation: EpisodeStore,
+        folder: Path,
+        seed: int,
+        simulated: bool = True,
     ) -> "UserModel":
         """Fit the parts that are not in `folder` yet; read the others.
 
@@ -58,6 +64,7 @@ class UserModel:
             validation: held-out episodes of the same store.
             folder: receives the fitted parts.
             seed: of rows drawn from large logs.
+            simulated: whether sessions will be simulated.
 
         Raises:
             InputError: all training rewards are equal, there are no held-out steps, or a file is
@@ -65,28 +72,33 @@ class UserModel:
         """
         require_blas_memory()
         reward, report = fit_item_reward_model(train, validation, folder, seed)
-        users = fit_training_users(train, folder, seed) if report.new_users else None
-        tags, path = MainTags.of(validation.item_states), folder / _SESSIONS
+        users = fit_training_users(train, folder, seed) if simulated and train.has_users else None
+        tags, path = MainTags.of(validation.item_states), folder / SESSIONS
         if not path.exists():
             runs = (LoggedRuns.of(v, tags, reward.lags, _MOST_STEPS) for v in (train, validation))
             tired = fit_fatigue(*runs) if reward.binary else None
-            ends = LoggedEnds.of(train, reward.lags, _MOST_STEPS, seed)
-            if users is None:
+            logged, held_out = (
+                LoggedEnds.of(view, reward.lags, _MOST_STEPS, seed) for view in (train, validation)
+            )
+            end, end_report = SessionEnd.fit(reward.likeness, logged, held_out, seed)
+            line = users.report.calibration if users else (1.0, 0.0)
+            if users is None or not report.new_users:
                 rows = RewardRows.of(validation, reward.reach, _MOST_STEPS, seed)
-                line = calibrate(reward, rows)
-            else:
-                line = users.report.calibration
+                line = calibrate(users.model if users else reward, rows)
             fitted = {
                 "fatigue": None if tired is None else dataclasses.asdict(tired),
                 "calibration": line,
+                "session_end": dataclasses.asdict(end_report),
             }
-            save_tensors(path, dict(SessionEnd.fit(reward.likeness, ends).tensors), fitted)
+            save_tensors(path, dict(end.tensors), fitted)
         tensors, about = load_tensors(path)
         with damage_explained(path, REMEDY):
             slope, intercept = about["calibration"]
             fatigue = None if about["fatigue"] is None else Fatigue(**about["fatigue"])
-        end = SessionEnd(reward.likeness, tensors)
-        return cls(reward, report, users, (slope, intercept), end, fatigue, tags)
+            end_report = SessionEndReport(**about["session_end"])
+            end = SessionEnd.of(reward.likeness, tensors)
+        line = slope, intercept
+        return cls(reward, report, users, line, end, end_report, fatigue, tags)
 
     @property
     def rewarding(self) -> ItemRewardModel:
@@ -119,5 +131,20 @@ class UserModel:
         return {
             "calibration": list(self.calibration),
             "users": None if users is None else dataclasses.asdict(users),
+            "session_end": dataclasses.asdict(self.session_end_report),
             "fatigue": None if self.fatigue is None else dataclasses.asdict(self.fatigue),
         }
+
+
+def load_session_end(folder: Path, reward: ItemRewardModel | None) -> SessionEnd | None:
+    """The model of session ends in the folder of a user model; None if there is none.
+
+    Raises:
+        InputError: its file is damaged.
+    """
+    path = folder / SESSIONS
+    if reward is None or not path.exists():
+        return None
+    tensors, _ = load_tensors(path)
+    with damage_explained(path, REMEDY):
+        return SessionEnd.of(reward.likeness, tensors)

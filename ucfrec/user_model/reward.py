@@ -139,9 +139,9 @@ class ItemRewardModel(nn.Module):
 
     def expected(self, scores: Tensor) -> Tensor:
         """Expected rewards, in reward units, of linear predictors of any shape."""
-        if bool(self.binary):
-            return self.reward_low + (self.reward_high - self.reward_low) * torch.sigmoid(scores)
-        return self.reward_mean + self.reward_std * scores
+        span = self.reward_high - self.reward_low
+        likely = self.reward_low + span * torch.sigmoid(scores)
+        return torch.where(self.binary, likely, self.reward_mean + self.reward_std * scores)
 
     @torch.no_grad()
     def set_effects(
@@ -156,6 +156,8 @@ class ItemRewardModel(nn.Module):
         for name in ("user", "affinity", "state", "interaction", "exposure"):
             buffer = self.get_buffer(name)
             buffer.copy_(effects.get(name, torch.zeros(buffer.shape)).view(buffer.shape))
+        if "context" in effects:
+            self.interaction[-len(effects["context"]) :] += effects["context"]
         self.item.copy_(effects["mean"] + effects.get("item", torch.zeros(())))
         if "content" in effects:
             self.item.add_(of_content(effects["content"]))

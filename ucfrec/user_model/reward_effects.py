@@ -13,7 +13,8 @@ from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_rows import RewardRows
 
 EFFECTS: Final = (
-    *("item", "user", "content", "affinity", "tastes", "exposure", "state", "interaction"),
+    *("item", "user", "content", "affinity", "tastes", "exposure"),
+    *("context", "state", "interaction"),
 )
 """In the order in which they are added to the model."""
 _ITERATIONS: Final = 100
@@ -44,6 +45,8 @@ class Design:
     both again, times the earlier item's reward on a scale from 0 to 1."""
     target: Tensor
     """(M,): 1 for the higher of two rewards and 0 for the lower, or standardised rewards."""
+    observed: Tensor
+    """(M, O) the last of `x`: the observations."""
     vectors: Tensor
     """(n_items, D) centred embeddings of all items."""
     rows: Tensor
@@ -65,11 +68,13 @@ class Design:
         """The design of `rows`, with the statistics of `model`; without `weights` all count one."""
         likeness, last = model.likeness, len(model.user) - 1
         n_tags = int(likeness.n_tags)
+        x = model.standardised(rows.states)
         known = (rows.users >= 0) & (rows.users < last)
         return cls(
             items=rows.items,
             users=torch.where(known, rows.users, last),
-            x=model.standardised(rows.states),
+            x=x,
+            observed=x[:, x.shape[1] - rows.observations :],
             exposure=_exposure(model, rows),
             target=model.target(rows.rewards),
             vectors=model.vectors,
@@ -89,6 +94,7 @@ class Design:
             items=self.items[rows],
             users=self.users[rows],
             x=self.x[rows],
+            observed=self.observed[rows],
             exposure=self.exposure[rows],
             target=self.target[rows],
             rows=self.rows[rows],
@@ -113,6 +119,7 @@ class Design:
             "exposure": (self.exposure.shape[1],),
             "state": (state,),
             "interaction": (state, dim),
+            "context": (self.observed.shape[1], dim),
         }
         return torch.zeros(shapes[name])
 
@@ -135,6 +142,8 @@ class Design:
             total = total + (F.embedding(self.users, effects["affinity"]) * self.rows).sum(1)
         if "interaction" in effects:
             total = total + ((self.x @ effects["interaction"]) * self.rows).sum(1)
+        if "context" in effects:
+            total = total + ((self.observed @ effects["context"]) * self.rows).sum(1)
         return total
 
     def of_content(self, content: Tensor) -> Tensor:
@@ -160,6 +169,8 @@ class Design:
                 return torch.cat([counts[: self.n_tags], vectors.sum(0)])
             case "affinity":
                 return sums.index_add(0, self.users, vectors)
+            case "context":
+                return self.observed.square().T @ vectors
             case "tastes":
                 return (self.weights * self.tastes.square()).sum()
             case "exposure":
@@ -309,11 +320,12 @@ def _units(design: Design, name: str, curvature: float, penalty: float) -> _Unit
         inputs = design.x if name == "state" else design.exposure
         factor, inverse = _factors(curvature * _moments(design, inputs), penalty)
         return _Units(lambda numbers: inverse @ numbers, lambda effect: factor @ effect)
-    if name == "interaction":
+    if name in ("context", "interaction"):
+        x = design.observed if name == "context" else design.x
         # The curvature is about a Kronecker product of two second moments, each with a part of the
         # penalty.
         scale = (curvature / design.count) ** 0.5
-        of_states, of_items = (scale * _moments(design, rows) for rows in (design.x, design.rows))
+        of_states, of_items = (scale * _moments(design, rows) for rows in (x, design.rows))
         ratio = float(of_states.diagonal().mean() / of_items.diagonal().mean())
         left, left_inverse = _factors(of_states, (penalty * ratio) ** 0.5)
         right, right_inverse = _factors(of_items, (penalty / ratio) ** 0.5)

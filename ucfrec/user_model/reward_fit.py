@@ -214,8 +214,8 @@ class EffectSearch:
         """Add the effect `name` with the best spread, if it lowers the held-out loss."""
         if name == "tastes" and self._root is not None:
             self._scale_tastes(self._root)
-        nobody = bool((self.design.users == self.design.n_users).all())
-        if not self.design.squares(name).any() or (nobody and name in ("user", "affinity")):
+        no_one = bool((self.design.users == self.design.n_users).all())
+        if not self.design.squares(name).any() or (no_one and name in ("user", "affinity")):
             return
         at, (effects, losses) = self._best(name, _FIRST, _STRIDES.get(name, (2,)))
         decrease = self.losses - losses

@@ -28,6 +28,8 @@ class RewardRows:
     """(M, S) float32 states before the step."""
     rewards: Tensor
     """(M,) float32, in reward units."""
+    observations: int
+    """O, the last numbers of the states: what was observed beside the session itself."""
 
     def __len__(self) -> int:
         return len(self.items)
@@ -59,6 +61,7 @@ class RewardRows:
             _shown(view, episodes, steps, lags),
             states,
             torch.from_numpy(view.step_values(schema.REWARD, episodes, steps)),
+            view.observation_size,
         )
 
 

@@ -1,23 +1,38 @@
 """When users leave: the probability that a session ends with a step, fitted to logged steps."""
 
+import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import torch
+from pydantic.dataclasses import dataclass
 from torch import Tensor
+from torch.nn import functional as F
 
 from ucfrec import schema
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.episodes.exposure import Likeness, Shown
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.user_model.reward_report import SAVED
+from ucfrec.user_model.trees import BoostedTrees
 
 _PENALTY: Final = 1.0
 """L2 penalty of the logistic regression on standardised inputs."""
+_LAGS: Final = 6
+"""Items shown before whose likeness counts."""
+_REWARD: Final = 3
+"""Number of the input that is the step's reward."""
+_REMEMBERED: Final = 10
+"""Items shown before that are compared with the item."""
+_FEWEST: Final = 20
+"""Fewest steps that end a session, and that do not, from which more than their share is told."""
+_LOGISTIC: Final = ("mean", "scale", "weights", "bias")
+_MOST: Final = 20.0
+"""Largest log-odds against what happened that count, so that no single step decides."""
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class LoggedEnds:
     """Logged steps, what was shown before each, and whether it ended its session."""
 
@@ -57,60 +72,160 @@ class LoggedEnds:
         return cls(Shown.before_last(window), window.actions[:, -1], rewards, steps, ended)
 
 
-@dataclass(frozen=True)
-class SessionEnd:
-    """A logistic regression of whether a session ends with a step.
+@dataclass(frozen=True, config=SAVED)
+class SessionEndReport:
+    """How well session ends are predicted."""
 
-    Inputs are the number of the step, its reward, and how often and how alike the item was shown in
-    the last 1, 3 and all of the steps before.
+    rows: int
+    """Number of training steps fitted to."""
+    validation_rows: int
+    """Number of held-out steps."""
+    loss: Mapping[str, float]
+    """Held-out log loss (nats) of each kind of model: `constant`, `logistic` and `boosted`."""
+    gain: Mapping[str, tuple[float, float]]
+    """By how much it is below that of the kind that would be kept otherwise, and the standard
+    error."""
+    kept: str
+    """The kind that is kept: each must lower the loss of simpler ones by more than the error."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SessionEnd:
+    """The probability that a session ends with a step.
+
+    A constant, a logistic regression, or boosted trees, of the number of the step, its reward, how
+    alike its item is to each of the last six, the largest of these over the last 2, 3 and 4, and
+    how often the item was shown in the last 1, 3 and 10.
     """
 
     likeness: Likeness
     tensors: Mapping[str, Tensor]
-    """float64 `mean` and `scale` (F,) of the inputs, and `weights` (F,) and `bias` ()."""
+    """Those of `BoostedTrees`; or `mean` and `scale` (F,) of the inputs, `weights` (F,) and `bias`
+    (), all float64."""
+    uses_rewards: bool = dataclasses.field(init=False)
+    """Whether the reward of the step counts."""
+    _trees: BoostedTrees | None = dataclasses.field(init=False)
 
     @classmethod
-    def fit(cls, likeness: Likeness, logged: LoggedEnds) -> "SessionEnd":
-        """Fit the regression; where all steps end sessions or none does, that is the model."""
-        from sklearn.linear_model import LogisticRegression
+    def fit(
+        cls, likeness: Likeness, logged: LoggedEnds, held_out: LoggedEnds, seed: int
+    ) -> tuple["SessionEnd", SessionEndReport]:
+        """Fit every kind to logged steps, and keep the best on held-out ones."""
+        inputs, ended = _inputs(likeness, logged), logged.ended
+        kinds = {"constant": _logistic(inputs, ended, weights=False)}
+        if _FEWEST <= ended.sum() <= len(ended) - _FEWEST:
+            kinds["logistic"] = _logistic(inputs, ended)
+            kinds["boosted"] = BoostedTrees.fit(inputs.numpy(), ended, seed).tensors()
+        target, models = torch.from_numpy(held_out.ended), {}
+        given, losses = _inputs(likeness, held_out), dict[str, Tensor]()
+        gains, kept = dict[str, tuple[float, float]](), "constant"
+        for kind, tensors in kinds.items():
+            models[kind] = cls(likeness, tensors)
+            scores = models[kind]._log_odds(given)
+            losses[kind] = F.softplus(torch.where(target, -scores, scores).clamp(max=_MOST))
+            decrease = losses[kept] - losses[kind]
+            error = float(decrease.std(correction=0)) / max(1, len(decrease)) ** 0.5
+            gains[kind] = float(decrease.mean()) if len(decrease) else 0.0, error
+            if gains[kind][0] > error:
+                kept = kind
+        means = {kind: float(each.mean()) if len(each) else 0.0 for kind, each in losses.items()}
+        report = SessionEndReport(len(ended), len(target), means, gains, kept)
+        return models[kept], report
 
-        inputs = _inputs(likeness, *_given(logged))
-        mean, weights = np.zeros(inputs.shape[1]), np.zeros(inputs.shape[1])
-        scale, bias = (
-            np.ones(inputs.shape[1]),
-            np.full(1, np.inf if logged.ended.any() else -np.inf),
-        )
-        if logged.ended.any() and not logged.ended.all():
-            mean, spread = inputs.mean(0), inputs.std(0)
-            scale = np.where(spread > 0, spread, 1.0)
-            model = LogisticRegression(C=1 / _PENALTY, max_iter=1000)
-            model.fit((inputs - mean) / scale, logged.ended)
-            weights, bias = model.coef_[0], model.intercept_
-        fitted = {"mean": mean, "scale": scale, "weights": weights, "bias": bias}
-        return cls(likeness, {name: torch.from_numpy(each) for name, each in fitted.items()})
+    @classmethod
+    def of(cls, likeness: Likeness, tensors: Mapping[str, Tensor]) -> "SessionEnd":
+        """From tensors of a file.
+
+        Raises:
+            KeyError: some are missing.
+            ValueError: they are no trees.
+        """
+        if "thresholds" in tensors:
+            return cls(likeness, BoostedTrees.of(tensors).tensors())
+        return cls(likeness, {name: tensors[name] for name in _LOGISTIC})
+
+    def __post_init__(self) -> None:
+        trees = BoostedTrees(**self.tensors) if "thresholds" in self.tensors else None
+        object.__setattr__(self, "_trees", trees)
+        if trees is None:
+            uses = bool(self.tensors["weights"][_REWARD] != 0)
+        else:
+            inner = trees.left != torch.arange(trees.left.shape[1])
+            uses = bool(((trees.inputs == _REWARD) & inner).any())
+        object.__setattr__(self, "uses_rewards", uses)
 
     def probabilities(
         self, shown: Shown, items: Tensor, rewards: Float64Array, steps: IntArray
     ) -> Float64Array:
         """Probabilities (M,) that sessions end with a step; arguments as in `LoggedEnds`."""
-        inputs = torch.from_numpy(_inputs(self.likeness, shown, items, rewards, steps))
-        inputs = (inputs - self.tensors["mean"]) / self.tensors["scale"]
-        return torch.sigmoid(inputs @ self.tensors["weights"] + self.tensors["bias"]).numpy()
+        nothing = np.zeros(len(steps), dtype=bool)
+        inputs = _inputs(self.likeness, LoggedEnds(shown, items, rewards, steps, nothing))
+        return torch.sigmoid(self._log_odds(inputs)).numpy()
+
+    def of_items(self, shown: Shown, items: Tensor, rewards: Tensor, steps: Tensor) -> Tensor:
+        """Probabilities (B, C) that sessions end if they show items.
+
+        Args:
+            shown: what they showed before.
+            items: (B, C) int64.
+            rewards: (B, C) that the items would be given.
+            steps: (B,) number of the step.
+        """
+        alike = [
+            self.likeness.to_candidates(_profile(self.likeness, shown, lag), items)
+            for lag in range(_LAGS)
+        ]
+        repeated = shown.items.unsqueeze(2) == items.unsqueeze(1)
+        inputs = _columns(torch.stack(alike, 1), repeated, rewards, steps.unsqueeze(1))
+        return torch.sigmoid(self._log_odds(inputs.flatten(0, 1))).view(-1, items.shape[1])
+
+    def _log_odds(self, inputs: Tensor) -> Tensor:
+        """(M,) from inputs (M, F), float64."""
+        tensors = self.tensors
+        if self._trees is not None:
+            return self._trees(inputs)
+        standard = (inputs - tensors["mean"]) / tensors["scale"]
+        return standard @ tensors["weights"] + tensors["bias"]
 
 
-def _given(logged: LoggedEnds) -> tuple[Shown, Tensor, Float64Array, IntArray]:
-    return logged.shown, logged.items, logged.rewards, logged.steps
+def _logistic(inputs: Tensor, ended: BoolArray, weights: bool = True) -> dict[str, Tensor]:
+    """Tensors of a logistic regression; without `weights`, of its bias alone."""
+    from sklearn.linear_model import LogisticRegression
+
+    rate, zeros = float(ended.mean()) if len(ended) else 0.0, torch.zeros_like(inputs[:0].sum(0))
+    if not weights:
+        bias = torch.logit(torch.tensor(rate).double())
+        return {"mean": zeros, "scale": zeros + 1, "weights": zeros.clone(), "bias": bias}
+    mean, spread = inputs.mean(0), inputs.std(0, correction=0)
+    scale = torch.where(spread > 0, spread, 1.0)
+    model = LogisticRegression(C=1 / _PENALTY, max_iter=1000)
+    model.fit(((inputs - mean) / scale).numpy(), ended)
+    fitted = {
+        "weights": torch.from_numpy(model.coef_[0]),
+        "bias": torch.tensor(model.intercept_[0]),
+    }
+    return {"mean": mean, "scale": scale, **fitted}
 
 
-def _inputs(
-    likeness: Likeness, shown: Shown, items: Tensor, rewards: Float64Array, steps: IntArray
-) -> Float64Array:
-    columns = [np.log1p(steps), steps, np.minimum(steps, 1), rewards]
-    repeated = (shown.items == items.unsqueeze(1)).double()
-    for reach in (1, 3, shown.items.shape[1]):
-        recent = shown.items.clone()
-        recent[:, reach:] = -1
-        profile = likeness.profile(recent, torch.ones(recent.shape))
-        alike = likeness.to_items(profile, items.unsqueeze(1))
-        columns += [repeated[:, :reach].sum(1).numpy(), alike.numpy(), (alike > 0).numpy()]
-    return np.stack(columns, axis=1).astype(np.float64)
+def _profile(likeness: Likeness, shown: Shown, lag: int) -> Tensor:
+    """(M, F) of the item that was shown `lag` steps before the last one, as `Likeness.profile`."""
+    items = shown.items[:, lag : lag + 1]
+    return likeness.profile(items, torch.ones(items.shape))
+
+
+def _inputs(likeness: Likeness, logged: LoggedEnds) -> Tensor:
+    """(M, F) inputs of logged steps."""
+    shown, items = logged.shown, logged.items.unsqueeze(1)
+    alike = [likeness.to_items(_profile(likeness, shown, lag), items) for lag in range(_LAGS)]
+    rewards, steps = torch.from_numpy(logged.rewards), torch.from_numpy(logged.steps)
+    return _columns(torch.stack(alike, 1), shown.items == items, rewards, steps)
+
+
+def _columns(alike: Tensor, repeated: Tensor, rewards: Tensor, steps: Tensor) -> Tensor:
+    """Inputs (M, ..., F) from likeness (M, 6, ...) and repetition (M, L, ...), the latest first."""
+    numbers = steps.double().expand(rewards.shape)
+    columns = [torch.log1p(numbers), numbers, numbers.clamp(max=1), rewards.double()]
+    columns += [*alike.double().unbind(1)]
+    columns += [alike[:, :reach].amax(1).double() for reach in (2, 3, 4)]
+    columns += [repeated[:, :reach].sum(1).double() for reach in (1, 3, _REMEMBERED)]
+    return torch.stack(columns, -1)

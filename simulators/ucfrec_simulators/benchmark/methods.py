@@ -61,7 +61,9 @@ METHODS: Final[Mapping[str, Method]] = {
 `ucf-wo-count` and `ucf-wo-arch` are Table 3's ablations of `ucf`."""
 COMPONENTS: Final[Mapping[str, Method]] = {
     "ucf-wo-exposure": Method("ucf", ("policy.exposure=false",), vectors=False),
-    "ucf-wo-reward-weight": Method("ucf", ("rule.reward_weights=[0]",), vectors=False),
+    "ucf-wo-reward-weight": Method(
+        "ucf", ("rule.reward_weights=[0]", "rule.lookaheads=[0]"), vectors=False
+    ),
     "ucf-wo-rule": Method("ucf", ("rule.choose=false",), vectors=False),
     "ucf-weights": Method("ucf", ("policy.advantage_weights=true",)),
     "ucf-max-return": Method("ucf", ("policy.max_return=true",)),

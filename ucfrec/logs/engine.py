@@ -156,7 +156,9 @@ def as_arrow(numbers: IntArray) -> "pa.Array":
 
 def _set_semantics(connection: duckdb.DuckDBPyConnection) -> None:
     """Make expressions mean the same in every connection and on every machine."""
-    connection.execute("SET enable_progress_bar = false")
+    # In Jupyter without ipywidgets it is off already, and cannot be set.
+    if connection.sql("SELECT current_setting('enable_progress_bar')").fetchall() != [(False,)]:
+        connection.execute("SET enable_progress_bar = false")
     # A division by zero is NULL, and so is every comparison with it; infinity would be above every
     # threshold. The logarithm of a negative number is an error, for TRY, instead of NaN.
     connection.execute("SET error_on_division_by_zero = false")

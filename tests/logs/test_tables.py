@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.logs.histories import read_histories
@@ -416,3 +417,31 @@ def test_a_store_in_a_folder_that_is_called_like_a_column_is_read(tmp_path: Path
     report = prepare([path], LogMapping(), tmp_path / "like", SMALL, like=store)
     assert (report["steps"], report["dropped"]["unknown_item"]) == (400, 0)
     assert (EpisodeStore.open(tmp_path / "like").episode_values("user") >= 0).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("policy", ["dt"])
+def test_a_policy_scores_users_of_text_and_of_integers_alike(tmp_path: Path, policy: str) -> None:
+    ids = [*map(str, range(1, 60)), "01"]
+    log, later = make_log(4000, 60, 20_000), make_log(600, 59, 20_000)
+    log["user_id"] = [ids[n] for n in log["user_id"]]
+    write(log, tmp_path / "logs" / "log.parquet")
+    groups = pd.DataFrame({"user_id": ids, "group": [f"g{n % 10}" for n in range(60)]})
+    write(groups, tmp_path / "logs" / "users.parquet")
+    later["user_id"] += 1
+    later["timestamp"] += 4000 * 20_000
+    store, run = str(tmp_path / "store"), str(tmp_path / "run")
+    assert main(["prepare", str(tmp_path / "logs"), "--out", store]) == 0
+    small = ["--set", "train.steps=30", "--set", "policy.dim=16"]
+    assert main(["train", store, "--policy", policy, "--out", run, *small]) == 0
+    scores = []
+    for name, kind in (("integers", int), ("text", str)):
+        path = write(later.astype({"user_id": kind}), tmp_path / f"{name}.parquet")
+        out = tmp_path / f"scores-{name}.parquet"
+        assert main(["score", run, str(path), "--out", str(out)]) == 0
+        scores.append(pd.read_parquet(out).astype({"user_id": str}))
+    order = ["user_id", "timestamp", "item_id"]
+    one, other = (each.sort_values(order, ignore_index=True) for each in scores)
+    pd.testing.assert_frame_equal(
+        one.drop(columns="session"), other.drop(columns="session"), rtol=1e-4
+    )

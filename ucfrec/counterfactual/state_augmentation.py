@@ -80,7 +80,7 @@ class MoveReport:
     """Edges of the bins of ‖Δ‖₂, from 0 to ρ_high."""
     histogram_counts: tuple[int, ...]
     """Number of edits in each bin."""
-    mean_move_ratio: float
+    mean_move_ratio: Undefinable
     """‖mean Δ‖ / mean ‖Δ‖: 1 if all edits are the same shift, near 0 if they are varied."""
     effective_rank: float
     """exp of the entropy of the spectrum of E[ΔΔᵀ]: effective number of directions of the moves."""

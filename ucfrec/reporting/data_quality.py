@@ -18,6 +18,7 @@ _LEVELS = ("0", "0.25", "0.5", "0.75", "0.99", "1")
 _COUNTS = {
     "rows_read": "rows read",
     "unsorted_rows": "rows out of order (sorted)",
+    "equal_times": "rows at equal times (in no order that could be learned)",
     "steps": "steps kept",
     "users": "users",
     "items": "items",
@@ -58,6 +59,7 @@ def data_quality(source: Source) -> DataQuality:
 def _dropped(dropped: Mapping[str, int], read: int) -> Table:
     reasons = {
         **REASONS,
+        "long_session": "its session, or the part of it in one split, is too long",
         "short_episode": "its session, or the part of it in one split, is too short",
     }
     body = [

@@ -95,7 +95,7 @@ class BoostedTrees:
         nodes, reached, depth = self.values.shape[1], torch.zeros_like(self.left[:, :1]), 0
         while depth < nodes and not torch.equal(self.left.gather(1, reached), reached):
             children = [side.gather(1, reached) for side in (self.left, self.right)]
-            reached, depth = torch.cat(children, 1).unique(dim=1), depth + 1
+            reached, depth = torch.unique(torch.cat(children, 1), dim=1), depth + 1
         object.__setattr__(self, "depth", depth)
 
     def __call__(self, inputs: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 # Everything here makes its own environment in .venv; nothing else need be installed but Python.
 PYTHON ?= python3
-# Outside a machine with the CPU wheel at hand, pip finds CPU builds of torch with
+# On Linux, PyPI's torch is the CUDA build; pip finds the CPU build with
 #   make demo PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu"
 PIP_FLAGS ?=
 BIN := .venv/bin

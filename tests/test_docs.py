@@ -1,12 +1,17 @@
 """What the pages say holds: commands parse, code runs, links lead somewhere, the site builds."""
 
+import ast
 import dataclasses
+import importlib.util
 import re
 import subprocess
 import sys
 import tomllib
+from configparser import RawConfigParser
 from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
+from xml.etree import ElementTree
 
 import pytest
 
@@ -18,15 +23,29 @@ REPOSITORY = [
     Page(name)
     for name in (
         "README.md",
+        "CHANGELOG.md",
         "CONTRIBUTING.md",
+        "SECURITY.md",
         "datasets/README.md",
         "simulators/README.md",
         "control/README.md",
     )
 ]
 PAGES = [*REPOSITORY, *SITE]
+GENERATED = {"docs/tables.md", "docs/log.md"}
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 NAV = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").split("\nnav:")[1].split("\n\n")[0]
+NOTEBOOKS = re.compile(r"^docs/tutorials/(\w+)\.md$")
+
+
+def _script(name: str) -> ModuleType:
+    """A Python file of `docs/`, which is no package."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.mark.parametrize(
@@ -38,21 +57,38 @@ def test_the_commands_parse(page: str, command: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("page", "code"), [(page.name, code) for page in PAGES[1:] for code in page.code("python")]
+    ("page", "code"),
+    [
+        (page.name, code)
+        for page in PAGES[1:]
+        for code in page.code("python")
+        if not code.startswith("--8<--")  # a file with tests of its own
+    ],
 )
 def test_the_python_code_runs(page: str, code: str, tmp_path: Path) -> None:
-    if code.startswith("--8<--"):
-        pytest.skip("an example; test_examples.py runs it")
     ran = run_python(code, tmp_path)
     assert ran.returncode == 0, ran.stderr
 
 
+@pytest.mark.parametrize(
+    ("page", "code"), [(page.name, code) for page in PAGES for code in page.code("toml")]
+)
+def test_the_toml_is_toml(page: str, code: str) -> None:
+    assert tomllib.loads(code)
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_its_links_lead_somewhere(page: Page) -> None:
+def test_its_links_and_pictures_exist(page: Page) -> None:
     for link in page.links():
         path, _, fragment = link.partition("#")
         target = (ROOT / page.name).parent / path if path else ROOT / page.name
+        notebook = NOTEBOOKS.match(str(target.resolve().relative_to(ROOT)))
+        if notebook:  # `docs/notebooks.py` makes this page
+            assert (ROOT / "examples" / f"{notebook[1]}.ipynb").is_file(), link
+            continue
         assert target.exists(), link
+        if target.suffix == ".svg":
+            ElementTree.parse(target)
         if fragment:
             assert fragment in anchors(_whole(target)), link
 
@@ -72,28 +108,37 @@ def test_lines_are_short(page: Page) -> None:
     assert [n for n, line in lines if len(line) > 100 and not line.startswith("|")] == []
 
 
-def test_every_page_is_in_the_navigation() -> None:
-    for page in SITE:
-        assert f" {page.name.removeprefix('docs/')}\n" in NAV + "\n", page.name
+@pytest.mark.parametrize("page", SITE, ids=lambda page: page.name)
+def test_a_page_is_short_and_in_the_navigation(page: Page) -> None:
+    if page.name not in GENERATED:
+        assert len(page.text.splitlines()) <= 150
+    assert f" {page.name.removeprefix('docs/')}\n" in NAV + "\n", page.name
 
 
-def test_the_settings_page_has_every_table() -> None:
+def test_the_settings_reference_has_every_table() -> None:
     config = resolve_config("ucf")
     tables = [f.name for f in dataclasses.fields(config)]
     tables = [name for name in tables if dataclasses.is_dataclass(getattr(config, name))]
     assert len(tables) == 6
-    assert anchors(Page("docs/settings.md").text) >= set(tables)
+    assert anchors(Page("docs/settings-reference.md").text) >= set(tables)
 
 
-def test_every_known_dataset_has_its_section() -> None:
-    known = set(PROJECT["entry-points"]["ucfrec.datasets"])
-    assert anchors(Page("docs/datasets.md").text) >= known
+def test_every_supported_dataset_has_its_section() -> None:
+    supported = set(PROJECT["entry-points"]["ucfrec.datasets"])
+    assert anchors(Page("docs/datasets.md").text) >= supported
 
 
-def test_every_known_simulator_is_named() -> None:
+def test_every_simulator_is_named() -> None:
     text = Page("docs/simulators.md").text
     for name in PROJECT["entry-points"]["ucfrec.simulators"]:
-        assert f"`{name.removesuffix('-on')}`" in text, name
+        stem = re.sub(r"(-on|-n[14](-nx0)?)$", "", name)
+        assert f"`{stem}`" in text, name
+
+
+def test_every_extra_is_in_the_quickstart() -> None:
+    text = Page("docs/quickstart.md").text
+    for extra in set(PROJECT["optional-dependencies"]) - {"dev", "docs"}:
+        assert f"`{extra}`" in text, extra
 
 
 def test_extras_that_the_pages_name_exist() -> None:
@@ -101,6 +146,49 @@ def test_extras_that_the_pages_name_exist() -> None:
     extras = {extra for group in named for extra in group.split(",")}
     assert extras
     assert extras <= set(PROJECT["optional-dependencies"])
+
+
+def test_every_metric_of_a_result_is_defined() -> None:
+    from ucfrec.evaluation.ranking import MEASURES
+
+    text = Page("docs/numbers.md").text
+    for name in MEASURES:
+        assert f"`{name}`" in text, name
+
+
+def _messages() -> str:
+    """Every text of the source, with … for what a format string fills in."""
+    texts = []
+    for package in ("ucfrec", "datasets", "simulators", "control"):
+        for file in (ROOT / package).rglob("*.py"):
+            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.JoinedStr):
+                    parts = [v.value if isinstance(v, ast.Constant) else "…" for v in node.values]
+                    texts.append("".join(map(str, parts)))
+                elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                    texts.append(node.value)
+    return "\n".join(texts)
+
+
+def test_the_messages_of_troubleshooting_exist() -> None:
+    source = _messages()
+    rows = [line for line in Page("docs/troubleshooting.md").text.splitlines() if line[:3] == "| `"]
+    rows += [row for row in Page("docs/troubleshooting.md").text.splitlines() if ": `" in row[:20]]
+    shown = [re.findall(r"`([^`]+)`", row)[0] for row in rows]
+    assert len(shown) > 20
+    for message in shown:
+        if message.startswith("No matching distribution"):  # pip's
+            continue
+        parts = [part.strip(" ;,()'") for part in re.split(r"…|'\w*'|\w+_id\b|=\.\.\.", message)]
+        for part in parts:
+            assert part in source, (message, part)
+
+
+def test_the_pictures_are_drawn_from_the_tables() -> None:
+    charts = _script("charts")
+    for name, text in charts.pictures().items():
+        found = (ROOT / "docs" / "assets" / name).read_text(encoding="utf-8")
+        assert found == text, f"{name}: run python docs/charts.py"
 
 
 def test_the_page_of_tables_is_what_the_rows_say() -> None:
@@ -115,6 +203,44 @@ def test_the_page_of_tables_rounds_to_three_digits() -> None:
     numbers = re.findall(r"(?<![\w.])\d+\.\d+(?:e[-+]\d+)?", cells)
     assert len(numbers) > 1000
     assert [each for each in numbers if len(re.sub(r"^[0.]+|\.", "", each)) > 3] == []
+
+
+def test_the_dockerfile_is_sound() -> None:
+    text = (ROOT / "deploy" / "Dockerfile").read_text(encoding="utf-8").replace("\\\n", " ")
+    lines = [line for line in text.splitlines() if line and not line.startswith("#")]
+    steps = [line.strip().split(" ", 1) for line in lines]
+    known = {"FROM", "WORKDIR", "COPY", "RUN", "USER", "EXPOSE", "HEALTHCHECK", "ENTRYPOINT", "CMD"}
+    assert {name for name, _ in steps} <= known
+    final = steps[max(n for n, (name, _) in enumerate(steps) if name == "FROM") :]
+    assert [rest for name, rest in final if name == "USER"] == ["ucfrec"]  # not root
+    lowest = PROJECT["requires-python"].removeprefix(">=").split(",")[0]
+    images = {rest.split()[0] for name, rest in steps if name == "FROM"}
+    assert images == {f"python:{lowest}-slim"}
+    (command,) = (ast.literal_eval(rest) for name, rest in final if name == "CMD")
+    parse(" ".join(["ucfrec", *command]))
+
+
+def test_the_systemd_units_are_sound() -> None:
+    for name, section in {"ucfrec.service": "Service", "ucfrec-retrain.timer": "Timer"}.items():
+        unit = RawConfigParser(strict=True)
+        unit.optionxform = str  # type: ignore[assignment, method-assign]
+        unit.read_string((ROOT / "deploy" / name).read_text(encoding="utf-8"))
+        assert unit.has_section(section)
+        if section == "Service":
+            program, *words = unit["Service"]["ExecStart"].split()
+            parse(" ".join([Path(program).name, *words]))
+            assert unit["Service"]["NoNewPrivileges"] == "true"
+            assert unit["Service"]["User"] != "root"
+
+
+def test_the_retraining_script_calls_commands_that_exist() -> None:
+    script = ROOT / "deploy" / "retrain.sh"
+    assert subprocess.run(["bash", "-n", str(script)], check=False).returncode == 0
+    text = script.read_text(encoding="utf-8").replace('"${training[@]}"', "a.parquet b.parquet")
+    commands = [line for line in text.splitlines() if line.startswith("ucfrec ")]
+    assert len(commands) == 4
+    for command in commands:
+        parse(command)
 
 
 @pytest.mark.skipif(find_spec("mkdocs") is None, reason="mkdocs is not installed; make docs")

@@ -38,6 +38,7 @@ ORDER = (
 TESTED_HERE = {
     "tests/control/test_authors_networks.py",
     "tests/control/test_settings.py",
+    "tests/logs/test_fuzzed_logs.py",
     "tests/policies/test_baselines.py",
     "tests/policies/test_known_answers.py",
     "tests/reporting/test_page_items.py",
@@ -48,6 +49,7 @@ TESTED_HERE = {
     "tests/test_packaging.py",
     "tests/test_readme.py",
     "tests/test_start.py",
+    "tests/test_vocabulary.py",
     "tests/simulators/benchmark/test_benchmark.py",
     "tests/simulators/test_synthetic_environments.py",
 }

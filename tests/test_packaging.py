@@ -1,5 +1,6 @@
 """What is installed: four packages, entry points that load."""
 
+import re
 import subprocess
 import sys
 import tomllib
@@ -73,3 +74,18 @@ def test_the_wheel_holds_four_packages_and_nothing_else(tmp_path: Path) -> None:
         for file in folder.rglob("*.py"):
             assert f"{package}/{file.relative_to(folder).as_posix()}" in names
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
+
+
+def test_every_pin_is_one_that_any_index_may_have() -> None:
+    """Local versions (torch==2.13.0+cpu) are not on PyPI; a plain version admits them."""
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    pins = [line for line in lines if not line.startswith("#")]
+    assert all(re.fullmatch(r"[\w.-]+==[\w.]+", line) for line in pins), pins
+    names = [line.partition("==")[0].lower() for line in pins]
+    assert len(names) == len(set(names)), "a package has one version"
+
+
+def test_the_python_versions_are_said_once() -> None:
+    minors = [int(c.rpartition(".")[2]) for c in PROJECT["classifiers"] if "Python :: 3." in c]
+    assert PROJECT["requires-python"] == f">=3.{minors[0]},<3.{minors[-1] + 1}"
+    assert minors == list(range(minors[0], minors[-1] + 1))

@@ -27,6 +27,31 @@ if __name__ == "__main__":
 """
 
 
+ASCII = {"PYTHONIOENCODING": "ascii"}
+C_LOCALE = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+
+
+@pytest.mark.parametrize("terminal", [ASCII, C_LOCALE], ids=["ascii", "C locale"])
+@pytest.mark.parametrize(
+    ("arguments", "status", "said"),
+    [
+        (["ucfrec", "settings", "--policy", "ucf"], 0, b"?"),
+        (["ucfrec", "prepare", "--help"], 0, b"s3://, ?"),
+        (["ucfrec_control", "--help"], 0, b"usage"),
+        (["ucfrec", "prepare", "caf\u00e9-\u4e2d.parquet", "--validate"], 2, b"does not exist"),
+        (["ucfrec", "prepare", os.fsdecode(b"no-utf8-\xff.csv"), "--validate"], 2, b"no-utf8"),
+    ],
+)
+def test_a_terminal_without_unicode_gets_replacement_characters(
+    terminal: dict[str, str], arguments: list[str], status: int, said: bytes
+) -> None:
+    command = [sys.executable, "-m", *map(os.fsencode, arguments)]
+    ended = subprocess.run(command, env=os.environ | terminal, capture_output=True, timeout=120)
+    assert ended.returncode == status, ended.stderr
+    assert said in ended.stdout + ended.stderr
+    assert (ended.stdout + ended.stderr).isascii()
+
+
 def ended(process: int, seconds: float = 20) -> bool:
     """Whether a process ends in time; one that nobody has waited for yet counts as ended."""
     until = time.monotonic() + seconds

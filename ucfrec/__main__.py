@@ -2,12 +2,13 @@
 
 import sys
 
-from ucfrec.processes import end_at_once_when_interrupted, ignore_interruptions
+from ucfrec.processes import end_at_once_when_interrupted, ignore_interruptions, print_anywhere
 
 
 def main() -> int:
     """Run one `ucfrec` command; returns its exit status, as `ucfrec.commands.cli.main` does."""
     end_at_once_when_interrupted()
+    print_anywhere()
     from ucfrec.commands.cli import main as run
 
     try:

@@ -1,5 +1,6 @@
 """How a process ends: by Ctrl-C or TERM at any moment, and with its parent."""
 
+import io
 import mmap
 import os
 import signal
@@ -40,6 +41,17 @@ def end_at_once_when_interrupted() -> None:
     """
     for number in ENDING:
         signal.signal(number, _end)
+
+
+def print_anywhere() -> None:
+    """From now on stdout and stderr replace characters that their encoding lacks.
+
+    An ASCII terminal, as PYTHONIOENCODING=ascii makes one, or a file name that is no Unicode must
+    not end a command whose work is done.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
 
 
 def ignore_interruptions() -> None:

@@ -14,9 +14,10 @@ import pyarrow.parquet as pq
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.locks import scratch_folder
+from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.logs.clean import REASONS
 from ucfrec.logs.histories import log_table
 from ucfrec.logs.mapping import LogMapping
@@ -115,7 +116,9 @@ class Recommender:
             if out is None:
                 # Whoever fits next removes the run, should this process be killed.
                 out = scratch.enter_context(scratch_folder(temporary, "run")) / "run"
-            train_run(store, Path(out), self.config)
+            record = train_run(store, Path(out), self.config)
+            if warning := record.learned_nothing(read_metrics(Path(out) / "policy")):
+                warnings.warn(InputNote(warning), stacklevel=2)
             write_card(Path(out))
             trained = TrainedPolicy.load(Path(out))
             kept = scratch.pop_all()

@@ -2,12 +2,13 @@
 
 import sys
 
-from ucfrec.processes import end_at_once_when_interrupted, ignore_interruptions
+from ucfrec.processes import end_at_once_when_interrupted, ignore_interruptions, print_anywhere
 
 
 def main() -> int:
     """Run one command; returns its exit status, as `ucfrec.commands.cli.main` does."""
     end_at_once_when_interrupted()
+    print_anywhere()
     from ucfrec_control.cli import main as run
 
     try:

@@ -1,5 +1,6 @@
 """`ucfrec verify` finds damage and says where."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -50,6 +51,18 @@ def test_damage_is_one_line_a_file(made: Path, capsys: pytest.CaptureFixture[str
     ]
     column.write_bytes(before)
     (made / "store" / "mine.txt").unlink()
+
+
+@pytest.mark.parametrize("name", ["a\0b", "\ud800", "a" * 5000, "x\ny"])
+def test_a_listed_name_that_no_file_has_is_a_fault(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    shutil.copytree(made / "store", tmp_path / "store")
+    record = read_json(tmp_path / "store" / "meta.json")
+    record["files"][name] = [1, "00"]
+    write_json(tmp_path / "store" / "meta.json", record)
+    assert main(["verify", str(tmp_path / "store")]) == 2
+    assert "11 of 12 files have the content" in capsys.readouterr().out
 
 
 def test_other_paths(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,6 +15,7 @@ from ucfrec import schema
 from ucfrec.commands.cli import main
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.evaluation import ranking
 from ucfrec.evaluation.ranking import MEASURES, Period, Ranked, Steps, compare, measure, rank_steps
 from ucfrec.evaluation.ranking_baselines import baselines
 from ucfrec.logs.mapping import LogMapping
@@ -110,6 +111,34 @@ def test_planted_taste_is_found_by_those_who_look_at_the_user(store: EpisodeStor
         assert set(row.values) == set(MEASURES)
         for name, (low, high) in row.intervals.items():
             assert low - 1e-9 <= row.values[name] <= high + 1e-9
+
+
+@pytest.mark.parametrize("left", [1, 2, 0])
+def test_the_size_of_the_last_batch_changes_nothing(
+    store: EpisodeStore, monkeypatch: pytest.MonkeyPatch, left: int
+) -> None:
+    train, test = store.split("train"), store.split("test")
+    users = Period.of(test, test.episode_values(schema.USER)).users
+    rankers = baselines(TrainingCounts.of(train), train, seed=0)[1:]  # `random` draws by batch
+    whole = [rank_steps(ranker, test, 10, users) for ranker in rankers]
+    monkeypatch.setattr(ranking, "_STEPS_AT_ONCE", (test.n_steps - left) // 2 or 1)
+    for ranker, expected in zip(rankers, whole, strict=True):
+        found = rank_steps(ranker, test, 10, users)
+        np.testing.assert_array_equal(found.ranks, expected.ranks)
+        assert found.top.shape == (test.n_steps, 10)
+
+
+def test_one_step_is_ranked(store: EpisodeStore) -> None:
+    train, names = store.split("train"), (schema.ITEM, schema.REWARD, schema.TIMESTAMP)
+    one = EpisodeStore.from_arrays(
+        {name: store.column(name)[:1] for name in names},
+        store.lengths[:1] * 0 + 1,
+        episodes={name: store.episode_values(name)[:1] for name in (schema.USER, schema.SPLIT)},
+        item_states=store.item_states,
+    )
+    users = Period.of(one, one.episode_values(schema.USER)).users
+    for ranker in baselines(TrainingCounts.of(train), train, seed=0):
+        assert rank_steps(ranker, one, 10, users).ranks.shape == (1,)
 
 
 def test_nothing_of_the_ranked_step_reaches_a_ranker(store: EpisodeStore) -> None:

@@ -6,15 +6,24 @@ import os
 import signal
 import stat
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ucfrec.errors import InputError
-from ucfrec.files.atomic import atomic_file, atomic_folder, read_json, write_json
+from ucfrec.files.atomic import (
+    atomic_file,
+    atomic_folder,
+    read_json,
+    write_json,
+    write_sealed_json,
+)
 from ucfrec.fitting.checkpoint import save_tensors
 
 
@@ -126,11 +135,17 @@ def test_json_comes_back(tmp_path_factory: pytest.TempPathFactory, value: object
     assert read_json(path) == value
 
 
-def test_numbers_that_are_not_finite_come_back(tmp_path: Path) -> None:
-    write_json(tmp_path / "a.json", {"nan": math.nan, "inf": math.inf})
-    read = read_json(tmp_path / "a.json")
-    assert math.isnan(read["nan"])
-    assert read["inf"] == math.inf
+NOT_FINITE = {"nan": math.nan, "within": [{"inf": (-math.inf, np.float64("nan"))}], "one": 1.5}
+
+
+@pytest.mark.parametrize("write", [write_json, write_sealed_json])
+def test_numbers_that_json_lacks_become_null(
+    tmp_path: Path, write: Callable[[Path, Any], None]
+) -> None:
+    write(tmp_path / "a.json", NOT_FINITE)
+    json.loads((tmp_path / "a.json").read_text(), parse_constant=pytest.fail)
+    expected = {"nan": None, "within": [{"inf": [None, None]}], "one": 1.5}
+    assert read_json(tmp_path / "a.json") == expected
 
 
 def test_a_value_that_is_not_json_leaves_the_old_file(tmp_path: Path) -> None:

@@ -1,7 +1,9 @@
 """Parquet files that claim too much, or hold something else than ids."""
 
+import os
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pandas as pd
 import pyarrow as pa
@@ -9,8 +11,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from ucfrec.errors import InputError
+from ucfrec.evaluation.gymnasium_items import item_table
 from ucfrec.files.parquet import read_ids, require_plausible_rows
 from ucfrec.logs import LogMapping, PrepareOptions, prepare
+from ucfrec.reporting.samples import read_features
 
 
 def test_ids_come_back(tmp_path: Path) -> None:
@@ -18,6 +22,20 @@ def test_ids_come_back(tmp_path: Path) -> None:
         frame = pd.DataFrame({"item_id": pd.Series(ids, dtype=None if ids else "int64")})
         frame.to_parquet(tmp_path / "ids.parquet")
         assert read_ids(tmp_path / "ids.parquet", "item_id").tolist() == ids
+
+
+def test_a_pipe_is_refused_and_not_read(tmp_path: Path) -> None:
+    for name in ("items.parquet", "items.csv", "items.npy"):
+        os.mkfifo(tmp_path / name)
+    with pytest.raises(InputError, match=r"items\.parquet is no regular file"):
+        read_ids(tmp_path / "items.parquet", "item_id")
+    for name in ("items.parquet", "items.csv"):
+        with pytest.raises(InputError, match="is no regular file"):
+            read_features(tmp_path / name)
+    env = gymnasium.make("CartPole-v1")
+    for name in ("items.parquet", "items.npy"):
+        with pytest.raises(InputError, match="is no regular file"):
+            item_table(str(tmp_path / name), env, 2)
 
 
 @pytest.mark.parametrize(

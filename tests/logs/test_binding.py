@@ -177,10 +177,9 @@ def test_later_rows_of_csv_are_not_cut_to_the_type_of_the_first(
 @pytest.mark.parametrize("later", ["u7", "99999999999999999999", "9" * 100_000])
 def test_later_rows_of_csv_of_another_kind_are_named(tmp_path: Path, later: str) -> None:
     path = csv_of(tmp_path, "visit", "1", later)
-    mapping = LogMapping({"session_id": "visit"})
     with pytest.raises(InputError, match=r"log.csv, line 25001: column visit: .*Parquet") as caught:
-        list(read_histories([path], mapping, "1", last=1, session_by="session_id"))
+        list(read_histories([path], LogMapping(), "visit", last=1))
     assert len(str(caught.value)) < 700
-    path = csv_of(tmp_path, "visit", "1", "1.5")
-    with pytest.raises(InputError, match=r"session_id \(visit\) is DOUBLE"):
-        list(read_histories([path], mapping, "1", last=1, session_by="session_id"))
+    # What names a session is text, whatever the first rows look like.
+    mapping = LogMapping({"session_id": "visit"})
+    assert list(read_histories([path], mapping, "1", last=1, session_by="session_id"))

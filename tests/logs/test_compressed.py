@@ -1,14 +1,18 @@
 """Compressed logs that unfold to fill the disk."""
 
 import gzip
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ucfrec.commands.cli import main
+from ucfrec.errors import InputError
 from ucfrec.logs import compressed
 from ucfrec.logs.compressed import require_plausible_size
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.prepare import validate
 
 HEADER = b"user_id,item_id,timestamp,reward\n"
 
@@ -56,3 +60,19 @@ def test_a_log_that_compresses_as_logs_do_passes(
     require_plausible_size(path)
     path.write_bytes(path.read_bytes()[:-40])
     require_plausible_size(path)  # its reader says that it is cut
+
+
+@pytest.mark.parametrize("name", ["log.csv", "log.csv.gz"])
+@pytest.mark.parametrize("place", [0, 5000])
+def test_a_field_of_50_megabytes_is_refused_in_a_second(
+    tmp_path: Path, name: str, place: int
+) -> None:
+    rows = [f"1,{n % 9},{1_700_000_000_000 + n},{n % 2},b" for n in range(6000)]
+    rows[place] += "a" * 50_000_000
+    text = "\n".join(["user_id,item_id,timestamp,reward,x", *rows]).encode()
+    path = tmp_path / name
+    path.write_bytes(gzip.compress(text, 1) if name.endswith(".gz") else text)
+    began = time.process_time()
+    with pytest.raises(InputError, match=rf"line {place + 2:,}: has more than 2,000,000 bytes"):
+        validate([path], LogMapping())
+    assert time.process_time() - began < 1

@@ -20,8 +20,8 @@ from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json
 from ucfrec.logs import FeatureTable, LogMapping, PrepareOptions, prepare, read_histories, validate
-from ucfrec.logs.binding import Table, bind, open_tables
-from ucfrec.logs.engine import engine
+from ucfrec.logs.binding import bind
+from ucfrec.logs.engine import engine, engine_in_memory
 from ucfrec.logs.expressions import (
     COPYING,
     FUNCTIONS,
@@ -30,6 +30,7 @@ from ucfrec.logs.expressions import (
     NotScalarError,
     columns_of,
 )
+from ucfrec.logs.tables import Table, open_tables
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_datasets import kuairand, kuairec, obd
 
@@ -161,7 +162,7 @@ def table(connection: duckdb.DuckDBPyConnection, log: Path) -> Table:
 def test_honest_expressions_are_values_of_a_log(
     connection: duckdb.DuckDBPyConnection, table: Table, text: str
 ) -> None:
-    sql, kind = bind(connection, table, "for the test", text)
+    sql, kind, *_ = bind(connection, table, "for the test", text)
     relation = connection.sql(f"SELECT {sql} AS x FROM log")
     assert [str(found) for found in relation.types] == [kind]
     assert relation.to_arrow_table().shape == (300, 1)
@@ -440,7 +441,7 @@ def test_soup_is_refused_or_is_a_value_of_each_row(
 ) -> None:
     """No other error than InputError, and none of the engine but for values that do not convert."""
     with contextlib.suppress(InputError):
-        sql, _ = bind(connection, table, "for the test", text)
+        sql, *_ = bind(connection, table, "for the test", text)
         with contextlib.suppress(
             duckdb.ConversionException, duckdb.InvalidInputException, duckdb.OutOfRangeException
         ):
@@ -466,5 +467,48 @@ def joined(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
 def test_sums_of_honest_parts_are_accepted(
     connection: duckdb.DuckDBPyConnection, table: Table, text: str
 ) -> None:
-    sql, _ = bind(connection, table, "for the test", text)
+    sql, *_ = bind(connection, table, "for the test", text)
     assert len(connection.sql(f"SELECT TRY({sql}) FROM log").fetchall()) == 300
+
+
+def nested(depth: int, template: str) -> str:
+    given = "a"
+    for _ in range(depth):
+        given = template.format(given)
+    return given
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        nested(8, "string_split({}, '')::VARCHAR"),
+        nested(12, "[{}, '''\\']::VARCHAR"),
+        nested(12, "list_value({})::JSON::VARCHAR"),
+        nested(12, "([{}]->>'$')"),
+        nested(6, "array_to_string(string_split({}, ''), ', and then ')"),
+        nested(4, "concat_ws({}" + ", ''" * 40 + ")"),
+        nested(9, "concat([{}], '')"),
+        "array_to_string(string_split(a, ''), a)",
+        f"array_to_string(string_split(a, ''), '{'x' * 1000}')",
+    ],
+)
+def test_text_cannot_grow_without_bound(text: str) -> None:
+    with engine_in_memory() as connection, pytest.raises(NotScalarError, match=r"text"):
+        columns_of(connection, text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "array_to_string(string_split(a, '|'), ', ')",
+        "concat_ws('-', a, b::VARCHAR, c)",
+        " || ".join(["a::VARCHAR"] * 60),
+        "+".join(["a"] * 90),
+        "CASE WHEN " + " OR ".join(f"a = '{n}'" for n in range(200)) + " THEN 1 END",
+        "coalesce(a->>'$.x', b::JSON->>'$.y')::DOUBLE",
+        "strftime(epoch_ms(a::BIGINT)::TIMESTAMP, '%Y-%m-%d')::VARCHAR || '!'",
+    ],
+)
+def test_what_shops_write_is_not_taken_for_growth(text: str) -> None:
+    with engine_in_memory() as connection:
+        assert "a" in columns_of(connection, text)

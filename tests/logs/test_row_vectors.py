@@ -7,11 +7,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from ucfrec.logs.binding import open_tables
 from ucfrec.logs.engine import engine
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.row_vectors import RowVectors
 from ucfrec.logs.sorted_rows import check_sorted, sorted_batches
+from ucfrec.logs.tables import open_tables
 from ucfrec.logs.typed import typed_log
 
 START = 1_700_000_000_000

@@ -6,11 +6,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ucfrec.logs.binding import open_tables
 from ucfrec.logs.engine import engine
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.sessions import Cut, by_sessions, episodes
 from ucfrec.logs.sorted_rows import check_sorted, sorted_batches
+from ucfrec.logs.tables import open_tables
 from ucfrec.logs.typed import typed_log
 
 START = 1_700_000_000_000

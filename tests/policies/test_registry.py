@@ -1,5 +1,6 @@
 """Learners by name: ucfrec's own, imported when asked for, and those installed beside it."""
 
+import shutil
 import subprocess
 import sys
 from importlib import invalidate_caches
@@ -43,6 +44,21 @@ class Mine(SequencePolicy):
     def features(self, windows):
         return self.net(windows.states)
 
+class Sees(SequencePolicy):
+    def features(self, windows):
+        return windows.actions
+
+class Normalizes(Sees):
+    def normalized(self, windows):
+        return windows
+
+class Values(Sees):
+    def values(self, windows):
+        return None
+
+class FromParent(Normalizes):
+    head = None
+
 class NotOne:
     pass
 
@@ -59,6 +75,10 @@ class Unchecked(SequencePolicy):
 ENTRY_POINTS = """[ucfrec.policies]
 mine = my_learner:Mine
 dt = my_learner:Mine
+sees = my_learner:Sees
+normalizes = my_learner:Normalizes
+values = my_learner:Values
+from-parent = my_learner:FromParent
 not-one = my_learner:NotOne
 odd = my_learner:Odd
 unchecked = my_learner:Unchecked
@@ -89,6 +109,33 @@ def small_store(path: Path) -> EpisodeStore:
         "reward": rng.random(60),
     }
     return EpisodeStore.write(path, columns, np.full(12, 5))
+
+
+def test_the_example_is_installed_and_trained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, site = tmp_path / "plugin", tmp_path / "site"
+    shutil.copytree(Path(__file__).parents[2] / "examples" / "plugin", source)
+    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation"]
+    subprocess.run([*pip, "--no-index", "--target", str(site), str(source)], check=True)
+    monkeypatch.syspath_prepend(str(site))
+    monkeypatch.delitem(sys.modules, "ucfrec_gru", raising=False)
+    invalidate_caches()
+    small_store(tmp_path / "store")
+    command = ["train", str(tmp_path / "store"), "--out", str(tmp_path / "run"), "--policy", "gru"]
+    command += ["--set", "train.steps=60", "--set", "policy.layers=2", "--set", "policy.dim=8"]
+    assert main(command) == 0
+    trained = TrainedPolicy.load(tmp_path / "run")
+    assert (trained.name, type(trained.policy).__module__) == ("gru", "ucfrec_gru")
+
+
+@pytest.mark.usefixtures("installed")
+def test_a_policy_that_reads_the_answer_leaves_no_run(tmp_path: Path) -> None:
+    store = small_store(tmp_path / "store")
+    config = resolve_config("sees", None, ["train.steps=2", "policy.dim=2"])
+    with pytest.raises(InputError, match="the policy 'sees' reads what it is to predict"):
+        train_run(store, tmp_path / "run", config)
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("name", BUILT_IN)
@@ -136,6 +183,9 @@ def test_an_installed_learner_is_trained_listed_and_read_back(
         ("not-one", "not a class derived from ucfrec.policies.base.SequencePolicy"),
         ("odd", "not derived from ucfrec.policies.base.PolicyConfig"),
         ("unchecked", "not derived from .* under @ucfrec.settings.settings_table"),
+        ("normalizes", "defines normalized, which .* keeps for itself"),
+        ("values", "defines values, which .* keeps for itself"),
+        ("from-parent", "defines head, normalized, which .* keeps for itself"),
         ("gone", "my_learner:Gone, which cannot be imported"),
         ("nowhere", "no_such_learner:Mine, which cannot be imported"),
         ("min", "choose from ucf, ucf-paper, dt, .*, mine"),

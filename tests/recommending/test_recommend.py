@@ -351,8 +351,8 @@ WRONG: dict[str, tuple[Callable[[pd.DataFrame], object], str]] = {
         "5 rows: reward is missing, NaN or infinite",
     ),
     "text for times": (
-        lambda log: log.assign(timestamp=log.timestamp.astype(str)),
-        r"timestamp \(timestamp\) is VARCHAR; use milliseconds",
+        lambda log: log.assign(timestamp="noon"),
+        r"timestamp \(timestamp\) is 'noon', no ISO 8601 time nor milliseconds",
     ),
     "text for rewards": (
         lambda log: log.assign(reward="good"),

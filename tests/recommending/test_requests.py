@@ -1,11 +1,13 @@
-"""A wrong request is refused soon, however many faults it has."""
+"""Requests: times in every usual form, identifiers without loss, faults refused soon."""
 
+import json
 import time
 
 import pytest
 
 from ucfrec.errors import InputError
-from ucfrec.recommending.requests import Limits, StreamRequest, parsed
+from ucfrec.recommending.requests import Limits, Request, StreamRequest, parsed
+from ucfrec.recommending.responder import Answer
 
 MANY = b",".join([b"{}"] * 690_000)
 ROW = b'{"item_id": 1, "timestamp": 1.7e12, "observation": '
@@ -28,3 +30,39 @@ def test_two_megabytes_of_faults_are_refused_at_once(entry: bytes, message: str)
     with pytest.raises(InputError, match=message):
         parsed(StreamRequest, text, Limits())
     assert time.process_time() - began < 0.5
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (1_714_557_600_000, 1_714_557_600_000),
+        ("2024-05-01T10:00:00Z", 1_714_557_600_000),
+        ("2024-05-01T12:00:00+02:00", 1_714_557_600_000),
+        ("2024-05-01 10:00:00", 1_714_557_600_000),
+        ("2024-05-01T10:00:00.250", 1_714_557_600_250),
+        ("2024-05-01", 1_714_521_600_000),
+        ("1997-09-01", 873_072_000_000),
+    ],
+)
+@pytest.mark.parametrize("kind", [Request, StreamRequest])
+def test_times_are_milliseconds_or_iso_text(
+    kind: type[Request], given: object, expected: int
+) -> None:
+    rows = [{"item_id": 1, "timestamp": given, "reward": 1}]
+    request = parsed(kind, json.dumps({"user_id": 1, "history": rows}).encode(), Limits())
+    assert request.history[0]["timestamp"] == expected
+
+
+@pytest.mark.parametrize("given", ["soon", "01/05/2024", "2024-13-01", "", "9" * 65])
+def test_other_text_is_no_time(given: str) -> None:
+    rows = [{"item_id": 1, "timestamp": given}]
+    with pytest.raises(InputError, match=r"history.0.timestamp"):
+        parsed(Request, json.dumps({"user_id": 1, "history": rows}).encode(), Limits())
+
+
+def test_integers_that_javascript_would_round_are_text() -> None:
+    largest = 2**53 - 1
+    answer = Answer([largest, largest + 1, -largest - 1, 7, "7"], [0.0] * 5).as_dict(2**60)
+    ids = [each["item_id"] for each in answer["items"]]
+    assert ids == [largest, str(largest + 1), str(-largest - 1), 7, "7"]
+    assert answer["user_id"] == str(2**60)

@@ -1,5 +1,6 @@
 """The server as a process: it verifies the run, listens, and ends its requests before itself."""
 
+import os
 import signal
 import socket
 import subprocess
@@ -7,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -47,9 +48,8 @@ def test_term_ends_it_after_the_requests_in_flight(trained: TrainedPolicy) -> No
         host, port = address.removeprefix("http://").split(":")
         with socket.create_connection((host, int(port)), timeout=60) as slow:
             body = b'{"user_id": 1, "k": 3}'
-            head = (
-                f"POST /recommendations HTTP/1.1\r\nHost: x\r\nContent-Length: {len(body)}\r\n\r\n"
-            )
+            head = f"POST /recommendations HTTP/1.1\r\nHost: {host}\r\n"
+            head += f"Content-Length: {len(body)}\r\n\r\n"
             slow.sendall(head.encode() + body[:5])
             assert httpx.get(f"{address}/health").status_code == 200
             process.send_signal(signal.SIGTERM)
@@ -64,6 +64,112 @@ def test_term_ends_it_after_the_requests_in_flight(trained: TrainedPolicy) -> No
         assert (process.returncode, errors) == (0, "ucfrec serve: stopped\n")
         with pytest.raises(httpx.TransportError):
             httpx.get(f"{address}/health")
+
+
+def answers_of(address: str, *parts: bytes) -> bytes:
+    """What the server sends until it closes the connection."""
+    host, port = address.removeprefix("http://").split(":")
+    answer = b""
+    with socket.create_connection((host, int(port)), timeout=60) as connection:
+        with suppress(ConnectionError):  # it may close before all is sent
+            for part in parts:
+                connection.sendall(part)
+        with suppress(ConnectionError):
+            while block := connection.recv(65536):
+                answer += block
+    return answer
+
+
+def head(*lines: bytes, what: bytes = b"GET /health") -> bytes:
+    return b"\r\n".join([what + b" HTTP/1.1", b"Host: localhost", *lines, b"", b""])
+
+
+CLOSE = b"Connection: close"
+CHUNKED = head(b"Transfer-Encoding: chunked", CLOSE, what=b"POST /recommendations")
+REQUESTS = {
+    "headers within the limits": (head(*[b"a: b"] * 90, CLOSE), b"200"),
+    "too many headers": (head(*[b"a: b"] * 101, CLOSE), b"431"),
+    "a long header": (head(b"a: " + b"b" * 2**17), b"4"),
+    "a header without end": (head(b"a: " + b"b" * 2**20)[:-4], b"4"),
+    "a long address": (head(what=b"GET /" + b"a" * 2**17), b"4"),
+    "trailers without end": (CHUNKED + b"0\r\n" + b"a: b\r\n" * 2**18, b"4"),
+    "no HTTP": (b"\x16\x03\x01" * 100 + b"\r\n\r\n", b"400"),
+    "another host": (head(CLOSE).replace(b"localhost", b"evil.example"), b"400"),
+    "another port": (head(CLOSE).replace(b"localhost", b"localhost:99"), b"200"),
+    "an address": (head(CLOSE).replace(b"localhost", b"127.0.0.1"), b"200"),
+    "an address of IPv6": (head(CLOSE).replace(b"localhost", b"[::1]:80"), b"200"),
+    "a name like ours": (head(CLOSE).replace(b"localhost", b"localhost.evil.example"), b"400"),
+}
+
+
+@pytest.fixture(scope="module")
+def address(trained: TrainedPolicy) -> Iterator[str]:
+    with served(trained.folder) as (_, address):
+        yield address
+
+
+@pytest.mark.parametrize("case", REQUESTS)
+def test_heads_are_bounded_and_hosts_checked(address: str, case: str) -> None:
+    sent, status = REQUESTS[case]
+    assert answers_of(address, sent).startswith(b"HTTP/1.1 " + status)
+    assert httpx.get(f"{address}/health").status_code == 200
+
+
+def resident(process: int) -> int:
+    """Megabytes of a process."""
+    lines = Path(f"/proc/{process}/status").read_text().splitlines()
+    return next(int(line.split()[1]) // 1024 for line in lines if line.startswith("VmRSS"))
+
+
+def cpu_seconds(process: int) -> float:
+    """Processor time of a process that is not waited for yet."""
+    numbers = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(numbers[11]) + int(numbers[12])) / os.sysconf("SC_CLK_TCK")
+
+
+@pytest.mark.parametrize("what", [b"GET /health", b"GET /nowhere"])
+def test_pipelined_requests_take_no_memory_and_term_is_obeyed(
+    trained: TrainedPolicy, what: bytes
+) -> None:
+    with served(trained.folder, "--timeout", "1") as (process, address):
+        host, port = address.removeprefix("http://").split(":")
+        before, many = resident(process.pid), head(what=what) * 20_000
+        with socket.create_connection((host, int(port)), timeout=0.5) as flood:
+            with suppress(TimeoutError, ConnectionError):
+                for _ in range(30):
+                    flood.sendall(many)
+            assert httpx.get(f"{address}/health", timeout=20).status_code == 200
+            assert resident(process.pid) < before + 100
+            began = cpu_seconds(process.pid)
+            process.send_signal(signal.SIGTERM)
+            os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+            # Answering what was sent would take minutes; the end of any server takes a second.
+            assert cpu_seconds(process.pid) - began < 5
+
+
+@pytest.mark.parametrize(
+    ("hosts", "answered"),
+    [
+        ("shop.example, *.shop.example", {"shop.example": 200, "a.shop.example": 200, "b": 400}),
+        ("*", {"anything": 200}),
+        ("::1", {"[::1]": 200, "[::2]:80": 400}),
+    ],
+)
+def test_hosts_that_are_allowed(
+    trained: TrainedPolicy, hosts: str, answered: dict[str, int]
+) -> None:
+    with served(trained.folder, "--allowed-hosts", hosts) as (_, address):
+        for host, status in answered.items():
+            found = httpx.get(f"{address}/health", headers={"Host": host})
+            assert found.status_code == status, host
+
+
+@pytest.mark.parametrize("hosts", ["a*", "http://a", "*.*", "", "a:80"])
+def test_what_is_no_host_is_refused(
+    trained: TrainedPolicy, capsys: pytest.CaptureFixture[str], hosts: str
+) -> None:
+    assert main(["serve", str(trained.folder), "--port", "0", "--allowed-hosts", hosts]) == 2
+    assert "is no host" in capsys.readouterr().err
 
 
 def test_requests_of_many_clients_are_answered(trained: TrainedPolicy) -> None:

@@ -73,6 +73,14 @@ def test_a_pipe_equals_the_command_on_files(trained: TrainedPolicy, tmp_path: Pa
     assert b"12 answers, 1 errors" in errors
 
 
+@pytest.mark.parametrize("blank", [b"", b"  ", b"\t\r"])
+def test_the_answer_of_a_line_has_its_number(trained: TrainedPolicy, blank: bytes) -> None:
+    request = json.dumps({"user_id": 1}).encode()
+    answers = streamed(trained, b"\n".join([blank, request, blank, blank, b"{", request]) + b"\n")
+    assert [answer.get("line") for answer in answers] == [1, None, 3, 4, 5, None]
+    assert "the line is blank" in answers[3]["error"]
+
+
 BAD = {
     "no JSON": (b"{", "the request is not JSON"),
     "not UTF-8": (b'{"user_id": "\xff"}', "the request is not JSON"),
@@ -112,7 +120,7 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_a_bad_line_has_one_error_and_the_stream_goes_on(trained: TrainedPolicy, case: str) -> None:
     line, message = BAD[case]
-    wrong, right = streamed(trained, line + b"\n\n" + lines([{"user_id": 1}]))
+    wrong, right = streamed(trained, line + b"\n" + lines([{"user_id": 1}]))
     assert message in wrong["error"]
     assert "\n" not in wrong["error"]
     assert wrong["line"] == 1

@@ -62,9 +62,12 @@ def test_it_says_data_reward_rule_and_limits(tmp_path: Path) -> None:
 def test_limits_follow_the_record(tmp_path: Path) -> None:
     worse = RECORD["policy"] | {"best_validation": 3.7}
     data = {"files": []}
-    write_card(run(tmp_path / "run", policy=worse, data=data))
+    folder = run(tmp_path / "run", policy=worse, data=data)
+    (folder / "policy").mkdir()
+    (folder / "policy" / "metrics.jsonl").write_text('{"step": 1, "action_loss": 4.0}\n')
+    write_card(folder)
     card = text_of(tmp_path / "run")
-    assert "3.7, is not below that of showing items by popularity, 3.6: it learned nothing" in card
+    assert "3.7, is not below 3.6, the loss of showing items by popularity: the policy" in card
     assert "Its logs have no propensities" in card
     (tmp_path / "run" / "decision_rule.json").unlink()
     write_card(tmp_path / "run")

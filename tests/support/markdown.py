@@ -72,7 +72,8 @@ def run_python(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 def anchors(text: str) -> set[str]:
-    """Fragments that headings of a page have, as GitHub and MkDocs make them."""
+    """Fragments that headings of a page have, as GitHub and MkDocs make them, and its ids."""
     prose = _BLOCK.sub("", text)
     headings = re.findall(r"^#+ (.+)$", prose, flags=re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}
+    ids = set(re.findall(r'<a id="([\w-]+)"></a>', prose))
+    return ids | {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}

@@ -52,6 +52,7 @@ def card_of_ranking(
             low, high = intervals[name]
             values[name] = f"{row.metrics[name]:.4g} [{low:.4g}, {high:.4g}]"
     of = f"{on}, {_rule(row)}, k {row.conditions['k']}, checkpoint {row.checkpoint}"
+    of += f", liked: {row.conditions['liked']}"
     add_measurement(run, "ucfrec rank", of, values, said)
 
 

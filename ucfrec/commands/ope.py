@@ -2,6 +2,8 @@
 
 import argparse
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,8 +20,8 @@ from ucfrec.errors import InputError
 
 if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
-    from ucfrec.off_policy.evaluate import OffPolicyReport
-    from ucfrec.off_policy.options import EstimateOptions
+    from ucfrec.off_policy.evaluate import EstimateOptions, OffPolicyReport
+    from ucfrec.off_policy.score import LoggedSessions
     from ucfrec.runs.trained_policy import TrainedPolicy
 
 
@@ -38,8 +40,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="T,…",
         help="compare drawing items at these temperatures; 0 takes the best: 0,0.5,1",
     )
-    parser.usage = "%(prog)s RUN... LOGS... [options]"
-    parser.epilog = "Several runs, targets or rules are ranked, with a band that holds all at once."
+    parser.usage = "%(prog)s RUN... [LOGS...] [options]"
+    parser.epilog = (
+        "Without LOGS, the estimate is from the test split of the run's store. Several runs, "
+        "targets or rules are ranked, with a band that holds all at once."
+    )
     estimate_options(parser)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, help="write the result rows here")
@@ -96,7 +101,7 @@ def estimates_asked(options: argparse.Namespace) -> "EstimateOptions":
     Raises:
         InputError: a value is out of its range.
     """
-    from ucfrec.off_policy.options import EstimateOptions
+    from ucfrec.off_policy.evaluate import EstimateOptions
 
     return EstimateOptions(
         discount=options.discount,
@@ -115,14 +120,14 @@ def run(options: argparse.Namespace) -> None:
     Raises:
         InputError: no run or no log is named, or one of them cannot be used.
     """
-    from ucfrec.off_policy.candidates import choose, names_of
+    from ucfrec.off_policy.selection import choose, names_of
     from ucfrec.reporting.tables import text_table
     from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 
     named = dict.fromkeys(map(Path, options.logs))
     runs = [path for path in named if (path / RUN).is_file()]
     options.logs = [path for path in options.logs if Path(path) not in runs]
-    if not runs or not options.logs:
+    if not runs:
         raise InputError("name a run folder of `ucfrec train` first, then the logs")
     candidates = [
         _Candidate(run, rule)
@@ -173,18 +178,13 @@ class _Candidate:
 
 def _judged(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicyReport":
     """Print and return what the logs say of one candidate."""
-    from ucfrec.logs.summary import format_report
     from ucfrec.off_policy.evaluate import evaluate_off_policy
-    from ucfrec.off_policy.score import logged_sessions
     from ucfrec.reporting.tables import format_rows
     from ucfrec.runs.trained_policy import TrainedPolicy
 
-    files, mapping = logs_given(options)
     run = candidate.run
     trained = TrainedPolicy.load(run, options.checkpoint)
-    limit = options.memory_limit
-    with logged_sessions(run, trained, files, mapping, True, limit) as logged:
-        print(format_report(logged.report))
+    with _logged(options, trained) as logged:
         found = evaluate_off_policy(
             run,
             trained,
@@ -200,8 +200,27 @@ def _judged(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicyRep
     for warning in found.warnings:
         print(f"warning: {warning}")
     print(f"verdict: {found.verdict.headline}")
-    card_of_estimates(run, options.logs, found)
+    card_of_estimates(run, options.logs or ["the test split"], found)
     return found
+
+
+@contextmanager
+def _logged(options: argparse.Namespace, trained: "TrainedPolicy") -> "Iterator[LoggedSessions]":
+    """What the policy is judged by: the logs, or else the test split of its store."""
+    from ucfrec.logs.summary import format_report
+    from ucfrec.off_policy.score import held_out_sessions, logged_sessions
+
+    if not options.logs:
+        logged = held_out_sessions([trained])
+        store = logged.store
+        print(f"test split of {store.path}: {store.n_episodes:,} sessions, {store.n_steps:,} steps")
+        yield logged
+        return
+    files, mapping = logs_given(options)
+    limit = options.memory_limit
+    with logged_sessions(trained.folder, trained, files, mapping, True, limit) as logged:
+        print(format_report(logged.report))
+        yield logged
 
 
 def _rules(options: argparse.Namespace, trained: "TrainedPolicy") -> "list[DecisionRule]":

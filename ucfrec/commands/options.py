@@ -59,7 +59,7 @@ def env_options(parser: argparse.ArgumentParser, required: bool, use: str = "") 
 
 
 def log_options(parser: argparse.ArgumentParser) -> argparse.Action:
-    """Add LOGS, which is returned, --dataset, --column and --mapping."""
+    """Add LOGS, which is returned, and how they are read."""
     logs = parser.add_argument(
         "logs",
         nargs="+",
@@ -87,6 +87,28 @@ def log_options(parser: argparse.ArgumentParser) -> argparse.Action:
         metavar="TOML",
         help="file with column mapping, reward and feature tables; --column overrides it "
         "(default: none)",
+    )
+    parser.add_argument(
+        "--time-format",
+        metavar="FORMAT",
+        help="how times are written that are text, e.g. '%%d/%%m/%%Y %%H:%%M' (default: ISO 8601, "
+        "and dates whose order of day and month the file settles)",
+    )
+    parser.add_argument(
+        "--earliest",
+        metavar="TIME",
+        help="ISO time before which times are clock errors (default: 2000-01-01)",
+    )
+    parser.add_argument(
+        "--where",
+        metavar="SQL",
+        help="condition over the log's columns; rows that do not fulfil it are left out and "
+        "counted, e.g. \"user_id NOT IN ('bot-0', 'bot-1')\" (default: none)",
+    )
+    parser.add_argument(
+        "--partitions",
+        action="store_true",
+        help="read names of folders such as country=DE as columns (default: no)",
     )
     return logs
 
@@ -282,11 +304,18 @@ def logs_given(options: argparse.Namespace) -> "tuple[tuple[Path, ...], LogMappi
     Raises:
         InputError: a file is missing, or the dataset, a --column or the mapping file is unusable.
     """
+    from ucfrec.logs.expressions import Expression
     from ucfrec.logs.mapping import LogMapping, columns_given, read_mapping
     from ucfrec.plugins import load_plugin
 
     dataset: Dataset = load_plugin("datasets", options.dataset)
-    given = LogMapping(columns_given(options.column))
+    given = LogMapping(
+        columns_given(options.column),
+        time_format=options.time_format,
+        earliest=options.earliest,
+        where=options.where and Expression(options.where, "--where"),
+        partitions=options.partitions,
+    )
     if options.mapping is not None:
         given = given.over(read_mapping(options.mapping))
     return dataset.resolve(options.logs, given)

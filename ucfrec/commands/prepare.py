@@ -49,6 +49,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "reward, or the first or last in the files (default: highest)",
     )
     parser.add_argument(
+        "--max-session",
+        type=int,
+        metavar="N",
+        help="leave out and count sessions of more than N rows, as of bots (default: none)",
+    )
+    parser.add_argument(
         "--memory-limit",
         metavar="SIZE",
         help="memory of the whole command, from 800MB on; beyond it rows spill to a scratch folder "
@@ -90,6 +96,7 @@ def run(options: argparse.Namespace) -> None:
         "dataset": options.dataset,
         "gap_minutes": options.gap_minutes,
         "duplicates": options.duplicates,
+        "max_session": options.max_session,
         "memory_limit": options.memory_limit,
         "engine": options.engine,
         "spark_master": options.spark_master,

@@ -3,7 +3,7 @@
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ucfrec.commands.cards import card_of_ranking
 from ucfrec.commands.options import log_options, logs_given, rule_given, rule_options
@@ -11,6 +11,8 @@ from ucfrec.errors import InputError
 
 if TYPE_CHECKING:
     from ucfrec.episodes.store import EpisodeStore
+    from ucfrec.evaluation.liked import LikedExpression
+    from ucfrec.off_policy.score import LoggedSessions
     from ucfrec.results.row import ResultRow
     from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -31,6 +33,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="seed of the bootstrap over users and of the random baseline (default: 0)",
     )
     parser.add_argument(
+        "--liked",
+        metavar="SQL",
+        help="what counts as liked, a truth value over the column reward, e.g. 'reward >= 4' "
+        "(default: at least 60%% of the way from the lowest training reward to the highest)",
+    )
+    parser.add_argument(
         "--json", type=Path, metavar="FILE", help="also write the rows, with intervals, as JSON"
     )
     parser.usage = "%(prog)s RUN... [LOGS...] [options]"
@@ -47,7 +55,7 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.evaluation.ranking import MEASURES
     from ucfrec.evaluation.ranking_table import require_one_catalogue, training_store
     from ucfrec.logs.summary import format_report
-    from ucfrec.off_policy.score import logged_sessions
+    from ucfrec.off_policy.score import held_out_sessions, logged_sessions
     from ucfrec.off_policy.training_rows import seen_too_often, share_seen
     from ucfrec.provenance import without_folders
     from ucfrec.reporting.tables import format_rows
@@ -62,23 +70,23 @@ def run(options: argparse.Namespace) -> None:
         raise InputError(f"--k is {options.k}; recommend at least 1 item")
     trained = [TrainedPolicy.load(run, options.checkpoint) for run in runs]
     require_one_catalogue(trained)
-    train = training_store(trained[0])
+    train, liked = training_store(trained[0]), _liked(options, trained[0])
     if options.logs:
         files, mapping = logs_given(options)
         with logged_sessions(runs[0], trained[0], files, mapping) as logged:
             print(format_report(logged.report), end="\n\n")
             warnings = [seen_too_often(share_seen(policy, logged.store)) for policy in trained]
-            rows = _rows(options, trained, train, logged.store, logged.users)
+            rows = _rows(options, trained, train, logged, liked)
     else:
-        test, warnings = _test_split(trained, train), [[] for _ in trained]
-        rows = _rows(options, trained, train, test, test.episode_values("user"))
+        warnings = [[] for _ in trained]
+        rows = _rows(options, trained, train, held_out_sessions(trained), liked)
     columns = (*_SHOWN, "coverage")
     lines = [dict.fromkeys(columns) | {"policy": row.method} | dict(row.metrics) for row in rows]
     print(format_rows(lines, ("policy", *columns)))
     print("\n" + "\n".join(f"{name:<16}{MEASURES[name]}" for name in _SHOWN))
-    print(
-        f"k is {rows[0].conditions['k']}; --json has 95% intervals and paired differences by user"
-    )
+    about = rows[0].conditions
+    print(f"{'liked':<16}{about['liked']}: {about['liked_share']:.1%} of the steps")
+    print(f"k is {about['k']}; --json has 95% intervals and paired differences by user")
     on = ", ".join(map(without_folders, options.logs)) or "the test split"
     for policy, row, said in zip(trained, rows, warnings, strict=False):
         for warning in said:
@@ -88,31 +96,22 @@ def run(options: argparse.Namespace) -> None:
         write_results(options.json, rows)
 
 
-def _test_split(trained: "list[TrainedPolicy]", store: "EpisodeStore | None") -> "EpisodeStore":
+def _liked(options: argparse.Namespace, trained: "TrainedPolicy") -> "LikedExpression | None":
+    """What `--liked` says; None without it."""
+    if options.liked is None:
+        return None
+    from ucfrec.evaluation.liked import LikedExpression
+    from ucfrec.logs.expressions import Expression
 
-    for policy in trained:
-        if policy.record.refit_of is not None:
-            raise InputError(
-                f"{policy.folder} is a refit, trained on the test split too; name later logs to "
-                "rank"
-            )
-    if store is None:
-        raise InputError(
-            f"{trained[0].folder}: its store {trained[0].record.store} is gone or has changed; "
-            "move the run together with its store, or name the logs to rank"
-        )
-    test = store.split("test")
-    if not test.n_episodes:
-        raise InputError(f"{store.path} has no test split; name later logs to rank")
-    return test
+    return LikedExpression(Expression(options.liked, "--liked"), trained.record.reward)
 
 
 def _rows(
     options: argparse.Namespace,
     trained: "list[TrainedPolicy]",
     train: "EpisodeStore | None",
-    later: "EpisodeStore",
-    users: Any,
+    later: "LoggedSessions",
+    liked: "LikedExpression | None",
 ) -> "list[ResultRow]":
     from ucfrec.evaluation.ranking_baselines import PolicyRanker
     from ucfrec.evaluation.ranking_table import ranking_rows
@@ -120,5 +119,6 @@ def _rows(
     policies = [
         PolicyRanker(policy, rule_given(options, policy), policy.name) for policy in trained
     ]
-    rows = ranking_rows(policies, trained[0], train, later, users, options.k, options.seed)
+    about = later.store, later.users, options.k, options.seed
+    rows = ranking_rows(policies, trained[0], train, *about, liked)
     return [replace(row, checkpoint=options.checkpoint) for row in rows]

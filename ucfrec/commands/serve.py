@@ -24,6 +24,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="address to listen on; others than this machine's own are open to whoever reaches "
         "them (default: 127.0.0.1)",
     )
+    parser.add_argument(
+        "--allowed-hosts",
+        metavar="HOST[,HOST…]",
+        help="answer only requests whose header Host names one of these: names, addresses, "
+        "*.example.org, or * for any (default: this machine's own names where --host is 127.0.0.1, "
+        "localhost or ::1, otherwise any)",
+    )
     parser.add_argument("--port", type=int, default=8080, help="0 for a free one (default: 8080)")
     parser.add_argument(
         "--k", type=int, default=10, help="items, if a request does not say how many (default: 10)"
@@ -78,8 +85,13 @@ def run(options: argparse.Namespace) -> None:
     verified(options.run)
     trained = TrainedPolicy.load(options.run, options.checkpoint)
     responder = responder_given(options, trained)
+    # h11 takes one request of a connection after the other and bounds what it keeps of a head;
+    # httptools does neither.
     config = uvicorn.Config(
-        application(responder, of_server),
+        application(responder, of_server, _allowed_hosts(options)),
+        http="h11",
+        h11_max_incomplete_event_size=2**16,
+        ws="none",
         access_log=False,
         log_level="warning",
         server_header=False,
@@ -91,3 +103,14 @@ def run(options: argparse.Namespace) -> None:
         except Interrupted:
             # What was asked of a server that is told to stop is done.
             print("ucfrec serve: stopped", file=sys.stderr)
+
+
+_OWN_NAMES = ("localhost", "127.0.0.1", "::1")
+
+
+def _allowed_hosts(options: argparse.Namespace) -> tuple[str, ...]:
+    """What the header `Host` may be: a page of the web cannot reach a server of this machine by a
+    name of its own (DNS rebinding)."""
+    if options.allowed_hosts is not None:
+        return tuple(host.strip() for host in options.allowed_hosts.split(","))
+    return _OWN_NAMES if options.host in _OWN_NAMES else ("*",)

@@ -87,6 +87,7 @@ def run(options: argparse.Namespace) -> None:
 def _train(options: argparse.Namespace) -> None:
     from ucfrec.episodes.store import EpisodeStore
     from ucfrec.fitting.distributed import leads, wait
+    from ucfrec.fitting.metrics_log import read_metrics
     from ucfrec.reporting.model_card import write_card
     from ucfrec.runs.config import resolve_config
     from ucfrec.runs.refit import refit
@@ -108,5 +109,5 @@ def _train(options: argparse.Namespace) -> None:
     if not leads():
         return
     card = write_card(options.out)
-    print(record.describe())
+    print(record.describe(read_metrics(options.out / "policy")))
     print(f"\nrun: {options.out}; TensorBoard can open it\nmodel card: {card}")

@@ -16,6 +16,7 @@ from ucfrec.counterfactual.effects_mean import EffectsMean
 from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, kl_to_prior
 from ucfrec.episodes.windows import Transitions
 from ucfrec.errors import InputError
+from ucfrec.files.record import Undefinable
 from ucfrec.fitting.loop import LoopConfig, fit
 from ucfrec.fitting.random_state import random_state_kept
 
@@ -48,9 +49,9 @@ class CRMReport:
     """Number of held-out transitions."""
     reward_std: float
     """Standard deviation of the training rewards, in reward units."""
-    r2: float
+    r2: Undefinable
     """R² of f̂_r(s, a, z) with the abduced z, which is computed from the reward itself."""
-    r2_without_z: float
+    r2_without_z: Undefinable
     """R² of f̂_r(s, a, 0), with z at its prior mean: what state and action alone predict."""
     z_share: float
     """Share of the reward's variance due to z (Sobol's total effect of z on f̂_r)."""

@@ -216,7 +216,7 @@ class Likeness(nn.Module):
         tags = self.tags[items]
         places = torch.where(tags < 0, self._count(), tags)
         read = nn.functional.pad(profile, (0, 1)).gather(1, places.flatten(1))
-        return read.view(items.shape[0], -1, tags.shape[2]).sum(2)
+        return read.view(tags.shape).sum(2)
 
     def _tags_of(self, items: Tensor) -> Tensor:
         """The rows (L, n_tags) of `_tag_matrix`; sparse if a product with them is then cheaper."""

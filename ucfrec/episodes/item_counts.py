@@ -1,5 +1,6 @@
 """How often each item was shown, and how often it was liked, in the training log."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,11 +47,15 @@ class TrainingCounts:
     """Number of training episodes."""
 
     @classmethod
-    def of(cls, train: EpisodeStore) -> "TrainingCounts":
-        """Count the items in `train`, a view of a store of items."""
+    def of(
+        cls,
+        train: EpisodeStore,
+        liked_of: Callable[[EpisodeStore, IntArray, IntArray], BoolArray] = liked_steps,
+    ) -> "TrainingCounts":
+        """Count the items in `train`, a view of a store of items; `liked_of` as `liked_steps`."""
         liked = np.zeros(len(train.item_states.embeddings), dtype=np.int64)
         for steps in train.step_batches():
-            items = train.step_values(schema.ITEM, *steps)[liked_steps(train, *steps)]
+            items = train.step_values(schema.ITEM, *steps)[liked_of(train, *steps)]
             liked += np.bincount(items, minlength=len(liked))
         shown = torch.from_numpy(train.item_counts())
         return cls(shown, torch.from_numpy(liked), train.n_episodes)

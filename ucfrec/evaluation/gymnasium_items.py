@@ -1,6 +1,7 @@
 """Item features of Gymnasium environments, from a file or from the environment."""
 
 from operator import attrgetter
+from pathlib import Path
 from typing import Any, Final
 
 import gymnasium
@@ -10,6 +11,7 @@ import pyarrow.parquet as pq
 
 from ucfrec.arrays import Array
 from ucfrec.errors import InputError
+from ucfrec.files.parquet import require_regular
 from ucfrec.schema import ITEM_ID
 
 FEATURES: Final = "features"
@@ -39,6 +41,8 @@ def item_table(source: str, env: gymnasium.Env[Any, Any], n_items: int) -> pa.Ta
         InputError: the file or attribute is missing, is of another kind or shape, or has numbers
             that are not finite.
     """
+    if source.endswith((".parquet", ".npy")):
+        require_regular(Path(source))
     try:
         if source.endswith(".parquet"):
             return _ordered(pq.read_table(source), source, n_items)

@@ -1,8 +1,8 @@
 """Ranking metrics on a later period: the rank of the items that users were shown or clicked.
 
 At every step, the whole catalogue is ranked from what was known before the step; no negatives are
-sampled (Krichene & Rendle, KDD 2020). A step is *liked* (a click) if its reward, scaled to [0, 1]
-as in item states, is at least `ucfrec.episodes.item_counts.LIKED`.
+sampled (Krichene & Rendle, KDD 2020). What counts as *liked* (a click) is said by
+`ucfrec.evaluation.liked`.
 """
 
 import warnings
@@ -21,6 +21,7 @@ from ucfrec.episodes.group_auc import group_auc
 from ucfrec.episodes.item_counts import liked_steps
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
+from ucfrec.evaluation.liked import Liked
 from ucfrec.evaluation.metrics import resampled_ratios
 
 _SCORES_AT_ONCE = 2**24
@@ -98,7 +99,7 @@ def rank_steps(ranker: Ranker, store: EpisodeStore, k: int, users: Array) -> Ran
         shown = store.step_values(schema.ITEM, batch.episodes, batch.steps).astype(np.int64)
         scores = ranker.scores(batch)
         if len(scores) == 1:
-            parts.append(_ranked_alike(scores[0], torch.from_numpy(shown), k))
+            parts.append(_ranked_alike(scores[0], shown, k))
         else:
             parts.append(_ranked(scores, torch.from_numpy(shown), k))
     ranks, top = (np.concatenate(columns) for columns in zip(*parts, strict=True))
@@ -131,7 +132,7 @@ def _ranked(scores: Tensor, shown: Tensor, k: int) -> tuple[Float64Array, IntArr
     return ranks.numpy(), scores.topk(k, dim=1).indices.numpy()
 
 
-def _ranked_alike(scores: Tensor, shown: Tensor, k: int) -> tuple[Float64Array, IntArray]:
+def _ranked_alike(scores: Tensor, shown: IntArray, k: int) -> tuple[Float64Array, IntArray]:
     """`_ranked` for scores (n_items,) that all steps share, which are sorted only once."""
     ranks = rankdata(-scores.double().numpy(), method="average")
     top = np.broadcast_to(scores.topk(k).indices.numpy(), (len(shown), k))
@@ -151,12 +152,13 @@ class Period:
     n_items: int
 
     @classmethod
-    def of(cls, store: EpisodeStore, users: Array) -> "Period":
-        """The steps of `store`; `users` (E,) are the user identifiers of its E episodes."""
+    def of(cls, store: EpisodeStore, users: Array, liked: Liked = liked_steps) -> "Period":
+        """The steps of `store`; `users` (E,) are the user identifiers of its E episodes, and
+        `liked` says of steps whether they were liked."""
         episodes, steps = store.all_steps()
         items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
         n_items = len(store.item_states.embeddings)
-        return cls(users[episodes], items, liked_steps(store, episodes, steps), n_items)
+        return cls(users[episodes], items, liked(store, episodes, steps), n_items)
 
     @property
     def item_rates(self) -> Float64Array:

@@ -14,6 +14,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer, logged_history, logged_scores
 from ucfrec.episodes.item_counts import TrainingCounts, liked_steps
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.evaluation.liked import Liked
 from ucfrec.evaluation.ranking import Ranker, Steps
 from ucfrec.policies.item_knn import ItemKNNConfig, ItemKNNPolicy
 from ucfrec.policies.item_rate import liked_rates
@@ -109,14 +110,16 @@ class MatrixFactorisation:
 
     name = "als"
 
-    def __init__(self, train: EpisodeStore, popularity: Tensor, seed: int) -> None:
+    def __init__(
+        self, train: EpisodeStore, popularity: Tensor, seed: int, liked_of: Liked = liked_steps
+    ) -> None:
         from implicit.als import AlternatingLeastSquares
         from threadpoolctl import threadpool_limits
 
         episodes, steps = train.all_steps()
         users = train.episode_values(schema.USER).astype(np.int64)[episodes]
         items = train.step_values(schema.ITEM, episodes, steps)
-        liked = liked_steps(train, episodes, steps).astype(np.float32)
+        liked = liked_of(train, episodes, steps).astype(np.float32)
         shape = (int(users.max()) + 1, len(popularity))
         matrix = sparse.csr_matrix((liked, (users, items)), shape=shape)
         matrix.eliminate_zeros()
@@ -138,7 +141,9 @@ class MatrixFactorisation:
         return self._users[torch.from_numpy(known)] @ self._items.T + self._tie_break
 
 
-def baselines(counts: TrainingCounts, train: EpisodeStore | None, seed: int) -> list[Ranker]:
+def baselines(
+    counts: TrainingCounts, train: EpisodeStore | None, seed: int, liked_of: Liked = liked_steps
+) -> list[Ranker]:
     """Baseline rankers: random, most shown, most clicked, item click rate, item-kNN and ALS.
 
     ALS is included if the package `implicit` is installed (extra `rank`).
@@ -148,6 +153,7 @@ def baselines(counts: TrainingCounts, train: EpisodeStore | None, seed: int) -> 
         train: the training episodes; None if their store is unavailable, which leaves out item-kNN
             and ALS.
         seed: of the random scores and of ALS.
+        liked_of: says which training steps were liked, for ALS; `counts` has its own.
     """
     shown, liked = counts.shown.double(), counts.liked.double()
     rankers: list[Ranker] = [
@@ -159,5 +165,5 @@ def baselines(counts: TrainingCounts, train: EpisodeStore | None, seed: int) -> 
     if train is not None:
         rankers.append(ItemNeighbours(train, shown.float()))
         if find_spec("implicit") is not None:
-            rankers.append(MatrixFactorisation(train, shown.float(), seed))
+            rankers.append(MatrixFactorisation(train, shown.float(), seed, liked_of))
     return rankers

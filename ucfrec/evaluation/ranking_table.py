@@ -7,8 +7,10 @@ from typing import Any, Final
 import numpy as np
 
 from ucfrec.arrays import Array
+from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.evaluation.liked import Liked, LikedByRange
 from ucfrec.evaluation.ranking import MEASURES, Period, compare, rank_steps, rankers_named
 from ucfrec.evaluation.ranking_baselines import PolicyRanker, RewardRanker, baselines
 from ucfrec.provenance import config_hash, provenance
@@ -50,6 +52,7 @@ def ranking_rows(
     users: Array,
     k: int,
     seed: int,
+    liked: Liked | None = None,
 ) -> list[ResultRow]:
     """One row for every policy and baseline.
 
@@ -65,14 +68,20 @@ def ranking_rows(
         users: (E,) identifier of the user of each episode of `later`.
         k: items that are recommended at a step.
         seed: of the resampled users and of `random`.
+        liked: which steps were liked; None for the run's own definition. Without `train`, "most
+            clicked" and "item click rate" keep the run's own.
     """
     counts = trained.counts
     assert counts is not None
+    assert trained.item_states is not None
     fitted_on = None if train is None else train.split("train")
+    if liked is not None and fitted_on is not None:
+        counts = TrainingCounts.of(fitted_on, liked)
+    liked = liked or LikedByRange(trained.item_states)
     model = [] if trained.reward_model is None else [RewardRanker(trained.scorer())]
-    named = rankers_named([*policies, *model, *baselines(counts, fitted_on, seed)])
+    named = rankers_named([*policies, *model, *baselines(counts, fitted_on, seed, liked)])
     k = min(k, len(counts.shown))
-    period = Period.of(later, np.asarray(users))
+    period = Period.of(later, np.asarray(users), liked)
     ranked = {name: rank_steps(ranker, later, k, period.users) for name, ranker in named.items()}
     reference = next(iter(named))
     own = dict(zip(named, policies, strict=False))
@@ -89,6 +98,8 @@ def ranking_rows(
             "steps": len(period.items),
             "users": len(np.unique(period.users)),
             "reference": reference,
+            "liked": str(liked),
+            "liked_share": float(period.liked.mean()),
         },
         "details": {"train_fingerprint": trained.record.fingerprint},
         **provenance(),

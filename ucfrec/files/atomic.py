@@ -2,6 +2,7 @@
 
 import errno
 import json
+import math
 import os
 import shutil
 from collections.abc import Iterator, Mapping
@@ -85,14 +86,38 @@ def atomic_file(path: Path) -> Iterator[Path]:
             remove(scratch)
 
 
+def json_text(value: Any, **layout: Any) -> str:
+    """`value` as JSON that every reader takes: NaN and ±∞, which JSON lacks, become null.
+
+    Args:
+        value: what `json.dumps` takes.
+        layout: further arguments of `json.dumps`.
+
+    Raises:
+        TypeError: `value` holds an object that JSON cannot represent.
+    """
+    try:
+        return json.dumps(value, allow_nan=False, **layout)
+    except ValueError:
+        return json.dumps(_finite(value), allow_nan=False, **layout)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def write_json(path: Path, value: Mapping[str, Any] | list[Any]) -> None:
-    """Write `value` as indented JSON, atomically; NaN and ±∞ become `NaN` and `Infinity`.
+    """Write `value` as indented JSON, atomically; see `json_text`.
 
     Raises:
         TypeError: `value` holds an object that JSON cannot represent.
     """
     with atomic_file(path) as scratch:
-        scratch.write_text(json.dumps(value, indent=2, allow_nan=True) + "\n", encoding="utf-8")
+        scratch.write_text(json_text(value, indent=2) + "\n", encoding="utf-8")
 
 
 def write_sealed_json(path: Path, value: Mapping[str, Any]) -> None:
@@ -163,7 +188,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 def content_checksum(value: Mapping[str, Any]) -> str:
     """XXH3 (64 bits, hexadecimal) of a JSON object, in whatever order and layout it is written."""
-    text = json.dumps(value, sort_keys=True, separators=(",", ":"))
+    text = json_text(value, sort_keys=True, separators=(",", ":"))
     return xxhash.xxh3_64_hexdigest(text.encode())
 
 

@@ -113,6 +113,8 @@ class Sealed:
             )
         except OSError as error:
             return f"cannot be read ({explain_os_error(error)})"
+        except ValueError as error:  # a name that no file can have
+            return f"cannot be read ({error})"
 
     def _error(self, name: str, fault: str) -> InputError:
         return InputError(f"{self.folder / name} {fault}; restore the file, or {self.remedy}")

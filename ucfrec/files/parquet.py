@@ -35,6 +35,16 @@ def require_plausible_rows(path: Path, rows: int) -> None:
         )
 
 
+def require_regular(path: Path) -> None:
+    """Check that a file is no pipe or device, reading which might never end; it may be missing.
+
+    Raises:
+        InputError: it is one.
+    """
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path} is no regular file; name or restore the file")
+
+
 def read_ids(path: Path, column: str) -> Array:
     """The ids in a column of a Parquet file, (n,) int64 or text.
 
@@ -45,6 +55,7 @@ def read_ids(path: Path, column: str) -> Array:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    require_regular(path)
     try:
         with pq.ParquetFile(path) as file:
             require_plausible_rows(path, file.metadata.num_rows)

@@ -4,6 +4,7 @@ A subclass of `Record` declares its entries with their types; reading checks the
 missing, of another type or out of range is one `InputError` that names file and entry.
 """
 
+import math
 from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Self
@@ -11,6 +12,7 @@ from typing import Annotated, Any, ClassVar, Final, Self
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     InstanceOf,
@@ -29,6 +31,8 @@ Text = InstanceOf[str]
 """A text; unlike pydantic's own, file names may have bytes that are not valid Unicode."""
 Count = Annotated[int, Field(strict=True, ge=0, lt=_LARGEST)]
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Undefinable = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
+"""A number that may be NaN, which JSON has as null."""
 
 
 def _inside(files: dict[str, tuple[int, str]]) -> dict[str, tuple[int, str]]:

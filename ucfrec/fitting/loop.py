@@ -14,6 +14,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from ucfrec.errors import InputError
+from ucfrec.files.record import Undefinable
 from ucfrec.fitting import distributed
 from ucfrec.fitting.average import WeightAverage
 from ucfrec.fitting.checkpoint import (
@@ -77,7 +78,7 @@ class Fit:
     """Last step, which early stopping can put before `LoopConfig.steps`."""
     best_step: int
     """Step of the weights with the lowest validation loss; the last without validation."""
-    best_validation: float
+    best_validation: Undefinable
     """Lowest validation loss; NaN without validation."""
     seconds: float
     """Wall-clock time up to the last checkpoint, summed over all resumptions."""

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ucfrec.errors import InputError
+from ucfrec.files.atomic import json_text
 from ucfrec.fitting.tensorboard import Events
 
 METRICS = "metrics.jsonl"
@@ -34,9 +35,8 @@ class MetricsLog:
 
     def add(self, step: int, scalars: Mapping[str, float]) -> None:
         """Log named scalars; the name `step` is reserved."""
-        finite = {name: x if math.isfinite(x) else None for name, x in scalars.items()}
         with self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps({_STEP: step} | finite, allow_nan=False) + "\n")
+            file.write(json_text({_STEP: step, **scalars}) + "\n")
         self._events.add(step, scalars)
 
     def close(self) -> None:

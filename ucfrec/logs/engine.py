@@ -13,7 +13,7 @@ import numpy as np
 from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.files.locks import scratch_folder
-from ucfrec.logs.binding import glob_pattern, text
+from ucfrec.logs.tables import glob_pattern, text
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -119,10 +119,16 @@ def rows_of_batch(numbers: int) -> int:
 
 
 @contextmanager
-def engine_in_memory() -> Iterator[duckdb.DuckDBPyConnection]:
-    """A DuckDB connection for registered tables only: it opens no file and never uses the disk."""
+def engine_in_memory(memory_limit: str | None = None) -> Iterator[duckdb.DuckDBPyConnection]:
+    """A DuckDB connection for registered tables only: it opens no file and never uses the disk.
+
+    Args:
+        memory_limit: of the engine, such as "256MB"; None for DuckDB's default.
+    """
     connection = duckdb.connect(":memory:", config={**_CLOSED, "temp_directory": ""})
     try:
+        if memory_limit is not None:
+            connection.execute("SET memory_limit = ?", [memory_limit])
         _set_semantics(connection)
         _close(connection, (), None)
         yield connection
@@ -150,7 +156,9 @@ def as_arrow(numbers: IntArray) -> "pa.Array":
 
 def _set_semantics(connection: duckdb.DuckDBPyConnection) -> None:
     """Make expressions mean the same in every connection and on every machine."""
-    connection.execute("SET enable_progress_bar = false")
+    # In Jupyter without ipywidgets it is off already, and cannot be set.
+    if connection.sql("SELECT current_setting('enable_progress_bar')").fetchall() != [(False,)]:
+        connection.execute("SET enable_progress_bar = false")
     # A division by zero is NULL, and so is every comparison with it; infinity would be above every
     # threshold. The logarithm of a negative number is an error, for TRY, instead of NaN.
     connection.execute("SET error_on_division_by_zero = false")

@@ -7,6 +7,7 @@ tree) and every node of the tree must be of a kind listed here.
 
 import json
 import re
+from collections.abc import Collection, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from ucfrec.errors import InputError
@@ -18,6 +19,8 @@ MAX_LENGTH: Final = 4000
 """Most characters of an expression."""
 MAX_NESTING: Final = 100
 """Most nested levels of an expression: brackets, calls, operators."""
+MAX_GROWTH: Final = 500
+"""Most times by which text of an expression may be longer than the text of its columns."""
 MAX_SIZE: Final = 20_000
 """Most nodes of an expression as DuckDB evaluates it, counting each copy of copied arguments."""
 _MAX_TREE: Final = 2_000_000
@@ -49,7 +52,8 @@ TYPES: Final = frozenset(_SCALARS.split()) | {"TIMESTAMP WITH TIME ZONE", "LIST"
 """Types that a cast may name, as the parser writes them; LIST is one of the others with []."""
 
 # No function here reads files, settings, the clock or a random number, returns several rows, or
-# returns text much longer than its arguments (replace, repeat, lpad and format would).
+# returns text much longer than its arguments (replace, repeat, lpad and format would; `_growth`
+# bounds what nested calls can do).
 _MATHS = """
     abs sign round floor ceil ceiling trunc even sqrt cbrt exp ln log log2 log10 pow power pi mod
     gcd lcm sin cos tan asin acos atan atan2 sinh cosh tanh degrees radians bit_count
@@ -87,6 +91,27 @@ FUNCTIONS: Final = frozenset(" ".join((_MATHS, _TEXTS, _TIMES, _LISTS, _OPERATOR
 """Allowed functions, and operators by the parser's names (~~ is LIKE)."""
 COPYING: Final = frozenset({"least", "greatest", "nullif", "split_part", "array_to_string"})
 """Macros: DuckDB copies each argument up to three times, or nine times with three arguments."""
+_JOINING: Final = frozenset(
+    {"concat", "concat_ws", "||", "list_concat", "list_cat", "list_append", "list_prepend"}
+)
+"""What they return is as long as all their arguments together."""
+_QUOTING: Final = frozenset(
+    {
+        "string_split",
+        "str_split",
+        "string_split_regex",
+        "json_extract",
+        "json_extract_string",
+        "->>",
+    }
+)
+"""What they return is longer than an argument once it is text: lists have quotes and commas."""
+_QUOTES: Final = 3
+_DATE_PARTS: Final = 12
+"""Characters for two of the format of `strftime`."""
+_TEXTS_AND_LISTS: Final = frozenset(
+    {"VARCHAR", "TEXT", "STRING", "BPCHAR", "NVARCHAR", "JSON", "LIST"}
+)
 _SIMPLE_CASE: Final = re.compile(r"\bcase\b(?!\s+when\b)", re.IGNORECASE)
 _WHEN: Final = re.compile(r"\bwhen\b", re.IGNORECASE)
 _ALLOWED: Final = (
@@ -159,7 +184,46 @@ def columns_of(connection: "duckdb.DuckDBPyConnection", given: str) -> tuple[str
     columns: dict[str, None] = {}
     if _walk(alone, 0, columns) > MAX_SIZE:
         raise _too_large()
+    if _growth(alone) > MAX_GROWTH:
+        raise NotScalarError(
+            f"its text could be {MAX_GROWTH} times as long as its columns'; nest fewer of "
+            "array_to_string, concat_ws, lists, and casts to text"
+        )
     return tuple(columns)
+
+
+def with_numbers_for_truth_values(
+    connection: "duckdb.DuckDBPyConnection", given: str, columns: Collection[str]
+) -> str:
+    """The same expression with 0 and 1 in place of the truth values of some columns.
+
+    Args:
+        connection: parses the expression.
+        given: as `columns_of` allows it.
+        columns: names of columns of truth values.
+    """
+    query = "SELECT json_serialize_sql(?)"
+    (tree,) = connection.execute(query, [f"SELECT {given}\n"]).fetchall()[0]
+    text, folded = f"SELECT {given}".encode(), {name.casefold() for name in columns}
+    # Places are in bytes; from the last one, those before it stay as they are.
+    for begin, length, name in sorted(_references(json.loads(tree)), reverse=True):
+        if name.casefold() in folded:
+            column = text[begin : begin + length]
+            text = text[:begin] + b"CAST(" + column + b" AS BIGINT)" + text[begin + length :]
+    return text.decode().removeprefix("SELECT ")
+
+
+def _references(tree: Any) -> Iterator[tuple[int, int, str]]:
+    """Begin, length and name of each column of a syntax tree."""
+    if isinstance(tree, list):
+        for part in tree:
+            yield from _references(part)
+    elif isinstance(tree, dict):
+        if tree.get("class") == "COLUMN_REF":
+            place = tree["query_location"], tree["query_location_length"]
+            yield *place, tree["column_names"][0]
+        for part in tree.values():
+            yield from _references(part)
 
 
 def _require_small(given: str) -> None:
@@ -260,6 +324,42 @@ def _walk(tree: Any, depth: int, columns: dict[str, None]) -> int:
     if tree["class"] == "FUNCTION" and tree["function_name"].lower() in COPYING:
         inner *= 3 ** max(0, len(tree["arguments"]) - 1)
     return 1 + inner
+
+
+def _growth(tree: Any) -> int:
+    """How many times as long as the text of the columns the text of a tree can be, at most."""
+    if isinstance(tree, list):
+        return max(map(_growth, tree), default=1)
+    if not isinstance(tree, dict):
+        return 1
+    if tree.get("class") == "CAST":
+        name = str(tree["type_expr"]["type_name"]).upper()
+        return _growth(tree["child"]) * (_QUOTES if name in _TEXTS_AND_LISTS else 1)
+    if tree.get("class") != "FUNCTION":
+        return max(map(_growth, tree.values()), default=1)
+    name = tree["function_name"].lower()
+    arguments = [argument["expression"] for argument in tree["arguments"]]
+    grown = [_growth(argument) for argument in arguments] or [1]
+    if name == "array_to_string":
+        return grown[0] * (1 + _length_of_separator(arguments))
+    if name == "concat_ws":
+        return grown[0] * len(grown) + sum(grown[1:])
+    if name in _JOINING:
+        return sum(grown)
+    if name == "list_value":
+        return _QUOTES * sum(grown)
+    if name == "strftime":
+        return _DATE_PARTS * max(grown)
+    return max(grown) * (_QUOTES if name in _QUOTING else 1)
+
+
+def _length_of_separator(arguments: Sequence[Any]) -> int:
+    """Characters of the separator of `array_to_string`, which may not come from a column."""
+    given = arguments[1] if len(arguments) > 1 else {}
+    literal = given["literal"] if given.get("class") == "CONSTANT" else {}
+    if literal.get("kind") != "STRING":
+        raise NotScalarError("the separator of array_to_string is no quoted text; write one")
+    return len(literal["text"])
 
 
 def _require_listed(node: dict[str, Any]) -> None:

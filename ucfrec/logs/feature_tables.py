@@ -1,24 +1,42 @@
 """Read the features of items and users into DuckDB tables."""
 
+import hashlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import duckdb
+import numpy as np
 
 from ucfrec.errors import InputError
-from ucfrec.logs.binding import (
+from ucfrec.logs.binding import Bound, bind, explained, wrong_type
+from ucfrec.logs.engine import BATCH_ROWS
+from ucfrec.logs.mapping import FeatureTable, log_files
+from ucfrec.logs.tables import (
+    NOTHING,
+    Table,
     as_timestamp,
-    bind,
     is_integer,
     is_number,
     is_vector,
     open_tables,
-    wrong_type,
+    quoted,
+    raw_name,
 )
-from ucfrec.logs.mapping import FeatureTable, log_files
 
 _WHOLE: Final = {"FLOAT": 2**24, "DOUBLE": 2**53}
 """DuckDB type of reals to the bound below which it holds every whole number."""
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Files of a feature table with the same columns."""
+
+    table: Table
+    key: Bound
+    first_by: str
+    features: dict[str, tuple[str, str]]
+    """Feature, without regard to case, to its (SQL, type)."""
 
 
 def load_features(
@@ -28,6 +46,9 @@ def load_features(
     id_type: str,
 ) -> list[str]:
     """Read feature tables into DuckDB tables `<kind>_features_0`, …, with columns `id`, `f0`, ….
+
+    The parts of a table are joined by the names of their columns, whatever their order: what a part
+    lacks is missing for its rows. A key is no feature.
 
     Args:
         connection: engine that may open the tables' files.
@@ -39,34 +60,23 @@ def load_features(
         Names of the DuckDB tables, one per feature table.
 
     Raises:
-        InputError: a file or column cannot be used, or a table repeats an id.
+        InputError: a file or column cannot be used, two parts have a column of different types, or
+            a table repeats an id.
     """
     names = []
     for number, table in enumerate(tables):
-        name, selects = f"{kind}_features_{number}", []
-        for opened in open_tables(connection, log_files(table.files)):
-            key, key_type = bind(connection, opened, f"key of {kind} features", table.key)
-            given = table.columns or tuple(c for c in opened.columns if c != table.key)
-            columns: list[str] = []
-            for column in given:
-                sql, type_ = bind(connection, opened, f"{kind} feature", column)
-                comparable = _comparable(sql, type_)
-                if comparable is None:
-                    wanted = "cast it to a number, text, or a list of either"
-                    raise wrong_type(opened, f"{kind} feature", column, type_, wanted)
-                columns.append(comparable)
-            id_sql, first = _as_id(key, key_type, id_type), ""
-            if table.first_by:
-                by, _ = bind(connection, opened, f"first_by of {kind} features", table.first_by)
-                # Ties are broken by the features, so that the order of rows does not matter.
-                order = ", ".join([by, *columns])
-                first = f" QUALIFY row_number() OVER (PARTITION BY {id_sql} ORDER BY {order}) = 1"
-            named = ", ".join(f"{sql} AS f{index}" for index, sql in enumerate(columns))
-            selects.append(f"SELECT {id_sql} AS id, {named} FROM {opened.sql}{first}")
-        connection.execute(
-            f"CREATE TABLE {name} AS SELECT * FROM ({' UNION ALL BY NAME '.join(selects)}) "
-            "WHERE id IS NOT NULL"
-        )
+        name = f"{kind}_features_{number}"
+        parts = [
+            _part(connection, opened, table, kind)
+            for opened in open_tables(connection, log_files(table.files))
+        ]
+        types = _common_types(parts, kind)
+        selects = " UNION ALL ".join(_rows(part, types, id_type) for part in parts)
+        tables_read = [part.table for part in parts]
+        with explained(connection, tables_read, tables_read[0].files[0].parent):
+            connection.execute(
+                f"CREATE TABLE {name} AS SELECT * FROM ({selects}) WHERE id IS NOT NULL"
+            )
         ((rows, ids),) = connection.sql(
             f"SELECT count(*), count(DISTINCT id) FROM {name}"
         ).fetchall()
@@ -77,6 +87,93 @@ def load_features(
             )
         names.append(name)
     return names
+
+
+def feature_digest(connection: duckdb.DuckDBPyConnection, names: Sequence[str]) -> str:
+    """A digest of every id and value of feature tables, in whatever order their rows are.
+
+    Args:
+        connection: engine with the tables.
+        names: of `load_features`.
+    """
+    digest = hashlib.sha256()
+    for name in names:
+        columns = connection.sql(f"DESCRIBE {name}").fetchall()
+        digest.update(repr([(column[0], column[1]) for column in columns]).encode())
+        for batch in connection.sql(f"SELECT * FROM {name} ORDER BY id").to_arrow_reader(
+            BATCH_ROWS
+        ):
+            for column in batch.columns:
+                if str(column.type) == "double":
+                    values = np.asarray(column.fill_null(np.nan))
+                    digest.update(np.where(np.isnan(values), np.nan, values).tobytes())
+                else:
+                    digest.update("\n".join(map(repr, column.to_pylist())).encode())
+    return digest.hexdigest()
+
+
+def _part(
+    connection: duckdb.DuckDBPyConnection, opened: Table, table: FeatureTable, kind: str
+) -> _Part:
+    key = bind(connection, opened, f"key of {kind} features", table.key)
+    keys = {name.casefold() for name in key.columns}
+    given = table.columns or tuple(c for c in opened.columns if c.casefold() not in keys)
+    # The text of a CSV file is what its keys are, not what DuckDB makes of it.
+    raw = key.columns if key.is_column and not opened.columnar else ()
+    if raw:
+        key = Bound(quoted(raw_name(raw[0])), "VARCHAR", (), False)
+    bound = {name: bind(connection, opened, f"{kind} feature", name) for name in given}
+    first_by = None
+    if table.first_by:
+        first_by = bind(connection, opened, f"first_by of {kind} features", table.first_by)
+    features = {}
+    for name, (sql, type_, *_) in bound.items():
+        comparable = _comparable(sql, type_)
+        if comparable is None:
+            wanted = "cast it to a number, text, or a list of either"
+            raise wrong_type(opened, f"{kind} feature", name, type_, wanted)
+        features[name.casefold()] = comparable
+    everything = (key, *bound.values(), *([first_by] if first_by else []))
+    used = (column for each in everything for column in each.columns)
+    return _Part(opened.of(used, raw), key, first_by.sql if first_by else "", features)
+
+
+def _common_types(parts: Sequence[_Part], kind: str) -> dict[str, str]:
+    """Feature to its type in all parts of a table.
+
+    Raises:
+        InputError: two parts differ.
+    """
+    types: dict[str, str] = {}
+    seen: dict[str, Table] = {}
+    for part in parts:
+        for name, (_, type_) in part.features.items():
+            known = types.setdefault(name, type_)
+            if known == NOTHING:
+                types[name] = type_
+            elif type_ not in (known, NOTHING):
+                raise InputError(
+                    f"{part.table.files[0]}: {kind} feature {name} is {type_} here and {known} in "
+                    f"{seen[name].files[0]}; write it in one type"
+                )
+            if types[name] != NOTHING:
+                seen.setdefault(name, part.table)
+    return {name: "VARCHAR" if type_ == NOTHING else type_ for name, type_ in types.items()}
+
+
+def _rows(part: _Part, types: dict[str, str], id_type: str) -> str:
+    """SQL of the rows of a part: `id`, `f0`, …."""
+    id_sql, first = _as_id(part.key.sql, part.key.kind, id_type), ""
+    columns = [
+        f"CAST({part.features[name][0] if name in part.features else 'NULL'} AS {type_})"
+        for name, type_ in types.items()
+    ]
+    if part.first_by:
+        # Ties are broken by the features, so that the order of rows does not matter.
+        order = ", ".join([part.first_by, *columns])
+        first = f" QUALIFY row_number() OVER (PARTITION BY {id_sql} ORDER BY {order}) = 1"
+    named = "".join(f", {sql} AS f{index}" for index, sql in enumerate(columns))
+    return f"SELECT {id_sql} AS id{named} FROM {part.table.sql}{first}"
 
 
 def require_known_ids(
@@ -122,20 +219,27 @@ def _as_id(key: str, key_type: str, id_type: str) -> str:
         # file did with whole numbers that its type does not hold.
         exact = f"AND abs({key}) < {_WHOLE[key_type]}" if key_type in _WHOLE else ""
         key = f"CASE WHEN {key} = trunc({key}) {exact} THEN TRY_CAST({key} AS HUGEINT) END"
+    elif id_type == "BIGINT" and not is_integer(key_type):
+        # Text is an integer only if it is written as the integer is: 007 is not 7.
+        number = f"TRY_CAST({key} AS BIGINT)"
+        return f"CASE WHEN CAST({number} AS VARCHAR) = CAST({key} AS VARCHAR) THEN {number} END"
     return f"TRY_CAST({key} AS {id_type})"
 
 
-def _comparable(sql: str, kind: str) -> str | None:
-    """SQL that casts a feature to DOUBLE, VARCHAR, VARCHAR[] or FLOAT[]; None if no cast does."""
+def _comparable(sql: str, kind: str) -> tuple[str, str] | None:
+    """SQL that casts a feature to DOUBLE, VARCHAR, VARCHAR[] or FLOAT[], and that type; None if no
+    cast does."""
+    if kind == NOTHING:
+        return "NULL", NOTHING
     if is_number(kind):
         # Undefined numbers, such as the logarithm of 0, are missing.
-        return f"TRY(CAST({sql} AS DOUBLE))"
+        return f"TRY(CAST({sql} AS DOUBLE))", "DOUBLE"
     if time := as_timestamp(sql, kind):
-        return f"epoch({time}) / 86400"
+        return f"epoch({time}) / 86400", "DOUBLE"
     if kind in ("VARCHAR", "BOOLEAN", "UUID") or kind.startswith("ENUM"):
-        return f"CAST({sql} AS VARCHAR)"
+        return f"CAST({sql} AS VARCHAR)", "VARCHAR"
     if is_vector(kind) and not is_integer(kind.partition("[")[0]):
-        return f"CAST({sql} AS FLOAT[])"
+        return f"CAST({sql} AS FLOAT[])", "FLOAT[]"
     if kind.endswith("[]"):
-        return f"CAST({sql} AS VARCHAR[])"
+        return f"CAST({sql} AS VARCHAR[])", "VARCHAR[]"
     return None

@@ -14,12 +14,13 @@ from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.files.locks import scratch_folder
-from ucfrec.logs.binding import Table, explained, open_tables, quoted
-from ucfrec.logs.clean import REASONS, require_rows
+from ucfrec.logs.binding import explained
+from ucfrec.logs.clean import CLOCK_HINT, REASONS, require_rows
 from ucfrec.logs.engine import as_arrow, engine, engine_in_memory
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.sessions import end_of_user
 from ucfrec.logs.sorted_rows import CODES, SortedRows, check_sorted, has_codes, sorted_batches
+from ucfrec.logs.tables import Table, open_tables, quoted
 from ucfrec.logs.typed import TypedLog, typed_log
 
 if TYPE_CHECKING:
@@ -77,7 +78,7 @@ def read_histories(
         scratch_folder(Path(gettempdir()), "histories") as folder,
         engine(files, folder, memory_limit, shared=True) as connection,
     ):
-        tables = tuple(open_tables(connection, files))
+        tables = tuple(open_tables(connection, files, mapping.partitions))
         log = typed_log(connection, tables, mapping, reward, session_by, folder)
         _require_items(log)
         with explained(connection, tables, folder):
@@ -174,7 +175,7 @@ def _require_clean(dropped: dict[str, int]) -> None:
     faults = {reason: n for reason, n in dropped.items() if n and reason != "duplicate"}
     if faults:
         rows = "; ".join(f"{n:,} rows: {REASONS[reason]}" for reason, n in faults.items())
-        hint = "; is the time in milliseconds?" if "clock_out_of_range" in faults else ""
+        hint = f"; {CLOCK_HINT}" if "clock_out_of_range" in faults else ""
         raise InputError(f"{HISTORIES}: {rows}{hint}; correct those rows or leave them out")
 
 

@@ -11,11 +11,11 @@ import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.arrays import IntArray
-from ucfrec.logs.binding import glob_pattern, text
 from ucfrec.logs.engine import BATCH_ROWS, as_arrow, as_numpy
 from ucfrec.logs.measures import Measures
 from ucfrec.logs.sorted_rows import CODES, has_codes
 from ucfrec.logs.spool import Spool
+from ucfrec.logs.tables import glob_pattern, text
 from ucfrec.logs.typed import TypedLog
 
 ITEMS_FILE: Final = "items.parquet"
@@ -46,9 +46,13 @@ def number_ids(
             continue
         _keep(log, measures, name, f"kept_{table}")
         if like is not None:
-            source = f"read_parquet({text(glob_pattern(like / file))}, file_row_number = true)"
-            # Ids may be integers in the store and text in the log, or vice versa.
-            known = f"TRY_CAST({name} AS {log.id_type(name)}) AS {name}"
+            options = "file_row_number = true, hive_partitioning = false"
+            source = f"read_parquet({text(glob_pattern(like / file))}, {options})"
+            # Ids may be integers in the store and text in the log, or vice versa: 07 is not 7.
+            kind = log.id_type(name)
+            cast = f"TRY_CAST({name} AS {kind})"
+            same = f"CAST({cast} AS VARCHAR) = CAST({name} AS VARCHAR)"
+            known = f"CASE WHEN {same} THEN {cast} END AS {name}"
             log.connection.execute(
                 f"CREATE TABLE {table} AS SELECT {known}, file_row_number AS number FROM {source}"
             )

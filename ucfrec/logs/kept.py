@@ -1,14 +1,21 @@
-"""Which of a log's usable rows stay: the one rule for files, frames and requests."""
+"""Which of a log's usable rows stay, and in which order: one rule for files, frames and requests.
 
-from collections.abc import Mapping
+Rows of one user at one time, such as a page that was logged at once or a log of days, have no order
+that could be learned: theirs is that of a hash of user, time and item. Any other order, such as
+that of the ids, is one that a policy predicts.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
+import xxhash
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, IntArray
-from ucfrec.logs.binding import MAX_FLOAT
+from ucfrec.logs.tables import MAX_FLOAT
 
 DUPLICATES: Final = {
     "highest": "has the highest",
@@ -27,6 +34,19 @@ _TIE_BREAKERS: Final = (
 )
 """Columns that decide between duplicates that are equal to the rule, the most important first, so
 that the order of rows and files does not matter."""
+
+
+Digests = npt.NDArray[np.uint64]
+
+
+@dataclass(frozen=True)
+class Hashes:
+    """Hashes of the text of identifiers, so that 7 and '7' have one."""
+
+    of_users: Callable[[Array], Digests]
+    """Of the values (M,) of the column `user`."""
+    of_items: Callable[[Array], Digests]
+    """Of the values (M,) of the column `item`."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +75,7 @@ def kept_rows(rows: Mapping[str, Array], duplicates: str) -> Kept:
     rewards = rows[schema.REWARD]
     good = np.abs(rewards) <= MAX_FLOAT
     kept = np.ones(len(rewards), dtype=bool)
-    same = same_key(rows)
+    same = _same_key(rows)
     lost = conflicts = 0
     if same.any():
         repeated = np.zeros(len(rewards), dtype=bool)
@@ -78,27 +98,85 @@ def kept_rows(rows: Mapping[str, Array], duplicates: str) -> Kept:
     return Kept(np.flatnonzero(kept & good), lost, conflicts, undefined)
 
 
-def kept_in_order(rows: Mapping[str, Array], duplicates: str) -> IntArray:
+def kept_in_order(
+    rows: Mapping[str, Array], duplicates: str, user_id: int | str | None = None
+) -> IntArray:
     """(K,) positions of the rows of a log in memory that are kept, in order of user and time.
 
     Args:
-        rows: (N,) columns as of `kept_rows`, in any order; `item` holds numbers or text.
+        rows: (N,) columns as of `kept_rows`, in any order; `item` holds identifiers, and so
+            does `user` but for `user_id`.
         duplicates: key of `DUPLICATES`.
+        user_id: the only user.
     """
     users, times = rows["user"], rows[schema.TIMESTAMP]
     order = np.lexsort((times, users))
     apart = (np.diff(times[order]) > 0) | (np.diff(users[order]) != 0)
     if apart.all():
         return np.asarray(order[np.abs(rows[schema.REWARD][order]) <= MAX_FLOAT])
-    items = rows[schema.ITEM]
-    if items.dtype == object:
-        items = np.unique(items, return_inverse=True)[1]
+    ids, items = np.unique(rows[schema.ITEM], return_inverse=True)
     order = np.lexsort((items, times, users))
-    rows = {**rows, schema.ITEM: items}
-    return order[kept_rows({name: values[order] for name, values in rows.items()}, duplicates).rows]
+    found = {name: values[order] for name, values in {**rows, schema.ITEM: items}.items()}
+    one = None if user_id is None else digests([user_id])
+    hashes = Hashes(
+        lambda users: digests(users.tolist()) if one is None else one.repeat(len(users)),
+        lambda items: digests(ids[items].tolist()),
+    )
+    return order[in_hashed_order(found, kept_rows(found, duplicates).rows, hashes)[0]]
 
 
-def same_key(rows: Mapping[str, Array]) -> BoolArray:
+def in_hashed_order(
+    rows: Mapping[str, Array], kept: IntArray, hashes: Hashes
+) -> tuple[IntArray, int]:
+    """Put the rows of one user at one time in the order of a hash.
+
+    Args:
+        rows: as of `kept_rows`.
+        kept: (K,) positions, in order, of the rows that are kept.
+        hashes: of the identifiers.
+
+    Returns:
+        (K,) the positions in the new order, and how many rows share their user and time.
+    """
+    users, times = rows["user"][kept], rows[schema.TIMESTAMP][kept]
+    tied = (users[1:] == users[:-1]) & (times[1:] == times[:-1])
+    if not tied.any():
+        return kept, 0
+    within = np.concatenate([[False], tied])
+    places = np.flatnonzero(within | np.concatenate([tied, [False]]))
+    groups = np.cumsum(~within)[places]
+    if schema.ITEM in rows:
+        key = hashes.of_items(rows[schema.ITEM][kept][places])
+    else:
+        key = np.zeros(len(places), dtype=np.uint64)
+        for column in rows[schema.ACTION][kept][places].view(np.uint32).T:
+            key = _mixed(key + column)
+    key = _mixed(key + _mixed(hashes.of_users(users[places]) + times[places].view(np.uint64)))
+    ordered = kept.copy()
+    ordered[places] = kept[places[np.lexsort((key, groups))]]
+    return ordered, len(places)
+
+
+def digests(ids: Sequence[object]) -> Digests:
+    """A hash (N,) of the text of each identifier."""
+    found = {each: _digest(str(each)) for each in dict.fromkeys(ids)}
+    return np.asarray([found[each] for each in ids], dtype=np.uint64)
+
+
+def _digest(text: str) -> int:
+    # Text of JSON may hold half a character.
+    return xxhash.xxh3_64_intdigest(text.encode("utf-8", "surrogatepass"))
+
+
+def _mixed(values: Digests) -> Digests:
+    """The finaliser of SplitMix64: every bit of the result depends on all of a value."""
+    values = values + np.uint64(0x9E3779B97F4A7C15)
+    values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return values ^ (values >> np.uint64(31))
+
+
+def _same_key(rows: Mapping[str, Array]) -> BoolArray:
     """(N − 1,) whether each row but the first has the user, time and choice of the row before."""
     user, times = rows["user"], rows[schema.TIMESTAMP]
     same = (user[1:] == user[:-1]) & (times[1:] == times[:-1])

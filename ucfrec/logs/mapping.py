@@ -1,8 +1,9 @@
 """Column mappings of logs, written as data, and the datasets that supply them."""
 
 import glob
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
@@ -19,6 +20,10 @@ OPTIONAL_COLUMNS: Final = (
     schema.SESSION_ID,
     schema.IS_RANDOM,
 )
+EARLIEST_MS: Final = 946_684_800_000
+"""2000-01-01 UTC in ms; rows with an earlier time are dropped as clock errors."""
+_RECORDS: Final = ("meta.json", "run.json")
+"""Files that make a folder a store or a run."""
 SESSIONS: Final = (schema.SESSION_ID, "gap", "user")
 """Ways in which rows form sessions."""
 
@@ -73,6 +78,15 @@ class LogMapping:
     it."""
     item_features: tuple[FeatureTable, ...] = ()
     user_features: tuple[FeatureTable, ...] = ()
+    time_format: str | None = None
+    """How times are written that are text, as of `strptime`, e.g. "%d/%m/%Y %H:%M"; None for ISO
+    8601, and for dates whose order of day and month is certain."""
+    earliest: str | None = None
+    """ISO time (UTC) before which times are clock errors; None for 2000."""
+    where: str | None = None
+    """SQL condition over the files' columns; rows that do not fulfil it are left out."""
+    partitions: bool = False
+    """Whether names of folders such as `country=DE` are columns."""
 
     def __post_init__(self) -> None:
         known = (*KEY_COLUMNS, *OPTIONAL_COLUMNS)
@@ -85,6 +99,25 @@ class LogMapping:
                 f"of sessions as {schema.SESSION_ID}"
             )
 
+        self.earliest_ms  # noqa: B018
+
+    @property
+    def earliest_ms(self) -> int:
+        """Milliseconds of `earliest`.
+
+        Raises:
+            InputError: it is no time.
+        """
+        if self.earliest is None:
+            return EARLIEST_MS
+        try:
+            time = datetime.fromisoformat(str(self.earliest))
+        except ValueError:
+            raise InputError(
+                f"earliest is {self.earliest!r}; write a date, e.g. 1990-01-01"
+            ) from None
+        return round(time.replace(tzinfo=time.tzinfo or UTC).timestamp() * 1000)
+
     def over(self, defaults: "LogMapping") -> "LogMapping":
         """This mapping, with its empty fields filled from `defaults`."""
         return LogMapping(
@@ -93,6 +126,10 @@ class LogMapping:
             self.session_by or defaults.session_by,
             self.item_features or defaults.item_features,
             self.user_features or defaults.user_features,
+            self.time_format or defaults.time_format,
+            self.earliest or defaults.earliest,
+            self.where or defaults.where,
+            self.partitions or defaults.partitions,
         )
 
 
@@ -145,8 +182,9 @@ def read_mapping(path: Path) -> LogMapping:
     try:
         for name, value in given.get("columns", {}).items():
             given["columns"][name] = Expression(value, str(path))
-        if "reward" in given:
-            given["reward"] = Expression(given["reward"], str(path))
+        for name in ("reward", "where"):
+            if name in given:
+                given[name] = Expression(given[name], str(path))
         for kind in ("item_features", "user_features"):
             tables = (FeatureTable(**table) for table in given.get(kind, []))
             given[kind] = tuple(
@@ -176,8 +214,8 @@ def _beside(mapping: Path, file: str | Path) -> Path:
 def log_files(paths: Sequence[str | Path]) -> tuple[Path, ...]:
     """List the log files among files, folders and globs, each once.
 
-    In a folder, and among the matches of a glob, a folder called like a table (`log.parquet`) is
-    one: its files are its parts.
+    A folder stands for all log files in it and its sub-folders, but for stores, runs, and those
+    whose names begin with a dot or an underscore.
 
     Args:
         paths: of files, folders and globs; or a single one.
@@ -201,32 +239,44 @@ def log_files(paths: Sequence[str | Path]) -> tuple[Path, ...]:
 
 
 def table_name(file: Path) -> str:
-    """Name of the table that a file is, or is a part of: Spark writes folders `items.parquet/`."""
-    folder = file.parent.name
-    return folder if folder.endswith(SUFFIXES) else file.name
+    """Name of the table that a file is, or is a part of: a folder `items.parquet/` is a table."""
+    folders = (each.name for each in file.parents if each.name.endswith(SUFFIXES))
+    return next(folders, file.name)
 
 
 def _matches(path: Path) -> list[Path]:
     if path.is_dir():
-        return _tables(path.iterdir())
+        return _tables(path)
     if path.is_file():
         if not is_table(path):
             raise InputError(f"{path} is not a {' or '.join(SUFFIXES)} file; convert it first")
         return [path]
     if not glob.has_magic(str(path)):
         raise InputError(f"{path} does not exist; check the path")
-    return _tables(map(Path, glob.glob(str(path), recursive=True)))
+    found = sorted(Path(name) for name in glob.glob(str(path), recursive=True))
+    shown = [each for each in found if not each.name.startswith(".")]
+    return [table for each in shown for table in _tables(each)]
 
 
-def _tables(paths: Iterable[Path]) -> list[Path]:
-    """Tables among paths, by name; of a folder that is called like one, the tables in it."""
-    found: list[Path] = []
-    for path in sorted(p for p in paths if not p.name.startswith(".")):
-        if path.name.endswith(SUFFIXES) and path.is_dir():
-            found += sorted(p for p in path.iterdir() if is_table(p) and p.name[0] != ".")
-        elif is_table(path):
-            found.append(path)
-    return found
+def _tables(path: Path, above: tuple[Path, ...] = ()) -> list[Path]:
+    """The tables at a path, those of a folder and its sub-folders by name.
+
+    Args:
+        path: a file or folder.
+        above: the folders that it lies in, without links: a link may lead back to one of them.
+    """
+    if not path.is_dir():
+        return [path] if is_table(path) else []
+    if (real := path.resolve()) in above:
+        return []
+    if above and any((path / name).is_file() for name in _RECORDS):
+        return []
+    entries = sorted(
+        each
+        for each in path.iterdir()
+        if each.name[0] != "." and not (each.name[0] == "_" and each.is_dir())
+    )
+    return [table for each in entries for table in _tables(each, (*above, real))]
 
 
 def is_table(path: Path) -> bool:

@@ -16,6 +16,8 @@ from ucfrec.logs.spool import BLOCK, Spool
 
 FEW_VALUES: Final = 20
 """Rewards with at most this many distinct values are counted by value, others in as many bins."""
+_NAMED: Final = 5
+"""Users of the longest sessions that are named."""
 SAMPLE_ROWS: Final = 100_000
 """Quantiles of rewards of many values are of a sample of about this many steps; a smaller log is
 used whole."""
@@ -82,6 +84,10 @@ class Measures:
     """Of training steps: rewards and number of steps from there to the end of the episode."""
     lengths: dict[int, int] = field(default_factory=dict)
     """Length in steps to the number of episodes."""
+    longest: list[tuple[int, int]] = field(default_factory=list)
+    """Steps of the longest episode of the users who have the longest, and these users."""
+    long_rows: int = 0
+    """Rows of episodes that are dropped as too long."""
     values: ValueCounts = field(default_factory=ValueCounts)
     """Rewards by value."""
 
@@ -104,6 +110,7 @@ def measure(spool: Spool, cut: Cut, log_end: int, items: int, folder: Path) -> M
     )
     user, trained, ended = None, 0, True
     for found in episodes(spool, cut, log_end):
+        measures.long_rows += found.long_rows
         if not len(found.lengths):
             continue
         _count_episodes(measures, found)
@@ -151,6 +158,12 @@ def _count_episodes(measures: Measures, found: Episodes) -> None:
     measures.splits[:, 1] += weighted.astype(np.int64)
     for length, count in zip(*np.unique(found.lengths, return_counts=True), strict=True):
         measures.lengths[int(length)] = measures.lengths.get(int(length), 0) + int(count)
+    longest = {user: length for length, user in measures.longest}
+    for number in np.argsort(-found.lengths, kind="stable")[: 10 * _NAMED]:
+        user, length = int(found.users[number]), int(found.lengths[number])
+        longest[user] = max(length, longest.get(user, 0))
+    pairs = ((length, user) for user, length in longest.items())
+    measures.longest = sorted(pairs, reverse=True)[:_NAMED]
 
 
 def _count_steps(measures: Measures, found: Episodes, spool: Spool) -> None:

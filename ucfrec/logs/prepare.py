@@ -21,11 +21,11 @@ from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.locks import scratch_folder
-from ucfrec.logs.binding import explained, open_tables
+from ucfrec.logs.binding import explained
 from ucfrec.logs.clean import require_rows
 from ucfrec.logs.distributions import RewardPasses, distributions
 from ucfrec.logs.engine import engine
-from ucfrec.logs.feature_tables import load_features, require_known_ids
+from ucfrec.logs.feature_tables import feature_digest, load_features, require_known_ids
 from ucfrec.logs.ids import (
     EPISODE_USERS,
     ID_TABLES,
@@ -39,12 +39,14 @@ from ucfrec.logs.ids import (
 from ucfrec.logs.kept import DUPLICATES
 from ucfrec.logs.mapping import SESSIONS, FeatureTable, LogMapping, log_files
 from ucfrec.logs.measures import Measures, binned_rewards, measure, sampled_rewards
+from ucfrec.logs.notes import note_bots, note_equal_times, note_losses
 from ucfrec.logs.order import count_unsorted
 from ucfrec.logs.sessions import Cut, Episodes, by_sessions, episodes, split_bounds
 from ucfrec.logs.sorted_rows import SortedRows, check_sorted, sorted_batches
 from ucfrec.logs.spool import Spool
 from ucfrec.logs.steps import StepNumbers, write_steps
 from ucfrec.logs.summary import build_report, require_variety
+from ucfrec.logs.tables import open_tables
 from ucfrec.logs.typed import TypedLog, typed_log
 from ucfrec.progress import progress
 
@@ -70,6 +72,8 @@ class PrepareOptions:
     """With "gap": a longer pause of the user ends the session, in minutes."""
     min_steps: int = 1
     """Episodes with fewer steps are dropped."""
+    max_session: int | None = None
+    """Episodes with more steps are dropped, as of bots; None for none."""
     split: tuple[float, ...] = (0.8, 0.1, 0.1)
     """Shares of the rows for train, validation and test in order of time, or the two times (ms) at
     which validation and test begin."""
@@ -102,6 +106,8 @@ class PrepareOptions:
             raise InputError(f"duplicates is {self.duplicates!r}; use {', '.join(DUPLICATES)}")
         if not (self.gap_minutes > 0 and self.min_steps >= 1 and self.embedding_size >= 1):
             raise InputError("gap_minutes, min_steps and embedding_size must be above 0")
+        if self.max_session is not None and self.max_session < self.min_steps:
+            raise InputError("max_session is below min_steps, so no session would be left")
         if self.gap_minutes == math.inf:
             raise InputError("gap_minutes is infinite; use session_by='user' for sessions of users")
         finite = all(math.isfinite(bound) for bound in self.split)
@@ -182,7 +188,8 @@ def prepare(
             numbers = StepNumbers.of(log, found.measures, found.scratch)
             with progress(report["steps"], "write the store", "steps") as bar:
                 writer = write_steps(folder, found.episodes(), found.spool, numbers, bar)
-            record = writer.finish(report["reward"], report, write_ids(log, folder))
+            ids = {**write_ids(log, folder), **_feature_digests(found)}
+            record = writer.finish(report["reward"], report, ids)
             if log.key == schema.ITEM_ID:
                 _write_states(found, folder, options.embedding_size, like)
             if like is not None:
@@ -256,7 +263,7 @@ def _prepared(
         engine(inputs, spill, options.memory_limit, shared=True) as connection,
     ):
         with progress(4, "check the logs", "stages") as stage:
-            tables = tuple(open_tables(connection, files))
+            tables = tuple(open_tables(connection, files, mapping.partitions))
             if options.engine == "spark":
                 # Spark is an extra.
                 from ucfrec.logs.spark import sorted_with_spark
@@ -280,10 +287,13 @@ def _prepared(
                 require_rows(log, len(rows.clean), rows.dropped)
                 if like is None:
                     require_variety(rows)
+                note_losses(rows, reward, mapping.where)
+                note_equal_times(rows)
                 stage.update()
                 spool, cut = _cut(rows, options, like, scratch)
                 stage.update()
                 measures = measure(spool, cut, rows.last_ms, rows.items, scratch / "users")
+                note_bots(rows, measures)
                 stage.update()
                 features = _features(log, mapping, like)
                 number_ids(log, measures, features, like)
@@ -302,7 +312,7 @@ def _cut(
     """The usable rows in the order of the store, and how they form episodes."""
     bounds = split_bounds(rows, options.split if like is None else (1.0, 0.0, 0.0))
     gap_ms = round(options.gap_minutes * 60_000)
-    cut = Cut(rows.log.session_by, gap_ms, options.min_steps, bounds)
+    cut = Cut(rows.log.session_by, gap_ms, options.min_steps, bounds, options.max_session)
     if cut.session_by == schema.SESSION_ID:
         return by_sessions(rows, scratch / "sessions"), cut
     return rows.clean, cut
@@ -327,6 +337,15 @@ def _features(log: TypedLog, mapping: LogMapping, like: Path | None) -> Features
         name: load_features(log.connection, tables, name, log.id_type(name))
         for name, tables in _feature_tables(mapping).items()
         if name in log.columns
+    }
+
+
+def _feature_digests(found: _Prepared) -> dict[str, list[Any]]:
+    """Digests for the fingerprint of the feature tables, if there are any."""
+    return {
+        f"features of {name}": [feature_digest(found.rows.log.connection, names)]
+        for name, names in found.features.items()
+        if names
     }
 
 

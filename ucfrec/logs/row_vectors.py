@@ -40,7 +40,12 @@ class RowVectors:
             file, np.float32, "r", shape=(rows, self._size)
         )
         # Neighbours of a row in the file are hardly ever its neighbours in the order.
-        self._map.madvise(mmap.MADV_RANDOM)
+        self._advise("MADV_RANDOM")
+
+    def _advise(self, advice: str) -> None:
+        """Tell the system how the file is read; Windows takes no advice."""
+        if hasattr(mmap, advice):
+            self._map.madvise(getattr(mmap, advice))
 
     @property
     def _map(self) -> mmap.mmap:
@@ -52,7 +57,7 @@ class RowVectors:
         """(M, O) observations of the rows at the positions (M,), from 1."""
         values = np.asarray(self._values[rows - 1])
         # Pages of a mapped file count as the memory of a process that must keep to a limit.
-        self._map.madvise(mmap.MADV_DONTNEED)
+        self._advise("MADV_DONTNEED")
         return values
 
     def joined(self, batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:

@@ -26,6 +26,8 @@ class Cut:
     """Episodes with fewer steps are dropped."""
     bounds: tuple[int, int]
     """Times (ms) at which the validation and the test split begin."""
+    max_steps: int | None = None
+    """Episodes with more steps are dropped; None for none."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,8 @@ class Episodes:
     """(E,) false for episodes cut at a split and for sessions that may have gone on after the log
     ended: a user's last one if sessions are users, or if it ended within the gap before the end of
     the log."""
+    long_rows: int
+    """Rows of episodes that are dropped as too long."""
 
     def column(self, spool: Spool, name: str) -> Array:
         """(M,) or (M, size) rows of a column of the spool."""
@@ -125,7 +129,7 @@ def end_of_user(spool: Spool, begin: int, rows: int) -> int:
 
 
 def episodes(spool: Spool, cut: Cut, log_end: int, block: int | None = None) -> Iterator[Episodes]:
-    """The episodes of sorted rows, those with fewer than `cut.min_steps` steps left out.
+    """The episodes of sorted rows, those with too few or too many steps left out.
 
     Args:
         spool: rows in the order of the store.
@@ -196,17 +200,19 @@ def _episodes(marks: _Marks, firsts: IntArray, cut: Cut, begin: int, log_end: in
     else:
         last_ends = np.full(len(at), cut.session_by == schema.SESSION_ID)
     terminated = np.where(marks.new_user[following], last_ends, marks.starts[following])
-    long = lengths >= cut.min_steps
+    too_long = lengths > (lengths.max() if cut.max_steps is None else cut.max_steps)
+    fit = (lengths >= cut.min_steps) & ~too_long
     kept: BoolArray | slice = slice(None)
-    if not long.all():
-        kept = np.repeat(long, lengths)
+    if not fit.all():
+        kept = np.repeat(fit, lengths)
     return Episodes(
         begin,
         begin + int(firsts[-1]),
         kept,
-        lengths[long],
-        marks.users[at][long],
-        marks.splits[at][long].astype(np.uint8),
-        marks.starts[at][long],
-        terminated[long],
+        lengths[fit],
+        marks.users[at][fit],
+        marks.splits[at][fit].astype(np.uint8),
+        marks.starts[at][fit],
+        terminated[fit],
+        int(lengths[too_long].sum()),
     )

@@ -5,10 +5,13 @@ duplicates and writes the others to a spool with numbers in place of ids.
 """
 
 from collections.abc import Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Final
 
+import duckdb
 import numpy as np
 import pyarrow as pa
 
@@ -16,10 +19,10 @@ from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray
 from ucfrec.logs.clean import REASONS, faults, require_rewards_in_range
 from ucfrec.logs.engine import as_numpy
-from ucfrec.logs.kept import kept_rows, same_key
+from ucfrec.logs.kept import Digests, Hashes, digests, in_hashed_order, kept_rows
 from ucfrec.logs.row_vectors import RowVectors
 from ucfrec.logs.spool import Spool
-from ucfrec.logs.typed import ROWS, TypedLog
+from ucfrec.logs.typed import ROWS, WANTED, TypedLog
 
 CODES: Final = {schema.USER_ID: "user_codes", schema.ITEM_ID: "item_codes"}
 """Id column to the table of its ids and their codes, numbers in the order of the ids."""
@@ -34,7 +37,7 @@ class SortedRows:
 
     log: TypedLog
     clean: Spool
-    """Usable rows in order of user, time and choice: `user` (int64 in the order of the ids),
+    """Usable rows in order of user, time and hash: `user` (int64 in the order of the ids),
     `item` (code, int32) or `action`, `timestamp`, `reward` (float64) and, if the log has them,
     `session` (with sessions by session_id), `observation`, `propensity` (NaN if unknown) and
     `is_random`."""
@@ -49,6 +52,8 @@ class SortedRows:
     """Number of rows."""
     conflicts: int = 0
     """Number of duplicates with another reward than the row that is kept."""
+    tied: int = 0
+    """Number of usable rows that share their user and time."""
     first_ms: int = 0
     """Time of the earliest usable row."""
     last_ms: int = 0
@@ -94,7 +99,7 @@ def sorted_batches(
 
 
 def _read(log: TypedLog, query: str) -> Iterator[pa.RecordBatch]:
-    return iter(log.connection.sql(query).to_arrow_reader(log.batch_rows))
+    yield from log.connection.sql(query).to_arrow_reader(log.batch_rows)
 
 
 def check_sorted(
@@ -111,35 +116,53 @@ def check_sorted(
     Raises:
         InputError: a reward is too large to train with.
     """
-    spools = [Spool(folder and folder / name) for name in ("clean", "placed")]
+    spools = [Spool(None if folder is None else folder / name) for name in ("clean", "placed")]
     rows = SortedRows(log, spools[0], spools[1])
-    reasons = list(REASONS)
-    large, largest = 0, 0.0
-    for batch in _whole_keys(_columns(batch, log) for batch in batches):
-        rows.read += len(batch["fault"])
-        placed = batch["fault"] < _UNPLACED
-        order = {name: batch[name] for name in ("user", "timestamp", "row")}
-        rows.placed.append(_where(placed, order))
-        counts = np.bincount(batch["fault"] % _UNPLACED, minlength=len(reasons) + 1)
-        for reason, n in zip(reasons, counts[1:], strict=True):
-            rows.dropped[reason] += int(n)
-        usable = batch.pop("fault") == 0
-        batch = _where(usable, batch)
-        kept = kept_rows(batch, duplicates)
-        rows.conflicts += kept.conflicts
-        rows.dropped["duplicate"] += kept.duplicates
-        rows.dropped["reward_not_finite"] += kept.undefined
-        clean = {name: values[kept.rows] for name, values in batch.items() if name in _spooled(log)}
-        size = np.abs(clean[schema.REWARD])
-        large += int(np.count_nonzero(size > schema.LARGEST_REWARD))
-        largest = max(largest, float(size.max(initial=0)))
-        rows.count(clean)
-        rows.clean.append(clean)
-    # The connection answers no query before the last batch.
+    rewards = _Rewards()
+    # The connection itself answers no query before the last batch of its rows.
+    with closing(log.connection.cursor()) as asked:
+        hashes = _hashes(log, asked)
+        for batch in _whole_times(_columns(batch, log) for batch in batches):
+            _check_batch(rows, batch, duplicates, hashes, rewards)
     if log.key == schema.ITEM_ID:
         (rows.items,) = log.one("SELECT count(*) FROM item_codes")
-    require_rewards_in_range(log, large, len(rows.clean), largest)
+    require_rewards_in_range(log, rewards.large, len(rows.clean), rewards.largest)
     return rows
+
+
+@dataclass
+class _Rewards:
+    """How large rewards are."""
+
+    large: int = 0
+    """Number of those that are too large."""
+    largest: float = 0.0
+
+
+def _check_batch(
+    rows: SortedRows, batch: dict[str, Array], duplicates: str, hashes: Hashes, rewards: _Rewards
+) -> None:
+    rows.read += len(batch["fault"])
+    placed = np.asarray(batch["fault"] < _UNPLACED)
+    rows.placed.append(_where(placed, {n: batch[n] for n in ("user", "timestamp", "row")}))
+    reasons = list(REASONS)
+    counts = np.bincount(batch["fault"] % _UNPLACED, minlength=len(reasons) + 1)
+    for reason, n in zip(reasons, counts[1:], strict=True):
+        rows.dropped[reason] += int(n)
+    usable = np.asarray(batch.pop("fault") == 0)
+    batch = _where(usable, batch)
+    kept = kept_rows(batch, duplicates)
+    rows.conflicts += kept.conflicts
+    rows.dropped["duplicate"] += kept.duplicates
+    rows.dropped["reward_not_finite"] += kept.undefined
+    order, tied = in_hashed_order(batch, kept.rows, hashes)
+    rows.tied += tied
+    good = {name: batch[name][order] for name in batch if name in _spooled(rows.log)}
+    size = np.abs(good[schema.REWARD])
+    rewards.large += int(np.count_nonzero(size > schema.LARGEST_REWARD))
+    rewards.largest = max(rewards.largest, float(size.max(initial=0)))
+    rows.count(good)
+    rows.clean.append(good)
 
 
 def _where(chosen: BoolArray, batch: dict[str, Array]) -> dict[str, Array]:
@@ -184,7 +207,8 @@ def with_faults(log: TypedLog, rows: str, conditions: Mapping[str, str]) -> str:
     )
     unplaced = f"{schema.USER_ID} IS NULL OR {schema.TIMESTAMP} IS NULL"
     fault = f"CASE {cases} ELSE 0 END + CASE WHEN {unplaced} THEN {_UNPLACED} ELSE 0 END"
-    query = f"SELECT *, CAST({fault} AS SMALLINT) AS fault FROM {rows}"
+    values = f"* EXCLUDE ({WANTED})" if log.has_condition else "*"
+    query = f"SELECT {values}, CAST({fault} AS SMALLINT) AS fault FROM {rows}"
     if log.key == schema.ITEM_ID:
         return query
     zeros = [0.0] * log.vector_size[schema.ACTION]
@@ -243,13 +267,38 @@ def _columns(batch: pa.RecordBatch, log: TypedLog) -> dict[str, Array]:
     return columns
 
 
-def _whole_keys(batches: Iterator[dict[str, Array]]) -> Iterator[dict[str, Array]]:
-    """The same rows in batches that end between two keys, so that no duplicates are parted."""
+def _hashes(log: TypedLog, asked: duckdb.DuckDBPyConnection) -> Hashes:
+    """Hashes by code, for which `asked` has the tables of `code_tables`."""
+    users_have_codes = has_codes(log, schema.USER_ID)
+
+    def of_codes(name: str, begin: int, end: int) -> Digests:
+        query = (
+            f"SELECT {name} FROM {CODES[name]} WHERE code BETWEEN {begin} AND {end} ORDER BY code"
+        )
+        return digests([each for (each,) in asked.execute(query).fetchall()])
+
+    @cache
+    def of_all_items() -> Digests:
+        return of_codes(schema.ITEM_ID, 0, np.iinfo(np.int32).max)
+
+    def of_users(codes: Array) -> Digests:
+        if not users_have_codes:
+            return digests(codes.tolist())
+        begin = int(codes[0])
+        found: Digests = of_codes(schema.USER_ID, begin, int(codes[-1]))[codes - begin]
+        return found
+
+    return Hashes(of_users, lambda codes: of_all_items()[codes])
+
+
+def _whole_times(batches: Iterator[dict[str, Array]]) -> Iterator[dict[str, Array]]:
+    """The same rows in batches that end between two times of a user: equal times stay together."""
     held: dict[str, Array] = {}
     for batch in batches:
         if held:
             batch = {name: np.concatenate([held[name], batch[name]]) for name in batch}
-        starts = np.flatnonzero(~same_key(batch))
+        users, times = batch["user"], batch[schema.TIMESTAMP]
+        starts = np.flatnonzero((users[1:] != users[:-1]) | (times[1:] != times[:-1]))
         if not len(starts):
             held = batch
             continue

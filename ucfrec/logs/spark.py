@@ -12,7 +12,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -23,12 +23,13 @@ import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.errors import InputError, one_line
-from ucfrec.logs.binding import Table, explained
+from ucfrec.logs.binding import explained
 from ucfrec.logs.clean import faults
 from ucfrec.logs.engine import BATCH_ROWS
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.sorted_rows import code_tables, coded_ids, in_order, with_faults
 from ucfrec.logs.spark_tasks import Task, run_tasks
+from ucfrec.logs.tables import Table
 from ucfrec.logs.typed import (
     ROWS,
     TypedLog,
@@ -86,17 +87,17 @@ def sorted_with_spark(
     """
     typed = typed_columns(connection, tables, mapping, reward, session_by)
     with explained(connection, tables, scratch):
-        every = zip(typed.selects, (table.sql for table in tables), strict=True)
+        every = zip(typed.selects, (table.sql for table in typed.tables), strict=True)
         connection.execute(f"CREATE VIEW {ROWS} AS {numbered_rows(every)}")
     files = [
-        (values, Table((file,), table.types))
-        for values, table in zip(typed.selects, tables, strict=True)
+        (values, replace(table, files=(file,)))
+        for values, table in zip(typed.selects, typed.tables, strict=True)
         for file in table.files
     ]
     with _session(master) as spark, _failures():
         found = _surveyed(spark, files, vectors(typed.names))
         sizes = vector_sizes(found.vectors)
-        log = TypedLog(connection, tables, typed.names, sizes, typed.session_by)
+        log = typed.log(connection, sizes, mapping)
         require_observations(tables, found.bad, sum(found.rows))
         tasks = _row_tasks(log, files, found.rows, known_items)
         rows = _run(spark, tasks, _schema(log))

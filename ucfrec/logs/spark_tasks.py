@@ -11,8 +11,9 @@ from typing import Final
 
 import pyarrow as pa
 
-from ucfrec.logs.binding import Table, explained
+from ucfrec.logs.binding import explained
 from ucfrec.logs.engine import BATCH_ROWS, engine
+from ucfrec.logs.tables import Table
 
 MEMORY: Final = "1GB"
 """Memory of DuckDB in a task."""

@@ -56,9 +56,14 @@ def build_report(
     report = {
         "files": [origin(file) for table in log.tables for file in table.files],
         "rows_read": rows.read,
-        "dropped": {**rows.dropped, "short_episode": len(rows.clean) - measures.steps},
+        "dropped": {
+            **rows.dropped,
+            "long_session": measures.long_rows,
+            "short_episode": len(rows.clean) - measures.steps - measures.long_rows,
+        },
         "conflicting_duplicates": rows.conflicts,
         "unsorted_rows": unsorted,
+        "equal_times": rows.tied,
         "steps": measures.steps,
         "episodes": measures.episodes,
         "sessions": measures.sessions,
@@ -112,6 +117,9 @@ def format_report(report: Mapping[str, Any]) -> str:
         kept = DUPLICATES[report.get("duplicates", "highest")]
         conflicts = f"{report['conflicting_duplicates']:,}  {CONFLICT}, which {kept}"
         lines.append(("  conflicting duplicates", conflicts))
+    if report["equal_times"]:
+        text = f"{report['equal_times']:,} (in no order that could be learned)"
+        lines.append(("  at equal times", text))
     lines += [
         ("  out of order", f"{report['unsorted_rows']:,} (sorted, none dropped)"),
         ("steps kept", f"{report['steps']:,}"),

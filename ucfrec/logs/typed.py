@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,22 +10,27 @@ import duckdb
 
 from ucfrec import schema
 from ucfrec.errors import InputError, InputNote
-from ucfrec.logs.binding import (
+from ucfrec.logs.binding import Bound, bind, explained, wrong_type
+from ucfrec.logs.engine import rows_of_batch
+from ucfrec.logs.expressions import NotScalarError, columns_of
+from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping
+from ucfrec.logs.tables import (
     MAX_FLOAT,
+    NOTHING,
     Table,
     as_timestamp,
-    bind,
-    explained,
     is_integer,
     is_number,
     is_vector,
-    wrong_type,
+    quoted,
+    raw_name,
 )
-from ucfrec.logs.engine import rows_of_batch
-from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping
+from ucfrec.logs.times import text_time
 
 ROWS: Final = "read"
 """Relation of `TypedLog`."""
+WANTED: Final = "wanted"
+"""Its column of whether a row fulfils the condition of `LogMapping.where`, if there is one."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +49,10 @@ class TypedLog:
     """Dimensions of `action` and `observation`, if the log has them."""
     session_by: str
     """"session_id", "gap" or "user"."""
+    earliest_ms: int
+    """Rows with an earlier time (ms) are dropped as clock errors."""
+    has_condition: bool
+    """Whether its rows have the column `WANTED`."""
 
     @property
     def key(self) -> str:
@@ -85,8 +94,27 @@ class TypedColumns:
     """Log columns that the files have, `user_id` first."""
     selects: tuple[str, ...]
     """For each table of the log, the values of these columns and of `reward`, as after SELECT."""
+    tables: tuple[Table, ...]
+    """The tables with no other columns than these values need."""
     session_by: str
     """"session_id", "gap" or "user"."""
+
+    def log(
+        self,
+        connection: duckdb.DuckDBPyConnection,
+        vector_size: dict[str, int],
+        mapping: LogMapping,
+    ) -> TypedLog:
+        """The log of these columns, whose rows `connection` has."""
+        return TypedLog(
+            connection,
+            self.tables,
+            self.names,
+            vector_size,
+            self.session_by,
+            mapping.earliest_ms,
+            mapping.where is not None,
+        )
 
 
 def typed_columns(
@@ -105,14 +133,17 @@ def typed_columns(
     """
     columns = _present(tables, mapping, session_by)
     _note_partial(tables, {*columns, *mapping.columns})
-    selects = [_select(connection, table, mapping, columns, reward) for table in tables]
+    found = [_select(connection, table, mapping, columns, reward) for table in tables]
     for name in (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID):
-        _unify_ids(selects, name)
+        if name in columns:
+            _unify_ids(connection, found, name)
     return TypedColumns(
         columns,
         tuple(
-            ", ".join(f"{sql} AS {name}" for name, (sql, _) in select.items()) for select in selects
+            ", ".join(f"{sql} AS {name}" for name, (sql, _) in select.values.items())
+            for select in found
         ),
+        tuple(select.table for select in found),
         session_by or (schema.SESSION_ID if schema.SESSION_ID in columns else "gap"),
     )
 
@@ -153,7 +184,7 @@ def typed_log(
     with explained(connection, tables, folder):
         # Columns of Parquet files are read as often as they are needed; text is parsed once.
         columnar = all(table.columnar for table in tables)
-        rows = numbered_rows(zip(typed.selects, (t.sql for t in tables), strict=True))
+        rows = numbered_rows(zip(typed.selects, (t.sql for t in typed.tables), strict=True))
         connection.execute(f"CREATE {'VIEW' if columnar else 'TABLE'} {ROWS} AS {rows}")
         counts = {
             name: dict(connection.sql(vector_counts(name)).fetchall())
@@ -164,7 +195,7 @@ def typed_log(
             bad, n_rows = connection.sql(observation_counts()).fetchall()[0]
     sizes = vector_sizes(counts)
     require_observations(tables, bad, n_rows)
-    return TypedLog(connection, tables, typed.names, sizes, typed.session_by)
+    return typed.log(connection, sizes, mapping)
 
 
 def vectors(columns: Iterable[str]) -> tuple[str, ...]:
@@ -252,8 +283,14 @@ def _files_with(tables: Sequence[Table], name: str) -> list[Path]:
     return [file for table in named for file in table.files]
 
 
-Select = dict[str, tuple[str, str]]
-"""Log column to its (SQL, DuckDB type)."""
+@dataclass(frozen=True)
+class _Select:
+    """The typed columns of one table."""
+
+    table: Table
+    """With the columns that are read."""
+    values: dict[str, tuple[str, str]]
+    """Log column to its (SQL, DuckDB type)."""
 
 
 def _select(
@@ -262,23 +299,99 @@ def _select(
     mapping: LogMapping,
     columns: tuple[str, ...],
     reward: str,
-) -> Select:
-    select: Select = {}
-    for name in columns:
-        given = mapping.columns.get(name) or name
-        what = f"for {name}; map it with --column {name}=..."
-        select[name] = _typed(table, name, given, *bind(connection, table, what, given))
-    sql, kind = bind(connection, table, "for the reward", reward)
-    if not (is_number(kind) or kind == "BOOLEAN"):
+) -> _Select:
+    given = {name: mapping.columns.get(name) or name for name in columns}
+    bound = {
+        name: bind(connection, table, f"for {name}; map it with --column {name}=...", each)
+        for name, each in given.items()
+    }
+    # The text of a CSV file is what its identifiers and times are, not what DuckDB makes of it.
+    raw = {
+        name: each.columns[0]
+        for name, each in bound.items()
+        if not table.columnar and each.is_column and each.columns[0] in dict(table.types)
+        if name in _IDS or (name == schema.TIMESTAMP and mapping.time_format)
+    }
+    for name, column in raw.items():
+        bound[name] = Bound(quoted(raw_name(column)), "VARCHAR", (), False)
+    table, of_reward = _reward(connection, table, reward)
+    read = [*bound.values(), of_reward]
+    if mapping.where is not None:
+        condition = bind(connection, table, "for --where", mapping.where)
+        if condition.kind != "BOOLEAN":
+            wanted = "write a condition, e.g. user_id <> 'bot'"
+            raise wrong_type(table, "--where", mapping.where, condition.kind, wanted)
+        read.append(condition)
+    used = (column for each in read for column in each.columns)
+    narrow = table.of(used, raw.values())
+    values = {
+        name: _typed(connection, narrow, name, given[name], each, mapping.time_format)
+        for name, each in bound.items()
+    }
+    sql, kind, *_ = of_reward
+    if not (is_number(kind) or kind in ("BOOLEAN", NOTHING)):
         raise wrong_type(table, "reward", reward, kind, "use a numeric or boolean expression")
     # An error in one row (division by zero, a cast) makes only that row's reward undefined.
-    select[schema.REWARD] = (f"TRY(CAST({sql} AS DOUBLE))", "DOUBLE")
-    return select
+    values[schema.REWARD] = (f"TRY(CAST({sql} AS DOUBLE))", "DOUBLE")
+    if mapping.where is not None:
+        values[WANTED] = (f"coalesce(TRY({condition.sql}), false)", "BOOLEAN")
+    return _Select(narrow, values)
 
 
-def _typed(table: Table, name: str, given: str, sql: str, kind: str) -> tuple[str, str]:
+def _reward(
+    connection: duckdb.DuckDBPyConnection, table: Table, reward: str
+) -> tuple[Table, Bound]:
+    """The reward, and the table in which a column of text without a value has no type."""
+    try:
+        return table, bind(connection, table, "for the reward", reward)
+    except InputError:
+        empty = _empty_words(connection, table, reward)
+        if not empty:
+            raise
+        kinds = ((name, NOTHING if name in empty else kind) for name, kind in table.types)
+        table = replace(table, types=tuple(kinds))
+        return table, bind(connection, table, "for the reward", reward)
+
+
+def _empty_words(connection: duckdb.DuckDBPyConnection, table: Table, given: str) -> set[str]:
+    """Columns of text without a value that an expression reads."""
+    try:
+        read = {name.casefold() for name in columns_of(connection, given)}
+    except NotScalarError:
+        return set()
+    words = [n for n, kind in table.types if kind == "VARCHAR" and n.casefold() in read]
+    if not words:
+        return set()
+    counts = ", ".join(f"count({quoted(name)})" for name in words)
+    (row,) = connection.sql(f"SELECT {counts} FROM {table.of(words).sql}").fetchall()
+    return {name for name, count in zip(words, row, strict=True) if not count}
+
+
+_IDS: Final = (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID)
+_TYPES: Final = {
+    **dict.fromkeys(_IDS, "VARCHAR"),
+    schema.TIMESTAMP: "BIGINT",
+    schema.ACTION: "FLOAT[]",
+    schema.OBSERVATION: "FLOAT[]",
+    schema.PROPENSITY: "FLOAT",
+    schema.IS_RANDOM: "BOOLEAN",
+}
+
+
+def _typed(
+    connection: duckdb.DuckDBPyConnection,
+    table: Table,
+    name: str,
+    given: str,
+    bound: Bound,
+    time_format: str | None,
+) -> tuple[str, str]:
     """SQL that casts a column to its type in the schema, and that DuckDB type."""
-    if name in (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID):
+    sql, kind = bound.sql, bound.kind
+    nothing = "false" if name == schema.IS_RANDOM else f"CAST(NULL AS {_TYPES[name]})"
+    if kind == NOTHING:
+        return nothing, NOTHING
+    if name in _IDS:
         if is_integer(kind) or kind in ("VARCHAR", "UUID"):
             return sql, kind
         wanted = f"use integers or text, e.g. --column {name}='({given})::BIGINT'"
@@ -289,6 +402,8 @@ def _typed(table: Table, name: str, given: str, sql: str, kind: str) -> tuple[st
             return f"TRY_CAST(round({sql}) AS BIGINT)", "BIGINT"
         if time := as_timestamp(sql, kind):
             return f"TRY(epoch_ms({time}))", "BIGINT"
+        if kind == "VARCHAR":
+            return text_time(connection, table, sql, given, time_format), "BIGINT"
         wanted = "use milliseconds, a date or a timestamp, e.g. --column timestamp='seconds * 1000'"
     elif name in (schema.ACTION, schema.OBSERVATION):
         if is_vector(kind):
@@ -303,18 +418,40 @@ def _typed(table: Table, name: str, given: str, sql: str, kind: str) -> tuple[st
         if is_number(kind) or kind == "BOOLEAN":
             return f"coalesce(TRY(CAST({sql} AS DOUBLE)) = 1, false)", "BOOLEAN"
         wanted = "use a boolean or 0 and 1"
+    # A part without any value has whatever type its writer gave it.
+    if not connection.sql(f"SELECT 1 FROM {table.sql} WHERE {sql} IS NOT NULL LIMIT 1").fetchall():
+        return nothing, NOTHING
     raise wrong_type(table, name, given, kind, wanted)
 
 
-def _unify_ids(selects: list[Select], name: str) -> None:
-    """Cast ids to BIGINT if every file has integers that fit, else to text."""
-    if name not in selects[0]:
-        return
-    wide = {"UBIGINT", "HUGEINT", "UHUGEINT"}
-    kinds = {select[name][1] for select in selects}
-    whole = all(is_integer(kind) and kind not in wide for kind in kinds)
-    for select in selects:
-        select[name] = (f"CAST({select[name][0]} AS {'BIGINT' if whole else 'VARCHAR'})", "")
+def _unify_ids(connection: duckdb.DuckDBPyConnection, found: list[_Select], name: str) -> None:
+    """Cast ids to BIGINT if every file has integers that fit, else to text.
+
+    Text of a CSV file is an integer only if it is written as the integer is: 007, 7.0 and 1e1 are
+    not.
+    """
+    whole = all(
+        kind == NOTHING
+        or (is_integer(kind) and kind not in ("UBIGINT", "HUGEINT", "UHUGEINT"))
+        or _are_integers(connection, each.table, sql)
+        for each in found
+        for sql, kind in [each.values[name]]
+    )
+    for each in found:
+        sql, _ = each.values[name]
+        each.values[name] = (f"CAST({sql} AS {'BIGINT' if whole else 'VARCHAR'})", "")
+
+
+def _are_integers(connection: duckdb.DuckDBPyConnection, table: Table, sql: str) -> bool:
+    """Whether a column is text of a CSV file, and all of it is written as integers are."""
+    if not table.raw or sql not in {quoted(raw_name(column)) for column in table.raw}:
+        return False
+    with explained(connection, (table,), table.files[0].parent):
+        ((others,),) = connection.sql(
+            f"SELECT bool_or(CAST(TRY_CAST(x AS BIGINT) AS VARCHAR) IS DISTINCT FROM x) "
+            f"FROM (SELECT {sql} AS x FROM {table.sql}) WHERE x IS NOT NULL"
+        ).fetchall()
+    return not others
 
 
 def vector_sizes(counts: Mapping[str, Mapping[int, int]]) -> dict[str, int]:

@@ -26,7 +26,8 @@ from ucfrec.logs.ids import EPISODE_USERS
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.progress import progress
-from ucfrec.runs.trained_policy import RUN, TrainedPolicy
+from ucfrec.runs.record import RUN, store_of
+from ucfrec.runs.trained_policy import TrainedPolicy
 
 SESSION, PROBABILITY, RANK, GREEDY = "session", "probability", "rank", "greedy_item_id"
 _STEPS_AT_ONCE = 1024
@@ -41,7 +42,8 @@ class LoggedSessions:
     users: Array
     """(E,): identifier of each session's user."""
     report: dict[str, Any]
-    """Counts of what was read and dropped, for `ucfrec.logs.summary.format_report`."""
+    """Counts of what was read and dropped, for `ucfrec.logs.summary.format_report`; of a split of
+    a store, only "dropped"."""
     unknown_items: int = 0
     """Number of steps that show an item which the run does not know."""
 
@@ -101,10 +103,7 @@ def logged_sessions(
             is known, or their observations are not those of the training logs.
     """
     if trained.item_states is None:
-        raise InputError(
-            f"{run}: the actions of this policy are vectors; it chooses one for certain, so a "
-            "logged action has no probability. Judge it with ucfrec evaluate"
-        )
+        raise _vectors(run)
     record = trained.record
     if not trained.logged_observation_size:
         mapping = LogMapping({schema.OBSERVATION: ""}).over(mapping)
@@ -220,3 +219,41 @@ def score(
         columns[RANK] = 1 + (batch.scores > scored).sum(1).numpy()
         columns[GREEDY] = item_ids[batch.scores.argmax(1).numpy()]
         yield pd.DataFrame(columns)
+
+
+def held_out_sessions(trained: Sequence[TrainedPolicy]) -> LoggedSessions:
+    """The test split of the store that policies were trained on, whose rows none of them has seen.
+
+    Args:
+        trained: at least one; all of the same store.
+
+    Raises:
+        InputError: the actions are vectors, the store is gone or has no test split, or a policy is
+            a refit, trained on all rows.
+    """
+    for policy in trained:
+        if policy.item_states is None:
+            raise _vectors(policy.folder)
+        if policy.record.refit_of is not None:
+            raise InputError(
+                f"{policy.folder} is a refit, trained on the test split too; name later logs"
+            )
+    first = trained[0]
+    store = store_of(first.folder, first.record)
+    if store is None:
+        raise InputError(
+            f"{first.folder}: its store {first.record.store} is gone or has changed; move the "
+            "run together with its store, or name later logs"
+        )
+    test = store.split("test")
+    if not test.n_episodes:
+        raise InputError(f"{store.path} has no test split; name later logs")
+    users = test.episode_values(schema.USER)
+    return LoggedSessions(_as_seen(test, first), users, {"dropped": {}})
+
+
+def _vectors(run: Path) -> InputError:
+    return InputError(
+        f"{run}: the actions of this policy are vectors; it chooses one for certain, so a logged "
+        "action has no probability. Judge it with ucfrec evaluate"
+    )

@@ -17,8 +17,6 @@ MOST_SEEN: Final = 0.05
 """Largest share of rows seen in training with which an estimate is accepted. It is above 0 because
 with coarse timestamps some rows of other logs have the same user, item and time by chance."""
 
-_ROWS_AT_ONCE: Final = 2**19
-
 KeyArray = npt.NDArray[np.uint64]
 
 
@@ -37,7 +35,10 @@ def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
     """
     record = trained.record
     if record.fingerprint == logged.record.fingerprint:
-        return 1.0
+        held_out = np.zeros(logged.n_episodes, dtype=bool)
+        if record.refit_of is None:
+            held_out = logged.episode_values(schema.SPLIT) == schema.SPLITS.index("test")
+        return float(logged.lengths[~held_out].sum() / logged.n_steps)
     try:
         store = store_of(trained.folder, record)
     except InputError:
@@ -69,8 +70,7 @@ def _keys(store: EpisodeStore) -> Iterator[KeyArray]:
     if not store.n_episodes:
         return
     users: Array = store.episode_values(schema.USER)
-    for begin in range(0, store.n_steps, _ROWS_AT_ONCE):
-        episodes, steps = store.locate(np.arange(begin, min(begin + _ROWS_AT_ONCE, store.n_steps)))
+    for episodes, steps in store.step_batches():
         keys = np.zeros(len(steps), dtype=np.uint64)
         for values in (
             users[episodes],

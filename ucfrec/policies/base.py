@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Final, Literal
 
 import numpy as np
 import torch
@@ -50,7 +50,7 @@ class PolicyConfig:
     return_to_go: Returns = "auto"
     """What returns-to-go count: the whole rest of the `session`; the rest `discounted` by
     `discount`; or the next `horizon` steps. `auto` is the horizon where the sessions of the log are
-    users, whose rest tells how many rows a user has left, and otherwise the session."""
+    users, whose rest shows how many rows a user has left, and otherwise the session."""
     discount: Annotated[float, Field(gt=0, le=1)] = 0.9
     """γ of discounted returns-to-go."""
     horizon: Annotated[int, Field(ge=1, le=10**6)] = 1
@@ -92,6 +92,18 @@ class PolicyConfig:
         return ReturnToGo(definition, self.discount, self.horizon)
 
 
+RESERVED_ATTRIBUTES: Final = frozenset(
+    {"config", "state_mean", "state_std", "return_scale", "lowest_return_to_go", "values"}
+)
+"""What `SequencePolicy` sets on its instances, and no subclass may replace."""
+RESERVED: Final = RESERVED_ATTRIBUTES | {
+    *("head", "normalized", "imitation", "act_and_features", "max_return", "exposed"),
+    "_exposed_last",
+}
+"""Names that no subclass of `SequencePolicy` may define; of its instances, `head` may be replaced
+by another with the same methods."""
+
+
 class SequencePolicy(nn.Module, ABC):
     """Predicts a_t from returns-to-go and states up to t and actions before t.
 
@@ -101,9 +113,9 @@ class SequencePolicy(nn.Module, ABC):
 
     Config: ClassVar[type[PolicyConfig]] = PolicyConfig
     augmented: ClassVar[bool] = False
-    """Whether the default of `augment.copies` is above 0 for this learner."""
+    """Whether the default of `augment.copies` is above 0 for this policy."""
     presets: ClassVar[Mapping[str, Any]] = {}
-    """Defaults of this learner for settings outside the table `policy`, by `table.field`."""
+    """Defaults of this policy for settings outside the table `policy`, by `table.field`."""
 
     state_mean: Tensor
     state_std: Tensor
@@ -116,7 +128,7 @@ class SequencePolicy(nn.Module, ABC):
         config: settings, an instance of the class's `Config`.
         sizes: `state` S; `action` A, the size of an action vector or of an item's embedding; and
             `items`, the number of items, 0 if actions are vectors; and `tags`, the most tags of an
-            item, 0 if that is left out.
+            item, 0 if that is omitted.
         """
         super().__init__()
         self.config = config
@@ -129,6 +141,20 @@ class SequencePolicy(nn.Module, ABC):
         )
         learns_values = config.advantage_weights or config.max_return
         self.values = ValueHead(sizes["state"], config.dim) if learns_values else None
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute.
+
+        Raises:
+            InputError: `name` is reserved, and set already.
+        """
+        taken = name in RESERVED_ATTRIBUTES and name in {*self.__dict__, *self._buffers}
+        if taken or (name == "values" and name in self._modules):
+            raise InputError(
+                f"{type(self).__name__} sets {name!r}, which ucfrec.policies.base.SequencePolicy "
+                "keeps for itself; choose another name"
+            )
+        super().__setattr__(name, value)
 
     @classmethod
     def training_view(
@@ -170,7 +196,7 @@ class SequencePolicy(nn.Module, ABC):
         """Inputs (B, K, d) of the action head, from normalised windows; row t ignores a_t."""
 
     def last_features(self, windows: Windows) -> Tensor:
-        """Row K − 1 of `features`, (B, d), for acting; subclasses may leave out what it ignores."""
+        """Row K − 1 of `features`, (B, d), for acting; subclasses may omit what it ignores."""
         return self.features(windows)[:, -1]
 
     def acting_features(self) -> Callable[[Windows], Tensor]:

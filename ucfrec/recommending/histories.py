@@ -12,11 +12,10 @@ import pyarrow as pa
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
-from ucfrec.logs.clean import EARLIEST_MS
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.histories import frame_histories, read_histories
 from ucfrec.logs.kept import kept_in_order
-from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.mapping import EARLIEST_MS, LogMapping
 from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 
 _PLAIN = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP)

@@ -5,10 +5,19 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any, Final, NamedTuple, NotRequired
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    StrictFloat,
+    StrictInt,
+    ValidationError,
+)
 
 # Of typing's TypedDict, pydantic cannot read the configuration before Python 3.12.
 from typing_extensions import TypedDict
@@ -16,7 +25,7 @@ from typing_extensions import TypedDict
 from ucfrec import schema
 from ucfrec.arrays import Array, Float32Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.logs.clean import DAY_MS, EARLIEST_MS
+from ucfrec.logs.clean import DAY_MS
 from ucfrec.logs.kept import kept_in_order
 from ucfrec.recommending.histories import LONGEST_HISTORY
 from ucfrec.recommending.row_rewards import RowRewards
@@ -27,11 +36,31 @@ _Integer = Annotated[StrictInt, Field(ge=-(2**63), lt=2**63)]
 """Of 64 bits: the largest that identifiers have, and small enough to be a float."""
 Id = _Integer | Annotated[str, Field(max_length=1000)]
 Number = Annotated[StrictFloat, Field(allow_inf_nan=False)] | _Integer
+_EARLIEST_MS: Final = 365 * DAY_MS
+"""Times before 1971 are hardly milliseconds; seconds of today would be there."""
 _LARGEST_FLOAT: Final = float(np.finfo(np.float32).max)
 _MOST_FAULTS: Final = 1000
 """Beyond so many, it would take too long to look at each."""
 _SHOWN: Final = 60
 """Most characters of a wrong value in a message."""
+
+
+def _milliseconds(given: float | str) -> float:
+    """A time of a request in milliseconds since 1970.
+
+    Raises:
+        ValueError: it is text, but not of ISO 8601.
+    """
+    if not isinstance(given, str):
+        return given
+    try:
+        time = datetime.fromisoformat(given.strip())
+        return (time.replace(tzinfo=time.tzinfo or UTC) - _EPOCH) // timedelta(milliseconds=1)
+    except (ValueError, OverflowError):
+        raise ValueError("no ISO 8601 time, such as 2024-05-01T10:00:00+02:00") from None
+
+
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 @settings_table("")
@@ -54,7 +83,11 @@ class Row(TypedDict):
     __pydantic_config__ = ConfigDict(extra="allow", strict=True)  # type: ignore[misc]
 
     item_id: Id
-    timestamp: Annotated[Number, Field(description="Milliseconds since 1970, UTC.")]
+    timestamp: Annotated[
+        Number | Annotated[str, Field(max_length=64)],
+        Field(description="Milliseconds since 1970, UTC; or ISO 8601 text, UTC without a zone."),
+        AfterValidator(_milliseconds),
+    ]
     reward: NotRequired[
         Annotated[Number, Field(description="Without it, the run's reward of the feedback.")]
     ]
@@ -199,7 +232,7 @@ class HistoryReader:
             RowRewards.of(trained),
         )
 
-    def read(self, rows: Sequence[Row]) -> UserHistory:
+    def read(self, rows: Sequence[Row], user_id: int | str) -> UserHistory:
         """The history of the rows of one user.
 
         Raises:
@@ -224,7 +257,7 @@ class HistoryReader:
             if {*map(len, given)} == {self.observation_size}:
                 columns[schema.OBSERVATION] = np.asarray(given, dtype=np.float64)
         columns[schema.REWARD] = np.asarray(self.rewards.of_rows(rows), dtype=np.float64)
-        order = kept_in_order(columns, self.duplicates)[-LONGEST_HISTORY:]
+        order = kept_in_order(columns, self.duplicates, user_id)[-LONGEST_HISTORY:]
         observation = None
         if self.observation_size:
             observation = self._observation(rows, int(order[-1]))
@@ -257,11 +290,11 @@ def _times(rows: Sequence[Row]) -> list[int]:
     times = []
     for n, row in enumerate(rows):
         # DuckDB rounds halves away from zero.
-        when = math.floor(row["timestamp"] + 0.5)
-        if not EARLIEST_MS <= when <= latest:
+        when = math.floor(float(row["timestamp"]) + 0.5)
+        if not _EARLIEST_MS <= when <= latest:
             raise InputError(
-                f"history.{n}: timestamp {row['timestamp']} is before 2000 or more than a day "
-                "ahead of now; give milliseconds since 1970"
+                f"history.{n}: timestamp {row['timestamp']} is before 1971 or more than a day "
+                "ahead of now; give milliseconds since 1970, or ISO 8601 text"
             )
         times.append(when)
     return times

@@ -18,6 +18,8 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 
 TORCH: Final = "torch"
 ONNXRUNTIME: Final = "onnxruntime"
+_LARGEST_EXACT: Final = 2**53 - 1
+"""Largest integer that JavaScript holds exactly."""
 ENGINES: Final = (TORCH, ONNXRUNTIME)
 
 
@@ -31,8 +33,13 @@ class Answer(NamedTuple):
     def as_dict(self, user_id: int | str) -> dict[str, Any]:
         """The answer to a request of a user, as a JSON object."""
         pairs = zip(self.items, self.scores, strict=True)
-        items = [{"item_id": item, "score": score} for item, score in pairs]
-        return {"user_id": user_id, "items": items}
+        items = [{"item_id": exact_id(item), "score": score} for item, score in pairs]
+        return {"user_id": exact_id(user_id), "items": items}
+
+
+def exact_id(given: int | str) -> int | str:
+    """An identifier for JSON: as text if a client that reads numbers as doubles would round it."""
+    return str(given) if isinstance(given, int) and abs(given) > _LARGEST_EXACT else given
 
 
 class _Asked(NamedTuple):
@@ -132,7 +139,7 @@ class Responder:
             return [outcome for outcome in outcomes if outcome is not None]
 
     def _asked(self, number: int, request: Request) -> _Asked:
-        history = self._reader.read(request.history)
+        history = self._reader.read(request.history, request.user_id)
         known = self._items.numbers(history.item_ids)
         if (known < 0).any() and not self._skip_unknown:
             unknown = sorted(set(history.item_ids[known < 0].tolist()))

@@ -11,14 +11,17 @@ import pyarrow as pa
 
 from ucfrec import schema
 from ucfrec.errors import InputError
-from ucfrec.logs.binding import bind, explained, is_number
+from ucfrec.logs.binding import bind, explained
 from ucfrec.logs.engine import engine_in_memory
 from ucfrec.logs.expressions import Expression, columns_of
 from ucfrec.logs.histories import FrameTable
+from ucfrec.logs.tables import is_number
 from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 
 _ROWS: Final = "history"
 """Name of the rows in messages and in the engine."""
+_MEMORY: Final = "256MB"
+"""Of the engine: a request is some megabytes, and no expression makes much more of it."""
 _NAME: Final = re.compile(r"[A-Za-z_]\w*")
 
 
@@ -63,7 +66,7 @@ class RowRewards:
 
     def _evaluated(self, rows: Sequence[Mapping[str, Any]]) -> list[Any]:
         if self._connection is None:
-            self._connection = self._stack.enter_context(engine_in_memory())
+            self._connection = self._stack.enter_context(engine_in_memory(_MEMORY))
         connection = self._connection
         names = columns_of(connection, self._expression)
         given = {name.casefold(): name for row in rows for name in row}
@@ -89,7 +92,7 @@ class RowRewards:
             described = connection.sql(f"DESCRIBE {_ROWS}").fetchall()
             table = FrameTable((source,), tuple((row[0], row[1]) for row in described))
             with explained(connection, (table,), source):
-                sql, kind = bind(connection, table, "for the reward", self._expression)
+                sql, kind, *_ = bind(connection, table, "for the reward", self._expression)
                 if not (is_number(kind) or kind == "BOOLEAN"):
                     raise InputError(f"history: the run's reward is {kind} here; give numbers")
                 query = f"SELECT TRY(CAST({sql} AS DOUBLE)) FROM {table.sql}"

@@ -1,14 +1,14 @@
 """Recommendations as a stream: lines of requests in, lines of answers out."""
 
-import json
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
 from ucfrec.errors import InputError
+from ucfrec.files.atomic import json_text
 from ucfrec.recommending.requests import Limits, Request, Row, StreamRequest, parsed
-from ucfrec.recommending.responder import Responder
+from ucfrec.recommending.responder import Responder, exact_id
 
 REMEMBERED: Final = 1_000_000
 """Rows that a stream remembers; whoever was heard of longest ago is forgotten first."""
@@ -42,10 +42,11 @@ class Counts:
 def answer_stream(
     responder: Responder, source: Readable, sink: Writable, remember: int = REMEMBERED
 ) -> Counts:
-    """Answer every line of `source` until it ends, in order; blank lines have no answer.
+    """Answer every line of `source` until it ends: the nth answer is that of the nth line.
 
     What has arrived is answered with one forward pass, and each answer is written at once. A line
-    that is no request is answered with `{"error": …, "line": …}`, and the stream goes on.
+    that is no request, a blank one too, is answered with `{"error": …, "line": …}`, and the stream
+    goes on.
 
     Args:
         responder: answers the requests.
@@ -56,7 +57,7 @@ def answer_stream(
     counts, remembered = Counts(), _Remembered(remember, responder.limits)
     for lines in _lines(source, responder.limits.bytes):
         for answer in _answered(responder, remembered, lines):
-            sink.write(json.dumps(answer).encode() + b"\n")
+            sink.write(json_text(answer).encode() + b"\n")
             counts.errors += "error" in answer
             counts.answers += "error" not in answer
         sink.flush()
@@ -90,6 +91,8 @@ def _answered(
 def _parsed(line: bytes | None, limits: Limits) -> StreamRequest:
     if line is None:
         raise InputError(f"the line has more than {limits.bytes:,} bytes; send fewer rows")
+    if not line.strip():
+        raise InputError("the line is blank; send a request on each line")
     request: StreamRequest = parsed(StreamRequest, line, limits)
     return request
 
@@ -108,7 +111,7 @@ def _together(
             continue
         answer = answers[number]
         if isinstance(answer, InputError):
-            yield {"user_id": request.user_id, "error": str(answer), "line": number}
+            yield {"user_id": exact_id(request.user_id), "error": str(answer), "line": number}
         else:
             remembered.keep(request, whole[number].history)
             yield answer.as_dict(request.user_id)
@@ -142,7 +145,7 @@ class _Remembered:
 
 
 def _lines(source: Readable, most: int) -> Iterator[list[Line]]:
-    """Lines that arrive together, without blank ones; None for one of over `most` bytes."""
+    """Lines that arrive together; None for one of over `most` bytes."""
     number, rest, too_long = 0, bytearray(), False
     while block := source.read(_BLOCK):
         first, *others = block.split(b"\n")
@@ -152,7 +155,7 @@ def _lines(source: Readable, most: int) -> Iterator[list[Line]]:
             number += 1
             if too_long or len(rest) > most:
                 lines.append((number, None))
-            elif rest.strip():
+            else:
                 lines.append((number, bytes(rest)))
             rest, too_long = bytearray(following), False
         if len(rest) > most:
@@ -161,5 +164,5 @@ def _lines(source: Readable, most: int) -> Iterator[list[Line]]:
             yield lines
     if too_long or len(rest) > most:
         yield [(number + 1, None)]
-    elif rest.strip():
+    elif rest:
         yield [(number + 1, bytes(rest))]

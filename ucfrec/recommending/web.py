@@ -1,12 +1,13 @@
 """The web server's application: recommendations, health, metrics and a page on all of them."""
 
 import asyncio
-import json
+import re
 import sys
 import time
 import traceback
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager, suppress
+from ipaddress import IPv6Address
 from typing import Annotated, Any, Final
 
 from fastapi import FastAPI, Response
@@ -15,16 +16,20 @@ from fastapi_offline import FastAPIOffline
 from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import Field
 from starlette.exceptions import HTTPException
+from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import ClientDisconnect
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from ucfrec import __version__
 from ucfrec.errors import InputError
+from ucfrec.files.atomic import json_text
 from ucfrec.recommending.batcher import Batcher, QueueFullError
 from ucfrec.recommending.requests import Request, parsed
 from ucfrec.recommending.responder import Answer, Responder
 from ucfrec.recommending.serving_metrics import ServingMetrics
 from ucfrec.settings import settings_table
 
+_HOST: Final = re.compile(r"\*|(\*\.)?[\w.-]+")
 _JSON: Final = "application/json"
 _ERROR: Final = {
     "type": "object",
@@ -49,11 +54,16 @@ _FAULTS: Final = {
     400: "Not JSON, no such request, or beyond a limit.",
     408: "The request's body did not arrive in time.",
     413: "The body is too large.",
+    431: "Too many headers, or too long ones.",
     500: "A defect, or no memory; the server's standard error says more.",
     503: "Too many requests wait; try again later.",
     504: "No answer in time.",
 }
 
+_MOST_HEADERS: Final = 100
+_MOST_HEADER_BYTES: Final = 2**16
+"""Of the address, names and values of a request. The server itself stops reading a head that is not
+whole by then."""
 _HUNG_UP: Final = 499
 """For the metrics, as nobody receives it; nginx calls it so."""
 
@@ -70,19 +80,57 @@ class ServerLimits:
     """Seconds for a request to arrive and to be answered."""
 
 
+def _host(given: str) -> str:
+    """A host as the header `Host` has it: addresses of IP version 6 are in brackets."""
+    with suppress(ValueError):
+        return f"[{IPv6Address(given.strip('[]'))}]"
+    if not _HOST.fullmatch(given):
+        raise InputError(
+            f"--allowed-hosts: {given!r} is no host; write names or addresses without a port, "
+            "*.example.org, or *"
+        )
+    return given
+
+
+class _HeaderLimits:
+    """ASGI middleware that answers 431 to requests with too many or too long headers."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        headers = scope.get("headers", ())
+        size = len(scope.get("raw_path", b"")) + len(scope.get("query_string", b""))
+        size += sum(len(name) + len(value) for name, value in headers)
+        if len(headers) <= _MOST_HEADERS and size <= _MOST_HEADER_BYTES:
+            await self._app(scope, receive, send)
+            return
+        most = f"{_MOST_HEADERS} headers and {_MOST_HEADER_BYTES:,} bytes of them are allowed"
+        refusal = _response(431, {"error": most}, {"connection": "close"})
+        await refusal(scope, receive, send)
+
+
 class _RefusalError(Exception):
     def __init__(self, status: int, message: str) -> None:
         super().__init__(message)
         self.status = status
 
 
-def application(responder: Responder, limits: ServerLimits) -> FastAPI:
+def application(
+    responder: Responder, limits: ServerLimits, allowed_hosts: Sequence[str] = ("*",)
+) -> FastAPI:
     """The application of one model; it keeps no state but the model and its metrics.
 
     Args:
         responder: answers the requests.
         limits: of the server.
+        allowed_hosts: values of the header `Host`, without a port, that are answered: names,
+            addresses, *.example.org for all names below, or * for any.
+
+    Raises:
+        InputError: a host is written otherwise.
     """
+    hosts = [_host(each) for each in allowed_hosts]
     metrics = ServingMetrics()
     batcher = Batcher(responder, metrics, limits.batch, limits.queue)
     metrics.waiting.set_function(lambda: batcher.waiting)
@@ -96,6 +144,9 @@ def application(responder: Responder, limits: ServerLimits) -> FastAPI:
     app = FastAPIOffline(
         title="ucfrec", version=__version__, lifespan=lifespan, redoc_url=None, docs_url="/docs"
     )
+
+    app.add_middleware(TrustedHostMiddleware, allowed_hosts=hosts, www_redirect=False)
+    app.add_middleware(_HeaderLimits)  # the last one added comes first
 
     @app.exception_handler(HTTPException)
     async def refused(_: HTTPRequest, error: HTTPException) -> Response:
@@ -176,7 +227,7 @@ async def _body(http: HTTPRequest, most: int) -> bytes:
 
 def _response(status: int, body: Any, headers: Any = None) -> Response:
     # One-line errors may quote text that is no Unicode; \u escapes can carry it.
-    return Response(json.dumps(body), status, headers, media_type=_JSON)
+    return Response(json_text(body), status, headers, media_type=_JSON)
 
 
 def _inline(schema: dict[str, Any]) -> dict[str, Any]:

@@ -6,15 +6,16 @@ which every evaluation of the run adds its newest values; nothing in it is typed
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path, PurePath
 from typing import Any
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.files.atomic import atomic_file, read_json, write_json
+from ucfrec.files.atomic import atomic_file, json_text, read_json, write_json
 from ucfrec.files.checksums import CARD, MEASURED
 from ucfrec.files.locks import claim
+from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.provenance import config_hash
 from ucfrec.reporting.tables import markdown_table, shown
 from ucfrec.runs.record import RunRecord, read_record
@@ -36,7 +37,7 @@ def write_card(run: Path) -> Path:
         "## How it acts",
         _rule(run),
         "## Limits",
-        "\n".join(f"- {limit}" for limit in _limits(record)),
+        "\n".join(f"- {limit}" for limit in _limits(record, read_metrics(run / "policy"))),
         "## Measured",
         _measured(_read(run)),
     ]
@@ -76,7 +77,7 @@ def _read(run: Path) -> list[dict[str, Any]]:
 
 
 def _plain(value: object) -> object:
-    return value if isinstance(value, (int, float, str, bool)) else json.loads(json.dumps(value))
+    return value if isinstance(value, (int, float, str, bool)) else json.loads(json_text(value))
 
 
 def _about(record: RunRecord) -> str:
@@ -136,7 +137,7 @@ def _rule(run: Path) -> str:
     )
 
 
-def _limits(record: RunRecord) -> list[str]:
+def _limits(record: RunRecord, logged: Container[str]) -> list[str]:
     items = record.sizes["items"]
     limits = []
     if record.refit_of is not None:
@@ -157,13 +158,8 @@ def _limits(record: RunRecord) -> list[str]:
         )
     elif unknown:
         limits.append(f"{unknown:,} steps of its logs have no propensity.")
-    best = None if record.policy is None else record.policy.best_validation
-    popularity = (record.reference_losses or {}).get("popularity")
-    if best is not None and popularity is not None and best >= popularity:
-        limits.append(
-            f"Its validation loss, {best:.4g}, is not below that of showing items by popularity, "
-            f"{popularity:.4g}: it learned nothing about users."
-        )
+    if warning := record.learned_nothing(logged):
+        limits.append(f"{warning[0].upper()}{warning[1:]}.")
     if record.augmentation is not None:
         limits.append(f"Counterfactual augmentation: {record.augmentation.verdict}")
     limits.append(

@@ -1,7 +1,5 @@
 """The HTML report on runs: conclusions from their results, and how they were trained."""
 
-import json
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,12 +11,12 @@ import pyarrow as pa
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from ucfrec import __version__
-from ucfrec.counterfactual.augment import AugmentationReport
+from ucfrec.counterfactual.state_augmentation import AugmentationReport
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.files.atomic import atomic_file
+from ucfrec.files.atomic import atomic_file, json_text
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.reporting import charts
-from ucfrec.reporting.copies import copies_table, moves_chart
+from ucfrec.reporting.augmentation import augmentation_table, moves_chart
 from ucfrec.reporting.curves import POINTS, REFERENCES, Curves, draw_curves, trained_on
 from ucfrec.reporting.data_quality import data_quality
 from ucfrec.reporting.forest import forest
@@ -140,21 +138,14 @@ def _warnings(run: _Run) -> list[str]:
 
 
 def _warnings_of(run: _Run) -> list[str]:
-    fit, report = run.record.policy, run.augmentation
-    warnings = [run.status] if fit is None else []
+    report = run.augmentation
+    warnings = [run.status] if run.record.policy is None else []
     if report is not None:
         warnings += report.warnings
         bound_is_useful = report.bound < report.reward_model.reward_std
         if not (bound_is_useful and report.moves.edits):
             warnings.append(report.verdict)
-    # A refit has no validation rows, and its loss is not a number.
-    best = math.nan if fit is None else fit.best_validation
-    popularity = run.references.get("popularity")
-    if math.isfinite(best) and popularity is not None and best >= popularity:
-        warnings.append(
-            f"the best validation loss, {best:.4g}, is not below {popularity:.4g}, the loss of "
-            "showing items by popularity: the policy learned nothing about users"
-        )
+    warnings.append(run.record.learned_nothing(run.logged))
     return [text for text in warnings if text]
 
 
@@ -184,11 +175,11 @@ def _variables(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any
         "finished": any(run.record.policy is not None for run in runs),
         "references": any(run.references for run in runs),
         "verdicts": [(name, report.verdict) for name, report in edited],
-        "copies": copies_table(edited) if edited else None,
+        "copies": augmentation_table(edited) if edited else None,
         "moves": moves_chart(styled),
         "samples": [(run.name, sample_tables(run.folder, features)) for run in item_runs],
         "differences": _differences(runs),
-        "records": [(run.name, json.dumps(run.record.model_dump(), indent=2)) for run in runs],
+        "records": [(run.name, json_text(run.record.model_dump(), indent=2)) for run in runs],
     }
 
 

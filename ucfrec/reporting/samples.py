@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 from ucfrec import schema
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import read_json
+from ucfrec.files.parquet import require_regular
 from ucfrec.reporting.tables import Table, shown
 from ucfrec.runs.samples import SAMPLES
 from ucfrec.runs.trained_policy import ITEMS
@@ -30,6 +31,7 @@ def sample_tables(run: Path, features: pa.Table | None) -> tuple[str, list[Table
     if not (run / SAMPLES).exists() or not (run / ITEMS).exists():
         return None
     samples = read_json(run / SAMPLES)
+    require_regular(run / ITEMS)
     with damage_explained(run / SAMPLES, "restore it or train again"):
         sessions = samples["sessions"]
         numbers = {n for s in sessions for n in (*s["history"], s["logged"], *s["recommended"])}
@@ -44,6 +46,7 @@ def read_features(path: Path) -> pa.Table:
     Raises:
         InputError: the file cannot be read as that or lacks the column.
     """
+    require_regular(path)
     try:
         table = csv.read_csv(path) if path.suffix == ".csv" else pq.read_table(path)
     except (OSError, pa.ArrowInvalid) as error:

@@ -1,7 +1,8 @@
 """`run.json`, the record of a run: provenance, configuration and the report of every stage."""
 
+import math
 import os
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal
@@ -17,8 +18,8 @@ from pydantic import (
 )
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.counterfactual.augment import AugmentationReport
 from ucfrec.counterfactual.screening import DimensionReport
+from ucfrec.counterfactual.state_augmentation import AugmentationReport
 from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.record import Source, StoreRecord
 from ucfrec.episodes.returns import ReturnToGo
@@ -192,7 +193,7 @@ class RunRecord(TrainingRecord):
         method's default.
         """
         config = self.config
-        augmented = config.augment.makes_copies
+        augmented = config.augment.augments
         if augmented == policy_class(config.policy_name).augmented:
             return config.policy_name
         return f"{config.policy_name}-{'augmented' if augmented else 'no-augmentation'}"
@@ -230,14 +231,38 @@ class RunRecord(TrainingRecord):
         states = [each.files.get(ITEM_STATES) for each in (self, store)]
         return self.fingerprint == store.fingerprint and states[0] == states[1]
 
-    def describe(self) -> str:
-        """What a finished run did, a few lines of text."""
+    def learned_nothing(self, logged: Container[str]) -> str:
+        """A warning if a policy of items predicts logged choices no better than popularity does.
+
+        Args:
+            logged: names of the scalars that the training logged; without `action_loss` among them,
+                the validation loss is not a log-likelihood of items and cannot be compared.
+
+        Returns:
+            What was found and what to do; empty if the policy learned something, has no validation
+            loss (as a refit), or is not trained yet.
+        """
+        best = math.nan if self.policy is None else self.policy.best_validation
+        popularity = (self.reference_losses or {}).get("popularity")
+        if popularity is None or "action_loss" not in logged or not best >= popularity:
+            return ""
+        return (
+            f"the best validation loss, {best:.4g}, is not below {popularity:.4g}, the loss of "
+            "showing items by popularity: the policy learned nothing about users; train with more "
+            "steps or a higher train.learning_rate, add features of users and items or more "
+            "history, or use --policy item-rate"
+        )
+
+    def describe(self, logged: Container[str] = ()) -> str:
+        """What a finished run did, a few lines of text; `logged` as in `learned_nothing`."""
         lines = [] if self.augmentation is None else _describe_augmentation(self.augmentation)
         fit = self.finished
         found = f"best validation loss {fit.best_validation:.4g} at step {fit.best_step}"
         if self.refit_of is not None:
             found = f"trained on all rows, up to step {fit.best_step}"
         lines.append(f"policy        {found} of {fit.steps}, {fit.seconds:.0f} s")
+        if warning := self.learned_nothing(logged):
+            lines.append(f"warning       {warning}")
         if self.rule is not None and self.reward_model is not None:
             lines.append(_describe_rule(self.rule, self.reward_model))
         if self.screening is not None:

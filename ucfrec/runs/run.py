@@ -12,10 +12,10 @@ import torch
 
 from ucfrec.acting.scorer import Scorer
 from ucfrec.choosing.choose import choose_rule
-from ucfrec.counterfactual.augment import AugmentationReport, AugmentConfig
-from ucfrec.counterfactual.copies import MODELS, counterfactual_copies
+from ucfrec.counterfactual.augmentation import MODELS, counterfactual_augmentation
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
+from ucfrec.counterfactual.state_augmentation import AugmentationReport, AugmentConfig
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.episodes.windows import Overlay
 from ucfrec.files.atomic import write_json
@@ -24,6 +24,7 @@ from ucfrec.fitting import distributed
 from ucfrec.fitting.loop import Fit
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
+from ucfrec.policies.checks import require_sound
 from ucfrec.runs.config import Config
 from ucfrec.runs.policy_fit import fit_policy
 from ucfrec.runs.record import RUN, RuleRecord, RunRecord, read_augmentation
@@ -134,6 +135,7 @@ def _prepare_inputs(
         require_startable(store, train, out, config)
     policy = new_policy(train, config)
     if distributed.leads():
+        require_sound(policy, train, config.policy_name)
         if not (out / RUN).exists():
             begin(store, train, validation, out, config, about)
         RunRecord.read(out).reopened(out, INPUTS)
@@ -160,7 +162,7 @@ def _augment(run: _Inputs) -> tuple[Overlay | None, AugmentationReport | None]:
     Made once, then read from the run folder; (None, None) for a run without augmentation.
     """
     config, out = run.config, run.out
-    if not config.augment.makes_copies:
+    if not config.augment.augments:
         return None, run.record.augmentation
     settings = (config.crm, config.csg, config.augment)
     # A policy's own view of the episodes has augmentation of its own.
@@ -168,7 +170,7 @@ def _augment(run: _Inputs) -> tuple[Overlay | None, AugmentationReport | None]:
     shared = OWN if own or not run.record.return_to_go.per_session else run.shared
 
     def make() -> None:
-        overlay, report = counterfactual_copies(
+        overlay, report = counterfactual_augmentation(
             run.train, run.validation, *settings, out, config.seed, run.device
         )
         overlay.save(out / _OVERLAY)
@@ -178,7 +180,7 @@ def _augment(run: _Inputs) -> tuple[Overlay | None, AugmentationReport | None]:
         if not (out / AUGMENTATION).exists():
             inputs = _dependencies(run.train, run.validation, config.seed, run.device, *settings)
             files = (*MODELS, _OVERLAY, AUGMENTATION)
-            shared.provide(inputs, counterfactual_copies.__module__, out, files, make)
+            shared.provide(inputs, counterfactual_augmentation.__module__, out, files, make)
         return Overlay.load(out / _OVERLAY), read_augmentation(out / AUGMENTATION)
 
 

@@ -77,10 +77,10 @@ class UserModel:
         if not path.exists():
             runs = (LoggedRuns.of(v, tags, reward.lags, _MOST_STEPS) for v in (train, validation))
             tired = fit_fatigue(*runs) if reward.binary else None
-            ends, later = (
+            logged, held_out = (
                 LoggedEnds.of(view, reward.lags, _MOST_STEPS, seed) for view in (train, validation)
             )
-            end, end_report = SessionEnd.fit(reward.likeness, ends, later, seed)
+            end, end_report = SessionEnd.fit(reward.likeness, logged, held_out, seed)
             line = users.report.calibration if users else (1.0, 0.0)
             if users is None or not report.new_users:
                 rows = RewardRows.of(validation, reward.reach, _MOST_STEPS, seed)

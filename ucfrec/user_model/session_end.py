@@ -177,8 +177,7 @@ class SessionEnd:
         ]
         repeated = shown.items.unsqueeze(2) == items.unsqueeze(1)
         inputs = _columns(torch.stack(alike, 1), repeated, rewards, steps.unsqueeze(1))
-        ends = torch.sigmoid(self._log_odds(inputs.flatten(0, 1)))
-        return ends.view(-1, items.shape[1])
+        return torch.sigmoid(self._log_odds(inputs.flatten(0, 1))).view(-1, items.shape[1])
 
     def _log_odds(self, inputs: Tensor) -> Tensor:
         """(M,) from inputs (M, F), float64."""

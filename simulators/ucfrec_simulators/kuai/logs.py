@@ -10,8 +10,8 @@ import pyarrow.parquet as pq
 
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file
-from ucfrec.logs.binding import glob_pattern, text
 from ucfrec.logs.engine import engine
+from ucfrec.logs.tables import glob_pattern, text
 from ucfrec.schema import SESSION_ID
 from ucfrec_simulators.kuai.environment import ExitRule
 from ucfrec_simulators.kuai.exit_cuts import sessions_by_exit
@@ -35,7 +35,7 @@ def window(files: Sequence[Path], time: str, where: str) -> pa.Table:
     key = f"{USER}, {VIDEO}, {time}"
     with engine(files, Path(gettempdir())) as connection:
         rows = connection.sql(
-            f"SELECT * FROM {read}([{names}]) WHERE {where} "
+            f"SELECT * FROM {read}([{names}], hive_partitioning = false) WHERE {where} "
             f"QUALIFY row_number() OVER (PARTITION BY {key}) = 1 ORDER BY {USER}, {time}, {VIDEO}"
         ).to_arrow_table()
     if not rows.num_rows:

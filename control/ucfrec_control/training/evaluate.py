@@ -1,0 +1,247 @@
+"""Evaluation of trained policies in their environment, with D4RL's normalised scores."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import VectorEnv
+
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.rollout import rollout
+from ucfrec.errors import InputError
+from ucfrec.evaluation.metrics import bootstrap_interval
+from ucfrec.provenance import config_hash, provenance
+from ucfrec.reporting.statistics import summary
+from ucfrec.results.row import ResultRow
+from ucfrec.runs.record import RUN, RunRecord
+from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec_control.data.trajectories import PACKAGES, control_source
+from ucfrec_control.environments.environments import (
+    SIDE_BY_SIDE,
+    Wrap,
+    environment_of_data,
+    make_env,
+    mismatches,
+)
+from ucfrec_control.environments.scores import find_kind, require_task
+from ucfrec_control.training.rl_baselines import RLPolicy, RLRecord, is_rl, read_run
+from ucfrec_control.training.train import find_preset
+
+Trained = TrainedPolicy | RLPolicy
+CHECKPOINTS = ("last", "best")
+NO_TARGET = "no target return"
+_SUFFIXES = {"copies": "-screened", "drop": "-dropped"}
+EVALUATE = "evaluate"
+"""Suite of the rows."""
+
+
+def evaluate_run(
+    run: Path,
+    *,
+    episodes: int,
+    seed: int,
+    env_id: str | None = None,
+    targets: Sequence[float | None] = (),
+    checkpoints: Sequence[str] = CHECKPOINTS,
+    distractor: float = 0.0,
+) -> list[ResultRow]:
+    """One result row for each checkpoint and target return.
+
+    All rows have the same initial states. Distractors are fixed. IQL and CQL keep only their last
+    checkpoint; they and behaviour cloning take no target return.
+
+    Args:
+        run: a run folder on a control store.
+        episodes: episodes of a row.
+        seed: seed of the environments and the bootstrap.
+        env_id: environment to evaluate in; None for that of the data.
+        targets: target returns, None for the largest that the policy expects in each state; empty
+            for those of the preset, or that one if the policy was trained to know it.
+        checkpoints: "last", "best" or both.
+        distractor: value that every distractor is fixed to (Appendix G.4: 0).
+
+    Raises:
+        InputError: the run is not on a control store, or keeps none of `checkpoints`, or its
+            environment is unknown or cannot be made.
+    """
+    if episodes < 1:
+        raise InputError(f"--episodes is {episodes}; at least one is needed")
+    rows: list[ResultRow] = []
+    for checkpoint in _kept(run, checkpoints):
+        trained = load_run(run, checkpoint)
+        training = trained.record.finished
+        if rows and training.best_step == training.steps:
+            # The best checkpoint is the last: the same weights would give the same episodes.
+            rows += [replace(row, checkpoint=checkpoint) for row in rows]
+            continue
+        environment = environment_of(trained, env_id)
+        rows += [
+            replace(
+                _row(trained, environment, rule, episodes, seed, distractor), checkpoint=checkpoint
+            )
+            for rule in rules_of(trained, environment, targets)
+        ]
+    return rows
+
+
+def _kept(run: Path, checkpoints: Sequence[str]) -> Sequence[str]:
+    return ("last",) if is_rl(read_run(run)) and "last" in checkpoints else checkpoints
+
+
+def load_run(run: Path, checkpoint: str) -> Trained:
+    """The policy of a run on a control store.
+
+    Raises:
+        InputError: `run` is not on a control store, is damaged or not finished, or has no such
+            checkpoint.
+    """
+    record = read_run(run)
+    rl = is_rl(record)
+    if record.policy is None:
+        raise InputError(f"the training in {run} has not ended; train with the same command first")
+    if rl and checkpoint != "last":
+        raise InputError(
+            f"{run} is of IQL or CQL, which keep their last checkpoint only; give --checkpoint last"
+        )
+    trained = RLPolicy(run) if rl else TrainedPolicy.load(run, checkpoint)
+    if "env_id" not in trained.record.data.others:
+        raise InputError(f"{run} is not a run of `ucfrec-control train`; evaluate it with `ucfrec`")
+    control_source(trained.record.data, run / RUN)
+    return trained
+
+
+def _dataset(trained: Trained) -> dict[str, Any]:
+    return control_source(trained.record.data, Path(RUN))
+
+
+def environment_of(trained: Trained, env_id: str | None) -> str:
+    """`env_id`, or the environment of the data if it is None.
+
+    Raises:
+        InputError: the environment of the data cannot be used; see `environment_of_data`.
+    """
+    return env_id or environment_of_data(_dataset(trained))
+
+
+def open_environment(
+    trained: Trained,
+    env_id: str,
+    count: int,
+    wrappers: Sequence[Wrap] = (),
+    distractor: float = 0.0,
+    **settings: Any,
+) -> VectorEnv[Any, Any, Any]:
+    """`count` environments that show what was logged where the policy was trained.
+
+    Distractors are fixed to `distractor`.
+
+    Args:
+        trained: the policy.
+        env_id: environment to make.
+        count: number of parallel environments.
+        wrappers: wrappers around each of them.
+        distractor: value that every distractor is fixed to.
+        settings: arguments of the environment, over those of the data.
+
+    Raises:
+        InputError: `env_id` cannot be made, or its sizes are not those of the training.
+    """
+    record, dataset = trained.record, _dataset(trained)
+    data_settings = dataset.get("env_settings", {}) if env_id == dataset["env_id"] else {}
+    appended = [distractor] * len(dataset.get("distractors", []))
+    env = make_env(env_id, count, appended, {**data_settings, **settings}, wrappers)
+    observation_size = int(np.prod(env.single_observation_space.shape or ()))
+    sizes = (observation_size, *(env.single_action_space.shape or ()))
+    logged = record.sizes["state"] + len(record.dropped_observations)
+    wanted = (logged, record.sizes["action"])
+    if sizes != wanted:
+        env.close()
+        raise InputError(
+            f"observations and actions of {env_id} have sizes {sizes}, the policy was trained "
+            f"on {wanted}"
+        )
+    return env
+
+
+def method_of(record: RunRecord | RLRecord) -> str:
+    """Name of the method of a run, with a suffix for how screening treated what it flagged."""
+    if record.screening is None or not record.screening.flagged:
+        return record.name
+    return record.name + _SUFFIXES[record.screening.how]
+
+
+def rules_of(
+    trained: Trained, env_id: str, given: Sequence[float | None] = ()
+) -> Sequence[DecisionRule | None]:
+    """The target returns given, else those of the preset, as rules; (None,) for policies without a
+    target return."""
+    dataset, method = _dataset(trained), trained.record.config.policy_name
+    if isinstance(trained, RLPolicy) or method == "bc":
+        return (None,)
+    task = require_task(env_id, dataset["dataset"])
+    preset = find_preset(task.name, find_kind(dataset["dataset"]), method).targets
+    own = (None,) if trained.policy.config.max_return else preset
+    return [DecisionRule(target) for target in given or own]
+
+
+def _row(
+    trained: Trained,
+    env_id: str,
+    rule: DecisionRule | None,
+    episodes: int,
+    seed: int,
+    distractor: float,
+) -> ResultRow:
+    record, dataset = trained.record, _dataset(trained)
+    task = require_task(env_id, dataset["dataset"])
+    began = time.perf_counter()
+    env = open_environment(trained, env_id, min(episodes, SIDE_BY_SIDE), distractor=distractor)
+    try:
+        actor = trained.actor(env.num_envs, rule)
+        rolled_out = rollout(env, actor, episodes, seed, describe=f"{trained.name} in {env_id}")
+    finally:
+        env.close()
+    seconds = time.perf_counter() - began
+    low, high = task.score(bootstrap_interval(rolled_out.returns, seed))
+    row = ResultRow(
+        suite=EVALUATE,
+        table=EVALUATE,
+        task=dataset["dataset"],
+        method=method_of(record),
+        policy=record.config.policy_name,
+        training_seed=record.seed,
+        evaluation_seed=seed,
+        conditions={
+            "episodes": episodes,
+            "distractor_fixed_to": distractor,
+            "lambda_mask": record.settings["policy"].get("lambda_mask"),
+        },
+        config_hash=config_hash(record.settings),
+        data_fingerprint=record.fingerprint,
+        metric="score",
+        metrics={},
+        interval=(float(low), float(high)),
+        environment=env_id,
+        target_return=None if rule is None else rule.target,
+        rule=NO_TARGET if rule is None else str(rule),
+        wall_time_s=seconds,
+        **provenance(PACKAGES),
+    )
+    found = {
+        "score": float(task.score(rolled_out.returns.mean())),
+        "score_std": summary(task.score(rolled_out.returns)).sd if episodes > 1 else None,
+        "return": float(rolled_out.returns.mean()),
+        "length": float(rolled_out.lengths.mean()),
+        "steps": record.finished.steps,
+        "best_step": record.finished.best_step,
+        "validation_loss": record.finished.best_validation,
+        "acceptance": record.augmentation and record.augmentation.acceptance,
+        "train_wall_time_s": record.wall_time_s,
+        "distractors": dataset.get("distractors") or None,
+        "dataset_versions": dataset["versions"],
+        "warnings": mismatches(dataset, env_id) or None,
+    }
+    return row.extended(found)

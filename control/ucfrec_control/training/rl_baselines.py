@@ -1,0 +1,449 @@
+"""IQL and CQL of d3rlpy (extra `rl`) on control stores, with CORL's settings (reference §3)."""
+
+import logging
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+from pydantic import Field, PlainSerializer, PlainValidator
+from torch import Tensor
+
+from ucfrec import schema
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.uniform import Memoryless
+from ucfrec.arrays import Array, BoolArray, Float32Array
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError, damage_explained
+from ucfrec.files.atomic import atomic_file, atomic_folder
+from ucfrec.files.locks import claimed, remove_leftovers_within
+from ucfrec.files.record import Count as Steps
+from ucfrec.files.record import Entry
+from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
+from ucfrec.fitting.metrics_log import MetricsLog
+from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.progress import progress
+from ucfrec.provenance import command_line, versions
+from ucfrec.runs.record import RUN, RunRecord, TrainingRecord
+from ucfrec.settings import BatchSize, Count, settings_table
+from ucfrec_control.data.trajectories import PACKAGES
+from ucfrec_control.environments.scores import find_kind, find_task
+
+ALGORITHMS = ("iql", "cql")
+CHECKPOINT_EVERY = 5000
+"""Steps between checkpoints and log lines."""
+_ACTOR, _CHECKPOINT = "actor.safetensors", "checkpoint.pt"
+_LOWEST_GAP = -200.0
+"""Least conservative term of a step in AntMaze."""
+_HOPPER_NARROW = ("medium", "medium-replay", "mixed")
+
+
+@settings_table("rl")
+class RLConfig:
+    """Settings of a training."""
+
+    algorithm: Literal["iql", "cql"]
+    """Algorithm of d3rlpy."""
+    steps: Count
+    """Number of updates."""
+    task: str
+    """Name of a `ucfrec_control.environments.scores.Task`, or ""; selects CORL's settings."""
+    kind: str
+    """Kind of dataset (`ucfrec_control.environments.scores.find_kind`); selects CORL's settings."""
+    batch_size: BatchSize = 256
+    """Transitions of an update."""
+    learning_rate: Annotated[float, Field(gt=0, lt=1)] = 3e-4
+    """Of the critics; CORL's by default. All other rates keep CORL's proportion to it."""
+
+
+def _rl_config(value: object) -> RLConfig:
+    if isinstance(value, RLConfig):
+        return value
+    if not isinstance(value, dict):
+        raise InputError("its settings are no table")
+    return RLConfig(**value)
+
+
+class RLRun(Entry):
+    """Settings and seed of a run."""
+
+    policy_name: Literal["iql", "cql"]
+    policy: Annotated[RLConfig, PlainValidator(_rl_config), PlainSerializer(asdict)]
+    seed: int
+
+
+class RLFit(Entry):
+    """The outcome of a training; no checkpoint but the last is kept."""
+
+    steps: Steps
+    best_step: None = None
+    best_validation: None = None
+
+
+class RLRecord(TrainingRecord):
+    """The content of `run.json` of a run of `train_rl`."""
+
+    library: Literal["d3rlpy"]
+    config: RLRun
+    policy: RLFit | None = None
+    threads: int
+    dropped_observations: tuple[int, ...] = ()
+    augmentation: None = None
+    screening: None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the method."""
+        return self.config.policy_name
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The configuration as JSON."""
+        return self.config.model_dump()
+
+    @property
+    def finished(self) -> RLFit:
+        """The report of the training.
+
+        Raises:
+            InputError: the training has not ended.
+        """
+        if self.policy is None:
+            raise InputError("the training of the run has not ended; train it to its end first")
+        return self.policy
+
+
+def read_run(run: Path) -> RunRecord | RLRecord:
+    """The record of a run of ucfrec or of d3rlpy.
+
+    Raises:
+        InputError: `run` is not a run folder, or is damaged.
+    """
+    rl = TrainingRecord.read(run).library == "d3rlpy"
+    return RLRecord.read(run) if rl else RunRecord.read(run)
+
+
+class RLPolicy(Memoryless):
+    """The trained actor of a run folder; it takes no target return."""
+
+    def __init__(self, run: Path) -> None:
+        """Raises:
+        InputError: `run` is unfinished, or d3rlpy is not installed.
+        """
+        self.record = RLRecord.read(run)
+        self.name: str = self.record.name
+        tensors, _ = load_tensors(run / _ACTOR)
+        with damage_explained(run, "train it again"):
+            mean, std = (tensors.pop(f"state.{name}") for name in ("mean", "std"))
+            sizes = self.record.sizes
+            if not mean.shape == std.shape == (sizes["state"],):
+                raise ValueError(f"statistics of {tuple(mean.shape)} states")
+            self._mean, self._std = mean.numpy(), std.numpy()
+            with random_state_kept():
+                self._algorithm = _algorithm(self.record.config.policy)
+                self._algorithm.create_impl((sizes["state"],), sizes["action"])
+        load_weights(run / _ACTOR, self._algorithm.impl.modules.policy, tensors)
+
+    def actor(self, episodes: int, rule: DecisionRule | None) -> "RLPolicy":
+        """Itself: it has no memory and ignores the target return."""
+        return self
+
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, None]:
+        """The policy's mean actions (N, A)."""
+        return self._algorithm.predict(_normalised(observations, self._mean, self._std)), None
+
+
+def is_rl(record: RunRecord | RLRecord) -> bool:
+    """Whether `record` is of a run of `train_rl`."""
+    return isinstance(record, RLRecord)
+
+
+def rl_config(dataset: Mapping[str, Any], algorithm: Any, **settings: Any) -> RLConfig:
+    """The settings for the data that `ucfrec_control.training.train.dataset_of` describes.
+
+    Args:
+        dataset: description of the data.
+        algorithm: one of `ALGORITHMS`.
+        settings: the other fields of `RLConfig`.
+    """
+    task = find_task(dataset["env_id"], dataset["dataset"])
+    kind = find_kind(dataset["dataset"])
+    return RLConfig(algorithm=algorithm, task=task.name if task else "", kind=kind, **settings)
+
+
+def action_loss(run: Path, store: EpisodeStore) -> float:
+    """Mean squared error of the actor's mean actions at all validation steps of `store`, whose
+    training `run` is."""
+    validation = store.split("validation")
+    steps = validation.all_steps()
+    policy = RLPolicy(run)
+    live = np.ones(len(steps[0]), dtype=bool)
+    taken, _ = policy.act(validation.step_values(schema.OBSERVATION, *steps), live)
+    return float(np.mean((taken - validation.step_values(schema.ACTION, *steps)) ** 2))
+
+
+def plain_config(config: RLConfig, seed: int) -> dict[str, Any]:
+    """`config` and `seed` in the form of a run's record."""
+    return {"policy_name": config.algorithm, "policy": asdict(config), "seed": seed}
+
+
+@random_state_kept()
+def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLRecord:
+    """Train on the training trajectories, or go on from the checkpoint in `out`; returns the record
+    of the run.
+
+    A finished run is read, not repeated. One that was killed and is started again ends with the
+    same actor as one left alone (same machine and device). The global random state is as before on
+    return.
+
+    Raises:
+        InputError: d3rlpy is not installed, `out` is of another configuration or other data, or
+            another process is training in it.
+    """
+    with claimed(out, "trained"):
+        remove_leftovers_within(out)
+        return _train(store, out, config, seed)
+
+
+def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLRecord:
+    """`train_rl` of a run that no other process trains."""
+    d3rlpy = _d3rlpy()
+    if (out / RUN).exists():
+        existing = RLRecord.read(out)
+        wanted = (plain_config(config, seed), store.record.fingerprint)
+        if (existing.settings, existing.fingerprint) != wanted:
+            raise InputError(
+                f"{out} has a run with other settings or data; remove it or name another folder"
+            )
+        if existing.policy is not None:
+            return existing
+    started = perf_counter()
+    d3rlpy.seed(seed)
+    train = store.split("train")
+    if not train.n_episodes:
+        raise InputError(
+            f"{store.path} has no training trajectories; prepare it with a later split"
+        )
+    mean, std = _statistics(train, config)
+    dataset = _dataset(d3rlpy, train, mean.numpy(), std.numpy())
+    algorithm = _algorithm(config, "cuda:0" if torch.cuda.is_available() else "cpu:0")
+    if not (out / RUN).exists():
+        _begin(store, out, config, seed)
+    record = RLRecord.read(out)
+    step, seconds = _resume(out / _CHECKPOINT, algorithm, dataset)
+    log = MetricsLog(out, step)
+    with progress(config.steps, config.algorithm, "steps", done=step) as bar:
+        while step < config.steps:
+            if step:  # a new seed after each checkpoint, so no generator's state is saved
+                d3rlpy.seed(seed + step)
+            steps = min(CHECKPOINT_EVERY, config.steps - step)
+            ((_, losses),) = algorithm.fit(
+                dataset,
+                n_steps=steps,
+                n_steps_per_epoch=steps,
+                logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
+                show_progress=False,
+                callback=lambda *_: bar.update(),
+            )
+            step += steps
+            log.add(step, losses)
+            _save(out / _CHECKPOINT, algorithm, step, seconds + perf_counter() - started)
+    log.close()
+    actor = algorithm.impl.modules.policy.state_dict()
+    save_tensors(out / _ACTOR, {**actor, "state.mean": mean, "state.std": std}, {})
+    record = record.with_entries(
+        policy=RLFit(steps=config.steps), wall_time_s=seconds + perf_counter() - started
+    )
+    if (out / _CHECKPOINT).exists():
+        record.written(out)
+        (out / _CHECKPOINT).unlink()
+    return record.sealed(out)
+
+
+@random_state_kept()
+def timed_updates(store: EpisodeStore, config: RLConfig, updates: int) -> float:
+    """Seconds of one update of a training on `store`, by the time of a few.
+
+    Raises:
+        InputError: d3rlpy is not installed.
+    """
+    d3rlpy, train = _d3rlpy(), store.split("train")
+    mean, std = _statistics(train, config)
+    dataset = _dataset(d3rlpy, train, mean.numpy(), std.numpy())
+    algorithm, times = _algorithm(config), [0.0]
+    algorithm.fit(
+        dataset,
+        n_steps=updates + 2,
+        n_steps_per_epoch=updates + 2,
+        logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
+        show_progress=False,
+        callback=lambda *_: times.append(perf_counter()),
+    )
+    return (times[-1] - times[2]) / updates
+
+
+def _begin(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> None:
+    entries = {
+        "files": {},
+        "library": "d3rlpy",
+        "command": command_line(),
+        "config": plain_config(config, seed),
+        "seed": seed,
+        "sizes": {
+            "state": store.state_size,
+            "action": store.record.columns[schema.ACTION][0],
+            "items": 0,
+        },
+        "fingerprint": store.record.fingerprint,
+        "data": store.record.source,
+        "versions": versions((*PACKAGES, "d3rlpy")),
+        "threads": torch.get_num_threads(),
+        "wall_time_s": 0.0,
+    }
+    with atomic_folder(out) as scratch:
+        RLRecord.of(entries, out / RUN).sealed(scratch)
+
+
+def _resume(path: Path, algorithm: Any, dataset: Any) -> tuple[int, float]:
+    """Put the checkpoint at `path`, if any, into `algorithm`; its step and the seconds spent."""
+    if not path.exists():
+        return 0, 0.0
+    checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    algorithm.build_with_dataset(dataset)
+    for name, part in _parts(algorithm).items():
+        part.load_state_dict(checkpoint["parts"][name])
+    algorithm.set_grad_step(checkpoint["step"])
+    return checkpoint["step"], checkpoint["seconds"]
+
+
+def _save(path: Path, algorithm: Any, step: int, seconds: float) -> None:
+    parts = {name: part.state_dict() for name, part in _parts(algorithm).items()}
+    with atomic_file(path) as scratch:
+        torch.save({"step": step, "seconds": seconds, "parts": parts}, scratch)
+
+
+def _parts(algorithm: Any) -> Mapping[str, Any]:
+    """Every network and optimizer of a algorithm, by name."""
+    parts: Mapping[str, Any] = algorithm.impl.modules.create_checkpointer("cpu:0").modules
+    return parts
+
+
+def _dataset(d3rlpy: Any, train: EpisodeStore, mean: Array, std: Array) -> Any:
+    episodes, steps = train.all_steps()
+    last = steps == train.lengths[episodes] - 1
+    terminated = train.episode_values(schema.TERMINATED).astype(bool)[episodes]
+    observations = train.step_values(schema.OBSERVATION, episodes, steps)
+    return d3rlpy.dataset.MDPDataset(
+        _normalised(observations, mean, std),
+        train.step_values(schema.ACTION, episodes, steps),
+        train.step_values(schema.REWARD, episodes, steps),
+        terminals=(last & terminated).astype(np.float32),
+        timeouts=(last & ~terminated).astype(np.float32),
+        action_space=d3rlpy.ActionSpace.CONTINUOUS,
+    )
+
+
+def _statistics(train: EpisodeStore, config: RLConfig) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation (S,) that states are normalised with; 0 and 1 where CORL does not
+    normalise them."""
+    mean, std = train.state_statistics
+    if config.algorithm == "cql" and config.task == "antmaze":
+        return torch.zeros_like(mean), torch.ones_like(std)
+    return mean, std + 1e-6
+
+
+def _algorithm(config: RLConfig, device: str = "cpu:0") -> Any:
+    d3rlpy = _d3rlpy()
+    if config.algorithm == "iql":
+        return _iql(d3rlpy, config).create(device=device)
+    if config.task == "antmaze":
+        from ucfrec_control.training.clipped_cql import ClippedCQL
+
+        return ClippedCQL(_cql(d3rlpy, config), device, _LOWEST_GAP)
+    return _cql(d3rlpy, config).create(device=device)
+
+
+def _iql(d3rlpy: Any, config: RLConfig) -> Any:
+    layers = d3rlpy.models.VectorEncoderFactory([256, 256])
+    cosine = d3rlpy.optimizers.CosineAnnealingLRFactory(T_max=config.steps)
+    settings: dict[str, Any] = {"expectile": 0.7, "weight_temp": 3.0, "tau": 0.005}
+    scaler = None
+    if config.task == "antmaze":
+        settings |= {"expectile": 0.9, "weight_temp": 10.0}
+        scaler = d3rlpy.preprocessing.ConstantShiftRewardScaler(-1.0)
+    elif config.task == "hopper" and config.kind == "medium-expert":
+        settings |= {"expectile": 0.5, "weight_temp": 6.0}
+    elif config.task == "hopper" and config.kind in _HOPPER_NARROW:
+        settings |= {"tau": 0.001}
+        scaler = d3rlpy.preprocessing.ReturnBasedRewardScaler(multiplier=1000.0)
+    return d3rlpy.algos.IQLConfig(
+        batch_size=config.batch_size,
+        max_weight=100.0,
+        reward_scaler=scaler,
+        actor_optim_factory=d3rlpy.optimizers.AdamFactory(lr_scheduler_factory=cosine),
+        actor_encoder_factory=layers,
+        critic_encoder_factory=layers,
+        value_encoder_factory=layers,
+        actor_learning_rate=config.learning_rate,
+        critic_learning_rate=config.learning_rate,
+        **settings,
+    )
+
+
+def _cql(d3rlpy: Any, config: RLConfig) -> Any:
+    layers = [d3rlpy.models.VectorEncoderFactory([256] * count) for count in (3, 5)]
+    antmaze = config.task == "antmaze"
+    rate = config.learning_rate
+    settings: dict[str, Any] = {
+        "actor_learning_rate": rate / 10,
+        "temp_learning_rate": rate / 10,
+        "conservative_weight": 10.0,
+        "alpha_learning_rate": 0.0,
+    }
+    if config.task == "hopper" and config.kind == "medium":
+        scaler = d3rlpy.preprocessing.ReturnBasedRewardScaler(multiplier=1000.0)
+        settings |= {"reward_scaler": scaler}
+    if antmaze:
+        settings = {
+            "actor_learning_rate": rate / 3,
+            "temp_learning_rate": rate / 3,
+            "alpha_learning_rate": rate,
+            # CORL starts the logarithm of its multiplier at 1.
+            "initial_alpha": math.e,
+            "conservative_weight": 5.0,
+            "alpha_threshold": 0.8,
+            "max_q_backup": True,
+            "reward_scaler": d3rlpy.preprocessing.ConstantShiftRewardScaler(-5.0, 10.0, True),
+        }
+    return d3rlpy.algos.CQLConfig(
+        batch_size=config.batch_size,
+        critic_learning_rate=rate,
+        n_action_samples=10,
+        actor_encoder_factory=layers[0],
+        critic_encoder_factory=layers[antmaze],
+        **settings,
+    )
+
+
+def _normalised(states: Array, mean: Array, std: Array) -> Float32Array:
+    normalised: Float32Array = ((states - mean) / std).astype(np.float32)
+    return normalised
+
+
+def _d3rlpy() -> Any:
+    try:
+        import d3rlpy
+        import structlog
+    except ImportError:
+        raise InputError(
+            "IQL and CQL need d3rlpy, which is not installed; install ucfrec[control,rl]"
+        ) from None
+    # It logs every training to stdout, and warns that networks exist already, which is intended
+    # after a checkpoint.
+    level = structlog.make_filtering_bound_logger(logging.ERROR)
+    structlog.configure(wrapper_class=level)
+    return d3rlpy

@@ -1,0 +1,102 @@
+"""Training on a control store, with presets and screening."""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.provenance import versions
+from ucfrec.runs.config import Config
+from ucfrec.runs.record import RunRecord
+from ucfrec.runs.screened import train_screened
+from ucfrec.runs.shared_stages import OWN, SharedStages
+from ucfrec_control.data.trajectories import PACKAGES, control_source
+from ucfrec_control.environments.scores import find_kind, find_task
+
+
+@dataclass(frozen=True)
+class Preset:
+    """The combination of all rules that match a run."""
+
+    tables: Mapping[str, Mapping[str, Any]]
+    """Configuration by table, as in TOML."""
+    targets: tuple[float, ...]
+    """Target returns; empty if no rule matches the task."""
+
+
+def find_preset(task: str, kind: str, policy: str) -> Preset:
+    """The preset of a method on one kind of dataset of a task.
+
+    Args:
+        task: name of a `ucfrec_control.environments.scores.Task`; "" for none.
+        kind: as `ucfrec_control.environments.scores.find_kind` returns it.
+        policy: one of `ucfrec.policies.registry.policy_names`.
+    """
+    run = {"task": task, "kind": kind, "policy": policy}
+    tables: dict[str, dict[str, Any]] = {}
+    targets: list[float] = []
+    text = files("ucfrec_control.training").joinpath("presets.toml").read_text(encoding="utf-8")
+    for rule in tomllib.loads(text)["rule"]:
+        if not all(_names(rule.get(key, value), value) for key, value in run.items()):
+            continue
+        for table, values in rule.get("set", {}).items():
+            tables[table] = tables.get(table, {}) | values
+        targets = rule.get("targets", targets)
+    return Preset(tables, tuple(targets))
+
+
+def _names(given: str | list[str], value: str) -> bool:
+    """Whether a rule's `given` is `value`, or names it among others."""
+    return value in ([given] if isinstance(given, str) else given)
+
+
+def dataset_of(store: EpisodeStore) -> Mapping[str, Any]:
+    """The `source` of a control store: dataset, environment and versions.
+
+    Raises:
+        InputError: `store` is not a control store.
+    """
+    source = store.record.source
+    if "env_id" not in source.others:
+        raise InputError(
+            f"{store.path} is not a control store; write one with `ucfrec-control prepare`"
+        )
+    return control_source(source, store.path)
+
+
+def preset_of(dataset: Mapping[str, Any], policy: str) -> Preset:
+    """The preset of a method on the dataset that `dataset_of` describes."""
+    task = find_task(dataset["env_id"], dataset["dataset"])
+    return find_preset(task.name if task else "", find_kind(dataset["dataset"]), policy)
+
+
+def train_control(
+    store: EpisodeStore,
+    out: Path,
+    config: Config,
+    *,
+    screening: str | None = None,
+    shared: SharedStages = OWN,
+) -> RunRecord:
+    """`ucfrec.runs.screened.train_screened` on a control store.
+
+    Args:
+        store: a control store.
+        out: run folder; an interrupted run resumes.
+        config: of the training.
+        screening: one of `ucfrec.runs.screened.SCREENINGS`; None for none.
+        shared: as `ucfrec.runs.run.train_run` has it.
+
+    Returns:
+        The run's record.
+
+    Raises:
+        InputError: as `train_screened`, or the store is not a control store.
+    """
+    dataset_of(store)
+    about = {"versions": versions(PACKAGES)}
+    return train_screened(store, out, config, screening, about, shared)

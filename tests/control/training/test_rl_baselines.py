@@ -1,0 +1,230 @@
+"""IQL and CQL of d3rlpy: what they read, that they resume, and rows like everybody else's."""
+
+import re
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tests.support.control_files import hopper_like, write_hdf5
+from ucfrec.benchmark.cells import Budget, Evaluation, Method
+from ucfrec.benchmark.grid import run_grid
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.fitting.metrics_log import read_metrics
+from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.results.row import ResultRow
+from ucfrec.results.rows_file import read_rows
+from ucfrec_control.benchmark.budgets import TRIED_RATES
+from ucfrec_control.benchmark.measure import RATE_MEASUREMENT, SCORE_MEASUREMENT
+from ucfrec_control.benchmark.methods import TABLES
+from ucfrec_control.benchmark.plan import rate_cells, score_cells
+from ucfrec_control.benchmark.rates import best_rates
+from ucfrec_control.cli import main
+from ucfrec_control.data.d4rl import read_d4rl
+from ucfrec_control.training import rl_baselines
+from ucfrec_control.training.evaluate import evaluate_run
+from ucfrec_control.training.rl_baselines import RLConfig, RLRecord, rl_config, train_rl
+from ucfrec_control.training.train import dataset_of
+
+pytest.importorskip("d3rlpy", reason="the extra rl is not installed")
+from d3rlpy.algos.qlearning.torch.cql_impl import CQLImpl
+
+pytest.importorskip("mujoco", reason="the extra control is not installed")
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> EpisodeStore:
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("rl")
+    file = write_hdf5(folder / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
+    return read_d4rl(file).write_store(folder / "store")
+
+
+class _Stops:
+    """Progress during whose fifth step the user interrupts."""
+
+    seen = 0
+
+    def update(self, n: float = 1, **shown: float) -> None:
+        self.seen += 1
+        if self.seen == 5:
+            raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("algorithm", ["iql", "cql"])
+def test_a_training_that_was_interrupted_ends_as_one_left_alone(
+    store: EpisodeStore,
+    tmp_path: Path,
+    algorithm: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config = rl_config(dataset_of(store), algorithm, steps=7, batch_size=16)
+    monkeypatch.setattr(rl_baselines, "CHECKPOINT_EVERY", 2)
+    train_rl(store, tmp_path / "alone", config, 0)
+    with monkeypatch.context() as interrupted:
+        interrupted.setattr(rl_baselines, "progress", lambda *_, **__: nullcontext(_Stops()))
+        with pytest.raises(KeyboardInterrupt):
+            train_rl(store, tmp_path / "interrupted", config, 0)
+    with pytest.raises(InputError, match="has not ended"):
+        evaluate_run(tmp_path / "interrupted", episodes=2, seed=0)
+    assert torch.load(tmp_path / "interrupted" / "checkpoint.pt", weights_only=True)["step"] == 4
+    train_rl(store, tmp_path / "interrupted", config, 0)
+    actors = [tmp_path / run / "actor.safetensors" for run in ("alone", "interrupted")]
+    assert actors[0].read_bytes() == actors[1].read_bytes()
+    alone, interrupted = (read_metrics(tmp_path / run) for run in ("alone", "interrupted"))
+    for loss in ("actor_loss", "critic_loss"):
+        assert list(alone[loss]) == [2, 4, 6, 7]
+        assert alone[loss] == interrupted[loss]
+
+
+@pytest.mark.parametrize("algorithm", ["iql", "cql"])
+def test_equal_seeds_train_equal_actors_that_are_judged_as_others_are(
+    store: EpisodeStore, tmp_path: Path, algorithm: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = rl_config(dataset_of(store), algorithm, steps=4)
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        train_rl(store, tmp_path / name, config, seed)
+    a, b, c = ((tmp_path / name / "actor.safetensors").read_bytes() for name in "abc")
+    assert a == b != c
+    (row,) = evaluate_run(tmp_path / "a", episodes=2, seed=0)
+    assert (row["method"], row["checkpoint"], row["target_return"]) == (algorithm, "last", None)
+    assert row.data_fingerprint == store.record.fingerprint
+    capsys.readouterr()
+    asked = ["evaluate", str(tmp_path / "a"), "--episodes", "2"]
+    assert main(asked) == 0
+    assert main([*asked, "--checkpoint", "best"]) == 2
+    assert "keep their last checkpoint only" in capsys.readouterr().err
+
+
+def learner_of(task: str, kind: str, algorithm: str = "cql", **settings: float) -> Any:
+    with random_state_kept():
+        learner = rl_baselines._algorithm(RLConfig(algorithm, 10, task, kind, **settings))
+        learner.create_impl((29,), 8)
+    return learner
+
+
+def test_cql_has_the_settings_of_corl() -> None:
+    scalers = {
+        (task, kind): type(learner_of(task, kind).config.reward_scaler).__name__
+        for task in ("hopper", "walker2d")
+        for kind in ("medium", "mixed", "medium-expert")
+    }
+    assert {key for key, name in scalers.items() if name != "NoneType"} == {("hopper", "medium")}
+    assert scalers["hopper", "medium"] == "ReturnBasedRewardScaler"
+    for task, hidden in (("walker2d", 3), ("antmaze", 5)):
+        modules = learner_of(task, "medium").impl.modules
+        for critic in modules.q_funcs:
+            assert sum(isinstance(m, torch.nn.Linear) for m in critic.modules()) == hidden + 1
+        actor = [m for m in modules.policy.modules() if isinstance(m, torch.nn.Linear)]
+        assert len(actor) == 3 + 2  # mean and deviation
+    learner = learner_of("antmaze", "diverse")
+    assert (learner.config.reward_scaler.shift, learner.config.reward_scaler.multiplier) == (-5, 10)
+    assert learner.config.alpha_learning_rate == learner.config.critic_learning_rate
+    for config in (learner.config, learner_of("walker2d", "medium").config):
+        assert config.temp_learning_rate == config.actor_learning_rate
+
+
+@pytest.mark.parametrize("algorithm", ["iql", "cql"])
+@pytest.mark.parametrize("task", ["hopper", "antmaze"])
+def test_all_rates_keep_their_proportion(algorithm: str, task: str) -> None:
+    usual, ten = (
+        {
+            name: rate
+            for name, rate in vars(learner_of(task, "medium", algorithm, **settings).config).items()
+            if name.endswith("learning_rate")
+        }
+        for settings in ({}, {"learning_rate": 3e-3})
+    )
+    assert usual["critic_learning_rate"] == 3e-4
+    assert ten == pytest.approx({name: 10 * rate for name, rate in usual.items()})
+
+
+def test_steps_of_antmaze_count_no_less_than_the_clip() -> None:
+    """Where the logged action is valued far above all others, the gap is held at −200."""
+    impl = learner_of("antmaze", "diverse").impl
+    states, actions, none = torch.zeros(4, 29), torch.zeros(4, 8), torch.zeros(4, 1)
+
+    def gap() -> torch.Tensor:
+        with torch.no_grad():
+            loss = impl._compute_conservative_loss(states, actions, states, none)
+        return loss / 5 + 0.8  # weight and threshold
+
+    plain = gap()
+    torch.manual_seed(0)
+    expected = CQLImpl._compute_conservative_loss(impl, states, actions, states, none) / 5 + 0.8
+    torch.manual_seed(0)
+    torch.testing.assert_close(gap(), expected.detach())
+    assert (plain > -200).all()
+    forward = impl._q_func_forwarder.compute_expected_q
+    impl._q_func_forwarder.compute_expected_q = lambda x, action, reduction: (
+        forward(x, action, reduction) + 1e4 * (len(action) == len(states))
+    )
+    torch.testing.assert_close(gap(), torch.full((2,), -200.0))
+
+
+def test_cql_sees_the_states_of_antmaze_as_they_are(store: EpisodeStore) -> None:
+    train = store.split("train")
+    for task, plain in (("antmaze", True), ("hopper", False)):
+        mean, std = rl_baselines._statistics(train, RLConfig("cql", 10, task, "medium"))
+        assert (not mean.any() and bool((std == 1).all())) == plain
+    mean, _ = rl_baselines._statistics(train, RLConfig("iql", 10, "antmaze", "medium"))
+    assert mean.any()
+
+
+def test_a_finished_run_is_read_and_another_configuration_refused(
+    store: EpisodeStore, tmp_path: Path
+) -> None:
+    config = rl_config(dataset_of(store), "iql", steps=2)
+    record = train_rl(store, tmp_path / "run", config, 0)
+    assert train_rl(store, tmp_path / "run", config, 0) == record
+    assert RLRecord.read(tmp_path / "run") == record
+    with pytest.raises(InputError, match="other settings or data"):
+        train_rl(store, tmp_path / "run", config, 1)
+
+
+def test_the_benchmark_finds_its_rl_rows_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
+    monkeypatch.setitem(TABLES, "main", {"iql": Method("iql")})
+    budget = made(2, "steps=2")
+    results = tmp_path / "rows.jsonl"
+
+    def measured() -> list[ResultRow]:
+        cells = list(score_cells(tmp_path, tmp_path / "runs", budget, "main"))
+        return run_grid(cells, SCORE_MEASUREMENT, results, 1)
+
+    (row,) = measured()
+    assert (row.table, row.method, row.checkpoint) == ("main", "iql", "last")
+    assert measured() == [row]
+    assert len(results.read_text().splitlines()) == 1
+    assert read_rows(results) == [row]
+    printed = capfd.readouterr()
+    assert "1 cells, 1 of them left" in printed.err
+    assert "1 cells, 0 of them left" in printed.err
+    # Neither here nor in the workers does d3rlpy tell of its trainings.
+    assert "[info" not in re.sub(r"\x1b\[[\d;]*m", "", printed.out)
+
+
+def made(episodes: int, *settings: str) -> Budget:
+    """A budget of one file with settings of IQL."""
+    evaluation = Evaluation(episodes, 1000)
+    return Budget("full", ("hopper_medium-made",), 1, evaluation, of_policies={"iql": settings})
+
+
+def test_rates_of_rl_are_searched_on_held_out_actions(tmp_path: Path) -> None:
+    columns = hopper_like((30, 8, 25) * 8)
+    columns["actions"] = np.tanh(columns["observations"][:, :3])
+    write_hdf5(tmp_path / "hopper_medium-made.hdf5", columns)
+    budget = made(1, "steps=99", "batch_size=64")
+    cells = list(rate_cells(tmp_path, tmp_path / "runs", budget, ("iql",), 60))
+    rows = run_grid(cells, RATE_MEASUREMENT, tmp_path / "rows.jsonl", 1)
+    assert [row.conditions["learning_rate"] for row in rows] == list(TRIED_RATES["full"])
+    assert {row.metrics["steps"] for row in rows} == {60}
+    of_no_action = np.mean(columns["actions"] ** 2)
+    assert rows[-1].value < 0.8 * rows[0].value < 0.8 * of_no_action
+    assert best_rates(rows) == {"iql": TRIED_RATES["full"][-1]}

@@ -1,0 +1,190 @@
+"""Logs of every make mean to ucfrec what they mean to an independent reader, or are refused."""
+
+import gzip
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import HealthCheck, event, given, settings
+from hypothesis import strategies as st
+
+from tests.support.pandas_reader import Rows, rows_of
+from ucfrec.errors import InputError
+from ucfrec.logs.histories import read_histories
+from ucfrec.logs.mapping import LogMapping
+
+START = pd.Timestamp("2024-02-20T00:00:00")
+WORDS = ["7", "07", "007", "7.0", "1e1", "10", "1_0", "0x1f", "31", "+7", "-7", "7 ", "NA", "null"]
+WORDS += [
+    "true",
+    "a,b",
+    'q"x',
+    "é",
+    "2024-01-01",
+    "9223372036854775808",
+    "line\nbreak",
+    "'7'",
+    "-0",
+]
+DAY_FIRST, MONTH_FIRST = "%d/%m/%Y %H:%M:%S", "%m/%d/%Y %H:%M:%S"
+FOLDERS = ["", "user_id=7", "date=2024-03-01", "reward=1/item_id=x"]
+
+
+@dataclass(frozen=True)
+class Part:
+    """A file of a log."""
+
+    frame: pd.DataFrame
+    folder: str
+    suffix: str
+    written: str
+    """Times: "ms", "iso", or a format of `strptime`."""
+    encoding: str
+
+
+@st.composite
+def parts(draw: st.DrawFn) -> Part:
+    """A part in some layout: names, types, order of the columns, times, encoding."""
+    rows = draw(st.integers(0, 12))
+    suffix = draw(st.sampled_from([".parquet", ".csv", ".csv.gz"]))
+    numbers = draw(st.booleans())
+    ids = st.integers(-3, 12) if numbers else st.sampled_from(WORDS)
+    written = draw(st.sampled_from(["ms", "iso", "iso", "zoned", DAY_FIRST, MONTH_FIRST]))
+    columns: dict[str, object] = {}
+    for name in ("user_id", "item_id"):
+        values = draw(st.lists(ids, min_size=rows, max_size=rows))
+        missing = draw(st.lists(st.integers(0, 19), min_size=rows, max_size=rows))
+        kept = [None if gap == 0 else value for value, gap in zip(values, missing, strict=True)]
+        columns[name] = pd.array(kept, dtype="Int64" if numbers else "string")
+    minutes = draw(st.lists(st.integers(0, 60 * 24 * 40), min_size=rows, max_size=rows))
+    times = pd.DatetimeIndex([START + pd.Timedelta(minutes=each) for each in minutes])
+    columns["timestamp"] = as_written(times, written, draw, suffix == ".parquet")
+    kind = draw(st.sampled_from(["floats", "numbers", "truth", "missing"]))
+    columns["reward"] = {
+        "floats": [n / 4 - 1 for n in range(rows)],
+        "numbers": list(range(rows)),
+        "truth": [n % 3 == 0 for n in range(rows)],
+        "missing": [None if n % 2 else 0.5 * n for n in range(rows)],
+    }[kind]
+    if draw(st.booleans()):
+        columns["more"] = ["x"] * rows
+    frame = pd.DataFrame(columns)[draw(st.permutations(list(columns)))]
+    changed = draw(st.sampled_from([str.lower, str.upper, str.title]))
+    encoding = draw(st.sampled_from(["utf-8", "utf-8", "utf-8-sig", "latin-1"]))
+    return Part(
+        frame.rename(columns=changed),
+        draw(st.sampled_from(FOLDERS)),
+        suffix,
+        "iso" if written == "zoned" else written,
+        "utf-8" if suffix == ".parquet" else encoding,
+    )
+
+
+def as_written(
+    times: pd.DatetimeIndex, written: str, draw: st.DrawFn, may_be_typed: bool
+) -> object:
+    if written == "ms":
+        return (times - pd.Timestamp(0)) // pd.Timedelta(milliseconds=1)
+    if written == "iso":
+        if may_be_typed and draw(st.booleans()):
+            return times.as_unit(draw(st.sampled_from(["ms", "us", "ns"])))
+        return times.strftime(draw(st.sampled_from(["%Y-%m-%dT%H:%M:%S", "%Y-%m-%d %H:%M:%S"])))
+    if written == "zoned":
+        zone = draw(st.sampled_from(["UTC", "Asia/Tokyo", "-03:30"]))
+        return [each.tz_localize("UTC").tz_convert(zone).isoformat() for each in times]
+    return times.strftime(written)
+
+
+def write(part: Part, folder: Path, number: int) -> Path:
+    path = folder / part.folder / f"{number}{part.suffix}"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if part.suffix == ".parquet":
+        part.frame.to_parquet(path, index=False)
+        return path
+    text = part.frame.to_csv(index=False).encode(part.encoding)
+    path.write_bytes(gzip.compress(text) if part.suffix == ".csv.gz" else text)
+    return path
+
+
+def may_be_refused(given: list[Part], expected: Rows) -> bool:
+    """Whether a log is one that must or may be asked about."""
+    asked = [part for part in given if "%" in part.written]
+    latin = any(part.encoding == "latin-1" and "é" in part.frame.to_csv() for part in given)
+    return bool(asked) or latin or not expected or all(part.frame.empty for part in given)
+
+
+def settled(given: list[Part]) -> bool:
+    """Whether every part has a day beyond 12, and all the same order."""
+    found = set()
+    for part in given:
+        if "%" in part.written and len(part.frame):
+            name = next(name for name in part.frame if str(name).lower() == "timestamp")
+            place = 0 if part.written == DAY_FIRST else 1
+            days = [int(str(each).split("/")[place]) for each in part.frame[name]]
+            found.add((part.written, max(days) > 12))
+    return len(found) == 1 and all(certain for _, certain in found)
+
+
+def check(given: list[Part], folder: Path) -> None:
+    files = [(write(part, folder, number), part.written) for number, part in enumerate(given)]
+    readable = [
+        (path, written)
+        for (path, written), part in zip(files, given, strict=True)
+        if part.encoding != "latin-1" or "é" not in part.frame.to_csv()
+    ]
+    expected = rows_of(readable) if readable else {}
+    batches, refusal = [], ""
+    try:
+        batches = list(read_histories([folder], LogMapping(), "reward", 1000))
+    except InputError as error:
+        refusal = str(error)
+    event("refused" if refusal else "read")
+    if refusal:
+        assert "\n" not in refusal
+        assert may_be_refused(given, expected), refusal
+        kinds = {part.written for part in given if len(part.frame)}
+        plain = len(kinds) == 1 and len(readable) == len(given) and expected
+        assert not (plain and settled(given)), refusal
+        return
+    found: Rows = {}
+    for batch in batches:
+        for user in batch.to_pylist():
+            steps = zip(
+                user["timestamps"], map(str, user["item_ids"]), user["rewards"], strict=True
+            )
+            found[str(user["user_id"])] = sorted(steps)
+    assert found == expected
+
+
+FUZZED = settings(
+    max_examples=300,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+
+
+@FUZZED
+@given(st.lists(parts(), min_size=1, max_size=3))
+def test_fuzzed_logs_agree_with_pandas_or_are_refused(
+    tmp_path_factory: pytest.TempPathFactory, logs: list[Part]
+) -> None:
+    check(logs, tmp_path_factory.mktemp("logs"))
+
+
+@pytest.mark.slow
+@settings(FUZZED, max_examples=4000)
+@given(st.lists(parts(), min_size=1, max_size=3))
+def test_many_fuzzed_logs_agree_with_pandas_or_are_refused(
+    tmp_path_factory: pytest.TempPathFactory, logs: list[Part]
+) -> None:
+    check(logs, tmp_path_factory.mktemp("logs"))
+
+
+def test_both_readers_tell_text_from_numbers(tmp_path: Path) -> None:
+    """The fuzzing would be of no use if its reader joined 7 and 07."""
+    frame = pd.DataFrame({"user_id": ["7", "07"], "item_id": ["1", "1"], "reward": [0.0, 1.0]})
+    frame["timestamp"] = np.array([1_700_000_000_000, 1_700_000_000_001])
+    frame.to_csv(tmp_path / "log.csv", index=False)
+    assert set(rows_of([(tmp_path / "log.csv", "ms")])) == {"7", "07"}

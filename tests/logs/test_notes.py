@@ -1,0 +1,155 @@
+"""The owner of a log is told what is lost in it, and of bots."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from ucfrec.commands.cli import main
+from ucfrec.errors import InputError, InputNote
+from ucfrec.logs.mapping import LogMapping, read_mapping
+from ucfrec.logs.prepare import PrepareOptions, prepare, validate
+
+START = 1_700_000_000_000
+
+
+def make_log(rows: int = 4000, users: int = 400) -> pd.DataFrame:
+    generator = np.random.default_rng(0)
+    log = pd.DataFrame({"user_id": generator.integers(users, size=rows)})
+    log["item_id"] = generator.integers(20, size=rows)
+    log["timestamp"] = START + 200_000 * np.arange(rows)
+    log["reward"] = (generator.random(rows) < 0.3) * 1.0
+    log["revenue"] = np.where(generator.random(rows) < 0.03, 9.9, np.nan)
+    return log
+
+
+def notes_of(path: Path, mapping: LogMapping | None = None, **options: object) -> list[str]:
+    with warnings.catch_warnings(record=True) as notes:
+        warnings.simplefilter("always", InputNote)
+        validate([path], mapping or LogMapping(), PrepareOptions(**options))  # type: ignore[arg-type]
+    return [str(note.message) for note in notes if note.category is InputNote]
+
+
+def write(log: pd.DataFrame, folder: Path, name: str = "log.parquet") -> Path:
+    if name.endswith(".csv"):
+        log.to_csv(folder / name, index=False)
+    else:
+        log.to_parquet(folder / name, index=False)
+    return folder / name
+
+
+@pytest.mark.parametrize("name", ["log.parquet", "log.csv"])
+def test_a_reward_that_is_null_because_a_column_is_names_it(tmp_path: Path, name: str) -> None:
+    path = write(make_log(), tmp_path, name)
+    (note,) = notes_of(path, reward="reward + REVENUE")
+    assert (
+        "(97%) are dropped: the reward reward + REVENUE is null because revenue is, in 3," in note
+    )
+    assert note.endswith("give a default: coalesce(revenue, 0)")
+    assert not notes_of(path, reward="reward + coalesce(revenue, 0)")
+    assert not notes_of(path)
+
+
+@pytest.mark.parametrize("share", [0.25, 0.15])
+@pytest.mark.parametrize("name", ["user_id", "item_id", "timestamp"])
+def test_many_rows_without_a_key_are_told_of_by_column(
+    tmp_path: Path, name: str, share: float
+) -> None:
+    log = make_log()
+    log[name] = log[name].astype("Int64")
+    log.loc[log.index[: int(4000 * share)], name] = None
+    notes = notes_of(write(log, tmp_path))
+    if share < 0.2:
+        assert not notes
+    else:
+        assert len(notes) == 1
+        assert "1,000 of 4,000 rows (25%) are dropped: user, item" in notes[0]
+        assert f"({name} in 1,000); fill it in, or map another column" in notes[0]
+
+
+def test_many_times_out_of_range_and_repetitions_are_told_of(tmp_path: Path) -> None:
+    log = make_log()
+    log.loc[:1999, "timestamp"] = np.arange(2000) * 1000 + 800_000_000_000
+    (note,) = notes_of(write(log, tmp_path))
+    assert "2,000 of 4,000 rows (50%) are dropped: time before 2000" in note
+    assert "say --earliest 1990-01-01" in note
+    (note,) = notes_of(write(pd.concat([make_log()] * 2), tmp_path))
+    assert "4,000 of 8,000 rows (50%) are dropped: repeats user, item" in note
+    assert "log finer times, or remove the repetitions" in note
+
+
+def with_bots(names: list[int], rows: int) -> pd.DataFrame:
+    bots = [
+        make_log(rows).assign(user_id=name, timestamp=START + 1000 * np.arange(rows))
+        for name in names
+    ]
+    return pd.concat([make_log(), *bots], ignore_index=True)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_the_largest_five_bots_are_named(tmp_path: Path, text: bool) -> None:
+    log = with_bots(list(range(1000, 1007)), 300)
+    log = pd.concat([log, with_bots([2000], 500)[4000:]], ignore_index=True)
+    if text:
+        log["user_id"] = "u" + log["user_id"].astype(str)
+    path = write(log, tmp_path)
+    (note,) = notes_of(path)
+    name = "u2000" if text else "2000"
+    assert f"{name} (500 rows), " in note
+    assert note.count("(300 rows)") == 4
+    assert "the median session has 1 row, " in note
+    assert '--where "user_id NOT IN (…)" or --max-session 100' in note
+    assert not notes_of(path, max_session=100)
+    where = "user_id NOT LIKE 'u%000' AND user_id < 'u1'" if text else "USER_ID < 1000"
+    report = validate([path], LogMapping(where=where))
+    assert report["dropped"]["left_out"] == len(log) - report["steps"] > 2500
+
+
+def test_ninety_nine_times_the_median_is_no_bot(tmp_path: Path) -> None:
+    assert not notes_of(write(with_bots([1000], 100), tmp_path))
+    assert notes_of(write(with_bots([1000], 101), tmp_path))
+
+
+def test_long_sessions_are_left_out_and_counted(tmp_path: Path) -> None:
+    path = write(with_bots([1000, 1001], 400), tmp_path)
+    options = PrepareOptions(max_session=399, session_by="user")
+    report = prepare([path], LogMapping(), tmp_path / "store", options)
+    assert report["dropped"]["long_session"] == 800
+    assert (report["steps"], report["users"]) == (4000, 400)
+    report = validate([path], LogMapping(), PrepareOptions(max_session=5, min_steps=2))
+    dropped = report["dropped"]
+    assert dropped["long_session"] >= 800
+    assert report["steps"] + dropped["long_session"] + dropped["short_episode"] == 4800
+    with pytest.raises(InputError, match="max_session is below min_steps"):
+        PrepareOptions(max_session=1, min_steps=2)
+
+
+@pytest.mark.parametrize(
+    ("where", "message"),
+    [
+        ("user_id", r"--where \(user_id\) is BIGINT; write a condition"),
+        ("visitor = 1", "has no column 'visitor'"),
+        ("read_text('/etc/passwd') = ''", "it calls 'read_text'"),
+        ("(SELECT true)", "it has a subquery"),
+    ],
+)
+def test_a_condition_is_an_expression_like_others(tmp_path: Path, where: str, message: str) -> None:
+    path = write(make_log(), tmp_path)
+    with pytest.raises(InputError, match=message):
+        validate([path], LogMapping(where=where))
+
+
+def test_a_condition_comes_from_the_command_or_the_mapping(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write(make_log(), tmp_path)
+    given = ["prepare", str(path), "--validate", "--where", "item_id < 10 OR NULL"]
+    assert main(given) == 0
+    shown = capsys.readouterr().out
+    (tmp_path / "mapping.toml").write_text('where = "item_id < 10"\n')
+    mapping = read_mapping(tmp_path / "mapping.toml")
+    left_out = validate([path], mapping)["dropped"]["left_out"]
+    assert 1500 < left_out < 2500
+    assert f"dropped: left_out  {left_out:,}  does not fulfil --where" in shown

@@ -1,0 +1,418 @@
+"""What is in a file is what counts: folders, parts, text that looks like a number, empty parts."""
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.logs.histories import read_histories
+from ucfrec.logs.mapping import FeatureTable, LogMapping, log_files
+from ucfrec.logs.prepare import PrepareOptions, prepare, validate
+from ucfrec_datasets import generic
+
+START = 1_700_000_000_000
+SMALL = PrepareOptions(embedding_size=4)
+
+
+def make_log(rows: int = 400, users: int = 100, step: int = 600_000) -> pd.DataFrame:
+    generator = np.random.default_rng(0)
+    log = pd.DataFrame({"user_id": generator.integers(users, size=rows)})
+    log["item_id"] = generator.integers(20, size=rows)
+    log["timestamp"] = START + step * np.arange(rows)
+    log["reward"] = (generator.random(rows) < 0.3) * 1.0
+    return log
+
+
+def write(frame: pd.DataFrame, path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".csv":
+        frame.to_csv(path, index=False)
+    else:
+        frame.to_parquet(path, index=False)
+    return path
+
+
+def prepared(folder: Path, out: Path, **columns: str) -> dict[str, Any]:
+    """The report of a folder and its meta.json's fingerprint, with features as files say."""
+    logs, mapping = generic.DATASET.resolve([folder], LogMapping(columns))
+    report = prepare(logs, mapping, out, SMALL)
+    fingerprint = pd.read_json(out / "meta.json", typ="series")["fingerprint"]
+    return {**report, "fingerprint": fingerprint}
+
+
+# Folders
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".csv"])
+@pytest.mark.parametrize("name", ["user_id", "item_id", "reward", "timestamp"])
+def test_the_name_of_a_folder_replaces_no_column(tmp_path: Path, name: str, suffix: str) -> None:
+    log = make_log()
+    write(log, tmp_path / f"{name}=7" / f"log{suffix}")
+    report = validate([tmp_path / f"{name}=7" / f"log{suffix}"], LogMapping())
+    assert report["users"] == log["user_id"].nunique()
+    assert (report["items"], report["steps"]) == (20, 400)
+
+
+def test_a_folder_is_read_with_its_sub_folders(tmp_path: Path) -> None:
+    log = make_log()
+    days = pd.to_datetime(log["timestamp"], unit="ms").dt.strftime("%Y-%m-%d")
+    lake = tmp_path / "lake"
+    for day, part in log.groupby(days):
+        write(part, lake / f"timestamp={day}" / "hour=0" / "part.parquet")
+    # Writers leave what is no part of the table.
+    for hidden in (".tmp", "_temporary", "_delta_log"):
+        write(log, lake / hidden / "part.parquet")
+    write(log, lake / ".part.parquet")
+    (lake / "back").symlink_to(lake)
+    for given in ([lake], [f"{lake}/time*"], [f"{lake}/*/*/*.parquet"], [f"{lake}/**/p*.parquet"]):
+        assert validate(given, LogMapping())["steps"] == 400
+
+
+def test_a_table_may_be_a_folder_with_sub_folders(tmp_path: Path) -> None:
+    write(make_log(), tmp_path / "log.parquet")
+    users = pd.DataFrame({"user_id": range(100), "age": np.arange(100) % 7 * 1.0})
+    for part in range(2):
+        write(users[part::2], tmp_path / "users.parquet" / f"part={part}" / "0.parquet")
+    logs, mapping = generic.DATASET.resolve([tmp_path], LogMapping())
+    assert logs == (tmp_path / "log.parquet",)
+    assert len(mapping.user_features[0].files) == 2
+
+
+def test_columns_come_from_folders_on_purpose(tmp_path: Path) -> None:
+    log = make_log()
+    for user, part in log.groupby("user_id"):
+        write(part.drop(columns="user_id"), tmp_path / f"user_id={user}" / "a%20b=x" / "p.parquet")
+    given = LogMapping(partitions=True)
+    assert validate([tmp_path], given)["users"] == log["user_id"].nunique()
+    with pytest.raises(InputError, match="has no column 'user_id'"):
+        validate([tmp_path], LogMapping())
+    (batch,) = read_histories([tmp_path], given, "reward", 1000)
+    assert batch.column("user_id").to_pylist() == sorted(log["user_id"].unique())
+
+
+def test_words_in_folders_make_words_of_them_all(tmp_path: Path) -> None:
+    log = make_log().drop(columns="user_id")
+    for name in ("7", "007", "a%20b"):
+        write(log, tmp_path / f"user_id={name}" / "part.parquet")
+    (batch,) = read_histories([tmp_path], LogMapping(partitions=True), "reward", 1000)
+    assert batch.column("user_id").to_pylist() == ["007", "7", "a b"]
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".csv"])
+def test_a_folder_that_contradicts_its_file_is_refused(tmp_path: Path, suffix: str) -> None:
+    log = make_log()
+    write(log.assign(user_id=7), tmp_path / "user_id=7" / f"log{suffix}")
+    assert validate([tmp_path], LogMapping(partitions=True))["users"] == 1
+    write(log, tmp_path / "user_id=8" / f"log{suffix}")
+    with pytest.raises(InputError, match="in the file, but its folder says another value"):
+        validate([tmp_path], LogMapping(partitions=True))
+
+
+# Parts
+
+
+def test_parts_of_a_log_are_joined_by_the_names_of_their_columns(tmp_path: Path) -> None:
+    log = make_log()
+    whole = write(log, tmp_path / "log.parquet")
+    parts = tmp_path / "parts"
+    write(log[:100], parts / "a.parquet")
+    write(log[100:200][["reward", "timestamp", "item_id", "user_id"]], parts / "b.parquet")
+    write(log[200:300].assign(more="x")[["more", *log.columns]], parts / "c.parquet")
+    write(log[300:].rename(columns=str.upper), parts / "d.csv")
+    stores = [
+        prepare([each], LogMapping(), tmp_path / f"store-{n}", SMALL)
+        for n, each in enumerate((whole, parts))
+    ]
+    assert stores[0]["steps"] == stores[1]["steps"] == 400
+    fingerprints = {
+        pd.read_json(tmp_path / f"store-{n}" / "meta.json", typ="series")["fingerprint"]
+        for n in range(2)
+    }
+    assert len(fingerprints) == 1
+
+
+USERS = pd.DataFrame(
+    {"user_id": range(100), "age": 20.0 + np.arange(100) % 7, "spend": 1000 - np.arange(100) ** 1.5}
+)
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".csv"])
+@pytest.mark.parametrize(
+    "second",
+    [
+        ["user_id", "spend", "age"],
+        ["spend", "age", "user_id"],
+        ["AGE", "User_ID", "spend"],
+    ],
+)
+def test_parts_of_features_are_joined_by_the_names_of_their_columns(
+    tmp_path: Path, suffix: str, second: list[str]
+) -> None:
+    reports = []
+    for n, columns in enumerate((list(USERS.columns), second)):
+        folder = tmp_path / str(n)
+        write(make_log(), folder / "log.parquet")
+        write(USERS[:50], folder / "users.parquet" / f"0{suffix}")
+        part = USERS[50:][[name.lower() for name in columns]]
+        part.columns = columns  # type: ignore[assignment]
+        write(part, folder / "users.parquet" / f"1{suffix}")
+        reports.append(prepared(folder, tmp_path / f"store-{n}"))
+    assert reports[0]["fingerprint"] == reports[1]["fingerprint"]
+
+
+def test_a_column_of_some_parts_is_missing_in_the_others(tmp_path: Path) -> None:
+    write(make_log(), tmp_path / "log.parquet")
+    write(USERS[:50], tmp_path / "users.parquet" / "0.parquet")
+    write(USERS[50:][["user_id", "age"]], tmp_path / "users.parquet" / "1.parquet")
+    first = prepared(tmp_path, tmp_path / "store-0")
+    write(USERS[50:].assign(spend=None), tmp_path / "users.parquet" / "1.parquet")
+    assert prepared(tmp_path, tmp_path / "store-1")["fingerprint"] == first["fingerprint"]
+    write(USERS[50:].assign(spend="many"), tmp_path / "users.parquet" / "1.parquet")
+    with pytest.raises(InputError, match=r"spend is VARCHAR here and DOUBLE in .*0\.parquet"):
+        prepared(tmp_path, tmp_path / "store-2")
+
+
+@pytest.mark.parametrize("change", [("age", 99.0), ("spend", np.nan), ("city", "Rome")])
+def test_the_fingerprint_covers_every_feature_value(
+    tmp_path: Path, change: tuple[str, object]
+) -> None:
+    users = USERS.assign(city=np.where(USERS["user_id"] % 2, "Oslo", "Lima"))
+    write(make_log(), tmp_path / "log.parquet")
+    write(users, tmp_path / "users.parquet")
+    first = prepared(tmp_path, tmp_path / "store-0")["fingerprint"]
+    write(users.sample(frac=1, random_state=0), tmp_path / "users.parquet")
+    assert prepared(tmp_path, tmp_path / "store-1")["fingerprint"] == first
+    users.loc[70, change[0]] = change[1]
+    write(users, tmp_path / "users.parquet")
+    assert prepared(tmp_path, tmp_path / "store-2")["fingerprint"] != first
+
+
+@pytest.mark.parametrize("key", ["USER_ID", "User_Id", "user_id"])
+def test_a_key_is_no_feature_whatever_its_case(tmp_path: Path, key: str) -> None:
+    fingerprints = set()
+    for name in (key, "user_id"):
+        write(make_log(), tmp_path / name / "log.parquet")
+        users = USERS[["user_id", "age"]].rename(columns={"user_id": name})
+        write(users, tmp_path / name / "users.parquet")
+        report = prepared(tmp_path / name, tmp_path / f"store-{len(fingerprints)}-{name}")
+        fingerprints.add(report["fingerprint"])
+    assert len(fingerprints) == 1
+
+
+def test_what_an_expression_for_the_key_reads_is_no_feature(tmp_path: Path) -> None:
+    write(make_log(), tmp_path / "log.parquet")
+    users = USERS[["user_id", "age"]].rename(columns={"user_id": "uid"})
+    write(users, tmp_path / "people.parquet")
+    found = set()
+    for n, columns in enumerate(((), ("age",))):
+        table = FeatureTable((tmp_path / "people.parquet",), "UID::BIGINT", columns)
+        mapping = LogMapping(user_features=(table,))
+        prepare([tmp_path / "log.parquet"], mapping, tmp_path / f"store-{n}", SMALL)
+        meta = pd.read_json(tmp_path / f"store-{n}" / "meta.json", typ="series")
+        found.add(meta["fingerprint"])
+    assert len(found) == 1
+
+
+# Identifiers
+
+
+@pytest.mark.parametrize("late", ["007", "1e1", "1_0", "1.0", "0x1f", "+7", "-0", "7 ", '"7"', "é"])
+@pytest.mark.parametrize("rows", [40, 21_000])
+def test_an_identifier_of_a_csv_file_is_its_text(tmp_path: Path, late: str, rows: int) -> None:
+    """Also where DuckDB, which looks at the first rows, takes the column for whole numbers."""
+    ids = [*map(str, np.arange(rows) % 49 + 1)]
+    ids[-1] = late
+    lines = (f"{n % 10},{each},{START + 1000 * n},{n % 2}" for n, each in enumerate(ids))
+    for name in ("user_id,item_id", "item_id,user_id"):
+        path = tmp_path / "log.csv"
+        path.write_text("\n".join([f"{name},timestamp,reward", *lines]) + "\n")
+        report = validate([path], LogMapping())
+        counts = {report["users"], report["items"]}
+        assert counts == {10, len({each.strip('"') for each in ids})}
+        lines = (f"{n % 10},{each},{START + 1000 * n},{n % 2}" for n, each in enumerate(ids))
+
+
+def test_text_of_a_csv_file_that_is_whole_numbers_throughout_is_numbers(tmp_path: Path) -> None:
+    log = make_log()
+    stores = []
+    for name in ("log.csv", "log.parquet"):
+        write(log, tmp_path / name)
+        prepare([tmp_path / name], LogMapping(), tmp_path / f"store-{name}", SMALL)
+        stores.append(pd.read_json(tmp_path / f"store-{name}" / "meta.json", typ="series"))
+    assert stores[0]["fingerprint"] == stores[1]["fingerprint"]
+    assert pq.read_table(tmp_path / "store-log.csv" / "users.parquet")["user_id"].type == pa.int64()
+
+
+@pytest.mark.parametrize("text", ["log", "later"])
+def test_users_of_text_and_of_integers_are_the_same_if_their_text_is(
+    tmp_path: Path, text: str
+) -> None:
+    """With `like`, as in `score`, `rank` and `ope`: '01' is not 1."""
+    ids = [*map(str, range(1, 60)), "01"]
+    log, later = make_log(2000, 60, 20_000), make_log(600, 59, 20_000)
+    later["user_id"] += 1
+    if text == "log":
+        log["user_id"] = [ids[n] for n in log["user_id"]]
+    else:
+        log["user_id"] += 1
+        later["user_id"] = later["user_id"].astype(str)
+        later.loc[:9, "user_id"] = "01"
+    write(log, tmp_path / "log.parquet")
+    write(later, tmp_path / "later.parquet")
+    prepare([tmp_path / "log.parquet"], LogMapping(), tmp_path / "store", SMALL)
+    prepare(
+        [tmp_path / "later.parquet"],
+        LogMapping(),
+        tmp_path / "found",
+        SMALL,
+        like=tmp_path / "store",
+    )
+    known = [*map(str, pq.read_table(tmp_path / "store" / "users.parquet")["user_id"].to_pylist())]
+    numbers = EpisodeStore.open(tmp_path / "found").episode_values("user")
+    users = pq.read_table(tmp_path / "found" / "episode_users.parquet")["user_id"].to_pylist()
+    expected = [known.index(str(each)) if str(each) in known else -1 for each in users]
+    assert [*numbers] == expected
+    assert max(expected) > 0
+
+
+def test_keys_of_features_in_a_csv_file_are_their_text(tmp_path: Path) -> None:
+    write(make_log(), tmp_path / "log.parquet")
+    keys = [f"{n:03d}" for n in range(100)]
+    write(USERS.assign(user_id=keys), tmp_path / "users.csv")
+    # 100 to 999 would be their own text; of these, none is.
+    with pytest.raises(InputError, match=r"no row belongs to a user_id of the log"):
+        prepared(tmp_path, tmp_path / "store", user_id="user_id + 100")
+    log = make_log()
+    log["user_id"] = log["user_id"].map("{:03d}".format)
+    write(log, tmp_path / "log.parquet")
+    assert prepared(tmp_path, tmp_path / "store-1")["users"] == log["user_id"].nunique()
+
+
+# Empty parts, missing values, truth values
+
+
+def test_empty_parts_and_columns_that_are_null_in_a_part_are_read(tmp_path: Path) -> None:
+    log = make_log(1500, 60)
+    nulls = pd.Series([None] * 700, dtype="float64")
+    write(log[:700].assign(propensity=nulls), tmp_path / "a.parquet")
+    write(log[700:].assign(propensity=0.05), tmp_path / "b.parquet")
+    write(log[:0].assign(propensity=0.05), tmp_path / "c.parquet")
+    report = validate([tmp_path], LogMapping())
+    assert (report["steps"], report["unknown_propensities"]) == (1500, 700)
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".csv"])
+@pytest.mark.parametrize(
+    "name", ["propensity", "session_id", "is_random", "observation", "feedback"]
+)
+@pytest.mark.parametrize("kind", ["object", "float64", "string"])
+def test_a_column_without_a_value_has_the_type_of_the_other_parts(
+    tmp_path: Path, suffix: str, name: str, kind: str
+) -> None:
+    log = make_log(200)
+    filled: dict[str, Any] = {
+        "propensity": 0.5,
+        "session_id": "s" + log["user_id"].astype(str),
+        "is_random": True,
+        "observation": [[1.0, 2.0]] * 200,
+        "feedback": 2,
+    }
+    if suffix == ".csv" and name == "observation":
+        pytest.skip("CSV files have no lists")
+    log[name] = filled[name]
+    write(log[:100].assign(**{name: pd.Series([None] * 100, dtype=kind)}), tmp_path / f"a{suffix}")
+    write(log[100:], tmp_path / f"b{suffix}")
+    options = PrepareOptions(
+        reward="coalesce(feedback, 0) + reward" if name == "feedback" else None
+    )
+    if name == "observation":
+        with pytest.raises(InputError, match=r"observation is missing .* in 100 of 200 rows"):
+            validate([tmp_path], LogMapping(), options)
+        return
+    report = validate([tmp_path], LogMapping(), options)
+    missing = 100 if name == "session_id" else 0
+    assert (report["steps"], report["dropped"]["null_key"]) == (200 - missing, missing)
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".csv"])
+def test_a_log_without_any_row_is_refused(tmp_path: Path, suffix: str) -> None:
+    write(make_log()[:0], tmp_path / f"a{suffix}")
+    write(make_log()[:0], tmp_path / f"b{suffix}")
+    with pytest.raises(InputError, match=rf"a{suffix} and 1 more is empty \(0 rows\)"):
+        validate([tmp_path], LogMapping())
+
+
+@pytest.mark.parametrize(
+    ("expression", "value"),
+    [
+        ("is_click + 2 * is_like", lambda f: f["is_click"] * 1.0 + 2 * f["is_like"]),
+        ('"is_click" * 3 - IS_LIKE', lambda f: 3.0 * f["is_click"] - f["is_like"]),
+        ("is_click AND is_like", lambda f: (f["is_click"] & f["is_like"]) * 1.0),
+        ("CASE WHEN is_click THEN 0.5 + is_like END", lambda f: f["is_like"] + 0.5),
+        ("length('é') * is_click + length(is_click::VARCHAR)", None),
+    ],
+)
+@pytest.mark.parametrize("suffix", [".parquet", ".csv"])
+def test_truth_values_are_numbers_in_arithmetic(
+    tmp_path: Path,
+    suffix: str,
+    expression: str,
+    value: Callable[[pd.DataFrame], "pd.Series[float]"] | None,
+) -> None:
+    generator = np.random.default_rng(0)
+    log = make_log()
+    for name in ("is_click", "is_like"):
+        log[name] = generator.random(len(log)) < 0.5
+    path = write(log, tmp_path / f"log{suffix}")
+    report = validate([path], LogMapping(), PrepareOptions(reward=expression))
+    if value is None:
+        expected = log["is_click"] * 1.0 + 1
+    else:
+        expected = value(log[log["is_click"]] if expression.startswith("CASE") else log)
+    assert report["reward_statistics"]["mean"] == pytest.approx(expected.mean(), rel=1e-4)
+
+
+# Time
+
+
+def test_columns_that_are_not_used_cost_next_to_nothing(tmp_path: Path) -> None:
+    log = make_log(300)
+    generator = np.random.default_rng(0)
+
+    def seconds(columns: int) -> float:
+        more = pd.DataFrame(generator.random((300, columns))).rename(columns="x{}".format)
+        path = write(pd.concat([log, more], axis=1), tmp_path / "log.parquet")
+        took = []
+        for _ in range(3):
+            began = time.process_time()
+            assert validate([path], LogMapping())["steps"] == 300
+            took.append(time.process_time() - began)
+        return min(took)
+
+    assert seconds(1000) < 1.5 * seconds(10) + 0.1
+
+
+def test_files_are_listed_once(tmp_path: Path) -> None:
+    write(make_log(), tmp_path / "a" / "log.parquet")
+    given = [tmp_path, tmp_path / "a", tmp_path / "a" / "log.parquet"]
+    assert log_files(given) == (tmp_path / "a" / "log.parquet",)
+    assert os.listdir(tmp_path) == ["a"]
+
+
+def test_a_store_in_a_folder_that_is_called_like_a_column_is_read(tmp_path: Path) -> None:
+    path = write(make_log(), tmp_path / "log.parquet")
+    store = tmp_path / "item_id=3" / "user_id=4" / "store"
+    store.parent.mkdir(parents=True)
+    prepare([path], LogMapping(), store, SMALL)
+    report = prepare([path], LogMapping(), tmp_path / "like", SMALL, like=store)
+    assert (report["steps"], report["dropped"]["unknown_item"]) == (400, 0)
+    assert (EpisodeStore.open(tmp_path / "like").episode_values("user") >= 0).all()

@@ -1,0 +1,163 @@
+"""Times mean what the file says, or are asked about; never guessed."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from ucfrec.errors import InputError
+from ucfrec.logs.histories import frame_histories, read_histories
+from ucfrec.logs.mapping import LogMapping, read_mapping
+from ucfrec.logs.prepare import PrepareOptions, validate
+
+DAY = 86_400_000
+
+
+def make_log(times: "pd.Series[str] | pd.DatetimeIndex | pd.Index[str]") -> pd.DataFrame:
+    generator = np.random.default_rng(0)
+    n = len(times)
+    return pd.DataFrame(
+        {
+            "user_id": generator.integers(10, size=n),
+            "item_id": generator.integers(20, size=n),
+            "timestamp": times,
+            "reward": generator.integers(0, 2, n),
+        }
+    )
+
+
+def write(frame: pd.DataFrame, path: Path) -> Path:
+    if path.suffix == ".csv":
+        frame.to_csv(path, index=False)
+    else:
+        frame.to_parquet(path, index=False)
+    return path
+
+
+def days(begin: str, n: int, rows: int = 3000) -> pd.DatetimeIndex:
+    return pd.DatetimeIndex(
+        pd.Timestamp(begin) + pd.to_timedelta(np.arange(rows) * (n * 86_400 / rows), unit="s")
+    ).floor("s")
+
+
+def range_of(path: Path, mapping: LogMapping | None = None) -> list[str]:
+    report = validate([path], mapping or LogMapping())
+    return [f"{pd.Timestamp(each, unit='ms'):%Y-%m-%d}" for each in report["time_range_ms"]]
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+@pytest.mark.parametrize("sign", ["/", ".", "-"])
+@pytest.mark.parametrize("clock", ["", " %H:%M", " %H:%M:%S", ", %H:%M:%S", " %I:%M:%S %p"])
+def test_an_order_of_day_and_month_that_no_row_settles_is_a_question(
+    tmp_path: Path, suffix: str, sign: str, clock: str
+) -> None:
+    written = f"%m{sign}%d{sign}%Y{clock}"
+    path = write(make_log(days("2024-03-01", 11).strftime(written)), tmp_path / f"log{suffix}")
+    said = f"3 January or 1 March\\? .*--time-format '%d{sign}%m{sign}%Y …' or '%m{sign}%d"
+    with pytest.raises(InputError, match=said):
+        validate([path], LogMapping())
+    assert range_of(path, LogMapping(time_format=written)) == ["2024-03-01", "2024-03-11"]
+    other = f"%d{sign}%m{sign}%Y{clock}"
+    assert range_of(path, LogMapping(time_format=other)) == ["2024-01-03", "2024-11-03"]
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+@pytest.mark.parametrize("written", ["%m/%d/%Y %H:%M:%S", "%d.%m.%Y %H:%M", "%d-%m-%Y, %H:%M:%S"])
+def test_a_day_beyond_12_anywhere_in_the_file_settles_it(
+    tmp_path: Path, suffix: str, written: str
+) -> None:
+    # The 13th comes after the first 20,000 rows, at which DuckDB looks.
+    path = write(
+        make_log(days("2024-03-01", 13, 24_000).strftime(written)), tmp_path / f"log{suffix}"
+    )
+    assert range_of(path) == ["2024-03-01", "2024-03-13"]
+
+
+def test_every_file_settles_its_own_order(tmp_path: Path) -> None:
+    write(make_log(days("2024-03-01", 31).strftime("%m/%d/%Y")), tmp_path / "a.parquet")
+    write(make_log(days("2024-04-01", 11).strftime("%m/%d/%Y")), tmp_path / "b.parquet")
+    with pytest.raises(InputError, match=r"b.parquet: timestamp is '04/01/2024': 4 January or"):
+        validate([tmp_path], LogMapping())
+    write(make_log(days("2024-04-01", 30).strftime("%d/%m/%Y")), tmp_path / "b.parquet")
+    with pytest.raises(InputError, match="the day first in some files and the month in others"):
+        validate([tmp_path], LogMapping())
+    mixed = pd.Index(["03/13/2024", "13/03/2024"] * 50)
+    write(make_log(mixed), tmp_path / "b.parquet")
+    with pytest.raises(InputError, match="neither day/month nor month/day reads every row"):
+        validate([tmp_path], LogMapping())
+
+
+@pytest.mark.parametrize(
+    ("written", "expected"),
+    [
+        ("2024-05-01T10:00:00+02:00", "2024-05-01 08:00:00"),
+        ("2024-05-01T10:00:00.250Z", "2024-05-01 10:00:00.250"),
+        ("2024-05-01T10:00:00", "2024-05-01 10:00:00"),
+        ("2024-05-01 10:00", "2024-05-01 10:00:00"),
+        ("2024-05-01", "2024-05-01 00:00:00"),
+        ("2024/05/01 10:00:00", "2024-05-01 10:00:00"),
+        ("2024-05-01T10:00:00,5-0330", "2024-05-01 13:30:00.500"),
+        ("1714557600000", "2024-05-01 10:00:00"),
+    ],
+)
+@pytest.mark.parametrize("suffix", [".csv", ".parquet", "frame"])
+def test_iso_times_are_read_with_and_without_zone(
+    tmp_path: Path, suffix: str, written: str, expected: str
+) -> None:
+    log = make_log(pd.Index([written] * 3)).assign(user_id=1, item_id=[1, 2, 3])
+    if suffix == "frame":
+        (batch,) = frame_histories(log, LogMapping(), "reward", 10)
+    else:
+        path = write(log, tmp_path / f"log{suffix}")
+        (batch,) = read_histories([path], LogMapping(), "reward", 10)
+    ms = round(pd.Timestamp(expected, tz="UTC").timestamp() * 1000)
+    assert batch.column("timestamps").to_pylist() == [[ms] * 3]
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_other_text_needs_its_format(tmp_path: Path, suffix: str) -> None:
+    times = days("2024-03-01", 11).strftime("%d %b %Y %H:%M")
+    path = write(make_log(times), tmp_path / f"log{suffix}")
+    with pytest.raises(
+        InputError, match="no ISO 8601 time nor milliseconds; say how it is written"
+    ):
+        validate([path], LogMapping())
+    mapping = LogMapping(time_format="%d %b %Y %H:%M")
+    assert range_of(path, mapping) == ["2024-03-01", "2024-03-11"]
+    zoned = write(make_log(times + " +0200"), tmp_path / f"zoned{suffix}")
+    mapping = LogMapping(time_format="%d %b %Y %H:%M %z")
+    assert range_of(zoned, mapping) == ["2024-02-29", "2024-03-11"]
+
+
+def test_times_before_2000_are_read_when_asked_for(tmp_path: Path) -> None:
+    path = write(make_log(days("1997-09-01", 200)), tmp_path / "log.parquet")
+    with pytest.raises(InputError, match=r"no row is left .* say --earliest 1990-01-01"):
+        validate([path], LogMapping())
+    expected = ["1997-09-01", "1998-03-19"]
+    assert range_of(path, LogMapping(earliest="1990-01-01")) == expected
+    (tmp_path / "m.toml").write_text('earliest = "1997-09-01T00:00:00+00:00"\n')
+    assert range_of(path, read_mapping(tmp_path / "m.toml")) == expected
+    (tmp_path / "m.toml").write_text('earliest = "1990-01-01"\ntime_format = "%Y"\n')
+    assert range_of(path, read_mapping(tmp_path / "m.toml")) == expected
+    with pytest.raises(InputError, match="earliest is 'soon'; write a date"):
+        LogMapping(earliest="soon")
+
+
+def test_a_frame_says_how_to_read_times_before_2000() -> None:
+    log = make_log(days("1997-09-01", 200))
+    with pytest.raises(InputError, match="or earliest in the mapping"):
+        list(frame_histories(log, LogMapping(), "reward", 10))
+    assert list(frame_histories(log, LogMapping(earliest="1990-01-01"), "reward", 10))
+
+
+def test_a_column_of_dates_in_an_expression_is_text_if_their_order_is_not_certain(
+    tmp_path: Path,
+) -> None:
+    log = make_log(pd.Index(map(str, 1_700_000_000_000 + np.arange(3000))))
+    log["made"] = days("2024-03-01", 11).strftime("%m/%d/%Y")
+    path = write(log, tmp_path / "log.csv")
+    with pytest.raises(InputError, match="no scalar SQL expression"):
+        validate([path], LogMapping(), PrepareOptions(reward="month(made)"))
+    options = PrepareOptions(reward="day(strptime(made, '%m/%d/%Y'))")
+    assert validate([path], LogMapping(), options)["reward_statistics"]["max"] == 11

@@ -24,6 +24,7 @@ from ucfrec.counterfactual.reward_model_fit import CRMReport, fit_warning
 from ucfrec.counterfactual.transitions import Read
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay, Transitions
+from ucfrec.files.record import Undefinable
 from ucfrec.settings import Count, Quantile, settings_table
 
 _CHUNK = 8192

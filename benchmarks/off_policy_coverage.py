@@ -41,7 +41,7 @@ import numpy as np
 
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.off_policy.estimators import Estimate, estimate
-from ucfrec.off_policy.fqe import cross_fitted
+from ucfrec.off_policy.fqe import fit_models
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.verdict import judge
 from ucfrec.progress import progress
@@ -126,14 +126,8 @@ class Environment:
         seen = one_hot[contexts, actions]
         at_policy = np.einsum("xa,xaf->xf", target, one_hot)[contexts].astype(np.float32)
         ones = np.ones((len(contexts), 1), dtype=np.float32)
-        model = cross_fitted(
-            np.hstack([ones, seen]),
-            np.hstack([ones, at_policy]),
-            steps.reward,
-            steps.session,
-            seed,
-            user,
-        )
+        features = (np.hstack([ones, seen]), np.hstack([ones, at_policy]))
+        model, _ = fit_models(lambda: iter([features]), steps.reward, steps.session, seed, user)
         return replace(steps, model=model)
 
 

@@ -132,6 +132,6 @@ class SessionMixture:
         return actions, np.stack(known)[self.component, rows]
 
     def observe(self, actions: Actions, rewards: Float32Array) -> None:
-        """Pass the played actions and rewards (N,) to every actor."""
+        """Pass the actions taken and rewards (N,) to every actor."""
         for actor in self._actors:
             actor.observe(actions, rewards)

@@ -1,7 +1,7 @@
-"""SARDINE's environments of single items: tastes that only feedback tells, and boredom.
+"""SARDINE's environments of single items: tastes that only feedback reveals, and boredom.
 
 SARDINE is the simulator of Deffayet et al. (2024), the package `sardine-rec` (extra `sardine`),
-which is played as published. A session has 100 steps. One of 1,000 items is shown in each and
+which is used as published. A session has 100 steps. One of 1,000 items is shown in each and
 clicked or not; an item is a vector of 10 topics, of which two or three are not zero. A user with
 tastes for 3 to 5 topics is drawn for every session. Nothing is observed besides what was shown and
 clicked. In `Static` tastes stay as they are. In `BoredInf` clicks change them, and a user who

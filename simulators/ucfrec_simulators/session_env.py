@@ -34,7 +34,7 @@ def draw_categories(
 
 
 class SessionsEnv(VectorEnv[Float32Array, Array, Array], ABC):
-    """N sessions played at once with `AutoresetMode.SAME_STEP`.
+    """N parallel sessions with `AutoresetMode.SAME_STEP`.
 
     A step that ends a session returns the first observation of the next session, and the last one
     of the ended session in `info["final_obs"]` and `info["final_info"]`, as `SyncVectorEnv` does.
@@ -52,7 +52,7 @@ class SessionsEnv(VectorEnv[Float32Array, Array, Array], ABC):
         single_action_space: spaces.Box | spaces.Discrete,
     ) -> None:
         if num_envs < 1:
-            raise InputError(f"num_envs is {num_envs}; at least one session must be played")
+            raise InputError(f"num_envs is {num_envs}; at least one session is needed")
         self.num_envs = num_envs
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
         self.single_observation_space = single_observation_space
@@ -89,7 +89,7 @@ class SessionsEnv(VectorEnv[Float32Array, Array, Array], ABC):
     def step(
         self, actions: Array
     ) -> tuple[Float32Array, Float32Array, BoolArray, BoolArray, dict[str, Any]]:
-        """Play one action in each session.
+        """Take one action in each session.
 
         Args:
             actions: (N, A) vectors or (N,) items.

@@ -36,11 +36,11 @@ class SyntheticCatalog(SessionsEnv):
     `info["user_id"]` (N,): the user of the next step, 0 to n_users − 1.
 
     With `mood` above 0, the log is confounded. Every session has a hidden mood, good or bad with
-    equal chances, which neither observations nor info tell. A good mood raises the log-odds of a
+    equal chances, which neither observations nor info reveal. A good mood raises the log-odds of a
     click on every item by `mood`, a bad one lowers them by as much; and `mixture`, as if it sensed
     the mood, shows items of even tags more often in a good mood and of odd tags in a bad one
-    (`SoftmaxGuess`). So in the log even tags earn more, and showing them causes nothing. Which
-    policy is best does not change: the mood moves all items alike.
+    (`SoftmaxGuess`). So in the log even tags have higher rewards, and showing them causes nothing.
+    Which policy is best does not change: the mood moves all items alike.
 
     Args:
         num_envs: number of parallel sessions, N.
@@ -170,10 +170,10 @@ class Rotation(Memoryless):
     `max_turn`, and S(t) the sum of the first t terms of m₁, …, m_N, m₁, …. Clicks do not affect
     later steps, so fixed sequences of items suffice. If a sequence ends with step t ≤ T, its
     first t − 1 steps did not end the session, so any N successive ones of them have different
-    tags. Cut into blocks of N from the start, they earn at most S(t − 1) in expectation, and
-    the last step at most m₁. As S grows with t, no sequence earns more than S(T − 1) + m₁. The
-    favourites in turn for T − 1 steps never repeat a tag too soon and earn S(T − 1); the last
-    step may end the session and earns m₁.
+    tags. Cut into blocks of N from the start, they return at most S(t − 1) in expectation, and
+    the last step at most m₁. As S grows with t, no sequence returns more than S(T − 1) + m₁. The
+    favourites in turn for T − 1 steps never repeat a tag too soon and return S(T − 1); the last
+    step may end the session and returns m₁.
     """
 
     def __init__(self, environment: SyntheticCatalog, favourites: IntArray) -> None:
@@ -225,7 +225,7 @@ class SoftmaxGuess(Memoryless):
         """(N, n_items) probability of each item in each session's next step.
 
         Args:
-            live: (N,) marks the sessions to tell of; None for all.
+            live: (N,) marks the sessions of interest; None for all.
         """
         environment, rows = self._environment, slice(None) if live is None else live
         shown = (environment.recent_tags[rows, :, None] == environment.tags).any(axis=1)

@@ -1,4 +1,9 @@
-"""DT, DC and LSDT answer as their authors' code does, with its weights (`fixtures/`)."""
+"""DT, DC and LSDT answer as their authors' code does, with its weights (`fixtures/`).
+
+The files are of commits e2d82e6 (kzl/decision-transformer), 3db9b9e (beanie00/Decision-ConvFormer)
+and 1feb77a (WangJinCheng1998/LONG-SHORT-DECISION-TRANSFORMER) with torch 2.13.0 on a CPU;
+`tests/control/fixtures/authors_networks.py` made them.
+"""
 
 from pathlib import Path
 

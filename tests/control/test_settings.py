@@ -15,7 +15,7 @@ from ucfrec.errors import InputError
 from ucfrec.settings import describe
 from ucfrec_control.data.collect import CollectConfig
 from ucfrec_control.data.sac import SacConfig
-from ucfrec_control.learners.rl_baselines import RLConfig
+from ucfrec_control.training.rl_baselines import RLConfig
 
 SOURCE = [Path(__file__).parents[2] / name for name in ("control", "ucfrec")]
 RL = RLConfig("iql", 100, "hopper", "medium")

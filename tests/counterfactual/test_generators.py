@@ -12,8 +12,6 @@ from torch import Tensor
 
 from tests.support.planted import CONSTANT, f, fitted, planted
 from tests.support.real_data import data_folder
-from ucfrec.counterfactual.augment import accept
-from ucfrec.counterfactual.edit_statistics import MoveReport, MoveStatistics
 from ucfrec.counterfactual.generators import (
     CounterfactualStateGenerator,
     CSGConfig,
@@ -24,6 +22,7 @@ from ucfrec.counterfactual.generators import (
 )
 from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig
 from ucfrec.counterfactual.reward_model_fit import fit_crm
+from ucfrec.counterfactual.state_augmentation import MoveReport, MoveStatistics, accept
 from ucfrec.episodes.windows import Transitions
 from ucfrec.errors import InputError
 

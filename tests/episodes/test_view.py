@@ -54,7 +54,7 @@ def copied(episodes: list[Logged], overlay: Overlay, copy: int) -> Logged:
     length=st.integers(1, 8),
     seed=st.integers(0, 99),
 )
-def test_action_copies_are_their_source_up_to_their_own_last_step(
+def test_action_augmentation_are_their_source_up_to_their_own_last_step(
     lengths: list[int], definition: ReturnToGo, items: bool, edits: int, length: int, seed: int
 ) -> None:
     episodes, states = random_episodes(lengths, seed, items=items), some_states() if items else None
@@ -164,7 +164,7 @@ def test_what_an_action_copy_says_of_the_steps_before(tmp_path: Path) -> None:
         union.windows(copies[:1], overlay.action_step[:1] + 1, 2)
 
 
-def test_action_copies_of_another_store_are_refused(tmp_path: Path) -> None:
+def test_action_augmentation_of_another_store_are_refused(tmp_path: Path) -> None:
     base = write_store(tmp_path / "store", random_episodes(LENGTHS), some_states())
     good = random_action_copies(base, 3, seed=5)
     vectors = np.zeros((3, 3), dtype=np.float32)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from tests.support import killed_run
-from ucfrec.counterfactual.copies import counterfactual_copies
+from ucfrec.counterfactual.augmentation import counterfactual_augmentation
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.environment import Environment
@@ -97,11 +97,13 @@ def test_the_loop(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["tangent", "faithful", "noise"])
-def test_copies(store: EpisodeStore, tmp_path: Path, kind: str) -> None:
+def test_augmentation(store: EpisodeStore, tmp_path: Path, kind: str) -> None:
     config = resolve_config("ucf", None, {"crm.epochs": 1, "csg.epochs": 1, "csg.kind": kind})
     tables = (config.crm, config.csg, config.augment)
     with unnoticed():
-        counterfactual_copies(store.split("train"), store.split("validation"), *tables, tmp_path, 0)
+        counterfactual_augmentation(
+            store.split("train"), store.split("validation"), *tables, tmp_path, 0
+        )
 
 
 @pytest.mark.parametrize("name", sorted(set(BUILT_IN) - {"item-knn", "item-rate"}))

@@ -8,7 +8,12 @@ import pytest
 
 from ucfrec.arrays import Float32Array, Float64Array, IntArray
 from ucfrec.off_policy import LoggedSteps, estimate
-from ucfrec.off_policy.behavior_model import BehaviorModel, fit_behavior
+from ucfrec.off_policy.behavior_model import (
+    BehaviorModel,
+    default_groups,
+    fit_behavior,
+    group_items,
+)
 
 GROUP_OF = np.array([0, 0, 0, 1, 1, 2, 2, 2, 2])
 STEPS = 6000
@@ -106,3 +111,24 @@ def test_one_group_is_certain() -> None:
     )
     np.testing.assert_allclose(model.group, 1)
     np.testing.assert_allclose(model.item, 1 / 9, rtol=0.1)
+
+
+def test_groups_are_the_clusters_of_embeddings() -> None:
+    rng = np.random.default_rng(0)
+    centres, true = 10 * rng.normal(size=(4, 8)), rng.integers(4, size=200)
+    embeddings = (centres[true] + 0.1 * rng.normal(size=(200, 8))).astype(np.float32)
+    found = group_items(embeddings, 4, seed=0)
+    assert len(set(zip(true, found, strict=True))) == 4
+    assert set(found) == {0, 1, 2, 3}
+
+
+def test_equal_items_are_one_group() -> None:
+    embeddings = np.repeat(np.eye(3, dtype=np.float32), 5, axis=0)
+    found = group_items(embeddings, 7, seed=0)
+    np.testing.assert_array_equal(found, np.repeat(found[::5], 5))
+    assert found.max() == 2
+
+
+@pytest.mark.parametrize(("items", "groups"), [(1, 2), (80, 9), (7583, 32)])
+def test_their_number_follows_the_catalogue(items: int, groups: int) -> None:
+    assert default_groups(items) == groups

@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 
 from tests.support.logged_steps import random_steps
+from ucfrec.errors import InputError
+from ucfrec.off_policy import LoggedSteps, judge
 from ucfrec.off_policy.diagnostics import (
     diagnose,
     identification_bounds,
     implied_items,
     pareto_tail,
 )
+from ucfrec.off_policy.logged_steps import ItemGroups
 
 
 @pytest.mark.parametrize("shape", [0.2, 0.5, 0.9])
@@ -74,3 +77,51 @@ def test_few_users_and_no_propensities_imply_nothing() -> None:
     listed = np.ones(50, dtype=bool)
     assert implied_items(replace(steps, user=np.arange(50) % 20), listed, 5) is None
     assert implied_items(replace(steps, propensity=np.full(50, np.nan)), listed, 5) is None
+
+
+def grouped(behavior: np.ndarray, target: np.ndarray, sessions: int = 8000) -> LoggedSteps:
+    """Steps of four items in two groups."""
+    items = np.random.default_rng(0).choice(4, p=behavior, size=sessions)
+    group_of = np.array([0, 0, 1, 1])
+    shares = np.array([target[:2].sum(), target[2:].sum()], dtype=np.float32)
+    return LoggedSteps(
+        np.arange(sessions),
+        (np.random.default_rng(1).random(sessions) < 0.3).astype(np.float64),
+        behavior[items],
+        target[items],
+        groups=ItemGroups(group_of[items], np.tile(shares, (sessions, 1))),
+    )
+
+
+def test_wrong_propensities_of_one_group_are_found() -> None:
+    """Too large for one, too small for the other: right on average."""
+    target = np.array([0.2, 0.3, 0.3, 0.2])
+    steps = grouped(np.full(4, 0.25), target)
+    tests = {test.name: test for test in diagnose(steps).tests}
+    assert tests["item group 0"].passed
+    assert tests["item group 1"].passed
+    assert steps.groups is not None
+    factor = np.where(steps.groups.number == 0, 1.25, 1 / 1.2)
+    twisted = diagnose(replace(steps, propensity=steps.propensity * factor))
+    failed = {test.name: test.mean for test in twisted.tests if not test.passed}
+    assert set(failed) == {"item group 0", "item group 1"}
+    assert failed["item group 0"] == pytest.approx(0.8, abs=0.05)
+    assert failed["item group 1"] == pytest.approx(1.2, abs=0.05)
+    wrong = replace(steps, propensity=steps.propensity * factor)
+    assert "item group" in str(judge(wrong, seed=0))
+
+
+def test_a_group_that_the_logs_lack_is_named() -> None:
+    behavior, target = np.array([0.5, 0.49, 0.01, 0.0]), np.array([0.4, 0.4, 0.01, 0.19])
+    failed = [test for test in diagnose(grouped(behavior, target)).tests if not test.passed]
+    assert {"item group 1", "step 1"} <= {test.name for test in failed}
+
+
+def test_groups_have_a_row_for_each_step() -> None:
+    steps = grouped(np.full(4, 0.25), np.full(4, 0.25), sessions=50)
+    groups = ItemGroups(np.zeros(49, dtype=np.int64), np.ones((50, 1), dtype=np.float32))
+    with pytest.raises(InputError, match="groups have shapes"):
+        replace(steps, groups=groups)
+    kept = steps.only(np.arange(50) < 10)
+    assert kept.groups is not None
+    assert len(kept.groups.target) == 10

@@ -9,11 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.support.logged_steps import random_steps, reference
+from tests.support.logged_steps import fitted, random_steps, reference
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.off_policy.estimators import LOGGED, estimate, session_terms
-from ucfrec.off_policy.fqe import cross_fitted
 from ucfrec.off_policy.logged_steps import LoggedSteps, Modelled
 from ucfrec.off_policy.shrinkage import DR_KINDS, IPS_KINDS
 
@@ -243,7 +242,7 @@ def test_fitted_q_evaluation_finds_the_value_of_a_environment_of_tables() -> Non
     for action in (0, 1):
         spread[np.arange(len(at)), 2 * state + action] = ENVIRONMENT.target[state, action]
     at_policy = np.column_stack([np.ones(len(at)), spread]).astype(np.float32)
-    model = cross_fitted(features, at_policy, steps.reward, steps.session, seed=0)
+    model = fitted(features, at_policy, steps.reward, steps.session, seed=0)
     found = estimate(replace(steps, model=model), 0)
     on_policy = ENVIRONMENT.behavior[0] @ ENVIRONMENT.q(100)[100][0]
     assert abs(on_policy - truth) > 0.1
@@ -251,7 +250,7 @@ def test_fitted_q_evaluation_finds_the_value_of_a_environment_of_tables() -> Non
     assert found["DR"].low < truth < found["DR"].high
     # A model that is nearly right leaves the weights little to correct.
     assert found["DR"].high - found["DR"].low < found["PDIS"].high - found["PDIS"].low
-    again = cross_fitted(features, at_policy, steps.reward, steps.session, seed=0)
+    again = fitted(features, at_policy, steps.reward, steps.session, seed=0)
     for mine, yours in zip(values_of(model), values_of(again), strict=True):
         np.testing.assert_array_equal(mine, yours)
 
@@ -261,9 +260,9 @@ def test_no_session_is_judged_by_a_model_that_saw_it() -> None:
     session = np.repeat(np.arange(40), 3)
     features = np.column_stack([np.ones(120), rng.normal(size=(120, 3))]).astype(np.float32)
     reward = rng.normal(size=120)
-    before = cross_fitted(features, features, reward, session, seed=3)
+    before = fitted(features, features, reward, session, seed=3)
     mine = session == 7
-    after = cross_fitted(features, features, np.where(mine, 50.0, reward), session, seed=3)
+    after = fitted(features, features, np.where(mine, 50.0, reward), session, seed=3)
     for found, expected in zip(values_of(after), values_of(before), strict=True):
         np.testing.assert_array_equal(found[mine], expected[mine])
     assert not np.allclose(after.reward[~mine], before.reward[~mine])
@@ -381,4 +380,4 @@ def test_densities_weigh_as_probabilities_do() -> None:
 def test_one_session_cannot_be_modelled() -> None:
     one = np.ones((3, 1), dtype=np.float32)
     with pytest.raises(InputError, match="sessions of users other than the one"):
-        cross_fitted(one, one, np.ones(3), np.zeros(3, dtype=np.int64), seed=0)
+        fitted(one, one, np.ones(3), np.zeros(3, dtype=np.int64), seed=0)

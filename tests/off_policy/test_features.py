@@ -1,5 +1,6 @@
 """What the models see: the policy's window and the return left, the same from disk as at once."""
 
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,7 +11,13 @@ import torch
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.logs import LogMapping
 from ucfrec.off_policy.evaluate import step_features
-from ucfrec.off_policy.features import ROWS_AT_ONCE, InputsFile, StepInputs, scores_of
+from ucfrec.off_policy.features import (
+    ROWS_AT_ONCE,
+    InputsFile,
+    StepInputs,
+    array_on_disk,
+    scores_of,
+)
 from ucfrec.off_policy.score import LoggedSessions, logged_sessions, scored_steps
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -85,3 +92,15 @@ def test_scores_are_of_the_item_and_their_mean_over_what_is_shown() -> None:
     half = float(np.log(0.5))
     torch.testing.assert_close(mean, torch.tensor([np.log(0.25), 0.5 * -20 + 0.5 * half]).float())
     torch.testing.assert_close(chosen, torch.tensor([half, float(mean[1])]))
+
+
+def test_an_array_keeps_what_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    values = array_on_disk((1000, 3))
+    assert values.shape == (1000, 3)
+    assert not values.any()
+    numbers = np.random.default_rng(0).normal(size=(1000, 3)).astype(np.float32)
+    values[:] = numbers
+    np.testing.assert_array_equal(values, numbers)
+    assert not list(tmp_path.iterdir())
+    assert array_on_disk((0, 3)).shape == (0, 3)

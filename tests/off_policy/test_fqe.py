@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from ucfrec.arrays import Float32Array
-from ucfrec.off_policy.fqe import Fitted, cross_fitted, fit_models
+from ucfrec.off_policy.fqe import ModelReport, fit_models
+from ucfrec.off_policy.logged_steps import Modelled
 
 
 def chain(sessions: int = 300, length: int = 4, seed: int = 0) -> tuple[Float32Array, ...]:
@@ -20,7 +21,7 @@ def chain(sessions: int = 300, length: int = 4, seed: int = 0) -> tuple[Float32A
 
 def fitted(
     features: Float32Array, reward: Float32Array, session: Float32Array, rows: int
-) -> Fitted:
+) -> tuple[Modelled, ModelReport]:
     def chunks() -> Iterator[tuple[Float32Array, Float32Array]]:
         for begin in range(0, len(features), rows):
             yield features[begin : begin + rows], features[begin : begin + rows]
@@ -32,30 +33,30 @@ def fitted(
 def test_chunks_change_nothing(rows: int) -> None:
     """Also where a session lies in several."""
     features, reward, session = chain()
-    found = fitted(features, reward, session, rows).modelled
-    whole = cross_fitted(features, features, reward, session, seed=0)
+    found = fitted(features, reward, session, rows)[0]
+    whole = fitted(features, reward, session, len(features))[0]
     for name, values in vars(whole).items():
         np.testing.assert_allclose(vars(found)[name], values, rtol=1e-3, atol=1e-4)
 
 
 def test_q_is_what_is_still_to_come() -> None:
     features, reward, session = chain(3000)
-    one = fitted(features, reward, session, 512)
+    modelled, report = fitted(features, reward, session, 512)
     # The penalty takes off a little.
-    assert np.abs(one.modelled.q - features[:, 2]).mean() < 0.03
-    assert np.abs(one.modelled.reward - features[:, 1]).mean() < 0.01
-    assert 4 < one.report.iterations < 40
-    assert one.report.settled
-    assert one.report.reward_r2 > 0.99
-    assert one.report.td_loss < 1e-3
-    assert abs(one.report.td_bias) < 0.01
+    assert np.abs(modelled.q - features[:, 2]).mean() < 0.03
+    assert np.abs(modelled.reward - features[:, 1]).mean() < 0.01
+    assert 4 < report.iterations < 40
+    assert report.settled
+    assert report.reward_r2 > 0.99
+    assert report.td_loss < 1e-3
+    assert abs(report.td_bias) < 0.01
 
 
 def test_a_model_that_knows_nothing_reports_so() -> None:
     features, reward, session = chain()
     rng = np.random.default_rng(1)
     noise = np.column_stack([features[:, 0], rng.normal(size=(len(features), 2))])
-    report = fitted(noise.astype(np.float32), reward, session, 512).report
+    report = fitted(noise.astype(np.float32), reward, session, 512)[1]
     assert report.reward_r2 < 0.02
     assert report.td_loss == pytest.approx(reward.var(), rel=0.1)
     assert report.columns()["model_reward_r2"] == report.reward_r2
@@ -72,7 +73,7 @@ def test_q_that_runs_away_is_stopped_and_said() -> None:
     def chunks() -> Iterator[tuple[Float32Array, Float32Array]]:
         yield logged, five
 
-    report = fit_models(chunks, np.abs(reward), session, seed=0).report
+    report = fit_models(chunks, np.abs(reward), session, seed=0)[1]
     assert not report.settled
     assert report.iterations < 400
     assert np.isfinite(report.td_loss)

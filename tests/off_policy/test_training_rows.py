@@ -28,7 +28,7 @@ def test_the_share_of_rows_seen_in_training(
     seen: int,
     expected: float,
 ) -> None:
-    monkeypatch.setattr("ucfrec.off_policy.training_rows._ROWS_AT_ONCE", 100)
+    monkeypatch.setattr("ucfrec.episodes.view._BATCH_STEPS", 100)
     train = pd.read_parquet(folder / "train.parquet").sort_values("timestamp")
     rest = pd.read_parquet(folder / "rest.parquet").head(600 - seen)
     # The last tenth of the training log is its test split, which the run never saw.

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.support.logged_steps import fitted
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.off_policy import LoggedSteps, diagnose, estimate, judge
-from ucfrec.off_policy.fqe import cross_fitted
 from ucfrec.off_policy.verdict import cautions
 
 ITEMS = 10
@@ -185,9 +185,9 @@ def test_users_are_never_judged_by_models_that_saw_them() -> None:
     user, session = np.repeat(np.arange(20), 5), np.arange(100)
     features = np.column_stack([np.ones(100), rng.normal(size=(100, 3))]).astype(np.float32)
     reward = rng.normal(size=100)
-    before = cross_fitted(features, features, reward, session, 3, user)
+    before = fitted(features, features, reward, session, 3, user)
     mine = user == 7
-    after = cross_fitted(features, features, np.where(mine, 50.0, reward), session, 3, user)
+    after = fitted(features, features, np.where(mine, 50.0, reward), session, 3, user)
     np.testing.assert_array_equal(after.q[mine], before.q[mine])
     assert not np.allclose(after.q[~mine], before.q[~mine])
 

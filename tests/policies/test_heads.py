@@ -9,11 +9,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from ucfrec.episodes.exposure import Exposed, ExposureTerm, Likeness
 from ucfrec.episodes.states import ItemStates
-from ucfrec.fitting.row_optimizer import RowAdamW
 from ucfrec.policies import heads
 from ucfrec.policies.heads import ItemHead, VectorHead, head_from
 
@@ -55,18 +53,6 @@ def test_vector_actions_stay_in_range(scale: float, size: float, seed: int) -> N
     predicted = head.predict(size * torch.randn(50, 4, DIM))
     assert predicted.shape == (50, 4, 3)
     assert (predicted.abs() <= head.scale).all()
-
-
-def test_the_whole_range_can_be_reached() -> None:
-    head = VectorHead(DIM, 2)
-    head.scale.copy_(torch.tensor([3.0, 0.5]))
-    wanted = torch.tensor([2.9, -0.49])
-    optimizer = torch.optim.Adam(head.out.parameters(), lr=0.1)
-    for _ in range(300):
-        optimizer.zero_grad()
-        head.loss(torch.ones(1, DIM), wanted.unsqueeze(0)).backward()
-        optimizer.step()
-    torch.testing.assert_close(head.predict(torch.ones(DIM)), wanted, rtol=0.04, atol=0)
 
 
 def test_vector_loss_is_the_mean_squared_error_in_shares_of_the_range() -> None:
@@ -168,25 +154,6 @@ def gradients_of(module: nn.Module, loss: Callable[[], Tensor]) -> Tensor:
     loss().backward()  # type: ignore[no-untyped-call]
     found = [parameter.grad for parameter in module.parameters()]
     return torch.cat([each.to_dense().flatten() for each in found if each is not None])
-
-
-def test_learning_from_samples_finds_the_true_shares() -> None:
-    """Without the correction for Q, an item would be learnt as rarer the oftener it is sampled:
-    by a factor of ten between the first and the last here."""
-    counts = torch.tensor([400.0, 20, 100, 80, 60, 40])
-    shown = torch.tensor([24, 2, 4, 2, 2, 6])
-    head = ItemHead(DIM, 6, 5, samples=4)
-    head.start_from(torch.zeros(6, 5), counts)
-    torch.manual_seed(0)
-    actions = torch.repeat_interleave(torch.arange(6), shown)
-    features = torch.zeros(len(actions), DIM)
-    optimizer = RowAdamW([head.bias], lr=0.03, weight_decay=0)
-    for _ in range(400):
-        optimizer.zero_grad()
-        head.loss(features, actions).backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-    learnt = head.predict(torch.zeros(DIM)).detach().softmax(-1)
-    torch.testing.assert_close(learnt, shown / shown.sum(), rtol=0.2, atol=0.015)
 
 
 def test_candidates_have_the_logits_that_they_have_among_all() -> None:
@@ -293,33 +260,6 @@ def test_sampling_the_softmax_sees_the_same_exposure(tags: bool) -> None:
     )
     assert float(sampled.mean()) == pytest.approx(float(full.mean()), rel=0.01)
     assert float((sampled - full).abs().max()) < 0.1 * float((without - full).abs().max())
-
-
-def test_exposure_learns_by_sampling_what_it_learns_without() -> None:
-    head, _ = exposed_head(True)
-    assert head.exposure is not None
-    features, actions = steps(head, 200)
-    shown = shown_before(200)
-    torch.manual_seed(0)
-    full = gradients_of(head.exposure, lambda: head.loss(features, actions, shown))
-    sampling(head, 500)
-    sampled = gradients_of(
-        head.exposure,
-        lambda: torch.stack([head.loss(features, actions, shown) for _ in range(20)]).mean(),
-    )
-    assert full.norm() > 0
-    assert F.cosine_similarity(full, sampled, dim=0) > 0.98
-
-
-def test_losses_of_vectors_have_the_loss_as_their_mean() -> None:
-    torch.manual_seed(0)
-    head = VectorHead(DIM, 2)
-    head.scale.copy_(torch.tensor([4.0, 0.5]))
-    features, actions = torch.randn(7, DIM), torch.randn(7, 2)
-    losses = head.losses(features, actions)
-    assert losses.shape == (7,)
-    torch.testing.assert_close(losses.mean(), head.loss(features, actions))
-    torch.testing.assert_close(losses[2], head.loss(features[2:3], actions[2:3]))
 
 
 def test_a_store_of_items_or_of_vectors_gets_its_head() -> None:

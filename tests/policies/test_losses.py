@@ -48,20 +48,6 @@ def test_targets_equal_a_plain_loop(
     )
 
 
-@given(masks, st.integers(0, 4), weights, weights)
-def test_rows_of_steps_sum_to_one_and_rows_of_padding_to_zero(
-    mask: Tensor, window: int, decay: float, previous_action: float
-) -> None:
-    targets = parent_targets(mask, window, decay, previous_action)
-    torch.testing.assert_close(targets.sum(-1), mask.float())
-    assert (targets >= 0).all()
-    # Neither padding nor anything after s_t is ever a parent.
-    assert not targets[~mask.repeat_interleave(3, 1).unsqueeze(1).expand_as(targets)].any()
-    length = mask.shape[1]
-    after = torch.arange(3 * length) > 3 * torch.arange(length).unsqueeze(1) + 1
-    assert not targets[:, after].any()
-
-
 @given(masks, st.integers(1, 4), st.integers(0, 99))
 def test_mask_loss_equals_a_plain_loop(mask: Tensor, heads: int, seed: int) -> None:
     targets = parent_targets(mask, 2, 0.6, 0.2)
@@ -79,39 +65,6 @@ def test_mask_loss_equals_a_plain_loop(mask: Tensor, heads: int, seed: int) -> N
         if mask[b, t]
     ]
     assert float(mask_loss(attention, targets, mask)) == pytest.approx(np.mean(rows), rel=1e-5)
-
-
-@given(masks, st.integers(0, 99))
-def test_mask_loss_is_least_where_attention_is_the_target(mask: Tensor, seed: int) -> None:
-    targets = parent_targets(mask, 2, 0.6, 0.2)
-    generator = torch.Generator().manual_seed(seed)
-    noise = torch.rand(targets.shape, generator=generator)
-    noise = noise / noise.sum(-1, keepdim=True)
-
-    def loss_at(share: float) -> float:
-        attention = (1 - share) * targets + share * noise
-        return float(mask_loss(attention.unsqueeze(1), targets, mask))
-
-    entropy = torch.special.entr(targets).sum(-1)[mask].mean()
-    assert loss_at(0.0) == pytest.approx(float(entropy), rel=1e-4, abs=1e-6)
-    losses = [loss_at(share) for share in (0.0, 0.1, 0.4, 1.0)]
-    assert losses == sorted(losses)
-    assert losses[-1] > losses[0]
-
-
-def test_attention_follows_its_gradient_to_the_target() -> None:
-    mask = torch.tensor([[False, True, True, True]])
-    targets = parent_targets(mask, 2, 0.6, 0.0)
-    scores = torch.zeros(1, 2, 4, 12, requires_grad=True)
-    optimizer = torch.optim.Adam([scores], lr=0.3)
-    for _ in range(300):
-        optimizer.zero_grad()
-        mask_loss(scores.softmax(-1), targets, mask).backward()
-        optimizer.step()
-    attention = scores.detach().softmax(-1)
-    for head in range(2):
-        torch.testing.assert_close(attention[0, head, 1:], targets[0, 1:], rtol=0, atol=0.01)
-    assert (scores[:, :, 0] == 0).all()  # the padded row has learnt nothing
 
 
 @given(masks, st.sampled_from([math.nan, math.inf, -math.inf, 1e30]), st.integers(0, 99))

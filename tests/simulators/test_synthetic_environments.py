@@ -270,5 +270,11 @@ def test_bad_input_is_refused() -> None:
     for wrong in ([0, 200], [-1, 0], [0.5, 1.0]):
         with pytest.raises(InputError, match="whole numbers from 0 to 199"):
             env.step(np.array(wrong))
+    pages = SyntheticTaobao(2)
+    pages.reset(seed=0)
+    with pytest.raises(InputError, match="shape"):
+        pages.step(np.zeros((2, 26), dtype=np.float32))
+    with pytest.raises(InputError, match="finite"):
+        pages.step(np.full((2, 27), np.nan, dtype=np.float32))
     with pytest.raises(InputError, match="not SyntheticTaobao"):
         CATALOG.behaviors["optimal"](SyntheticTaobao(1), 0)

@@ -1,11 +1,16 @@
-"""Random logged steps, and the reference inputs of the Open Bandit Pipeline and SCOPE-RL."""
+"""Random logged steps, and the reference inputs of the Open Bandit Pipeline and SCOPE-RL.
+
+The references are those of sb-obp 0.5.10 and scope-rl 0.2.1;
+`tests/off_policy/fixtures/make_*_fixture.py` made them.
+"""
 
 from pathlib import Path
 
 import numpy as np
 
-from ucfrec.arrays import Array
-from ucfrec.off_policy.logged_steps import LoggedSteps, Modelled, cluster_probabilities
+from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
+from ucfrec.off_policy.fqe import fit_models
+from ucfrec.off_policy.logged_steps import LoggedSteps, Modelled
 
 REFERENCE = Path(__file__).parents[1] / "off_policy" / "fixtures" / "reference.npz"
 
@@ -25,6 +30,18 @@ def random_steps(
     )
 
 
+def fitted(
+    features: Float32Array,
+    at_policy: Float32Array,
+    reward: Float64Array,
+    session: IntArray,
+    seed: int = 0,
+    user: IntArray | None = None,
+) -> Modelled:
+    """What models say of steps whose features are in memory."""
+    return fit_models(lambda: iter([(features, at_policy)]), reward, session, seed, user)[0]
+
+
 def reference(name: str) -> tuple[LoggedSteps, dict[str, Array]]:
     """The inputs "bandit" or "sequence" as logged steps, and what the references make of them."""
     with np.load(REFERENCE) as files:
@@ -37,8 +54,8 @@ def reference(name: str) -> tuple[LoggedSteps, dict[str, Array]]:
     clusters = {}
     if name == "bandit":
         for policy, column in (("behavior", "propensity"), ("target", "target")):
-            of_cluster = cluster_probabilities(ours[policy], ours["cluster"], action)
-            clusters[f"cluster_{column}"] = of_cluster
+            same = ours["cluster"] == ours["cluster"][action][:, None]
+            clusters[f"cluster_{column}"] = (ours[policy] * same).sum(axis=1).clip(max=1)
     steps = LoggedSteps(
         session=row // length,
         reward=ours["reward"],

@@ -20,8 +20,7 @@ from ucfrec.errors import InputError
 
 if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
-    from ucfrec.off_policy.evaluate import OffPolicyReport
-    from ucfrec.off_policy.options import EstimateOptions
+    from ucfrec.off_policy.evaluate import EstimateOptions, OffPolicyReport
     from ucfrec.off_policy.score import LoggedSessions
     from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -102,7 +101,7 @@ def estimates_asked(options: argparse.Namespace) -> "EstimateOptions":
     Raises:
         InputError: a value is out of its range.
     """
-    from ucfrec.off_policy.options import EstimateOptions
+    from ucfrec.off_policy.evaluate import EstimateOptions
 
     return EstimateOptions(
         discount=options.discount,
@@ -121,7 +120,7 @@ def run(options: argparse.Namespace) -> None:
     Raises:
         InputError: no run or no log is named, or one of them cannot be used.
     """
-    from ucfrec.off_policy.candidates import choose, names_of
+    from ucfrec.off_policy.selection import choose, names_of
     from ucfrec.reporting.tables import text_table
     from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 

@@ -41,7 +41,7 @@ class CSGConfig:
     band: Annotated[tuple[Length, Length], Field(strict=False)] = (0.2, 0.5)
     """(ρ_low, ρ_high): shortest and longest move, in standard deviations of the states."""
     reward_quantile: Quantile = 0.3
-    """Steps with a reward below this quantile are left out of training: 0.3 uses the top 70%."""
+    """Steps with a reward below this quantile are excluded from training: 0.3 uses the top 70%."""
     clusters: Annotated[int, Field(ge=1, le=100_000)] = 32
     """tangent: clusters of states, each with its own covariance."""
     corrections: Annotated[int, Field(ge=0, le=1000)] = 3

@@ -1,16 +1,16 @@
 """Which observation dimensions measure the reward, although they are logged with the state.
 
-A dimension d_t that records what was earned (r_t, or r_{t+1}) is a leak: where it is fixed, nothing
-changes. It predicts the reward as a cause would, but depends on nothing else: what the rest tells
-of it, the action above all, it tells through the reward. So
+A dimension d_t that records the reward (r_t, or r_{t+1}) is a leak: where it is fixed, nothing
+changes. It predicts the reward as a cause would, but depends on nothing else: what the rest
+explains of it, the action above all, it explains through the reward. So
 
 1. the rest (other dimensions, action, next action) helps to predict d_t;
 2. the reward alone predicts d_t at least as well;
 3. given the reward, the rest hardly helps any more.
 
-A cause fails one of these. If the logging policy did not see it, the action tells nothing of it
-(1); if the policy did, the action tells of it with or without the reward (3). A dimension of a
-process that goes on, such as a position or a user's feature, is told by other dimensions (3).
+A cause fails one of these. If the logging policy did not see it, the action explains none of it
+(1); if the policy did, the action explains it with or without the reward (3). A dimension of a
+process that goes on, such as a position or a user's feature, is explained by other dimensions (3).
 """
 
 from collections.abc import Collection, Sequence
@@ -46,11 +46,11 @@ class MeasurementConfig:
     learning_rate: LearningRate = 0.1
     """Share of each tree's prediction that is added."""
     min_told: Share = 0.003
-    """Least share of a dimension's variance that the rest must tell without the reward."""
+    """Least share of a dimension's variance that the rest must explain without the reward."""
     most_left: Share = 0.25
     """Largest share of that which the rest may add to the reward."""
     level: Annotated[float, Field(gt=0, lt=1)] = 0.001
-    """Level of the tests that the rest and the reward tell of the dimension at all."""
+    """Level of the tests that the rest and the reward explain the dimension at all."""
 
 
 def measured_reward(
@@ -92,7 +92,7 @@ def measured_reward(
         return tuple(first.values())
     first |= verdicts([dimension for dimension in every if dimension not in first])
     found = {dimension for dimension, measures in first.items() if measures}
-    # A measurement tells of a cause too, through the reward: the others are left out of the rest.
+    # A measurement explains a cause too, through the reward: the others are excluded from the rest.
     return tuple(
         d in found and (len(found) == 1 or _measures(data, d, found - {d}, config, seed))
         for d in tested
@@ -132,28 +132,28 @@ class _Steps:
 def _measures(
     data: _Steps, dimension: int, without: Collection[int], config: MeasurementConfig, seed: int
 ) -> bool:
-    """Whether a dimension measures the reward; the columns `without` are left out of the rest."""
+    """Whether a dimension measures the reward; the columns `without` are excluded from the rest."""
     values, held_out = data.columns[:, dimension], data.held_out
     alone = np.square(values[held_out] - values[~held_out].mean(dtype=np.float64))
     variance = max(float(alone.mean()), 1e-12)
 
     def saved(inputs: Float32Array) -> Float64Array:
-        """Share (B,) of the variance that the inputs tell of held-out steps."""
+        """Share (B,) of the variance that the inputs explain of held-out steps."""
         predicted = _predicted(inputs, values, held_out, config, seed)
         return np.asarray((alone - np.square(values[held_out] - predicted)) / variance)
 
-    def told(shares: Float64Array) -> bool:
+    def explains(shares: Float64Array) -> bool:
         p_value = clustered_p_value(torch.from_numpy(shares), data.episodes[held_out])
         return bool(shares.mean() >= config.min_told) and p_value < config.level
 
     # The cheapest first: most dimensions fail one of these.
     of_reward = saved(data.rewards)
-    if not told(of_reward):
+    if not explains(of_reward):
         return False
     others = np.delete(data.columns, [dimension, *without], axis=1)
     rest = np.column_stack([others, data.rest])
     of_rest = saved(rest)
-    if not told(of_rest) or of_reward.mean() < of_rest.mean():
+    if not explains(of_rest) or of_reward.mean() < of_rest.mean():
         return False
     both = saved(np.column_stack([rest, data.rewards]))
     return bool(both.mean() - of_reward.mean() <= config.most_left * of_rest.mean())

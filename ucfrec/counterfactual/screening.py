@@ -103,7 +103,7 @@ class DimensionReport:
     """Share it explains of the reward's variance."""
     reward_p_value: float | None
     measures_reward: bool | None
-    """Whether it tells of the reward after the fact; None where that does not matter."""
+    """Whether it records the reward after the fact; None where that does not matter."""
     causes: bool
     """Whether it counts as having an effect, be it for want of evidence, or with others that are no
     help one by one."""
@@ -166,13 +166,13 @@ def screen(train: EpisodeStore, config: ScreeningConfig, seed: int) -> Screening
             leaks = [dimension for dimension, yes in measures.items() if yes]
             r2 = _Errors.of(shared, data, [leaks], config, seed).r2(0) if leaks else r2
     if r2 < config.min_reward_r2:
-        # Only what measures the reward can be without effect; the effects of the rest are left out.
+        # Only what measures the reward can be without effect; the effects of the rest are excluded.
         measures |= measured([dimension for dimension in tested if dimension not in measures])
         tested = [dimension for dimension in tested if measures[dimension]]
-    effects = _Effects.of(shared, data, tested, config, seed, r2)
-    undecided = [each.dimension for each in effects.found if each.undecided]
+    effects, r2 = _effects(shared, data, tested, config, seed, r2)
+    undecided = [each.dimension for each in effects if each.undecided]
     measures |= measured([dimension for dimension in undecided if dimension not in measures])
-    found = {each.dimension: each.report(measures.get(each.dimension)) for each in effects.found}
+    found = {each.dimension: each.report(measures.get(each.dimension)) for each in effects}
     flagged = [dimension for dimension, report in found.items() if not report.causes]
     if len(flagged) > 1:
         measures |= measured([dimension for dimension in flagged if dimension not in measures])
@@ -184,7 +184,7 @@ def screen(train: EpisodeStore, config: ScreeningConfig, seed: int) -> Screening
         found |= {d: replace(found[d], measures_reward=False, causes=together) for d in others}
     size = data.states.shape[1]
     reports = [found.get(dimension) or _untested(dimension, False) for dimension in range(size)]
-    return ScreeningReport(tuple(reports), effects.r2, len(data.episodes))
+    return ScreeningReport(tuple(reports), r2, len(data.episodes))
 
 
 def _helpful(shared: PredictorPair, data: StandardSteps, config: ScreeningConfig) -> list[int]:
@@ -301,11 +301,8 @@ class _Effect:
     """What a dimension adds to the predictions."""
 
     dimension: int
-    effect: float
-    helps: tuple[int, ...]
-    p_value: float
-    reward_effect: float
-    reward_p_value: float
+    of_next: _Help
+    of_reward: _Help
     helps_next: bool
     helps_reward: bool
     """True too where the reward cannot be predicted well."""
@@ -317,50 +314,40 @@ class _Effect:
 
     def report(self, measures: bool | None) -> DimensionReport:
         """The verdict; `measures` is None if it does not matter."""
-        causes = self.helps_next or (self.helps_reward and not measures)
         return DimensionReport(
-            self.dimension, self.effect, self.helps, self.p_value, self.reward_effect,
-            self.reward_p_value, measures, causes,
-        )  # fmt: skip
+            dimension=self.dimension,
+            effect=self.of_next.share,
+            helps=self.of_next.helps,
+            p_value=self.of_next.p_value,
+            reward_effect=self.of_reward.share,
+            reward_p_value=self.of_reward.p_value,
+            measures_reward=measures,
+            causes=self.helps_next or (self.helps_reward and not measures),
+        )
 
 
-@dataclass(frozen=True)
-class _Effects:
-    """The effects of some dimensions, and the R² of the reward with none missing."""
+def _effects(
+    shared: PredictorPair,
+    data: StandardSteps,
+    dimensions: Sequence[int],
+    config: ScreeningConfig,
+    seed: int,
+    r2: float,
+) -> tuple[list[_Effect], float]:
+    """The effects of some dimensions, and the R² of the reward with none missing.
 
-    found: Sequence[_Effect]
-    r2: float
-
-    @classmethod
-    def of(
-        cls,
-        shared: PredictorPair,
-        data: StandardSteps,
-        dimensions: Sequence[int],
-        config: ScreeningConfig,
-        seed: int,
-        r2: float,
-    ) -> "_Effects":
-        """`r2` is that of the reward without what measures it."""
-        missing = [*((dimension,) for dimension in dimensions), ()]
-        errors, hard = _Errors.of(shared, data, missing, config, seed), r2 < config.min_reward_r2
-        found, none = [], len(dimensions)
-        for row, dimension in enumerate(dimensions):
-            effect = errors.effect(row, none, config)
-            of_reward = errors.effect_on_reward(row, none)
-            found.append(
-                _Effect(
-                    dimension=dimension,
-                    effect=effect.share,
-                    helps=effect.helps,
-                    p_value=effect.p_value,
-                    reward_effect=of_reward.share,
-                    reward_p_value=of_reward.p_value,
-                    helps_next=effect.counts(config.min_effect, config.level),
-                    helps_reward=hard or of_reward.counts(config.min_reward_effect, config.level),
-                )
-            )
-        return cls(found, errors.r2(none))
+    Args:
+        r2: R² of the reward without what measures it.
+    """
+    missing = [*((dimension,) for dimension in dimensions), ()]
+    errors, hard = _Errors.of(shared, data, missing, config, seed), r2 < config.min_reward_r2
+    found, none = [], len(dimensions)
+    for row, dimension in enumerate(dimensions):
+        of_next, of_reward = errors.effect(row, none, config), errors.effect_on_reward(row, none)
+        helps_next = of_next.counts(config.min_effect, config.level)
+        helps_reward = hard or of_reward.counts(config.min_reward_effect, config.level)
+        found.append(_Effect(dimension, of_next, of_reward, helps_next, helps_reward))
+    return found, errors.r2(none)
 
 
 def _effect_on_next(

@@ -1,4 +1,4 @@
-"""What a policy would have earned, estimated from logs of another policy.
+"""Off-policy estimates: the return of a policy, from logs of another policy.
 
 The array functions need no ucfrec run:
 
@@ -19,7 +19,6 @@ _HOMES = {
     "Modelled": "logged_steps",
     "Verdict": "verdict",
     "as_pages": "pages",
-    "cluster_probabilities": "logged_steps",
     "diagnose": "diagnostics",
     "estimate": "estimators",
     "judge": "verdict",

@@ -3,7 +3,7 @@
 Groups by a multinomial logistic regression on the state before the choice, items within a group by
 their share of its logged steps. Every user is predicted by a model of other users (cross-fitting),
 and those predictions are calibrated by one temperature and by mixing in the group's share of the
-logs, as much as predicts best: all of it where the state tells nothing.
+logs, as much as predicts best: all of it where the state predicts nothing.
 """
 
 from collections.abc import Callable, Iterator
@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 
 from ucfrec.arrays import Float32Array, Float64Array, IntArray
-from ucfrec.off_policy.on_disk import array_on_disk
+from ucfrec.off_policy.features import array_on_disk
 from ucfrec.processes import require_blas_memory
 from ucfrec.progress import progress
 
@@ -27,6 +27,25 @@ _SHARES = (0.01, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
 """How much of the group's share in the logs may be mixed in; never nothing, so that no probability
 is 0."""
 _TEMPERATURES = (0.7, 1.0, 1.4, 2.0, 3.0)
+_MOST_ITEM_GROUPS = 32
+
+
+def default_groups(items: int) -> int:
+    """How many groups a catalogue has: the root of its items, from 2 to 32."""
+    return int(np.clip(round(items**0.5), 2, _MOST_ITEM_GROUPS))
+
+
+def group_items(embeddings: Float32Array, groups: int, seed: int) -> IntArray:
+    """(n_items,) group of every item, from 0, by k-means of embeddings (n_items, D).
+
+    Items of equal embeddings are in one group, so there may be fewer than `groups`.
+    """
+    # Importing scikit-learn takes a second, which no other estimate must cost.
+    from sklearn.cluster import KMeans
+
+    distinct = len(np.unique(embeddings, axis=0))
+    means = KMeans(min(groups, distinct), n_init=4, random_state=seed).fit(embeddings)
+    return np.asarray(np.unique(means.labels_, return_inverse=True)[1], dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -72,7 +91,7 @@ def fit_behavior(
         group: (N,) their groups, from 0.
         session: (N,) number of each step's session, from 0.
         seed: draws folds and samples.
-        user: (S,) of each session; None where each is somebody else's.
+        user: (S,) of each session; None where each is of another user.
     """
     rng = np.random.default_rng(seed)
     owner = session if user is None else np.unique(user, return_inverse=True)[1][session]

@@ -70,12 +70,12 @@ class Diagnosis:
     """Shape k of the Pareto tail of the weights (`pareto_tail`)."""
     bounds: tuple[float, float] | None
     """Between these lies the value if the propensities are true, whatever the choices that the logs
-    lack would earn; up to the sampling error of PDIS."""
+    lack are worth; up to the sampling error of PDIS."""
 
     @property
     def stops_telling_at(self) -> int | None:
         """First step (from 1) with fewer effective users than an estimate needs; None if the logs
-        tell to the end."""
+        suffice to the end."""
         few = [n < ENOUGH_USERS for n in self.effective_by_step]
         return few.index(True) + 1 if any(few) else None
 
@@ -92,14 +92,13 @@ def diagnose(
         segment: (S,) number of each session's segment (of users, of weeks, of contexts known before
             the first choice), each of which is tested alone.
     """
-    lacking = steps.per_session(np.isnan(steps.propensity).astype(np.float64)) > 0
-    users = len(lacking) if steps.user is None else len(np.unique(steps.user))
+    lacking, users = steps.lacking, int(steps.users.max()) + 1
     if lacking.all():
         nothing = (None, (), (), 0.0, 1.0, 0, None, None, None)
         return Diagnosis(len(lacking), users, len(lacking), *nothing)
     known = steps.known()
-    by_user = _summed(_users(known), known.session_weights)
-    rewarded = _summed(_users(known), np.abs(known.session_weights * known.returns))
+    by_user = np.bincount(known.users, known.session_weights).astype(np.float64)
+    rewarded = np.bincount(known.users, np.abs(known.session_weights * known.returns))
     if reward_range is None:
         reward_range = (float(steps.reward.min()), float(steps.reward.max()))
     return Diagnosis(
@@ -121,7 +120,7 @@ def diagnose(
 def weight_tests(steps: LoggedSteps, segment: IntArray | None = None) -> tuple[WeightTest, ...]:
     """Two-sided tests that mean weights are 1: the ratios of each step, the session products, and
     those of each segment and item group. Errors are clustered by user; what fewer than 30 users
-    have is left out.
+    have is excluded.
 
     Over all steps, the ratios of an item group's own have the mean of the evaluated policy's
     probability of the group; their quotient is tested.
@@ -141,7 +140,7 @@ def weight_tests(steps: LoggedSteps, segment: IntArray | None = None) -> tuple[W
         groups.append((f"segment {number}", steps.session_weights[there], there))
     found = []
     for name, values, sessions in groups:
-        user = sessions if steps.user is None else steps.user[sessions]
+        user = steps.users[sessions]
         if len(np.unique(user)) >= ENOUGH_TO_TEST:
             (mean,), (error,) = cluster_means(values[:, None], user)
             found.append((name, float(mean), float(error)))
@@ -157,7 +156,7 @@ def _group_weights(steps: LoggedSteps, ratios: Float64Array) -> list[tuple[str, 
     """Name, mean weight and its error of each item group that the evaluated policy shows."""
     if steps.groups is None:
         return []
-    user = steps.session if steps.user is None else steps.user[steps.session]
+    user = steps.users[steps.session]
     found = []
     for number in range(steps.groups.target.shape[1]):
         here = steps.groups.number == number
@@ -186,7 +185,7 @@ def implied_items(steps: LoggedSteps, listed: BoolArray, items: int) -> WeightTe
         users, or without propensities.
     """
     known = ~np.isnan(steps.propensity)
-    user = steps.session if steps.user is None else steps.user[steps.session]
+    user = steps.users[steps.session]
     if not known.any() or len(np.unique(user[known])) < ENOUGH_TO_TEST:
         return None
     shares = np.where(listed[known], 1 / steps.propensity[known], 0.0) / items
@@ -229,34 +228,22 @@ def pareto_tail(weights: Float64Array) -> float | None:
 def identification_bounds(
     steps: LoggedSteps, reward_range: tuple[float, float]
 ) -> tuple[float, float]:
-    """PDIS plus the least and the most that choices without support could have earned.
+    """PDIS plus the least and the most that choices without support could return.
 
     At step t a share 1 − E_n[w_t] of the evaluated policy's sessions has left what the logs support
-    (Manski 1990, for weights: Khan et al., AISTATS 2024); each of their steps earns something in
+    (Manski 1990, for weights: Khan et al., AISTATS 2024); each of their steps has a reward in
     `reward_range`, or nothing once the session has ended. No session is longer than the longest
     logged.
     """
     totals = step_totals(steps, steps.weights) / len(steps.first)
     lacking = np.maximum(1 - totals, 0)
     worth = float((steps.discount ** np.arange(len(totals)) * lacking).sum())
-    earned = steps.per_session(steps.discounts * steps.weights * steps.reward).mean()
+    supported = steps.per_session(steps.discounts * steps.weights * steps.reward).mean()
     low, high = reward_range
     # A single step is always taken; a longer session may end.
     if len(totals) > 1:
         low, high = min(low, 0.0), max(high, 0.0)
-    return float(earned + worth * low), float(earned + worth * high)
-
-
-def _users(steps: LoggedSteps) -> IntArray:
-    """(S,) users numbered from 0."""
-    if steps.user is None:
-        return np.arange(len(steps.first))
-    return np.asarray(np.unique(steps.user, return_inverse=True)[1])
-
-
-def _summed(users: IntArray, values: Float64Array) -> Float64Array:
-    """(U,) sums of values (S,) by user."""
-    return np.bincount(users, values).astype(np.float64)
+    return float(supported + worth * low), float(supported + worth * high)
 
 
 def _by_place(steps: LoggedSteps) -> list[IntArray]:
@@ -266,7 +253,7 @@ def _by_place(steps: LoggedSteps) -> list[IntArray]:
 
 
 def _effective_by_step(steps: LoggedSteps) -> tuple[float, ...]:
-    users, weights = _users(steps), steps.weights
+    users, weights = steps.users, steps.weights
     # An ended session keeps the weight of its last step.
     summed, found = np.bincount(users).astype(np.float64), []
     for place, rows in enumerate(_by_place(steps)):

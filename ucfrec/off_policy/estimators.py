@@ -1,4 +1,4 @@
-"""What a policy would have earned a session, from logs of another: arrays in, estimates out.
+"""The return per session of a policy, from logs of another: arrays in, estimates out.
 
 Every estimate is a mean discounted return of a session, in the unit of the reward. Notation as in
 `ucfrec.off_policy.logged_steps`: G_i the logged return, w_it the weight of step t, w_i that of the
@@ -49,7 +49,7 @@ class Estimate:
     """Ends of the 95% interval, studentised and clustered by user (`cluster_intervals`). None for
     DM and FQE, whose error is the model's and not that of the sessions it is averaged over; for
     MIPS and where weights are shrunk, whose bias no resampling shows; and where nothing spreads:
-    too few sessions earn anything under the weights."""
+    too few sessions have a reward under the weights."""
     high: float | None
     error: float | None
     """Standard error, over users."""
@@ -77,13 +77,13 @@ class Terms:
 
 
 def estimate(steps: LoggedSteps, seed: int) -> dict[str, Estimate]:
-    """What sessions earned as logged, and what they would have earned under the evaluated policy.
+    """Mean return per session as logged, and under the evaluated policy.
 
     DM, FQE and the doubly robust need `steps.model`; MIPS the probabilities of clusters; all that
-    weigh need propensities: sessions with a step whose propensity is unknown are left out of them,
-    which is right where propensities are lost at random. Where no session has any weight, those
-    that weigh are left out. SWITCH-DR, DRos and sub-Gaussian DR are defined for sessions of one
-    step.
+    weigh need propensities: sessions with a step whose propensity is unknown are excluded from
+    them, which is right where propensities are lost at random. Where no session has any weight,
+    those that weigh are omitted. SWITCH-DR, DRos and sub-Gaussian DR are defined for sessions of
+    one step.
 
     Args:
         seed: draws the bootstrap's resamples.
@@ -140,11 +140,7 @@ def _groups(steps: LoggedSteps) -> Iterator[tuple[LoggedSteps, dict[str, Terms]]
         if not steps.pages:
             plain["FQE"] = Terms(steps.model.v[steps.first], ones, ones, biased=True)
     yield steps, plain
-    without = steps.per_session(np.isnan(steps.propensity).astype(np.float64)) > 0
-    if without.all():
-        return
-    known = steps.known()
-    if weighted := session_terms(known):
+    if not steps.lacking.all() and (weighted := session_terms(known := steps.known())):
         yield known, weighted
 
 

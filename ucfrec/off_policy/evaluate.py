@@ -2,25 +2,35 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Array, Float64Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.off_policy.behavior_model import BehaviorModel, fit_behavior
+from ucfrec.off_policy.behavior_model import (
+    BehaviorModel,
+    default_groups,
+    fit_behavior,
+    group_items,
+)
 from ucfrec.off_policy.columns import diagnosis_columns, estimate_row, verdict_columns
 from ucfrec.off_policy.diagnostics import diagnose, implied_items
 from ucfrec.off_policy.estimators import estimate, session_terms
-from ucfrec.off_policy.features import InputsFile, StepInputs, context_of, scores_of
+from ucfrec.off_policy.features import (
+    InputsFile,
+    StepInputs,
+    array_on_disk,
+    context_of,
+    scores_of,
+)
 from ucfrec.off_policy.fqe import ModelReport, fit_models
-from ucfrec.off_policy.item_groups import default_groups, group_items
 from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps
-from ucfrec.off_policy.on_disk import array_on_disk
-from ucfrec.off_policy.options import EstimateOptions
 from ucfrec.off_policy.pages import as_pages, pages_of
 from ucfrec.off_policy.score import LoggedSessions, ScoredSteps, scored_steps
 from ucfrec.off_policy.training_rows import seen_too_often, share_seen
@@ -28,6 +38,37 @@ from ucfrec.off_policy.verdict import FAR_OFF, Verdict, cautions, influences, ju
 from ucfrec.provenance import without_folders
 from ucfrec.results.row import ResultRow, Scalar
 from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.settings import require, settings_table
+
+
+@settings_table("")
+class EstimateOptions:
+    """How `evaluate_off_policy` estimates."""
+
+    discount: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """Discount factor γ of the estimated returns."""
+    pages: bool = False
+    """Estimate the return of a page: sessions of one step, of one user within 10 ms, are the
+    positions of a page (`ucfrec.off_policy.pages`)."""
+    users_known: bool = True
+    """Whether the logs' users are persons, whose sessions are resampled together; if not, each
+    session is taken to be of another user."""
+    reward_range: tuple[float, float] | None = None
+    """Least and greatest reward of a step, for the bounds of the value of unsupported choices;
+    unset, those observed."""
+    wanted_lift: Annotated[float, Field(gt=0)] | None = None
+    """Return per session that a launch should gain over the logged policy; unset, 5% of the mean
+    logged return."""
+    item_clusters: Annotated[int, Field(ge=0)] = 0
+    """Clusters of items for MIPS; 0 chooses by the size of the catalogue, 1 omits MIPS."""
+    estimate_propensities: bool = False
+    """Estimate the propensities that the logs lack, cross-fitted and calibrated."""
+
+    def __post_init__(self) -> None:
+        """Check that the range is in order."""
+        low, high = self.reward_range or (0.0, 0.0)
+        require(low <= high, f"the reward range is {low} to {high}; name the least one first")
+
 
 DEFAULTS = EstimateOptions()
 
@@ -268,16 +309,16 @@ def logged_steps(
         if grouped or options.estimate_propensities:
             known = np.maximum(group, 0)
             behavior = fit_behavior(inputs.states, items, known, plain.session, seed, plain.user)
-        fitted = fit_models(
+        modelled, models = fit_models(
             inputs.chunks, plain.reward, plain.session, seed, plain.user, plain.discount
         )
     groups = ItemGroups(group, shown)
-    steps = replace(plain, target=target, model=fitted.modelled, groups=groups)
+    steps = replace(plain, target=target, model=modelled, groups=groups)
     estimated = 0
     if behavior is not None:
         estimated = plain.unknown_propensities if options.estimate_propensities else 0
         steps = _weighed_by_model(steps, groups, behavior, options.estimate_propensities)
-    return JudgedSteps(steps, fitted.report, behavior, estimated)
+    return JudgedSteps(steps, models, behavior, estimated)
 
 
 def _unjudged(logged: LoggedSessions, options: EstimateOptions) -> LoggedSteps:

@@ -1,5 +1,6 @@
 """What models of future reward see of a logged step, kept on disk in bounded memory."""
 
+import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -54,7 +55,7 @@ class StepInputs:
 def context_of(batch: ScoredSteps) -> Tensor:
     """(B, C) state, return left of the target, and last-layer features of the policy's window.
 
-    A learner that is no network of features (item-knn, crm-greedy) has the first two only.
+    A policy that is no network of features (item-knn, crm-greedy) has the first two only.
     """
     parts = [batch.states, batch.returns_left[:, None]]
     parts += [] if batch.features is None else [batch.features]
@@ -103,6 +104,21 @@ class InputsFile:
             rows = torch.from_numpy(np.frombuffer(read, dtype=np.float32).reshape(-1, width).copy())
             parts = torch.split(rows, [context, item, item, 2], dim=1)
             yield StepInputs(parts[0], state, parts[1], parts[2], parts[3])
+
+
+def array_on_disk(shape: tuple[int, int]) -> Float32Array:
+    """An array of zeros whose memory the system can take back, writing it to a file without a name.
+
+    Raises:
+        OSError: the disk of the system's temporary folder is full.
+    """
+    if 0 in shape:
+        return np.zeros(shape, dtype=np.float32)
+    with tempfile.TemporaryFile(prefix="ucfrec-") as file:
+        if hasattr(os, "posix_fallocate"):  # not on macOS
+            # A full disk is an error now; later it would be the end of the process.
+            os.posix_fallocate(file.fileno(), 0, 4 * shape[0] * shape[1])
+        return np.memmap(file, np.float32, "r+", shape=shape)
 
 
 def scores_of(

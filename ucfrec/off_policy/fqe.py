@@ -1,4 +1,4 @@
-"""Models of what a policy would earn, each fitted on other users than it predicts.
+"""Models of a policy's return, each fitted on other users than it predicts.
 
 Fitted Q evaluation is Algorithm 3 of Le, Voloshin & Yue, *Batch Policy Learning under Constraints*
 (ICML 2019), with ridge regression, on sessions that end. With a linear model each of its
@@ -24,7 +24,6 @@ action, the first of them 1, and (B, P) their mean over the evaluated policy's a
 states (what is linear in features has its exact mean over these actions)."""
 
 FOLDS = 5
-_ROWS_AT_ONCE = 2**13
 _CLOSE = 1e-6
 _ROUNDS = 10
 """Regressions of FQE for each step of the longest session, unless they settle before: a linear Q
@@ -59,38 +58,6 @@ class ModelReport:
         )
 
 
-@dataclass(frozen=True)
-class Fitted:
-    """What the models say of N steps, and how good they are."""
-
-    modelled: Modelled
-    report: ModelReport
-
-
-def cross_fitted(
-    features: Float32Array,
-    at_policy: Float32Array,
-    reward: Float64Array,
-    session: IntArray,
-    seed: int,
-    user: IntArray | None = None,
-    discount: float = 1.0,
-) -> Modelled:
-    """`fit_models` for features (N, P) that lie in memory.
-
-    Args:
-        features: (N, P) of the logged state and action; the first is 1.
-        at_policy: (N, P) their mean over the evaluated policy's actions in the same states.
-    """
-
-    def chunks() -> Iterator[tuple[Float32Array, Float32Array]]:
-        for begin in range(0, len(features), _ROWS_AT_ONCE):
-            rows = slice(begin, begin + _ROWS_AT_ONCE)
-            yield features[rows], at_policy[rows]
-
-    return fit_models(chunks, reward, session, seed, user, discount).modelled
-
-
 def fit_models(
     chunks: Chunks,
     reward: Float64Array,
@@ -98,7 +65,7 @@ def fit_models(
     seed: int,
     user: IntArray | None = None,
     discount: float = 1.0,
-) -> Fitted:
+) -> tuple[Modelled, ModelReport]:
     """Linear models of reward and Q, cross-fitted over users: no session is predicted by a model
     that saw it, nor by one that saw another session of its user.
 
@@ -107,8 +74,11 @@ def fit_models(
         reward: (N,).
         session: (N,) number of each step's session, from 0, never falling; steps in order.
         seed: draws the folds.
-        user: (S,) whose session each is; None where each is somebody else's.
+        user: (S,) whose session each is; None where each is of another user.
         discount: γ of Q.
+
+    Returns:
+        What the models say of the N steps, and how good they are.
 
     Raises:
         InputError: there are fewer than two users.
@@ -117,7 +87,7 @@ def fit_models(
     group = sessions if user is None else np.unique(user, return_inverse=True)[1]
     users = int(group.max()) + 1
     if users < 2:
-        raise InputError("a model needs sessions of users other than the one it judges")
+        raise InputError("a model needs sessions of users other than the one it predicts")
     folds = (np.random.default_rng(seed).permutation(users) % min(FOLDS, users))[group][session]
     last = np.diff(session, append=len(sessions)) > 0
     with progress(2 * len(reward), "models", "steps") as bar:
@@ -128,7 +98,7 @@ def fit_models(
             for fold in range(len(sums.rows))
         ]
         modelled, at_logged = _predicted(chunks, fits, folds, bar.update)
-    return Fitted(modelled, _report(modelled, at_logged, reward, last, discount, fits))
+    return modelled, _report(modelled, at_logged, reward, last, discount, fits)
 
 
 @dataclass(frozen=True)
@@ -149,7 +119,7 @@ class _Sums:
     """(F, P, P) Σ φ φᵀ."""
     follows: Float64Array
     """(F, P, P) Σ φ φ̄'ᵀ over steps that another follows, φ̄' the mean features of that one."""
-    earned: Float64Array
+    rewards: Float64Array
     """(F, P) Σ φ r."""
     rows: IntArray
     """(F,)."""
@@ -160,17 +130,17 @@ class _Sums:
         Args:
             reward: rewards of the steps of the other folds.
         """
-        gram, follows, earned = (
-            sums.sum(axis=0) - sums[fold] for sums in (self.gram, self.follows, self.earned)
+        gram, follows, rewards = (
+            sums.sum(axis=0) - sums[fold] for sums in (self.gram, self.follows, self.rewards)
         )
         rows = int(self.rows.sum() - self.rows[fold])
         factor = cho_factor(gram + np.diag(_penalty(self.gram.sum(axis=0), int(self.rows.sum()))))
-        weights = first = cho_solve(factor, earned, check_finite=False)
+        weights = first = cho_solve(factor, rewards, check_finite=False)
         most = horizon * max(abs(reward.min()), abs(reward.max()))
         iterations, settled = 1, True
         while iterations < _ROUNDS * horizon:
             iterations += 1
-            before, target = weights, earned + discount * (follows @ weights)
+            before, target = weights, rewards + discount * (follows @ weights)
             weights = cho_solve(factor, target, check_finite=False)
             size = (weights @ gram @ weights / rows) ** 0.5
             if not size <= most:
@@ -207,7 +177,7 @@ def _sums(
             here = folds[begin:end] == fold
             mine = features[here]
             sums.gram[fold] += mine.T @ mine
-            sums.earned[fold] += mine.T @ reward[begin:end][here].astype(np.float32)
+            sums.rewards[fold] += mine.T @ reward[begin:end][here].astype(np.float32)
             goes_on = (folds[start : end - 1] == fold) & ~last[start : end - 1]
             sums.follows[fold] += earlier[goes_on].T @ later[goes_on]
         held, begin = features[-1:], end

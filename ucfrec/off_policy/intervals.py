@@ -135,10 +135,7 @@ def cluster_means(
         cluster: (S,); None where each row is its own.
         weights: (S, K) how often each value counts; None for once each.
     """
-    names = (
-        np.arange(len(values)) if cluster is None else np.unique(cluster, return_inverse=True)[1]
-    )
-    clusters = int(names.max()) + 1
+    names, clusters = _numbered(cluster, len(values))
     counts = np.ones_like(values) if weights is None else weights
     above = _by_cluster(values * counts, names, clusters)
     below = _by_cluster(counts, names, clusters)

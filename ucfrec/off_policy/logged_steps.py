@@ -49,7 +49,7 @@ class LoggedSteps:
     """
 
     session: IntArray
-    """(N,) number of each step's session: 0 to S − 1, never falling, none left out."""
+    """(N,) number of each step's session: 0 to S − 1, never falling, without gaps."""
     reward: Float64Array
     """(N,) in any unit; estimates are in the same unit."""
     propensity: Float64Array
@@ -59,12 +59,12 @@ class LoggedSteps:
     model: Modelled | None = None
     user: IntArray | None = None
     """(S,) whose session it is: sessions of one user are resampled together. None where every
-    session is somebody else's."""
+    session is of another user."""
     discount: float = 1.0
     """γ in (0, 1]: a reward at step t (from 0) counts γ^t."""
     cluster_propensity: Float64Array | None = None
-    """(N,) the behavior policy's probability of the logged action's cluster, for MIPS; see
-    `cluster_probabilities`."""
+    """(N,) the behavior policy's probability of the logged action's cluster, for MIPS
+    (Saito & Joachims, ICML 2022), e.g. k-means of item embeddings."""
     cluster_target: Float64Array | None = None
     """(N,) the evaluated policy's probability of it."""
     groups: ItemGroups | None = None
@@ -109,6 +109,18 @@ class LoggedSteps:
     def first(self) -> IntArray:
         """(S,) step that begins each session."""
         return np.flatnonzero(np.diff(self.session, prepend=-1))
+
+    @cached_property
+    def users(self) -> IntArray:
+        """(S,) users numbered from 0; each session is one where users are unknown."""
+        if self.user is None:
+            return np.arange(len(self.first))
+        return np.asarray(np.unique(self.user, return_inverse=True)[1])
+
+    @cached_property
+    def lacking(self) -> BoolArray:
+        """(S,) whether the session has a step of unknown propensity."""
+        return self.per_session(np.isnan(self.propensity).astype(np.float64)) > 0
 
     @cached_property
     def lengths(self) -> IntArray:
@@ -168,17 +180,17 @@ class LoggedSteps:
         return earlier
 
     def known(self) -> "LoggedSteps":
-        """The sessions of whose every step the propensity is known, numbered anew.
+        """The sessions of whose every step the propensity is known, renumbered.
 
         Raises:
             InputError: there is none.
         """
         if not self.unknown_propensities:
             return self
-        return self.only(self.per_session(np.isnan(self.propensity).astype(np.float64)) == 0)
+        return self.only(~self.lacking)
 
     def only(self, keep: BoolArray) -> "LoggedSteps":
-        """The sessions that `keep` (S,) marks, numbered anew.
+        """The sessions that `keep` (S,) marks, renumbered.
 
         Raises:
             InputError: it marks none.
@@ -197,7 +209,7 @@ class LoggedSteps:
         Args:
             order: (N,) steps in their new order.
             session: (N,) session of each, in the new order.
-            user: (S,) of the new sessions; None where each is somebody else's.
+            user: (S,) of the new sessions; None where each is of another user.
         """
         return replace(self, session=session, user=user, **self._columns(order))
 
@@ -222,28 +234,6 @@ class LoggedSteps:
             at = starts[: np.searchsorted(-lengths, -place, side="left")] + place
             upto[at] = np.minimum(upto[at] * upto[at - 1], _LARGEST)
         return np.asarray(np.minimum(upto, _LARGEST))
-
-
-def cluster_probabilities(
-    probabilities: Float64Array, cluster: IntArray, action: IntArray
-) -> Float64Array:
-    """A policy's probability of the cluster of each logged action, for MIPS.
-
-    In a large catalogue hardly any single item is shown often by both policies, but items alike
-    are. Where the reward depends on an item only through its cluster, weights of clusters are
-    unbiased, and far smaller (Saito & Joachims, ICML 2022, eq. 7 and Theorem 3.2).
-
-    Args:
-        probabilities: (N, A) of every action at every step; give large catalogues in chunks of
-            rows.
-        cluster: (A,) cluster of every action, e.g. k-means of item embeddings.
-        action: (N,) the logged actions.
-
-    Returns:
-        (N,) for `cluster_propensity` or `cluster_target` of `LoggedSteps`.
-    """
-    same = cluster[None, :] == cluster[action][:, None]
-    return np.asarray(np.minimum((probabilities * same).sum(axis=1), 1.0), dtype=np.float64)
 
 
 def _require_shape(name: str, values: Float64Array, n: int) -> None:

@@ -1,6 +1,6 @@
 """Pages: sessions whose steps are positions of one page, chosen at once.
 
-What a page earns under another policy depends on how its positions influence each other, and the
+The return of a page under another policy depends on how its positions influence each other, and the
 weights follow from what is assumed (McInerney, Brost, Chandar, Mehrotra & Carterette,
 *Counterfactual Evaluation of Slate Recommendations with Sequential Reward Interactions*, KDD 2020):
 
@@ -79,8 +79,8 @@ def independent_terms(steps: LoggedSteps) -> dict[str, tuple[Float64Array, Float
     what each page counts (S,), its mean ratio. Propensities of all steps are known."""
     ratios = steps.target / steps.propensity
     counts = steps.per_session(ratios) / steps.lengths
-    earned = steps.per_session(steps.discounts * ratios * steps.reward)
-    found = {"IIPS": (earned, counts)}
+    rewards = steps.per_session(steps.discounts * ratios * steps.reward)
+    found = {"IIPS": (rewards, counts)}
     # Mean over pages, by position, of ρ r γ^t, of ρ, and of there being such a position.
     pages = len(steps.first)
     above = np.bincount(steps.step, steps.discounts * ratios * steps.reward) / pages

@@ -12,14 +12,18 @@ together, from one bootstrap that draws users and treats all candidates alike:
   chapter 10).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.off_policy.intervals import Resampled, resample
+
+if TYPE_CHECKING:
+    from ucfrec.off_policy.evaluate import OffPolicyReport
 
 LEVEL = 0.95
 
@@ -49,7 +53,7 @@ class Selection:
     corrected: float
     """Value of the first without the luck of having been chosen."""
     regret: float
-    """With 95% confidence the first earns at most so much less than the best of them; 0 if it is
+    """With 95% confidence the first is at most this far below the best of them; 0 if it is
     best beyond doubt (Hsu, Annals of Statistics 1984, with the clustered bootstrap)."""
 
     @property
@@ -81,7 +85,7 @@ def select(
         names: K candidates.
         terms: (S, K) whose means over sessions are the estimates, e.g. `influences` of DR.
         seed: draws the resamples.
-        user: (S,) whose session each is; None where each is somebody else's.
+        user: (S,) whose session each is; None where each is of another user.
 
     Raises:
         InputError: there is no candidate, shapes differ, or a term is not finite.
@@ -135,3 +139,104 @@ def _critical(drawn: Resampled, two_sided: bool = True) -> float:
         t = np.where(drawn.usable & drawn.spreads, drawn.shift / drawn.errors, 0.0)
     largest = np.abs(t).max(axis=1) if two_sided else (-t).max(axis=1)
     return float(np.quantile(largest, LEVEL))
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What the logs say of several candidates together."""
+
+    selection: Selection | None
+    """The candidates whose verdicts stand, ranked; None if there are none."""
+    excluded: Mapping[str, str]
+    """Name of each other candidate, and what forbids a conclusion."""
+
+    @property
+    def headline(self) -> str:
+        """Which candidate to take, or that the logs do not show it."""
+        if self.selection is None:
+            return "The logs allow no conclusion on any of the candidates"
+        return self.selection.headline
+
+    def columns(self, name: str) -> dict[str, Any]:
+        """What the rows of a candidate record of it."""
+        found: dict[str, Any] = {"selection": self.headline}
+        if self.selection is None:
+            return found
+        for one in self.selection.standings:
+            if one.name == name:
+                found |= {
+                    "band_low": one.low,
+                    "band_high": one.high,
+                    "probability_best": one.probability_best,
+                    "rank": one.rank,
+                    "candidates": len(self.selection.standings),
+                }
+                if one.rank == 1:
+                    found |= {
+                        "corrected": self.selection.corrected,
+                        "regret": self.selection.regret,
+                    }
+        return found
+
+
+def choose(reports: "Mapping[str, OffPolicyReport]", seed: int) -> Choice:
+    """Rank the candidates whose verdicts stand.
+
+    Args:
+        reports: of each candidate by name, all made from the same logs.
+        seed: draws the bootstrap's resamples.
+
+    Raises:
+        InputError: the candidates' runs read the logs as different sessions or rewards.
+    """
+    _require_same_sessions(reports)
+    standing = {name: one for name, one in reports.items() if one.verdict.reliable}
+    excluded = {
+        name: "; ".join(one.verdict.reasons)
+        for name, one in reports.items()
+        if not one.verdict.reliable
+    }
+    terms = {name: one.terms for name, one in standing.items() if one.terms is not None}
+    if not terms:
+        return Choice(None, excluded)
+    user = next(iter(standing.values())).user
+    columns = np.stack(list(terms.values()), axis=1)
+    return Choice(select(list(terms), columns, seed, user), excluded)
+
+
+def _require_same_sessions(reports: "Mapping[str, OffPolicyReport]") -> None:
+    (first, one), *others = reports.items()
+    for name, other in others:
+        if len(other.returns) != len(one.returns) or not np.allclose(other.returns, one.returns):
+            raise InputError(
+                f"{first} and {name} read these logs as different sessions or rewards (their "
+                "stores were prepared in different ways), so their estimates cannot be compared; "
+                "judge them one at a time"
+            )
+
+
+def names_of(candidates: Sequence[Mapping[str, object]]) -> list[str]:
+    """Names that say what differs among the candidates, e.g. "target return 5, greedy".
+
+    Candidates that differ have different names: numbers have the digits that distinguish them.
+
+    Args:
+        candidates: of each, what it is made of, e.g. run, target return and rule.
+    """
+    differing = [
+        key for key in candidates[0] if len({str(one[key]) for one in candidates}) > 1
+    ] or list(candidates[0])[:1]
+    columns = [_parts(key, [one[key] for one in candidates]) for key in differing]
+    return [", ".join(parts) for parts in zip(*columns, strict=True)]
+
+
+def _parts(key: str, values: Sequence[object]) -> list[str]:
+    """What the names say of one part of all candidates."""
+    short, full = ([_part(key, value, digits) for value in values] for digits in (6, 17))
+    return short if len(set(short)) == len(set(values)) else full
+
+
+def _part(key: str, value: object, digits: int) -> str:
+    if value is None:
+        return f"largest {key} expected"
+    return f"{key} {value:.{digits}g}" if isinstance(value, float) else str(value)

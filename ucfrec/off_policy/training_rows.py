@@ -17,8 +17,6 @@ MOST_SEEN: Final = 0.05
 """Largest share of rows seen in training with which an estimate is accepted. It is above 0 because
 with coarse timestamps some rows of other logs have the same user, item and time by chance."""
 
-_ROWS_AT_ONCE: Final = 2**19
-
 KeyArray = npt.NDArray[np.uint64]
 
 
@@ -72,8 +70,7 @@ def _keys(store: EpisodeStore) -> Iterator[KeyArray]:
     if not store.n_episodes:
         return
     users: Array = store.episode_values(schema.USER)
-    for begin in range(0, store.n_steps, _ROWS_AT_ONCE):
-        episodes, steps = store.locate(np.arange(begin, min(begin + _ROWS_AT_ONCE, store.n_steps)))
+    for episodes, steps in store.step_batches():
         keys = np.zeros(len(steps), dtype=np.uint64)
         for values in (
             users[episodes],

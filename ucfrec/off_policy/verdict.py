@@ -19,7 +19,7 @@ HEAVY_TAIL: Final = 0.5
 """Pareto shape from which on the variance is infinite, and no interval means anything."""
 FAR_OFF: Final = 0.1
 """A mean session weight further from 1 shows that the heaviest sessions are missing, or too many,
-though their number may be too small for a test to tell."""
+though their number may be too small for a test to show it."""
 ENOUGH_REWARDED: Final = 30
 MOST_LEFT_OUT: Final = 0.05
 _DETECTED: Final = 1.96 + 0.84

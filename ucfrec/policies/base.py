@@ -50,7 +50,7 @@ class PolicyConfig:
     return_to_go: Returns = "auto"
     """What returns-to-go count: the whole rest of the `session`; the rest `discounted` by
     `discount`; or the next `horizon` steps. `auto` is the horizon where the sessions of the log are
-    users, whose rest tells how many rows a user has left, and otherwise the session."""
+    users, whose rest shows how many rows a user has left, and otherwise the session."""
     discount: Annotated[float, Field(gt=0, le=1)] = 0.9
     """γ of discounted returns-to-go."""
     horizon: Annotated[int, Field(ge=1, le=10**6)] = 1
@@ -113,9 +113,9 @@ class SequencePolicy(nn.Module, ABC):
 
     Config: ClassVar[type[PolicyConfig]] = PolicyConfig
     augmented: ClassVar[bool] = False
-    """Whether the default of `augment.copies` is above 0 for this learner."""
+    """Whether the default of `augment.copies` is above 0 for this policy."""
     presets: ClassVar[Mapping[str, Any]] = {}
-    """Defaults of this learner for settings outside the table `policy`, by `table.field`."""
+    """Defaults of this policy for settings outside the table `policy`, by `table.field`."""
 
     state_mean: Tensor
     state_std: Tensor
@@ -128,7 +128,7 @@ class SequencePolicy(nn.Module, ABC):
         config: settings, an instance of the class's `Config`.
         sizes: `state` S; `action` A, the size of an action vector or of an item's embedding; and
             `items`, the number of items, 0 if actions are vectors; and `tags`, the most tags of an
-            item, 0 if that is left out.
+            item, 0 if that is omitted.
         """
         super().__init__()
         self.config = config
@@ -196,7 +196,7 @@ class SequencePolicy(nn.Module, ABC):
         """Inputs (B, K, d) of the action head, from normalised windows; row t ignores a_t."""
 
     def last_features(self, windows: Windows) -> Tensor:
-        """Row K − 1 of `features`, (B, d), for acting; subclasses may leave out what it ignores."""
+        """Row K − 1 of `features`, (B, d), for acting; subclasses may omit what it ignores."""
         return self.features(windows)[:, -1]
 
     def acting_features(self) -> Callable[[Windows], Tensor]:

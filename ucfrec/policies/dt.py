@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping
 
-import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -16,7 +15,7 @@ from ucfrec.policies.base import (
     interleave,
     require_heads,
 )
-from ucfrec.policies.layers import Dropout, attend
+from ucfrec.policies.layers import Dropout, attend, visible_tokens
 from ucfrec.settings import settings_table
 
 
@@ -135,14 +134,3 @@ def rows_through(
     for block in others:
         hidden = block(hidden, visible)
     return last.rows(hidden, visible, rows)
-
-
-def visible_tokens(valid: Tensor) -> Tensor:
-    """Causal attention mask (B, 1, L, L), true where row i may attend to column j.
-
-    A token attends to itself and to earlier tokens that are `valid` (B, L), i.e. not padding.
-    """
-    length = valid.shape[1]
-    earlier = torch.ones(length, length, dtype=torch.bool, device=valid.device).tril()
-    diagonal = torch.eye(length, dtype=torch.bool, device=valid.device)
-    return ((earlier & valid.unsqueeze(1)) | diagonal).unsqueeze(1)

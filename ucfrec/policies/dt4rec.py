@@ -92,8 +92,8 @@ class DT4RecPolicy(DTPolicy):
             other = torch.randperm(len(mask), device=mask.device)
             both_valid = mask & mask[other]
             returns = torch.where(both_valid, windows.returns_to_go[other], windows.returns_to_go)
-            asked = self.embed.returns(replace(windows, returns_to_go=returns))
-            negative = self.attended((asked, *encoded), mask)[:, 1::3]
+            prompts = self.embed.returns(replace(windows, returns_to_go=returns))
+            negative = self.attended((prompts, *encoded), mask)[:, 1::3]
             score = F.cosine_similarity(negative[mask], actions, dim=-1)
             # An equal return-to-go is not a negative.
             same = (returns == windows.returns_to_go)[mask]

@@ -37,7 +37,7 @@ class EDT4RecConfig(DTConfig):
     cql_steps: Count = 2000
     """Updates of CQL's network, if `relabel` is true."""
     return_to_go: Returns = "session"
-    """What returns-to-go count, as for all learners; relabelling needs those of sessions."""
+    """What returns-to-go count, as for all policies; relabelling needs those of sessions."""
     cql_weight: Weight = 1.0
     """α, weight of CQL's conservative term, which lowers the values of unlogged actions."""
 
@@ -67,9 +67,9 @@ class EDT4RecPolicy(DTPolicy):
         super().__init__(config, sizes)
         if isinstance(self.head, VectorHead):
             self.head = GaussianHead(config.dim, sizes["action"])
-            self.floor = config.vector_entropy * sizes["action"]
+            self.least_entropy = config.vector_entropy * sizes["action"]
         else:
-            self.floor = config.item_entropy * math.log(sizes["items"])
+            self.least_entropy = config.item_entropy * math.log(sizes["items"])
         self.log_multiplier = nn.Parameter(torch.tensor(config.multiplier).log())
 
     @classmethod
@@ -93,7 +93,9 @@ class EDT4RecPolicy(DTPolicy):
         exposed = None if exposed is None else exposed.select(windows.mask.flatten())
         entropy = _entropy(self.head, features[windows.mask], exposed)
         multiplier = self.log_multiplier.exp()
-        constraint = multiplier * (entropy.detach() - self.floor) - multiplier.detach() * entropy
+        constraint = (
+            multiplier * (entropy.detach() - self.least_entropy) - multiplier.detach() * entropy
+        )
         return imitation + constraint, {
             **scalars,
             "entropy": entropy.detach(),

@@ -1,4 +1,4 @@
-"""The items that users liked best on average: a floor for every policy that pursues reward."""
+"""The items that users liked best on average: a baseline for every policy that pursues reward."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +21,7 @@ PRIOR: Final = 10.0
 class ItemRatePolicy(SequencePolicy):
     """Scores items by the log-odds of their rate of liked training steps, whatever the inputs.
 
-    With a tag window of the decision rule, it is the floor "item click rate with a tag mask".
+    With a tag window of the decision rule, it is the baseline "item click rate with a tag mask".
     """
 
     def closed_form(

@@ -122,3 +122,14 @@ class _ShiftedProducts(torch.autograd.Function):
             of_steps[:, :-back].addcmul_(later, taps[2 - back])
             of_taps[2 - back] = (later * earlier).sum((0, 1))
         return of_steps, of_taps, gradient.sum((0, 1))
+
+
+def visible_tokens(valid: Tensor) -> Tensor:
+    """Causal attention mask (B, 1, L, L), true where row i may attend to column j.
+
+    A token attends to itself and to earlier tokens that are `valid` (B, L), i.e. not padding.
+    """
+    length = valid.shape[1]
+    earlier = torch.ones(length, length, dtype=torch.bool, device=valid.device).tril()
+    diagonal = torch.eye(length, dtype=torch.bool, device=valid.device)
+    return ((earlier & valid.unsqueeze(1)) | diagonal).unsqueeze(1)

@@ -139,9 +139,7 @@ class _Attention(nn.Module):
             x.view(batch, tokens, self.heads, dim // self.heads).transpose(1, 2)
             for x in self.query_key_value(hidden).chunk(3, dim=-1)
         )
-        earlier = torch.ones(tokens, tokens, dtype=torch.bool, device=hidden.device).tril()
-        diagonal = torch.eye(tokens, dtype=torch.bool, device=hidden.device)
-        visible = ((earlier & valid.unsqueeze(1)) | diagonal).unsqueeze(1)
+        visible = layers.visible_tokens(valid)
         mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=visible)
         return self.dropout(mixed.transpose(1, 2).reshape(hidden.shape))  # type: ignore[no-any-return]
 

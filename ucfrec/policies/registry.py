@@ -1,6 +1,6 @@
-"""Learners by their `--policy` names; a learner is imported when it is first used.
+"""Policies by their `--policy` names; a policy is imported when it is first used.
 
-Other packages add learners through the entry-point group `ucfrec.policies`, which maps a name to
+Other packages add policies through the entry-point group `ucfrec.policies`, which maps a name to
 a class derived from `ucfrec.policies.base.SequencePolicy`::
 
     [project.entry-points."ucfrec.policies"]
@@ -32,19 +32,19 @@ BUILT_IN: Final = {
     "item-knn": "item_knn:ItemKNNPolicy",
     "crm-greedy": "crm_greedy:CRMGreedyPolicy",
 }
-"""Module in `ucfrec.policies` and class of each built-in learner, by name."""
+"""Module in `ucfrec.policies` and class of each built-in policy, by name."""
 
 
 def policy_names() -> tuple[str, ...]:
-    """Names of all learners: the built-in ones, then those of installed plugins."""
+    """Names of all policies: the built-in ones, then those of installed plugins."""
     return (*BUILT_IN, *(name for name in plugin_names("policies") if name not in BUILT_IN))
 
 
 def policy_class(name: str) -> "type[SequencePolicy]":
-    """The class of the learner `name`; built-in learners take precedence over plugins.
+    """The class of the policy `name`; built-in policies take precedence over plugins.
 
     Raises:
-        InputError: no learner has this name, it cannot be imported, or it is not a `SequencePolicy`
+        InputError: no policy has this name, it cannot be imported, or it is not a `SequencePolicy`
             whose `Config` is a table of settings.
     """
     if name in BUILT_IN:
@@ -56,24 +56,24 @@ def policy_class(name: str) -> "type[SequencePolicy]":
     return _checked(name, load_plugin("policies", name))
 
 
-def _checked(name: str, learner: object) -> "type[SequencePolicy]":
+def _checked(name: str, policy_type: object) -> "type[SequencePolicy]":
     from ucfrec.policies.base import RESERVED, PolicyConfig, SequencePolicy
     from ucfrec.settings import is_table
 
-    if not (isinstance(learner, type) and issubclass(learner, SequencePolicy)):
+    if not (isinstance(policy_type, type) and issubclass(policy_type, SequencePolicy)):
         raise InputError(
-            f"the policy {name!r} is installed as {learner!r}, which is not a class derived from "
-            "ucfrec.policies.base.SequencePolicy"
+            f"the policy {name!r} is installed as {policy_type!r}, which is not a class derived "
+            "from ucfrec.policies.base.SequencePolicy"
         )
-    own = learner.__mro__[: learner.__mro__.index(SequencePolicy)]
+    own = policy_type.__mro__[: policy_type.__mro__.index(SequencePolicy)]
     if taken := sorted(RESERVED.intersection(n for each in own for n in vars(each))):
         raise InputError(
             f"the policy {name!r} defines {', '.join(taken)}, which "
             "ucfrec.policies.base.SequencePolicy keeps for itself; choose another name"
         )
-    if not (issubclass(learner.Config, PolicyConfig) and is_table(learner.Config)):
+    if not (issubclass(policy_type.Config, PolicyConfig) and is_table(policy_type.Config)):
         raise InputError(
-            f"the policy {name!r} is configured by {learner.Config!r}, which is not derived from "
-            "ucfrec.policies.base.PolicyConfig under @ucfrec.settings.settings_table"
+            f"the policy {name!r} is configured by {policy_type.Config!r}, which is not derived "
+            "from ucfrec.policies.base.PolicyConfig under @ucfrec.settings.settings_table"
         )
-    return learner
+    return policy_type

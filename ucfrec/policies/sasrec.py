@@ -6,8 +6,8 @@ from torch import Tensor, nn
 
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import Layers, SequencePolicy
-from ucfrec.policies.dt import Block, DTConfig, rows_through, visible_tokens
-from ucfrec.policies.layers import Dropout
+from ucfrec.policies.dt import Block, DTConfig, rows_through
+from ucfrec.policies.layers import Dropout, visible_tokens
 from ucfrec.settings import settings_table
 
 

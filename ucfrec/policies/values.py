@@ -1,4 +1,4 @@
-"""State values: what a session earned from here on average, and at its best."""
+"""State values: the mean return from here on, and at its best."""
 
 import torch
 from torch import Tensor, nn
@@ -36,8 +36,8 @@ class ValueHead(nn.Module):
         """
         mask = windows.mask
         time = torch.log1p(windows.timesteps.float()).unsqueeze(-1) / 5
-        played = actions.detach().masked_fill(~mask.unsqueeze(-1), 0.0)
-        before = F.pad(played, (0, 0, 1, 0))[:, :-1]
+        taken = actions.detach().masked_fill(~mask.unsqueeze(-1), 0.0)
+        before = F.pad(taken, (0, 0, 1, 0))[:, :-1]
         tokens = F.relu(self.embed(torch.cat([windows.states, time, before], dim=-1)))
         # Padding is moved from the left to the right, where it follows every step.
         padding, steps = (~mask).sum(1, keepdim=True), torch.arange(mask.shape[1]).to(mask.device)

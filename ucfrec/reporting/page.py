@@ -11,12 +11,12 @@ import pyarrow as pa
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from ucfrec import __version__
-from ucfrec.counterfactual.augment import AugmentationReport
+from ucfrec.counterfactual.state_augmentation import AugmentationReport
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import atomic_file, json_text
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.reporting import charts
-from ucfrec.reporting.copies import copies_table, moves_chart
+from ucfrec.reporting.augmentation import augmentation_table, moves_chart
 from ucfrec.reporting.curves import POINTS, REFERENCES, Curves, draw_curves, trained_on
 from ucfrec.reporting.data_quality import data_quality
 from ucfrec.reporting.forest import forest
@@ -175,7 +175,7 @@ def _variables(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any
         "finished": any(run.record.policy is not None for run in runs),
         "references": any(run.references for run in runs),
         "verdicts": [(name, report.verdict) for name, report in edited],
-        "copies": copies_table(edited) if edited else None,
+        "copies": augmentation_table(edited) if edited else None,
         "moves": moves_chart(styled),
         "samples": [(run.name, sample_tables(run.folder, features)) for run in item_runs],
         "differences": _differences(runs),

@@ -10,9 +10,9 @@ import numpy as np
 from pydantic import Field
 
 from ucfrec.choosing.config import RuleConfig
-from ucfrec.counterfactual.augment import AugmentConfig
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
+from ucfrec.counterfactual.state_augmentation import AugmentConfig
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_toml
 from ucfrec.fitting.loop import LoopConfig

@@ -18,8 +18,8 @@ from pydantic import (
 )
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.counterfactual.augment import AugmentationReport
 from ucfrec.counterfactual.screening import DimensionReport
+from ucfrec.counterfactual.state_augmentation import AugmentationReport
 from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.record import Source, StoreRecord
 from ucfrec.episodes.returns import ReturnToGo
@@ -193,7 +193,7 @@ class RunRecord(TrainingRecord):
         method's default.
         """
         config = self.config
-        augmented = config.augment.makes_copies
+        augmented = config.augment.augments
         if augmented == policy_class(config.policy_name).augmented:
             return config.policy_name
         return f"{config.policy_name}-{'augmented' if augmented else 'no-augmentation'}"

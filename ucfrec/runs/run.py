@@ -12,10 +12,10 @@ import torch
 
 from ucfrec.acting.scorer import Scorer
 from ucfrec.choosing.choose import choose_rule
-from ucfrec.counterfactual.augment import AugmentationReport, AugmentConfig
-from ucfrec.counterfactual.copies import MODELS, counterfactual_copies
+from ucfrec.counterfactual.augmentation import MODELS, counterfactual_augmentation
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
+from ucfrec.counterfactual.state_augmentation import AugmentationReport, AugmentConfig
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.episodes.windows import Overlay
 from ucfrec.files.atomic import write_json
@@ -162,7 +162,7 @@ def _augment(run: _Inputs) -> tuple[Overlay | None, AugmentationReport | None]:
     Made once, then read from the run folder; (None, None) for a run without augmentation.
     """
     config, out = run.config, run.out
-    if not config.augment.makes_copies:
+    if not config.augment.augments:
         return None, run.record.augmentation
     settings = (config.crm, config.csg, config.augment)
     # A policy's own view of the episodes has augmentation of its own.
@@ -170,7 +170,7 @@ def _augment(run: _Inputs) -> tuple[Overlay | None, AugmentationReport | None]:
     shared = OWN if own or not run.record.return_to_go.per_session else run.shared
 
     def make() -> None:
-        overlay, report = counterfactual_copies(
+        overlay, report = counterfactual_augmentation(
             run.train, run.validation, *settings, out, config.seed, run.device
         )
         overlay.save(out / _OVERLAY)
@@ -180,7 +180,7 @@ def _augment(run: _Inputs) -> tuple[Overlay | None, AugmentationReport | None]:
         if not (out / AUGMENTATION).exists():
             inputs = _dependencies(run.train, run.validation, config.seed, run.device, *settings)
             files = (*MODELS, _OVERLAY, AUGMENTATION)
-            shared.provide(inputs, counterfactual_copies.__module__, out, files, make)
+            shared.provide(inputs, counterfactual_augmentation.__module__, out, files, make)
         return Overlay.load(out / _OVERLAY), read_augmentation(out / AUGMENTATION)
 
 

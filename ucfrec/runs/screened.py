@@ -6,7 +6,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
-from ucfrec.counterfactual.interventions import interventions
+from ucfrec.counterfactual.augmentation import interventions
 from ucfrec.counterfactual.screening import ScreeningConfig, ScreeningReport, screen
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError

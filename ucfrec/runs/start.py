@@ -13,7 +13,7 @@ import torch
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Float32Array
-from ucfrec.counterfactual.copies import require_rewards_vary
+from ucfrec.counterfactual.augmentation import require_rewards_vary
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
@@ -63,7 +63,7 @@ def require_startable(store: EpisodeStore, train: EpisodeStore, out: Path, confi
     """
     if (out / RUN).exists():
         _require_same(RunRecord.read(out), store, out, config)
-    elif config.augment.makes_copies:
+    elif config.augment.augments:
         require_rewards_vary(train)
 
 

@@ -15,7 +15,7 @@ from ucfrec_control.benchmark.methods import (
     TABLES,
     WITH_TIME,
 )
-from ucfrec_control.learners.rl_baselines import ALGORITHMS
+from ucfrec_control.training.rl_baselines import ALGORITHMS
 
 
 def _longer(steps: int) -> dict[str, tuple[str, ...]]:

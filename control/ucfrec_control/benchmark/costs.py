@@ -14,8 +14,8 @@ from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.runs.start import new_policy, training_views
 from ucfrec_control.benchmark.measure import rl_config_of, targets_of
 from ucfrec_control.environments.environments import SIDE_BY_SIDE, environment_of_data, make_env
-from ucfrec_control.learners.rl_baselines import ALGORITHMS, timed_updates
-from ucfrec_control.learners.train import dataset_of
+from ucfrec_control.training.rl_baselines import ALGORITHMS, timed_updates
+from ucfrec_control.training.train import dataset_of
 
 _TIMED: Final = 5
 _WARM: Final = 2

@@ -14,9 +14,9 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_control.benchmark.screening_table import verdicts
 from ucfrec_control.data.distractor import CLEAN
 from ucfrec_control.data.trajectories import PACKAGES
-from ucfrec_control.learners.evaluate import evaluate_run
-from ucfrec_control.learners.held_out_losses import held_out_losses
-from ucfrec_control.learners.rl_baselines import (
+from ucfrec_control.training.evaluate import evaluate_run
+from ucfrec_control.training.held_out_losses import held_out_losses
+from ucfrec_control.training.rl_baselines import (
     ALGORITHMS,
     RLConfig,
     RLRecord,
@@ -25,7 +25,7 @@ from ucfrec_control.learners.rl_baselines import (
     rl_config,
     train_rl,
 )
-from ucfrec_control.learners.train import dataset_of, preset_of, train_control
+from ucfrec_control.training.train import dataset_of, preset_of, train_control
 
 TARGET: Final = "target"
 """Condition of rows of budgets with several target returns."""

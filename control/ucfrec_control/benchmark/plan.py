@@ -15,8 +15,8 @@ from ucfrec_control.benchmark.measure import DISTRACTOR, RATE
 from ucfrec_control.benchmark.methods import RATES, ROBUST, ROBUSTNESS, SCORES, TABLES
 from ucfrec_control.benchmark.rates import SEARCHED, settings_of
 from ucfrec_control.data.distractor import DISTRACTORS, zoo_store
-from ucfrec_control.learners.rl_baselines import ALGORITHMS
-from ucfrec_control.learners.train import dataset_of, preset_of
+from ucfrec_control.training.rl_baselines import ALGORITHMS
+from ucfrec_control.training.train import dataset_of, preset_of
 
 
 def stores_of(folder: Path) -> Path:

@@ -17,7 +17,7 @@ from ucfrec.results.row import ResultRow
 from ucfrec_control.benchmark.budgets import TRIED_RATES
 from ucfrec_control.benchmark.measure import RATE
 from ucfrec_control.benchmark.methods import METHODS, METHODS_WO_TIME, Methods
-from ucfrec_control.learners.rl_baselines import ALGORITHMS
+from ucfrec_control.training.rl_baselines import ALGORITHMS
 
 _TIME: Final = "policy.max_timestep"
 

@@ -21,7 +21,7 @@ from ucfrec_control.commands.options import (
     narrowed,
     rates_option,
 )
-from ucfrec_control.learners.evaluate import CHECKPOINTS
+from ucfrec_control.training.evaluate import CHECKPOINTS
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -1,4 +1,4 @@
-"""`ucfrec-control collect`: datasets from a SAC learner, which resumes, or from a saved agent."""
+"""`ucfrec-control collect`: datasets from SAC, which resumes, or from a saved agent."""
 
 import argparse
 from pathlib import Path
@@ -7,8 +7,7 @@ from ucfrec.commands.grid_options import seed_given
 from ucfrec.errors import InputError
 from ucfrec.reporting.tables import format_rows
 from ucfrec_control.data.collect import SHOWN as COLLECTED
-from ucfrec_control.data.collect import CollectConfig, collect
-from ucfrec_control.data.collect_agent import collect_agent
+from ucfrec_control.data.collect import CollectConfig, collect, collect_agent
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -44,22 +43,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec-control collect`."""
     if options.agent is not None:
-        row = collect_agent(
-            options.agent,
-            options.env,
-            options.out,
-            noise=options.noise,
-            size=options.size,
-            seed=options.seed,
-        )
-        print(format_rows([row], COLLECTED))
-        print(f"\nfiles: {options.out}")
-        return
-    if options.noise:
+        acting = {"noise": options.noise, "size": options.size, "seed": options.seed}
+        rows = [collect_agent(options.agent, options.env, options.out, **acting)]
+    elif options.noise:
         raise InputError("--noise is for the actions of an --agent")
-    config = CollectConfig(
-        steps=options.steps, every=options.every, fraction=options.fraction, size=options.size
-    )
-    rows = collect(options.env, options.out, options.seed, config)
+    else:
+        config = CollectConfig(
+            steps=options.steps, every=options.every, fraction=options.fraction, size=options.size
+        )
+        rows = collect(options.env, options.out, options.seed, config)
     print(format_rows(rows, COLLECTED))
     print(f"\nfiles: {options.out}")

@@ -12,8 +12,8 @@ from ucfrec.reporting.tables import format_rows
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import write_results
 from ucfrec_control.commands.options import MAX_RETURN, target_given
-from ucfrec_control.learners.evaluate import CHECKPOINTS, NO_TARGET, evaluate_run
-from ucfrec_control.learners.video import record_episode
+from ucfrec_control.training.evaluate import CHECKPOINTS, NO_TARGET, evaluate_run
+from ucfrec_control.training.video import record_episode
 
 SHOWN = (
     *("dataset", "method", "seed", "checkpoint", "target_return", "score", "return", "episodes"),

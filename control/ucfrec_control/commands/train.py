@@ -7,7 +7,7 @@ import torch
 from ucfrec.commands.train import training_options
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.runs.config import resolve_config
-from ucfrec_control.learners.train import dataset_of, preset_of, train_control
+from ucfrec_control.training.train import dataset_of, preset_of, train_control
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -3,7 +3,7 @@
 A saved agent is a zip file: tensors in `policy.pth`, and settings in `data`, a JSON file in which
 whatever JSON cannot say is pickled. Unpickling runs what its author wrote. Here the tensors are
 read by PyTorch's loader of plain weights, the JSON without its pickled parts, and the network is
-rebuilt from the names and shapes of the tensors. What that does not tell is refused.
+rebuilt from the names and shapes of the tensors. What these do not determine is refused.
 """
 
 import io
@@ -21,7 +21,8 @@ import torch
 from gymnasium.spaces import Box
 from torch import Tensor, nn
 
-from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
+from ucfrec.acting.uniform import Memoryless
+from ucfrec.arrays import BoolArray, Float32Array
 from ucfrec.errors import InputError
 
 _MOST_BYTES: Final = {"policy.pth": 2**30, "data": 2**26}
@@ -56,7 +57,7 @@ _KINDS: Final = (
 )
 
 
-class Agent:
+class Agent(Memoryless):
     """The deterministic action of a saved agent plus Gaussian noise (an `Actor` of `rollout`)."""
 
     def __init__(self, network: nn.Module, squashed: bool, space: Box, noise: float, seed: int):
@@ -72,9 +73,6 @@ class Agent:
         self._noise, self._seed = noise, seed
         self._generator = np.random.default_rng(seed)
 
-    def begin(self, rows: IntArray) -> None:
-        """Do nothing: the agent has no memory."""
-
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[Float32Array, None]:
         """Actions (N, A) within the action space, and None."""
         with torch.no_grad():
@@ -84,9 +82,6 @@ class Agent:
             mean = self._low + half * (mean + 1)
         noise = self._noise * half * self._generator.normal(size=mean.shape)
         return np.clip(mean + noise, self._low, self._high).astype(np.float32), None
-
-    def observe(self, actions: Array, rewards: Float32Array) -> None:
-        """Do nothing: the agent has no memory."""
 
 
 def read_agent(file: Path, observations: int, space: Box, noise: float, seed: int) -> Agent:
@@ -101,8 +96,8 @@ def read_agent(file: Path, observations: int, space: Box, noise: float, seed: in
 
     Raises:
         InputError: the file is missing or damaged, or its network is not one of layers that its
-            tensors tell in full (perceptrons of SAC, TQC, TD3, DDPG, PPO, A2C or TRPO), or of other
-            sizes.
+            tensors determine in full (perceptrons of SAC, TQC, TD3, DDPG, PPO, A2C or TRPO), or of
+            other sizes.
     """
     tensors, settings = _contents(file)
     kind, names = _kind_of(file, tensors)

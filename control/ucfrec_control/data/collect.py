@@ -1,18 +1,20 @@
-"""Collect datasets by D4RL's protocol (Fu et al., 2020, section 5) with a SAC learner."""
+"""Collect datasets with SAC by D4RL's protocol (Fu et al., 2020, section 5) or a saved agent."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import gymnasium
 import numpy as np
+from gymnasium.spaces import Box
 from gymnasium.vector import VectorEnv
 from pydantic import Field
 
 from ucfrec.acting.rollout import Actor, Step, rollout
-from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
+from ucfrec.acting.uniform import Memoryless
+from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json, write_json
 from ucfrec.files.locks import claimed, remove_leftovers_within
@@ -20,8 +22,9 @@ from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.progress import progress
 from ucfrec.provenance import provenance
 from ucfrec.settings import Count, require, settings_table
+from ucfrec_control.data.agents import read_agent
 from ucfrec_control.data.d4rl import write_d4rl
-from ucfrec_control.data.sac import SacConfig, SacLearner, seed_all
+from ucfrec_control.data.sac import SacConfig, SacTraining, seed_all
 from ucfrec_control.data.trajectories import PACKAGES, Trajectories
 from ucfrec_control.environments.environments import SIDE_BY_SIDE, make_env
 
@@ -43,13 +46,13 @@ class CollectConfig:
     size: Count = 1_000_000
     """Steps rolled out of `medium` and of `expert`, rounded up to whole episodes."""
     sac: SacConfig = field(default_factory=SacConfig)
-    """The learner."""
+    """The sac."""
 
     def __post_init__(self) -> None:
         """Check the fields against each other."""
         require(
             self.steps > self.sac.learning_starts,
-            f"steps is {self.steps}, all of them uniform play; learning starts after "
+            f"steps is {self.steps}, all of them uniform actions; learning starts after "
             f"{self.sac.learning_starts}",
             "steps",
             "sac.learning_starts",
@@ -86,14 +89,58 @@ def collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[di
             a `Box`, Stable-Baselines3 is not installed, or no policy beat the random policy.
     """
     with claimed(out, "filled"):
-        remove_leftovers_within(out)
+        _require_incomplete(out)
         return _collect(env_id, out, seed, config)
+
+
+def collect_agent(
+    agent: Path, env_id: str, out: Path, *, noise: float, size: int, seed: int
+) -> dict[str, Any]:
+    """Let a saved agent act and write a dataset in D4RL's layout.
+
+    Args:
+        agent: file that Stable-Baselines3 or its contrib package saved.
+        env_id: Gymnasium environment with vector observations and actions.
+        out: output folder; gets `TASK_AGENT.hdf5` and `MANIFEST.json`.
+        noise: standard deviation of Gaussian noise on the agent's deterministic actions, in halves
+            of the action space's range.
+        size: steps, rounded up to whole episodes.
+        seed: of environments and noise.
+
+    Returns:
+        One row: `file`, `dataset`, numbers of `trajectories` and `steps`, `mean_return`.
+
+    Raises:
+        InputError: the agent cannot be read as data or does not fit the environment, which cannot
+            be made; `noise` is negative or not finite, or `size` below 1; or `out` is complete
+            already.
+    """
+    if not 0 <= noise < np.inf or size < 1:
+        raise InputError(f"--noise {noise:g} and --size {size}: give at least 0, and at least 1")
+    with claimed(out, "filled"):
+        _require_incomplete(out)
+        env = make_env(env_id, 1)
+        shown, space = env.single_observation_space.shape or (), env.single_action_space
+        env.close()
+        if len(shown) != 1 or not isinstance(space, Box) or len(space.shape) != 1:
+            raise InputError(f"{env_id} has no vector observations and actions")
+        actor = read_agent(agent, shown[0], space, noise, seed_all(seed, 5))
+        trajectories = roll_out(actor, env_id, size, (seed, 6), f"roll out {agent.stem}")
+        name = f"{_task(env_id)}_{agent.stem}" + (f"-noise{noise:g}" if noise else "")
+        recorded = {"env_id": env_id, "agent": agent.name, "noise": noise, "seed": seed}
+        (row,) = _write(out, {name: trajectories}, recorded, PACKAGES)
+        return row
+
+
+def _require_incomplete(out: Path) -> None:
+    """Check that a folder is not complete, and remove what an interrupted call left in it."""
+    remove_leftovers_within(out)
+    if (out / "MANIFEST.json").exists():
+        raise InputError(f"{out} is complete already; remove it or name another output folder")
 
 
 def _collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[dict[str, Any]]:
     """`collect` into a folder that no other process fills."""
-    if (out / "MANIFEST.json").exists():
-        raise InputError(f"{out} is complete already; remove it or name another output folder")
     training = _train(env_id, out / "training", seed, config)
     medium, expert = _choose(training.evaluations, training.random_return, config.fraction)
     parts = {
@@ -113,19 +160,26 @@ def _collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[d
         "expert_return": training.evaluations[expert]["return"],
         "expert_steps": training.evaluations[expert]["steps"],
     }
-    return _write(out, parts, recorded)
+    names = {f"{_task(env_id)}_{kind}-sac": part for kind, part in parts.items()}
+    return _write(out, names, recorded, (*PACKAGES, "stable-baselines3"))
+
+
+def _task(env_id: str) -> str:
+    """Name of an environment in names of datasets."""
+    return env_id.split("/")[-1].rsplit("-v", 1)[0].lower()
 
 
 def _write(
-    out: Path, parts: Mapping[str, Trajectories], recorded: Mapping[str, Any]
+    out: Path,
+    parts: Mapping[str, Trajectories],
+    recorded: Mapping[str, Any],
+    packages: Sequence[str],
 ) -> list[dict[str, Any]]:
     """Write one file per dataset and the manifest, and return one row per dataset."""
-    run_provenance = provenance((*PACKAGES, "stable-baselines3"))
-    task = recorded["env_id"].split("/")[-1].rsplit("-v", 1)[0].lower()
+    run_provenance = provenance(packages)
     rows = []
-    for kind, trajectories in parts.items():
-        name = f"{task}_{kind}-sac"
-        row = {
+    for name, trajectories in parts.items():
+        row: dict[str, Any] = {
             "file": f"{name}.hdf5",
             "dataset": name,
             "trajectories": len(trajectories.lengths),
@@ -133,7 +187,7 @@ def _write(
             "mean_return": float(trajectories.returns.mean()),
         }
         metadata = {**recorded, **row, "versions": json.dumps(run_provenance["versions"])}
-        write_d4rl(trajectories, out / f"{name}.hdf5", metadata)
+        write_d4rl(trajectories, out / row["file"], metadata)
         rows.append(row)
     write_json(out / "MANIFEST.json", {**run_provenance, **recorded, "files": rows})
     return rows
@@ -152,7 +206,7 @@ def _claim(file: Path, settings: Mapping[str, Any]) -> None:
 
 @dataclass(frozen=True)
 class _Training:
-    learner: SacLearner
+    sac: SacTraining
     folder: Path
     random_return: float
     evaluations: list[dict[str, Any]]
@@ -171,21 +225,21 @@ def _train(env_id: str, folder: Path, seed: int, config: CollectConfig) -> _Trai
     limit = gymnasium.spec(env_id).max_episode_steps
     if limit is None:
         raise InputError(f"{env_id} has no step limit, so its episodes may never end")
-    learner = SacLearner(env, seed, config.steps + limit, config.sac)
+    sac = SacTraining(env, seed, config.steps + limit, config.sac)
     _claim(folder / "config.json", {"env": env_id, "seed": seed, **asdict(config)})
     evaluation_env = make_env(env_id, min(config.episodes, SIDE_BY_SIDE))
     random_return = _mean_return(
         evaluation_env, _Uniform(evaluation_env, seed), config.episodes, (seed, 2)
     )
-    training = _Training(learner, folder, random_return, [])
+    training = _Training(sac, folder, random_return, [])
     if training.checkpoint.exists():
-        training.evaluations.extend(learner.load(training.checkpoint)["evaluations"])
-    with progress(config.steps, "train SAC", "steps", done=learner.steps) as bar:
-        while learner.steps < config.steps:
-            steps_before = learner.steps
-            learner.play_episode(bar)
-            due = learner.steps // config.every > steps_before // config.every
-            if due or learner.steps >= config.steps:
+        training.evaluations.extend(sac.load(training.checkpoint)["evaluations"])
+    with progress(config.steps, "train SAC", "steps", done=sac.steps) as bar:
+        while sac.steps < config.steps:
+            steps_before = sac.steps
+            sac.run_episode(bar)
+            due = sac.steps // config.every > steps_before // config.every
+            if due or sac.steps >= config.steps:
                 _evaluate(training, evaluation_env, seed, config.episodes)
                 bar.update(0, mean_return=training.evaluations[-1]["return"])
     env.close()
@@ -194,12 +248,12 @@ def _train(env_id: str, folder: Path, seed: int, config: CollectConfig) -> _Trai
 
 
 def _evaluate(training: _Training, env: VectorEnv[Any, Any, Any], seed: int, episodes: int) -> None:
-    """Evaluate and save the current policy, and save a checkpoint of the learner."""
-    learner, index = training.learner, len(training.evaluations)
-    mean_return = _mean_return(env, learner, episodes, (seed, 3, index))
-    training.evaluations.append({"steps": learner.steps, "return": mean_return})
-    learner.save_policy(training.policy(index), training.evaluations[-1])
-    learner.save(training.checkpoint, {"evaluations": training.evaluations})
+    """Evaluate and save the current policy, and save a checkpoint of the sac."""
+    sac, index = training.sac, len(training.evaluations)
+    mean_return = _mean_return(env, sac, episodes, (seed, 3, index))
+    training.evaluations.append({"steps": sac.steps, "return": mean_return})
+    sac.save_policy(training.policy(index), training.evaluations[-1])
+    sac.save(training.checkpoint, {"evaluations": training.evaluations})
 
 
 def _mean_return(
@@ -212,22 +266,16 @@ def _mean_return(
     return float(result.returns.mean())
 
 
-class _Uniform:
+class _Uniform(Memoryless):
     """Actor that chooses uniformly random actions."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any], seed: int) -> None:
         self._space = env.action_space
         self._space.seed(seed)
 
-    def begin(self, rows: IntArray) -> None:
-        """Do nothing: the actor has no state."""
-
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, None]:
         """Return (N, A) random actions, and None."""
         return self._space.sample(), None
-
-    def observe(self, actions: Array, rewards: Float32Array) -> None:
-        """Do nothing: the actor has no state."""
 
 
 def _choose(
@@ -238,15 +286,15 @@ def _choose(
     expert = int(returns.argmax())
     if returns[expert] <= random_return:
         raise InputError(
-            f"the best policy earns {returns[expert]:.1f}, random play {random_return:.1f}; train "
-            "for more --steps into another folder"
+            f"the best policy returns {returns[expert]:.1f}, random actions {random_return:.1f}; "
+            "train for more --steps into another folder"
         )
     threshold = random_return + fraction * (returns[expert] - random_return)
     return int((returns >= threshold).argmax()), expert
 
 
 def _replay(training: _Training, medium: int, env_id: str) -> Trajectories:
-    replay = training.learner.replay(training.evaluations[medium]["steps"])
+    replay = training.sac.replay(training.evaluations[medium]["steps"])
     ends = np.flatnonzero(replay["terminals"] | replay["timeouts"])
     return Trajectories(
         observations=replay["observations"],
@@ -261,19 +309,19 @@ def _replay(training: _Training, medium: int, env_id: str) -> Trajectories:
 
 def _roll_out(training: _Training, index: int, env_id: str, seed: int, size: int) -> Trajectories:
     """Roll out a saved policy."""
-    training.learner.load_policy(training.policy(index))
-    return roll_out(training.learner, env_id, size, (seed, 4, index), f"roll out policy {index}")
+    training.sac.load_policy(training.policy(index))
+    return roll_out(training.sac, env_id, size, (seed, 4, index), f"roll out policy {index}")
 
 
 def roll_out(
     actor: Actor, env_id: str, size: int, key: tuple[int, ...], describe: str
 ) -> Trajectories:
-    """Play whole episodes, with at least `size` steps in total.
+    """Roll out whole episodes, with at least `size` steps in total.
 
     Every round has a fixed number of episodes, so that short episodes are not overrepresented.
 
     Args:
-        actor: who plays.
+        actor: whose actions are taken.
         env_id: Gymnasium environment.
         size: least number of steps.
         key: seeds of the episodes.

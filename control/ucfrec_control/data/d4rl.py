@@ -26,7 +26,7 @@ def read_d4rl(path: Path, env_id: str | None = None) -> Trajectories:
 
     A trajectory ends at `terminals` or `timeouts`. Steps after the last end are an unfinished
     trajectory and are dropped; in AntMaze, so are trajectories of one step, which are the ant still
-    standing on the goal. A file without `timeouts` tells where trajectories end by
+    standing on the goal. A file without `timeouts` shows where trajectories end by
     `next_observations` that the next row does not begin with.
 
     Args:
@@ -154,7 +154,7 @@ def _timeouts(steps: Mapping[str, Array], path: Path) -> BoolArray:
         return _flags(steps["timeouts"], "timeouts", path)
     if "next_observations" not in steps:
         raise InputError(
-            f"{path} has neither timeouts nor next_observations, so nothing tells where its "
+            f"{path} has neither timeouts nor next_observations, so nothing shows where its "
             "trajectories end; use a later release of the dataset"
         )
     goes_on = (steps["next_observations"][:-1] == steps["observations"][1:]).all(axis=1)

@@ -1,4 +1,4 @@
-"""Open HDF5 files of strangers: nothing outside the file, nothing larger than it can hold."""
+"""Open untrusted HDF5 files: nothing outside the file, nothing larger than it can hold."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -115,7 +115,7 @@ def _require_inside(group: Any, name: str, path: Path) -> None:
 
 
 def _require_plausible_size(dataset: Any, path: Path, name: str) -> None:
-    """Check that the values can be in the file, before memory for them is asked for."""
+    """Check that the values can be in the file, before memory is allocated for them."""
     stored = min(int(dataset.id.get_storage_size()), path.stat().st_size)
     factor = _DEFLATE if dataset.id.get_create_plist().get_nfilters() else 1
     if dataset.size * dataset.dtype.itemsize > stored * factor:

@@ -51,7 +51,7 @@ def read_minari(source: str, env_id: str | None = None, download: bool = False) 
 
     Episodes that were neither terminated nor truncated are unfinished and are dropped. Goal-based
     observations become the achieved position followed by the other observations, as in D4RL; the
-    desired goal is left out.
+    desired goal is excluded.
 
     Args:
         source: identifier or folder of a dataset.

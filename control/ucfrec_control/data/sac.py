@@ -1,4 +1,4 @@
-"""A soft actor-critic learner that can be stopped and resumed with the same results.
+"""Training by soft actor-critic that can be stopped and resumed with the same results.
 
 Stable-Baselines3 (extra `collect`) provides the networks, the replay buffer and the update; this
 module runs the episodes. At the start of every episode, all random generators are seeded from the
@@ -15,7 +15,8 @@ import torch
 from gymnasium.vector import VectorEnv
 from pydantic import Field
 
-from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
+from ucfrec.acting.uniform import Memoryless
+from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, save_tensors
 from ucfrec.progress import Progress
@@ -43,8 +44,8 @@ class SacConfig:
     """Share of the critics that their targets take over every update."""
 
 
-class SacLearner:
-    """SAC learner that plays whole episodes in one environment and learns at every step.
+class SacTraining(Memoryless):
+    """SAC that runs whole episodes in one environment and learns at every step.
 
     It implements `ucfrec.acting.rollout.Actor`, so its policy can be evaluated with `rollout`.
 
@@ -52,7 +53,7 @@ class SacLearner:
         env: vector environment of size one, with `AutoresetMode.SAME_STEP` and a `Box` action
             space.
         seed: seed of the networks, the exploration and the environment.
-        capacity: size of the replay buffer in steps; every step ever played must fit.
+        capacity: size of the replay buffer in steps; every step taken must fit.
         config: hyperparameters.
 
     Raises:
@@ -66,15 +67,15 @@ class SacLearner:
         self._model = _sb3_model(env, seed, capacity, config)
         self._buffer = self._model.replay_buffer
         self.episode = 0
-        """Episodes played so far."""
+        """Episodes run so far."""
 
     @property
     def steps(self) -> int:
-        """Number of steps played so far, all of them in the replay buffer."""
+        """Number of steps taken so far, all of them in the replay buffer."""
         return int(self._buffer.pos)
 
-    def play_episode(self, bar: Progress) -> None:
-        """Play one complete episode, with one update per step.
+    def run_episode(self, bar: Progress) -> None:
+        """Run one complete episode, with one update per step.
 
         Before `learning_starts`, actions are uniformly random and there are no updates.
 
@@ -108,7 +109,7 @@ class SacLearner:
         return np.asarray(self._model.policy.scale_action(drawn), dtype=np.float32)
 
     def replay(self, steps: int) -> dict[str, Array]:
-        """Return the first steps played, with D4RL's column names.
+        """Return the first steps taken, with D4RL's column names.
 
         Args:
             steps: number N of steps.
@@ -195,9 +196,6 @@ class SacLearner:
         self.episode = metadata.pop("episode")
         return metadata
 
-    def begin(self, rows: IntArray) -> None:
-        """Do nothing: the policy depends only on the current observation."""
-
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[Float32Array, None]:
         """Sample actions from the policy, as in training.
 
@@ -209,9 +207,6 @@ class SacLearner:
             (N, A) actions in the units of the environment, and None.
         """
         return self._model.predict(observations.astype(np.float32), deterministic=False)[0], None
-
-    def observe(self, actions: Array, rewards: Float32Array) -> None:
-        """Do nothing: the learner does not learn from `rollout`."""
 
 
 def seed_all(*key: int) -> int:

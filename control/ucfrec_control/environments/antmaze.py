@@ -65,7 +65,7 @@ def antmaze_settings(env_id: str) -> Mapping[str, Any]:
 class GoalObservations(gymnasium.ObservationWrapper[Any, Any, Any]):
     """Flattens AntMaze's dictionary observations to the vectors (29,) of D4RL's datasets.
 
-    A vector holds the position (x, y) and then the rest of the ant's state. It leaves out the goal.
+    A vector holds the position (x, y) and then the rest of the ant's state. It excludes the goal.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:

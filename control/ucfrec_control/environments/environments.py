@@ -21,7 +21,7 @@ from ucfrec_control.environments.antmaze import (
 )
 
 SIDE_BY_SIDE = 50
-"""Largest number of episodes played at once; the policy chooses all their actions together."""
+"""Largest number of episodes rolled out at once; the policy chooses all their actions together."""
 _MOST_FRAMES = 1000
 """Largest number of simulated frames a step, which data of others states; MuJoCo's environments:
 5."""

@@ -9,13 +9,13 @@ import numpy as np
 import torch
 
 from ucfrec.arrays import Float64Array
-from ucfrec.counterfactual.augment import AugmentationReport, accept
 from ucfrec.counterfactual.generators import (
     CounterfactualStateGenerator,
     TangentGenerator,
     make_generator,
 )
 from ucfrec.counterfactual.reward_model import CausalRewardModel
+from ucfrec.counterfactual.state_augmentation import AugmentationReport, accept
 from ucfrec.counterfactual.transitions import sample_transitions
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay, Transitions
@@ -53,7 +53,7 @@ def store_of(run: Path) -> EpisodeStore:
     return without_columns(store, record.dropped_observations)
 
 
-def has_copies(run: Path) -> bool:
+def is_augmented(run: Path) -> bool:
     """Whether edited copies were made for a run."""
     return (run / _REPORT).exists() and read_augmentation(run / _REPORT).proposals > 0
 
@@ -162,7 +162,7 @@ def attention(run: Path, seed: int = 0) -> Float64Array:
     The mean over heads and over full windows of validation episodes; a row sums to one.
 
     Raises:
-        InputError: the learner is not UCF, no episode fills a window, or the store is gone.
+        InputError: the policy is not UCF, no episode fills a window, or the store is gone.
     """
     trained = TrainedPolicy.load(run)
     if not isinstance(trained.policy, UCFPolicy):
@@ -182,7 +182,7 @@ def attention(run: Path, seed: int = 0) -> Float64Array:
 
 
 def _augmentation(run: Path) -> AugmentationReport:
-    if not has_copies(run):
+    if not is_augmented(run):
         raise InputError(f"{run} has no edited copies; train it with augment.copies of 1 or more")
     return read_augmentation(run / _REPORT)
 

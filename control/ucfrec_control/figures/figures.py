@@ -22,8 +22,8 @@ from ucfrec_control.benchmark.methods import ROBUSTNESS, SCORES
 from ucfrec_control.benchmark.robustness import drops, loss_rises
 from ucfrec_control.data.trajectories import control_source
 from ucfrec_control.figures import diagnostics, plots
-from ucfrec_control.learners.evaluate import EVALUATE, method_of
-from ucfrec_control.learners.rl_baselines import RLRecord, read_run
+from ucfrec_control.training.evaluate import EVALUATE, method_of
+from ucfrec_control.training.rl_baselines import RLRecord, read_run
 
 LOWS = (0.0, 0.1, 0.2, 0.3, 0.4)
 HIGHS = (0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
@@ -167,10 +167,9 @@ def _distinguished(runs: Sequence[_Run]) -> list[_Run]:
 
 def _of_runs(runs: Sequence[_Run]) -> Iterator[_Plan]:
     for run in _first(runs, lambda run: (run.group, run.method)):
-        if diagnostics.has_copies(run.path):
-            yield _Plan("moves", run.name, partial(_moves, run))
-            yield _Plan("states", run.name, partial(_states, run))
-            yield _Plan("acceptance", run.name, partial(_acceptance, run))
+        if diagnostics.is_augmented(run.path):
+            for kind in ("moves", "states", "acceptance"):
+                yield _Plan(kind, run.name, partial(_of_copies, run, kind))
         if run.policy == "ucf":
             yield _Plan("attention", run.name, partial(_attention, run))
     for run in _first(runs, lambda run: run.group):
@@ -185,15 +184,12 @@ def _first(runs: Iterable[_Run], key: Callable[[_Run], Any]) -> Iterable[_Run]:
     return first.values()
 
 
-def _moves(run: _Run) -> Figure:
-    return plots.move_histogram(*diagnostics.move_histogram(run.path), run.title)
-
-
-def _states(run: _Run) -> Figure:
-    return plots.state_overlay(*diagnostics.edited_states(run.path), run.title)
-
-
-def _acceptance(run: _Run) -> Figure:
+def _of_copies(run: _Run, kind: str) -> Figure:
+    """A figure of the edited copies of a run."""
+    if kind == "states":
+        return plots.state_overlay(*diagnostics.edited_states(run.path), run.title)
+    if kind == "moves":
+        return plots.move_histogram(*diagnostics.move_histogram(run.path), run.title)
     band = diagnostics.move_histogram(run.path)[2]
     shares = diagnostics.acceptance_grid(run.path, LOWS, HIGHS)
     return plots.acceptance_heatmap(LOWS, HIGHS, shares, band, run.title)

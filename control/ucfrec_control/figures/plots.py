@@ -148,17 +148,17 @@ def lambda_curves(rows: Sequence[Row], title: str = "") -> Figure:
 
 @styled
 def return_curves(rows: Sequence[Row], title: str = "") -> Figure:
-    """Return earned over target return, a line a method: mean over seeds, lowest to highest around
-    it. On the dashed line, the target is earned.
+    """Return reached over target return, a line a method: mean over seeds, lowest to highest around
+    it. On the dashed line, the target is reached.
 
     Args:
         rows: lines (`ResultRow.as_line`) that differ in `method`, `target_return` and seed.
     """
     figure, axes = _figure(COLUMN, 2.5, title)
-    earned = _by_seed(rows, ("method", "target_return"), "return")
+    reached = _by_seed(rows, ("method", "target_return"), "return")
     for method, color in colors(sorted({row["method"] for row in rows})).items():
-        at = sorted(target for other, target in earned if other == method)
-        found = [earned[method, target] for target in at]
+        at = sorted(target for other, target in reached if other == method)
+        found = [reached[method, target] for target in at]
         means = [summary(values).mean for values in found]
         axes.plot(at, means, "o-", color=color, label=label(method))
         axes.fill_between(

@@ -38,7 +38,7 @@ def _stages(cell: Cell) -> dict[object, float]:
         found[log] = _REWARDS.get(task, _ELSE["rewards"])
     if cell.screening is not None:
         found[cell.store, SCREENING] = _SCREENING.get(task, 10.0)
-    if config.augment.makes_copies:
+    if config.augment.augments:
         settings = repr((config.crm, config.csg, config.augment))
         found[log, settings] = _AUGMENTATION.get(task, _ELSE["augmentation"])
     return found

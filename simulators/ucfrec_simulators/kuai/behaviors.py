@@ -1,6 +1,7 @@
-"""Built-in policies of the Kuaishou environments: two floors, and a ceiling."""
+"""Built-in policies of the Kuaishou environments (two baselines, an oracle), and simulators."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -10,17 +11,18 @@ from ucfrec.acting.rollout import Actor
 from ucfrec.acting.uniform import Memoryless, Uniform
 from ucfrec.arrays import BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec_simulators.kuai.environment import ExitRule, KuaiEnv
+from ucfrec.evaluation.simulator import Simulator
+from ucfrec_simulators.kuai.environment import EXITS, REGIMES, ExitRule, KuaiEnv
 
 MASK: Final = ExitRule(window=10, threshold=0, max_turn=100)
-"""Whose tags `random-mask` leaves out: those of the last ten items, in every environment."""
+"""Whose tags `random-mask` excludes: those of the last ten items, in every environment."""
 
 
 class RandomMask(Memoryless):
     """A uniformly random item without a tag of the last ten, and that is not masked.
 
-    If there is none, any item that is not masked. It knows no rewards: a floor for what a policy
-    earns by not repeating itself.
+    If there is none, any item that is not masked. It uses no rewards: a baseline for what not
+    repeating itself is worth.
     """
 
     def __init__(self, environment: KuaiEnv, seed: int) -> None:
@@ -41,7 +43,7 @@ class Oracle(Memoryless):
     """The item of highest true reward that is not masked and does not end the session.
 
     It reads the environment's rewards, which no recommender can. It is greedy and so not optimal:
-    it does not plan beyond the current step. If every item left ends the session, it plays the one
+    it does not plan beyond the current step. If every item left ends the session, it shows the one
     of highest reward.
     """
 
@@ -95,3 +97,41 @@ BEHAVIORS: Final[Mapping[str, Callable[[VectorEnv[Any, Any, Any], int], Actor]]]
     "oracle": oracle,
 }
 """Built-in policies of the Kuaishou environments."""
+
+
+def simulators(
+    make: Callable[..., KuaiEnv], own_exit: ExitRule, summary: str, feedback: str
+) -> tuple[Simulator, ...]:
+    """The published variants of an environment, for the command line.
+
+    Args:
+        make: makes the environment of so many sessions, from a folder, with an exit rule and a
+            regime.
+        own_exit: the environment's exit rule in EasyRL4Rec.
+        summary: what the environment is.
+        feedback: column of the reward in the logs.
+
+    Returns:
+        Regimes FB, NX_0 and NX_10 with `own_exit`, then FB and NX_0 with DORL's exit rules of four
+        items and of one item.
+    """
+    four, one = EXITS["dorl-main-explore"], EXITS["dorl-main"]
+    variants = [("FB", own_exit), ("NX_0", own_exit), ("NX_10", own_exit)]
+    variants += [("FB", four), ("NX_0", four), ("FB", one), ("NX_0", one)]
+    return tuple(
+        Simulator(
+            summary=f"{summary}; {_described(regime, exit_rule)}",
+            make=partial(make, exit_rule=exit_rule, regime=REGIMES[regime]),
+            behaviors=BEHAVIORS,
+            feedback=feedback,
+        )
+        for regime, exit_rule in variants
+    )
+
+
+def _described(regime: str, exit_rule: ExitRule) -> str:
+    """A regime, by its name, and an exit rule, in words."""
+    if REGIMES[regime].steps is not None:
+        return f"regime {regime}"
+    times = "a tag" if exit_rule.threshold == 0 else f"a tag shown {exit_rule.threshold + 1} times"
+    return f"regime {regime}; users leave at {times} among the {exit_rule.window} items before"

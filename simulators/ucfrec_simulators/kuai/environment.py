@@ -62,7 +62,7 @@ EXITS: Final = {
 
 @dataclass(frozen=True)
 class Regime:
-    """How an evaluation is played."""
+    """How an evaluation is run."""
 
     masked: bool
     """Whether an item may be recommended only once per session."""
@@ -89,7 +89,7 @@ class KuaiEnv(SessionsEnv):
     """One item per step to a user drawn uniformly; the reward is the table's entry.
 
     A session terminates in the step whose item triggers the `ExitRule`, and the reward of that step
-    counts. It is truncated at its maximum length. If the regime masks items, playing an item twice
+    counts. It is truncated at its maximum length. If the regime masks items, showing an item twice
     in a session is an error: `info["forbidden"]` (N, maximum length) lists the items already shown,
     padded with −1.
 
@@ -107,7 +107,7 @@ class KuaiEnv(SessionsEnv):
 
     Raises:
         InputError: tags or ids do not match the table, or there are fewer items than steps of a
-            masked session. In `step`: a masked item was played.
+            masked session. In `step`: a masked item was shown.
     """
 
     def __init__(
@@ -231,11 +231,3 @@ def _coded(tags: Sequence[Sequence[int]]) -> tuple[IntArray, int]:
     codes = np.full((len(tags), lengths.max()), len(known), dtype=np.int64)
     codes[np.arange(codes.shape[1]) < lengths[:, None]] = numbers
     return codes, len(known)
-
-
-def said(regime: str, exit_rule: ExitRule) -> str:
-    """What the command line says of an environment's regime, by its name, and of its exit rule."""
-    if REGIMES[regime].steps is not None:
-        return f"regime {regime}"
-    times = "a tag" if exit_rule.threshold == 0 else f"a tag shown {exit_rule.threshold + 1} times"
-    return f"regime {regime}; users leave at {times} among the {exit_rule.window} items before"

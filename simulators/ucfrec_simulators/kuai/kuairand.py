@@ -7,7 +7,6 @@ from a store of that window.
 import argparse
 import sys
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -18,9 +17,8 @@ from ucfrec import schema
 from ucfrec.arrays import Float32Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators.folders import data_folder
-from ucfrec_simulators.kuai.behaviors import BEHAVIORS
+from ucfrec_simulators.kuai.behaviors import simulators
 from ucfrec_simulators.kuai.completion import ITEMS_FILE, USERS_FILE, Completed, complete
 from ucfrec_simulators.kuai.environment import (
     EXITS,
@@ -28,7 +26,6 @@ from ucfrec_simulators.kuai.environment import (
     ExitRule,
     KuaiEnv,
     Regime,
-    said,
 )
 from ucfrec_simulators.kuai.kuairec import parse_tags, read_columns
 
@@ -87,23 +84,17 @@ def read_tags(path: Path) -> dict[int, tuple[int, ...]]:
     return {video: parse_tags(text) for video, text in zip(table["video_id"], tags, strict=True)}
 
 
-def simulator(regime: str, exit_rule: ExitRule = EXITS["easyrl4rec-kuairand"]) -> Simulator:
-    """The environment under one of `REGIMES` and an exit rule, for the command line."""
-    return Simulator(
-        summary=f"KuaiRand's videos, completed click rates; {said(regime, exit_rule)}",
-        make=partial(kuairand, exit_rule=exit_rule, regime=REGIMES[regime]),
-        behaviors=BEHAVIORS,
-        feedback="is_click",
-    )
-
-
-SIMULATOR: Final = simulator("FB")
-SIMULATOR_NX_0: Final = simulator("NX_0")
-SIMULATOR_NX_10: Final = simulator("NX_10")
-SIMULATOR_N4: Final = simulator("FB", EXITS["dorl-main-explore"])
-SIMULATOR_N4_NX_0: Final = simulator("NX_0", EXITS["dorl-main-explore"])
-SIMULATOR_N1: Final = simulator("FB", EXITS["dorl-main"])
-SIMULATOR_N1_NX_0: Final = simulator("NX_0", EXITS["dorl-main"])
+(
+    SIMULATOR,
+    SIMULATOR_NX_0,
+    SIMULATOR_NX_10,
+    SIMULATOR_N4,
+    SIMULATOR_N4_NX_0,
+    SIMULATOR_N1,
+    SIMULATOR_N1_NX_0,
+) = simulators(
+    kuairand, EXITS["easyrl4rec-kuairand"], "KuaiRand's videos, completed click rates", "is_click"
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

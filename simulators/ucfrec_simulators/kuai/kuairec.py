@@ -1,7 +1,6 @@
 """The KuaiRec environment: the nearly fully observed users × videos of `small_matrix`."""
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -9,16 +8,14 @@ import numpy as np
 import pandas as pd
 
 from ucfrec.errors import InputError
-from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators.folders import data_folder
-from ucfrec_simulators.kuai.behaviors import BEHAVIORS
+from ucfrec_simulators.kuai.behaviors import simulators
 from ucfrec_simulators.kuai.environment import (
     EXITS,
     REGIMES,
     ExitRule,
     KuaiEnv,
     Regime,
-    said,
 )
 
 REWARD_CAP: Final = 5.0
@@ -97,20 +94,17 @@ def parse_tags(text: str) -> tuple[int, ...]:
     return tuple(int(tag) for tag in text.split(",") if tag.strip())
 
 
-def simulator(regime: str, exit_rule: ExitRule = EXITS["easyrl4rec-kuairec"]) -> Simulator:
-    """The environment under one of `REGIMES` and an exit rule, for the command line."""
-    return Simulator(
-        summary=f"KuaiRec's fully observed videos, watch ratio; {said(regime, exit_rule)}",
-        make=partial(kuairec, exit_rule=exit_rule, regime=REGIMES[regime]),
-        behaviors=BEHAVIORS,
-        feedback="watch_ratio",
-    )
-
-
-SIMULATOR: Final = simulator("FB")
-SIMULATOR_NX_0: Final = simulator("NX_0")
-SIMULATOR_NX_10: Final = simulator("NX_10")
-SIMULATOR_N4: Final = simulator("FB", EXITS["dorl-main-explore"])
-SIMULATOR_N4_NX_0: Final = simulator("NX_0", EXITS["dorl-main-explore"])
-SIMULATOR_N1: Final = simulator("FB", EXITS["dorl-main"])
-SIMULATOR_N1_NX_0: Final = simulator("NX_0", EXITS["dorl-main"])
+(
+    SIMULATOR,
+    SIMULATOR_NX_0,
+    SIMULATOR_NX_10,
+    SIMULATOR_N4,
+    SIMULATOR_N4_NX_0,
+    SIMULATOR_N1,
+    SIMULATOR_N1_NX_0,
+) = simulators(
+    kuairec,
+    EXITS["easyrl4rec-kuairec"],
+    "KuaiRec's fully observed videos, watch ratio",
+    "watch_ratio",
+)

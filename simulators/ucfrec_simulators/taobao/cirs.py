@@ -7,7 +7,6 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
-from ucfrec.acting.uniform import Uniform
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators.folders import data_folder
@@ -17,8 +16,6 @@ from ucfrec_simulators.taobao.environment import (
     MAX_CLICKS,
     PAGE_INDICES,
     USER_BITS,
-    best_constant_actor,
-    zero_actor,
 )
 from ucfrec_simulators.taobao.virtual import VirtualTaobao, mixture
 
@@ -83,12 +80,6 @@ class CirsTaobao(VirtualTaobao):
 SIMULATOR: Final = Simulator(
     summary="VirtualTB-v0 with the exit rule of CIRS: similarly ranked pages end the session",
     make=lambda num_envs, folder: CirsTaobao(folder or data_folder("virtualtaobao"), num_envs),
-    behaviors={
-        "random": Uniform,
-        "zero": zero_actor,
-        "best-constant": best_constant_actor,
-        "mixture": mixture,
-        **ddpg.BEHAVIORS,
-    },
+    behaviors={**ddpg.COMMON, "mixture": mixture},
     feedback="clicks",
 )

@@ -1,8 +1,8 @@
-"""DDPG behavior policies in the Taobao environments: a learner in training, its snapshots, the
+"""DDPG behavior policies in the Taobao environments: one that is being trained, its snapshots, the
 last one.
 
 Stable-Baselines3 (extra `collect`) provides the networks, the replay buffer and the update. The
-sessions are played by `ucfrec.acting.rollout`, so that the steps learned from are those logged.
+sessions are run by `ucfrec.acting.rollout`, so that the steps learned from are those logged.
 """
 
 import hashlib
@@ -20,14 +20,21 @@ from gymnasium.vector import VectorEnv
 from torch import nn
 
 from ucfrec.acting.rollout import Actor, Step, rollout
-from ucfrec.acting.uniform import Memoryless
+from ucfrec.acting.uniform import Memoryless, Uniform
 from ucfrec.arrays import BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.provenance import versions
 from ucfrec_simulators.behaviors import Actions, SessionMixture, truncated_normal
-from ucfrec_simulators.taobao.environment import ACTION_DIM, MAX_CLICKS, TaobaoEnv, taobao
+from ucfrec_simulators.taobao.environment import (
+    ACTION_DIM,
+    MAX_CLICKS,
+    TaobaoEnv,
+    best_constant_actor,
+    taobao,
+    zero_actor,
+)
 
 
 @dataclass(frozen=True)
@@ -72,8 +79,8 @@ class Noisy(Memoryless):
         return truncated_normal(mean, self._noise, self._generator)
 
 
-class Learner:
-    """DDPG (Lillicrap et al., 2016) as an actor that learns from every step played.
+class Training:
+    """DDPG (Lillicrap et al., 2016) as an actor that learns from every step taken.
 
     After a uniform warm-up, it serves all N sessions with its current network and noise; the
     propensity is the density of the action. It learns from the live rows only, which are those that
@@ -95,7 +102,7 @@ class Learner:
         self._generator = np.random.default_rng([seed, 51])
         self._model = _sb3_model(env, seed, config)
         self._ended = np.zeros(env.num_envs, dtype=np.bool_)
-        self._played: _Played | None = None
+        self._taken: _Taken | None = None
         self._steps, self._due = 0, 0.0
 
     @property
@@ -115,8 +122,8 @@ class Learner:
             Actions (N, A) and their densities (N,).
         """
         scaled = observations / self._high
-        if self._played is not None:
-            self._learn(self._played, scaled)
+        if self._taken is not None:
+            self._learn(self._taken, scaled)
         self._ended[:] = False
         if self._steps < self._config.warm_up:
             box = (len(observations), ACTION_DIM)
@@ -125,22 +132,22 @@ class Learner:
         else:
             mean = _forward(self.network, scaled)
             actions, density = truncated_normal(mean, self._config.noise, self._generator)
-        self._played = _Played(scaled, np.flatnonzero(live))
+        self._taken = _Taken(scaled, np.flatnonzero(live))
         return actions, density
 
     def observe(self, actions: Actions, rewards: Float32Array) -> None:
         """Keep the step until its next observations are known."""
-        assert self._played is not None
-        self._played.actions, self._played.rewards = actions, rewards / np.float32(MAX_CLICKS)
+        assert self._taken is not None
+        self._taken.actions, self._taken.rewards = actions, rewards / np.float32(MAX_CLICKS)
 
-    def _learn(self, played: "_Played", next_observations: Float32Array) -> None:
-        buffer, rows, config = self._model.replay_buffer, played.rows, self._config
+    def _learn(self, taken: "_Taken", next_observations: Float32Array) -> None:
+        buffer, rows, config = self._model.replay_buffer, taken.rows, self._config
         # `ReplayBuffer.add` takes steps of all N sessions; only the M live ones may enter.
         slots = (buffer.pos + np.arange(len(rows))) % buffer.buffer_size
-        buffer.observations[slots, 0] = played.observations[rows]
+        buffer.observations[slots, 0] = taken.observations[rows]
         buffer.next_observations[slots, 0] = next_observations[rows]
-        buffer.actions[slots, 0] = played.actions[rows]
-        buffer.rewards[slots, 0] = played.rewards[rows]
+        buffer.actions[slots, 0] = taken.actions[rows]
+        buffer.rewards[slots, 0] = taken.rewards[rows]
         buffer.dones[slots, 0] = self._ended[rows]
         buffer.full |= buffer.pos + len(rows) >= buffer.buffer_size
         buffer.pos = (buffer.pos + len(rows)) % buffer.buffer_size
@@ -153,7 +160,7 @@ class Learner:
 
 
 @dataclass
-class _Played:
+class _Taken:
     """A step whose next observations are not known yet."""
 
     observations: Float32Array
@@ -165,7 +172,7 @@ class _Played:
 
 
 class _Spaces(gymnasium.Env[Float32Array, Actions]):
-    """The spaces that Stable-Baselines3 needs; the sessions themselves are played by `rollout`."""
+    """The spaces that Stable-Baselines3 needs; the sessions themselves are run by `rollout`."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
         self.observation_space = gymnasium.spaces.Box(-1, 1, env.single_observation_space.shape)
@@ -252,7 +259,7 @@ def snapshots(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig) -> l
 def _train(
     env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig
 ) -> list[dict[str, torch.Tensor]]:
-    learner = Learner(env, seed, config)
+    ongoing = Training(env, seed, config)
     taken: list[dict[str, torch.Tensor]] = []
     ended = 0
 
@@ -260,11 +267,11 @@ def _train(
         nonlocal ended
         ended += int((step.terminated | step.truncated).sum())
         while ended * config.snapshots >= (len(taken) + 1) * config.sessions:
-            taken.append({k: v.clone() for k, v in learner.network.state_dict().items()})
+            taken.append({k: v.clone() for k, v in ongoing.network.state_dict().items()})
 
     # A separate random stream, so that no logged session is a training session.
     users_seed = int(np.random.SeedSequence([seed, 52]).generate_state(1)[0])
-    rollout(env, learner, config.sessions, users_seed, watch, describe="train DDPG")
+    rollout(env, ongoing, config.sessions, users_seed, watch, describe="train DDPG")
     return taken
 
 
@@ -282,9 +289,9 @@ def _fingerprint(environment: TaobaoEnv, seed: int, config: DdpgConfig) -> str:
     return hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:16]
 
 
-def training(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig = DEFAULT) -> Learner:
-    """A learner from its first step on: the logged sessions are its training sessions."""
-    return Learner(env, seed, config)
+def training(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig = DEFAULT) -> Training:
+    """A training from its first step on: the logged sessions are its training sessions."""
+    return Training(env, seed, config)
 
 
 def snapshot_mixture(
@@ -305,5 +312,12 @@ BEHAVIORS: Final[Mapping[str, Callable[[VectorEnv[Any, Any, Any], int], Actor]]]
     "ddpg-training": training,
     "ddpg-snapshots": snapshot_mixture,
     "ddpg-expert": expert,
+}
+"""Behavior policies by DDPG."""
+COMMON: Final[Mapping[str, Callable[[VectorEnv[Any, Any, Any], int], Actor]]] = {
+    "random": Uniform,
+    "zero": zero_actor,
+    "best-constant": best_constant_actor,
+    **BEHAVIORS,
 }
 """Behavior policies of every Taobao environment."""

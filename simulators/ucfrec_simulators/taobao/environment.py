@@ -113,15 +113,7 @@ def default_action() -> Float32Array:
     return np.random.default_rng([0, 11]).uniform(-1, 1, ACTION_DIM).astype(np.float32)
 
 
-def best_constant(
-    env: TaobaoEnv,
-    seed: int,
-    restarts: int = 16,
-    pages: int = 64,
-    candidates: int = 160,
-    elite: int = 16,
-    rounds: int = 15,
-) -> Float32Array:
+def best_constant(env: TaobaoEnv, seed: int) -> Float32Array:
     """The constant action vector (27,) with the highest expected clicks over all users' pages.
 
     The best result of several cross-entropy searches, since one may end in a local optimum. It uses
@@ -131,12 +123,10 @@ def best_constant(
     Args:
         env: the environment.
         seed: seed of the search.
-        restarts: number of searches.
-        pages: pages, drawn again in every round, on which actions are scored.
-        candidates: actions drawn per round.
-        elite: best actions of a round, which give the mean and spread of the next round's draws.
-        rounds: rounds of a search.
     """
+    restarts, rounds = 16, 15
+    # A round scores 160 actions on 64 new pages; the best 16 give the next mean and spread.
+    pages, candidates, elite = 64, 160, 16
     generator = np.random.default_rng([seed, 12])
     users, lengths = env.sample_users(40 * pages, generator)
     owner = np.repeat(np.arange(len(users)), lengths)
@@ -164,7 +154,7 @@ def best_constant(
 
 
 def zero_actor(env: VectorEnv[Any, Any, Any], seed: int) -> Constant:
-    """A policy that always plays the zero action; `seed` is unused."""
+    """A policy that always takes the zero action; `seed` is unused."""
     return Constant(np.zeros(ACTION_DIM, dtype=np.float32))
 
 

@@ -20,11 +20,9 @@ from ucfrec_simulators.taobao.environment import (
     PAGE_INDICES,
     USER_BITS,
     TaobaoEnv,
-    best_constant_actor,
     default_action,
     split_observations,
     taobao,
-    zero_actor,
 )
 
 BEST_CLICK_PROBABILITY: Final = 0.9
@@ -39,7 +37,7 @@ class SyntheticTaobao(TaobaoEnv):
     taste b common to all users, a taste W_g for each of the eleven attributes g, and a drift d.
     Each of a page's ten items is clicked with probability p = 0.9 / (1 + ‖a − a*‖² / (27 · 0.1))²,
     so clicks are Binomial(10, p), p is largest at a* only, and a* lies inside the box. Always
-    playing a* is optimal, since actions do not affect the session's length. Lengths are log-normal
+    taking a* is optimal, since actions do not affect the session's length. Lengths are log-normal
     with a median that depends on the attributes, rounded up, at most 100. The page index is uniform
     noise.
 
@@ -110,7 +108,7 @@ QUALITIES: Final = ((0.1, 0.2, 0.25), (0.4, 0.2, 0.25), (0.7, 0.2, 0.20), (0.95,
 
 
 def optimal(env: VectorEnv[Any, Any, Any], seed: int) -> Rule:
-    """The optimal policy, which always plays a*; `seed` is unused."""
+    """The optimal policy, which always takes a*; `seed` is unused."""
     environment = taobao(env)
     assert isinstance(environment, SyntheticTaobao)
     return Rule(environment.optimal_actions)
@@ -136,13 +134,6 @@ def _make(num_envs: int, folder: Path | None) -> SyntheticTaobao:
 SIMULATOR: Final = Simulator(
     summary="built-in users with a known best action: 27 ranking weights per page, 0-10 clicks",
     make=_make,
-    behaviors={
-        "random": Uniform,
-        "zero": zero_actor,
-        "best-constant": best_constant_actor,
-        "mixture": mixture,
-        "optimal": optimal,
-        **ddpg.BEHAVIORS,
-    },
+    behaviors={**ddpg.COMMON, "mixture": mixture, "optimal": optimal},
     feedback="clicks",
 )

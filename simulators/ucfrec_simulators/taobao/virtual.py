@@ -27,7 +27,6 @@ from ucfrec_simulators.taobao.environment import (
     TaobaoEnv,
     best_constant_actor,
     default_action,
-    zero_actor,
 )
 
 SOURCE: Final = "https://github.com/eyounx/VirtualTaobao (virtualTB/data)"
@@ -88,7 +87,7 @@ class VirtualTaobao(TaobaoEnv):
                 axis=1,
             )
             lengths = _weights(self._leave_model(torch.from_numpy(users)))
-        # The original checks for the end after a page, so a drawn length of 0 plays one page.
+        # The original checks for the end after a page, so a drawn length of 0 gives one page.
         return users, np.maximum(draw_categories(lengths, generator.random(count)), 1)
 
     def expected_clicks(
@@ -165,12 +164,6 @@ def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
 SIMULATOR: Final = Simulator(
     summary="VirtualTB-v0 from its published networks: 27 ranking weights per page, 0-10 clicks",
     make=lambda num_envs, folder: VirtualTaobao(folder or data_folder("virtualtaobao"), num_envs),
-    behaviors={
-        "random": Uniform,
-        "zero": zero_actor,
-        "best-constant": best_constant_actor,
-        "mixture": mixture,
-        **ddpg.BEHAVIORS,
-    },
+    behaviors={**ddpg.COMMON, "mixture": mixture},
     feedback="clicks",
 )

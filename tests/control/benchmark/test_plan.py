@@ -31,9 +31,9 @@ from ucfrec_control.benchmark.plan import score_cells
 from ucfrec_control.benchmark.rates import settings_of
 from ucfrec_control.data.distractor import zoo_store
 from ucfrec_control.environments.scores import find_kind, require_task
-from ucfrec_control.learners.evaluate import load_run
-from ucfrec_control.learners.presets import find_preset
-from ucfrec_control.learners.rl_baselines import ALGORITHMS
+from ucfrec_control.training.evaluate import load_run
+from ucfrec_control.training.rl_baselines import ALGORITHMS
+from ucfrec_control.training.train import find_preset
 
 
 def resolved(table: str, budget: Budget, file: str) -> dict[str, Config]:

@@ -23,7 +23,7 @@ from ucfrec_control.benchmark.rates import (
     write_rates,
 )
 from ucfrec_control.cli import main
-from ucfrec_control.learners.rl_baselines import ALGORITHMS
+from ucfrec_control.training.rl_baselines import ALGORITHMS
 
 SHORT = ("train.steps=4", "train.validate_every=2")
 

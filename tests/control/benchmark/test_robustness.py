@@ -24,8 +24,8 @@ from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.distractor import DISTRACTORS, add_distractor
 from ucfrec_control.figures.figures import make_figures
-from ucfrec_control.learners.evaluate import evaluate_run
-from ucfrec_control.learners.train import train_control
+from ucfrec_control.training.evaluate import evaluate_run
+from ucfrec_control.training.train import train_control
 
 TINY = ("train.steps=4", "train.validate_every=2", "policy.dim=16", "policy.context=5")
 FILE = "hopper_medium-made"

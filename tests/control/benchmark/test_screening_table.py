@@ -26,7 +26,7 @@ from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.distractor import add_distractor
 from ucfrec_control.figures.diagnostics import store_of
-from ucfrec_control.learners.train import train_control
+from ucfrec_control.training.train import train_control
 
 QUICKEST = ScreeningConfig(
     hidden=8,

@@ -18,7 +18,7 @@ from ucfrec_control.cli import main
 from ucfrec_control.data import collect as module
 from ucfrec_control.data.collect import CollectConfig, collect
 from ucfrec_control.data.d4rl import read_d4rl
-from ucfrec_control.data.sac import SacConfig, SacLearner
+from ucfrec_control.data.sac import SacConfig, SacTraining
 from ucfrec_control.data.trajectories import Trajectories
 from ucfrec_control.environments.scores import find_kind
 
@@ -53,9 +53,9 @@ def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_medium_is_the_first_policy_past_the_threshold(collected: Path) -> None:
     said = json.loads((collected / "MANIFEST.json").read_text())
-    learner = SacLearner(module.make_env(ENV, 1), 3, 10, CONFIG.sac)
+    sac = SacTraining(module.make_env(ENV, 1), 3, 10, CONFIG.sac)
     files = sorted((collected / "training").glob("policy-*.safetensors"))
-    about = [learner.load_policy(file) for file in files]
+    about = [sac.load_policy(file) for file in files]
     assert said["expert_return"] == max(row["return"] for row in about)
     threshold = 0.5 * (said["random_return"] + said["expert_return"])
     before = [row["return"] for row in about if row["steps"] < said["medium_steps"]]
@@ -117,11 +117,11 @@ def test_files_say_what_they_are(collected: Path) -> None:
 
 
 def test_an_episode_cut_by_the_step_limit_is_a_timeout() -> None:
-    learner = SacLearner(module.make_env("Pendulum-v1", 1), 0, 1000, SacConfig())
+    sac = SacTraining(module.make_env("Pendulum-v1", 1), 0, 1000, SacConfig())
     with progress(None, "play", "steps") as bar:
         for _ in range(2):
-            learner.play_episode(bar)
-    replay = learner.replay(learner.steps)
+            sac.run_episode(bar)
+    replay = sac.replay(sac.steps)
     assert np.flatnonzero(replay["timeouts"]).tolist() == [199, 399]
     assert not replay["terminals"].any()
     assert 1.9 < np.abs(replay["actions"]).max() <= 2
@@ -141,7 +141,7 @@ def test_the_threshold_lies_between_random_and_expert_also_below_zero(fraction: 
     medium, expert = module._choose(rows, -1250.0, fraction)
     assert expert == 4
     assert [(value + 1250) / 1050 >= fraction for value in returns].index(True) == medium
-    with pytest.raises(InputError, match=r"random play -100\.0; train for more"):
+    with pytest.raises(InputError, match=r"random actions -100\.0; train for more"):
         module._choose(rows, -100.0, fraction)
 
 

@@ -26,7 +26,7 @@ from ucfrec_control.data.minari import read_minari
 from ucfrec_control.environments.antmaze import antmaze_settings
 from ucfrec_control.environments.environments import make_env, mismatches
 from ucfrec_control.environments.scores import find_kind, require_task
-from ucfrec_control.learners.evaluate import load_run, open_environment
+from ucfrec_control.training.evaluate import load_run, open_environment
 
 needs_robotics = pytest.mark.skipif(
     find_spec("gymnasium_robotics") is None, reason="the extra antmaze is not installed"

@@ -7,15 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode
 from torch.nn import functional as F
 
 from tests.support.real_data import data_folder
 from ucfrec.acting.rollout import Episodes, rollout
 from ucfrec.arrays import Float32Array
 from ucfrec.errors import InputError
-from ucfrec_simulators.session_env import SingleSession
 from ucfrec_simulators.taobao import environment
 from ucfrec_simulators.taobao.environment import TaobaoEnv, best_constant
 from ucfrec_simulators.taobao.virtual import SIMULATOR, VirtualTaobao
@@ -184,24 +181,6 @@ def test_the_mixture_is_mediocre_and_varied(folder: Path) -> None:
     assert np.quantile(rates, 0.95) > 2.5
 
 
-def test_same_seed_same_numbers_and_another_differs(
-    folder: Path, searches: dict[int, Float32Array]
-) -> None:
-    first, other = (played(folder, "mixture", 80, seed) for seed in (4, 5))
-    searches.clear()
-    again = played(folder, "mixture", 80, 4)
-    np.testing.assert_array_equal(first.returns, again.returns)
-    assert not np.array_equal(first.returns, other.returns)
-
-
-def test_gymnasium_accepts_it(folder: Path) -> None:
-    env = VirtualTaobao(folder, num_envs=3)
-    assert env.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
-    assert env.action_space.shape == (3, 27)
-    assert env.single_observation_space.shape == (91,)
-    check_env(SingleSession(VirtualTaobao(folder)), skip_render_check=True)
-
-
 def test_missing_or_broken_networks_are_named(folder: Path, tmp_path: Path) -> None:
     for name in ("generator_model.pt", "leave_model.pt", "action_model.pt"):
         shutil.copyfile(folder / name, tmp_path / name)
@@ -216,12 +195,3 @@ def test_missing_or_broken_networks_are_named(folder: Path, tmp_path: Path) -> N
     action.unlink()
     with pytest.raises(InputError, match=r"action_model\.pt is missing; put the file"):
         VirtualTaobao(tmp_path)
-
-
-def test_bad_actions_are_refused(folder: Path) -> None:
-    env = VirtualTaobao(folder, num_envs=2)
-    env.reset(seed=0)
-    with pytest.raises(InputError, match="shape"):
-        env.step(np.zeros((2, 26), dtype=np.float32))
-    with pytest.raises(InputError, match="finite"):
-        env.step(np.full((2, 27), np.nan, dtype=np.float32))

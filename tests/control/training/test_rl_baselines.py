@@ -25,10 +25,10 @@ from ucfrec_control.benchmark.plan import rate_cells, score_cells
 from ucfrec_control.benchmark.rates import best_rates
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
-from ucfrec_control.learners import rl_baselines
-from ucfrec_control.learners.evaluate import evaluate_run
-from ucfrec_control.learners.rl_baselines import RLConfig, RLRecord, rl_config, train_rl
-from ucfrec_control.learners.train import dataset_of
+from ucfrec_control.training import rl_baselines
+from ucfrec_control.training.evaluate import evaluate_run
+from ucfrec_control.training.rl_baselines import RLConfig, RLRecord, rl_config, train_rl
+from ucfrec_control.training.train import dataset_of
 
 pytest.importorskip("d3rlpy", reason="the extra rl is not installed")
 from d3rlpy.algos.qlearning.torch.cql_impl import CQLImpl
@@ -102,7 +102,7 @@ def test_equal_seeds_train_equal_actors_that_are_judged_as_others_are(
 
 def learner_of(task: str, kind: str, algorithm: str = "cql", **settings: float) -> Any:
     with random_state_kept():
-        learner = rl_baselines._learner(RLConfig(algorithm, 10, task, kind, **settings))
+        learner = rl_baselines._algorithm(RLConfig(algorithm, 10, task, kind, **settings))
         learner.create_impl((29,), 8)
     return learner
 

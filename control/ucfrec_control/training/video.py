@@ -17,7 +17,7 @@ from matplotlib.image import imsave
 from ucfrec.acting.rollout import rollout
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file, atomic_folder
-from ucfrec_control.learners.evaluate import environment_of, load_run, open_environment, rules_of
+from ucfrec_control.training.evaluate import environment_of, load_run, open_environment, rules_of
 
 Frame = npt.NDArray[np.uint8]
 """(height, width, 3)."""
@@ -36,7 +36,8 @@ def record_episode(
     target: float | None,
     distractor: float = 0.0,
 ) -> float:
-    """Play one episode, with the initial state of the first of `evaluate_run`, and keep its frames.
+    """Roll out one episode, with the initial state of the first of `evaluate_run`, and keep its
+    frames.
 
     Args:
         run: a run folder on a control store.
@@ -44,7 +45,7 @@ def record_episode(
             It is written when the episode has ended.
         seed: seed of the environment.
         checkpoint: "last" or "best".
-        env_id: environment to play; None for that of the data.
+        env_id: environment to act in; None for that of the data.
         target: target return; None for the preset's first.
         distractor: value that every distractor is fixed to.
 
@@ -72,10 +73,10 @@ def record_episode(
                 trained, environment, 1, [recorder], distractor=distractor, render_mode="rgb_array"
             )
         try:
-            played = rollout(env, trained.actor(1, rule), 1, seed, describe="record episode")
+            rolled_out = rollout(env, trained.actor(1, rule), 1, seed, describe="record episode")
         finally:
             env.close()
-    return float(played.returns[0])
+    return float(rolled_out.returns[0])
 
 
 class _Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):

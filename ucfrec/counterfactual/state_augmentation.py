@@ -5,6 +5,7 @@ only the edited states (paper appendix H).
 """
 
 import copy
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple
@@ -15,9 +16,8 @@ from pydantic import Field
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.arrays import BoolArray, Float32Array, IntArray
-from ucfrec.counterfactual.action_copies import ActionReport
-from ucfrec.counterfactual.edit_statistics import MoveReport, MoveStatistics
+from ucfrec.arrays import BoolArray, Float32Array, Float64Array, IntArray
+from ucfrec.counterfactual.action_augmentation import ActionReport
 from ucfrec.counterfactual.generators import Generator
 from ucfrec.counterfactual.reward_model import CausalRewardModel
 from ucfrec.counterfactual.reward_model_fit import CRMReport, fit_warning
@@ -29,6 +29,8 @@ from ucfrec.settings import Count, Quantile, settings_table
 _CHUNK = 8192
 _DELTA_LEVEL = "0.95"
 _ROUNDING = 1e-9
+_QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+_BINS = 20
 
 
 @settings_table("augment")
@@ -43,13 +45,13 @@ class AugmentConfig:
     copies: Annotated[int, Field(ge=0, le=1000)] = 1
     """Maximum number of edited copies of each episode, whose states differ; 0 for none."""
     actions: Annotated[int, Field(ge=0, le=1000)] = 0
-    """Number of other actions to ask about at each step: a copy of the episode up to this step ends
-    with the other action and the reward that it would have earned, where the reward model can tell.
+    """Number of other actions to propose at each step: a copy of the episode up to this step ends
+    with the other action and its counterfactual reward, where the reward model is accurate enough.
     With neither actions nor copies, no reward model is fitted."""
     edits_per_copy: Annotated[int, Field(ge=0, le=1_000_000)] = 0
     """Maximum number of edited steps in a copy; 0 means no limit."""
     reward_quantile: Quantile = 0.3
-    """Steps with a reward below this quantile are neither edited nor asked about."""
+    """Steps with a reward below this quantile are neither edited nor given other actions."""
     epsilon_r: Annotated[float, Field(ge=0, le=1e15)] | None = None
     """ε_r, tolerance of the reward gate in reward units; unset, 0.1 × standard deviation of the
     rewards."""
@@ -57,13 +59,83 @@ class AugmentConfig:
     """Maximum number of steps to propose edits for; from a larger store, episodes are sampled."""
 
     @property
-    def makes_copies(self) -> bool:
+    def augments(self) -> bool:
         """Whether there are copies of any kind."""
         return self.copies > 0 or self.actions > 0
 
     def tolerance(self, crm: CausalRewardModel) -> float:
         """ε_r, in reward units."""
         return 0.1 * float(crm.reward_std) if self.epsilon_r is None else self.epsilon_r
+
+
+@dataclass(frozen=True)
+class MoveReport:
+    """Moves Δ = (s_c − s) / σ_s of the accepted edits (paper appendix I.2)."""
+
+    edits: int
+    """Number of accepted edits."""
+    length_quantiles: dict[str, float]
+    """Quantiles of ‖Δ‖₂ by level; empty without edits."""
+    histogram_edges: tuple[float, ...]
+    """Edges of the bins of ‖Δ‖₂, from 0 to ρ_high."""
+    histogram_counts: tuple[int, ...]
+    """Number of edits in each bin."""
+    mean_move_ratio: float
+    """‖mean Δ‖ / mean ‖Δ‖: 1 if all edits are the same shift, near 0 if they are varied."""
+    effective_rank: float
+    """exp of the entropy of the spectrum of E[ΔΔᵀ]: effective number of directions of the moves."""
+    dimensions: int
+    """Number of state dimensions that vary in the training data; bounds the effective rank."""
+
+
+class MoveStatistics:
+    """Accumulates statistics of moves chunk by chunk, without keeping the moves."""
+
+    def __init__(self, size: int) -> None:
+        """
+        Args:
+            size: S, dimensions of a move.
+        """
+        self._total = torch.zeros(size, dtype=torch.float64)
+        self._moments = torch.zeros(size, size, dtype=torch.float64)
+        self._lengths: list[Tensor] = []
+
+    def add(self, moves: Tensor) -> None:
+        """Add the moves Δ (M, S) of M accepted edits."""
+        moves = moves.double()
+        self._total += moves.sum(dim=0)
+        self._moments += moves.T @ moves
+        self._lengths.append(moves.norm(dim=1))
+
+    def report(self, rho_high: float, dimensions: int) -> MoveReport:
+        """Summarise the moves added so far; if none has a length, ratio is NaN and rank 0.
+
+        Args:
+            rho_high: upper end of the histogram of lengths.
+            dimensions: number of state dimensions that vary.
+        """
+        lengths = torch.cat([torch.zeros(0, dtype=torch.float64), *self._lengths]).numpy()
+        counts, edges = np.histogram(lengths, bins=_BINS, range=(0.0, rho_high))
+        moved = bool(lengths.sum() > 0)
+        return MoveReport(
+            edits=len(lengths),
+            length_quantiles=_length_quantiles(lengths) if len(lengths) else {},
+            histogram_edges=tuple(edges.tolist()),
+            histogram_counts=tuple(counts.tolist()),
+            mean_move_ratio=float(self._total.norm()) / lengths.sum() if moved else math.nan,
+            effective_rank=_effective_rank(self._moments) if moved else 0.0,
+            dimensions=dimensions,
+        )
+
+
+def _length_quantiles(values: Float64Array) -> dict[str, float]:
+    return {f"{level:g}": float(np.quantile(values, level)) for level in _QUANTILES}
+
+
+def _effective_rank(moments: Tensor) -> float:
+    spectrum = torch.linalg.eigvalsh(moments).clamp(min=0)
+    share = spectrum / spectrum.sum()
+    return float(torch.exp(-torch.special.xlogy(share, share).sum()))
 
 
 @dataclass(frozen=True)
@@ -92,7 +164,7 @@ class AugmentationReport:
     reward_model: CRMReport
     """Quality of the reward model."""
     actions: ActionReport | None = None
-    """Action copies; None if no other action was asked about."""
+    """Action copies; None if no other action was proposed."""
 
 
 def accept(

@@ -18,15 +18,15 @@ from torch import Tensor
 from tests.support.planted import ACTION, CONSTANT, STATE, STEPS, fitted, planted
 from tests.support.planted import planted_store as store
 from ucfrec import schema
-from ucfrec.counterfactual.augment import (
+from ucfrec.counterfactual.generators import CSGConfig, Generator, make_generator
+from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig
+from ucfrec.counterfactual.state_augmentation import (
     AugmentationReport,
     AugmentConfig,
+    MoveStatistics,
     accept,
     augment,
 )
-from ucfrec.counterfactual.edit_statistics import MoveStatistics
-from ucfrec.counterfactual.generators import CSGConfig, Generator, make_generator
-from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig
 from ucfrec.episodes.windows import Overlay, Transitions
 from ucfrec.errors import InputError
 

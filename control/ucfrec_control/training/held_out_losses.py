@@ -17,7 +17,7 @@ _BATCHES, _BATCH = 8, 512
 def held_out_losses(trained: TrainedPolicy, store: EpisodeStore) -> dict[str, float]:
     """Mean action loss at 4,096 steps of validation episodes.
 
-    Unlike scores, the losses do not vary with the course of played episodes.
+    Unlike scores, the losses do not vary with the course of the rollout.
 
     Returns:
         `loss` with the logged states, and `loss_at_zero` with every distractor fixed to 0.

@@ -1,4 +1,4 @@
-"""Copies of episodes that end with another action: what it would have earned instead."""
+"""Augmented trajectories that end with another action and its counterfactual reward."""
 
 import copy
 from dataclasses import dataclass
@@ -23,10 +23,10 @@ _STREAM = 1
 
 @dataclass(frozen=True)
 class ActionReport:
-    """Other actions that were asked about, and what they would have earned."""
+    """Other actions that were proposed, and their counterfactual rewards."""
 
     proposals: int
-    """Number of other actions asked about."""
+    """Number of other actions proposed."""
     reproduced: float
     """Share of them at steps whose logged reward the reward model reproduces within ε_r."""
     copies: int
@@ -38,8 +38,8 @@ class ActionReport:
 
 
 @dataclass(frozen=True)
-class OtherActions:
-    """Asks what other actions would have earned at logged steps.
+class ActionGenerator:
+    """Proposes other actions at logged steps, with their counterfactual rewards.
 
     For a logged step (s, a, r), the disturbance z is abduced and kept; another action a' is the
     action of a random training step whose state lies in the same cluster as s; and its reward is
@@ -57,15 +57,15 @@ class OtherActions:
     epsilon_r: float
     """ε_r: the model must reproduce the logged reward, |f̂_r(s, a, z) − r| ≤ ε_r."""
     delta: float
-    """δ, the model's error on held-out steps: it cannot tell rewards r' and r apart that
-    differ by no more."""
+    """δ, the model's error on held-out steps: rewards r' and r that differ by no more
+    cannot be distinguished."""
     read: Read
     """Reads transitions with the actions that the reward model was fitted to."""
 
-    def ask(
+    def propose(
         self, episodes: IntArray, steps: IntArray, count: int, seed: int
     ) -> tuple[Overlay, ActionReport]:
-        """Ask about `count` other actions at each of the given steps, and copy what passes.
+        """Propose `count` other actions at each of the given steps, and copy what passes.
 
         Actions are drawn with replacement; a draw of the logged action itself is no proposal.
 
@@ -79,32 +79,32 @@ class OtherActions:
         chunks = []
         for start in range(0, max(1, len(steps)), _CHUNK):
             part = slice(start, start + _CHUNK)
-            chunks.append(self._ask(exact, episodes[part], steps[part], count, rng))
-        asked = _Asked(*(np.concatenate(parts) for parts in zip(*chunks, strict=True)))
+            chunks.append(self._predicted(exact, episodes[part], steps[part], count, rng))
+        proposed = _Proposed(*(np.concatenate(parts) for parts in zip(*chunks, strict=True)))
         rewards = self.view.column(schema.REWARD)
-        reward = asked.reward.clip(rewards.min(), rewards.max()).astype(np.float32)
-        change = reward - asked.logged
-        kept = asked.reproduced & (np.abs(change) > self.delta)
+        reward = proposed.reward.clip(rewards.min(), rewards.max()).astype(np.float32)
+        change = reward - proposed.logged
+        kept = proposed.reproduced & (np.abs(change) > self.delta)
         report = ActionReport(
             proposals=len(kept),
-            reproduced=float(asked.reproduced.mean()) if len(kept) else 0.0,
+            reproduced=float(proposed.reproduced.mean()) if len(kept) else 0.0,
             copies=int(kept.sum()),
             mean_change=float(change[kept].mean()) if kept.any() else 0.0,
             earns_more=float((change[kept] > 0).mean()) if kept.any() else 0.0,
         )
-        passed = (asked.episode[kept], asked.step[kept], asked.action[kept], reward[kept])
+        passed = (proposed.episode[kept], proposed.step[kept], proposed.action[kept], reward[kept])
         return self._copies(*passed), report
 
     @torch.no_grad()
-    def _ask(
+    def _predicted(
         self,
         exact: CausalRewardModel,
         episodes: IntArray,
         steps: IntArray,
         count: int,
         rng: np.random.Generator,
-    ) -> "_Asked":
-        """Draw other actions at each of the given steps, and predict what they would have earned.
+    ) -> "_Proposed":
+        """Draw other actions at each of the given steps, and predict their rewards.
 
         `exact` is the reward model in float64, so that a later check confirms what passes.
         """
@@ -119,7 +119,8 @@ class OtherActions:
         logged = logged_actions(self.view, episodes[rows], steps[rows])
         other = known & np.atleast_2d((actions != logged).T).any(axis=0)
         rows, actions = rows[other], actions[other]
-        # Copies with these actions, whatever they earn, say what the reward model reads of them.
+        # Copies with these actions, whatever their rewards, show what the reward model reads of
+        # them.
         nothing = np.zeros(len(rows), dtype=np.float32)
         copies = self.view.with_overlay(self._copies(episodes[rows], steps[rows], actions, nothing))
         places = self.view.n_episodes + np.arange(len(rows))
@@ -127,7 +128,7 @@ class OtherActions:
         at = torch.from_numpy(rows).to(s.device)
         reward = exact.predict(s[at], given, z[at]).cpu().numpy()
         own = (r.cpu().numpy()[rows], reproduced[rows])
-        return _Asked(episodes[rows], steps[rows], actions, reward, *own)
+        return _Proposed(episodes[rows], steps[rows], actions, reward, *own)
 
     def _copies(
         self, episodes: IntArray, steps: IntArray, actions: Array, rewards: Float32Array
@@ -136,17 +137,17 @@ class OtherActions:
         return Overlay.of_actions(sources, steps, actions, rewards, size)
 
 
-class _Asked(NamedTuple):
-    """N other actions: position of the episode in the view, step, action, and what it earns."""
+class _Proposed(NamedTuple):
+    """N other actions: position of the episode in the view, step, action, and its reward."""
 
     episode: IntArray
     step: IntArray
     action: Array
     reward: Float64Array
     logged: Float64Array
-    """What the logged action earned."""
+    """Reward of the logged action."""
     reproduced: BoolArray
-    """Whether the reward model says the same of the logged action."""
+    """Whether the reward model reproduces it."""
 
 
 def logged_actions(view: EpisodeStore, episodes: IntArray, steps: IntArray) -> Array:

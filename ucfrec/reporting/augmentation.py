@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
-from ucfrec.counterfactual.augment import AugmentationReport
+from ucfrec.counterfactual.state_augmentation import AugmentationReport
 from ucfrec.reporting import charts
 from ucfrec.reporting.tables import Table, shown
 
 
-def copies_table(runs: Sequence[tuple[str, AugmentationReport]]) -> Table:
+def augmentation_table(runs: Sequence[tuple[str, AugmentationReport]]) -> Table:
     """Quality of the reward model and of the edits, one column per run (name, report)."""
     reports = [report for _, report in runs]
     models, moves = [r.reward_model for r in reports], [r.moves for r in reports]

@@ -15,8 +15,8 @@ from ucfrec.files.atomic import read_json
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.environments.environments import make_env
-from ucfrec_control.learners.evaluate import evaluate_run
-from ucfrec_control.learners.video import record_episode
+from ucfrec_control.training.evaluate import evaluate_run
+from ucfrec_control.training.video import record_episode
 
 SMALL = {"width": 64, "height": 48, "max_episode_steps": 4}
 TINY = ("train.steps=2", "train.validate_every=2", "policy.dim=16", "policy.context=5")

@@ -1,5 +1,6 @@
 """Counterfactual copies of the training episodes: reward model, generator, gates (Algorithm 1)."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -8,18 +9,18 @@ import numpy as np
 import torch
 
 from ucfrec import schema
-from ucfrec.counterfactual.action_copies import OtherActions, logged_actions
-from ucfrec.counterfactual.augment import (
-    AugmentationReport,
-    AugmentConfig,
-    augment,
-    candidates,
-)
+from ucfrec.counterfactual.action_augmentation import ActionGenerator, logged_actions
 from ucfrec.counterfactual.clusters import ActionSupport
 from ucfrec.counterfactual.effects_mean import EffectsMean, EffectTransitions
 from ucfrec.counterfactual.generators import CSGConfig, make_generator, state_clusters
 from ucfrec.counterfactual.reward_model import CRMConfig
 from ucfrec.counterfactual.reward_model_fit import fit_crm
+from ucfrec.counterfactual.state_augmentation import (
+    AugmentationReport,
+    AugmentConfig,
+    augment,
+    candidates,
+)
 from ucfrec.counterfactual.transitions import Read, sample_steps, sample_transitions
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay
@@ -28,8 +29,8 @@ from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.user_model.reward_fit import fit_item_reward_model
 
 MODELS: Final = ("item-reward", "crm", "csg")
-"""Folders of the checkpoints of `counterfactual_copies`; which of them there are depends on the
-settings."""
+"""Folders of the checkpoints of `counterfactual_augmentation`; which of them there are depends on
+the settings."""
 _CPU: Final = torch.device("cpu")
 
 
@@ -50,7 +51,7 @@ def require_rewards_vary(train: EpisodeStore) -> None:
 
 
 @random_state_kept()
-def counterfactual_copies(
+def counterfactual_augmentation(
     train: EpisodeStore,
     validation: EpisodeStore,
     crm_config: CRMConfig,
@@ -98,7 +99,37 @@ def counterfactual_copies(
     states = crm.normalised_states(training.states.to(device)).cpu()
     labels = clusters.nearest(states).numpy()
     support = ActionSupport(labels, logged_actions(train, *sampled))
-    others = OtherActions(train, crm, clusters, support, report.epsilon_r, report.delta, read)
-    asked_at = candidates(train, config, np.random.default_rng(seed))
-    copies, found = others.ask(*asked_at, config.actions, seed)
+    others = ActionGenerator(train, crm, clusters, support, report.epsilon_r, report.delta, read)
+    places = candidates(train, config, np.random.default_rng(seed))
+    copies, found = others.propose(*places, config.actions, seed)
     return overlay.joined(copies), replace(report, actions=found)
+
+
+def interventions(
+    view: EpisodeStore, dimensions: Sequence[int], seed: int, copies: int = 2
+) -> Overlay:
+    """Copies of every episode of `view` under do(d ~ marginal), d being `dimensions`.
+
+    Values are drawn, jointly, from the steps of the view. Copies 0, 2, … draw once an episode, as
+    an intervention that stays put; copies 1, 3, … at every step.
+
+    Args:
+        view: a view without an overlay.
+    """
+    rng = np.random.default_rng(seed)
+    episodes, steps = view.all_steps()
+    states = view.windows(episodes, steps, 1).states[:, 0].numpy()
+    edited = []
+    for copy in range(copies):
+        by_episode = rng.integers(len(steps), size=view.n_episodes)[episodes]
+        drawn = by_episode if copy % 2 == 0 else rng.integers(len(steps), size=len(steps))
+        changed = states.copy()
+        changed[:, list(dimensions)] = states[drawn][:, list(dimensions)]
+        edited.append(changed)
+    numbers = np.arange(copies)[:, None] * view.n_episodes + episodes
+    return Overlay(
+        copy_source=np.tile(view.episode_ids, copies),
+        edit_copy=numbers.reshape(-1),
+        edit_step=np.tile(steps, copies),
+        edit_state=np.concatenate(edited),
+    )

@@ -1,6 +1,9 @@
 """Training on a control store, with presets and screening."""
 
+import tomllib
 from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +16,42 @@ from ucfrec.runs.screened import train_screened
 from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec_control.data.trajectories import PACKAGES, control_source
 from ucfrec_control.environments.scores import find_kind, find_task
-from ucfrec_control.learners.presets import Preset, find_preset
+
+
+@dataclass(frozen=True)
+class Preset:
+    """The combination of all rules that match a run."""
+
+    tables: Mapping[str, Mapping[str, Any]]
+    """Configuration by table, as in TOML."""
+    targets: tuple[float, ...]
+    """Target returns; empty if no rule matches the task."""
+
+
+def find_preset(task: str, kind: str, policy: str) -> Preset:
+    """The preset of a method on one kind of dataset of a task.
+
+    Args:
+        task: name of a `ucfrec_control.environments.scores.Task`; "" for none.
+        kind: as `ucfrec_control.environments.scores.find_kind` returns it.
+        policy: one of `ucfrec.policies.registry.policy_names`.
+    """
+    run = {"task": task, "kind": kind, "policy": policy}
+    tables: dict[str, dict[str, Any]] = {}
+    targets: list[float] = []
+    text = files("ucfrec_control.training").joinpath("presets.toml").read_text(encoding="utf-8")
+    for rule in tomllib.loads(text)["rule"]:
+        if not all(_names(rule.get(key, value), value) for key, value in run.items()):
+            continue
+        for table, values in rule.get("set", {}).items():
+            tables[table] = tables.get(table, {}) | values
+        targets = rule.get("targets", targets)
+    return Preset(tables, tuple(targets))
+
+
+def _names(given: str | list[str], value: str) -> bool:
+    """Whether a rule's `given` is `value`, or names it among others."""
+    return value in ([given] if isinstance(given, str) else given)
 
 
 def dataset_of(store: EpisodeStore) -> Mapping[str, Any]:
@@ -31,7 +69,7 @@ def dataset_of(store: EpisodeStore) -> Mapping[str, Any]:
 
 
 def preset_of(dataset: Mapping[str, Any], policy: str) -> Preset:
-    """The preset of a learner on the dataset that `dataset_of` describes."""
+    """The preset of a method on the dataset that `dataset_of` describes."""
     task = find_task(dataset["env_id"], dataset["dataset"])
     return find_preset(task.name if task else "", find_kind(dataset["dataset"]), policy)
 

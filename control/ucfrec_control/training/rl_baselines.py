@@ -15,7 +15,8 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
+from ucfrec.acting.uniform import Memoryless
+from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import atomic_file, atomic_folder
@@ -126,7 +127,7 @@ def read_run(run: Path) -> RunRecord | RLRecord:
     return RLRecord.read(run) if rl else RunRecord.read(run)
 
 
-class RLPolicy:
+class RLPolicy(Memoryless):
     """The trained actor of a run folder; it takes no target return."""
 
     def __init__(self, run: Path) -> None:
@@ -143,23 +144,17 @@ class RLPolicy:
                 raise ValueError(f"statistics of {tuple(mean.shape)} states")
             self._mean, self._std = mean.numpy(), std.numpy()
             with random_state_kept():
-                self._learner = _learner(self.record.config.policy)
-                self._learner.create_impl((sizes["state"],), sizes["action"])
-        load_weights(run / _ACTOR, self._learner.impl.modules.policy, tensors)
+                self._algorithm = _algorithm(self.record.config.policy)
+                self._algorithm.create_impl((sizes["state"],), sizes["action"])
+        load_weights(run / _ACTOR, self._algorithm.impl.modules.policy, tensors)
 
     def actor(self, episodes: int, rule: DecisionRule | None) -> "RLPolicy":
         """Itself: it has no memory and ignores the target return."""
         return self
 
-    def begin(self, rows: IntArray) -> None:
-        """See `ucfrec.acting.rollout.Actor`."""
-
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, None]:
         """The policy's mean actions (N, A)."""
-        return self._learner.predict(_normalised(observations, self._mean, self._std)), None
-
-    def observe(self, actions: Array, rewards: Float32Array) -> None:
-        """See `ucfrec.acting.rollout.Actor`."""
+        return self._algorithm.predict(_normalised(observations, self._mean, self._std)), None
 
 
 def is_rl(record: RunRecord | RLRecord) -> bool:
@@ -168,7 +163,7 @@ def is_rl(record: RunRecord | RLRecord) -> bool:
 
 
 def rl_config(dataset: Mapping[str, Any], algorithm: Any, **settings: Any) -> RLConfig:
-    """The settings for the data that `ucfrec_control.learners.train.dataset_of` describes.
+    """The settings for the data that `ucfrec_control.training.train.dataset_of` describes.
 
     Args:
         dataset: description of the data.
@@ -235,18 +230,18 @@ def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLRec
         )
     mean, std = _statistics(train, config)
     dataset = _dataset(d3rlpy, train, mean.numpy(), std.numpy())
-    learner = _learner(config, "cuda:0" if torch.cuda.is_available() else "cpu:0")
+    algorithm = _algorithm(config, "cuda:0" if torch.cuda.is_available() else "cpu:0")
     if not (out / RUN).exists():
         _begin(store, out, config, seed)
     record = RLRecord.read(out)
-    step, seconds = _resume(out / _CHECKPOINT, learner, dataset)
+    step, seconds = _resume(out / _CHECKPOINT, algorithm, dataset)
     log = MetricsLog(out, step)
     with progress(config.steps, config.algorithm, "steps", done=step) as bar:
         while step < config.steps:
             if step:  # a new seed after each checkpoint, so no generator's state is saved
                 d3rlpy.seed(seed + step)
             steps = min(CHECKPOINT_EVERY, config.steps - step)
-            ((_, losses),) = learner.fit(
+            ((_, losses),) = algorithm.fit(
                 dataset,
                 n_steps=steps,
                 n_steps_per_epoch=steps,
@@ -256,9 +251,9 @@ def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLRec
             )
             step += steps
             log.add(step, losses)
-            _save(out / _CHECKPOINT, learner, step, seconds + perf_counter() - started)
+            _save(out / _CHECKPOINT, algorithm, step, seconds + perf_counter() - started)
     log.close()
-    actor = learner.impl.modules.policy.state_dict()
+    actor = algorithm.impl.modules.policy.state_dict()
     save_tensors(out / _ACTOR, {**actor, "state.mean": mean, "state.std": std}, {})
     record = record.with_entries(
         policy=RLFit(steps=config.steps), wall_time_s=seconds + perf_counter() - started
@@ -279,8 +274,8 @@ def timed_updates(store: EpisodeStore, config: RLConfig, updates: int) -> float:
     d3rlpy, train = _d3rlpy(), store.split("train")
     mean, std = _statistics(train, config)
     dataset = _dataset(d3rlpy, train, mean.numpy(), std.numpy())
-    learner, times = _learner(config), [0.0]
-    learner.fit(
+    algorithm, times = _algorithm(config), [0.0]
+    algorithm.fit(
         dataset,
         n_steps=updates + 2,
         n_steps_per_epoch=updates + 2,
@@ -313,27 +308,27 @@ def _begin(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> None:
         RLRecord.of(entries, out / RUN).sealed(scratch)
 
 
-def _resume(path: Path, learner: Any, dataset: Any) -> tuple[int, float]:
-    """Put the checkpoint at `path`, if any, into `learner`; its step and the seconds spent."""
+def _resume(path: Path, algorithm: Any, dataset: Any) -> tuple[int, float]:
+    """Put the checkpoint at `path`, if any, into `algorithm`; its step and the seconds spent."""
     if not path.exists():
         return 0, 0.0
     checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    learner.build_with_dataset(dataset)
-    for name, part in _parts(learner).items():
+    algorithm.build_with_dataset(dataset)
+    for name, part in _parts(algorithm).items():
         part.load_state_dict(checkpoint["parts"][name])
-    learner.set_grad_step(checkpoint["step"])
+    algorithm.set_grad_step(checkpoint["step"])
     return checkpoint["step"], checkpoint["seconds"]
 
 
-def _save(path: Path, learner: Any, step: int, seconds: float) -> None:
-    parts = {name: part.state_dict() for name, part in _parts(learner).items()}
+def _save(path: Path, algorithm: Any, step: int, seconds: float) -> None:
+    parts = {name: part.state_dict() for name, part in _parts(algorithm).items()}
     with atomic_file(path) as scratch:
         torch.save({"step": step, "seconds": seconds, "parts": parts}, scratch)
 
 
-def _parts(learner: Any) -> Mapping[str, Any]:
-    """Every network and optimizer of a learner, by name."""
-    parts: Mapping[str, Any] = learner.impl.modules.create_checkpointer("cpu:0").modules
+def _parts(algorithm: Any) -> Mapping[str, Any]:
+    """Every network and optimizer of a algorithm, by name."""
+    parts: Mapping[str, Any] = algorithm.impl.modules.create_checkpointer("cpu:0").modules
     return parts
 
 
@@ -361,12 +356,12 @@ def _statistics(train: EpisodeStore, config: RLConfig) -> tuple[Tensor, Tensor]:
     return mean, std + 1e-6
 
 
-def _learner(config: RLConfig, device: str = "cpu:0") -> Any:
+def _algorithm(config: RLConfig, device: str = "cpu:0") -> Any:
     d3rlpy = _d3rlpy()
     if config.algorithm == "iql":
         return _iql(d3rlpy, config).create(device=device)
     if config.task == "antmaze":
-        from ucfrec_control.learners.clipped_cql import ClippedCQL
+        from ucfrec_control.training.clipped_cql import ClippedCQL
 
         return ClippedCQL(_cql(d3rlpy, config), device, _LOWEST_GAP)
     return _cql(d3rlpy, config).create(device=device)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tests.support.planted import f, planted, planted_store
 from ucfrec import schema
-from ucfrec.counterfactual.action_copies import ActionReport, OtherActions, logged_actions
+from ucfrec.counterfactual.action_augmentation import ActionGenerator, ActionReport, logged_actions
 from ucfrec.counterfactual.clusters import ActionSupport
 from ucfrec.counterfactual.generators import CSGConfig, state_clusters
 from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig
@@ -43,7 +43,7 @@ def fitted() -> tuple[CausalRewardModel, CRMReport]:
 
 
 @functools.cache
-def others() -> OtherActions:
+def others() -> ActionGenerator:
     """Asks at the steps of the planted store, with the gate of the default settings."""
     crm, report = fitted()
     steps = view().all_steps()
@@ -53,11 +53,11 @@ def others() -> OtherActions:
     support = ActionSupport(labels, logged_actions(view(), *steps))
     epsilon_r, delta = 0.1 * float(crm.reward_std), report.delta["0.95"]
     read = EpisodeStore.transitions
-    return OtherActions(view(), crm, clusters, support, epsilon_r, delta, read)
+    return ActionGenerator(view(), crm, clusters, support, epsilon_r, delta, read)
 
 
-def asked(how: OtherActions, count: int = 3, seed: int = 0) -> tuple[Overlay, ActionReport]:
-    return how.ask(*view().all_steps(), count, seed)
+def asked(how: ActionGenerator, count: int = 3, seed: int = 0) -> tuple[Overlay, ActionReport]:
+    return how.propose(*view().all_steps(), count, seed)
 
 
 def sources(overlay: Overlay) -> tuple[Tensor, Tensor, Tensor]:
@@ -141,5 +141,5 @@ def test_no_reward_leaves_the_range_of_the_log() -> None:
 
 def test_no_steps_make_no_copies() -> None:
     nothing = np.zeros(0, dtype=np.int64)
-    overlay, report = others().ask(nothing, nothing, 2, 0)
+    overlay, report = others().propose(nothing, nothing, 2, 0)
     assert (report.proposals, len(overlay.action_source)) == (0, 0)

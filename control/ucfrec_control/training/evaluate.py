@@ -27,8 +27,8 @@ from ucfrec_control.environments.environments import (
     mismatches,
 )
 from ucfrec_control.environments.scores import find_kind, require_task
-from ucfrec_control.learners.presets import find_preset
-from ucfrec_control.learners.rl_baselines import RLPolicy, RLRecord, is_rl, read_run
+from ucfrec_control.training.rl_baselines import RLPolicy, RLRecord, is_rl, read_run
+from ucfrec_control.training.train import find_preset
 
 Trained = TrainedPolicy | RLPolicy
 CHECKPOINTS = ("last", "best")
@@ -57,7 +57,7 @@ def evaluate_run(
         run: a run folder on a control store.
         episodes: episodes of a row.
         seed: seed of the environments and the bootstrap.
-        env_id: environment to play; None for that of the data.
+        env_id: environment to evaluate in; None for that of the data.
         targets: target returns, None for the largest that the policy expects in each state; empty
             for those of the preset, or that one if the policy was trained to know it.
         checkpoints: "last", "best" or both.
@@ -74,7 +74,7 @@ def evaluate_run(
         trained = load_run(run, checkpoint)
         training = trained.record.finished
         if rows and training.best_step == training.steps:
-            # The best checkpoint is the last: the same weights would play the same episodes.
+            # The best checkpoint is the last: the same weights would give the same episodes.
             rows += [replace(row, checkpoint=checkpoint) for row in rows]
             continue
         environment = environment_of(trained, env_id)
@@ -176,13 +176,13 @@ def method_of(record: RunRecord | RLRecord) -> str:
 def rules_of(
     trained: Trained, env_id: str, given: Sequence[float | None] = ()
 ) -> Sequence[DecisionRule | None]:
-    """The target returns given, else those of the preset, as rules; (None,) for learners without a
+    """The target returns given, else those of the preset, as rules; (None,) for policies without a
     target return."""
-    dataset, learner = _dataset(trained), trained.record.config.policy_name
-    if isinstance(trained, RLPolicy) or learner == "bc":
+    dataset, method = _dataset(trained), trained.record.config.policy_name
+    if isinstance(trained, RLPolicy) or method == "bc":
         return (None,)
     task = require_task(env_id, dataset["dataset"])
-    preset = find_preset(task.name, find_kind(dataset["dataset"]), learner).targets
+    preset = find_preset(task.name, find_kind(dataset["dataset"]), method).targets
     own = (None,) if trained.policy.config.max_return else preset
     return [DecisionRule(target) for target in given or own]
 
@@ -201,11 +201,11 @@ def _row(
     env = open_environment(trained, env_id, min(episodes, SIDE_BY_SIDE), distractor=distractor)
     try:
         actor = trained.actor(env.num_envs, rule)
-        played = rollout(env, actor, episodes, seed, describe=f"{trained.name} in {env_id}")
+        rolled_out = rollout(env, actor, episodes, seed, describe=f"{trained.name} in {env_id}")
     finally:
         env.close()
     seconds = time.perf_counter() - began
-    low, high = task.score(bootstrap_interval(played.returns, seed))
+    low, high = task.score(bootstrap_interval(rolled_out.returns, seed))
     row = ResultRow(
         suite=EVALUATE,
         table=EVALUATE,
@@ -231,10 +231,10 @@ def _row(
         **provenance(PACKAGES),
     )
     found = {
-        "score": float(task.score(played.returns.mean())),
-        "score_std": summary(task.score(played.returns)).sd if episodes > 1 else None,
-        "return": float(played.returns.mean()),
-        "length": float(played.lengths.mean()),
+        "score": float(task.score(rolled_out.returns.mean())),
+        "score_std": summary(task.score(rolled_out.returns)).sd if episodes > 1 else None,
+        "return": float(rolled_out.returns.mean()),
+        "length": float(rolled_out.lengths.mean()),
         "steps": record.finished.steps,
         "best_step": record.finished.best_step,
         "validation_loss": record.finished.best_validation,

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 import torch
 
+from tests.support.causes import planted_vectors
 from tests.support.planted import planted_store
 from ucfrec import schema
-from ucfrec.counterfactual.augment import AugmentConfig
-from ucfrec.counterfactual.copies import counterfactual_copies
+from ucfrec.counterfactual.augmentation import counterfactual_augmentation, interventions
 from ucfrec.counterfactual.effects_mean import EffectTransitions
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
+from ucfrec.counterfactual.state_augmentation import AugmentConfig
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay
@@ -29,7 +30,7 @@ def one_thread() -> None:
 
 
 def test_from_views_to_an_overlay(tmp_path: Path) -> None:
-    overlay, report = counterfactual_copies(
+    overlay, report = counterfactual_augmentation(
         planted_store().split("train"),
         planted_store().split("validation"),
         QUICK,
@@ -46,7 +47,7 @@ def test_from_views_to_an_overlay(tmp_path: Path) -> None:
 def made(config: AugmentConfig, folder: Path, kind: str = "tangent") -> Overlay:
     views = planted_store().split("train"), planted_store().split("validation")
     csg = CSGConfig(kind=kind, epochs=1, hidden=32)  # type: ignore[arg-type]
-    return counterfactual_copies(*views, QUICK, csg, config, folder, seed=0)[0]
+    return counterfactual_augmentation(*views, QUICK, csg, config, folder, seed=0)[0]
 
 
 def test_asking_about_actions_leaves_the_edits_as_they_are(tmp_path: Path) -> None:
@@ -61,7 +62,7 @@ def test_actions_alone_need_no_generator(tmp_path: Path) -> None:
     views = planted_store().split("train"), planted_store().split("validation")
     config = AugmentConfig(copies=0, actions=1, epsilon_r=3.0, reward_quantile=0.5)
     kind = CSGConfig(kind="faithful")
-    overlay, report = counterfactual_copies(*views, QUICK, kind, config, tmp_path, seed=0)
+    overlay, report = counterfactual_augmentation(*views, QUICK, kind, config, tmp_path, seed=0)
     assert not (tmp_path / "csg").exists()
     assert (len(overlay.copy_source), report.copies, report.proposals) == (0, 0, 0)
     assert report.verdict == "no state is edited"
@@ -116,7 +117,7 @@ def test_additive_effects_read_the_other_item_where_it_would_have_been_shown(
     train, validation = store.split("train"), store.split("validation")
     config = AugmentConfig(copies=0, actions=2, epsilon_r=10.0)
     crm = CRMConfig(mean="effects", epochs=1, hidden=16)
-    overlay, report = counterfactual_copies(
+    overlay, report = counterfactual_augmentation(
         train, validation, crm, CSGConfig(), config, tmp_path, seed=0
     )
     assert report.actions is not None
@@ -132,3 +133,40 @@ def test_additive_effects_read_the_other_item_where_it_would_have_been_shown(
         torch.testing.assert_close(copied.actions[copy], shown.actions[0])
         # What was not known before the step is not in its state.
         assert torch.equal(shown.states, store.transitions(episode, step).states)
+
+
+def test_interventions_change_the_flagged_dimensions_alone(tmp_path: Path) -> None:
+    store = planted_vectors(tmp_path / "store", trajectories=20, length=30)
+    train = store.split("train")
+    union = train.with_overlay(interventions(train, [1, 4], seed=5))
+    n = train.n_episodes
+    assert union.n_episodes == 3 * n
+    factual = train.windows(np.arange(n), train.lengths - 1, 30).states
+    held, redrawn = (
+        union.windows(np.arange(k * n, (k + 1) * n), train.lengths - 1, 30) for k in (1, 2)
+    )
+    rest = [0, 2, 3]
+    for copy in (held, redrawn):
+        assert torch.equal(copy.states[..., rest], factual[..., rest])
+    assert torch.equal(held.states[:, 1:, [1, 4]], held.states[:, :-1, [1, 4]])
+    assert (redrawn.states[:, 1:, 4] != redrawn.states[:, :-1, 4]).float().mean() > 0.9
+    # Jointly from the marginal: every pair of values is some step's own.
+    pairs = {tuple(pair) for pair in factual[..., [1, 4]].reshape(-1, 2).tolist()}
+    drawn = redrawn.states[..., [1, 4]].reshape(-1, 2)
+    assert all(tuple(pair) in pairs for pair in drawn.tolist())
+    cut = np.corrcoef(drawn[:, 0], factual[..., 1].reshape(-1))[0, 1]
+    assert abs(cut) < 0.15
+    again = interventions(train, [1, 4], seed=5)
+    assert union.overlay is not None
+    np.testing.assert_array_equal(again.edit_state, union.overlay.edit_state)
+
+
+def test_overlays_join_in_order(tmp_path: Path) -> None:
+    train = planted_vectors(tmp_path / "store", trajectories=20, length=10).split("train")
+    first, second = (interventions(train, [d], seed=d, copies=1) for d in (0, 3))
+    union, n = train.with_overlay(first.joined(second)), train.n_episodes
+    for k, alone in ((1, first), (2, second)):
+        copies = np.arange(k * n, (k + 1) * n)
+        there = union.windows(copies, train.lengths - 1, 10).states
+        wanted = train.with_overlay(alone).windows(np.arange(n, 2 * n), train.lengths - 1, 10)
+        assert torch.equal(there, wanted.states)

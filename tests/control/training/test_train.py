@@ -28,9 +28,8 @@ from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.distractor import add_distractor
 from ucfrec_control.environments.environments import make_env, mismatches
 from ucfrec_control.environments.scores import TASKS
-from ucfrec_control.learners.evaluate import evaluate_run
-from ucfrec_control.learners.presets import find_preset
-from ucfrec_control.learners.train import train_control
+from ucfrec_control.training.evaluate import evaluate_run
+from ucfrec_control.training.train import find_preset, train_control
 
 TINY = ["train.steps=4", "train.validate_every=2", "policy.dim=16", "policy.context=5"]
 SETTINGS = [argument for setting in TINY for argument in ("--set", setting)]

@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[1]
 RESULTS, PAGE = ROOT / "benchmarks" / "results", ROOT / "docs" / "tables.md"
 PICTURES = ROOT / "docs" / "assets" / "tables"
 FILES = (
-    *("recommendation", "counterfactual_augmentation"),
+    *("recommendation", "counterfactual_copies"),
     *("control", "control_robustness", "control_histories"),
 )
 PAPER = """\
@@ -471,8 +471,8 @@ SECTIONS = (
         "the strength of a planted confounder of each session. Over all sizes in percent of the "
         "return without augmentation. Augmented actions gain with a confounder and nothing "
         "without; augmented states change nothing significant.",
-        f"`python benchmarks/counterfactual_augmentation.py --out runs/copies` {IN_TAG}",
-        of("counterfactual_augmentation", "counterfactual-copies"),
+        f"`python benchmarks/counterfactual_copies.py --out runs/copies` {IN_TAG}",
+        of("counterfactual_copies", "counterfactual-copies"),
         augmentation,
     ),
     Section(

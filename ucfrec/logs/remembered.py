@@ -22,7 +22,8 @@ def settled(
     the plain ones.
 
     What is given counts. Otherwise a remembered column, condition or reward counts if all files
-    have the columns that it needs; if not, the plain name does, and no condition.
+    have the columns that it needs; if not, the plain name does, and no condition. The column `reward`
+    stands for the reward of a log whose columns were mapped.
 
     Args:
         connection: any engine.
@@ -57,7 +58,8 @@ def settled(
     where = mapping.where
     if where is None and remembered.where and missing.of(remembered.where) is None:
         where = remembered.where
-    if missing.of(reward) is not None and missing.of(schema.REWARD) is None:
+    mapped = any(remembered.columns.values())
+    if mapped and missing.of(reward) is not None and missing.of(schema.REWARD) is None:
         reward = schema.REWARD
     return replace(mapping, columns=columns, where=where, remembered=None), reward
 

@@ -22,8 +22,8 @@ def settled(
     the plain ones.
 
     What is given counts. Otherwise a remembered column, condition or reward counts if all files
-    have the columns that it needs; if not, the plain name does, and no condition. The column `reward`
-    stands for the reward of a log whose columns were mapped.
+    have the columns that it needs; if not, the plain name does, and no condition. The column
+    `reward` stands for the reward of a log whose columns were mapped.
 
     Args:
         connection: any engine.

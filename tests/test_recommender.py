@@ -141,7 +141,7 @@ def test_data_that_cannot_be_used(fitted: Recommender, folder: Path, log: pd.Dat
         (store, {"mapping": LogMapping({"user_id": "uid"})}, "is prepared already"),
         (folder / "nothing", {}, "nothing does not exist"),
         ([1, 2], {}, "data: a list is not a pandas DataFrame"),
-        (log.head(0), {}, "logs: the frame has no rows"),
+        (log.head(0), {}, "data: the frame has no rows"),
         (log.drop(columns="item_id"), {}, "no column 'item_id'"),
         (log, {"reward": "is_click"}, "no column 'is_click'"),
         (log, {"session_by": "day"}, "session_by is 'day'"),

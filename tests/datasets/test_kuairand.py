@@ -193,7 +193,7 @@ def test_a_run_remembers_that_its_log_is_of_kuairand_whatever_the_next_is_called
         scores.append(pd.read_parquet(out))
     frame = scores[0]
     assert len(frame) > 200
-    pd.testing.assert_frame_equal(*scores)
+    pd.testing.assert_frame_equal(scores[0], scores[1])
     # The same rows under plain names, as an own service would log them.
     plain = pd.read_csv(log).rename(
         columns={"video_id": "item_id", "time_ms": "timestamp", "is_click": "reward"}

@@ -103,7 +103,7 @@ def test_no_command_needs_the_mapping_again(
         out = folder / f"next-{n}.parquet"
         assert main(["recommend", run, late, "--k", "3", "--out", str(out), *more]) == 0
         frames.append(pd.read_parquet(out))
-    pd.testing.assert_frame_equal(*frames)
+    pd.testing.assert_frame_equal(frames[0], frames[1])
     assert 7 not in set(frames[0].user_id)
 
 

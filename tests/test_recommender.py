@@ -140,7 +140,7 @@ def test_data_that_cannot_be_used(fitted: Recommender, folder: Path, log: pd.Dat
         (EpisodeStore.open(store), {"gap_minutes": 3.0}, "is prepared already"),
         (store, {"mapping": LogMapping({"user_id": "uid"})}, "is prepared already"),
         (folder / "nothing", {}, "nothing does not exist"),
-        ([1, 2], {}, "logs: a list is not a pandas DataFrame"),
+        ([1, 2], {}, "data: a list is not a pandas DataFrame"),
         (log.head(0), {}, "logs: the frame has no rows"),
         (log.drop(columns="item_id"), {}, "no column 'item_id'"),
         (log, {"reward": "is_click"}, "no column 'is_click'"),
@@ -157,7 +157,7 @@ def test_data_that_cannot_be_used(fitted: Recommender, folder: Path, log: pd.Dat
 
 def test_a_recommender_says_what_it_was_trained_on(fitted: Recommender) -> None:
     record = fitted.trained.record
-    steps, episodes = record["train_steps"], record["train_episodes"]
+    steps, episodes = record.train_steps, record.train_episodes
     facts = f"'dt', trained on {steps:,} steps, {episodes:,} episodes, 30 items, reward=reward"
     assert repr(fitted) == f"Recommender({facts})"
     assert repr(fitted.trained) == f"TrainedPolicy({facts})"

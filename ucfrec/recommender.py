@@ -1,13 +1,14 @@
 """Recommender: train a policy on logs, recommend items, save and load it."""
 
+import re
 import shutil
 import tempfile
 import warnings
 import weakref
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import pandas as pd
 import pyarrow.parquet as pq
@@ -28,6 +29,18 @@ from ucfrec.reporting.model_card import write_card
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
+
+_OPTIONS: Final = (
+    (r" or --max-session \d+", ""),
+    (r"--column (\w+)=('[^']*'|\.\.\.)", r"mapping=LogMapping({'\1': \2})"),
+    (r"--column (\w+)=", r"mapping=LogMapping({'\1': ''})"),
+    (r"--where (\"[^\"]*\")", r"mapping=LogMapping(where=\1)"),
+    (r"--time-format ('[^']*')", r"mapping=LogMapping(time_format=\1)"),
+    (r"--earliest ([\d-]+)", r"mapping=LogMapping(earliest='\1')"),
+    (r"--time-format", "LogMapping.time_format"),
+    (r"--(where|earliest|partitions|column)", r"LogMapping.\1"),
+)
+"""Options of commands in messages, and what they are in Python."""
 
 
 class Recommender:
@@ -178,7 +191,8 @@ class Recommender:
             skip_unknown: ignore rows of items that are not in the training data.
             rule: the decision rule; None for the run's own, `Recommender.trained.rule`.
             seed: of the draws of a rule with a temperature.
-            mapping: names of the columns of `histories`.
+            mapping: names of the columns of `histories`; those that it leaves open are as in the
+                training log if `histories` has them, and otherwise as above.
 
         Returns:
             `user_id`, `rank` (from 1), `item_id`, `score` (log-probability at temperature 1 among
@@ -201,7 +215,8 @@ class Recommender:
             candidates=candidates,
             skip_unknown=skip_unknown,
         )
-        return pd.concat(frames, ignore_index=True)
+        with _in_words_of_python():
+            return pd.concat(frames, ignore_index=True)
 
     def save(self, folder: Path | str) -> None:
         """Copy the run to a new folder, which `load` and the command line can read.
@@ -245,8 +260,10 @@ def _store(
         logs = data
     else:
         logs = scratch / "logs.parquet"
-        pq.write_table(log_table(data, "logs"), logs)
-    report = prepare([logs], mapping or LogMapping(), scratch / "store", PrepareOptions(**options))
+        pq.write_table(log_table(data, "data"), logs)
+    with _in_words_of_python(scratch / "logs.parquet"):
+        prepared = PrepareOptions(**options)
+        report = prepare([logs], mapping or LogMapping(), scratch / "store", prepared)
     dropped = {reason: rows for reason, rows in report["dropped"].items() if rows}
     if dropped:
         reasons = "; ".join(f"{n:,}: {REASONS.get(name, name)}" for name, n in dropped.items())
@@ -255,3 +272,27 @@ def _store(
             stacklevel=3,
         )
     return EpisodeStore.open(scratch / "store")
+
+
+@contextmanager
+def _in_words_of_python(file: Path | None = None) -> Iterator[None]:
+    """Let errors and warnings of the block name arguments, not a scratch file or options.
+
+    Args:
+        file: scratch file of the argument `data`.
+    """
+
+    def translated(message: object) -> str:
+        text = str(message) if file is None else str(message).replace(str(file), "data")
+        for option, python in _OPTIONS:
+            text = re.sub(option, python, text)
+        return text
+
+    with warnings.catch_warnings(record=True) as noted:
+        warnings.simplefilter("always")
+        try:
+            yield
+        except InputError as error:
+            raise InputError(translated(error)) from None
+    for each in noted:
+        warnings.warn(each.category(translated(each.message)), stacklevel=5)

@@ -8,7 +8,8 @@ from ucfrec.errors import InputError
 from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, log_files
 
 LOGS: Final = ("log_standard_", "log_random_")
-USERS, BASIC, STATISTIC = "user_features_", "video_features_basic_", "video_features_statistic_"
+FEATURES: Final = ("user_features_", "video_features_basic_", "video_features_statistic_")
+USERS, BASIC, STATISTIC = FEATURES
 
 USER_COLUMNS: Final = (
     "user_active_degree",
@@ -62,14 +63,16 @@ MAPPING: Final = LogMapping(
 def _resolve(paths: Sequence[str | Path], given: LogMapping) -> tuple[tuple[Path, ...], LogMapping]:
     """All given logs, with user and basic video features of the same paths or the logs' folder.
 
-    Video statistics are used only if a path names their file.
+    Logs may have any name if none is called as in the releases. Video statistics are used only if a
+    path names their file.
     """
     named = log_files(paths)
-    logs = tuple(file for file in named if file.name.startswith(LOGS))
+    others = tuple(file for file in named if not file.name.startswith(FEATURES))
+    logs = tuple(file for file in others if file.name.startswith(LOGS)) or others
     if not logs:
         raise InputError(
-            f"no KuaiRand log among {len(named)} file(s) such as {named[0]}; name files called "
-            f"{'* or '.join(LOGS)}*"
+            f"no KuaiRand log among {len(named)} file(s) such as {named[0]}, only tables of "
+            f"features; name the log too, e.g. {LOGS[0]}*"
         )
     candidates = (*named, *log_files([logs[0].parent]))
     wanted = [path for path in paths if Path(path).name.startswith(STATISTIC)]

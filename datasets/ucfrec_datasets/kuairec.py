@@ -8,7 +8,8 @@ from ucfrec.errors import InputError
 from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, log_files
 
 TRAINING, EVALUATION = "big_matrix", "small_matrix"
-USERS, CATEGORIES, DAILY = "user_features", "item_categories", "item_daily_features"
+FEATURES: Final = ("user_features", "item_categories", "item_daily_features")
+USERS, CATEGORIES, DAILY = FEATURES
 
 USER_COLUMNS: Final = (
     "user_active_degree",
@@ -54,7 +55,7 @@ def _resolve(paths: Sequence[str | Path], given: LogMapping) -> tuple[tuple[Path
         file
         for file in named
         if file.name.startswith(TRAINING)
-        or (file.name.startswith(EVALUATION) and file.parent not in folders)
+        or (not file.name.startswith(FEATURES) and file.parent not in folders)
     )
     if not logs:
         raise InputError(

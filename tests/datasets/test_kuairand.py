@@ -1,5 +1,6 @@
 """KuaiRand: official file names of all releases, and the real rows."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from tests.support.real_data import data_folder
 from ucfrec import schema
+from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import LogMapping
@@ -171,3 +173,31 @@ def test_videos_of_unknown_length_earn_no_watch_ratio(tmp_path: Path) -> None:
     assert report["dropped"]["reward_not_finite"] == len(kept) - len(known)
     ratio = np.minimum(known["play_time_ms"] / known["duration_ms"], 5)
     assert report["reward_statistics"]["mean"] == pytest.approx(ratio.mean(), rel=1e-3)
+
+
+def test_a_run_remembers_that_its_log_is_of_kuairand_whatever_the_next_is_called(
+    tmp_path: Path,
+) -> None:
+    folder = tmp_path / "data"
+    folder.mkdir()
+    official(folder, "pure", {})
+    store, run, out = (str(tmp_path / name) for name in ("store", "run", "scores.parquet"))
+    assert main(["prepare", str(folder), "--dataset", "kuairand", "--out", store]) == 0
+    assert main(["train", store, "--policy", "popular", "--out", run]) == 0
+    scores = []
+    for name in ("log_standard_4_08_to_4_21_pure.csv", "may.csv"):
+        log = tmp_path / "later" / name
+        log.parent.mkdir(exist_ok=True)
+        shutil.copy(folder / "log_standard_4_08_to_4_21_pure.csv", log)
+        assert main(["score", run, str(log), "--out", out]) == 0
+        scores.append(pd.read_parquet(out))
+    frame = scores[0]
+    assert len(frame) > 200
+    pd.testing.assert_frame_equal(*scores)
+    # The same rows under plain names, as an own service would log them.
+    plain = pd.read_csv(log).rename(
+        columns={"video_id": "item_id", "time_ms": "timestamp", "is_click": "reward"}
+    )
+    plain[["user_id", "item_id", "timestamp", "reward"]].to_parquet(tmp_path / "own.parquet")
+    assert main(["score", run, str(tmp_path / "own.parquet"), "--out", out]) == 0
+    pd.testing.assert_frame_equal(pd.read_parquet(out), frame)

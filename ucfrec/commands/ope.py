@@ -216,7 +216,7 @@ def _logged(options: argparse.Namespace, trained: "TrainedPolicy") -> "Iterator[
         print(f"test split of {store.path}: {store.n_episodes:,} sessions, {store.n_steps:,} steps")
         yield logged
         return
-    files, mapping = logs_given(options)
+    files, mapping = logs_given(options, trained)
     limit = options.memory_limit
     with logged_sessions(trained.folder, trained, files, mapping, True, limit) as logged:
         print(format_report(logged.report))

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ucfrec.errors import InputError
 from ucfrec.files.remote import Input, uri_or_path
 
 if TYPE_CHECKING:
@@ -69,9 +70,9 @@ def log_options(parser: argparse.ArgumentParser) -> argparse.Action:
     )
     parser.add_argument(
         "--dataset",
-        default="generic",
         metavar="NAME",
-        help="kind of logs: generic, kuairand, kuairec, obd, … (default: generic)",
+        help="kind of logs: generic, kuairand, kuairec, obd, … (default: that of the run, if there "
+        "is one, else generic)",
     )
     parser.add_argument(
         "--column",
@@ -79,14 +80,14 @@ def log_options(parser: argparse.ArgumentParser) -> argparse.Action:
         default=[],
         metavar="NAME=COLUMN",
         help="file column or SQL expression for a log column, e.g. user_id=uid; repeatable "
-        "(default: the column of the same name)",
+        "(default: as in the logs that the run was trained on, or the column of the same name)",
     )
     parser.add_argument(
         "--mapping",
         type=Path,
         metavar="TOML",
         help="file with column mapping, reward and feature tables; --column overrides it "
-        "(default: none)",
+        "(default: none; a run remembers the columns of its logs)",
     )
     parser.add_argument(
         "--time-format",
@@ -298,8 +299,14 @@ def rule_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "Decisi
     return replace(trained.rule, **given)
 
 
-def logs_given(options: argparse.Namespace) -> "tuple[tuple[Path, ...], LogMapping]":
-    """Log files and full column mapping that `log_options` name.
+def logs_given(
+    options: argparse.Namespace, trained: "TrainedPolicy | None" = None
+) -> "tuple[tuple[Path, ...], LogMapping]":
+    """Log files and column mapping that `log_options` name.
+
+    Args:
+        options: with the logs.
+        trained: policy that the logs are for, which remembers the dataset of its training logs.
 
     Raises:
         InputError: a file is missing, or the dataset, a --column or the mapping file is unusable.
@@ -308,7 +315,6 @@ def logs_given(options: argparse.Namespace) -> "tuple[tuple[Path, ...], LogMappi
     from ucfrec.logs.mapping import LogMapping, columns_given, read_mapping
     from ucfrec.plugins import load_plugin
 
-    dataset: Dataset = load_plugin("datasets", options.dataset)
     given = LogMapping(
         columns_given(options.column),
         time_format=options.time_format,
@@ -318,7 +324,30 @@ def logs_given(options: argparse.Namespace) -> "tuple[tuple[Path, ...], LogMappi
     )
     if options.mapping is not None:
         given = given.over(read_mapping(options.mapping))
+    if trained is not None and options.dataset is None:
+        return _logs_like(trained, options.logs, given)
+    dataset: Dataset = load_plugin("datasets", options.dataset or "generic")
     return dataset.resolve(options.logs, given)
+
+
+def _logs_like(
+    trained: "TrainedPolicy", paths: list[str], given: "LogMapping"
+) -> "tuple[tuple[Path, ...], LogMapping]":
+    """Logs of the dataset that a policy was trained on, whose columns may have plain names too."""
+    from ucfrec.logs.mapping import LogMapping
+    from ucfrec.plugins import load_plugin, plugin_names
+
+    source = trained.record.data
+    # A record may also name a dataset that is not read by an adapter.
+    known = source.dataset in plugin_names("datasets")
+    dataset: Dataset = load_plugin("datasets", str(source.dataset) if known else "generic")
+    remembered = LogMapping.of_source(source, str(trained.folder)).remembered or LogMapping()
+    try:
+        files, found = dataset.resolve(paths, given)
+    except InputError:
+        files, found = dataset.resolve(paths, given.over(LogMapping(remembered.columns)))
+    columns = {name: text for name, text in found.columns.items() if name not in given.columns}
+    return files, replace(given, remembered=LogMapping(columns))
 
 
 def environment_given(options: argparse.Namespace) -> "Environment":

@@ -93,7 +93,7 @@ def run(options: argparse.Namespace) -> None:
     given = {
         "reward": options.reward and Expression(options.reward, "--reward"),
         "session_by": options.session_by,
-        "dataset": options.dataset,
+        "dataset": options.dataset or "generic",
         "gap_minutes": options.gap_minutes,
         "duplicates": options.duplicates,
         "max_session": options.max_session,

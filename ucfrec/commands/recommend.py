@@ -86,8 +86,8 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.recommending.recommend import recommend
     from ucfrec.runs.trained_policy import TrainedPolicy
 
-    files, mapping = logs_given(options)
     trained = TrainedPolicy.load(options.run, options.checkpoint)
+    files, mapping = logs_given(options, trained)
     rule, index = rule_given(options, trained), None
     if options.approximate:
         from ucfrec.acting.item_index import ItemIndex

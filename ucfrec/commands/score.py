@@ -35,8 +35,8 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.off_policy.score import logged_sessions, score
     from ucfrec.runs.trained_policy import TrainedPolicy
 
-    files, mapping = logs_given(options)
     trained = TrainedPolicy.load(options.run, options.checkpoint)
+    files, mapping = logs_given(options, trained)
     limit = options.memory_limit
     with logged_sessions(options.run, trained, files, mapping, memory_limit=limit) as logged:
         print(format_report(logged.report))

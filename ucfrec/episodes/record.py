@@ -50,6 +50,12 @@ class Source(Entry):
     """Name of the dataset adapter, or of the dataset."""
     mapping: dict[Text, Text] = Field(default_factory=dict)
     """Log column to the column of the files or the SQL expression that it was."""
+    time_format: Text | None = None
+    """How its times were written, if they were text; see `ucfrec.logs.mapping.LogMapping`."""
+    earliest: Text | None = None
+    where: Text | None = None
+    """Condition of the rows that were read."""
+    partitions: bool = False
     session_by: Text | None = None
     session_gap_ms: Count | None = None
     duplicates: Literal["highest", "lowest", "first", "last"] = "highest"

@@ -18,6 +18,7 @@ from ucfrec.logs.binding import explained
 from ucfrec.logs.clean import CLOCK_HINT, REASONS, require_rows
 from ucfrec.logs.engine import as_arrow, engine, engine_in_memory
 from ucfrec.logs.mapping import LogMapping, log_files
+from ucfrec.logs.remembered import settled
 from ucfrec.logs.sessions import end_of_user
 from ucfrec.logs.sorted_rows import CODES, SortedRows, check_sorted, has_codes, sorted_batches
 from ucfrec.logs.tables import Table, open_tables, quoted
@@ -79,6 +80,7 @@ def read_histories(
         engine(files, folder, memory_limit, shared=True) as connection,
     ):
         tables = tuple(open_tables(connection, files, mapping.partitions))
+        mapping, reward = settled(connection, tables, mapping, reward)
         log = typed_log(connection, tables, mapping, reward, session_by, folder)
         _require_items(log)
         with explained(connection, tables, folder):
@@ -123,6 +125,7 @@ def frame_histories(
         described = connection.sql(f"DESCRIBE {HISTORIES}").fetchall()
         table = FrameTable((Path(HISTORIES),), tuple((row[0], row[1]) for row in described))
         source = Path(HISTORIES)
+        mapping, reward = settled(connection, (table,), mapping, reward)
         log = typed_log(connection, (table,), mapping, reward, session_by, source)
         _require_items(log)
         with explained(connection, log.tables, source):
@@ -172,7 +175,8 @@ def log_table(frame: "pd.DataFrame", name: str) -> pa.Table:
 
 
 def _require_clean(dropped: dict[str, int]) -> None:
-    faults = {reason: n for reason, n in dropped.items() if n and reason != "duplicate"}
+    fine = ("duplicate", "left_out")
+    faults = {reason: n for reason, n in dropped.items() if n and reason not in fine}
     if faults:
         rows = "; ".join(f"{n:,} rows: {REASONS[reason]}" for reason, n in faults.items())
         hint = f"; {CLOCK_HINT}" if "clock_out_of_range" in faults else ""

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from ucfrec import schema
+from ucfrec.episodes.record import Source
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_toml
 from ucfrec.logs.expressions import Expression
@@ -87,6 +88,9 @@ class LogMapping:
     """SQL condition over the files' columns; rows that do not fulfil it are left out."""
     partitions: bool = False
     """Whether names of folders such as `country=DE` are columns."""
+    remembered: "LogMapping | None" = None
+    """Mapping of the log that a run was trained on. Its columns, time format and condition count
+    where nothing else is given and the files have the columns they need."""
 
     def __post_init__(self) -> None:
         known = (*KEY_COLUMNS, *OPTIONAL_COLUMNS)
@@ -130,6 +134,25 @@ class LogMapping:
             self.earliest or defaults.earliest,
             self.where or defaults.where,
             self.partitions or defaults.partitions,
+            self.remembered.over(defaults.remembered)
+            if self.remembered and defaults.remembered
+            else self.remembered or defaults.remembered,
+        )
+
+    @classmethod
+    def of_source(cls, source: Source, origin: str) -> "LogMapping":
+        """What is remembered of the log that a store was made from, for later logs.
+
+        Args:
+            source: in the record of the store or the run.
+            origin: file of the record, for messages.
+        """
+        columns = {name: Expression(text, origin) for name, text in source.mapping.items()}
+        where = source.where and Expression(source.where, origin)
+        return cls(
+            earliest=source.earliest,
+            partitions=source.partitions,
+            remembered=cls(columns, time_format=source.time_format, where=where),
         )
 
 

@@ -6,6 +6,7 @@ from typing import Final
 import numpy as np
 
 from ucfrec import schema
+from ucfrec.episodes.long_sessions import LONG
 from ucfrec.errors import InputNote
 from ucfrec.logs.binding import bind
 from ucfrec.logs.clean import CLOCK_HINT, REASONS
@@ -16,8 +17,6 @@ from ucfrec.logs.typed import ROWS, TypedLog
 
 MANY: Final = 0.2
 """Share of the rows from which on what happens to them is worth a warning."""
-LONG: Final = 100
-"""Times the median from which on a session is hardly a person's."""
 _REMEDIES: Final = {
     "null_key": "fill it in, or map another column",
     "clock_out_of_range": CLOCK_HINT,

@@ -41,6 +41,7 @@ from ucfrec.logs.mapping import SESSIONS, FeatureTable, LogMapping, log_files
 from ucfrec.logs.measures import Measures, binned_rewards, measure, sampled_rewards
 from ucfrec.logs.notes import note_bots, note_equal_times, note_losses
 from ucfrec.logs.order import count_unsorted
+from ucfrec.logs.remembered import settled
 from ucfrec.logs.sessions import Cut, Episodes, by_sessions, episodes, split_bounds
 from ucfrec.logs.sorted_rows import SortedRows, check_sorted, sorted_batches
 from ucfrec.logs.spool import Spool
@@ -264,6 +265,7 @@ def _prepared(
     ):
         with progress(4, "check the logs", "stages") as stage:
             tables = tuple(open_tables(connection, files, mapping.partitions))
+            mapping, reward = settled(connection, tables, mapping, reward)
             if options.engine == "spark":
                 # Spark is an extra.
                 from ucfrec.logs.spark import sorted_with_spark
@@ -301,7 +303,7 @@ def _prepared(
                 report = _report(rows, spool, cut, measures)
                 report = {"reward": reward, **report, "duplicates": options.duplicates}
                 report["dataset"] = options.dataset
-                report["mapping"] = {name: str(column) for name, column in mapping.columns.items()}
+                report |= _remembered(mapping)
                 stage.update()
         yield _Prepared(rows, spool, cut, measures, features, report, scratch)
 
@@ -316,6 +318,15 @@ def _cut(
     if cut.session_by == schema.SESSION_ID:
         return by_sessions(rows, scratch / "sessions"), cut
     return rows.clean, cut
+
+
+def _remembered(mapping: LogMapping) -> dict[str, Any]:
+    """What the store remembers of the mapping, for later logs."""
+    found: dict[str, Any] = {"mapping": {name: str(s) for name, s in mapping.columns.items()}}
+    for name in ("time_format", "earliest", "where"):
+        if (text := getattr(mapping, name)) is not None:
+            found[name] = str(text)
+    return found | ({"partitions": True} if mapping.partitions else {})
 
 
 def _report(rows: SortedRows, spool: Spool, cut: Cut, measures: Measures) -> dict[str, Any]:

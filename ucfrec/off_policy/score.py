@@ -91,7 +91,8 @@ def logged_sessions(
         run: folder of the run.
         trained: the policy of the run.
         files: the log files.
-        mapping: which columns of the logs mean what.
+        mapping: which columns of the logs mean what; what it leaves open is as in the training
+            logs.
         keep_unknown: keep rows whose item the run does not know.
         memory_limit: of the process while it reads, such as "2GB"; rows spill to disk.
 
@@ -105,6 +106,7 @@ def logged_sessions(
     if trained.item_states is None:
         raise _vectors(run)
     record = trained.record
+    mapping = mapping.over(LogMapping.of_source(record.data, str(run / RUN)))
     if not trained.logged_observation_size:
         mapping = LogMapping({schema.OBSERVATION: ""}).over(mapping)
     gap_ms = record.session_gap_ms

@@ -1,5 +1,6 @@
 """Users' histories, read in the same way as the training logs of a run."""
 
+import re
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -21,6 +22,7 @@ from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 _PLAIN = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP)
 _MOST_PLAIN_ROWS = 1_000_000
 """Rows up to which a frame is read at once, not in batches of users."""
+_WORD = re.compile(r"\w+")
 LONGEST_HISTORY = 1000
 """Most recent rows of a user that are read; older ones only count as seen."""
 
@@ -170,7 +172,7 @@ def histories_of_files(
     Args:
         trained: policy whose reward expression, session rule and observations apply.
         files: log files, folders and globs.
-        mapping: names of the columns.
+        mapping: names of the columns; what it leaves open is as in the training log.
         memory_limit: of the process, such as "2GB"; rows spill to disk.
 
     Returns:
@@ -201,7 +203,7 @@ def histories_of_frame(
     Args:
         trained: policy whose reward expression, session rule and observations apply.
         frame: one row per interaction.
-        mapping: names of the columns.
+        mapping: names of the columns; what it leaves open is as in the training log.
 
     Returns:
         The batches.
@@ -210,7 +212,8 @@ def histories_of_frame(
         InputError: a column is missing, or has values that cannot be used.
     """
     by_id = _session_by(trained) == schema.SESSION_ID
-    if not trained.record.observation_size and mapping == LogMapping():
+    plain_names = mapping == LogMapping() and not _concerned(trained, frame)
+    if not trained.record.observation_size and plain_names:
         plain = Histories.from_plain(frame, by_id, trained.record.data.duplicates)
         if plain is not None:
             return iter((plain,))
@@ -254,11 +257,25 @@ def _plain_columns(frame: pd.DataFrame, by_id: bool) -> list[Array] | None:
     return [rewards, *keys] if fine else None
 
 
+def _remembered(trained: TrainedPolicy) -> LogMapping:
+    return LogMapping.of_source(trained.record.data, str(trained.folder / RUN))
+
+
+def _concerned(trained: TrainedPolicy, frame: pd.DataFrame) -> bool:
+    """Whether what the run remembers of its training log may mean columns of the frame."""
+    source, names = trained.record.data, {str(n).casefold() for n in getattr(frame, "columns", ())}
+    texts = [*source.mapping.values(), source.where or ""]
+    words = {word.casefold() for text in texts for word in _WORD.findall(text)}
+    return source.earliest is not None or bool(words & names)
+
+
 def _reward(trained: TrainedPolicy) -> Expression:
     return Expression(trained.record.reward, str(trained.folder / RUN))
 
 
 def _columns_used(trained: TrainedPolicy, mapping: LogMapping) -> LogMapping:
+    """The mapping with what the run remembers of its training log."""
+    mapping = mapping.over(_remembered(trained))
     if trained.record.observation_size:
         return mapping
     return LogMapping({schema.OBSERVATION: ""}).over(mapping)

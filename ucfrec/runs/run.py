@@ -16,6 +16,7 @@ from ucfrec.counterfactual.augmentation import MODELS, counterfactual_augmentati
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
 from ucfrec.counterfactual.state_augmentation import AugmentationReport, AugmentConfig
+from ucfrec.episodes.long_sessions import of_people
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.episodes.windows import Overlay
 from ucfrec.files.atomic import write_json
@@ -197,9 +198,10 @@ def _train_policy(
 
 def _fit_user_model(run: _Inputs) -> UserModel:
     """Fit what users would do: the reward of every item, session ends and fatigue."""
-    inputs = _dependencies(run.logged, run.held_out, run.config.seed, torch.device("cpu"))
+    views = of_people(run.logged), of_people(run.held_out)
+    inputs = _dependencies(*views, run.config.seed, torch.device("cpu"))
     inputs["simulated"] = simulated = run.record.return_to_go.per_session
-    given = run.logged, run.held_out, run.out / REWARD_MODEL, run.config.seed
+    given = *views, run.out / REWARD_MODEL, run.config.seed
     fit = partial(UserModel.fit, *given, simulated)
     run.shared.provide(inputs, UserModel.__module__, run.out, (REWARD_MODEL,), fit)
     return fit()  # read from the folder
@@ -212,7 +214,8 @@ def _choose_rule(run: _Inputs, users: UserModel) -> RuleRecord:
     scorer = Scorer(run.policy, trained.rule, *parts)
     config = run.config.rule
     targets = {quantile: trained.target_return(quantile) for quantile in config.quantiles}
-    choice = choose_rule(scorer, users, targets, run.logged, run.held_out, config, run.config.seed)
+    views = of_people(run.logged), of_people(run.held_out)
+    choice = choose_rule(scorer, users, targets, *views, config, run.config.seed)
     write_json(run.out / RULE, choice.rule.as_dict())
     return RuleRecord.model_validate(choice.as_dict())
 

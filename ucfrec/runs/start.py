@@ -15,6 +15,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Float32Array
 from ucfrec.counterfactual.augmentation import require_rewards_vary
 from ucfrec.episodes.item_counts import TrainingCounts
+from ucfrec.episodes.long_sessions import of_people
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError
@@ -165,8 +166,11 @@ def returns_of(store: EpisodeStore, config: Config) -> ReturnToGo:
 def _target_returns(train: EpisodeStore, definition: ReturnToGo) -> Float32Array:
     """Sorted returns-to-go of sessions, or of steps if targets are set anew at every step.
 
-    Of more than a million, evenly spaced order statistics are kept, the lowest and highest too.
+    Sessions as long as only those of bots are count for nothing. Of more than a million, evenly
+    spaced order statistics are kept, the lowest and highest too.
     """
+    if train.has_items:
+        train = of_people(train)
     returns = train.returns
     if not definition.per_session:
         returns = train.with_return_to_go(definition).column(schema.RETURN_TO_GO)

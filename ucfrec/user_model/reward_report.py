@@ -1,11 +1,11 @@
 """How good the reward model of items is on held-out steps."""
 
 from collections.abc import Mapping
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 import torch
-from pydantic import ConfigDict
+from pydantic import BeforeValidator, ConfigDict
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
@@ -20,6 +20,8 @@ _PRIOR: Final = 10.0
 _CHUNK: Final = 16_384
 SAVED: Final = ConfigDict(extra="forbid")
 """Of reports that are saved beside what they are of, and read again."""
+_OrNaN = Annotated[float, BeforeValidator(lambda value: np.nan if value is None else value)]
+"""Undefined in a log that shows too little, and then null in JSON."""
 
 
 @dataclass(frozen=True, config=SAVED)
@@ -71,23 +73,23 @@ class ItemRewardReport:
     """Held-out loss of item effects alone."""
     loss: float
     """Held-out loss of the model."""
-    r2: float
+    r2: _OrNaN
     """R² of the expected reward on held-out rows."""
     calibration: Calibration
     """Predicted and observed rewards."""
-    gauc: float
+    gauc: _OrNaN
     """Probability that a liked step scores higher than another of the same user, by impressions.
 
     What all items share at a step (user and state) is left out of the scores: it does not rank
     items, and as the state contains the last reward, it would compare a user's steps by what was
     liked before them."""
-    gauc_error: float
+    gauc_error: _OrNaN
     """Standard error of `gauc`, over users."""
-    item_rate_gauc: float
+    item_rate_gauc: _OrNaN
     """`gauc` of the items' training rates of liked steps, 10 impressions at the mean added."""
-    gauc_gain: float
+    gauc_gain: _OrNaN
     """`gauc` minus `item_rate_gauc`."""
-    gauc_gain_error: float
+    gauc_gain_error: _OrNaN
     """Standard error of `gauc_gain`, over users."""
     seconds: float
     """Processor time of the fit."""

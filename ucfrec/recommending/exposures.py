@@ -146,9 +146,9 @@ class ExposureLog:
             # Read first: what is added before the log is closed is written.
             closed = self._closed
             self._wake.clear()
-            self._flush()
+            self._flush(last=closed)
 
-    def _flush(self) -> None:
+    def _flush(self, last: bool) -> None:
         with self._lock:
             waiting, self._waiting, count, self._count = self._waiting, [], self._count, 0
             lost, self._lost = self._lost, 0
@@ -161,12 +161,15 @@ class ExposureLog:
             with atomic_file(self._folder / name) as scratch:
                 pq.write_table(self._table(waiting), scratch)
         except (OSError, InputError, pa.ArrowException) as error:
-            _warn(f"{self._folder / name} cannot be written: {error}; {count:,} rows wait")
+            ends = "are lost" if last else "wait"
+            _warn(f"{self._folder / name} cannot be written: {error}; {count:,} rows {ends}")
+            if last:
+                return
             with self._lock:
                 self._waiting = waiting + self._waiting
                 self._count += count
             # A full log would otherwise try again at every answer.
-            time.sleep(0 if self._closed else min(1.0, self._seconds))
+            time.sleep(min(1.0, self._seconds))
 
     def _table(self, waiting: list[tuple[str, int, Answer]]) -> pa.Table:
         columns: dict[str, list[object]] = {name: [] for name in self._schema.names}

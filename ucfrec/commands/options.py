@@ -235,7 +235,7 @@ def draw_options(parser: argparse.ArgumentParser, place: str) -> None:
         "--exposures",
         type=Path,
         metavar=place,
-        help="write what was shown, with its probability, as Parquet (docs/serving.md)",
+        help="write what was shown, with its probability, as Parquet (docs/exposures.md)",
     )
 
 

@@ -66,9 +66,11 @@ def test_the_hash_is_that_of_the_values_alone() -> None:
         DecisionRule(5.0, tag_run=1),
         DecisionRule(5.0, lookahead=1.0),
         DecisionRule(5.0, policy_weight=0.5),
+        DecisionRule(5.0, explore=0.5),
+        DecisionRule(5.0, explore=0.5, explore_top=3),
     ]
-    assert len({rule.hash for rule in [DecisionRule(5.0), *others]}) == 9
-    assert len({str(rule) for rule in others}) == 8
+    assert len({rule.hash for rule in [DecisionRule(5.0), *others]}) == len(others) + 1
+    assert len({str(rule) for rule in others}) == len(others)
 
 
 HOSTILE: dict[str, Any] = {

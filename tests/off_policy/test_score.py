@@ -129,8 +129,8 @@ def test_features_at_the_policy_are_the_mean_over_its_items(
     probabilities = batch.log_probabilities.exp().numpy()
     mean = np.zeros(at_policy.shape)
     for item in range(probabilities.shape[1]):
-        shown = replace(batch.windows, actions=torch.full_like(batch.windows.actions, item))
-        target, _, seen = step_features(trained, replace(batch, windows=shown))
+        shown = replace(batch, items=torch.full_like(batch.items, item))
+        target, _, seen = step_features(trained, shown)
         of_item, _ = seen.features()
         np.testing.assert_allclose(target, probabilities[:, item], rtol=1e-6)
         mean += probabilities[:, item, None] * of_item

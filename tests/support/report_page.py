@@ -93,7 +93,8 @@ def record_of(run: Path) -> dict[str, Any]:
 def rewritten(run: Path, to: Path, **changes: Any) -> Path:
     """A copy of a run with another record; a change to None takes the field away."""
     shutil.copytree(run, to)
-    record = {k: v for k, v in (record_of(run) | changes).items() if v is not None}
+    absent = [name for name, value in changes.items() if value is None]
+    record = {k: v for k, v in (record_of(run) | changes).items() if k not in absent}
     (to / "run.json").write_text(json.dumps(record))
     return to
 

@@ -58,6 +58,8 @@ class Source(Entry):
     dropped: dict[Text, Count] = Field(default_factory=dict)
     """Rows dropped, by reason."""
     unsorted_rows: Count | None = None
+    equal_times: Count | None = None
+    """Rows that share their time with another row of their user."""
     steps: Count | None = None
     users: Count | None = None
     items: Count | None = None

@@ -190,14 +190,16 @@ class Recommender:
             candidates: the only item_ids to recommend; None for all.
             skip_unknown: ignore rows of items that are not in the training data.
             rule: the decision rule; None for the run's own, `Recommender.trained.rule`.
-            seed: of the draws of a rule with a temperature.
+            seed: of the draws of a rule with a temperature, or that explores. They also depend on
+                the user and the time of the user's last row.
             mapping: names of the columns of `histories`; those that it leaves open are as in the
                 training log if `histories` has them, and otherwise as above.
 
         Returns:
             `user_id`, `rank` (from 1), `item_id`, `score` (log-probability at temperature 1 among
-            the items that are left, nats): k rows per user, users in sorted order; fewer rows if
-            fewer items remain, as with less than k candidates.
+            the items that are left, nats), `propensity` (probability of the item at its position,
+            given those before it), `request_id`: k rows per user in the order shown, users in
+            sorted order; fewer rows if fewer items remain, as with less than k candidates.
 
         Raises:
             InputError: the recommender is not trained, an argument is wrong, a column is missing or

@@ -48,10 +48,10 @@ class ItemIndex:
             raise InputError(
                 "the approximate search needs faiss, which is not installed; install ucfrec[faiss]"
             ) from None
-        if scorer.rule.temperature > 0:
+        if scorer.rule.draws:
             raise InputError(
-                f"the rule draws items at temperature {scorer.rule.temperature:g}, which needs the "
-                "scores of all of them; leave --approximate out, or give --temperature 0"
+                f"the rule draws items ({scorer.rule}), which needs all scores; leave "
+                "--approximate out, or give --temperature 0 --explore 0"
             )
         if not scorer.is_product:
             raise InputError(

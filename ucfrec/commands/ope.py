@@ -196,6 +196,18 @@ def _judged(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicyRep
     shown = ("estimator", "policy", "choice", "R_cum", "effective_sessions", "sessions")
     lines = [{**dict.fromkeys(shown), **r.as_line(), "estimator": r.method} for r in found.rows]
     print(f"\n{format_rows(lines, shown)}")
+    if found.per_step is not None:
+        per_step = ("estimator", "policy", "choice", "R_step", "effective_steps", "steps")
+        lines = [
+            {
+                **dict.fromkeys(per_step),
+                **row.as_line(),
+                "estimator": row.method,
+                "steps": found.per_step.steps,
+            }
+            for row in found.step_rows
+        ]
+        print(f"\n{format_rows(lines, per_step)}\n{found.per_step}\n")
     print(f"models: {found.models}")
     for warning in found.warnings:
         print(f"warning: {warning}")
@@ -278,6 +290,6 @@ def _write(
     rows = [
         row.extended({"candidate": name, **more.get(name, {})}, checkpoint=options.checkpoint)
         for name, report in reports.items()
-        for row in report.rows
+        for row in (*report.rows, *report.step_rows)
     ]
     write_results(options.json, rows)

@@ -1,6 +1,8 @@
 """Options that several commands share, and the objects made from them."""
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +14,7 @@ if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
     from ucfrec.evaluation.environment import Environment
     from ucfrec.logs.mapping import Dataset, LogMapping
+    from ucfrec.recommending.exposures import ExposureLog
     from ucfrec.recommending.requests import Limits
     from ucfrec.recommending.responder import Responder
     from ucfrec.runs.trained_policy import TrainedPolicy
@@ -178,6 +181,15 @@ def rule_options(parser: argparse.ArgumentParser) -> None:
     )
     rule.add_argument("--top-k", type=int, metavar="N", help="draw from the N best items only")
     rule.add_argument(
+        "--explore",
+        type=float,
+        metavar="SHARE",
+        help="share of the requests that draw uniformly from all items that are allowed",
+    )
+    rule.add_argument(
+        "--explore-top", type=int, metavar="N", help="these draw from the N best items only"
+    )
+    rule.add_argument(
         "--exclude-seen", action="store_true", help="leave out items that the session has shown"
     )
     rule.add_argument(
@@ -205,6 +217,26 @@ def item_options(parser: argparse.ArgumentParser) -> None:
         "--skip-unknown",
         action="store_true",
         help="ignore rows with items outside the catalogue of the run (default: an error)",
+    )
+
+
+def draw_options(parser: argparse.ArgumentParser, place: str) -> None:
+    """Add --seed and --exposures, of a rule that draws items.
+
+    Args:
+        place: FILE or DIR.
+    """
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=0,
+        help="of the draws of a rule with --temperature or --explore (default: 0)",
+    )
+    parser.add_argument(
+        "--exposures",
+        type=Path,
+        metavar=place,
+        help="write what was shown, with its probability, as Parquet (docs/exposures.md)",
     )
 
 
@@ -253,8 +285,8 @@ def limits_given(options: argparse.Namespace) -> "Limits":
 
 
 def responder_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "Responder":
-    """What answers requests, by `--k`, `item_options`, `engine_option`, `limit_options` and
-    `rule_options`.
+    """What answers requests, by `--k`, `item_options`, `draw_options`, `engine_option`,
+    `limit_options` and `rule_options`.
 
     Raises:
         InputError: a value is out of range, or the policy's actions are vectors.
@@ -268,8 +300,23 @@ def responder_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "R
         k=options.k,
         filter_seen=not options.keep_seen,
         skip_unknown=options.skip_unknown,
+        seed=options.seed,
         engine=options.engine,
     )
+
+
+@contextmanager
+def exposures_given(
+    options: argparse.Namespace, trained: "TrainedPolicy"
+) -> "Iterator[ExposureLog | None]":
+    """Where `draw_options` say that a server's answers are written; None for nowhere."""
+    from ucfrec.recommending.exposures import ExposureLog
+
+    if options.exposures is None:
+        yield None
+        return
+    with ExposureLog(options.exposures, trained) as log:
+        yield log
 
 
 def rule_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "DecisionRule":
@@ -289,6 +336,8 @@ def rule_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "Decisi
         "lookahead": options.lookahead,
         "temperature": options.temperature,
         "top_k": options.top_k,
+        "explore": options.explore,
+        "explore_top": options.explore_top,
         "exclude_seen": options.exclude_seen or None,
         "tag_window": options.tag_window,
         "tag_run": options.tag_run,

@@ -1,5 +1,6 @@
 """Estimates from logs what a trained policy would have earned, and reports how reliable that is."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -21,7 +22,7 @@ from ucfrec.off_policy.behavior_model import (
 )
 from ucfrec.off_policy.columns import diagnosis_columns, estimate_row, verdict_columns
 from ucfrec.off_policy.diagnostics import diagnose, implied_items
-from ucfrec.off_policy.estimators import estimate, session_terms
+from ucfrec.off_policy.estimators import Estimate, estimate, session_terms
 from ucfrec.off_policy.features import (
     InputsFile,
     StepInputs,
@@ -32,6 +33,7 @@ from ucfrec.off_policy.features import (
 from ucfrec.off_policy.fqe import ModelReport, fit_models
 from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps
 from ucfrec.off_policy.pages import as_pages, pages_of
+from ucfrec.off_policy.per_step import StepValue, step_value
 from ucfrec.off_policy.score import LoggedSessions, ScoredSteps, scored_steps
 from ucfrec.off_policy.training_rows import seen_too_often, share_seen
 from ucfrec.off_policy.verdict import FAR_OFF, Verdict, cautions, influences, judge
@@ -90,6 +92,10 @@ class OffPolicyReport:
     """(S,) whose they are; None where each is somebody else's."""
     terms: Float64Array | None
     """(S,) whose mean is the estimate that the verdict is of; None where nothing can be weighed."""
+    per_step: StepValue | None = None
+    """The value per step, where only some steps have propensities."""
+    step_rows: Sequence[ResultRow] = ()
+    """Its result rows, one for each estimator."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +157,8 @@ def evaluate_off_policy(
     )
     said = [*verdict.reasons, *cautions(diagnosis, found), *_of_the_logs(seen, logged), *of_groups]
     said += _of_the_models(judged)
+    value = None if options.pages else step_value(judged.steps, seed)
+    said += [value.doubt] if value is not None and value.doubt else []
     about = {
         "seen_in_training": seen,
         "warnings": said,
@@ -162,18 +170,30 @@ def evaluate_off_policy(
     }
     conditions = {"run": without_folders(str(run)), **_conditions(steps, options)}
     fingerprint = logged.store.record.fingerprint
-    rows = [
-        replace(
-            estimate_row(name, one, trained, rule, seed, conditions, about),
-            data_fingerprint=fingerprint,
+
+    def rows_of(estimates: Mapping[str, Estimate], per_step: bool) -> list[ResultRow]:
+        rows = (
+            estimate_row(name, one, trained, rule, seed, conditions, about, per_step=per_step)
+            for name, one in estimates.items()
         )
-        for name, one in found.items()
-    ]
+        return [replace(row, data_fingerprint=fingerprint) for row in rows]
+
+    report = OffPolicyReport(
+        rows_of(found, per_step=False),
+        said,
+        verdict,
+        judged.models,
+        returns=np.empty(0),
+        user=None,
+        terms=None,
+        per_step=value,
+        step_rows=[] if value is None else rows_of(value.estimates, per_step=True),
+    )
     if diagnosis.left_out == diagnosis.sessions:
-        return OffPolicyReport(rows, said, verdict, judged.models, np.empty(0), None, None)
+        return report
     known = steps.known()
     terms = _terms(known, verdict)
-    return OffPolicyReport(rows, said, verdict, judged.models, known.returns, known.user, terms)
+    return replace(report, returns=known.returns, user=known.user, terms=terms)
 
 
 def _conditions(steps: LoggedSteps, options: EstimateOptions) -> dict[str, Scalar]:

@@ -160,7 +160,7 @@ def _description(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
         "rule_hash": rule.hash,
         "rule_notes": "the graph applies target, minimum_target, reward_weight, tag_window and "
         "tag_run; with exclude_seen, put the session's items into `excluded`; with a temperature, "
-        "draw from `scores`",
+        "draw from `scores`, and with explore, draw that share of the requests uniformly",
         "policy": trained.name,
         "reward": trained.record.reward,
         "session_by": trained.record.session_by,

@@ -120,6 +120,18 @@ class Request(BaseModel):
         ]
         | None
     ) = None
+    request_id: (
+        Annotated[
+            str,
+            Field(
+                min_length=1,
+                max_length=200,
+                description="Identifies the request: a repetition gets the same items. Without "
+                "one, the server makes one.",
+            ),
+        ]
+        | None
+    ) = None
 
 
 class StreamRequest(Request):

@@ -1,4 +1,5 @@
-"""Open Bandit Dataset: official file names, and two real policies judged by each other's logs."""
+"""Open Bandit Dataset: official file names, and two real policies evaluated on each other's
+logs."""
 
 import shutil
 from pathlib import Path
@@ -157,7 +158,7 @@ def test_every_real_impression_is_a_session_with_its_propensity(tmp_path: Path) 
 
 @pytest.mark.realdata
 def test_random_logs_tell_what_thompson_sampling_earns() -> None:
-    """The policy of the bts logs, taken as its shares of items by position, judged by the random
+    """The policy of the bts logs, taken as its shares of items by position, evaluated on the random
     logs; the truth is the click rate of the bts logs, 42 clicks in 10,000, itself uncertain."""
     _, random = real("random")
     _, bts = real("bts")

@@ -117,8 +117,8 @@ def test_the_user_that_reset_gives_is_that_of_the_whole_session() -> None:
 @pytest.mark.parametrize(
     ("name", "observe", "said"),
     [
-        ("Slate", (), "takes actions of MultiDiscrete.*plays one item"),
-        ("Matrix", (), "takes actions of Box.*plays one item"),
+        ("Slate", (), "takes actions of MultiDiscrete.*takes one item"),
+        ("Matrix", (), "takes actions of Box.*takes one item"),
         ("Discrete", ("secrets",), "--observe secrets: .* has the entries secret, step"),
         ("Whole", ("step",), "--observe step: .* has no named entries"),
         ("Notes", ("step", "notes"), "name entries of a fixed size with --observe"),

@@ -90,7 +90,7 @@ def test_one_clear_winner_loses_nothing() -> None:
     assert found.chosen.probability_best == 1
     assert found.regret == 0
     assert found.corrected == pytest.approx(found.chosen.value, abs=0.01)
-    assert found.headline.startswith("No other earns more than c: ")
+    assert found.headline.startswith("No other has a higher value than c: ")
     assert [one.rank for one in found.standings] == [1, 2, 3, 4]
 
 

@@ -1,4 +1,4 @@
-"""Rows that a run was trained on are noticed where it is judged by them."""
+"""Rows that a run was trained on are noticed where it is evaluated on them."""
 
 import re
 import shutil

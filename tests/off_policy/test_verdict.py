@@ -19,8 +19,8 @@ PAYS = np.linspace(0.1, 0.5, ITEMS)
 def logs(
     sessions: int, seed: int = 0, length: int = 1, behavior: Float64Array | None = None
 ) -> tuple[LoggedSteps, IntArray]:
-    """Sessions of a behavior policy (uniform unless given) judged for one that likes later items;
-    its value is `value(length)`. Returns the items shown too."""
+    """Sessions of a behavior policy (uniform unless given) evaluated for one that likes later
+    items; its value is `value(length)`. Returns the items shown too."""
     rng = np.random.default_rng(seed)
     behavior = np.full(ITEMS, 1 / ITEMS) if behavior is None else behavior
     items = rng.choice(ITEMS, p=behavior, size=sessions * length)
@@ -49,7 +49,7 @@ def test_good_logs_stand_and_say_what_the_policy_gains() -> None:
     assert verdict.lift_high is not None
     assert 0 < verdict.lift_low < lift < verdict.lift_high
     assert verdict.probability_better == 1
-    assert str(verdict).startswith("The policy earns more than the logged one: +0.0")
+    assert str(verdict).startswith("The policy has a higher return than the logged one: +0.0")
     same = judge(replace(steps, target=steps.propensity), seed=0)
     assert same.lift == pytest.approx(0)
     assert same.reasons == ("the sessions do not differ enough for an interval",)
@@ -137,7 +137,7 @@ def test_weights_are_tested_by_segment() -> None:
 
 
 def test_no_rewarded_weight_is_refused() -> None:
-    """The policy repeats one item that never earned anything: not "0 [0, 0]"."""
+    """The policy repeats one item that never had a reward: not "0 [0, 0]"."""
     steps, items = logs(5000)
     steps = replace(
         steps, reward=steps.reward * (items != 3), target=(items == 3).astype(np.float64)

@@ -1,4 +1,4 @@
-"""Exposure, advantage weights and the largest return, in every learner; without them, nothing."""
+"""Exposure, advantage weights and the largest return, in every policy; without them, nothing."""
 
 import time
 from dataclasses import replace
@@ -152,7 +152,7 @@ def test_exposure_moves_predictions_by_what_was_shown_alone(name: str) -> None:
 
 
 def reference_loss(policy: SequencePolicy, windows: Any) -> Tensor:
-    """The action loss as it was before there were additions."""
+    """The action loss as it was without shared components."""
     features = policy.features(policy.normalized(windows))
     return policy.head.loss(features[windows.mask], windows.actions[windows.mask])
 

@@ -1,4 +1,4 @@
-"""Learners by name: ucfrec's own, imported when asked for, and those installed beside it."""
+"""Policies by name: ucfrec's own, imported when needed, and those installed beside it."""
 
 import shutil
 import subprocess

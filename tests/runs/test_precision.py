@@ -1,4 +1,4 @@
-"""Training in bfloat16: close to float32, resumed to the last bit, and with every learner."""
+"""Training in bfloat16: close to float32, resumed to the last bit, and with every policy."""
 
 from pathlib import Path
 

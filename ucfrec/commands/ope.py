@@ -1,4 +1,4 @@
-"""`ucfrec ope`: what a policy would have earned, from logs alone."""
+"""`ucfrec ope`: the return of a policy, estimated from logs alone."""
 
 import argparse
 import math
@@ -64,21 +64,21 @@ def estimate_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--anonymous",
         action="store_true",
-        help="the logs' users are no persons (as in obd): take each session for somebody else's",
+        help="the logs' users are no persons (as in obd): treat each session as of another user",
     )
     parser.add_argument(
         "--reward-range",
         type=float,
         nargs=2,
         metavar=("LEAST", "MOST"),
-        help="what a step can earn, to bound what unsupported choices could (default: as observed)",
+        help="reward of a step, to bound what unsupported choices could (default: as observed)",
     )
     parser.add_argument(
         "--lift",
         type=float,
         metavar="RETURN",
-        help="return a session that a launch should gain; the verdict says how many sessions would "
-        "show it (default: 5%% of the mean logged return)",
+        help="return per session that a launch should gain; the verdict says how many "
+        "sessions would show it (default: 5%% of the mean logged return)",
     )
     parser.add_argument(
         "--item-groups",
@@ -145,7 +145,7 @@ def run(options: argparse.Namespace) -> None:
         return
     choice = choose(reports, options.seed)
     if choice.selection is not None:
-        print("\nvalue of a session, with a 95% band that holds all of them at once:")
+        print("\nvalue per session, with a 95% band that holds all of them at once:")
         head = ("candidate", "value [band]", "P(best)", "rank")
         body = [
             (one.name, f"{one.value:.4g} [{one.low:.4g}, {one.high:.4g}]",
@@ -206,7 +206,7 @@ def _judged(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicyRep
 
 @contextmanager
 def _logged(options: argparse.Namespace, trained: "TrainedPolicy") -> "Iterator[LoggedSessions]":
-    """What the policy is judged by: the logs, or else the test split of its store."""
+    """What the policy is evaluated on: the logs, or else the test split of its store."""
     from ucfrec.logs.summary import format_report
     from ucfrec.off_policy.score import held_out_sessions, logged_sessions
 
@@ -224,7 +224,7 @@ def _logged(options: argparse.Namespace, trained: "TrainedPolicy") -> "Iterator[
 
 
 def _rules(options: argparse.Namespace, trained: "TrainedPolicy") -> "list[DecisionRule]":
-    """The decision rules to judge: the run's own with the parts that the options name.
+    """The decision rules to evaluate: the run's own with the parts that the options name.
 
     Raises:
         InputError: one of `--targets` is neither a number nor a quantile, or a temperature is no

@@ -37,7 +37,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     item_options(parser)
     parser.add_argument(
-        "--threads", type=int, metavar="N", help="of a forward pass (default: one a core)"
+        "--threads", type=int, metavar="N", help="of a forward pass (default: one per core)"
     )
     rule_options(parser)
     engine_option(parser)
@@ -101,7 +101,7 @@ def run(options: argparse.Namespace) -> None:
         try:
             Server(config, f"ucfrec serve: {trained!r}").run([listening])
         except Interrupted:
-            # What was asked of a server that is told to stop is done.
+            # What was asked of a server that is stopped is done.
             print("ucfrec serve: stopped", file=sys.stderr)
 
 

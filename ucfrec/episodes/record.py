@@ -140,7 +140,8 @@ class StoreRecord(Record):
         return super().of(value, path)
 
     def _require_held(self, folder: Path) -> None:
-        """Check that the files can hold the steps, before memory for an entry a step is asked for.
+        """Check that the files can hold the steps, before memory for an entry per step is
+        allocated.
 
         Raises:
             InputError: they are too small, or there are fewer steps than episodes.

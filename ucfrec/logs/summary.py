@@ -152,7 +152,7 @@ def _returns_to_go(report: Mapping[str, Any]) -> str:
     text = f"{report['return_length_share']:.0%} of its variance is the number of steps left"
     if report["session_by"] != "user":
         return text
-    return f"{text}, which is chance where sessions are users: policies learn the next step's"
+    return f"{text}, which is random where sessions are users: policies learn the next step's"
 
 
 def _clock(milliseconds: int) -> str:

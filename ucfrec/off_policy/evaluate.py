@@ -1,4 +1,4 @@
-"""Estimates from logs what a trained policy would have earned, and reports how reliable that is."""
+"""Estimates from logs the return of a trained policy, and reports how reliable that is."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -87,7 +87,7 @@ class OffPolicyReport:
     returns: Float64Array
     """(S,) of the logged sessions, or pages, with all their propensities; empty if none has."""
     user: IntArray | None
-    """(S,) whose they are; None where each is somebody else's."""
+    """(S,) whose they are; None where each is of another user."""
     terms: Float64Array | None
     """(S,) whose mean is the estimate that the verdict is of; None where nothing can be weighed."""
 
@@ -123,7 +123,7 @@ def evaluate_off_policy(
         trained: the policy of the run.
         logged: logs read with `keep_unknown`. The policy would never show an item that it does not
             know, so such a step has weight 0.
-        rule: the decision rule to judge; None for the run's own.
+        rule: the decision rule to evaluate; None for the run's own.
         seed: seed of the folds and of the bootstrap.
         options: what else is asked.
 
@@ -211,7 +211,7 @@ def _without_far_off_groups(steps: LoggedSteps) -> tuple[LoggedSteps, list[str]]
     weights = steps.cluster_weights
     if weights is None or abs((mean := float(weights[steps.last].mean())) - 1) <= FAR_OFF:
         return steps, []
-    said = f"MIPS is left out: its session weights have mean {mean:.3g} where 1 is expected"
+    said = f"MIPS is excluded: its session weights have mean {mean:.3g} where 1 is expected"
     return replace(steps, cluster_propensity=None, cluster_target=None), [said]
 
 
@@ -273,7 +273,7 @@ def logged_steps(
     seed: int,
     options: EstimateOptions = DEFAULTS,
 ) -> JudgedSteps:
-    """Collect the logged steps, the policy's probabilities and models of what it would earn.
+    """Collect the logged steps, the policy's probabilities and models of its return.
 
     In memory are some ten numbers a step; what the models see of it, and the probabilities of item
     groups, lie on disk.
@@ -281,7 +281,7 @@ def logged_steps(
     Args:
         trained: a policy that chooses items.
         logged: logs read with `keep_unknown`.
-        rule: the decision rule to judge.
+        rule: the decision rule to evaluate.
         seed: seed of the folds, item groups and samples.
         options: what else is asked.
 

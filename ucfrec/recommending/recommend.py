@@ -42,7 +42,7 @@ def recommend(
     """`k` next items of every user, by the decision rule.
 
     A user's latest session is assumed to continue: items are scored at its next step, and the
-    rewards that the session has earned lower the target as in acting. A rule with a temperature
+    rewards that the session has had lower the target as in acting. A rule with a temperature
     draws the items one after the other, without repetition; otherwise they are the `k` best. For
     users who are not in the training logs, the state is made of their rows alone.
 
@@ -51,7 +51,7 @@ def recommend(
         batches: the users' histories.
         k: number of items per user, at least 1.
         rule: the decision rule; None for the run's own.
-        filter_seen: leave out every item that the user has seen.
+        filter_seen: exclude every item that the user has seen.
         candidates: the only item_ids to recommend, for all users; None for all items.
         skip_unknown: ignore rows of items that are not in the training data.
         seed: of the draws of a rule with a temperature.
@@ -165,7 +165,7 @@ def best_of(
     rule: DecisionRule, scores: Tensor, k: int, drawn: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """`k` items (B, k) and their log-probabilities (B, k) at temperature 1 among those left, −∞
-    for items that are left out.
+    for items that are excluded.
 
     Args:
         rule: the decision rule.

@@ -38,7 +38,7 @@ def augmentation_table(runs: Sequence[tuple[str, AugmentationReport]]) -> Table:
             ("other actions asked about", [a and a.proposals for a in asked]),
             ("copies with another action", [a and a.copies for a in asked]),
             ("mean change of their reward", [a and a.mean_change for a in asked]),
-            ("share of them that earns more", [a and a.earns_more for a in asked]),
+            ("share of them with a higher reward", [a and a.earns_more for a in asked]),
         ]
     body = [(name, [shown(value) for value in values]) for name, values in rows]
     caption = "Reward model and edited copies, on held-out steps; δ, ε_r in units of the reward"

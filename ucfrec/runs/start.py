@@ -163,7 +163,7 @@ def returns_of(store: EpisodeStore, config: Config) -> ReturnToGo:
 
 
 def _target_returns(train: EpisodeStore, definition: ReturnToGo) -> Float32Array:
-    """Sorted returns-to-go of sessions, or of steps if targets are set anew at every step.
+    """Sorted returns-to-go of sessions, or of steps if targets are set again at every step.
 
     Of more than a million, evenly spaced order statistics are kept, the lowest and highest too.
     """

@@ -206,7 +206,7 @@ def test_the_benchmark_finds_its_rl_rows_again(
     printed = capfd.readouterr()
     assert "1 cells, 1 of them left" in printed.err
     assert "1 cells, 0 of them left" in printed.err
-    # Neither here nor in the workers does d3rlpy tell of its trainings.
+    # Neither here nor in the workers does d3rlpy report its trainings.
     assert "[info" not in re.sub(r"\x1b\[[\d;]*m", "", printed.out)
 
 

@@ -56,8 +56,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     some_states().save(folder / "store" / ITEM_STATES)
     ids = pa.table({"item_id": [f"item {n}" for n in range(N_ITEMS)], "train_count": [7] * N_ITEMS})
     pq.write_table(ids, folder / "store" / "items.parquet")
-    for run, learner in (("ucf", "ucf"), ("greedy", "crm-greedy")):
-        config = resolve_config(learner, None, SETTINGS if run == "ucf" else SETTINGS[:-1], seed=3)
+    for run, policy_name in (("ucf", "ucf"), ("greedy", "crm-greedy")):
+        config = resolve_config(
+            policy_name, None, SETTINGS if run == "ucf" else SETTINGS[:-1], seed=3
+        )
         train_run(EpisodeStore.open(folder / "store"), folder / run, config)
     return folder
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
     from ucfrec.off_policy.evaluate import EstimateOptions, OffPolicyReport
     from ucfrec.off_policy.score import LoggedSessions
+    from ucfrec.off_policy.verdict import Verdict
     from ucfrec.runs.trained_policy import TrainedPolicy
 
 
@@ -139,7 +140,7 @@ def run(options: argparse.Namespace) -> None:
     for name, candidate in zip(names, candidates, strict=True):
         if len(candidates) > 1:
             print(f"\n{name}:")
-        reports[name] = _judged(options, candidate)
+        reports[name] = _evaluated(options, candidate)
     if len(candidates) == 1:
         _write(options, reports, {})
         return
@@ -176,7 +177,7 @@ class _Candidate:
         }
 
 
-def _judged(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicyReport":
+def _evaluated(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicyReport":
     """Print and return what the logs say of one candidate."""
     from ucfrec.off_policy.evaluate import evaluate_off_policy
     from ucfrec.reporting.tables import format_rows
@@ -196,18 +197,31 @@ def _judged(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicyRep
     shown = ("estimator", "policy", "choice", "R_cum", "effective_sessions", "sessions")
     lines = [{**dict.fromkeys(shown), **r.as_line(), "estimator": r.method} for r in found.rows]
     print(f"\n{format_rows(lines, shown)}")
+    print("R_cum: return per session, with a 95% interval where an estimator has one")
     print(f"models: {found.models}")
     for warning in found.warnings:
         print(f"warning: {warning}")
     print(f"verdict: {found.verdict.headline}")
+    print(_next_step(found.verdict))
     card_of_estimates(run, options.logs or ["the test split"], found)
     return found
+
+
+def _next_step(verdict: "Verdict") -> str:
+    """What to do about a verdict, in a line."""
+    if not verdict.reliable or verdict.lift_low is None or verdict.lift_high is None:
+        return "next: do not launch on this; remedy the warnings, or log more sessions at random"
+    if verdict.lift_low > 0:
+        return "next: test the policy on a share of the users, then compare with this estimate"
+    if verdict.lift_high < 0:
+        return "next: do not launch this policy; compare other ones, or other --targets"
+    return "next: log more sessions, or compare other policies, --targets or --temperatures"
 
 
 @contextmanager
 def _logged(options: argparse.Namespace, trained: "TrainedPolicy") -> "Iterator[LoggedSessions]":
     """What the policy is evaluated on: the logs, or else the test split of its store."""
-    from ucfrec.logs.summary import format_report
+    from ucfrec.logs.summary import format_summary
     from ucfrec.off_policy.score import held_out_sessions, logged_sessions
 
     if not options.logs:
@@ -219,7 +233,7 @@ def _logged(options: argparse.Namespace, trained: "TrainedPolicy") -> "Iterator[
     files, mapping = logs_given(options)
     limit = options.memory_limit
     with logged_sessions(trained.folder, trained, files, mapping, True, limit) as logged:
-        print(format_report(logged.report))
+        print(format_summary(logged.report))
         yield logged
 
 

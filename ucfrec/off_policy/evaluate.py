@@ -34,7 +34,7 @@ from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps
 from ucfrec.off_policy.pages import as_pages, pages_of
 from ucfrec.off_policy.score import LoggedSessions, ScoredSteps, scored_steps
 from ucfrec.off_policy.training_rows import seen_too_often, share_seen
-from ucfrec.off_policy.verdict import FAR_OFF, Verdict, cautions, influences, judge
+from ucfrec.off_policy.verdict import FAR_OFF, Verdict, cautions, conclude, influences
 from ucfrec.provenance import without_folders
 from ucfrec.results.row import ResultRow, Scalar
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -93,7 +93,7 @@ class OffPolicyReport:
 
 
 @dataclass(frozen=True)
-class JudgedSteps:
+class EvaluatedSteps:
     """Logged steps with the evaluated policy's probabilities, and the models fitted on them."""
 
     steps: LoggedSteps
@@ -135,22 +135,22 @@ def evaluate_off_policy(
             for and a session has several steps.
     """
     rule = rule or trained.rule
-    judged = logged_steps(trained, logged, rule, seed, options)
-    steps = as_pages(judged.steps, *_pages(logged)) if options.pages else judged.steps
+    evaluated = logged_steps(trained, logged, rule, seed, options)
+    steps = as_pages(evaluated.steps, *_pages(logged)) if options.pages else evaluated.steps
     steps, of_groups = _without_far_off_groups(steps)
     segment = None if options.pages else _quarters(logged.store, steps)
     found, diagnosis = estimate(steps, seed), diagnose(steps, options.reward_range, segment)
     seen = share_seen(trained, logged.store)
-    verdict = judge(
+    verdict = conclude(
         steps,
         seed,
         diagnosis=diagnosis,
         wanted_lift=options.wanted_lift,
-        forbidden=[*seen_too_often(seen), *_too_many_items(trained, judged)],
-        declared=_declared(judged),
+        forbidden=[*seen_too_often(seen), *_too_many_items(trained, evaluated)],
+        declared=_declared(evaluated),
     )
     said = [*verdict.reasons, *cautions(diagnosis, found), *_of_the_logs(seen, logged), *of_groups]
-    said += _of_the_models(judged)
+    said += _of_the_models(evaluated)
     about = {
         "seen_in_training": seen,
         "warnings": said,
@@ -158,7 +158,7 @@ def evaluate_off_policy(
         "unknown_item_rows": logged.unknown_items,
         **verdict_columns(verdict),
         **diagnosis_columns(diagnosis),
-        **judged.models.columns(),
+        **evaluated.models.columns(),
     }
     conditions = {"run": without_folders(str(run)), **_conditions(steps, options)}
     fingerprint = logged.store.record.fingerprint
@@ -170,10 +170,10 @@ def evaluate_off_policy(
         for name, one in found.items()
     ]
     if diagnosis.left_out == diagnosis.sessions:
-        return OffPolicyReport(rows, said, verdict, judged.models, np.empty(0), None, None)
+        return OffPolicyReport(rows, said, verdict, evaluated.models, np.empty(0), None, None)
     known = steps.known()
     terms = _terms(known, verdict)
-    return OffPolicyReport(rows, said, verdict, judged.models, known.returns, known.user, terms)
+    return OffPolicyReport(rows, said, verdict, evaluated.models, known.returns, known.user, terms)
 
 
 def _conditions(steps: LoggedSteps, options: EstimateOptions) -> dict[str, Scalar]:
@@ -222,14 +222,16 @@ def _quarters(store: EpisodeStore, steps: LoggedSteps) -> IntArray:
     return np.asarray(1 + quarters)
 
 
-def _declared(judged: JudgedSteps) -> str:
-    if not judged.estimated:
+def _declared(evaluated: EvaluatedSteps) -> str:
+    if not evaluated.estimated:
         return ""
-    return f"with the propensities of {judged.estimated:,} steps estimated ({judged.behavior})"
+    return (
+        f"with the propensities of {evaluated.estimated:,} steps estimated ({evaluated.behavior})"
+    )
 
 
-def _of_the_models(judged: JudgedSteps) -> list[str]:
-    if judged.models.settled:
+def _of_the_models(evaluated: EvaluatedSteps) -> list[str]:
+    if evaluated.models.settled:
         return []
     return [
         "fitted Q evaluation ran away (its values grew beyond what so many rewards can be) and was "
@@ -237,12 +239,12 @@ def _of_the_models(judged: JudgedSteps) -> list[str]:
     ]
 
 
-def _too_many_items(trained: TrainedPolicy, judged: JudgedSteps) -> list[str]:
-    steps = judged.steps
+def _too_many_items(trained: TrainedPolicy, evaluated: EvaluatedSteps) -> list[str]:
+    steps = evaluated.steps
     assert trained.item_ids is not None
     assert steps.groups is not None
     items = len(trained.item_ids)
-    found = None if judged.estimated else implied_items(steps, steps.groups.number >= 0, items)
+    found = None if evaluated.estimated else implied_items(steps, steps.groups.number >= 0, items)
     if found is None or found.passed:
         return []
     return [
@@ -272,7 +274,7 @@ def logged_steps(
     rule: DecisionRule,
     seed: int,
     options: EstimateOptions = DEFAULTS,
-) -> JudgedSteps:
+) -> EvaluatedSteps:
     """Collect the logged steps, the policy's probabilities and models of its return.
 
     In memory are some ten numbers a step; what the models see of it, and the probabilities of item
@@ -318,7 +320,7 @@ def logged_steps(
     if behavior is not None:
         estimated = plain.unknown_propensities if options.estimate_propensities else 0
         steps = _weighed_by_model(steps, groups, behavior, options.estimate_propensities)
-    return JudgedSteps(steps, models, behavior, estimated)
+    return EvaluatedSteps(steps, models, behavior, estimated)
 
 
 def _unjudged(logged: LoggedSessions, options: EstimateOptions) -> LoggedSteps:

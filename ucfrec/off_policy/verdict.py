@@ -74,7 +74,7 @@ class Verdict:
         return f" ({self.declared})" if self.declared else ""
 
 
-def judge(
+def conclude(
     steps: LoggedSteps,
     seed: int,
     *,

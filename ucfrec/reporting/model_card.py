@@ -83,7 +83,7 @@ def _plain(value: object) -> object:
 def _about(record: RunRecord) -> str:
     fit = record.policy
     rows = {
-        "learner": record.name,
+        "policy": record.name,
         "configuration": config_hash(record.settings),
         "seed": record.seed,
         "training steps of the model": fit and fit.steps,

@@ -105,18 +105,18 @@ class _Setting(NamedTuple):
 
 def _build(policy_name: str, settings: Iterable[_Setting], seed: int) -> Config:
     """Build each table once, from all its settings, so that values are checked together."""
-    learner = policy_class(policy_name)
+    policy_type = policy_class(policy_name)
     tables: dict[str, dict[str, Any]] = {name: {} for name in TABLES}
-    if not learner.augmented:
+    if not policy_type.augmented:
         tables["augment"]["copies"] = 0
     sources = {}
-    for table, key, value, source in (*_from_mapping(learner.presets, policy_name), *settings):
+    for table, key, value, source in (*_from_mapping(policy_type.presets, policy_name), *settings):
         tables[table][key] = value.item() if isinstance(value, np.generic) else value
         sources[f"{table}.{key}"] = source
     try:
         return Config(
             policy_name,
-            learner.Config(**tables["policy"]),
+            policy_type.Config(**tables["policy"]),
             LoopConfig(**tables["train"]),
             CRMConfig(**tables["crm"]),
             CSGConfig(**tables["csg"]),

@@ -260,8 +260,7 @@ class RunRecord(TrainingRecord):
         found = f"best validation loss {fit.best_validation:.4g} at step {fit.best_step}"
         if self.refit_of is not None:
             found = f"trained on all rows, up to step {fit.best_step}"
-        name = self.config.policy_name
-        lines.append(f"policy        {name}: {found} of {fit.steps}, {fit.seconds:.0f} s")
+        lines.append(f"policy        {found} of {fit.steps}, {fit.seconds:.0f} s")
         if warning := self.learned_nothing(logged):
             lines.append(f"warning       {warning}")
         if self.rule is not None and self.reward_model is not None:

@@ -211,7 +211,7 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
     """An untrained policy with the normalisation and item embeddings of `train`."""
     torch.manual_seed(config.seed)
     policy = policy_class(config.policy_name)(config.policy, policy_sizes(train))
-    base = train.without_copies()
+    base = train.without_augmentation()
     mean, std = base.state_statistics
     policy.state_mean.copy_(mean)
     policy.state_std.copy_(torch.where(std > 1e-6, std, 1.0))

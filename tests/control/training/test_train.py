@@ -176,10 +176,10 @@ def test_policies_that_know_their_largest_return_are_asked_for_it(
     pursue = ["policy.advantage_weights=true", "policy.max_return=true", "policy.best_share=0.5"]
     own = {"lsdt": ["policy.kernel_groups=4"], "ucf": ["crm.epochs=1", "csg.epochs=1"]}
     store = EpisodeStore.open(folder / "store")
-    for learner in ("dt", "dc", "lsdt", "ucf"):
-        settings = [*TINY, *pursue, "policy.max_timestep=1", *own.get(learner, [])]
-        run = tmp_path / learner
-        record = train_control(store, run, resolve_config(learner, None, settings))
+    for policy_name in ("dt", "dc", "lsdt", "ucf"):
+        settings = [*TINY, *pursue, "policy.max_timestep=1", *own.get(policy_name, [])]
+        run = tmp_path / policy_name
+        record = train_control(store, run, resolve_config(policy_name, None, settings))
         losses = read_metrics(run / "policy")
         assert losses["value_loss"]
         assert record.finished.steps == 4

@@ -96,7 +96,7 @@ def test_real_rows_make_a_environment_that_can_be_believed(
     """Evaluated on 29–30 April; what policies learn from, the days before, stays out."""
     source = data_folder("kuairand")
     log = pd.read_parquet(next(source.glob("log_*.parquet")))
-    folder = tmp_path / "judge"
+    folder = tmp_path / "later"
     folder.mkdir()
     log[log["date"] >= 20220429].to_parquet(folder / "log_standard_judge_pure.parquet")
     basic = folder / "video_features_basic_pure.csv"

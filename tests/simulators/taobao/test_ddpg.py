@@ -78,10 +78,10 @@ def test_draws_follow_the_density(mean: float) -> None:
 def test_what_it_learns_from_is_what_is_logged() -> None:
     need_sb3()
     env = SyntheticTaobao(16)
-    learner = ddpg.training(env, 0, SMALL)
+    agent = ddpg.training(env, 0, SMALL)
     steps: list[Step] = []
-    rollout(env, learner, 200, 0, steps.append)
-    buffer, high = learner._model.replay_buffer, env.single_observation_space.high
+    rollout(env, agent, 200, 0, steps.append)
+    buffer, high = agent._model.replay_buffer, env.single_observation_space.high
     # All but the very last step, whose outcome no one waited for.
     logged = {
         name: np.concatenate([getattr(step, name) for step in steps[:-1]])

@@ -26,6 +26,7 @@ def design(rows: int, binary: bool, items: int = 12, users: int = 9) -> Design:
         items=torch.from_numpy(shown),
         users=torch.from_numpy(rng.integers(users + 1, size=rows)),
         x=torch.from_numpy(x).float(),
+        observed=torch.from_numpy(x[:, 3:]).float(),
         exposure=torch.from_numpy(rng.random((rows, 4)) < 0.2).float(),
         target=torch.from_numpy(target).float(),
         vectors=torch.from_numpy(vectors).float(),
@@ -52,6 +53,8 @@ def matrix(given: Design, name: str) -> sparse.csr_matrix:
     if name == "affinity":
         of_users = torch.nn.functional.one_hot(given.users, given.n_users + 1).float()
         return sparse.csr_matrix(_products(of_users, given.rows).numpy())
+    if name == "context":
+        return sparse.csr_matrix(_products(given.observed, given.rows).numpy())
     if name == "interaction":
         return sparse.csr_matrix(_products(given.x, given.rows).numpy())
     columns = {"exposure": given.exposure, "state": given.x, "tastes": given.tastes.unsqueeze(1)}

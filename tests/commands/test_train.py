@@ -1,16 +1,16 @@
-"""What is said of a policy that predicts choices no better than popularity does."""
+"""`ucfrec train` warns of a policy that predicts choices no better than popularity does."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
-from ucfrec.runs.reference_losses import learned_nothing
 
 from ucfrec import Recommender
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputNote
+from ucfrec.fitting.loop import Fit
+from ucfrec.runs.record import RunRecord
 
 LOGGED = {"action_loss", "validation_loss"}
 SETTINGS = ["train.steps=150", "train.validate_every=150", "policy.dim=16", "policy.context=4"]
@@ -18,9 +18,10 @@ SETTINGS += ["train.learning_rate=0.01", "augment.copies=0", "rule.choose=false"
 SAID = "the policy learned nothing about users; train with more steps"
 
 
-def record(best: float | None, popularity: float | None) -> dict[str, Any]:
-    losses = {} if popularity is None else {"reference_losses": {"popularity": popularity}}
-    return {"policy": {"best_validation": best}, **losses}
+def record(best: float | None, popularity: float | None) -> RunRecord:
+    losses = None if popularity is None else {"popularity": popularity}
+    fit = None if best is None else Fit(10, 10, best, 1.0)
+    return RunRecord.model_construct(policy=fit, reference_losses=losses)
 
 
 @pytest.mark.parametrize(
@@ -35,10 +36,10 @@ def record(best: float | None, popularity: float | None) -> dict[str, Any]:
         (3.1, 3.0, {"validation_loss"}, False),
     ],
 )
-def test_only_a_comparable_loss_that_is_not_lower_is_told(
+def test_only_a_comparable_loss_that_is_not_lower_is_reported(
     best: float | None, popularity: float | None, logged: set[str], said: bool
 ) -> None:
-    assert (SAID in learned_nothing(record(best, popularity), logged)) == said
+    assert (SAID in record(best, popularity).learned_nothing(logged)) == said
 
 
 def log(users_differ: bool) -> pd.DataFrame:

@@ -58,6 +58,8 @@ class Source(Entry):
     dropped: dict[Text, Count] = Field(default_factory=dict)
     """Rows dropped, by reason."""
     unsorted_rows: Count | None = None
+    equal_times: Count | None = None
+    """Rows at the time of another row of their user, in no order that could be learned."""
     steps: Count | None = None
     users: Count | None = None
     items: Count | None = None

@@ -30,6 +30,7 @@ from tests.support.report_page import (
 )
 from ucfrec.acting.scorer import logged_scores
 from ucfrec.commands.cli import main
+from ucfrec.counterfactual.reward_model_fit import fit_warning
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.reporting.page import write_report
@@ -118,7 +119,7 @@ def test_a_reward_model_that_predicts_nothing_is_a_warning(folder: Path, tmp_pat
     augmentation = record_of(folder / "ucf")["augmentation"]
     for r2, warned in ((-0.07, True), (0.02, True), (0.03, False)):
         model = augmentation["reward_model"] | {"r2_without_z": r2}
-        changed = augmentation | {"reward_model": model, "warnings": []}
+        changed = augmentation | {"reward_model": model, "warnings": [fit_warning(r2)]}
         run = rewritten(folder / "ucf", tmp_path / f"run {r2}", augmentation=changed)
         text = page_of(tmp_path / "report.html", run).text
         assert (f"the reward model predicts nothing: from state and action its R² on held-out "

@@ -373,9 +373,10 @@ def _describe_rule(choice: RuleRecord, model: ItemRewardReport, logged: float) -
         how = f"It ranked best of {tried} rules in the validation period"
     else:
         how = (
-            f"Of {tried} ways to turn the policy into recommendations, tried on simulated users, it "
-            "has the best return\n              (or one level with it) that the log supports: "
-            f"{value[0]:.4g} ± {value[1]:.2g} per session, estimated; logged sessions have {logged:.4g}"
+            f"Of {tried} ways to turn the policy into recommendations, tried on simulated users, "
+            "it has the best return\n              (or one level with it) that the log supports: "
+            f"{value[0]:.4g} ± {value[1]:.2g} per session, estimated; logged sessions have "
+            f"{logged:.4g}"
         )
     return (
         f"user model    held-out loss {model.loss:.4f}, "

@@ -18,7 +18,7 @@ from ucfrec.results.rows_file import read_results
 TINY = DemoConfig(
     sessions=400,
     episodes=200,
-    settings=("train.steps=20", "crm.epochs=1"),
+    settings=("train.steps=20", "crm.epochs=1", "rule.sessions=10"),
     context=4,
     dim=16,
     methods=tuple(METHODS),

@@ -1,4 +1,4 @@
-"""The decision rule: probabilities by hand, the best items, and target returns."""
+"""The decision rule: probabilities worked out, the best items, and target returns."""
 
 import json
 import math

@@ -309,7 +309,7 @@ def test_models_alone_carry_no_interval() -> None:
 
 
 def test_weights_without_a_reward_have_no_interval() -> None:
-    """Of 10,000 sessions, those that the policy would repeat earned nothing: that is not 0 ± 0."""
+    """Of 10,000 sessions, those that the policy would repeat had no reward: that is not 0 ± 0."""
     rng = np.random.default_rng(0)
     action = rng.integers(100, size=10_000)
     steps = LoggedSteps(

@@ -131,7 +131,7 @@ def test_scores_are_the_policys_at_the_next_step(
     users = trained.user_ids[store.episode_values("user")[at]]
     assert users.tolist() == sorted(set(given.user_id))
     windows = store.windows(at, ends[at], trained.policy.config.context)
-    # What the session has earned lowers what is asked for.
+    # The rewards of the session so far lowers what is requested.
     more = torch.from_numpy(7.0 - store.returns[at])
     assert len(set(more.tolist())) > 1
     asked = (windows.returns_to_go + more.unsqueeze(1)).masked_fill(~windows.mask, 0.0).float()

@@ -39,7 +39,7 @@ def trained_run(folder: Path, policy: str = "ucf") -> TrainedPolicy:
 
 
 def learn_tastes(trained: TrainedPolicy) -> None:
-    """Give the run's reward model tastes that sessions tell of, as where users are new."""
+    """Give the run's reward model tastes that sessions show, as where users are new."""
     assert trained.reward_model is not None
     tastes, random = trained.reward_model.tastes, torch.Generator().manual_seed(3)
     tastes.root.copy_(torch.randn(tastes.root.shape, generator=random).tril())

@@ -67,13 +67,14 @@ class DecisionRule:
     temperature: float = 0.0
     """T; items are drawn, or, at 0, the best is taken."""
     top_k: int | None = None
-    """Only the so many best items are drawn from; None for all."""
+    """Only this number of best items are drawn from; None for all."""
     exclude_seen: bool = False
-    """Whether items that the session has shown are left out."""
+    """Whether items that the session has shown are excluded."""
     tag_window: int = 0
-    """Items that share a tag with one of so many shown before are left out, unless none remain."""
+    """Items that share a tag with one of this number shown before are excluded, unless none
+    remain."""
     tag_run: int = 0
-    """Items with the main tag of the so many shown before are left out, if all of these had it and
+    """Items with the main tag of the so many shown before are excluded, if all of these had it and
     were liked, unless none remain; 0 for no such limit."""
     explore: float = 0.0
     """Share of the requests whose items are drawn uniformly from all that are allowed."""
@@ -138,7 +139,7 @@ class DecisionRule:
         parts += ["unseen items"] if self.exclude_seen else []
         parts += [f"no tag of the last {self.tag_window}"] if self.tag_window else []
         parts += (
-            [f"no main tag liked more than {self.tag_run} times on end"] if self.tag_run else []
+            [f"no main tag liked more than {self.tag_run} times in a row"] if self.tag_run else []
         )
         how = f"drawn at temperature {self.temperature:g}" if self.temperature else "argmax"
         if self.explore:
@@ -158,7 +159,7 @@ class DecisionRule:
 
     @property
     def hash(self) -> str:
-        """12 hexadecimal digits that tell rules apart, for results."""
+        """12 hexadecimal digits that distinguish rules, for results."""
         return config_hash(self.as_dict())
 
     def target_returns(self, returns: ReturnToGo, collected: Tensor, best: Tensor | None) -> Tensor:
@@ -313,7 +314,7 @@ def best_items(scores: Tensor, k: int) -> Tensor:
     tied = highest[:, 0] == highest[:, 1]
     if tied.any():
         first = scores[tied].argmax(-1, keepdim=True)
-        # The first comes in front, and leaves out itself further back or else the last.
+        # The first comes in front, and excludes itself further back or else the last.
         joined = torch.cat([first, found[tied]], dim=1)
         again = (joined == first).index_fill(1, torch.tensor([0]), False)
         found[tied] = joined.gather(1, again.int().argsort(dim=1, stable=True)[:, :k])

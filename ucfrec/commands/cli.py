@@ -34,7 +34,7 @@ class Program:
 
 UCFREC = Program(
     "ucfrec",
-    "Train recommender policies from Parquet logs and estimate the return they would earn.",
+    "Train recommender policies from Parquet logs and estimate the return.",
     "ucfrec.commands",
     {
         "demo": "run every step on simulated logs and write a report; resumes",

@@ -106,7 +106,7 @@ def log_options(parser: argparse.ArgumentParser) -> argparse.Action:
     parser.add_argument(
         "--where",
         metavar="SQL",
-        help="condition over the log's columns; rows that do not fulfil it are left out and "
+        help="condition over the log's columns; rows that do not fulfil it are excluded and "
         "counted, e.g. \"user_id NOT IN ('bot-0', 'bot-1')\" (default: none)",
     )
     parser.add_argument(
@@ -190,19 +190,19 @@ def rule_options(parser: argparse.ArgumentParser) -> None:
         "--explore-top", type=int, metavar="N", help="these draw from the N best items only"
     )
     rule.add_argument(
-        "--exclude-seen", action="store_true", help="leave out items that the session has shown"
+        "--exclude-seen", action="store_true", help="exclude items that the session has shown"
     )
     rule.add_argument(
         "--tag-window",
         type=int,
         metavar="N",
-        help="leave out items that share a tag with one of the last N, unless none remain",
+        help="exclude items that share a tag with one of the last N, unless none remain",
     )
     rule.add_argument(
         "--tag-run",
         type=int,
         metavar="N",
-        help="leave out items of one main tag once the last N had it and were liked",
+        help="exclude items of one main tag once the last N had it and were liked",
     )
 
 
@@ -247,7 +247,7 @@ def limit_options(parser: argparse.ArgumentParser) -> None:
         "--max-bytes", type=int, default=2**21, metavar="N", help="bytes of JSON (default: 2 MiB)"
     )
     limits.add_argument(
-        "--max-k", type=int, default=1000, metavar="N", help="items asked for (default: 1,000)"
+        "--max-k", type=int, default=1000, metavar="N", help="items requested (default: 1,000)"
     )
     limits.add_argument(
         "--max-history", type=int, default=5000, metavar="N", help="rows (default: 5,000)"

@@ -45,7 +45,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     item_options(parser)
     parser.add_argument(
-        "--threads", type=int, metavar="N", help="of a forward pass (default: one a core)"
+        "--threads", type=int, metavar="N", help="of a forward pass (default: one per core)"
     )
     rule_options(parser)
     draw_options(parser, "DIR")
@@ -122,7 +122,7 @@ def _serve(
         try:
             Server(config, f"ucfrec serve: {responder.trained!r}").run([listening])
         except Interrupted:
-            # What was asked of a server that is told to stop is done.
+            # What was asked of a server that is stopped is done.
             print("ucfrec serve: stopped", file=sys.stderr)
 
 

@@ -44,7 +44,7 @@ def recommend(
     """`k` next items of every user, by the decision rule.
 
     A user's latest session is assumed to continue: items are scored at its next step, and the
-    rewards that the session has earned lower the target as in acting. A rule with a temperature
+    rewards that the session has had lower the target as in acting. A rule with a temperature
     draws the items one after the other, without repetition; otherwise they are the `k` best. For
     users who are not in the training logs, the state is made of their rows alone.
 
@@ -53,7 +53,7 @@ def recommend(
         batches: the users' histories.
         k: number of items per user, at least 1.
         rule: the decision rule; None for the run's own.
-        filter_seen: leave out every item that the user has seen.
+        filter_seen: exclude every item that the user has seen.
         candidates: the only item_ids to recommend, for all users; None for all items.
         skip_unknown: ignore rows of items that are not in the training data.
         seed: of the draws of a rule with a temperature, or that explores. They also depend on the
@@ -180,7 +180,7 @@ def best_of(
     rule: DecisionRule, scores: Tensor, k: int, drawn: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`k` items (B, k), their log-probabilities (B, k) at temperature 1 among those left, −∞ for
-    items that are left out, and their propensities (B, k) float64.
+    items that are excluded, and their propensities (B, k) float64.
 
     Args:
         rule: the decision rule.

@@ -95,7 +95,7 @@ class Responder:
             limits: of a request.
             rule: the decision rule; None for the run's own.
             k: items for requests that do not say how many.
-            filter_seen: leave out every item that the user has seen.
+            filter_seen: exclude every item that the user has seen.
             skip_unknown: ignore rows of items that are not in the training data.
             seed: of the draws of a rule with a temperature, or that explores; they also depend on
                 user and request_id.

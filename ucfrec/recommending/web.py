@@ -73,7 +73,7 @@ _MOST_HEADER_BYTES: Final = 2**16
 """Of the address, names and values of a request. The server itself stops reading a head that is not
 whole by then."""
 _HUNG_UP: Final = 499
-"""For the metrics, as nobody receives it; nginx calls it so."""
+"""For the metrics, as no client receives it; nginx calls it so."""
 
 
 @settings_table("")

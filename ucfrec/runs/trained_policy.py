@@ -60,7 +60,7 @@ class TrainedPolicy:
     """(n_users,) user identifiers in the logs; empty if the store has none."""
     training_returns: Float32Array
     """(M,) returns-to-go that targets are set for, sorted, in reward units: those of sessions, or
-    of steps if a target is set anew at every step (`ReturnToGo.per_session`)."""
+    of steps if a target is set again at every step (`ReturnToGo.per_session`)."""
     rule: DecisionRule
     """The decision rule of the run."""
     reward_model: ItemRewardModel | None = None

@@ -1,10 +1,7 @@
-"""`ucfrec train` warns of a policy that predicts choices no better than popularity does."""
+"""What is said of a policy that predicts choices no better than popularity does."""
 
 from pathlib import Path
-<<<<<<<< HEAD:tests/runs/test_start.py
 from types import SimpleNamespace
-========
->>>>>>>> wt-words:tests/commands/test_train.py
 
 import numpy as np
 import pandas as pd
@@ -13,10 +10,6 @@ import pytest
 from ucfrec import Recommender
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputNote
-<<<<<<<< HEAD:tests/runs/test_start.py
-========
-from ucfrec.fitting.loop import Fit
->>>>>>>> wt-words:tests/commands/test_train.py
 from ucfrec.runs.record import RunRecord
 
 LOGGED = {"action_loss", "validation_loss"}
@@ -27,13 +20,8 @@ SAID = "the policy learned nothing about users; train with more steps"
 
 def record(best: float | None, popularity: float | None) -> RunRecord:
     losses = None if popularity is None else {"popularity": popularity}
-<<<<<<<< HEAD:tests/runs/test_start.py
     trained = None if best is None else SimpleNamespace(best_validation=best)
     return RunRecord.model_construct(policy=trained, reference_losses=losses)
-========
-    fit = None if best is None else Fit(10, 10, best, 1.0)
-    return RunRecord.model_construct(policy=fit, reference_losses=losses)
->>>>>>>> wt-words:tests/commands/test_train.py
 
 
 @pytest.mark.parametrize(
@@ -48,7 +36,7 @@ def record(best: float | None, popularity: float | None) -> RunRecord:
         (3.1, 3.0, {"validation_loss"}, False),
     ],
 )
-def test_only_a_comparable_loss_that_is_not_lower_is_reported(
+def test_only_a_comparable_loss_that_is_not_lower_is_told(
     best: float | None, popularity: float | None, logged: set[str], said: bool
 ) -> None:
     assert (SAID in record(best, popularity).learned_nothing(logged)) == said

@@ -65,9 +65,8 @@ def exposures_written(
 
     def passed() -> Iterator[pd.DataFrame]:
         for frame in frames:
-            shown = frame.rename(columns={RANK: POSITION}).assign(
-                **{RUN: trained.fingerprint, RULE: rule, schema.TIMESTAMP: now}
-            )
+            shown = frame.rename(columns={RANK: POSITION})
+            shown[RUN], shown[RULE], shown[schema.TIMESTAMP] = trained.fingerprint, rule, now
             shown[schema.USER_ID] = shown[schema.USER_ID].astype(str)
             table = pa.Table.from_pandas(shown[columns.names], columns, preserve_index=False)
             writer.write_table(table)

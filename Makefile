@@ -4,7 +4,7 @@ PYTHON ?= python3
 #   make demo PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu"
 PIP_FLAGS ?=
 BIN := .venv/bin
-# Files of tests side by side, one a core; a file stays whole, so that what its tests share is made
+# Files of tests side by side, one per core; a file stays whole, so that what its tests share is made
 # once. One thread each, or the workers' linear algebra fights over the cores.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --durations 30
 
@@ -16,7 +16,7 @@ demo: .venv/base  ## Set up and run the main job end to end on simulated logs.
 test: .venv/dev  ## Set up and run the tests, all but the slow ones.
 	$(PYTEST) -m "not slow"
 
-test-slow: .venv/dev  ## The slow tests: trainings and worlds that take many seconds each.
+test-slow: .venv/dev  ## The slow tests: trainings and simulations that take many seconds each.
 	$(PYTEST) -m slow --no-loadscope-reorder
 
 # SCALE is a share of the cases. What build/torture.jsonl has for this code is not measured again.
@@ -39,16 +39,17 @@ wheel: .venv/dev  ## Build the wheel into dist/.
 	$(BIN)/hatchling build -t wheel
 
 .venv/base: pyproject.toml constraints.txt
+	@echo "Setting up .venv: downloads torch and some twenty packages, a few minutes"
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install -q $(PIP_FLAGS) -c constraints.txt -e .
+	$(BIN)/pip install $(PIP_FLAGS) -c constraints.txt -e .
 	touch $@
 
 .venv/dev: .venv/base
-	$(BIN)/pip install -q $(PIP_FLAGS) -c constraints.txt -e ".[control,dev]"
+	$(BIN)/pip install $(PIP_FLAGS) -c constraints.txt -e ".[control,dev]"
 	touch $@
 
 .venv/docs: .venv/base
-	$(BIN)/pip install -q $(PIP_FLAGS) -c constraints.txt -e ".[docs]"
+	$(BIN)/pip install $(PIP_FLAGS) -c constraints.txt -e ".[docs]"
 	touch $@
 
 clean:

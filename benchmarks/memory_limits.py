@@ -7,7 +7,7 @@ one of rows with long observations. Then every command runs as a process of its 
 and its memory is watched: what the system calls anonymous, which it cannot give back as it can
 pages of mapped files. With --cgroup the system holds each to the limit, such pages and what it
 keeps of files included. A few training steps will do: what grows with a store grows before the
-first one. Scoring takes time a row, so the long log is trained on and the wide one judged too.
+first one. Scoring takes time a row, so the long log is trained on and the wide one evaluated too.
 Appends a row a command to runs/memory_limits/results.jsonl, or to --results; FOLDER is kept, and
 logs and stores that it has are not made again.
 """

@@ -1,6 +1,6 @@
 """What later days of KuaiRand-Pure tell of policies trained on the days before.
 
-    python benchmarks/next_period.py --out runs/next                       # judged on 29-30 April
+    python benchmarks/next_period.py --out runs/next    # evaluated on 29-30 April
     python benchmarks/next_period.py --out runs/next --validation 27 --until 29      # on 28 April
 
 Runs the commands of docs/quickstart.md on the files in $UCFREC_DATA/kuairand: it trains on the days
@@ -39,7 +39,7 @@ def run(*arguments: str | Path) -> None:
 def logs(out: Path, until: int | None) -> list[Path]:
     """The folder of KuaiRand, or its files with logs that are cut before the day `until` of April.
 
-    The statistics of videos are means over the whole month, the judged days included; like the
+    The statistics of videos are means over the whole month, the evaluated days included; like the
     adapter that is given the folder, this leaves them out.
     """
     folder = data_folder("kuairand")
@@ -62,7 +62,7 @@ def main() -> None:
     parser.add_argument("--results", type=Path, help="file of result rows")
     parser.add_argument("--validation", type=int, default=28, help="day of April (default: 28)")
     parser.add_argument("--until", type=int, help="the first day of April that is left out")
-    parser.add_argument("--policy", action="append", help="learners (default: ucf)")
+    parser.add_argument("--policy", action="append", help="policies (default: ucf)")
     parser.add_argument("--refit", action="store_true", help="also learn from the validation day")
     parser.add_argument("--set", action="append", default=[], help="settings over the command's")
     options = parser.parse_args()
@@ -75,9 +75,9 @@ def main() -> None:
         run("prepare", *logs(out, until), "--dataset", "kuairand", "--out", store, *split)
     settings = [part for each in (*SETTINGS, *options.set) for part in ("--set", each)]
     runs = []
-    for learner in options.policy or ["ucf"]:
-        runs.append(out / "-".join([learner, *options.set]).replace("/", "-"))
-        run("train", store, "--out", runs[-1], "--policy", learner, *settings)
+    for policy in options.policy or ["ucf"]:
+        runs.append(out / "-".join([policy, *options.set]).replace("/", "-"))
+        run("train", store, "--out", runs[-1], "--policy", policy, *settings)
     if options.refit:
         runs.append(runs[0].with_name(runs[0].name + "-refit"))
         run("train", store, "--out", runs[-1], "--refit", runs[0])

@@ -43,7 +43,7 @@ from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.off_policy.estimators import Estimate, estimate
 from ucfrec.off_policy.fqe import fit_models
 from ucfrec.off_policy.logged_steps import LoggedSteps
-from ucfrec.off_policy.verdict import judge
+from ucfrec.off_policy.verdict import conclude
 from ucfrec.progress import progress
 from ucfrec.provenance import provenance
 from ucfrec.results.row import ResultRow
@@ -169,7 +169,7 @@ class Replication:
 
 def replication(environment: Environment, seed: int) -> Replication:
     steps, (truth, as_logged) = environment.logged(seed), environment.value(seed)
-    verdict, found = judge(steps, seed), estimate(steps, seed)
+    verdict, found = conclude(steps, seed), estimate(steps, seed)
     holds: dict[str, bool] = {}
     for name in SHOWN[:-1]:
         holds[name] = held(found.get(name), as_logged if name == "logged" else truth)

@@ -31,7 +31,7 @@ from ucfrec.runs.config import resolve_config
 
 RESULTS = Path("runs/step_time/results.jsonl")
 SIZES = {"state": 91, "action": 27, "items": 0}
-LEARNERS = ("dt", "dc", "lsdt", "ucf", "dt4rec", "cdt4rec", "edt4rec", "sasrec", "bc")
+POLICIES = ("dt", "dc", "lsdt", "ucf", "dt4rec", "cdt4rec", "edt4rec", "sasrec", "bc")
 REFERENCE = "reference_dc"
 
 
@@ -111,7 +111,7 @@ def main() -> None:
     parser.add_argument("--context", type=int, default=20, help="steps of a window (default: 20)")
     parser.add_argument("--batch", type=int, default=64, help="windows of a batch (default: 64)")
     parser.add_argument("--rounds", type=int, default=20, help="timed rounds (default: 20)")
-    parser.add_argument("--learner", action="append", choices=LEARNERS, help="repeatable (all)")
+    parser.add_argument("--policy", action="append", choices=POLICIES, help="repeatable (all)")
     parser.add_argument(
         "--reference", type=Path, metavar="CLONE", help="Decision ConvFormer's code"
     )
@@ -123,7 +123,7 @@ def main() -> None:
     torch.manual_seed(0)
     batch = windows(options.batch, options.context)
     steps: dict[str, Step] = {}
-    for name in dict.fromkeys(("dt", "dc", *(options.learner or LEARNERS))):
+    for name in dict.fromkeys(("dt", "dc", *(options.policy or POLICIES))):
         settings = [f"policy.dim={options.dim}", f"policy.context={options.context}"]
         config = resolve_config(name, None, settings).policy
         steps[name] = step_of(policy_class(name)(config, SIZES), batch)

@@ -48,8 +48,8 @@ TESTED_HERE = {
     "tests/test_layering.py",
     "tests/test_packaging.py",
     "tests/test_readme.py",
-    "tests/test_start.py",
-    "tests/test_vocabulary.py",
+    "tests/commands/test_start.py",
+    "tests/commands/test_vocabulary.py",
     "tests/simulators/benchmark/test_benchmark.py",
     "tests/simulators/test_synthetic_environments.py",
 }

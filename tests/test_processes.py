@@ -53,7 +53,7 @@ def test_a_terminal_without_unicode_gets_replacement_characters(
 
 
 def ended(process: int, seconds: float = 20) -> bool:
-    """Whether a process ends in time; one that nobody has waited for yet counts as ended."""
+    """Whether a process ends in time; one that no process has waited for yet counts as ended."""
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         try:

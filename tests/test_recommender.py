@@ -128,7 +128,7 @@ def test_an_interrupted_fit_on_a_frame_goes_on(log: pd.DataFrame, tmp_path: Path
 
 def test_rows_that_are_left_out_are_warned_of(log: pd.DataFrame, tmp_path: Path) -> None:
     holes = log.assign(reward=log.reward.mask(log.index < 5))
-    with pytest.warns(UserWarning, match=r"5 of 1,500 rows were left out \(5: reward is missing"):
+    with pytest.warns(UserWarning, match=r"5 of 1,500 rows were excluded \(5: reward is missing"):
         Recommender("dt", settings=SMALL).fit(holes, tmp_path / "run")
 
 

@@ -4,12 +4,17 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any, Protocol
 
 FIRST_LINE = 10.0
 """Seconds before the first line, without a terminal; a shorter job prints nothing."""
 NEXT_LINE = 30.0
 """Seconds between lines."""
+
+_LABEL: ContextVar[str] = ContextVar("label", default="")
+"""Which of several jobs at the same time this is; empty for the only one."""
+_PHASE: ContextVar[str] = ContextVar("phase", default="")
 
 
 class Progress(Protocol):
@@ -30,12 +35,35 @@ def progress(total: float | None, job: str, unit: str, done: float = 0) -> Itera
         done: units that were finished before this process resumed the job; they do not count
             towards the rate.
     """
-    display_class = _Bar if sys.stderr.isatty() else _Lines
-    display = display_class(total, job, unit, done)
+    label = _LABEL.get()
+    # Bars of several processes would overwrite each other.
+    display_class = _Bar if sys.stderr.isatty() and not label else _Lines
+    name = ": ".join(part for part in (label, _PHASE.get(), job) if part)
+    display = display_class(total, name, unit, done)
     try:
         yield display
     finally:
         display.close()
+
+
+@contextmanager
+def labelled(name: str) -> Iterator[None]:
+    """Name this job in the progress of all that it does, as one of several at the same time."""
+    before = _LABEL.set(name)
+    try:
+        yield
+    finally:
+        _LABEL.reset(before)
+
+
+@contextmanager
+def phase(doing: str, number: int, of: int) -> Iterator[None]:
+    """Name the phase of a long job, e.g. `Fitting the reward model (2 of 5)`, in its progress."""
+    before = _PHASE.set(f"{doing} ({number} of {of})")
+    try:
+        yield
+    finally:
+        _PHASE.reset(before)
 
 
 @contextmanager

@@ -19,7 +19,7 @@ def versions(packages: Sequence[str] = ()) -> dict[str, str]:
         packages: further distributions to include, e.g. those of a simulator.
 
     Returns:
-        {name: version}; packages that are not installed are left out.
+        {name: version}; packages that are not installed are excluded.
     """
     installed = {"python": sys.version.split()[0]}
     for name in (*_PACKAGES, *packages):

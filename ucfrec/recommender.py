@@ -60,7 +60,7 @@ class Recommender:
     ) -> None:
         """
         Args:
-            policy: learner, "ucf" or a baseline, as for `ucfrec train --policy`.
+            policy: its name, "ucf" or a baseline, as for `ucfrec train --policy`.
             settings: as for `ucfrec train --set`: `{"train.steps": 200}`,
                 `{"train": {"steps": 200}}` or `["train.steps=200"]`.
             seed: of everything random.
@@ -186,18 +186,20 @@ class Recommender:
                 reward's expression; `session_id`, if the run's sessions are split by it; and
                 `observation` (lists of floats), if the run has observations.
             k: number of items per user, at least 1.
-            filter_seen: leave out items that the user's history contains.
+            filter_seen: exclude items that the user's history contains.
             candidates: the only item_ids to recommend; None for all.
             skip_unknown: ignore rows of items that are not in the training data.
             rule: the decision rule; None for the run's own, `Recommender.trained.rule`.
-            seed: of the draws of a rule with a temperature.
+            seed: of the draws of a rule with a temperature, or that explores. They also depend on
+                the user and the time of the user's last row.
             mapping: names of the columns of `histories`; those that it leaves open are as in the
                 training log if `histories` has them, and otherwise as above.
 
         Returns:
             `user_id`, `rank` (from 1), `item_id`, `score` (log-probability at temperature 1 among
-            the items that are left, nats): k rows per user, users in sorted order; fewer rows if
-            fewer items remain, as with less than k candidates.
+            the items that are left, nats), `propensity` (probability of the item at its position,
+            given those before it), `request_id`: k rows per user in the order shown, users in
+            sorted order; fewer rows if fewer items remain, as with less than k candidates.
 
         Raises:
             InputError: the recommender is not trained, an argument is wrong, a column is missing or
@@ -242,7 +244,7 @@ class Recommender:
 
 
 UCF = Recommender
-"""A `Recommender`, whose default learner is the Unified Causal Transformer (Algorithm 1)."""
+"""A `Recommender`, whose default policy is the Unified Causal Transformer (Algorithm 1)."""
 
 
 def _store(
@@ -268,7 +270,7 @@ def _store(
     if dropped:
         reasons = "; ".join(f"{n:,}: {REASONS.get(name, name)}" for name, n in dropped.items())
         warnings.warn(
-            f"{sum(dropped.values()):,} of {report['rows_read']:,} rows were left out ({reasons})",
+            f"{sum(dropped.values()):,} of {report['rows_read']:,} rows were excluded ({reasons})",
             stacklevel=3,
         )
     return EpisodeStore.open(scratch / "store")

@@ -48,7 +48,7 @@ BatchSize = Annotated[int, Field(ge=1, le=1_000_000)]
 Dropout = Annotated[float, Field(ge=0, lt=1)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Quantile = Annotated[float, Field(ge=0, lt=1)]
-"""A threshold below which steps are left out; 1 is not allowed, it would leave out all."""
+"""A threshold below which steps are excluded; 1 is not allowed, it would exclude all."""
 
 
 class SettingError(InputError):

@@ -33,7 +33,7 @@ DAILY_COLUMNS: Final = (
     "video_width > video_height",
     "video_tag_id::VARCHAR",
 )
-"""Features that do not change from day to day. The 45 statistics are left out: those of a later day
+"""Features that do not change from day to day. The 45 statistics are excluded: those of a later day
 contain how users received the video on the days of the evaluation."""
 
 MAPPING: Final = LogMapping(

@@ -97,7 +97,7 @@ class DistractorEnv(VectorWrapper[Float32Array, Array, Array]):
     def step(
         self, actions: Array
     ) -> tuple[Float32Array, Float32Array, BoolArray, BoolArray, dict[str, Any]]:
-        """Play one action in each session, as the wrapped environment does."""
+        """Take one action in each session, as the wrapped environment does."""
         observations, rewards, terminated, truncated, info = self.env.step(actions)
         if "final_obs" in info:
             rows = np.flatnonzero(info["_final_obs"])

@@ -1,4 +1,4 @@
-"""SARDINE's environments of single items: tastes that only feedback reveals, and boredom.
+"""SARDINE's environments of single items: tastes that only feedback reveals, and satiation.
 
 SARDINE is the simulator of Deffayet et al. (2024), the package `sardine-rec` (extra `sardine`),
 which is used as published. A session has 100 steps. One of 1,000 items is shown in each and
@@ -138,4 +138,4 @@ def _simulator(variant: str, summary: str) -> Simulator:
 
 
 STATIC: Final = _simulator("Static", "tastes of a session stay as they are")
-BORED_INF: Final = _simulator("BoredInf", "boredom, and clicks that change tastes")
+BORED_INF: Final = _simulator("BoredInf", "satiation, and clicks that change tastes")

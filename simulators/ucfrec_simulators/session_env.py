@@ -170,7 +170,7 @@ class SingleSession(gymnasium.Env[Float32Array, Array]):
         return observations[0], _first(infos)
 
     def step(self, action: Array) -> tuple[Float32Array, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Play one action; returns observation (O,), reward, terminated, truncated and info."""
+        """Take one action; returns observation (O,), reward, terminated, truncated and info."""
         observations, rewards, terminated, truncated, infos = self._environment.step(
             np.asarray(action)[None]
         )

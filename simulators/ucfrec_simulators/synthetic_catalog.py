@@ -162,11 +162,11 @@ class SyntheticCatalog(SessionsEnv):
 
 
 class Rotation(Memoryless):
-    """Play each user's favourites in turn, and the best again in the last step.
+    """Show each user's favourites in turn, and the best again in the last step.
 
     With the true probabilities it is optimal. Proof:
 
-    Let m₁ ≥ m₂ ≥ … be the user's best probability in each tag, N the boredom window, T =
+    Let m₁ ≥ m₂ ≥ … be the user's best probability in each tag, N the satiation window, T =
     `max_turn`, and S(t) the sum of the first t terms of m₁, …, m_N, m₁, …. Clicks do not affect
     later steps, so fixed sequences of items suffice. If a sequence ends with step t ≤ T, its
     first t − 1 steps did not end the session, so any N successive ones of them have different

@@ -1,4 +1,4 @@
-"""The decision rule: probabilities by hand, the best items, and target returns."""
+"""The decision rule: probabilities worked out, the best items, and target returns."""
 
 import json
 import math
@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import chisquare
 
 from ucfrec.acting.decision import DecisionRule, best_items
 from ucfrec.episodes.returns import ReturnToGo
@@ -26,7 +27,14 @@ rules = st.builds(
     exclude_seen=st.booleans(),
     tag_window=st.integers(0, 9),
     tag_run=st.integers(0, 10),
+    explore=st.floats(0, 1),
+    explore_top=st.one_of(st.none(), st.integers(1, 99)),
 )
+
+
+def draws(scores: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    """Uniforms for `DecisionRule.ranked`."""
+    return torch.rand(len(scores), scores.shape[1] + 1, generator=generator)
 
 
 # The rule as data.
@@ -58,9 +66,11 @@ def test_the_hash_is_that_of_the_values_alone() -> None:
         DecisionRule(5.0, tag_run=1),
         DecisionRule(5.0, lookahead=1.0),
         DecisionRule(5.0, policy_weight=0.5),
+        DecisionRule(5.0, explore=0.5),
+        DecisionRule(5.0, explore=0.5, explore_top=3),
     ]
-    assert len({rule.hash for rule in [DecisionRule(5.0), *others]}) == 9
-    assert len({str(rule) for rule in others}) == 8
+    assert len({rule.hash for rule in [DecisionRule(5.0), *others]}) == len(others) + 1
+    assert len({str(rule) for rule in others}) == len(others)
 
 
 HOSTILE: dict[str, Any] = {
@@ -143,6 +153,9 @@ def test_only_the_best_are_drawn_from() -> None:
         DecisionRule(0.0),
         DecisionRule(0.0, temperature=1.0),
         DecisionRule(0.0, temperature=2.0, top_k=2),
+        DecisionRule(0.0, explore=0.3),
+        DecisionRule(0.0, temperature=1.0, explore=0.4, explore_top=3),
+        DecisionRule(0.0, explore=1.0, explore_top=2),
     ],
 )
 def test_what_is_chosen_and_ranked_first_follows_the_probabilities(rule: DecisionRule) -> None:
@@ -152,7 +165,9 @@ def test_what_is_chosen_and_ranked_first_follows_the_probabilities(rule: Decisio
         scores = SCORES[row].expand(n, -1)
         items, chances = rule.choose(scores, generator)
         torch.testing.assert_close(chances, probabilities[row][items])
-        firsts = rule.ranked(scores, 3, torch.rand(scores.shape, generator=generator))[:, 0]
+        ranked, propensities = rule.ranked(scores, 3, draws(scores, generator))
+        firsts = ranked[:, 0]
+        torch.testing.assert_close(propensities[:, 0].float(), probabilities[row][firsts])
         for drawn in (items, firsts):
             shares = torch.bincount(drawn, minlength=4) / n
             torch.testing.assert_close(shares, probabilities[row], rtol=0, atol=0.015)
@@ -162,8 +177,8 @@ def test_ranked_items_are_drawn_one_after_the_other_without_repetition() -> None
     """The second item is drawn as the first, from what is left."""
     generator, n = torch.Generator().manual_seed(1), 40_000
     scores = torch.tensor([[0.0, 1.0, 2.0]]).expand(n, -1)
-    found = DecisionRule(0.0, temperature=1.0).ranked(
-        scores, 3, torch.rand(scores.shape, generator=generator)
+    found, propensities = DecisionRule(0.0, temperature=1.0).ranked(
+        scores, 3, draws(scores, generator)
     )
     assert (found.sort(1).values == torch.arange(3)).all()
     chances = scores[0].softmax(0)
@@ -172,6 +187,43 @@ def test_ranked_items_are_drawn_one_after_the_other_without_repetition() -> None
             share = ((found[:, 0] == first) & (found[:, 1] == second)).float().mean()
             expected = chances[first] * chances[second] / (1 - chances[first])
             assert float(share) == pytest.approx(float(expected), abs=0.012)
+            stated = propensities[(found[:, 0] == first) & (found[:, 1] == second)]
+            torch.testing.assert_close(stated[0, :2].prod().float(), expected)
+    assert (propensities[:, 2] == 1).all()
+
+
+RANDOM = [
+    DecisionRule(0.0, temperature=1.0),
+    DecisionRule(0.0, temperature=0.5, top_k=2),
+    DecisionRule(0.0, explore=0.2),
+    DecisionRule(0.0, temperature=0.7, top_k=2, explore=0.3),
+    DecisionRule(0.0, temperature=0.7, explore=0.5, explore_top=2),
+]
+
+
+@pytest.mark.parametrize("rule", RANDOM, ids=str)
+@pytest.mark.parametrize("n", [20_000, pytest.param(100_000, marks=pytest.mark.slow)])
+def test_lists_are_as_frequent_as_their_propensities_say(rule: DecisionRule, n: int) -> None:
+    """Chi-square over all lists of three of the five items; one item may not be shown."""
+    scores = torch.tensor([[0.0, 1.5, -math.inf, 2.0, 0.5]]).expand(n, -1)
+    generator = torch.Generator().manual_seed(2)
+    items, propensities = rule.ranked(scores, 3, draws(scores, generator))
+    lists, number, counts = items.unique(dim=0, return_inverse=True, return_counts=True)
+    stated = torch.zeros(len(lists), dtype=torch.float64)
+    stated[number] = propensities.prod(1)
+    torch.testing.assert_close(propensities.prod(1), stated[number])
+    assert float(stated.sum()) == pytest.approx(1, abs=1e-6)
+    found = chisquare(counts.numpy(), n * (stated / stated.sum()).numpy())
+    assert found.pvalue > 1e-3
+
+
+def test_propensities_stay_exact_where_one_item_has_nearly_all_probability() -> None:
+    scores = torch.tensor([[0.0, 40.0, 1.0]])
+    items, propensities = DecisionRule(0.0, temperature=1.0).ranked(
+        scores, 3, torch.full((1, 4), 0.5)
+    )
+    assert items.tolist() == [[1, 2, 0]]
+    assert propensities[0].tolist() == pytest.approx([1, math.e / (1 + math.e), 1], rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -179,12 +231,12 @@ def test_ranked_items_are_drawn_one_after_the_other_without_repetition() -> None
 )
 def test_items_left_out_are_ranked_last_and_good_ones_first(rule: DecisionRule) -> None:
     scores = torch.tensor([[1.0, -math.inf, 7.0, 3.0, 2.0, 6.0]]).expand(200, -1)
-    uniforms = torch.rand(scores.shape, generator=torch.Generator().manual_seed(0))
-    found = rule.ranked(scores, 6, uniforms)
+    found, propensities = rule.ranked(scores, 6, draws(scores, torch.Generator().manual_seed(0)))
+    assert (propensities[:, 2:] == 1).all()
     assert (found.sort(1).values == torch.arange(6)).all()
     assert (found[:, :2].sort(1).values == torch.tensor([2, 5])).all()
     assert (found[:, 2:] == torch.tensor([3, 4, 0, 1])).all()
-    assert (len(found.unique(dim=0)) > 1) == (rule.temperature > 0)
+    assert (len(found.unique(dim=0)) > 1) == rule.draws
 
 
 # Target returns.

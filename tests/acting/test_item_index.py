@@ -1,4 +1,4 @@
-"""The approximate search scores exactly what it finds, and tells how much that is."""
+"""The approximate search scores exactly what it finds, and reports how much that is."""
 
 from pathlib import Path
 

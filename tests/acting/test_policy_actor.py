@@ -1,5 +1,5 @@
 """A policy acts on what it was trained on: windows gathered from the logs of its own sessions give
-the actions that it played."""
+the actions that it took."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -45,7 +45,7 @@ def build(name: str, sizes: dict[str, int]) -> SequencePolicy:
 def written(
     folder: Path, steps: list[Step], action: str, states: ItemStates | None
 ) -> EpisodeStore:
-    """The sessions played, as a store in the order of their numbers."""
+    """The sessions simulated, as a store in the order of their numbers."""
     episodes = np.concatenate([step.episodes for step in steps])
     order = np.argsort(episodes, kind="stable")
     columns = {

@@ -37,7 +37,7 @@ class Countdown(gym.Env[Float32Array, int]):
 
 
 class Recorder:
-    """An actor that notes what it is told."""
+    """An actor that notes what it receives."""
 
     def __init__(self, n: int) -> None:
         self.steps = np.zeros(n, dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Scores are those of a naive computation, wherever the rule acts: played, scored, ranked and
+"""Scores are those of a naive computation, wherever the rule acts: simulated, scored, ranked and
 recommended."""
 
 from collections.abc import Iterator
@@ -230,7 +230,7 @@ def test_all_may_be_left_out_where_it_is_said_and_no_score_may_be_nan() -> None:
     scorer, history = scorer_of("dt", True, DecisionRule(3.0)), history_of(random_windows(CATALOG))
     excluded = torch.zeros(B, ITEMS, dtype=torch.bool)
     excluded[1] = True
-    with pytest.raises(InputError, match="in 1 of 3 decisions every item is left out"):
+    with pytest.raises(InputError, match="in 1 of 3 decisions every item is excluded"):
         scorer.scores(history, excluded=excluded)
     assert scorer.scores(history, excluded=excluded, empty=True)[1].isneginf().all()
     excluded[1, 4] = False
@@ -360,7 +360,8 @@ def test_played_scored_ranked_and_recommended_alike(
 
 
 def test_rewards_of_the_session_lower_the_target_of_recommendations(trained: TrainedPolicy) -> None:
-    """A session that has earned r with target T is recommended as one that has not, with T − r."""
+    """A session with rewards of r so far with target T is recommended as one that has not, with T
+    − r."""
     log = tagged_log()
     user, items, _ = max(last_sessions(log), key=lambda session: len(session[1]))
     window = trained.policy.config.context

@@ -93,7 +93,7 @@ def test_a_run_acts_by_the_rule_that_it_chose_and_says_how(
     found = read_record(folder / "run")
     assert found.rule is not None
     assert found.rule.simulated == (own["value"], own["error"])
-    assert f"promised by it {own['value']:.4g} ±" in found.describe()
+    assert f"the log supports: {own['value']:.4g} ±" in found.describe()
     assert RuleRecord.model_validate({**rule, "candidates": []}).simulated is None
 
 
@@ -267,7 +267,7 @@ def test_of_rules_that_the_model_cannot_tell_apart_the_widest_draws_are_taken(
 
 
 def tiring_store(folder: Path) -> EpisodeStore:
-    """Sessions of users who like nothing for 4 steps after 3 likes of one tag on end."""
+    """Sessions of users who like nothing for 4 steps after 3 likes of one tag in a row."""
     rng, rows = np.random.default_rng(0), list[tuple[int, int, int, float]]()
     for user in range(160):
         tags, tired = list[int](), 0

@@ -4,15 +4,24 @@ from pathlib import Path
 
 import pytest
 
-from ucfrec.commands.demo import BEHAVIORS, ENVIRONMENTS, LEARNERS, DemoConfig, demo
+from ucfrec.commands.demo import (
+    BEHAVIORS,
+    ENVIRONMENTS,
+    METHODS,
+    SHARED,
+    DemoConfig,
+    conclusion,
+    demo,
+)
 from ucfrec.results.rows_file import read_results
 
 TINY = DemoConfig(
     sessions=400,
     episodes=200,
-    settings=("train.steps=20", "crm.epochs=1"),
+    settings=("train.steps=20", "crm.epochs=1", "rule.sessions=10"),
     context=4,
     dim=16,
+    methods=tuple(METHODS),
 )
 
 
@@ -21,9 +30,11 @@ def test_the_demo_writes_every_row_and_goes_on_where_it_was(tmp_path: Path) -> N
     rows = demo(tmp_path / "demo", seed=0, config=TINY)
     written = read_results(tmp_path / "demo" / "results.json")
     assert written == rows
-    names = {*LEARNERS, *BEHAVIORS}
-    assert names == {"logging", "random", "bc", "dt", "ucf-no-augmentation", "ucf", "optimal"}
+    assert {*METHODS} == {"bc", "dt", SHARED, "ucf-no-augmentation", "ucf"}
     for environment in ENVIRONMENTS:
+        methods = TINY.names(environment)
+        assert (SHARED in methods) == (environment == "synthetic-catalog")
+        names = {*methods, *BEHAVIORS}
         of_environment = {row.method: row for row in written if row.environment == environment}
         assert of_environment.keys() == names
         assert max(of_environment.values(), key=lambda row: row.value).method == "optimal"
@@ -33,10 +44,14 @@ def test_the_demo_writes_every_row_and_goes_on_where_it_was(tmp_path: Path) -> N
             assert (row.config_hash is None) == (row.training_seed is None)
             assert row.command
             assert row.versions
+        said = conclusion(environment, of_environment)
+        assert f"UCF reaches {of_environment['ucf'].value:.3g} [" in said
+        assert ("With them, DT has" in said) == (SHARED in methods)
     page = (tmp_path / "demo" / "report.html").read_text()
     for environment in ENVIRONMENTS:
         assert f"R_cum in {environment}" in page
-        assert all(f"<summary>{environment}/{learner}</summary>" in page for learner in LEARNERS)
+        for name in TINY.names(environment):
+            assert f"<summary>{environment}/{name}</summary>" in page
     weights = tmp_path / "demo" / ENVIRONMENTS[0] / "dt" / "policy" / "best.safetensors"
     written_at = weights.stat().st_mtime_ns
     again = demo(tmp_path / "demo", seed=0, config=TINY)

@@ -22,7 +22,7 @@ FIXTURES = Path(__file__).parent / "fixtures"
 SIZES = {"state": 5, "action": 3, "items": 0}
 WIDTH, LAYERS, STEPS, TABLE = 16, 2, 6, 40
 SHAPE = {"context": STEPS, "dim": WIDTH, "layers": LAYERS, "max_timestep": TABLE}
-LEARNERS: dict[str, tuple[type[SequencePolicy], PolicyConfig]] = {
+POLICIES: dict[str, tuple[type[SequencePolicy], PolicyConfig]] = {
     "dt": (DTPolicy, DTConfig(**SHAPE, heads=2)),
     "dc": (DCPolicy, DCConfig(**SHAPE)),
     "lsdt": (LSDTPolicy, LSDTConfig(**SHAPE, heads=2, kernel_groups=2)),
@@ -73,7 +73,7 @@ BLOCKS = {
 UNUSED = ("transformer.wte", "predict_return", "predict_rtg", "predict_state")
 
 
-def renamed(learner: str, weights: dict[str, Tensor]) -> dict[str, Tensor]:
+def renamed(policy_name: str, weights: dict[str, Tensor]) -> dict[str, Tensor]:
     """The authors' weights by our names."""
     found, left = {}, dict(weights)
     for name in weights:
@@ -84,13 +84,13 @@ def renamed(learner: str, weights: dict[str, Tensor]) -> dict[str, Tensor]:
             found[f"{SHARED[layer]}.{field}"] = left.pop(name)
         else:
             block, inner = layer.removeprefix("transformer.").removeprefix("h.").split(".", 1)
-            if inner in BLOCKS[learner]:
+            if inner in BLOCKS[policy_name]:
                 # The layers of DT's blocks keep their weights transposed.
-                transposed = learner == "dt" and weights[name].ndim == 2
+                transposed = policy_name == "dt" and weights[name].ndim == 2
                 value = left.pop(name)
-                ours = f"blocks.{block}.{BLOCKS[learner][inner]}.{field}"
+                ours = f"blocks.{block}.{BLOCKS[policy_name][inner]}.{field}"
                 found[ours] = value.T.contiguous() if transposed else value
-    for block in range(LAYERS) if learner == "lsdt" else ():
+    for block in range(LAYERS) if policy_name == "lsdt" else ():
         found |= long_and_short(left, f"transformer.{block}.attention.", f"blocks.{block}.")
     assert not left, "weights of the authors that have no name of ours"
     return found
@@ -121,22 +121,22 @@ def windows_of(inputs: dict[str, Tensor]) -> Windows:
     )
 
 
-@pytest.mark.parametrize("learner", LEARNERS)
-def test_outputs_equal_those_of_the_authors_code(learner: str) -> None:
-    fixture = load_file(FIXTURES / f"{learner}.safetensors")
+@pytest.mark.parametrize("policy_name", POLICIES)
+def test_outputs_equal_those_of_the_authors_code(policy_name: str) -> None:
+    fixture = load_file(FIXTURES / f"{policy_name}.safetensors")
     parts: dict[str, dict[str, Tensor]] = {"weight": {}, "input": {}}
     for name, value in fixture.items():
         part, _, rest = name.partition(".")
         if rest:
             parts[part][rest] = value
-    kind, config = LEARNERS[learner]
+    kind, config = POLICIES[policy_name]
     policy = kind(config, SIZES).eval()
     buffers = {name for name, _ in policy.named_buffers()}
-    weights = renamed(learner, parts["weight"])
+    weights = renamed(policy_name, parts["weight"])
     assert weights.keys() == policy.state_dict().keys() - buffers
     policy.load_state_dict(weights, strict=False)
     windows = windows_of(parts["input"])
-    assert bool(windows.mask.all()) == (learner != "dt")
+    assert bool(windows.mask.all()) == (policy_name != "dt")
     with torch.no_grad():
         actions = policy.head.predict(policy.features(windows))
     torch.testing.assert_close(

@@ -1,4 +1,4 @@
-"""Action copies: what another action earns, and which answers the gate lets pass."""
+"""Action copies: the reward of another action, and which answers the gate lets pass."""
 
 import copy
 import functools

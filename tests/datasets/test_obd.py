@@ -1,4 +1,5 @@
-"""Open Bandit Dataset: official file names, and two real policies judged by each other's logs."""
+"""Open Bandit Dataset: official file names, and two real policies evaluated on each other's
+logs."""
 
 import shutil
 from pathlib import Path
@@ -18,7 +19,7 @@ from ucfrec.logs.prepare import prepare
 from ucfrec.off_policy.diagnostics import diagnose
 from ucfrec.off_policy.estimators import estimate
 from ucfrec.off_policy.logged_steps import LoggedSteps
-from ucfrec.off_policy.verdict import judge
+from ucfrec.off_policy.verdict import conclude
 from ucfrec.plugins import load_plugin
 from ucfrec_datasets.obd import DATASET
 
@@ -92,8 +93,8 @@ def test_a_run_of_one_campaign_reads_no_other(tmp_path: Path) -> None:
     assert EpisodeStore.open(tmp_path / "store").item_states.embeddings.abs().sum() > 0
     files, mapping = DATASET.resolve([women], LogMapping())
     with pytest.raises(InputError, match="item is not in the store"):
-        prepare(files, mapping, tmp_path / "judged", like=tmp_path / "store")
-    assert not (tmp_path / "judged").exists()
+        prepare(files, mapping, tmp_path / "evaluated", like=tmp_path / "store")
+    assert not (tmp_path / "evaluated").exists()
 
 
 def test_two_campaigns_at_once_are_one_clear_error(tmp_path: Path) -> None:
@@ -157,7 +158,7 @@ def test_every_real_impression_is_a_session_with_its_propensity(tmp_path: Path) 
 
 @pytest.mark.realdata
 def test_random_logs_tell_what_thompson_sampling_earns() -> None:
-    """The policy of the bts logs, taken as its shares of items by position, judged by the random
+    """The policy of the bts logs, taken as its shares of items by position, evaluated on the random
     logs; the truth is the click rate of the bts logs, 42 clicks in 10,000, itself uncertain."""
     _, random = real("random")
     _, bts = real("bts")
@@ -177,7 +178,7 @@ def test_random_logs_tell_what_thompson_sampling_earns() -> None:
     assert found["PDIS"].value == found["IPS"].value  # one step a session
     assert 1000 < found["IPS"].effective_sessions < 5000
     assert diagnose(steps).overlap == pytest.approx(1, abs=0.05)
-    verdict = judge(steps, seed=0)
+    verdict = conclude(steps, seed=0)
     assert verdict.reliable
     assert verdict.lift_low is not None
     assert verdict.lift_low < earned.mean() - random.click.mean() < verdict.lift_high

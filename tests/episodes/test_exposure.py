@@ -1,4 +1,4 @@
-"""Additions to logits by what was shown lately: against loops, and what they must not see."""
+"""Terms added to logits by what was shown lately: against loops, and what they must not see."""
 
 from dataclasses import replace
 
@@ -80,7 +80,7 @@ def alike(states: ItemStates, one: int, other: int) -> float:
 
 
 def slowly(made: ExposureTerm, states: ItemStates, shown: Exposed) -> Tensor:
-    """The additions to all logits, one at a time."""
+    """The terms added to all logits, one at a time."""
     added = torch.zeros(len(shown.items), ITEMS, dtype=torch.float64)
     for row, (items, rewards, returns) in enumerate(
         zip(shown.items.tolist(), shown.rewards.tolist(), shown.returns.tolist(), strict=True)

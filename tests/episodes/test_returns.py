@@ -136,7 +136,7 @@ def test_acting_with_the_logged_return_as_target_gives_the_training_returns_to_g
     for episode in episodes:
         collected = torch.zeros(1).double()
         for reward in episode:
-            seen += returns.asked(sum(episode), collected).float().tolist()
+            seen += returns.target_returns(sum(episode), collected).float().tolist()
             collected += reward
     assert seen == trained
 
@@ -144,17 +144,17 @@ def test_acting_with_the_logged_return_as_target_gives_the_training_returns_to_g
 def test_only_a_target_of_a_session_is_lowered_by_rewards() -> None:
     collected = torch.tensor([0.0, 2.0, -1.0]).double()
     assert ReturnToGo().per_session
-    assert ReturnToGo().asked(5.0, collected).tolist() == [5, 3, 6]
+    assert ReturnToGo().target_returns(5.0, collected).tolist() == [5, 3, 6]
     for definition in (ReturnToGo("discounted"), ReturnToGo("horizon", horizon=3)):
         assert not definition.per_session
-        assert definition.asked(5.0, collected).tolist() == [5, 5, 5]
+        assert definition.target_returns(5.0, collected).tolist() == [5, 5, 5]
 
 
 @given(definitions, st.lists(eighths, min_size=1, max_size=12), st.integers(1, 12))
 def test_the_past_of_a_window_is_as_in_training(
     definition: ReturnToGo, rewards: list[float], length: int
 ) -> None:
-    """If the future earns what is asked for, acting sees what training would have shown.
+    """If the future brings the target, acting sees what training would have shown.
 
     Of a horizon, what is asked for is taken to come evenly: the rewards from the last step on are
     equal here.

@@ -19,7 +19,7 @@ from tests.support.episodes import (
     Logged,
     episode_columns,
     lengths_of,
-    random_action_copies,
+    random_action_augmentation,
     random_episodes,
     random_overlay,
     some_states,
@@ -503,9 +503,9 @@ def test_copies_are_never_dropped_silently(folder: Path) -> None:
         lambda: union.with_returns_to_go(np.zeros(union.n_steps, dtype=np.float32)),
         lambda: union.without_observation_dimensions([0]),
     ):
-        with pytest.raises(InputError, match=r"9 edited copies.*without_copies\(\)"):
+        with pytest.raises(InputError, match=r"9 augmented episodes.*without_augmentation\(\)"):
             lose()
-    plain = union.without_copies()
+    plain = union.without_augmentation()
     assert plain.overlay is None
     assert same(every_window(plain, 4), every_window(base, 4))
     for name in schema.SPLITS:
@@ -579,7 +579,7 @@ def test_a_store_says_what_it_holds(folder: Path) -> None:
         repr(train) == "EpisodeStore(700 steps, 1 episodes, 11 items, reward=reward, split=train)"
     )
     overlay, edits = random_overlay(store, 3, seed=0, share=0.01)
-    assert "2 episodes and 3 edited copies" in repr(store.with_overlay(overlay))
+    assert "2 episodes and 3 augmented episodes" in repr(store.with_overlay(overlay))
     assert repr(overlay) == f"Overlay(3 copies, {len(edits)} edited states of {store.state_size})"
     at = np.array([0, 1, 1]), np.array([5, 6, 7])
     assert repr(store.windows(*at, 4)) == (
@@ -614,7 +614,9 @@ def test_tensors_whose_shapes_do_not_go_together_are_refused(folder: Path, of: s
     good: Windows | Transitions | Overlay = {
         "windows": store.windows(*at, 3),
         "transitions": store.transitions(*at),
-        "overlay": random_overlay(store, 3, seed=0)[0].joined(random_action_copies(store, 4, 0)),
+        "overlay": random_overlay(store, 3, seed=0)[0].joined(
+            random_action_augmentation(store, 4, 0)
+        ),
     }[of]
     for name, values in vars(good).items():
         for wrong in (values[1:], values[..., None, None]):
@@ -628,7 +630,7 @@ def test_an_overlay_comes_back_from_its_file(folder: Path) -> None:
     base = write_store(folder / "store", random_episodes(LENGTHS), some_states())
     for copies in (0, 5):
         overlay, _ = random_overlay(base, copies, seed=5)
-        overlay = overlay.joined(random_action_copies(base, copies, seed=6))
+        overlay = overlay.joined(random_action_augmentation(base, copies, seed=6))
         overlay.save(folder / "overlay.safetensors")
         read = Overlay.load(folder / "overlay.safetensors")
         for name, values in vars(overlay).items():

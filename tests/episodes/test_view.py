@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from tests.support.episodes import (
     Logged,
-    random_action_copies,
+    random_action_augmentation,
     random_episodes,
     random_overlay,
     some_states,
@@ -62,7 +62,7 @@ def test_action_augmentation_are_their_source_up_to_their_own_last_step(
         base = write_store(Path(name) / "store", episodes, states, shard_steps=6)
         base = base.with_return_to_go(definition)
         logged = every_value(base, length)
-        overlay = random_action_copies(base, 4, seed)
+        overlay = random_action_augmentation(base, 4, seed)
         union = base.with_overlay(random_overlay(base, edits, seed)[0].joined(overlay))
         first = len(base) + edits
         assert len(union) == first + 4
@@ -109,7 +109,7 @@ def same_values(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor])
 def test_training_draws_the_last_step_of_an_action_copy_alone(tmp_path: Path, items: bool) -> None:
     states = some_states() if items else None
     base = write_store(tmp_path / "store", random_episodes(LENGTHS, items=items), states)
-    overlay = random_overlay(base, 2, seed=1)[0].joined(random_action_copies(base, 5, seed=2))
+    overlay = random_overlay(base, 2, seed=1)[0].joined(random_action_augmentation(base, 5, seed=2))
     union = base.with_overlay(overlay)
     episodes, steps = union.all_steps()
     first = len(base) + 2
@@ -136,7 +136,7 @@ def test_training_draws_the_last_step_of_an_action_copy_alone(tmp_path: Path, it
 
 def test_no_state_of_an_action_copy_depends_on_its_action(tmp_path: Path) -> None:
     base = write_store(tmp_path / "store", random_episodes(LENGTHS), some_states(window=5))
-    overlay = random_action_copies(base, 8, seed=3)
+    overlay = random_action_augmentation(base, 8, seed=3)
     other = replace(overlay, action=(overlay.action + 1) % 11, action_reward=-overlay.action_reward)
     at = len(base) + np.arange(8), overlay.action_step
     first, second = (base.with_overlay(each).windows(*at, 6) for each in (overlay, other))
@@ -147,7 +147,7 @@ def test_no_state_of_an_action_copy_depends_on_its_action(tmp_path: Path) -> Non
 
 def test_what_an_action_copy_says_of_the_steps_before(tmp_path: Path) -> None:
     base = write_store(tmp_path / "store", random_episodes(LENGTHS), some_states())
-    overlay = random_action_copies(base, 6, seed=4)
+    overlay = random_action_augmentation(base, 6, seed=4)
     union, copies = base.with_overlay(overlay), len(base) + np.arange(6)
     position = {int(number): at for at, number in enumerate(base.episode_ids)}
     source = np.array([position[int(number)] for number in overlay.action_source])
@@ -166,7 +166,7 @@ def test_what_an_action_copy_says_of_the_steps_before(tmp_path: Path) -> None:
 
 def test_action_augmentation_of_another_store_are_refused(tmp_path: Path) -> None:
     base = write_store(tmp_path / "store", random_episodes(LENGTHS), some_states())
-    good = random_action_copies(base, 3, seed=5)
+    good = random_action_augmentation(base, 3, seed=5)
     vectors = np.zeros((3, 3), dtype=np.float32)
     for message, wrong in (
         ("copies of episodes", {"action_source": good.action_source + len(LENGTHS)}),
@@ -178,6 +178,6 @@ def test_action_augmentation_of_another_store_are_refused(tmp_path: Path) -> Non
         with pytest.raises(InputError, match=message):
             base.with_overlay(replace(good, **wrong))
     moving = write_store(tmp_path / "vectors", random_episodes(LENGTHS, items=False))
-    copies = random_action_copies(moving, 3, seed=5)
+    copies = random_action_augmentation(moving, 3, seed=5)
     with pytest.raises(InputError, match="does not know"):
         moving.with_overlay(replace(copies, action=vectors[:, :2]))

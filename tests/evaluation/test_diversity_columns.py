@@ -89,6 +89,6 @@ def test_a_run_knows_its_training_log(tmp_path: Path) -> None:
     assert trained.counts.liked.tolist() == [liked[item] for item in range(200)]
     best = DecisionRule(1.0)
     row = evaluate_policy(environment, trained, "popular", 10, 0, best)
-    # The one item that it plays is the one shown most.
+    # The one item that it shows is the one shown most.
     assert row["novelty"] == pytest.approx(-math.log(max(shown.values()) / train.n_episodes))
     assert row["majority_category_dominance"] in (0.0, 1.0)

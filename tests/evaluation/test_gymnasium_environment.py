@@ -117,8 +117,8 @@ def test_the_user_that_reset_gives_is_that_of_the_whole_session() -> None:
 @pytest.mark.parametrize(
     ("name", "observe", "said"),
     [
-        ("Slate", (), "takes actions of MultiDiscrete.*plays one item"),
-        ("Matrix", (), "takes actions of Box.*plays one item"),
+        ("Slate", (), "takes actions of MultiDiscrete.*takes one item"),
+        ("Matrix", (), "takes actions of Box.*takes one item"),
         ("Discrete", ("secrets",), "--observe secrets: .* has the entries secret, step"),
         ("Whole", ("step",), "--observe step: .* has no named entries"),
         ("Notes", ("step", "notes"), "name entries of a fixed size with --observe"),
@@ -159,8 +159,8 @@ def test_from_the_environment_to_an_evaluation_on_the_command_line(
     settings = [argument for setting in small for argument in ("--set", setting)]
     assert main(["train", store, "--policy", "bc", "--out", run, *settings]) == 0
     rows = tmp_path / "rows.json"
-    judged = ["--episodes", "8", "--behavior", "random", "--json", str(rows)]
-    assert main(["evaluate", run, *env, *judged]) == 0
+    evaluated = ["--episodes", "8", "--behavior", "random", "--json", str(rows)]
+    assert main(["evaluate", run, *env, *evaluated]) == 0
     found = read_results(rows)
     assert [row.method for row in found] == ["bc", "random"]
     assert {row.metrics["length"] for row in found} == {LENGTH}

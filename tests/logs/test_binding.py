@@ -19,7 +19,7 @@ START = 1_700_000_000_000
 
 
 def rewards_of(columns: dict[str, object], reward: str, folder: Path) -> list[float]:
-    """Rewards of rows in order, undefined ones left out; checks that a frame gives the same."""
+    """Rewards of rows in order, undefined ones excluded; checks that a frame gives the same."""
     frame = pd.DataFrame(columns)
     frame = frame.assign(user_id=1, item_id=2, timestamp=START + np.arange(len(frame)))
     frame.to_parquet(folder / "log.parquet")
@@ -76,7 +76,7 @@ def test_narrow_seconds_are_times(tmp_path: Path) -> None:
         ("coalesce(x, 7)", [0.25, 1.0, 7.0, 7.0]),
         ("if(isnan(x), 7, x)", [0.25, 1.0, 7.0, 7.0]),
         ("clicks + x", [0.25, 2.0]),
-        # Extremes and number of missing values in the file tell nothing of NaN.
+        # Extremes and number of missing values in the file show nothing of NaN.
         ("y > 0.5", [1.0, 1.0, 1.0]),
         ("y < 5", [1.0, 1.0, 1.0]),
         ("if(y < 5, 1, 2)", [1.0, 1.0, 2.0, 1.0]),
@@ -146,7 +146,8 @@ def test_undefined_numbers_of_features_are_missing(tmp_path: Path) -> None:
 
 
 def csv_of(folder: Path, column: str, first: str, later: str) -> Path:
-    """A CSV log whose `column` is `first`, in more rows than types are told from, then `later`."""
+    """A CSV log whose `column` is `first`, in more rows than types are inferred from, then
+    `later`."""
     rows = 25_000
     lines = [f"{column},user_id,item_id,timestamp"]
     values = [first] * (rows - 1) + [later]

@@ -17,7 +17,7 @@ from ucfrec.logs import LogMapping, PrepareOptions, prepare, validate
 from ucfrec.logs.engine import engine
 from ucfrec.logs.tables import Table, glob_pattern, open_tables, text
 
-SECRET = "the content of a file that nobody named"
+SECRET = "the content of a file that was not named"
 
 REFUSED = (
     "COPY (SELECT 1) TO '{out}'",

@@ -34,7 +34,7 @@ from ucfrec.logs.tables import Table, open_tables
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_datasets import kuairand, kuairec, obd
 
-SECRET = "the content of a file that nobody named"
+SECRET = "the content of a file that was not named"
 HONEST = (
     "is_click",
     "IS_CLICK",

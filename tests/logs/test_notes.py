@@ -1,4 +1,4 @@
-"""The owner of a log is told what is lost in it, and of bots."""
+"""The owner of a log sees what is lost in it, and of bots."""
 
 import warnings
 from pathlib import Path

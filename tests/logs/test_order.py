@@ -1,4 +1,4 @@
-"""Order statistics of rows on disk: the same in blocks of any size, and as counted by hand."""
+"""Order statistics of rows on disk: the same in blocks of any size, and as counted naively."""
 
 from pathlib import Path
 

@@ -43,7 +43,7 @@ def make_log(rows: int = 600, users: int = 25, items: int = 12, seed: int = 0) -
         {
             "user_id": generator.integers(users, size=rows),
             "item_id": generator.integers(items, size=rows),
-            # Coarse times, so that users have ties, repeated keys and silences.
+            # Coarse times, so that users have ties, repeated keys and long pauses.
             "timestamp": START + generator.integers(400, size=rows) * 10 * MINUTE,
             "reward": generator.integers(4, size=rows) / 2,
             "propensity": generator.uniform(0.01, 1, rows),

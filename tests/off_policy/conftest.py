@@ -1,4 +1,4 @@
-"""A run on logs in sessions, and other logs to judge it by."""
+"""A run on logs in sessions, and other logs to evaluate it on."""
 
 from pathlib import Path
 

@@ -16,7 +16,9 @@ def test_every_public_name_is_there() -> None:
 
 
 def test_array_functions_need_no_torch() -> None:
-    code = "from ucfrec.off_policy import diagnose, estimate, judge; import sys; print(sys.modules)"
+    code = (
+        "from ucfrec.off_policy import diagnose, estimate, conclude; import sys; print(sys.modules)"
+    )
     loaded = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )

@@ -7,7 +7,7 @@ import pytest
 
 from tests.support.logged_steps import random_steps
 from ucfrec.errors import InputError
-from ucfrec.off_policy import LoggedSteps, judge
+from ucfrec.off_policy import LoggedSteps, conclude
 from ucfrec.off_policy.diagnostics import (
     diagnose,
     identification_bounds,
@@ -108,7 +108,7 @@ def test_wrong_propensities_of_one_group_are_found() -> None:
     assert failed["item group 0"] == pytest.approx(0.8, abs=0.05)
     assert failed["item group 1"] == pytest.approx(1.2, abs=0.05)
     wrong = replace(steps, propensity=steps.propensity * factor)
-    assert "item group" in str(judge(wrong, seed=0))
+    assert "item group" in str(conclude(wrong, seed=0))
 
 
 def test_a_group_that_the_logs_lack_is_named() -> None:

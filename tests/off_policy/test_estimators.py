@@ -17,8 +17,8 @@ from ucfrec.off_policy.logged_steps import LoggedSteps, Modelled
 from ucfrec.off_policy.shrinkage import DR_KINDS, IPS_KINDS
 
 
-def values_of(model: Modelled) -> tuple[Float64Array, Float64Array, Float64Array]:
-    return model.reward, model.q, model.v
+def values_of(model: Modelled) -> tuple[Float64Array, ...]:
+    return model.reward, model.q, model.v, model.logged_reward
 
 
 def rows_of(steps: LoggedSteps) -> list[list[int]]:
@@ -222,6 +222,7 @@ def test_weighted_estimates_are_unbiased_whatever_the_model(right: bool) -> None
                 v=np.array(
                     [(ENVIRONMENT.target[s] * q[s]).sum() for q, s in zip(qs, states, strict=True)]
                 ),
+                logged_reward=np.zeros(len(path)),
             ),
         )
         found = estimate(steps, 0)
@@ -308,7 +309,7 @@ def test_models_alone_carry_no_interval() -> None:
 
 
 def test_weights_without_a_reward_have_no_interval() -> None:
-    """Of 10,000 sessions, those that the policy would repeat earned nothing: that is not 0 ± 0."""
+    """Of 10,000 sessions, those that the policy would repeat had no reward: that is not 0 ± 0."""
     rng = np.random.default_rng(0)
     action = rng.integers(100, size=10_000)
     steps = LoggedSteps(

@@ -11,7 +11,7 @@ from ucfrec.off_policy.logged_steps import Modelled
 
 
 def chain(sessions: int = 300, length: int = 4, seed: int = 0) -> tuple[Float32Array, ...]:
-    """Sessions that earn their x at every step; features 1, x and x · steps left."""
+    """Sessions with a reward of their x at every step; features 1, x and x · steps left."""
     rng = np.random.default_rng(seed)
     x = np.repeat(rng.normal(size=sessions), length)
     left = np.tile(np.arange(length, 0, -1), sessions)

@@ -9,7 +9,7 @@ import pytest
 
 from tests.support.logged_steps import random_steps
 from ucfrec.errors import InputError
-from ucfrec.off_policy import LoggedSteps, as_pages, estimate, judge
+from ucfrec.off_policy import LoggedSteps, as_pages, conclude, estimate
 from ucfrec.off_policy.estimators import session_terms
 from ucfrec.off_policy.pages import pages_of
 
@@ -113,7 +113,7 @@ def test_pages_have_a_verdict_and_no_fqe() -> None:
     found = estimate(as_pages(rows(300), np.arange(300) // 3), 0)
     assert {"DM", "DR", "IIPS"} <= set(found)
     assert "FQE" not in found  # its Q is of one position
-    assert judge(as_pages(rows(300), np.arange(300) // 3), 0).estimator == "DR"
+    assert conclude(as_pages(rows(300), np.arange(300) // 3), 0).estimator == "DR"
 
 
 def test_sessions_of_several_steps_are_no_positions() -> None:

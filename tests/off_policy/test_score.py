@@ -158,7 +158,7 @@ def test_unknown_items_may_stay_with_no_probability(
     folder: Path, trained: TrainedPolicy, logged: LoggedSessions, tmp_path: Path
 ) -> None:
     """Every third row shows something new: its probability is 0, and what came before in the
-    session is judged as ever."""
+    session is evaluated as usual."""
     log = pd.read_parquet(folder / "rest.parquet")
     new = np.arange(len(log)) % 3 == 0
     log.assign(item_id=np.where(new, 999, log.item_id)).to_parquet(tmp_path / "log.parquet")

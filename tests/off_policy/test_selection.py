@@ -10,7 +10,7 @@ from tests.off_policy import test_verdict
 from tests.off_policy.test_verdict import logs
 from ucfrec.arrays import Float64Array
 from ucfrec.errors import InputError
-from ucfrec.off_policy import LoggedSteps, judge
+from ucfrec.off_policy import LoggedSteps, conclude
 from ucfrec.off_policy.estimators import session_terms
 from ucfrec.off_policy.evaluate import OffPolicyReport
 from ucfrec.off_policy.fqe import ModelReport
@@ -28,7 +28,7 @@ def policy(liking: float) -> Float64Array:
     return np.asarray(weights / weights.sum())
 
 
-def judged(seed: int, sessions: int = 3000) -> Selection:
+def evaluated(seed: int, sessions: int = 3000) -> Selection:
     """The four policies by logs of a uniform one."""
     rng = np.random.default_rng(seed)
     items = rng.integers(ITEMS, size=sessions)
@@ -47,7 +47,7 @@ def test_the_best_of_four_policies_is_chosen() -> None:
     truth = {name: float(policy(liking) @ PAYS) for name, liking in LIKING.items()}
     chosen, correlations, regrets, held, within = 0, [], [], 0, 0
     for seed in range(40):
-        found = judged(seed)
+        found = evaluated(seed)
         chosen += found.chosen.name == "best"
         named = {one.name: one for one in found.standings}
         ranks = [named[name].rank for name in truth]
@@ -90,7 +90,7 @@ def test_one_clear_winner_loses_nothing() -> None:
     assert found.chosen.probability_best == 1
     assert found.regret == 0
     assert found.corrected == pytest.approx(found.chosen.value, abs=0.01)
-    assert found.headline.startswith("No other earns more than c: ")
+    assert found.headline.startswith("No other has a higher value than c: ")
     assert [one.rank for one in found.standings] == [1, 2, 3, 4]
 
 
@@ -137,7 +137,7 @@ def test_wrong_arrays_are_input_errors(names: list[str], terms: Float64Array, sa
 
 
 def report(steps: LoggedSteps) -> OffPolicyReport:
-    verdict = judge(steps, seed=0)
+    verdict = conclude(steps, seed=0)
     terms = influences(session_terms(steps)["SNPDIS"])
     models = ModelReport(reward_r2=0, td_loss=0, td_bias=0, iterations=1, settled=True)
     return OffPolicyReport([], [], verdict, models, steps.returns, None, terms)

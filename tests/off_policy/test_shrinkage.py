@@ -81,7 +81,7 @@ def test_only_unshrunk_weights_have_an_interval() -> None:
         earned,
         np.full(500, 1e-3),
         np.minimum(weights * 1e-3, 1),
-        Modelled(*np.full((3, 500), 0.3)),
+        Modelled(*np.full((4, 500), 0.3)),
     )
     found = estimate(steps, 0)
     for name in (*IPS_KINDS, *DR_KINDS):

@@ -1,4 +1,4 @@
-"""Rows that a run was trained on are noticed where it is judged by them."""
+"""Rows that a run was trained on are noticed where it is evaluated on them."""
 
 import re
 import shutil
@@ -43,10 +43,10 @@ def test_judging_by_the_training_log_is_refused(folder: Path, trained: TrainedPo
     log = folder / "train.parquet"
     with logged_sessions(folder / "run", trained, [log], LogMapping(), keep_unknown=True) as logged:
         rule = DecisionRule(5.0, temperature=1.0)
-        judged = evaluate_off_policy(folder / "run", trained, logged, rule=rule, seed=0)
-    assert not judged.verdict.reliable
-    assert "90% of the rows were seen in training" in judged.verdict.reasons[0]
-    assert judged.rows[0]["seen_in_training"] == pytest.approx(0.9, abs=0.01)
+        evaluated = evaluate_off_policy(folder / "run", trained, logged, rule=rule, seed=0)
+    assert not evaluated.verdict.reliable
+    assert "90% of the rows were seen in training" in evaluated.verdict.reasons[0]
+    assert evaluated.rows[0]["seen_in_training"] == pytest.approx(0.9, abs=0.01)
 
 
 def test_a_refit_has_seen_the_test_split_too(

@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.logged_steps import fitted
 from ucfrec.arrays import Float64Array, IntArray
-from ucfrec.off_policy import LoggedSteps, diagnose, estimate, judge
+from ucfrec.off_policy import LoggedSteps, conclude, diagnose, estimate
 from ucfrec.off_policy.verdict import cautions
 
 ITEMS = 10
@@ -19,8 +19,8 @@ PAYS = np.linspace(0.1, 0.5, ITEMS)
 def logs(
     sessions: int, seed: int = 0, length: int = 1, behavior: Float64Array | None = None
 ) -> tuple[LoggedSteps, IntArray]:
-    """Sessions of a behavior policy (uniform unless given) judged for one that likes later items;
-    its value is `value(length)`. Returns the items shown too."""
+    """Sessions of a behavior policy (uniform unless given) evaluated for one that likes later
+    items; its value is `value(length)`. Returns the items shown too."""
     rng = np.random.default_rng(seed)
     behavior = np.full(ITEMS, 1 / ITEMS) if behavior is None else behavior
     items = rng.choice(ITEMS, p=behavior, size=sessions * length)
@@ -41,7 +41,7 @@ def value(length: int = 1) -> float:
 
 def test_good_logs_stand_and_say_what_the_policy_gains() -> None:
     steps, _ = logs(5000)
-    verdict = judge(steps, seed=0)
+    verdict = conclude(steps, seed=0)
     lift = value() - PAYS.mean()
     assert verdict.reliable, verdict.reasons
     assert verdict.estimator == "SNPDIS"
@@ -49,8 +49,8 @@ def test_good_logs_stand_and_say_what_the_policy_gains() -> None:
     assert verdict.lift_high is not None
     assert 0 < verdict.lift_low < lift < verdict.lift_high
     assert verdict.probability_better == 1
-    assert str(verdict).startswith("The policy earns more than the logged one: +0.0")
-    same = judge(replace(steps, target=steps.propensity), seed=0)
+    assert str(verdict).startswith("The policy has a higher return than the logged one: +0.0")
+    same = conclude(replace(steps, target=steps.propensity), seed=0)
     assert same.lift == pytest.approx(0)
     assert same.reasons == ("the sessions do not differ enough for an interval",)
 
@@ -58,11 +58,11 @@ def test_good_logs_stand_and_say_what_the_policy_gains() -> None:
 def test_sessions_needed_are_enough_four_times_in_five() -> None:
     steps, _ = logs(5000)
     wanted = value() - PAYS.mean()
-    needed = judge(steps, seed=0, wanted_lift=wanted).sessions_needed
+    needed = conclude(steps, seed=0, wanted_lift=wanted).sessions_needed
     assert needed is not None
     found = 0
     for seed in range(100):
-        low = judge(logs(needed, seed)[0], seed).lift_low
+        low = conclude(logs(needed, seed)[0], seed).lift_low
         found += low is not None and low > 0
     assert 65 <= found <= 95
 
@@ -75,15 +75,15 @@ def test_unknown_items_weigh_nothing() -> None:
     known = np.arange(ITEMS) < 5
     target = np.where(known, 0.2, 0.0)
     truth = float(target @ PAYS)
-    judged = replace(steps, target=target[items])
-    one = estimate(judged, seed=0)["IPS"]
+    evaluated = replace(steps, target=target[items])
+    one = estimate(evaluated, seed=0)["IPS"]
     assert one.low is not None
     assert one.high is not None
     assert one.low < truth < one.high
-    dropped = estimate(judged.only(known[items]), seed=0)["IPS"]
+    dropped = estimate(evaluated.only(known[items]), seed=0)["IPS"]
     assert dropped.low is not None
     assert dropped.low > 1.5 * truth
-    assert judge(judged, seed=0).reliable
+    assert conclude(evaluated, seed=0).reliable
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ def test_unknown_items_weigh_nothing() -> None:
 def test_wrong_propensities_are_refused(name: str, says: str) -> None:
     steps, _ = logs(5000)
     wrong = steps.propensity / 2 if name == "halved" else np.ones(5000)
-    verdict = judge(replace(steps, propensity=wrong), seed=0)
+    verdict = conclude(replace(steps, propensity=wrong), seed=0)
     assert not verdict.reliable
     assert re.search(says, str(verdict))
 
@@ -117,7 +117,7 @@ def test_unsupported_choices_over_ten_steps_are_refused_with_bounds() -> None:
     assert failed >= {"step 1", "step 10", "session products"}
     assert diagnosis.bounds is not None
     assert diagnosis.bounds[0] < truth < diagnosis.bounds[1]
-    verdict = judge(steps, seed=0, diagnosis=diagnosis)
+    verdict = conclude(steps, seed=0, diagnosis=diagnosis)
     assert not verdict.reliable
     assert "the logs lack choices that the policy makes" in str(verdict)
     assert f"the value lies between {diagnosis.bounds[0]:.4g}" in str(verdict)
@@ -133,16 +133,16 @@ def test_weights_are_tested_by_segment() -> None:
     failed = [test for test in diagnose(twisted, segment=half).tests if not test.passed]
     assert [test.name for test in failed] == ["segment 0", "segment 1"]
     assert failed[0].mean < 1 < failed[1].mean
-    assert not judge(twisted, seed=0, diagnosis=diagnose(twisted, segment=half)).reliable
+    assert not conclude(twisted, seed=0, diagnosis=diagnose(twisted, segment=half)).reliable
 
 
 def test_no_rewarded_weight_is_refused() -> None:
-    """The policy repeats one item that never earned anything: not "0 [0, 0]"."""
+    """The policy repeats one item that never had a reward: not "0 [0, 0]"."""
     steps, items = logs(5000)
     steps = replace(
         steps, reward=steps.reward * (items != 3), target=(items == 3).astype(np.float64)
     )
-    verdict = judge(steps, seed=0)
+    verdict = conclude(steps, seed=0)
     assert not verdict.reliable
     assert "no session has both weight and reward" in str(verdict)
     assert estimate(steps, seed=0)["IPS"].low is None
@@ -153,11 +153,11 @@ def test_one_missing_propensity_leaves_the_verdict_standing_and_many_do_not() ->
     one, many = steps.propensity.copy(), steps.propensity.copy()
     one[17], many[::10] = np.nan, np.nan
     few = replace(steps, propensity=one)
-    verdict, diagnosis = judge(few, seed=0), diagnose(few)
+    verdict, diagnosis = conclude(few, seed=0), diagnose(few)
     assert verdict.reliable
     assert "1 of 20,000 sessions have a step without propensity" in cautions(diagnosis, {})[0]
-    assert "10% of the sessions" in judge(replace(steps, propensity=many), seed=0).reasons[0]
-    nothing = judge(replace(steps, propensity=np.full(20_000, np.nan)), seed=0)
+    assert "10% of the sessions" in conclude(replace(steps, propensity=many), seed=0).reasons[0]
+    nothing = conclude(replace(steps, propensity=np.full(20_000, np.nan)), seed=0)
     assert nothing.reasons == ("no session has all its propensities, so nothing can be weighed",)
     assert nothing.lift is None
 
@@ -220,4 +220,4 @@ def test_heavy_tails_are_noticed(sigma: float, heavy: bool) -> None:
     tail = diagnose(steps).tail
     assert tail is not None
     assert (tail > 0.5) is heavy
-    assert any("heavy a tail" in line for line in judge(steps, seed=0).reasons) is heavy
+    assert any("heavy a tail" in line for line in conclude(steps, seed=0).reasons) is heavy

@@ -1,4 +1,4 @@
-"""Exposure, advantage weights and the largest return, in every learner; without them, nothing."""
+"""Exposure, advantage weights and the largest return, in every policy; without them, nothing."""
 
 import time
 from dataclasses import replace
@@ -22,17 +22,17 @@ from ucfrec.policies.registry import policy_class
 from ucfrec.policies.values import advantage_weights
 
 TAGGED = {**CATALOG, "tags": 2}
-LEARNERS = ("ucf", "dt", "dc", "lsdt", "dt4rec", "cdt4rec", "edt4rec", "sasrec")
+POLICIES = ("ucf", "dt", "dc", "lsdt", "dt4rec", "cdt4rec", "edt4rec", "sasrec")
 ADDITIONS = {"advantage_weights": True, "max_return": True}
-learners = pytest.mark.parametrize("name", LEARNERS)
+policies = pytest.mark.parametrize("name", POLICIES)
 kinds = pytest.mark.parametrize("sizes", [VECTORS, TAGGED], ids=["vectors", "items"])
 
 
 def build(name: str, sizes: dict[str, int], **settings: Any) -> SequencePolicy:
     torch.manual_seed(0)
-    learner = policy_class(name)
+    policy_type = policy_class(name)
     small = {**SMALL, "dropout": 0.0, **({"kernel_groups": 4} if name == "lsdt" else {})}
-    policy = learner(learner.Config(**{**small, "exposure": False, **settings}), sizes)
+    policy = policy_type(policy_type.Config(**{**small, "exposure": False, **settings}), sizes)
     if sizes["items"]:
         generator = torch.Generator().manual_seed(4)
         embeddings = torch.randn(ITEMS, 4, generator=generator)
@@ -57,7 +57,7 @@ def trained(policy: SequencePolicy, steps: int = 25) -> SequencePolicy:
 
 
 @kinds
-@learners
+@policies
 def test_every_learner_trains_and_acts_with_the_additions(name: str, sizes: dict[str, int]) -> None:
     more = {"exposure": True, "exposure_window": 3} if sizes["items"] else {}
     policy, windows = build(name, sizes, **ADDITIONS, **more), random_windows(sizes)
@@ -80,7 +80,7 @@ def test_every_learner_trains_and_acts_with_the_additions(name: str, sizes: dict
         assert (moved != 0).any(), "the exposure term learns too"
 
 
-@pytest.mark.parametrize("name", [*LEARNERS, "bc"])
+@pytest.mark.parametrize("name", [*POLICIES, "bc"])
 def test_every_learner_learns_from_sampled_items(name: str) -> None:
     settings = {"sampled_above": ITEMS - 1, "sampled_items": 4, **ADDITIONS, "exposure": True}
     policy, windows = build(name, TAGGED, **settings), random_windows(TAGGED)
@@ -108,9 +108,9 @@ def test_a_step_costs_about_the_same_in_every_catalogue() -> None:
     windows = random_windows(TAGGED)
     for n in seconds:
         torch.manual_seed(0)
-        learner = policy_class("ucf")
-        config = learner.Config(**SMALL, sampled_above=100, sampled_items=256)
-        policy = learner(config, {**TAGGED, "items": n}).train()
+        policy_type = policy_class("ucf")
+        config = policy_type.Config(**SMALL, sampled_above=100, sampled_items=256)
+        policy = policy_type(config, {**TAGGED, "items": n}).train()
         steps[n] = policy, RowAdamW(policy.parameters(), fused=True)
     for _ in range(8):
         for n, (policy, optimizer) in steps.items():
@@ -123,7 +123,7 @@ def test_a_step_costs_about_the_same_in_every_catalogue() -> None:
     assert seconds[400_000] < 4 * seconds[4_000]
 
 
-@learners
+@policies
 def test_exposure_moves_predictions_by_what_was_shown_alone(name: str) -> None:
     """Prediction t with the term is prediction t without it plus what `Exposed.before` says."""
     policy = trained(build(name, TAGGED, exposure=True, exposure_window=3))
@@ -152,13 +152,13 @@ def test_exposure_moves_predictions_by_what_was_shown_alone(name: str) -> None:
 
 
 def reference_loss(policy: SequencePolicy, windows: Any) -> Tensor:
-    """The action loss as it was before there were additions."""
+    """The action loss as it was without shared components."""
     features = policy.features(policy.normalized(windows))
     return policy.head.loss(features[windows.mask], windows.actions[windows.mask])
 
 
 @kinds
-@learners
+@policies
 def test_without_additions_the_action_loss_is_that_of_the_head(
     name: str, sizes: dict[str, int]
 ) -> None:

@@ -37,7 +37,7 @@ def steps(head: ItemHead, m: int, seed: int = 1) -> tuple[Tensor, Tensor]:
 
 
 def sampling(head: ItemHead, samples: int) -> ItemHead:
-    """The head, trained from now on with so many draws for a batch."""
+    """The head, trained from now on with this number of draws for a batch."""
     head.samples = samples
     return head
 

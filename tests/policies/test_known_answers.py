@@ -1,4 +1,4 @@
-"""Known answers, of every learner: planted preferences are learned, and noise teaches nothing."""
+"""Known answers, of every policy: planted preferences are learned, and noise teaches nothing."""
 
 from pathlib import Path
 
@@ -40,7 +40,7 @@ def store(folder: Path, seed: int, noise: bool, items: bool) -> tuple[EpisodeSto
 
     Half of what was logged is what the user's kind prefers, which pays 1; the rest is arbitrary and
     pays nothing. As noise, logged actions and rewards have nothing to do with the user, and the
-    answer is the action that was logged last, which nothing tells beforehand.
+    answer is the action that was logged last, which nothing shows first.
     """
     rng = np.random.default_rng([seed, noise, items])
     kinds = rng.integers(KINDS, size=SESSIONS)
@@ -68,7 +68,8 @@ def directions() -> np.ndarray:
 
 
 def chosen(run: Path, given: EpisodeStore, items: bool) -> np.ndarray:
-    """Which kind's preference every session gets when all is asked for, in its last step."""
+    """Which kind's preference every session gets when the largest return is the target, in its
+    last step."""
     trained = TrainedPolicy.load(run)
     episodes = np.arange(given.n_episodes)
     windows = given.windows(episodes, np.full(len(episodes), STEPS - 1), 3)
@@ -102,7 +103,7 @@ def test_planted_preferences_are_learned_and_noise_is_not(
         assert abs(right - 1 / KINDS) < 0.1
     elif name in SEES_NO_STATE:
         # Two actions before tell the kind for certain only where both are what it prefers: the best
-        # answer is right in 0.625 of the sessions, chance in 0.25.
+        # answer is right in 0.625 of the sessions, a guess in 0.25.
         assert right > 0.45
     else:
         assert right > 0.9

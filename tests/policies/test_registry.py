@@ -1,4 +1,4 @@
-"""Learners by name: ucfrec's own, imported when asked for, and those installed beside it."""
+"""Policies by name: ucfrec's own, imported when needed, and those installed beside it."""
 
 import shutil
 import subprocess
@@ -94,7 +94,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     info = site / "my_learner-1.0.dist-info"
     info.mkdir(parents=True)
     (site / "my_learner.py").write_text(MINE)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-learner\nVersion: 1.0\n")
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-policy\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(ENTRY_POINTS)
     monkeypatch.syspath_prepend(str(site))
     monkeypatch.delitem(sys.modules, "my_learner", raising=False)

@@ -299,7 +299,7 @@ def test_stacked_streams_are_the_streams(
         expected = policy.last_features(windows)
         found = policy.acting_features()(windows)
         torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
-        # Padding that all windows share can be left out.
+        # Padding that all windows share can be excluded.
         if min(padding) >= cropped:
             short = policy.acting_features()(windows.last(windows.mask.shape[1] - cropped))
             torch.testing.assert_close(short, expected, rtol=1e-5, atol=1e-5)

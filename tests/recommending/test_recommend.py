@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from scipy.stats import chisquare
 
 from ucfrec import EpisodeStore, Recommender
 from ucfrec.acting.decision import DecisionRule
@@ -130,7 +131,7 @@ def test_scores_are_the_policys_at_the_next_step(
     users = trained.user_ids[store.episode_values("user")[at]]
     assert users.tolist() == sorted(set(given.user_id))
     windows = store.windows(at, ends[at], trained.policy.config.context)
-    # What the session has earned lowers what is asked for.
+    # The rewards of the session so far lowers what is requested.
     more = torch.from_numpy(7.0 - store.returns[at])
     assert len(set(more.tolist())) > 1
     asked = (windows.returns_to_go + more.unsqueeze(1)).masked_fill(~windows.mask, 0.0).float()
@@ -207,7 +208,10 @@ def test_only_candidates_are_recommended(
     expected["score"] -= np.log(chances.groupby(expected.user_id).transform("sum"))
     for given in (chosen, np.array(chosen), set(chosen), list(map(str, chosen))):
         found = policy.recommend(log, k=30, filter_seen=False, candidates=given)
-        pd.testing.assert_frame_equal(found, expected, atol=1e-4)
+        # The propensity of a draw among fewer items is another.
+        pd.testing.assert_frame_equal(
+            found.drop(columns="propensity"), expected.drop(columns="propensity"), atol=1e-4
+        )
     unseen = policy.recommend(log, k=30, candidates=chosen)
     assert set(zip(unseen.user_id, unseen.item_id, strict=True)) == {
         (user, item)
@@ -231,8 +235,10 @@ def test_unknown_items_are_refused_or_skipped(
     strange = pd.concat([log, log.tail(9).assign(item_id=999, timestamp=log.timestamp.max() + 1)])
     with pytest.raises(InputError, match=r"\d rows have an item_id .* \(1 items: 999\)"):
         policy.recommend(strange)
+    best = replace(policy.trained.rule, temperature=0.0)
     pd.testing.assert_frame_equal(
-        policy.recommend(strange, skip_unknown=True), policy.recommend(log)
+        policy.recommend(strange, skip_unknown=True, rule=best).drop(columns="request_id"),
+        policy.recommend(log, rule=best).drop(columns="request_id"),
     )
     newcomer = pd.DataFrame(
         {"user_id": [777], "item_id": [999], "timestamp": log.timestamp.max(), "reward": [1.0]}
@@ -404,11 +410,41 @@ def test_sessions_by_id_need_the_column(log: pd.DataFrame) -> None:
         )
 
 
-def test_draws_depend_on_user_item_and_seed_alone() -> None:
-    users = np.array([3, 5, 8])
-    drawn = uniforms(users, 2000, 0)
-    assert torch.equal(uniforms(users[1:2], 500, 0)[0], drawn[1, :500])
-    assert not torch.equal(uniforms(users, 2000, 1), drawn)
-    assert ((drawn >= 0) & (drawn < 1)).all()
-    np.testing.assert_allclose(drawn.mean(1), 0.5, atol=0.03)
-    assert np.abs(np.corrcoef(drawn)[np.triu_indices(3, 1)]).max() < 0.08
+def test_draws_depend_on_user_request_item_and_seed_alone() -> None:
+    users, requests = np.array([3, 5, 8]), np.array(["a", "b", "c"])
+    drawn = uniforms(users, requests, 2000, 0)
+    assert torch.equal(uniforms(users[1:2], requests[1:2], 500, 0)[0], drawn[1, :500])
+    assert not torch.equal(uniforms(users, requests, 2000, 1), drawn)
+    same_user = uniforms(users[[0, 0, 0]], requests, 2000, 0)
+    for several in (drawn, same_user):
+        assert ((several >= 0) & (several < 1)).all()
+        np.testing.assert_allclose(several.mean(1), 0.5, atol=0.03)
+        assert np.abs(np.corrcoef(several)[np.triu_indices(3, 1)]).max() < 0.08
+
+
+@pytest.mark.parametrize("n", [20_000, pytest.param(100_000, marks=pytest.mark.slow)])
+def test_items_of_many_requests_are_as_frequent_as_their_propensities(n: int) -> None:
+    """One user's requests are draws as independent as those of different users."""
+    rule = DecisionRule(0.0, temperature=1.0, explore=0.1)
+    scores = torch.linspace(0, 3, 12).expand(n, -1)
+    chances = rule.log_probabilities(scores[:1]).double().exp()[0].numpy()
+    ids = np.arange(n)
+    for users, requests in ((ids, ids * 0), (ids * 0, ids)):
+        items, _ = rule.ranked(scores, 1, uniforms(users, requests, 13, 0))
+        counts = np.bincount(items[:, 0].numpy(), minlength=12)
+        assert chisquare(counts, n * chances / chances.sum()).pvalue > 1e-3
+
+
+def test_later_rows_draw_again_and_a_replay_is_exact(log: pd.DataFrame) -> None:
+    policy = Recommender("dt", settings=SMALL).fit(log)
+    rule = replace(policy.trained.rule, temperature=5.0)
+    first, again, other = (policy.recommend(log, k=4, rule=rule, seed=seed) for seed in (0, 0, 1))
+    pd.testing.assert_frame_equal(first, again)
+    assert not first.item_id.equals(other.item_id)
+    assert (first.groupby("user_id").request_id.nunique() == 1).all()
+    # The same histories a minute later, with nothing else changed.
+    later = policy.recommend(log.assign(timestamp=log.timestamp + 60_000), k=4, rule=rule)
+    assert not (first.item_id == later.item_id).groupby(first.user_id).all().all()
+    assert ((first.propensity > 0) & (first.propensity <= 1)).all()
+    assert (first[first["rank"] == 1].propensity < 1).all()
+    assert (policy.recommend(log, k=4, rule=replace(rule, temperature=0.0)).propensity == 1).all()

@@ -62,7 +62,9 @@ def test_other_text_is_no_time(given: str) -> None:
 
 def test_integers_that_javascript_would_round_are_text() -> None:
     largest = 2**53 - 1
-    answer = Answer([largest, largest + 1, -largest - 1, 7, "7"], [0.0] * 5).as_dict(2**60)
+    answer = Answer(
+        [largest, largest + 1, -largest - 1, 7, "7"], [0.0] * 5, [1.0] * 5, "r", "run", "rule"
+    ).as_dict(2**60)
     ids = [each["item_id"] for each in answer["items"]]
     assert ids == [largest, str(largest + 1), str(-largest - 1), 7, "7"]
     assert answer["user_id"] == str(2**60)

@@ -40,7 +40,14 @@ def recommended(trained: TrainedPolicy, log: pd.DataFrame, k: int, **named: obje
 
 
 @pytest.mark.parametrize(
-    "rule", [None, FULL, DecisionRule(3.0, temperature=0.7, top_k=9)], ids=["own", "full", "drawn"]
+    "rule",
+    [
+        None,
+        FULL,
+        DecisionRule(3.0, temperature=0.7, top_k=9),
+        DecisionRule(3.0, explore=0.5, explore_top=12),
+    ],
+    ids=["own", "full", "drawn", "explores"],
 )
 @pytest.mark.parametrize("keep_seen", [False, True])
 def test_answers_are_those_of_recommend(
@@ -83,6 +90,26 @@ def test_each_request_has_its_own_k_and_candidates(trained: TrainedPolicy) -> No
         pd.testing.assert_frame_equal(own, expected, check_dtype=False, rtol=1e-5, atol=1e-6)
 
 
+def test_a_request_id_gives_the_same_answer_and_another_draws_again(
+    trained: TrainedPolicy,
+) -> None:
+    by = responder(trained, k=9, rule=DecisionRule(3.0, temperature=4.0))
+    given = [Request(user_id=7, request_id=name) for name in ("a", "a", "b")] + [Request(user_id=7)]
+    one, same, other, made = by.answers(given)
+    assert isinstance(one, Answer)
+    assert isinstance(same, Answer)
+    assert one.items == same.items
+    np.testing.assert_allclose(one.propensities, same.propensities, rtol=1e-5)
+    assert isinstance(other, Answer)
+    assert isinstance(made, Answer)
+    assert one.items != other.items
+    assert len({one.request_id, other.request_id, made.request_id}) == 3
+    assert (one.run, one.rule) == (trained.fingerprint, by.rule.hash)
+    (again,) = by.answers([Request(user_id=7, request_id=made.request_id)])
+    assert isinstance(again, Answer)
+    assert again.items == made.items
+
+
 def test_a_user_without_a_history_is_answered(trained: TrainedPolicy) -> None:
     found = answered(responder(trained, k=4), [{"user_id": "nobody"}, {"user_id": 10**9}])
     one, other = (found[found.user_id == user] for user in ("nobody", 10**9))
@@ -94,7 +121,8 @@ def test_a_user_who_has_seen_everything_gets_nothing(trained: TrainedPolicy) -> 
     rows = [{"item_id": n, "timestamp": 1_700_000_000_000 + n, "reward": 1} for n in range(24)]
     requests = [{"user_id": 1, "history": rows}, {"user_id": 2, "history": rows[:20]}]
     none, four = responder(trained).answers([Request.model_validate(r) for r in requests])
-    assert none == Answer([], [])
+    assert isinstance(none, Answer)
+    assert none[:3] == ([], [], [])
     assert isinstance(four, Answer)
     assert set(four.items) <= {20, 21, 22, 23}
 
@@ -148,9 +176,10 @@ def test_an_observation_that_is_infinite_in_single_precision_is_refused() -> Non
 
 def test_nothing_of_a_request_is_kept(trained: TrainedPolicy) -> None:
     by, requests = responder(trained), requests_of(histories(users=2))
-    before = answered(by, [{"user_id": 100}])
+    request = {"user_id": 100, "request_id": "a"}
+    before = answered(by, [request])
     answered(by, requests)
-    pd.testing.assert_frame_equal(answered(by, [{"user_id": 100}]), before)
+    pd.testing.assert_frame_equal(answered(by, [request]), before)
 
 
 def test_a_policy_of_vectors_and_a_wrong_k_are_refused(

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from tests.support.served import trained_run
@@ -41,6 +42,31 @@ def served(run: Path, *options: str) -> Iterator[tuple["subprocess.Popen[str]", 
             yield process, ready.split("ready at ")[1].split()[0]
         finally:
             process.kill()
+
+
+def test_term_writes_the_exposures_of_every_answer(trained: TrainedPolicy, tmp_path: Path) -> None:
+    folder = tmp_path / "shown"
+    with served(trained.folder, "--temperature", "2", "--exposures", str(folder)) as (
+        process,
+        address,
+    ):
+        answers = [
+            httpx.post(f"{address}/recommendations", json={"user_id": user, "k": 2}).json()
+            for user in range(5)
+        ]
+        assert not list(folder.iterdir())
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 0
+    (file,) = folder.iterdir()
+    shown = pd.read_parquet(file)
+    expected = [
+        (str(answer["user_id"]), item["item_id"], answer["request_id"], item["propensity"])
+        for answer in answers
+        for item in answer["items"]
+    ]
+    found = shown[["user_id", "item_id", "request_id", "propensity"]]
+    assert list(found.itertuples(index=False, name=None)) == expected
+    assert shown.position.tolist() == [1, 2] * 5
 
 
 def test_term_ends_it_after_the_requests_in_flight(trained: TrainedPolicy) -> None:

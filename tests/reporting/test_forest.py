@@ -60,7 +60,7 @@ def test_logs_that_differ_have_no_common_reference() -> None:
 def test_rows_of_ope_are_drawn_in_the_report(folder: Path, tmp_path: Path) -> None:
     from ucfrec.reporting.page import write_report
 
-    said = "The policy earns more than the logged one: +2"
+    said = "The policy has a higher return than the logged one: +2"
     about = {
         "conditions": {"choice": "softmax", "run": "runs/ucf", "sessions": 10},
         "details": {"warnings": [], "verdict": said, "verdict_of": "DR", "reliable": True},
@@ -72,7 +72,8 @@ def test_rows_of_ope_are_drawn_in_the_report(folder: Path, tmp_path: Path) -> No
     write_results(tmp_path / "ope.json", rows)
     write_report(tmp_path / "report.html", [folder / "ucf"], [tmp_path / "ope.json"])
     page = Page(tmp_path / "report.html")
-    assert "For ucf (softmax) of runs/ucf: The policy earns more than the logged one" in page.text
+    verdict = "The policy has a higher return than the logged one"
+    assert f"For ucf (softmax) of runs/ucf: {verdict}" in page.text
     (group,) = [found for tag, found in page.elements if tag == "g" and found.get("class")]
     assert group["class"] == "stands"
     assert any(tag == "circle" for tag, _ in page.elements)

@@ -79,8 +79,8 @@ def test_a_refit_knows_all_rows_of_its_store(tmp_path: Path) -> None:
     write_card(run(tmp_path / "run", policy=refitted, refit_of={}))
     card = text_of(tmp_path / "run")
     assert "2019-11-24 00:00 to 2019-12-01 00:00" in card
-    assert "nothing of what happened after 2019-12-01 00:00 UTC" in card
-    assert "It was trained on all rows of its store: only later logs can judge it." in card
+    assert "not trained on anything after 2019-12-01 00:00 UTC" in card
+    assert "It was trained on all rows of its store: only later logs can evaluate it." in card
     assert "is not below that of showing items" not in card
 
 

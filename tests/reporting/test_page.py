@@ -33,9 +33,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         EpisodeStore.write(folder / name, columns, lengths, {"split": split})
     small = [*killed_run.SETTINGS, "train.steps=30"]
     supervised = {"ucf": ["policy.lambda_mask=0.1"]}
-    for run, store, learner in (("ucf", "store", "ucf"), ("dt", "store", "dt"),
+    for run, store, policy_name in (("ucf", "store", "ucf"), ("dt", "store", "dt"),
                                 ("other", "other-store", "dt")):  # fmt: skip
-        config = resolve_config(learner, None, [*small, *supervised.get(run, [])], seed=3)
+        config = resolve_config(policy_name, None, [*small, *supervised.get(run, [])], seed=3)
         train_run(EpisodeStore.open(folder / store), folder / run, config)
     return folder
 
@@ -56,11 +56,11 @@ def test_the_numbers_are_those_of_the_record(runs: Path, tmp_path: Path) -> None
         assert number(data[f"{level:.0%} of returns are at most"]) == pytest.approx(
             quantile, rel=1e-3
         )
-    (copies,) = (table for caption, table in tables.items() if "edited copies" in caption)
+    (copies,) = (table for caption, table in tables.items() if "augmented episodes" in caption)
     report = record["augmentation"]
     model, moves = report["reward_model"], report["moves"]
     expected = {
-        "edited copies": report["copies"],
+        "augmented episodes": report["copies"],
         "acceptance (share of proposals)": report["acceptance"],
         "bound δ + ε_r": report["delta"] + report["epsilon_r"],
         "share of z in the reward's variance": model["z_share"],
@@ -174,7 +174,7 @@ def test_a_killed_run_is_shown_as_far_as_it_got(runs: Path, tmp_path: Path) -> N
     shown = page.tables["Validation loss (action, held-out steps)"]
     assert list(shown) == ["5", "10", "15", "20", "25"]
     assert page.tables["Runs"]["best validation loss"] == {"killed": "–"}
-    assert any("edited copies" in caption for caption in page.tables)
+    assert any("augmented episodes" in caption for caption in page.tables)
     metrics.unlink()
     assert "Nothing is logged yet" in page_of(tmp_path / "report.html", killed).text
 

@@ -30,6 +30,7 @@ from tests.support.report_page import (
 )
 from ucfrec.acting.scorer import logged_scores
 from ucfrec.commands.cli import main
+from ucfrec.counterfactual.reward_model_fit import fit_warning
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.reporting.page import write_report
@@ -56,8 +57,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     some_states().save(folder / "store" / ITEM_STATES)
     ids = pa.table({"item_id": [f"item {n}" for n in range(N_ITEMS)], "train_count": [7] * N_ITEMS})
     pq.write_table(ids, folder / "store" / "items.parquet")
-    for run, learner in (("ucf", "ucf"), ("greedy", "crm-greedy")):
-        config = resolve_config(learner, None, SETTINGS if run == "ucf" else SETTINGS[:-1], seed=3)
+    for run, policy_name in (("ucf", "ucf"), ("greedy", "crm-greedy")):
+        config = resolve_config(
+            policy_name, None, SETTINGS if run == "ucf" else SETTINGS[:-1], seed=3
+        )
         train_run(EpisodeStore.open(folder / "store"), folder / run, config)
     return folder
 
@@ -116,7 +119,7 @@ def test_a_reward_model_that_predicts_nothing_is_a_warning(folder: Path, tmp_pat
     augmentation = record_of(folder / "ucf")["augmentation"]
     for r2, warned in ((-0.07, True), (0.02, True), (0.03, False)):
         model = augmentation["reward_model"] | {"r2_without_z": r2}
-        changed = augmentation | {"reward_model": model, "warnings": []}
+        changed = augmentation | {"reward_model": model, "warnings": [fit_warning(r2)]}
         run = rewritten(folder / "ucf", tmp_path / f"run {r2}", augmentation=changed)
         text = page_of(tmp_path / "report.html", run).text
         assert (f"the reward model predicts nothing: from state and action its R² on held-out "

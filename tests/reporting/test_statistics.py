@@ -1,4 +1,4 @@
-"""Means and spreads, checked against numbers worked out by hand."""
+"""Means and spreads, checked against numbers worked out on paper."""
 
 import math
 

@@ -29,7 +29,7 @@ def of_logs(*rows: ResultRow, warnings: tuple[str, ...] = (), logged: bool = Tru
     return said
 
 
-def test_without_results_nothing_is_said_of_earnings() -> None:
+def test_without_results_nothing_is_said_of_returns() -> None:
     assert verdict(Results({}, ())) == [NO_RESULTS]
     assert "the returns of these policies are unknown" in NO_RESULTS
 
@@ -39,16 +39,16 @@ def test_the_best_is_named_with_its_interval_and_what_it_lies_above() -> None:
         earned("random", 1.0), earned("optimal", 9.0), earned("logging", 2.95),
         earned("dt", 2.0, training_seed=0), earned("ucf", 3.0, training_seed=0),
     )  # fmt: skip
-    assert "ucf earned most of 2 trained policies: 3 (95% interval 2.9 to 3.1)" in said
+    assert "ucf has the highest return of 2 trained policies: 3 (95% interval 2.9 to 3.1)" in said
     assert "lies above those of the others, the next being dt (2)" in said
-    assert "more than random (1), and less than optimal (9)" in said
-    assert "Whether it earns more or less than logging (2.95) is open" in said
+    assert "higher than that of random (1), and lower than that of optimal (9)" in said
+    assert "Whether it is higher or lower than that of logging (2.95) is open" in said
     assert "Each policy was trained once" in said
 
 
 def test_intervals_that_overlap_leave_it_open() -> None:
     said = of_environment(earned("dt", 2.9, training_seed=0), earned("ucf", 3.0, training_seed=0))
-    assert "overlaps that of dt (2.9): which of them earns more is open" in said
+    assert "overlaps that of dt (2.9): which of them has the higher return is open" in said
     assert "to compare it with" in said
 
 
@@ -56,8 +56,8 @@ def test_seeds_of_training_are_taken_together() -> None:
     rows = [earned("ucf", value, training_seed=seed) for seed, value in enumerate((3.0, 4.0, 5.0))]
     said = of_environment(*rows, earned("random", 3.5), earned("bad", 1.0))
     assert "4 in the mean of 3 trainings (their 95% intervals span 2.9 to 5.1)" in said
-    assert "more than bad (1)" in said
-    assert "less than random (3.5) is open" in said
+    assert "higher than that of bad (1)" in said
+    assert "lower than that of random (3.5) is open" in said
     assert "trained once" not in said
 
 
@@ -65,7 +65,7 @@ def test_checkpoints_of_one_run_are_no_seeds() -> None:
     rows = [earned("ucf", 3.0, training_seed=0, checkpoint="best"),
             earned("ucf", 2.0, training_seed=0, checkpoint="last")]  # fmt: skip
     said = of_environment(*rows)
-    assert "ucf, checkpoint best earned most of 2 trained policies: 3 (" in said
+    assert "ucf, checkpoint best has the highest return of 2 trained policies: 3 (" in said
     assert "trained once" in said
 
 
@@ -78,24 +78,24 @@ def test_built_in_policies_alone_say_nothing_of_trained_ones() -> None:
 @pytest.mark.parametrize(
     ("dr", "ips", "says"),
     [
-        (2.0, 3.0, "Every weighted estimate (IPS and DR) says that it earns more"),
-        (0.2, 0.1, "Every weighted estimate (IPS and DR) says that it earns less"),
+        (2.0, 3.0, "Every weighted estimate (IPS and DR) says that its return is higher"),
+        (0.2, 0.1, "Every weighted estimate (IPS and DR) says that its return is lower"),
         (1.1, 0.9, "No weighted estimate (IPS and DR) distinguishes it from the logging policy"),
-        (2.0, 1.0, "disagree (DR more than the logging policy, of IPS and DR)"),
-        (2.0, 0.1, "disagree (DR more; IPS less than the logging policy, of IPS and DR)"),
+        (2.0, 1.0, "disagree (DR higher than the logging policy, of IPS and DR)"),
+        (2.0, 0.1, "disagree (DR higher; IPS lower than the logging policy, of IPS and DR)"),
     ],
 )
 def test_estimates_conclude_only_where_all_of_them_do(dr: float, ips: float, says: str) -> None:
     said = of_logs(estimated("DM", 9.0), estimated("IPS", ips), estimated("DR", dr))
     assert f"DR estimates {dr:g} [" in said
-    assert "logged sessions earned 1 [0.9, 1.1]" in said
+    assert "logged sessions have 1 [0.9, 1.1]" in said
     assert says in said
 
 
 def test_an_estimate_with_warnings_is_not_relied_on() -> None:
     said = of_logs(estimated("DR", 5.0), warnings=("effective sample 3",))
     assert "DR estimates 5 [4.9, 5.1] per session, which is not reliable: effective" in said
-    assert "earns more" not in said
+    assert "is higher" not in said
 
 
 def test_models_alone_conclude_nothing() -> None:

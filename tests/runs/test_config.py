@@ -199,7 +199,7 @@ def read() -> set[str]:
 
 @pytest.mark.parametrize("policy", BUILT_IN)
 def test_every_field_means_something_and_is_read(policy: str, read: set[str]) -> None:
-    """A field that nothing reads is a promise that nothing keeps."""
+    """A field that nothing reads has no effect."""
     config = resolve_config(policy)
     tables = [(name, getattr(config, name)) for name in TABLES]
     for name, table in [*tables, ("cql", CQLConfig())]:

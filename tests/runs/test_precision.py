@@ -1,4 +1,4 @@
-"""Training in bfloat16: close to float32, resumed to the last bit, and with every learner."""
+"""Training in bfloat16: close to float32, resumed to the last bit, and with every policy."""
 
 from pathlib import Path
 
@@ -58,20 +58,20 @@ def test_a_resumed_training_ends_with_the_same_weights(store: EpisodeStore, tmp_
     assert all(torch.equal(each, whole[name]) for name, each in resumed.items())
 
 
-LEARNERS = ["ucf", "ucf-paper", "dt", "dc", "lsdt", "sasrec", "bc", "dt4rec", "cdt4rec", "edt4rec"]
+POLICIES = ["ucf", "ucf-paper", "dt", "dc", "lsdt", "sasrec", "bc", "dt4rec", "cdt4rec", "edt4rec"]
 SAMPLED = ["policy.sampled_above=1", "policy.sampled_items=8"]
 
 
 @pytest.mark.parametrize(
-    ("learner", "more"),
-    [*((learner, []) for learner in LEARNERS), ("ucf", SAMPLED)],
-    ids=[*LEARNERS, "sampled"],
+    ("policy_name", "more"),
+    [*((policy_name, []) for policy_name in POLICIES), ("ucf", SAMPLED)],
+    ids=[*POLICIES, "sampled"],
 )
 def test_gradients_of_every_learner_are_those_of_float32(
-    store: EpisodeStore, learner: str, more: list[str]
+    store: EpisodeStore, policy_name: str, more: list[str]
 ) -> None:
     sizes = ["policy.dim=32", "policy.context=6", "policy.exposure=true"]
-    config = resolve_config(learner, None, [*sizes, *more])
+    config = resolve_config(policy_name, None, [*sizes, *more])
     view = training_views(store)[0]
     policy = new_policy(view, config)
     steps = view.draw_steps(np.random.default_rng(0), 64)

@@ -125,8 +125,8 @@ def test_other_actions_alone_on_the_command_line(
     assert TrainedPolicy.load(tmp_path / "run").name == "ucf"
 
 
-@pytest.mark.parametrize("learner", ["ucf", "dt4rec", "cdt4rec"])
-def test_other_items_with_every_addition(tmp_path: Path, learner: str) -> None:
+@pytest.mark.parametrize("policy_name", ["ucf", "dt4rec", "cdt4rec"])
+def test_other_items_with_every_addition(tmp_path: Path, policy_name: str) -> None:
     states, episodes = some_states(), random_episodes([6] * 60)
     for number, episode in enumerate(episodes):
         episode.split = int(number % 5 == 0)
@@ -137,7 +137,7 @@ def test_other_items_with_every_addition(tmp_path: Path, learner: str) -> None:
         *("policy.exposure=true", "policy.advantage_weights=true", "policy.max_return=true"),
         *("policy.return_to_go=horizon", "policy.horizon=2", "rule.choose=false"),
     ]
-    record = train_run(store, tmp_path / "run", resolve_config(learner, None, settings))
+    record = train_run(store, tmp_path / "run", resolve_config(policy_name, None, settings))
     assert record.augmentation is not None
     assert record.augmentation.actions is not None
     assert record.augmentation.actions.copies > 10

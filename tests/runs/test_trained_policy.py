@@ -1,4 +1,4 @@
-"""Runs of strangers: sizes are compared before memory is asked for."""
+"""Untrusted runs: sizes are compared before memory is allocated."""
 
 import shutil
 from pathlib import Path

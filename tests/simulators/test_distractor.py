@@ -171,7 +171,7 @@ def test_a_policy_is_shown_the_distractor_where_it_was_trained_on_it(
 def _play_and_watch(
     env: VectorEnv[Any, Any, Any], trained: TrainedPolicy, ids: IntArray | None
 ) -> tuple[int, torch.Tensor]:
-    """Steps played and the states (M, S) that the policy was given in them."""
+    """Steps simulated and the states (M, S) that the policy was given in them."""
     actor = trained.actor(env.num_envs, DecisionRule(1.0), ids)
     shown: list[torch.Tensor] = []
     played = rollout(
@@ -198,7 +198,7 @@ def test_screening_finds_the_distractor_among_items_and_drops_it_to_the_last_bit
         assert dropped.keys() == plain.keys()
         for key, value in plain.items():
             assert torch.equal(dropped[key], value), (file, key)
-    # What it earns is the same, wherever the distractor is.
+    # Its return is the same, wherever the distractor is.
     folder = kuairand_folder / "environment"
     earned = [
         evaluate_policy(environment, TrainedPolicy.load(tmp_path / run), "ucf", 20, 0, None)[

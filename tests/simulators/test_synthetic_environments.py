@@ -48,7 +48,7 @@ def test_an_ended_session_is_replaced_within_the_step(environment: SessionsEnv) 
         final = info.get("final_obs", np.full(8, None))
         assert [row is not None for row in final] == ended.tolist()
         for row in np.flatnonzero(ended):
-            # A session's user never changes; its successor is somebody else.
+            # A session's user never changes; its successor is another user.
             np.testing.assert_array_equal(final[row][:12], before[row][:12])
             assert not np.array_equal(final[row], after[row])
         before = after

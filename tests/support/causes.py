@@ -84,7 +84,7 @@ def planted_items(
     out: Path, sessions: int = 400, length: int = 12, flip: float = 0.0
 ) -> EpisodeStore:
     """Clicks on eight items. Column 0 is the click itself, wrong in the share `flip`, column 4 the
-    next step's. Columns 1 and 2 raise and lower what some items are clicked, drawn anew at every
+    next step's. Columns 1 and 2 raise and lower what some items are clicked, drawn again at every
     step; the logging policy prefers the right items by column 1 only. Column 3 is the user's."""
     rng = np.random.default_rng(0)
     n, items = sessions * length, 8

@@ -179,7 +179,7 @@ def random_overlay(
     return overlay, edits
 
 
-def random_action_copies(store: EpisodeStore, copies: int, seed: int) -> Overlay:
+def random_action_augmentation(store: EpisodeStore, copies: int, seed: int) -> Overlay:
     """Copies of random episodes of the view that end at a random step with a random action."""
     rng = np.random.default_rng(seed)
     positions = rng.integers(len(store.episode_ids), size=copies)

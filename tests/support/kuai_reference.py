@@ -10,7 +10,7 @@ from ucfrec_simulators.kuai.environment import ExitRule, Rewards
 
 
 class Plain:
-    """One session as the published code plays it, its slices included."""
+    """One session as the published code simulates it, its slices included."""
 
     def __init__(self, tags: list[tuple[int, ...]], rule: ExitRule) -> None:
         self.tags, self.rule, self.shown = tags, rule, list[int]()

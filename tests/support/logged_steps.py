@@ -25,7 +25,7 @@ def random_steps(
         reward=rng.normal(size=n),
         propensity=rng.uniform(0.05, 1, n),
         target=rng.uniform(0, 1, n) * (rng.random(n) < 0.9),
-        model=Modelled(*rng.normal(size=(3, n))) if modelled else None,
+        model=Modelled(*rng.normal(size=(3, n)), np.zeros(n)) if modelled else None,
         discount=discount,
     )
 
@@ -61,7 +61,7 @@ def reference(name: str) -> tuple[LoggedSteps, dict[str, Array]]:
         reward=ours["reward"],
         propensity=ours["behavior"][row, action],
         target=ours["target"][row, action],
-        model=Modelled(reward=v, q=q[row, action], v=v),
+        model=Modelled(reward=v, q=q[row, action], v=v, logged_reward=q[row, action]),
         discount=1.0 if name == "bandit" else float(given["gamma"]),
         **clusters,
     )

@@ -1,10 +1,10 @@
 """A small record, and values that no entry of a record should have."""
 
+import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
-from ucfrec.files.atomic import write_json
 from ucfrec.files.record import Record
 
 
@@ -52,4 +52,4 @@ def damaged(file: Path, value: Mapping[str, Any], path: tuple[str, ...], damage:
         others = {key: each for key, each in here.items() if key != name}
         return others if changed is MISSING else {**others, name: changed}
 
-    write_json(file, inner(value, path))
+    file.write_text(json.dumps(inner(value, path)))  # with NaN, which `write_json` makes null

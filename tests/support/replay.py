@@ -13,7 +13,7 @@ from ucfrec.schema import USER_IDS
 
 
 class Told(DecisionRule):
-    """A rule that chooses what it is told, and keeps what it would have chosen."""
+    """A rule that chooses what it is given, and keeps what it would have chosen."""
 
     items: Iterator[int]
     thought: list[Tensor]

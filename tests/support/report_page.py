@@ -93,7 +93,8 @@ def record_of(run: Path) -> dict[str, Any]:
 def rewritten(run: Path, to: Path, **changes: Any) -> Path:
     """A copy of a run with another record; a change to None takes the field away."""
     shutil.copytree(run, to)
-    record = {k: v for k, v in (record_of(run) | changes).items() if v is not None}
+    record = record_of(run) | changes
+    record = {k: v for k, v in record.items() if k not in changes or v is not None}
     (to / "run.json").write_text(json.dumps(record))
     return to
 

@@ -1,4 +1,4 @@
-"""Result rows made by hand."""
+"""Result rows written out."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -39,7 +39,7 @@ def trained_run(folder: Path, policy: str = "ucf") -> TrainedPolicy:
 
 
 def learn_tastes(trained: TrainedPolicy) -> None:
-    """Give the run's reward model tastes that sessions tell of, as where users are new."""
+    """Give the run's reward model tastes that sessions show, as where users are new."""
     assert trained.reward_model is not None
     tastes, random = trained.reward_model.tastes, torch.Generator().manual_seed(3)
     tastes.root.copy_(torch.randn(tastes.root.shape, generator=random).tril())
@@ -86,7 +86,9 @@ def request_of(rows: pd.DataFrame, **more: Any) -> dict[str, Any]:
     """The request with one user's rows as its history."""
     columns = [name for name in rows.columns if name != "user_id"]
     history = json.loads(rows[columns].to_json(orient="records"))
-    return {"user_id": int(rows.user_id.iloc[0]), "history": history, **more}
+    # The id that `recommend` gives to the request of such a history.
+    request = {"request_id": f"0-{rows.timestamp.max()}"} | more
+    return {"user_id": int(rows.user_id.iloc[0]), "history": history, **request}
 
 
 def requests_of(log: pd.DataFrame, **more: Any) -> list[dict[str, Any]]:
@@ -97,7 +99,7 @@ def requests_of(log: pd.DataFrame, **more: Any) -> list[dict[str, Any]]:
 def as_frame(answers: list[dict[str, Any]]) -> pd.DataFrame:
     """Answers in the form of `ucfrec recommend`."""
     rows = [
-        {"user_id": answer["user_id"], "rank": rank, **item}
+        {"user_id": answer["user_id"], "rank": rank, **item, "request_id": answer["request_id"]}
         for answer in answers
         for rank, item in enumerate(answer["items"], 1)
     ]

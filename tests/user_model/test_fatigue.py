@@ -1,4 +1,5 @@
-"""Fatigue is found where users tire, and only there; later steps tell nothing of earlier ones."""
+"""Fatigue is found where users have fatigue, and only there; later steps show nothing of earlier
+ones."""
 
 from pathlib import Path
 
@@ -15,7 +16,8 @@ LAGS = 10
 
 
 def sessions(factor: float, seed: int, count: int = 150, length: int = 40) -> LoggedRuns:
-    """Sessions of two tags whose users tire for 4 steps after 3 likes of one tag on end."""
+    """Sessions of two tags whose users have fatigue for 4 steps after 3 likes of one tag in a
+    row."""
     rng, runs, liked = np.random.default_rng(seed), [], []
     for _ in range(count):
         tags, likes = np.zeros(0, dtype=int), np.zeros(0, dtype=bool)
@@ -32,7 +34,7 @@ def sessions(factor: float, seed: int, count: int = 150, length: int = 40) -> Lo
 
 
 def on_end(tags: IntArray, likes: BoolArray) -> int:
-    """Steps on end, up to the last, with its tag and liked; as `MainTags.runs` counts them."""
+    """Steps in a row, up to the last, with its tag and liked; as `MainTags.runs` counts them."""
     length = 0
     while length < len(tags) and likes[-1 - length] and tags[-1 - length] == tags[-1]:
         length += 1

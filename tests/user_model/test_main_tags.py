@@ -1,4 +1,4 @@
-"""Main tags: the tag that an item is most typical of, and runs of them counted by hand."""
+"""Main tags: the tag that an item is most typical of, and runs of them counted naively."""
 
 from dataclasses import replace
 

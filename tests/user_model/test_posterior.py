@@ -1,4 +1,4 @@
-"""What a session tells of tastes: a ridge regression within the session, the same everywhere."""
+"""What a session shows of tastes: a ridge regression within the session, the same everywhere."""
 
 import numpy as np
 import pytest

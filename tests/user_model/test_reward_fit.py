@@ -160,7 +160,7 @@ def test_for_new_users_the_session_tells_what_users_effects_tell_of_training_row
     slope, intercept = calibrate(model, rows)
     assert 0.85 < slope < 1.15
     assert abs(intercept) < 0.3
-    # After ten steps, the session tells what its user likes, which the log never says.
+    # After ten steps, the session shows what its user likes, which the log never says.
     late = (torch.arange(len(rows)) % LENGTH >= 10).numpy()
     true = planted.predictor[split[planted.users] == 1][late]
     scores = model.score(rows.states, rows.shown, None, rows.items).numpy()[late]

@@ -106,7 +106,7 @@ def test_the_last_step_of_a_users_last_session_tells_nothing() -> None:
     lengths = np.array([2, 3, 2, 2])
     store = EpisodeStore.from_arrays(columns, lengths, episodes, states)
     logged = LoggedEnds.of(store, 2, 100, 0)
-    # Left out: step 4 (user 0's last session), 6 (cut, not terminated) and 8 (user 1's last).
+    # Excluded: step 4 (user 0's last session), 6 (cut, not terminated) and 8 (user 1's last).
     assert logged.rewards.tolist() == [0, 1, 2, 3, 5, 7]
     assert logged.ended.tolist() == [False, True, False, False, False, False]
 

@@ -60,7 +60,7 @@ def test_users_who_liked_one_main_tag_on_end_reward_less_for_a_while(store: Epis
     shares = [float(users.step(item)[0].mean()) for item in [one, one, one, one, other, one, one]]
     assert shares[:3] == [1.0] * 3
     assert shares[3:5] == pytest.approx([0.25] * 2, abs=0.05)
-    # A fourth like tires for two steps, too; then the run is broken.
+    # A fourth like causes fatigue for two steps, too; then the run is broken.
     assert shares[5:] == pytest.approx([1 - 0.25 * 0.75, 1.0], abs=0.03)
     users = UserSimulator(users_of(store, 40.0), store, 3000, 50, seed=3)
     assert all(users.step(one)[0].all() for _ in range(6))

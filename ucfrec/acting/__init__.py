@@ -1,1 +1,1 @@
-"""Playing episodes in simulated environments with a trained or built-in policy."""
+"""Simulating episodes in simulated environments with a trained or built-in policy."""

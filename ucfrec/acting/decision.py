@@ -1,5 +1,6 @@
 """The decision rule: what turns a trained policy into what is shown, the same wherever it acts."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Final, Self
@@ -23,11 +24,13 @@ _RANGES: Final = {
     "top_k": (1, 10**9),
     "tag_window": (0, 10**4),
     "tag_run": (0, WINDOW),
+    "explore": (0.0, 1.0),
+    "explore_top": (1, 10**9),
 }
 _COLDEST: Final = 1e-30
 """Temperature below which dividing by it would leave the range of float32."""
-_OPTIONAL: Final = ("target", "minimum_target", "top_k")
-_WHOLE: Final = ("top_k", "tag_window", "tag_run")
+_OPTIONAL: Final = ("target", "minimum_target", "top_k", "explore_top")
+_WHOLE: Final = ("top_k", "tag_window", "tag_run", "explore_top")
 _FEW: Final = 2**16
 """Scores up to which looking for blocks first costs more."""
 _BLOCK: Final = 128
@@ -64,14 +67,19 @@ class DecisionRule:
     temperature: float = 0.0
     """T; items are drawn, or, at 0, the best is taken."""
     top_k: int | None = None
-    """Only the so many best items are drawn from; None for all."""
+    """Only this number of best items are drawn from; None for all."""
     exclude_seen: bool = False
-    """Whether items that the session has shown are left out."""
+    """Whether items that the session has shown are excluded."""
     tag_window: int = 0
-    """Items that share a tag with one of so many shown before are left out, unless none remain."""
+    """Items that share a tag with one of this number shown before are excluded, unless none
+    remain."""
     tag_run: int = 0
-    """Items with the main tag of the so many shown before are left out, if all of these had it and
+    """Items with the main tag of the so many shown before are excluded, if all of these had it and
     were liked, unless none remain; 0 for no such limit."""
+    explore: float = 0.0
+    """Share of the requests whose items are drawn uniformly from all that are allowed."""
+    explore_top: int | None = None
+    """Such requests draw from the so many best items only; None for all."""
 
     def __post_init__(self) -> None:
         for name, (low, high) in _RANGES.items():
@@ -131,10 +139,18 @@ class DecisionRule:
         parts += ["unseen items"] if self.exclude_seen else []
         parts += [f"no tag of the last {self.tag_window}"] if self.tag_window else []
         parts += (
-            [f"no main tag liked more than {self.tag_run} times on end"] if self.tag_run else []
+            [f"no main tag liked more than {self.tag_run} times in a row"] if self.tag_run else []
         )
         how = f"drawn at temperature {self.temperature:g}" if self.temperature else "argmax"
+        if self.explore:
+            of = f"the {self.explore_top} best items" if self.explore_top else "all items"
+            how += f", {self.explore:.3g} of the requests uniformly from {of}"
         return ", ".join([*parts, how])
+
+    @property
+    def draws(self) -> bool:
+        """Whether the items are random."""
+        return self.temperature > 0 or self.explore > 0
 
     @property
     def looks_ahead(self) -> bool:
@@ -143,7 +159,7 @@ class DecisionRule:
 
     @property
     def hash(self) -> str:
-        """12 hexadecimal digits that tell rules apart, for results."""
+        """12 hexadecimal digits that distinguish rules, for results."""
         return config_hash(self.as_dict())
 
     def target_returns(self, returns: ReturnToGo, collected: Tensor, best: Tensor | None) -> Tensor:
@@ -162,20 +178,13 @@ class DecisionRule:
         return targets if self.minimum_target is None else targets.clamp(min=self.minimum_target)
 
     def log_probabilities(self, scores: Tensor) -> Tensor:
-        """Log-probabilities (nats) with which items are shown, (B, n_items).
+        """Log-probabilities (nats) with which items are shown (first), (B, n_items).
 
         Args:
             scores: (B, n_items) of `Scorer.scores`.
         """
-        if self.temperature == 0:
-            best = scores.argmax(-1, keepdim=True)
-            return torch.full_like(scores, -torch.inf).scatter(1, best, 0.0)
-        if self.top_k is not None and self.top_k < scores.shape[1]:
-            lowest = scores.topk(self.top_k, dim=-1).values[:, -1:]
-            scores = scores.masked_fill(scores < lowest, -torch.inf)
-        # Relative to the best, so that no temperature makes every score −∞.
-        relative = scores - scores.amax(-1, keepdim=True)
-        return (relative / max(self.temperature, _COLDEST)).log_softmax(-1)
+        modes = [math.log(share) + logs for share, logs in self._modes(scores)]
+        return modes[0] if len(modes) == 1 else torch.logaddexp(*modes)
 
     def choose(self, scores: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Items (B,) and the probabilities (B,) with which they were chosen.
@@ -184,34 +193,112 @@ class DecisionRule:
             scores: (B, n_items) of `Scorer.scores`.
             generator: of the draws.
         """
-        if self.temperature == 0:
+        if not self.draws:
             return scores.argmax(-1), torch.ones(len(scores))
         probabilities = self.log_probabilities(scores).exp()
         items = torch.multinomial(probabilities, 1, generator=generator)
         return items[:, 0], probabilities.gather(1, items)[:, 0]
 
-    def ranked(self, scores: Tensor, k: int, uniforms: Tensor | None) -> Tensor:
-        """`k` different items (B, k), best first, or drawn one after the other.
+    def ranked(self, scores: Tensor, k: int, uniforms: Tensor | None) -> tuple[Tensor, Tensor]:
+        """`k` different items (B, k) in the order shown, best first or drawn one after the other,
+        and their propensities (B, k) float64.
 
-        Once all of the `top_k` items have been drawn, the others follow, best first.
+        Once all items that can be drawn have been, the others follow, best first. A propensity is
+        the probability that the item is shown at its position, given those at the positions before.
 
         Args:
             scores: (B, n_items) of `Scorer.scores`; k at most n_items.
             k: number of items.
-            uniforms: (B, n_items) draws from [0, 1); needed at a temperature above 0.
+            uniforms: (B, n_items + 1) draws from [0, 1), needed if the rule `draws`; the last
+                decides whether a request explores.
         """
-        if self.temperature > 0:
-            assert uniforms is not None
-            # The largest sums of log-probability and Gumbel noise are draws without replacement.
-            noise = uniforms.double().clamp(min=1e-300)
-            drawn = self.log_probabilities(scores) - torch.log(-torch.log(noise))
-            found = drawn.topk(k, dim=-1)
-            if not torch.isneginf(found.values).any():
-                return found.indices
-            by_score = scores.argsort(dim=-1, descending=True)
+        if not self.draws:
+            return best_items(scores, k), torch.ones(len(scores), k, dtype=torch.float64)
+        assert uniforms is not None
+        modes = [(share, logs.double()) for share, logs in self._modes(scores)]
+        logs = modes[0][1]
+        if len(modes) > 1:
+            logs = torch.where(uniforms[:, -1:] < self.explore, modes[1][1], logs)
+        # The largest sums of log-probability and Gumbel noise are draws without replacement.
+        noise = uniforms[:, :-1].double().clamp(min=1e-300)
+        drawn = logs - torch.log(-torch.log(noise))
+        found = drawn.topk(k, dim=-1)
+        items = found.indices
+        by_score = scores.argsort(dim=-1, descending=True, stable=True)
+        if torch.isneginf(found.values).any():
             places = drawn.gather(1, by_score).argsort(dim=-1, descending=True, stable=True)
-            return by_score.gather(1, places)[:, :k]
-        return best_items(scores, k)
+            items = by_score.gather(1, places)[:, :k]
+        if len(modes) == 1:
+            return items, _conditional(logs, items).exp()
+        follows = _next_best(by_score, items)
+        joint = [
+            math.log(share) + _conditional(logs, items, follows).cumsum(1) for share, logs in modes
+        ]
+        start = torch.zeros(len(items), 1, dtype=torch.float64)
+        return items, torch.logaddexp(*joint).diff(dim=1, prepend=start).exp()
+
+    def _modes(self, scores: Tensor) -> list[tuple[float, Tensor]]:
+        """Ways in which a request may be answered: its share, and log-probabilities (B, n_items) of
+        the first item."""
+        modes = []
+        if self.explore < 1:
+            modes.append((1 - self.explore, self._exploiting(scores)))
+        if self.explore > 0:
+            allowed = _only_best(scores, self.explore_top)
+            even = torch.zeros_like(allowed).masked_fill(torch.isneginf(allowed), -torch.inf)
+            modes.append((self.explore, even.log_softmax(-1)))
+        return modes
+
+    def _exploiting(self, scores: Tensor) -> Tensor:
+        """Log-probabilities (B, n_items) of a request that does not explore."""
+        if self.temperature == 0:
+            best = scores.argmax(-1, keepdim=True)
+            return torch.full_like(scores, -torch.inf).scatter(1, best, 0.0)
+        scores = _only_best(scores, self.top_k)
+        # Relative to the best, so that no temperature makes every score −∞.
+        relative = scores - scores.amax(-1, keepdim=True)
+        return (relative / max(self.temperature, _COLDEST)).log_softmax(-1)
+
+
+def _only_best(scores: Tensor, count: int | None) -> Tensor:
+    """The scores (B, n), −∞ below the `count` best."""
+    if count is None or count >= scores.shape[1]:
+        return scores
+    lowest = scores.topk(count, dim=-1).values[:, -1:]
+    return scores.masked_fill(scores < lowest, -torch.inf)
+
+
+def _conditional(logs: Tensor, items: Tensor, follows: Tensor | None = None) -> Tensor:
+    """Log-probabilities (B, k) of items drawn without replacement, each given those before it.
+
+    Args:
+        logs: (B, n) float64 log-probabilities of a single draw.
+        items: (B, k) in the order drawn.
+        follows: (B, k) whether the item is next once none is left to draw; None for always.
+    """
+    of_items = logs.gather(1, items)
+    rest = logs.scatter(1, items, -torch.inf).logsumexp(-1, keepdim=True)
+    # What is left before each draw is summed from the end, so that nothing cancels.
+    left = torch.cat([rest, of_items.flip(1)], dim=1).logcumsumexp(1).flip(1)[:, :-1]
+    given = (of_items - left).clamp(max=0.0)
+    after = torch.zeros_like(given)
+    if follows is not None:
+        after = after.masked_fill(~follows, -torch.inf)
+    return torch.where(torch.isneginf(left), after, given)
+
+
+def _next_best(by_score: Tensor, items: Tensor) -> Tensor:
+    """(B, k) whether each of the items is the best of those that are not before it.
+
+    Args:
+        by_score: (B, n) all items, best first.
+        items: (B, k).
+    """
+    ranks = by_score.argsort(dim=-1).gather(1, items)
+    return torch.stack(
+        [(ranks[:, :n] < ranks[:, n : n + 1]).sum(1) == ranks[:, n] for n in range(items.shape[1])],
+        dim=1,
+    )
 
 
 def best_items(scores: Tensor, k: int) -> Tensor:
@@ -227,7 +314,7 @@ def best_items(scores: Tensor, k: int) -> Tensor:
     tied = highest[:, 0] == highest[:, 1]
     if tied.any():
         first = scores[tied].argmax(-1, keepdim=True)
-        # The first comes in front, and leaves out itself further back or else the last.
+        # The first comes in front, and excludes itself further back or else the last.
         joined = torch.cat([first, found[tied]], dim=1)
         again = (joined == first).index_fill(1, torch.tensor([0]), False)
         found[tied] = joined.gather(1, again.int().argsort(dim=1, stable=True)[:, :k])

@@ -18,7 +18,7 @@ _SHARE: Final = 16
 _AT_LEAST: Final = 8
 """Lists that are searched at least."""
 _MORE: Final = 256
-"""Candidates that are scored beside three times those asked for."""
+"""Candidates that are scored beside three times those requested."""
 _SAMPLE: Final = 32
 """One in so many sessions is also searched exactly."""
 
@@ -28,7 +28,7 @@ class ItemIndex:
     exactly.
 
     Lists are chosen by the product with the items' vectors. What was shown (repetition, shared
-    tags) and what is left out counts among the candidates found, not in finding them. Sessions of
+    tags) and what is excluded counts among the candidates found, not in finding them. Sessions of
     which too few candidates are left are scored exactly.
     """
 
@@ -48,10 +48,10 @@ class ItemIndex:
             raise InputError(
                 "the approximate search needs faiss, which is not installed; install ucfrec[faiss]"
             ) from None
-        if scorer.rule.temperature > 0:
+        if scorer.rule.draws:
             raise InputError(
-                f"the rule draws items at temperature {scorer.rule.temperature:g}, which needs the "
-                "scores of all of them; leave --approximate out, or give --temperature 0"
+                f"the rule draws items ({scorer.rule}), which needs all scores; leave "
+                "--approximate out, or give --temperature 0 --explore 0"
             )
         if not scorer.is_product:
             raise InputError(
@@ -88,7 +88,7 @@ class ItemIndex:
         Args:
             sessions: B sessions; see `Scorer.scores`.
             left_out: rows (N,) and items (N,) of what may not be recommended.
-            excluded: (n_items,) bool, what nobody is recommended.
+            excluded: (n_items,) bool, what no user is recommended.
             k: at most the number of items.
         """
         items, scores = self._candidates(sessions, left_out, excluded, k)

@@ -1,4 +1,4 @@
-"""The scores of all items as a product of what sessions ask for with one matrix of all items.
+"""The scores of all items as a product of what sessions look for with one matrix of all items.
 
 All operations can be exported to ONNX.
 """
@@ -175,7 +175,7 @@ class ItemProduct:
     def factors(
         self, items: Tensor, policy: Part | None, model: Part | None, reward_weight: float
     ) -> Factors:
-        """The weighted sum of the parts; without a part, the rows of its own are left out."""
+        """The weighted sum of the parts; without a part, the rows of its own are excluded."""
         repeated = alike = torch.zeros_like(items, dtype=torch.float32)
         factors = list[Tensor]()
         if policy is not None:
@@ -235,7 +235,7 @@ class ItemProduct:
     def without_tags(
         self, rule: DecisionRule, shown: Shown, items: Tensor | None = None
     ) -> Iterator[Tensor]:
-        """What each tag filter of the rule leaves out, (B, n_items) bool, or (B, C) of items."""
+        """What each tag filter of the rule excludes, (B, n_items) bool, or (B, C) of items."""
         if rule.tag_window:
             recent = shown.items[:, : rule.tag_window]
             once = torch.ones_like(recent, dtype=torch.float32)

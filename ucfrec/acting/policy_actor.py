@@ -20,9 +20,10 @@ from ucfrec.schema import FORBIDDEN, USER_IDS
 
 
 class PolicyActor:
-    """Plays N episodes at once with one batched forward pass per step (an `Actor` of `rollout`).
+    """Simulates N episodes at once with one batched forward pass per step (an `Actor` of
+    `rollout`).
 
-    Vector actions are played as predicted. Items are chosen by the decision rule among those that
+    Vector actions are taken as predicted. Items are chosen by the decision rule among those that
     the environment has and allows. Users who are in the training logs keep their logged features.
     """
 
@@ -40,7 +41,7 @@ class PolicyActor:
         """
         Args:
             scorer: the policy under its decision rule.
-            episodes: N, number of episodes played in parallel.
+            episodes: N, number of episodes simulated in parallel.
             observation_size: leading entries of the environment's observation that the logs
                 contain, less those in `dropped`; 0 ignores the observation.
             item_states: builds states from items; None if the observation is the state.
@@ -111,7 +112,7 @@ class PolicyActor:
 
     @torch.no_grad()
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, Float32Array | None]:
-        """Choose the actions of the live rows; other rows play the first item that is allowed.
+        """Choose the actions of the live rows; other rows take the first item that is allowed.
 
         Args:
             observations: (N, O) with all entries that the policy sees.

@@ -1,4 +1,4 @@
-"""Play episodes with one actor in many environments in parallel."""
+"""Roll out episodes with one actor in many environments in parallel."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ class Actor(Protocol):
         """
 
     def observe(self, actions: Array, rewards: Float32Array) -> None:
-        """Record the actions just played, (N, A) or (N,), and their rewards (N,)."""
+        """Record the actions just taken, (N, A) or (N,), and their rewards (N,)."""
 
 
 @runtime_checkable
@@ -97,15 +97,15 @@ def rollout(
     on_step: Callable[[Step], None] | None = None,
     describe: str = "rollout",
 ) -> Episodes:
-    """Play exactly `episodes` episodes.
+    """Roll out exactly `episodes` episodes.
 
-    Environment i of N plays episodes i, i + N, i + 2N, …: with a fixed assignment, short episodes
-    are not over-represented.
+    Environment i of N simulates episodes i, i + N, i + 2N, …: with a fixed assignment, short
+    episodes are not over-represented.
 
     Args:
         env: N environments, reset within the step (`AutoresetMode.SAME_STEP`).
         actor: chooses the actions.
-        episodes: number of episodes to play.
+        episodes: number of episodes.
         seed: environment i is seeded with `seed` + i.
         on_step: called after each step with the rows that belong to one of the `episodes`.
         describe: name of the progress bar.

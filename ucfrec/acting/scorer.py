@@ -42,7 +42,7 @@ class Query(NamedTuple):
     features: Tensor | None
     """(B, D) that the policy predicts from; None for such a policy."""
     model: Part | None
-    """f̂_r; None if nobody asks for it."""
+    """f̂_r; None if it is not needed."""
 
     def at(self, rows: slice) -> "Query":
         """The sessions with the given numbers."""
@@ -127,7 +127,7 @@ class Scorer:
         for name, value in (("tag window", rule.tag_window), ("tag run", rule.tag_run)):
             if value and (tags is None or not bool((tags >= 0).any())):
                 raise InputError(
-                    f"the rule has a {name}, which leaves out items by their tags, but the store "
+                    f"the rule has a {name}, which excludes items by their tags, but the store "
                     f"has none; give the items a column of lists, or set the {name} to 0"
                 )
         if rule.tag_window > self.known:
@@ -233,7 +233,7 @@ class Scorer:
             given: B sessions, of at least `reach` items or `length` items each.
             left_out: rows (N,) and items (N,) of what may not be shown.
             excluded: (B, n_items) or (n_items,) bool, what may not be shown.
-            empty: whether all items of a row may be left out.
+            empty: whether all items of a row may be excluded.
 
         Raises:
             InputError: no item is left in some row, or the scores of some row are NaN.
@@ -282,7 +282,7 @@ class Scorer:
     def of_items(
         self, sessions: Sessions, factors: Factors, items: Tensor, products: Tensor
     ) -> Tensor:
-        """Scores (B, C) of some items; −∞ for those that the rule's tags leave out, even if no
+        """Scores (B, C) of some items; −∞ for those that the rule's tags exclude, even if no
         others remain.
 
         Args:
@@ -353,7 +353,7 @@ class Scorer:
         excluded: Tensor | None,
         empty: bool,
     ) -> Tensor:
-        """The scores with −∞ for what is left out; the given ones are overwritten."""
+        """The scores with −∞ for what is excluded; the given ones are overwritten."""
         if not torch.compiler.is_exporting():
             _require_numbers(scores)
         if left_out is not None:
@@ -368,7 +368,7 @@ class Scorer:
             none = torch.isneginf(scores.amax(1))
             if none.any():
                 raise InputError(
-                    f"in {int(none.sum())} of {len(none)} decisions every item is left out; allow "
+                    f"in {int(none.sum())} of {len(none)} decisions every item is excluded; allow "
                     "more candidates, or keep seen items"
                 )
         return scores
@@ -377,7 +377,7 @@ class Scorer:
 def logged_history(
     scorer: Scorer, store: EpisodeStore, episodes: IntArray, steps: IntArray
 ) -> tuple[History, Tensor | None]:
-    """What was known before logged steps, and what the rule leaves out because it was shown.
+    """What was known before logged steps, and what the rule excludes because it was shown.
 
     Args:
         scorer: the policy under its rule.

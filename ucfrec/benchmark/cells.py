@@ -93,7 +93,7 @@ class Budget:
     tasks_of: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Tasks of tables that have others than `tasks`."""
     optional: tuple[str, ...] = ()
-    """Those of `tasks` that are left out where their data is missing."""
+    """Those of `tasks` that are excluded where their data is missing."""
     logs: int = 1
     """Logs of every task: simulated ones of as many seeds, or parts of a given log."""
     sessions: int = 0

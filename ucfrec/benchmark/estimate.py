@@ -17,7 +17,7 @@ class Costs:
     """Of the updates of the cell's policy."""
     evaluation: Callable[[Cell], float]
     note: str
-    """Where these numbers come from, and what they leave out."""
+    """Where these numbers come from, and what they exclude."""
     stages: Callable[[Cell], Mapping[object, float]] = lambda cell: {}
     """Of the stages before and after the updates, by a key that cells with a common one share."""
 

@@ -93,7 +93,7 @@ class Plan:
         Args:
             table: table of the rows.
             task: whose behaviors are evaluated.
-            methods: of the table; a built-in policy of the same name is told apart from it.
+            methods: of the table; a built-in policy of the same name is distinguished from it.
         """
         for name in task.behaviors:
             yield Cell(

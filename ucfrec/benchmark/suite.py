@@ -33,7 +33,7 @@ class Cells(Protocol):
         """The cells of a table."""
 
     def missing(self) -> Sequence[str]:
-        """Tasks that are left out because their files or packages are missing."""
+        """Tasks that are excluded because their files or packages are missing."""
 
 
 @dataclass(frozen=True)
@@ -108,10 +108,10 @@ def measure(suite: Benchmark, request: BenchmarkRequest) -> str:
     _require_known("method", request.methods, suite.methods)
     tables = list(request.tables)
     if request.environment is not None and not (tables := [t for t in tables if t == "main"]):
-        raise InputError("--env gives the table main only; leave out --table")
+        raise InputError("--env gives the table main only; omit --table")
     plan = suite.plan(request, budget)
     parts = [
-        f"{name} is left out: its files are not in the data folder, or its package is not installed"
+        f"{name} is excluded: its files are not in the data folder, or its package is not installed"
         for name in plan.missing()
     ]
     plots = request.out / request.budget / "plots"

@@ -1,6 +1,6 @@
 """Choose the reward weight of a run by how it ranks the validation rows of its log.
 
-Where the log has no true sessions there is nothing to simulate, but every row tells what a user
+Where the log has no true sessions there is nothing to simulate, but every row shows what a user
 liked. A candidate is worth the mean rate, in the validation period, of the ten items that it would
 show, and overlaps with the log enough if it finds liked items better than the ten most liked ones
 do, by a standard error. The choice is repeated on two halves of the users.
@@ -41,7 +41,7 @@ def choose_by_ranking(
     """Choose the reward weight of the rule of `scorer`; its other parts stay.
 
     Of those with enough overlap, the one with the highest rate is chosen, and of those whose rates
-    cannot be told apart the one with the most hits; without any, no reward weight. If the next
+    cannot be distinguished the one with the most hits; without any, no reward weight. If the next
     larger of the candidates overlaps too little, reward weights between the two are tried. The
     arguments are those of `ucfrec.choosing.choose.choose_rule`; `config.reward_weights` are the
     first candidates, and `seed` is of the validation rows that are drawn from more than 4,000.

@@ -139,8 +139,8 @@ def choose_by_simulation(
     Where items have tags, tag window and temperature follow, and the reward weight with the
     window; where the log shows fatigue, the tag run, and temperature and reward weight with it.
     For new users, the rules of the highest value are then simulated in more sessions. Of rules that
-    the model cannot tell apart, the one at the highest temperature is taken, which stays nearest to
-    the log. The arguments are those of `choose_rule`.
+    the model cannot distinguish, the one at the highest temperature is taken, which stays nearest
+    to the log. The arguments are those of `choose_rule`.
     """
     search = RuleSearch(scorer, users, train, validation, config, seed)
     learned = scorer.policy.values is not None and bool(scorer.policy.config.max_return)
@@ -151,7 +151,7 @@ def choose_by_simulation(
     tried += _with_lookahead(search, second, config, train)
     if validation.item_states.tags.shape[1]:
         tried += _with_tag_window(search, second, config, scorer.known)
-        # Without a tag window, which may only have served to tire no one.
+        # Without a tag window, which may only have served to cause no fatigue.
         tried += _with_tag_run(search, second, config)
     best = search.best(tried)
     if users.reward_report.new_users:
@@ -172,7 +172,7 @@ def choose_by_simulation(
 def _with_lookahead(
     search: RuleSearch, rule: DecisionRule, config: RuleConfig, train: EpisodeStore
 ) -> list[SimulatedRule]:
-    """The rule with a lookahead, if more than chance ends sessions."""
+    """The rule with a lookahead, if more than randomness ends sessions."""
     mean = float(train.returns.sum(dtype=np.float64)) / train.n_steps
     lookaheads = [each * mean for each in config.lookaheads if each * mean > 0]
     if search.users.session_end_report.kept == "constant":
@@ -187,7 +187,7 @@ def _with_tag_window(
     """The rule with a tag window of items that are `known`, then with other reward weights.
 
     At all temperatures: at a low one, the log may support what the policy shows only once some
-    items are left out.
+    items are excluded.
     """
     windows = [window for window in config.tag_windows if 0 < window <= known]
     tried = search.simulate([*_variants(rule, temperature=config.temperatures, tag_window=windows)])
@@ -202,7 +202,8 @@ def _with_tag_window(
 def _with_tag_run(
     search: RuleSearch, rule: DecisionRule, config: RuleConfig
 ) -> list[SimulatedRule]:
-    """The rule with a tag run, if users tire, then at other temperatures and reward weights."""
+    """The rule with a tag run, if users have fatigue, then at other temperatures and reward
+    weights."""
     runs = [run for run in config.tag_runs if run] if search.users.fatigue else []
     tried = search.simulate([*_variants(rule, tag_run=runs)])
     if not tried:

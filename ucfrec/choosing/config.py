@@ -27,7 +27,7 @@ class RuleConfig:
     default_quantile: Share = 1.0
     """Quantile of the training returns that is the default rule's target."""
     default_tag_window: _Steps = 0
-    """Number of steps whose tags the default rule leaves out."""
+    """Number of steps whose tags the default rule excludes."""
     quantiles: Annotated[tuple[Share, ...], _SOME] = (0.9, 1.0)
     """Candidates for the target, as quantiles of the training returns; each with and without a
     minimum target at the same value."""
@@ -36,16 +36,16 @@ class RuleConfig:
     reward_weights: Annotated[tuple[_RewardWeight, ...], _SOME] = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
     """Candidates for β, the weight of the reward model."""
     lookaheads: Annotated[tuple[Weight, ...], _SOME] = (0.0, 4.0, 16.0)
-    """Candidates for the lookahead, in mean rewards, where the log tells what ends sessions."""
+    """Candidates for the lookahead, in mean rewards, where the log shows what ends sessions."""
     lookahead_weights: Annotated[tuple[_RewardWeight, ...], _SOME] = (8.0, 32.0)
     """Candidates for β with a lookahead, where it is the weight of rewards scaled to [0, 1]."""
     policy_weights: Annotated[tuple[Weight, ...], _SOME] = (0.0, 0.5, 1.0)
     """Candidates for the policy's weight with a lookahead."""
     tag_windows: Annotated[tuple[_Steps, ...], _SOME] = (0, 3, 10)
-    """Candidates for the number of steps whose tags are left out, where items have tags."""
+    """Candidates for the number of steps whose tags are excluded, where items have tags."""
     tag_runs: Annotated[tuple[_Runs, ...], _SOME] = (0, 2, 3, 4, 6, 8)
-    """Candidates for how often on end one main tag may be liked, where the log shows that more
-    tires users."""
+    """Candidates for how often in a row one main tag may be liked, where the log shows that more
+    causes fatigue."""
     sessions: Count = 100
     """Sessions simulated of each candidate."""
     least_impressions: Count = 10

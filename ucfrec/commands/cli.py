@@ -34,7 +34,7 @@ class Program:
 
 UCFREC = Program(
     "ucfrec",
-    "Train recommender policies from Parquet logs and estimate the return they would earn.",
+    "Train recommender policies from Parquet logs and estimate the return.",
     "ucfrec.commands",
     {
         "demo": "run every step on simulated logs and write a report; resumes",
@@ -47,6 +47,7 @@ UCFREC = Program(
         "rank": "measure how well policies rank items shown and clicked later",
         "recommend": "recommend the next items to the users of a log",
         "serve": "answer requests for recommendations over HTTP",
+        "join": "make a log of exposures and the feedback that they got",
         "export": "write the policy with its rule as an ONNX graph",
         "score": "write a policy's probability of every logged choice",
         "ope": "estimate a policy's return from logs alone (off-policy evaluation)",

@@ -59,5 +59,12 @@ def run(options: argparse.Namespace) -> None:
         for behavior in options.behavior
     ]
     print(evaluation_table(rows))
+    print(
+        "\nR_cum: mean return of a session, the sum of its rewards, with a 95% interval; where two "
+        "overlap, the order is open.\nR_avg: reward per step, over all steps (pooled) or in the "
+        "mean of sessions (episode)."
+    )
     if options.json is not None:
         write_results(options.json, rows)
+        runs = " ".join(map(str, options.runs)) or "RUN"
+        print(f"next: ucfrec report {runs} --results {options.json} --out report.html")

@@ -1,4 +1,4 @@
-"""`ucfrec ope`: what a policy would have earned, from logs alone."""
+"""`ucfrec ope`: the return of a policy, estimated from logs alone."""
 
 import argparse
 import math
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
     from ucfrec.off_policy.evaluate import EstimateOptions, OffPolicyReport
     from ucfrec.off_policy.score import LoggedSessions
+    from ucfrec.off_policy.verdict import Verdict
     from ucfrec.runs.trained_policy import TrainedPolicy
 
 
@@ -64,21 +65,21 @@ def estimate_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--anonymous",
         action="store_true",
-        help="the logs' users are no persons (as in obd): take each session for somebody else's",
+        help="the logs' users are no persons (as in obd): treat each session as of another user",
     )
     parser.add_argument(
         "--reward-range",
         type=float,
         nargs=2,
         metavar=("LEAST", "MOST"),
-        help="what a step can earn, to bound what unsupported choices could (default: as observed)",
+        help="reward of a step, to bound what unsupported choices could (default: as observed)",
     )
     parser.add_argument(
         "--lift",
         type=float,
         metavar="RETURN",
-        help="return a session that a launch should gain; the verdict says how many sessions would "
-        "show it (default: 5%% of the mean logged return)",
+        help="return per session that a launch should gain; the verdict says how many "
+        "sessions would show it (default: 5%% of the mean logged return)",
     )
     parser.add_argument(
         "--item-groups",
@@ -139,13 +140,13 @@ def run(options: argparse.Namespace) -> None:
     for name, candidate in zip(names, candidates, strict=True):
         if len(candidates) > 1:
             print(f"\n{name}:")
-        reports[name] = _judged(options, candidate)
+        reports[name] = _evaluated(options, candidate)
     if len(candidates) == 1:
         _write(options, reports, {})
         return
     choice = choose(reports, options.seed)
     if choice.selection is not None:
-        print("\nvalue of a session, with a 95% band that holds all of them at once:")
+        print("\nvalue per session, with a 95% band that holds all of them at once:")
         head = ("candidate", "value [band]", "P(best)", "rank")
         body = [
             (one.name, f"{one.value:.4g} [{one.low:.4g}, {one.high:.4g}]",
@@ -176,7 +177,7 @@ class _Candidate:
         }
 
 
-def _judged(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicyReport":
+def _evaluated(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicyReport":
     """Print and return what the logs say of one candidate."""
     from ucfrec.off_policy.evaluate import evaluate_off_policy
     from ucfrec.reporting.tables import format_rows
@@ -196,18 +197,43 @@ def _judged(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicyRep
     shown = ("estimator", "policy", "choice", "R_cum", "effective_sessions", "sessions")
     lines = [{**dict.fromkeys(shown), **r.as_line(), "estimator": r.method} for r in found.rows]
     print(f"\n{format_rows(lines, shown)}")
+    if found.per_step is not None:
+        per_step = ("estimator", "policy", "choice", "R_step", "effective_steps", "steps")
+        lines = [
+            {
+                **dict.fromkeys(per_step),
+                **row.as_line(),
+                "estimator": row.method,
+                "steps": found.per_step.steps,
+            }
+            for row in found.step_rows
+        ]
+        print(f"\n{format_rows(lines, per_step)}\n{found.per_step}\n")
+    print("R_cum: return per session, with a 95% interval where an estimator has one")
     print(f"models: {found.models}")
     for warning in found.warnings:
         print(f"warning: {warning}")
     print(f"verdict: {found.verdict.headline}")
+    print(_next_step(found.verdict))
     card_of_estimates(run, options.logs or ["the test split"], found)
     return found
 
 
+def _next_step(verdict: "Verdict") -> str:
+    """What to do about a verdict, in a line."""
+    if not verdict.reliable or verdict.lift_low is None or verdict.lift_high is None:
+        return "next: do not launch on this; remedy the warnings, or log more sessions at random"
+    if verdict.lift_low > 0:
+        return "next: test the policy on a share of the users, then compare with this estimate"
+    if verdict.lift_high < 0:
+        return "next: do not launch this policy; compare other ones, or other --targets"
+    return "next: log more sessions, or compare other policies, --targets or --temperatures"
+
+
 @contextmanager
 def _logged(options: argparse.Namespace, trained: "TrainedPolicy") -> "Iterator[LoggedSessions]":
-    """What the policy is judged by: the logs, or else the test split of its store."""
-    from ucfrec.logs.summary import format_report
+    """What the policy is evaluated on: the logs, or else the test split of its store."""
+    from ucfrec.logs.summary import format_summary
     from ucfrec.off_policy.score import held_out_sessions, logged_sessions
 
     if not options.logs:
@@ -219,12 +245,12 @@ def _logged(options: argparse.Namespace, trained: "TrainedPolicy") -> "Iterator[
     files, mapping = logs_given(options, trained)
     limit = options.memory_limit
     with logged_sessions(trained.folder, trained, files, mapping, True, limit) as logged:
-        print(format_report(logged.report))
+        print(format_summary(logged.report))
         yield logged
 
 
 def _rules(options: argparse.Namespace, trained: "TrainedPolicy") -> "list[DecisionRule]":
-    """The decision rules to judge: the run's own with the parts that the options name.
+    """The decision rules to evaluate: the run's own with the parts that the options name.
 
     Raises:
         InputError: one of `--targets` is neither a number nor a quantile, or a temperature is no
@@ -278,6 +304,6 @@ def _write(
     rows = [
         row.extended({"candidate": name, **more.get(name, {})}, checkpoint=options.checkpoint)
         for name, report in reports.items()
-        for row in report.rows
+        for row in (*report.rows, *report.step_rows)
     ]
     write_results(options.json, rows)

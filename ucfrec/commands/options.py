@@ -1,6 +1,8 @@
 """Options that several commands share, and the objects made from them."""
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +14,7 @@ if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
     from ucfrec.evaluation.environment import Environment
     from ucfrec.logs.mapping import Dataset, LogMapping
+    from ucfrec.recommending.exposures import ExposureLog
     from ucfrec.recommending.requests import Limits
     from ucfrec.recommending.responder import Responder
     from ucfrec.runs.trained_policy import TrainedPolicy
@@ -103,7 +106,7 @@ def log_options(parser: argparse.ArgumentParser) -> argparse.Action:
     parser.add_argument(
         "--where",
         metavar="SQL",
-        help="condition over the log's columns; rows that do not fulfil it are left out and "
+        help="condition over the log's columns; rows that do not fulfil it are excluded and "
         "counted, e.g. \"user_id NOT IN ('bot-0', 'bot-1')\" (default: none)",
     )
     parser.add_argument(
@@ -178,19 +181,28 @@ def rule_options(parser: argparse.ArgumentParser) -> None:
     )
     rule.add_argument("--top-k", type=int, metavar="N", help="draw from the N best items only")
     rule.add_argument(
-        "--exclude-seen", action="store_true", help="leave out items that the session has shown"
+        "--explore",
+        type=float,
+        metavar="SHARE",
+        help="share of the requests that draw uniformly from all items that are allowed",
+    )
+    rule.add_argument(
+        "--explore-top", type=int, metavar="N", help="these draw from the N best items only"
+    )
+    rule.add_argument(
+        "--exclude-seen", action="store_true", help="exclude items that the session has shown"
     )
     rule.add_argument(
         "--tag-window",
         type=int,
         metavar="N",
-        help="leave out items that share a tag with one of the last N, unless none remain",
+        help="exclude items that share a tag with one of the last N, unless none remain",
     )
     rule.add_argument(
         "--tag-run",
         type=int,
         metavar="N",
-        help="leave out items of one main tag once the last N had it and were liked",
+        help="exclude items of one main tag once the last N had it and were liked",
     )
 
 
@@ -208,6 +220,26 @@ def item_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def draw_options(parser: argparse.ArgumentParser, place: str) -> None:
+    """Add --seed and --exposures, of a rule that draws items.
+
+    Args:
+        place: FILE or DIR.
+    """
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=0,
+        help="of the draws of a rule with --temperature or --explore (default: 0)",
+    )
+    parser.add_argument(
+        "--exposures",
+        type=Path,
+        metavar=place,
+        help="write what was shown, with its probability, as Parquet (docs/exposures.md)",
+    )
+
+
 def limit_options(parser: argparse.ArgumentParser) -> None:
     """Add the limits of a request for recommendations."""
     limits = parser.add_argument_group("limits of a request", "beyond one, it gets an error")
@@ -215,7 +247,7 @@ def limit_options(parser: argparse.ArgumentParser) -> None:
         "--max-bytes", type=int, default=2**21, metavar="N", help="bytes of JSON (default: 2 MiB)"
     )
     limits.add_argument(
-        "--max-k", type=int, default=1000, metavar="N", help="items asked for (default: 1,000)"
+        "--max-k", type=int, default=1000, metavar="N", help="items requested (default: 1,000)"
     )
     limits.add_argument(
         "--max-history", type=int, default=5000, metavar="N", help="rows (default: 5,000)"
@@ -253,8 +285,8 @@ def limits_given(options: argparse.Namespace) -> "Limits":
 
 
 def responder_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "Responder":
-    """What answers requests, by `--k`, `item_options`, `engine_option`, `limit_options` and
-    `rule_options`.
+    """What answers requests, by `--k`, `item_options`, `draw_options`, `engine_option`,
+    `limit_options` and `rule_options`.
 
     Raises:
         InputError: a value is out of range, or the policy's actions are vectors.
@@ -268,8 +300,23 @@ def responder_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "R
         k=options.k,
         filter_seen=not options.keep_seen,
         skip_unknown=options.skip_unknown,
+        seed=options.seed,
         engine=options.engine,
     )
+
+
+@contextmanager
+def exposures_given(
+    options: argparse.Namespace, trained: "TrainedPolicy"
+) -> "Iterator[ExposureLog | None]":
+    """Where `draw_options` say that a server's answers are written; None for nowhere."""
+    from ucfrec.recommending.exposures import ExposureLog
+
+    if options.exposures is None:
+        yield None
+        return
+    with ExposureLog(options.exposures, trained) as log:
+        yield log
 
 
 def rule_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "DecisionRule":
@@ -289,6 +336,8 @@ def rule_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "Decisi
         "lookahead": options.lookahead,
         "temperature": options.temperature,
         "top_k": options.top_k,
+        "explore": options.explore,
+        "explore_top": options.explore_top,
         "exclude_seen": options.exclude_seen or None,
         "tag_window": options.tag_window,
         "tag_run": options.tag_run,

@@ -52,7 +52,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--max-session",
         type=int,
         metavar="N",
-        help="leave out and count sessions of more than N rows, as of bots (default: none)",
+        help="exclude and count sessions of more than N rows, as of bots (default: none)",
     )
     parser.add_argument(
         "--memory-limit",
@@ -88,7 +88,7 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.logs.summary import format_report
 
     if options.spark_master and options.engine != "spark":
-        raise InputError("--spark-master is for --engine spark; add it, or leave both out")
+        raise InputError("--spark-master is for --engine spark; add it, or omit both")
     files, mapping = logs_given(options)
     given = {
         "reward": options.reward and Expression(options.reward, "--reward"),
@@ -105,8 +105,13 @@ def run(options: argparse.Namespace) -> None:
     prepared = PrepareOptions(**{name: value for name, value in given.items() if value is not None})
     if options.validate:
         print(format_report(validate(files, mapping, prepared)))
+        print("\nnothing was written; next: the same command with --out STORE, not --validate")
         return
     if options.out is None:
         raise InputError("no store is named; add --out STORE, or --validate to only check the logs")
     print(format_report(prepare(files, mapping, options.out, prepared)))
-    print(f"\nstore: {origin(options.out)}")
+    store = origin(options.out)
+    print(
+        f"\nstore: {store}; policies learn from its train split, later rows validate and test them"
+        f"\nnext: ucfrec train {store} --out RUN"
+    )

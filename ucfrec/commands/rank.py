@@ -54,7 +54,7 @@ def run(options: argparse.Namespace) -> None:
     """
     from ucfrec.evaluation.ranking import MEASURES
     from ucfrec.evaluation.ranking_table import require_one_catalogue, training_store
-    from ucfrec.logs.summary import format_report
+    from ucfrec.logs.summary import format_summary
     from ucfrec.off_policy.score import held_out_sessions, logged_sessions
     from ucfrec.off_policy.training_rows import seen_too_often, share_seen
     from ucfrec.provenance import without_folders
@@ -74,7 +74,7 @@ def run(options: argparse.Namespace) -> None:
     if options.logs:
         files, mapping = logs_given(options, trained[0])
         with logged_sessions(runs[0], trained[0], files, mapping) as logged:
-            print(format_report(logged.report), end="\n\n")
+            print(format_summary(logged.report), end="\n\n")
             warnings = [seen_too_often(share_seen(policy, logged.store)) for policy in trained]
             rows = _rows(options, trained, train, logged, liked)
     else:
@@ -94,6 +94,22 @@ def run(options: argparse.Namespace) -> None:
         card_of_ranking(policy.folder, row, _SHOWN, on, said)
     if options.json is not None:
         write_results(options.json, rows)
+    print(_conclusion(rows, trained))
+
+
+def _conclusion(rows: "list[ResultRow]", trained: "list[TrainedPolicy]") -> str:
+    """What the rows show, in two lines: the best by liked items, and what to do next."""
+    found = [row.metrics.get("hit_rate_liked") for row in rows]
+    rated = {n: value for n, value in enumerate(found) if value is not None and value == value}
+    if 0 not in rated:
+        return "\nno step was liked; next: name what counts as liked with --liked"
+    best = max(rated, key=lambda n: rated[n])
+    own = f"; {trained[0].name} has {rated[0]:.3f}" if best else ""
+    return (
+        f"\n{rows[best].method} finds most liked items ({rated[best]:.3f} of them among its "
+        f"{rows[best].conditions['k']}){own}. Logged clicks favour what was shown:\n"
+        f"next: ucfrec ope {trained[0].folder}, the return per session that it would bring"
+    )
 
 
 def _liked(options: argparse.Namespace, trained: "TrainedPolicy") -> "LikedExpression | None":

@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ucfrec.commands.options import (
+    draw_options,
     engine_option,
+    exposures_given,
     item_options,
     limit_options,
     log_options,
@@ -33,6 +35,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--k", type=int, default=10, help="items for each user (default: 10)")
     item_options(parser)
     rule_options(parser)
+    draw_options(parser, "FILE")
     parser.add_argument(
         "--approximate",
         action="store_true",
@@ -82,6 +85,7 @@ def run(options: argparse.Namespace) -> None:
         _answer_stream(options)
         return
     from ucfrec.commands.frames import write_frames
+    from ucfrec.recommending.exposures import exposures_written
     from ucfrec.recommending.histories import histories_of_files
     from ucfrec.recommending.recommend import recommend
     from ucfrec.runs.trained_policy import TrainedPolicy
@@ -101,9 +105,14 @@ def run(options: argparse.Namespace) -> None:
             rule=rule,
             filter_seen=not options.keep_seen,
             skip_unknown=options.skip_unknown,
+            seed=options.seed,
             index=index,
         )
-        rows = write_frames(options.out, frames)
+        if options.exposures is None:
+            rows = write_frames(options.out, frames)
+        else:
+            with exposures_written(options.exposures, trained, rule.hash, frames) as written:
+                rows = write_frames(options.out, written)
     print(f"{origin(options.out)}: {rows:,} rows")
     if index is not None and index.wanted:
         print(
@@ -123,8 +132,11 @@ def _answer_stream(options: argparse.Namespace) -> None:
     trained = TrainedPolicy.load(options.run, options.checkpoint)
     responder = responder_given(options, trained)
     # Unbuffered, so that a request is answered without waiting for the next ones.
-    with open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as source:
-        counts = answer_stream(responder, source, sys.stdout.buffer)
+    with (
+        exposures_given(options, trained) as exposures,
+        open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as source,
+    ):
+        counts = answer_stream(responder, source, sys.stdout.buffer, exposures=exposures)
     responder.close()
     print(
         f"ucfrec recommend: {counts.answers:,} answers, {counts.errors:,} errors", file=sys.stderr

@@ -3,9 +3,12 @@
 import argparse
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ucfrec.commands.options import (
+    draw_options,
     engine_option,
+    exposures_given,
     item_options,
     limit_options,
     responder_given,
@@ -13,6 +16,11 @@ from ucfrec.commands.options import (
 )
 from ucfrec.errors import InputError
 from ucfrec.processes import Interrupted
+
+if TYPE_CHECKING:
+    from ucfrec.recommending.exposures import ExposureLog
+    from ucfrec.recommending.responder import Responder
+    from ucfrec.recommending.web import ServerLimits
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -37,9 +45,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     item_options(parser)
     parser.add_argument(
-        "--threads", type=int, metavar="N", help="of a forward pass (default: one a core)"
+        "--threads", type=int, metavar="N", help="of a forward pass (default: one per core)"
     )
     rule_options(parser)
+    draw_options(parser, "DIR")
     engine_option(parser)
     limit_options(parser)
     server = parser.add_argument_group("limits of the server")
@@ -62,16 +71,13 @@ def run(options: argparse.Namespace) -> None:
             `serve` is not installed, or the address cannot be listened on.
     """
     try:
-        import uvicorn
-
-        from ucfrec.recommending.web import ServerLimits, application
+        from ucfrec.recommending.web import ServerLimits
     except ModuleNotFoundError as error:
         raise InputError(
             f"serving needs {error.name}, which is not installed; install ucfrec[serve]"
         ) from None
     import torch
 
-    from ucfrec.recommending.server import Server, listening_socket
     from ucfrec.runs.record import verified
     from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -85,10 +91,25 @@ def run(options: argparse.Namespace) -> None:
     verified(options.run)
     trained = TrainedPolicy.load(options.run, options.checkpoint)
     responder = responder_given(options, trained)
+    with exposures_given(options, trained) as exposures:
+        _serve(options, responder, of_server, exposures)
+
+
+def _serve(
+    options: argparse.Namespace,
+    responder: "Responder",
+    of_server: "ServerLimits",
+    exposures: "ExposureLog | None",
+) -> None:
+    import uvicorn
+
+    from ucfrec.recommending.server import Server, listening_socket
+    from ucfrec.recommending.web import application
+
     # h11 takes one request of a connection after the other and bounds what it keeps of a head;
     # httptools does neither.
     config = uvicorn.Config(
-        application(responder, of_server, _allowed_hosts(options)),
+        application(responder, of_server, _allowed_hosts(options), exposures),
         http="h11",
         h11_max_incomplete_event_size=2**16,
         ws="none",
@@ -99,9 +120,9 @@ def run(options: argparse.Namespace) -> None:
     )
     with listening_socket(options.host, options.port) as listening:
         try:
-            Server(config, f"ucfrec serve: {trained!r}").run([listening])
+            Server(config, f"ucfrec serve: {responder.trained!r}").run([listening])
         except Interrupted:
-            # What was asked of a server that is told to stop is done.
+            # What was asked of a server that is stopped is done.
             print("ucfrec serve: stopped", file=sys.stderr)
 
 

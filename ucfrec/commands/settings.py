@@ -25,7 +25,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--policy",
         default="ucf",
         metavar="NAME",
-        help=f"learner whose settings to list: {', '.join(policy_names())} (default: ucf)",
+        help=f"policy whose settings to list: {', '.join(policy_names())} (default: ucf)",
     )
 
 
@@ -38,11 +38,11 @@ def settings_text(policy: str, width: int) -> str:
     """Every setting of a training of `policy`, one section per table.
 
     Args:
-        policy: name of the learner.
+        policy: name of the policy.
         width: terminal columns of a line.
 
     Raises:
-        InputError: no learner has this name.
+        InputError: no policy has this name.
     """
     from ucfrec.runs.config import TABLES, resolve_config
     from ucfrec.settings import describe

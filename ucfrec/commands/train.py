@@ -41,7 +41,7 @@ def training_options(parser: argparse.ArgumentParser) -> None:
         "--policy",
         default="ucf",
         metavar="NAME",
-        help=f"learner: {', '.join(policy_names())} (default: ucf)",
+        help=f"policy: {', '.join(policy_names())} (default: ucf)",
     )
     parser.add_argument(
         "--config",
@@ -100,7 +100,7 @@ def _train(options: argparse.Namespace) -> None:
     if options.refit is not None:
         if options.config is not None or options.set or options.screen:
             raise InputError(
-                "--refit takes all settings of the run; leave out --config, --set and --screen"
+                "--refit takes all settings of the run; omit --config, --set and --screen"
             )
         record = refit(store, options.refit, options.out)
     else:
@@ -110,4 +110,11 @@ def _train(options: argparse.Namespace) -> None:
         return
     card = write_card(options.out)
     print(record.describe(read_metrics(options.out / "policy")))
-    print(f"\nrun: {options.out}; TensorBoard can open it\nmodel card: {card}")
+    print(f"\nrun: {options.out} (TensorBoard can open it)\nmodel card: {card}")
+    if record.rule is None:
+        print(f"next: ucfrec evaluate {options.out} --env NAME, in a simulator of these actions")
+    else:
+        print(
+            f"next: ucfrec ope {options.out}, its value on the test split of the store\n"
+            f"      ucfrec recommend {options.out} LOGS --out FILE, the next items of every user"
+        )

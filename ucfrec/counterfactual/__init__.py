@@ -1,1 +1,1 @@
-"""The causal reward model, the state generators and the edited copies."""
+"""The causal reward model, the state generators and the augmented episodes."""

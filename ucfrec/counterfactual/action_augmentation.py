@@ -34,7 +34,7 @@ class ActionReport:
     mean_change: Undefinable
     """Mean change of the reward in the copies, in reward units; 0 without copies."""
     earns_more: Undefinable
-    """Share of the copies that earn more than the logged action did; 0 without copies."""
+    """Share of the copies with a higher reward than the logged action; 0 without copies."""
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,7 @@ class EffectTransitions:
 
     @torch.no_grad()
     def __call__(self, view: EpisodeStore, episodes: IntArray, steps: IntArray) -> Transitions:
-        """Single steps of a view without edited copies, as `EpisodeStore.transitions`.
+        """Single steps of a view without augmented episodes, as `EpisodeStore.transitions`.
 
         Actions are (M, D + 1): the vectors of the items, then what of their scores does not depend
         on the state.

@@ -61,7 +61,7 @@ class CRMConfig:
     epochs: Annotated[int, Field(ge=0, le=100_000)] = 0
     """Maximum number of passes over the transitions, for regression and CVAE each; 0 selects 5, or
     from few transitions as many as take 800 updates. The regression, which overfits rewards that
-    are mostly chance within a pass, is fitted by a sixth and a third of them first, and by all only
+    are mostly noise within a pass, is fitted by a sixth and a third of them first, and by all only
     if more has helped."""
     patience: Annotated[int, Field(ge=0, le=100_000)] = 5
     """Passes without a better validation loss before the CVAE stops early; 0 never stops early."""

@@ -44,7 +44,7 @@ class AugmentConfig:
     """
 
     copies: Annotated[int, Field(ge=0, le=1000)] = 1
-    """Maximum number of edited copies of each episode, whose states differ; 0 for none."""
+    """Maximum number of augmented episodes of each episode, whose states differ; 0 for none."""
     actions: Annotated[int, Field(ge=0, le=1000)] = 0
     """Number of other actions to propose at each step: a copy of the episode up to this step ends
     with the other action and its counterfactual reward, where the reward model is accurate enough.
@@ -144,7 +144,7 @@ class AugmentationReport:
     """Number and kind of the edits, and the bound of Proposition 1 on their effect."""
 
     copies: int
-    """Number of edited copies."""
+    """Number of augmented episodes."""
     proposals: int
     """Number of proposed edits."""
     acceptance: float
@@ -204,10 +204,10 @@ def augment(
     seed: int,
     read: Read = EpisodeStore.transitions,
 ) -> tuple[Overlay, AugmentationReport]:
-    """Make edited copies of episodes (Algorithm 5, or appendix H; see `AugmentConfig`).
+    """Make augmented episodes of episodes (Algorithm 5, or appendix H; see `AugmentConfig`).
 
     Args:
-        view: the training episodes, without edited copies.
+        view: the training episodes, without augmented episodes.
         crm: the fitted reward model.
         crm_report: its quality, for the report.
         generator: proposes counterfactual states.

@@ -1,4 +1,4 @@
-"""What a session was shown lately, as additions to the logits of the items that resemble it."""
+"""What a session was shown lately, as terms added to the logits of the items that resemble it."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
@@ -251,7 +251,7 @@ class ExposureTerm(nn.Module):
     i_n is the item shown n steps before, r_n its reward scaled to [0, 1] as in item states, and l
     the likeness of two items. Each weight is a common one plus one of its lag, both interpolated
     linearly in the return-to-go Ĝ between knots: how much a repetition costs depends on how much
-    is still to be earned, and on how the item was received. All weights start at 0.
+    is still to come, and on how the item was received. All weights start at 0.
     """
 
     knots: Tensor
@@ -316,7 +316,7 @@ class ExposureTerm(nn.Module):
         return logits.index_put_((rows, columns[rows, lags]), repeated[rows, lags], True)
 
     def to_items(self, exposed: Exposed, items: Tensor) -> Tensor:
-        """Additions (M,) to the logits of one item each, (M, 1)."""
+        """Terms (M,) added to the logits of one item each, (M, 1)."""
         repeated, alike = self.weights(exposed)
         added = self.likeness.to_items(self.likeness.profile(exposed.items, alike), items)
         return added + (repeated * (exposed.items == items)).sum(1)

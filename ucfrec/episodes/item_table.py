@@ -17,7 +17,7 @@ from ucfrec.files.atomic import atomic_file
 ITEM_STATES: Final = "item_states.safetensors"
 """Name of the file in a store or a run."""
 DISTINCT_TAGS: Final = 1000
-"""Most tags of a catalogue that are told apart; rarer ones are left out."""
+"""Most tags of a catalogue that are distinguished; rarer ones are excluded."""
 TAGS_PER_ITEM: Final = 16
 """Most tags that one item keeps."""
 WINDOW: Final = 10

@@ -64,6 +64,8 @@ class Source(Entry):
     dropped: dict[Text, Count] = Field(default_factory=dict)
     """Rows dropped, by reason."""
     unsorted_rows: Count | None = None
+    equal_times: Count | None = None
+    """Rows at the time of another row of their user, in no order that could be learned."""
     steps: Count | None = None
     users: Count | None = None
     items: Count | None = None
@@ -146,7 +148,8 @@ class StoreRecord(Record):
         return super().of(value, path)
 
     def _require_held(self, folder: Path) -> None:
-        """Check that the files can hold the steps, before memory for an entry a step is asked for.
+        """Check that the files can hold the steps, before memory for an entry per step is
+        allocated.
 
         Raises:
             InputError: they are too small, or there are fewer steps than episodes.

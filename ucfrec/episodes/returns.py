@@ -48,12 +48,13 @@ class ReturnToGo:
     def per_session(self) -> bool:
         """Whether a target is set for a session as a whole, so that rewards lower what is left.
 
-        Otherwise, the same target is set anew at every step.
+        Otherwise, the same target is set again at every step.
         """
         return self.definition == "session"
 
     def weights(self, ahead: IntArray) -> Float64Array:
-        """How much of a reward that comes so many steps later counts, of the shape of `ahead`."""
+        """How much of a reward counts that comes this number of steps later, of the shape of
+        `ahead`."""
         if self.definition == "discounted":
             return np.asarray(self.discount**ahead, dtype=np.float64)
         reach = self.horizon if self.definition == "horizon" else np.inf

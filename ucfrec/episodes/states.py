@@ -45,7 +45,7 @@ class ItemStates:
     """Factor by which the weight in the means falls with each step back."""
     tags: Tensor = field(default_factory=lambda: torch.zeros(0, 0, dtype=torch.int64))
     """(n_items, T) int64 numbers of each item's tags, padded with −1; T is 0 if the catalogue has
-    none. States do not contain them: they tell which items are alike."""
+    none. States do not contain them: they show which items are alike."""
 
     def __post_init__(self) -> None:
         if self.embeddings.dim() != 2 or self.user_features.dim() != 2:
@@ -194,7 +194,7 @@ class SessionStates:
         Args:
             states: builds the states.
             sessions: N.
-            memory: items of a session that `shown` tells at least.
+            memory: items of a session that `shown` names at least.
         """
         self._states, length = states, max(states.window, memory)
         self._items = torch.full((sessions, length), -1, dtype=torch.int64)

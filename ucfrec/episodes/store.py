@@ -111,7 +111,7 @@ class EpisodeStore(EpisodeView):
             episodes: positions, 0 to E − 1, of any number.
 
         Raises:
-            InputError: this view has edited copies.
+            InputError: this view has augmented episodes.
         """
         _require_no_copies(self, "select from")
         return EpisodeStore(self._columns, self.episode_ids[episodes])
@@ -123,7 +123,7 @@ class EpisodeStore(EpisodeView):
             name: "train", "validation" or "test"; the split may be empty.
 
         Raises:
-            InputError: `name` is none of these, or this view has edited copies.
+            InputError: `name` is none of these, or this view has augmented episodes.
         """
         if name not in schema.SPLITS:
             raise InputError(f"no split is called {name!r}; there are {', '.join(schema.SPLITS)}")
@@ -138,12 +138,12 @@ class EpisodeStore(EpisodeView):
             InputError: the overlay was made from another store: it copies episodes or steps that
                 this store does not have, or its states or actions have another size.
         """
-        _require_own_copies(self, overlay)
+        _require_own_overlay(self, overlay)
         joined = overlay if self.overlay is None else self.overlay.joined(overlay)
         return EpisodeStore(self._columns, self._selected, joined)
 
-    def without_copies(self) -> "EpisodeStore":
-        """A view of the same logged episodes, without edited copies."""
+    def without_augmentation(self) -> "EpisodeStore":
+        """A view of the same logged episodes, without augmented episodes."""
         return EpisodeStore(self._columns, self._selected)
 
     def with_returns_to_go(
@@ -156,7 +156,7 @@ class EpisodeStore(EpisodeView):
             definition: what they count; None for what they counted before.
 
         Raises:
-            InputError: this view has edited copies.
+            InputError: this view has augmented episodes.
         """
         _require_no_copies(self, "replace the returns-to-go of")
         column = self._columns.step_column(schema.RETURN_TO_GO)
@@ -169,7 +169,7 @@ class EpisodeStore(EpisodeView):
         """A view of the same episodes whose returns-to-go are counted by `definition`.
 
         Raises:
-            InputError: this view has edited copies.
+            InputError: this view has augmented episodes.
         """
         rewards = self.step_values(schema.REWARD, *self.all_steps())
         offsets = np.concatenate([[0], np.cumsum(self.lengths)])
@@ -182,7 +182,7 @@ class EpisodeStore(EpisodeView):
             dimensions: to remove, each 0 to O − 1.
 
         Raises:
-            InputError: this view has edited copies; their states include all dimensions.
+            InputError: this view has augmented episodes; their states include all dimensions.
         """
         _require_no_copies(self, "remove observation dimensions from")
         kept = np.setdiff1d(np.arange(self.observation_size), dimensions)
@@ -223,7 +223,7 @@ class EpisodeStore(EpisodeView):
         )
 
     def transitions(self, episodes: IntArray, steps: IntArray) -> Transitions:
-        """Single steps with their next states; next states are as logged, also in edited copies.
+        """Single steps with their next states; next states are as logged, also where augmented.
 
         Args:
             episodes: (M,) positions in the view.
@@ -276,12 +276,12 @@ class EpisodeStore(EpisodeView):
 def _require_no_copies(store: EpisodeStore, operation: str) -> None:
     if store.overlay is not None:
         raise InputError(
-            f"{store} has edited copies; {operation} its without_copies(), then add copies with "
-            "with_overlay"
+            f"{store} has augmented episodes; {operation} its without_augmentation(), then add "
+            "them with with_overlay"
         )
 
 
-def _require_own_copies(store: EpisodeStore, overlay: Overlay) -> None:
+def _require_own_overlay(store: EpisodeStore, overlay: Overlay) -> None:
     size = overlay.edit_state.shape[1]
     for source in (overlay.copy_source, overlay.action_source):
         if len(source) and not 0 <= source.min() <= source.max() < store.record.n_episodes:

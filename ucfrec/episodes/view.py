@@ -21,7 +21,7 @@ _BATCH_STEPS = 2**20
 
 
 class EpisodeView:
-    """Some episodes of a store: E logged episodes, then C edited copies, then N action copies.
+    """Some episodes of a store: E logged episodes, then C augmented episodes, then N action copies.
 
     Wherever a method takes `episodes`, these are positions in the view, 0 to E + C + N − 1. An
     action copy ends with the step that has another action; only this step of it counts and is
@@ -35,7 +35,7 @@ class EpisodeView:
         Args:
             columns: of the store.
             episode_ids: (E,) numbers in the store of the view's episodes; None for all.
-            overlay: edited copies and action copies.
+            overlay: augmented episodes and action copies.
         """
         self._columns, self._selected = columns, episode_ids
         self.overlay = overlay
@@ -44,7 +44,7 @@ class EpisodeView:
     def __repr__(self) -> str:
         facts = [f"{self.n_steps:,} steps", f"{len(self.episode_ids):,} episodes"]
         if self.overlay is not None:
-            facts[1] += f" and {len(self.overlay.copy_source):,} edited copies"
+            facts[1] += f" and {len(self.overlay.copy_source):,} augmented episodes"
             if len(self.overlay.action_source):
                 facts[1] += f" and {len(self.overlay.action_source):,} action copies"
         if self.has_items and self._columns.has_item_states:

@@ -94,7 +94,7 @@ class Windows:
         return Windows(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     def last(self, steps: int) -> "Windows":
-        """The windows of the last so many steps."""
+        """The windows of this number of last steps."""
         return Windows(**{f.name: getattr(self, f.name)[:, -steps:] for f in fields(self)})
 
     def to(self, device: torch.device) -> "Windows":
@@ -155,7 +155,7 @@ class Overlay:
 
     C copies have other states at some steps: rewards, actions, returns-to-go and next states are
     those of the source (paper appendix H). N action copies end with another action: the source up
-    to some step, at which another action earned another reward.
+    to some step, at which another action had another reward.
 
     Raises:
         InputError: the shapes do not match.
@@ -176,7 +176,7 @@ class Overlay:
     action: Array = field(default_factory=_no_integers)
     """(N,) int64 items or (N, A) float32 vectors: the other actions."""
     action_reward: Float32Array = field(default_factory=_no_floats)
-    """(N,) what they earned, in reward units."""
+    """(N,) their rewards, in reward units."""
 
     def __post_init__(self) -> None:
         shape = self.edit_copy.shape

@@ -1,4 +1,4 @@
-"""Play a behavior policy in a simulator and write its sessions as Parquet logs."""
+"""Simulate a behavior policy in a simulator and write its sessions as Parquet logs."""
 
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
@@ -59,19 +59,19 @@ def collect(
     env_name: str,
     behavior: str,
 ) -> Episodes:
-    """Play `sessions` sessions and write them as logs that `ucfrec prepare` reads.
+    """Simulate `sessions` sessions and write them as logs that `ucfrec prepare` reads.
 
     `out` contains `sessions.parquet` (one row per step: user, session, time in ms, item or action,
     the simulator's feedback, the observation unless it is empty, and the propensity if it is known;
-    sessions played in parallel are interleaved), `items.parquet` if the environment describes its
-    items, and `collect.json`, the record of the run. Sessions start 60 s apart and their steps 1 s
-    apart. Memory is bounded, because rows are written one row group at a time.
+    sessions simulated in parallel are interleaved), `items.parquet` if the environment describes
+    its items, and `collect.json`, the record of the run. Sessions start 60 s apart and their steps
+    1 s apart. Memory is bounded, because rows are written one row group at a time.
 
     Args:
         simulator: names the feedback column.
         env: an environment made by `simulator`.
         actor: a behavior policy for `env`.
-        sessions: number of sessions to play, at least 1.
+        sessions: number of sessions, at least 1.
         seed: environment i is seeded with `seed` + i.
         out: new folder.
         env_name: name of the environment in the record.

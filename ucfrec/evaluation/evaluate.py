@@ -27,7 +27,7 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 SUITE: Final = "evaluate"
 """Suite of the rows."""
 SIDE_BY_SIDE = 512
-"""Largest number of episodes played in parallel."""
+"""Largest number of episodes simulated in parallel."""
 
 
 @random_state_kept()
@@ -39,7 +39,7 @@ def evaluate_behavior(
     Args:
         environment: the simulated environment.
         behavior: name of the policy.
-        episodes: number of episodes to play.
+        episodes: number of episodes.
         seed: seed of the environments and of the policy.
 
     Raises:
@@ -70,7 +70,7 @@ def evaluate_policy(
         environment: the simulated environment.
         trained: the policy.
         name: name of the policy in the row.
-        episodes: number of episodes to play.
+        episodes: number of episodes.
         seed: environment i is seeded with `seed` + i; also of the draws of the rule.
         rule: the decision rule; None for the run's own.
 

@@ -29,7 +29,7 @@ Items = Callable[[gymnasium.Env[Any, Any], int], pa.Table]
 def gymnasium_simulator(
     env_id: str, observe: Sequence[str], item_features: str | None
 ) -> Simulator:
-    """The simulator that plays a Gymnasium environment.
+    """The simulator that wraps a Gymnasium environment.
 
     Args:
         env_id: identifier as `gymnasium.make` takes it; `module:ID` imports `module` first.
@@ -74,7 +74,7 @@ class GymnasiumEnvironment(SyncVectorEnv):
 
     def __init__(self, env_id: str, num_envs: int, observe: Sequence[str] = ()) -> None:
         if num_envs < 1:
-            raise InputError(f"num_envs is {num_envs}; at least one session must be played")
+            raise InputError(f"num_envs is {num_envs}; at least one session must be simulated")
         make = partial(_Session, env_id, tuple(observe))
         super().__init__([make] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
 
@@ -96,13 +96,14 @@ class GymnasiumEnvironment(SyncVectorEnv):
     def step(
         self, actions: Any
     ) -> tuple[Float32Array, _Floats, BoolArray, BoolArray, dict[str, Any]]:
-        """Play one item or vector in each session, (N,) or (N, A); see `VectorEnv.step`."""
+        """Take one item or vector as action in each session, (N,) or (N, A); see
+        `VectorEnv.step`."""
         played = super().step(actions)
         self._require_all_users(played[-1])
         return played
 
     def _require_all_users(self, info: dict[str, Any]) -> None:
-        # Gymnasium fills the entries of sessions that give none with 0, which may be somebody.
+        # Gymnasium fills the entries of sessions that give none with 0, which may be a user's.
         given = info.get(f"_{USER_IDS}", np.zeros(self.num_envs, dtype=bool))
         if (given != self._gives_users).any():
             raise InputError(
@@ -128,7 +129,7 @@ class GymnasiumCatalog(GymnasiumEnvironment):
         super().__init__(env_id, num_envs, observe)
         space = self.single_action_space
         if not isinstance(space, spaces.Discrete):
-            raise InputError(f"{env_id} takes vectors, not items; leave out --item-features")
+            raise InputError(f"{env_id} takes vectors, not items; omit --item-features")
         self._table = items(self.envs[0], int(space.n))
 
     def item_features(self) -> pa.Table:
@@ -162,7 +163,7 @@ class _Session(gymnasium.Wrapper[Float32Array, Any, Any, Any]):
         return self._vector(observation), self._user
 
     def step(self, action: Any) -> tuple[Float32Array, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Play one item or vector (A,)."""
+        """Take one item or vector as action (A,)."""
         played = self.env.step(self._to_action(action))
         observation, reward, terminated, truncated, info = played
         # Many environments give it once, at the start of the session.
@@ -194,7 +195,7 @@ def _actions(
         box = spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
         return box, lambda vector: np.clip(vector, low, high).astype(kind)
     raise InputError(
-        f"gymnasium:{env_id} takes actions of {space}; ucfrec plays one item (Discrete, or "
+        f"gymnasium:{env_id} takes actions of {space}; ucfrec takes one item (Discrete, or "
         "MultiDiscrete of one entry) or one vector (Box of one dimension)"
     )
 

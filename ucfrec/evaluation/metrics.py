@@ -1,4 +1,4 @@
-"""Metrics of played episodes (R_cum, two versions of R_avg, length) and bootstrap intervals."""
+"""Metrics of simulated episodes (R_cum, two versions of R_avg, length) and bootstrap intervals."""
 
 from dataclasses import dataclass
 
@@ -31,7 +31,7 @@ class SessionMetrics:
 
 
 def session_metrics(played: Episodes, seed: int) -> SessionMetrics:
-    """Metrics of the played episodes; `seed` seeds the bootstrap."""
+    """Metrics of the simulated episodes; `seed` seeds the bootstrap."""
     low, high = bootstrap_interval(played.returns, seed)
     return SessionMetrics(
         R_cum=float(played.returns.mean()),
@@ -55,7 +55,7 @@ def ratio_intervals(
 ) -> Float64Array:
     """Percentile bootstrap intervals (C, 2) of the column ratios Σ above / Σ below.
 
-    Rows are resampled; resamples whose denominator is 0 are left out.
+    Rows are resampled; resamples whose denominator is 0 are excluded.
 
     Args:
         above: (N, C) numerators.

@@ -150,7 +150,7 @@ def baselines(
 
     Args:
         counts: item counts of the training rows.
-        train: the training episodes; None if their store is unavailable, which leaves out item-kNN
+        train: the training episodes; None if their store is unavailable, which excludes item-kNN
             and ALS.
         seed: of the random scores and of ALS.
         liked_of: says which training steps were liked, for ALS; `counts` has its own.

@@ -63,7 +63,7 @@ def ranking_rows(
     Args:
         policies: at least one; the first is the reference of the differences.
         trained: any of their runs, for the counts of the training rows and the reward model.
-        train: the store of those rows; None leaves out item-kNN and ALS.
+        train: the store of those rows; None excludes item-kNN and ALS.
         later: the steps to rank.
         users: (E,) identifier of the user of each episode of `later`.
         k: items that are recommended at a step.

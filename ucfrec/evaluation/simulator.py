@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Simulator:
-    """A simulated environment in which sessions are played."""
+    """A simulated environment in which sessions are simulated."""
 
     summary: str
     """One line for `--help`."""
@@ -28,5 +28,5 @@ class Simulator:
 
     @property
     def logging_behavior(self) -> str:
-        """The behavior policy of logs that nobody chose another for."""
+        """The behavior policy of logs unless another is named."""
         return "mixture" if "mixture" in self.behaviors else "random"

@@ -126,7 +126,7 @@ def write_sealed_json(path: Path, value: Mapping[str, Any]) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file; the entry `checksum` of `write_sealed_json` is verified and left out.
+    """Read a JSON file; the entry `checksum` of `write_sealed_json` is verified and excluded.
 
     Raises:
         InputError: the file is missing, is not JSON, or was changed after it was sealed.

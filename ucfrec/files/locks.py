@@ -26,7 +26,8 @@ from ucfrec.errors import InputError
 LOCK: Final = ".ucfrec-lock"
 SCRATCH: Final = ".ucfrec-partial"
 _PATIENCE: Final = 0.5
-"""Seconds before a claim is given up: somebody may just be looking whether its owner is dead."""
+"""Seconds before a claim is given up: another process may just be checking whether its owner is
+dead."""
 _FOREVER: Final = -1.0
 _COMMAND_LENGTH: Final = 160
 
@@ -133,7 +134,7 @@ def remove_leftovers_within(folder: Path) -> None:
 
 @contextmanager
 def scratch_folder(parent: Path, name: str) -> Iterator[Path]:
-    """Yield a new folder for scratch in `parent` that nobody else can read; removed at the end.
+    """Yield a new folder for scratch in `parent` that no other user can read; removed at the end.
 
     If this process is killed, the next one that calls this or `remove_leftovers` removes it.
     """

@@ -1,4 +1,4 @@
-"""Parquet files of strangers: how many rows a small file may claim, and columns of ids."""
+"""Untrusted Parquet files: how many rows a small file may claim, and columns of ids."""
 
 from pathlib import Path
 from typing import Final

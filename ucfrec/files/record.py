@@ -43,7 +43,7 @@ def _inside(files: dict[str, tuple[int, str]]) -> dict[str, tuple[int, str]]:
 
 
 class Entry(BaseModel):
-    """An immutable JSON object; optional entries that are None or empty are left out."""
+    """An immutable JSON object; optional entries that are None or empty are excluded."""
 
     model_config = ConfigDict(frozen=True)
 

@@ -157,7 +157,7 @@ def load_module(path: Path, build: Callable[[], _Module], tensors: dict[str, Ten
     """Build a module and load `tensors` into it.
 
     The sizes of a module come from a record that may state any. They are compared with those of the
-    tensors, which a file holds, before memory is asked for.
+    tensors, which a file holds, before memory is allocated.
 
     Args:
         path: where `tensors` were read from, for messages.
@@ -173,7 +173,7 @@ def load_module(path: Path, build: Callable[[], _Module], tensors: dict[str, Ten
         if shapes[name] != tensors[name].shape:
             raise InputError(
                 f"{path} holds weights of another architecture ({name} is "
-                f"{list(tensors[name].shape)}, the run's record asks for {list(shapes[name])}); "
+                f"{list(tensors[name].shape)}, the run's record names {list(shapes[name])}); "
                 "restore both, or train again"
             )
     if shapes and shapes.keys() != tensors.keys():

@@ -59,7 +59,7 @@ def joined() -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        # gloo and NCCL say in many words that nobody answers; torch has no type for it.
+        # gloo and NCCL say in many words that no process answers; torch has no type for it.
         if any(phrase in str(error) for phrase in ("closed by peer", "Connection re", "NCCL")):
             raise InputError(
                 "another process of this training has ended; see what it printed, then start the "

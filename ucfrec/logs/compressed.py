@@ -1,4 +1,4 @@
-"""Compressed logs of strangers: how large a small file may unfold."""
+"""Untrusted compressed logs: how large a small file may unfold."""
 
 import gzip
 import zlib

@@ -54,7 +54,7 @@ def engine(
         memory_limit: size such as "2GB", of the engine or with `shared` of the process, beyond
             which rows spill to disk; None for DuckDB's default.
         shared: whether the rest of the process keeps to the limit too, with at most half of it.
-        threads: most threads; None for one a core.
+        threads: most threads; None for one per core.
 
     Raises:
         InputError: `memory_limit` is not a size.
@@ -91,7 +91,7 @@ def anonymous_bytes(process: int | None = None) -> int:
         process: its number; None for this one.
 
     Returns:
-        0 where the system does not tell, or the process has ended.
+        0 where the system does not say, or the process has ended.
     """
     try:
         lines = Path(f"/proc/{process or os.getpid()}/status").read_text().splitlines()

@@ -54,7 +54,7 @@ def load_features(
         connection: engine that may open the tables' files.
         tables: feature tables of the mapping.
         kind: "item_id" or "user_id".
-        id_type: DuckDB type of the log's ids; rows whose key is none are left out.
+        id_type: DuckDB type of the log's ids; rows whose key is none are excluded.
 
     Returns:
         Names of the DuckDB tables, one per feature table.

@@ -85,7 +85,7 @@ class LogMapping:
     earliest: str | None = None
     """ISO time (UTC) before which times are clock errors; None for 2000."""
     where: str | None = None
-    """SQL condition over the files' columns; rows that do not fulfil it are left out."""
+    """SQL condition over the files' columns; rows that do not fulfil it are excluded."""
     partitions: bool = False
     """Whether names of folders such as `country=DE` are columns."""
     remembered: "LogMapping | None" = None

@@ -365,7 +365,7 @@ def _feature_tables(mapping: LogMapping) -> dict[str, tuple[FeatureTable, ...]]:
 
 
 def _require_known_ids(log: TypedLog, mapping: LogMapping, features: Features) -> None:
-    """Check that feature tables tell of users and items of the log; after `number_ids`."""
+    """Check that feature tables are about users and items of the log; after `number_ids`."""
     kept = {name: f"kept_{table}" for name, table, _ in ID_TABLES}
     for name, names in features.items():
         tables = _feature_tables(mapping)[name]

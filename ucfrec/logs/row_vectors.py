@@ -43,7 +43,7 @@ class RowVectors:
         self._advise("MADV_RANDOM")
 
     def _advise(self, advice: str) -> None:
-        """Tell the system how the file is read; Windows takes no advice."""
+        """Advise the system how the file is read; Windows takes no advice."""
         if hasattr(mmap, advice):
             self._map.madvise(getattr(mmap, advice))
 

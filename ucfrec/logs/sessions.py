@@ -129,7 +129,7 @@ def end_of_user(spool: Spool, begin: int, rows: int) -> int:
 
 
 def episodes(spool: Spool, cut: Cut, log_end: int, block: int | None = None) -> Iterator[Episodes]:
-    """The episodes of sorted rows, those with too few or too many steps left out.
+    """The episodes of sorted rows, those with too few or too many steps excluded.
 
     Args:
         spool: rows in the order of the store.

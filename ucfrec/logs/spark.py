@@ -119,7 +119,7 @@ class _Survey:
     rows: list[int]
     """Number of rows of each file."""
     vectors: dict[str, Counter[int]]
-    """Vector column to the number of its vectors by size, missing ones left out."""
+    """Vector column to the number of its vectors by size, missing ones excluded."""
     bad: int = 0
     """Number of observations that are missing or not finite."""
 
@@ -188,7 +188,7 @@ def _run(spark: Any, tasks: Sequence[Task], columns: str) -> Any:
 
 def _written(spark: Any, frame: Any, folder: Path) -> Any:
     """Write a frame to Parquet files; returns it as read from them."""
-    # Each is used several times, and Spark would compute it anew each time.
+    # Each is used several times, and Spark would compute it again each time.
     address = folder.absolute().as_uri()
     frame.write.parquet(address)
     return spark.read.parquet(address)

@@ -148,11 +148,22 @@ def format_report(report: Mapping[str, Any]) -> str:
     return "\n".join(f"{name:<{width}}{value}".rstrip() for name, value in lines)
 
 
+def format_summary(report: Mapping[str, Any]) -> str:
+    """What was read and dropped, in two lines, where logs are only evaluated on."""
+    dropped = [f"{rows:,} {reason}" for reason, rows in report["dropped"].items() if rows]
+    begin, end = (_clock(time) for time in report["time_range_ms"])
+    return (
+        f"{report['rows_read']:,} rows read, {report['steps']:,} kept: {report['sessions']:,} "
+        f"sessions of {report['users']:,} users, {begin} to {end} UTC\n"
+        f"dropped: {', '.join(dropped) or 'none'}"
+    )
+
+
 def _returns_to_go(report: Mapping[str, Any]) -> str:
     text = f"{report['return_length_share']:.0%} of its variance is the number of steps left"
     if report["session_by"] != "user":
         return text
-    return f"{text}, which is chance where sessions are users: policies learn the next step's"
+    return f"{text}, which is random where sessions are users: policies learn the next step's"
 
 
 def _clock(milliseconds: int) -> str:

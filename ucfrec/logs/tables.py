@@ -1,7 +1,7 @@
 """Log and feature files as tables of DuckDB: what is in a file is what counts.
 
-No column comes from the name of a folder unless it is asked for, parts of one table may have their
-columns in any order, and text that looks like a number stays at hand as text (`Table.raw`).
+No column comes from the name of a folder unless it is requested, parts of one table may have their
+columns in any order, and text that looks like a number stays available as text (`Table.raw`).
 """
 
 import re
@@ -135,8 +135,8 @@ def _computed_as(kind: str) -> str:
 def _read(column: str, kind: str) -> str:
     """SQL of a quoted column of a DuckDB type, as expressions compute with it."""
     if kind in ("FLOAT", "DOUBLE"):
-        # To DuckDB, NaN is greater than every number: `score > 0.5` would hold. It would leave out
-        # `isnan` here, because the extremes that a Parquet file states tell of no NaN.
+        # To DuckDB, NaN is greater than every number: `score > 0.5` would hold. It would exclude
+        # `isnan` here, because the extremes that a Parquet file states show no NaN.
         return f"CASE WHEN isfinite({column}) OR isinf({column}) THEN {column} END"
     if kind == NOTHING:
         return "NULL"
@@ -188,7 +188,7 @@ def open_tables(
 ) -> list[Table]:
     """Read the columns of every file and group consecutive files with equal columns.
 
-    Files without rows are left out, if others have some.
+    Files without rows are excluded, if others have some.
 
     Args:
         connection: engine that may open the files.
@@ -238,7 +238,7 @@ def _partitions(connection: duckdb.DuckDBPyConnection, table: Table) -> tuple[tu
         if other:
             raise InputError(
                 f"{file}: {column} is {other[0][0]!r:.60} in the file, but its folder says another "
-                "value; leave out --partitions, or rename the folders"
+                "value; omit --partitions, or rename the folders"
             )
     return tuple((name, "VARCHAR") for name in found if name.casefold() not in columns)
 
@@ -302,7 +302,7 @@ def _columns(
 def _of_all_rows(
     connection: duckdb.DuckDBPyConnection, file: Path, types: tuple[tuple[str, str], ...]
 ) -> tuple[tuple[str, str], ...]:
-    """Types of the columns of a CSV file, given those that DuckDB told from its first rows.
+    """Types of the columns of a CSV file, given those that DuckDB inferred from its first rows.
 
     In later rows it would round 0.25 to a whole number, and cut the hour off a date, without an
     error. For values of another kind there is one, when they are read. Dates that do not begin with
@@ -328,7 +328,7 @@ def _of_all_rows(
     try:
         (row,) = connection.sql(f"SELECT {every} FROM {source}").fetchall()
     except duckdb.Error:
-        return types  # reading the rows tells what is wrong with the file
+        return types  # reading the rows shows what is wrong with the file
     told = iter(row)
     changed = {name: exact[name] for name in exact if next(told)}
     changed |= {name: "VARCHAR" for name in dated if next(told)}

@@ -126,7 +126,7 @@ def typed_columns(
 ) -> TypedColumns:
     """Resolve the columns and the reward of a log; the arguments are those of `typed_log`.
 
-    Optional columns that only some of the files have are left out, with an `InputNote`.
+    Optional columns that only some of the files have are excluded, with an `InputNote`.
 
     Raises:
         InputError: a column is missing or of an unsupported type, or an expression cannot be used.
@@ -204,7 +204,7 @@ def vectors(columns: Iterable[str]) -> tuple[str, ...]:
 
 
 def vector_counts(name: str, rows: str = ROWS) -> str:
-    """SQL of how many vectors of each size a column has, missing ones left out."""
+    """SQL of how many vectors of each size a column has, missing ones excluded."""
     return (
         f"SELECT len({name}) AS size, count(*) AS n FROM {rows} WHERE {name} IS NOT NULL "
         "GROUP BY size"
@@ -236,7 +236,7 @@ def require_observations(tables: Sequence[Table], bad: int, rows: int) -> None:
 
 
 def not_finite(vector: str) -> str:
-    """SQL that tells whether a vector is missing or has a number that is not finite."""
+    """SQL that says whether a vector is missing or has a number that is not finite."""
     finite = f"list_bool_and([coalesce(isfinite(v), false) FOR v IN {vector}])"
     return f"{vector} IS NULL OR NOT {finite}"
 
@@ -271,7 +271,7 @@ def _note_partial(tables: Sequence[Table], settled: set[str]) -> None:
     for name, files in have.items():
         if files:
             warnings.warn(
-                f"{name} is left out: only {len(files)} of {every} files have it ({files[0]}); add "
+                f"{name} is excluded: only {len(files)} of {every} files have it ({files[0]}); add "
                 f"it to the others, or drop it with --column {name}=",
                 InputNote,
                 stacklevel=4,
@@ -458,7 +458,7 @@ def vector_sizes(counts: Mapping[str, Mapping[int, int]]) -> dict[str, int]:
     """Dimensions of each vector column.
 
     Args:
-        counts: column to the number of its vectors by size, missing ones left out.
+        counts: column to the number of its vectors by size, missing ones excluded.
 
     Raises:
         InputError: a column has vectors of unequal or no size.

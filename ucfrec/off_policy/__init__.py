@@ -21,7 +21,7 @@ _HOMES = {
     "as_pages": "pages",
     "diagnose": "diagnostics",
     "estimate": "estimators",
-    "judge": "verdict",
+    "conclude": "verdict",
     "select": "selection",
 }
 """Public name to the module that defines it."""

@@ -24,6 +24,8 @@ def estimate_row(
     seed: int,
     conditions: Mapping[str, Scalar],
     about: Mapping[str, Any],
+    *,
+    per_step: bool = False,
 ) -> ResultRow:
     """The result row of an estimate.
 
@@ -35,16 +37,18 @@ def estimate_row(
         seed: seed of the estimate.
         conditions: how the logs were read.
         about: what all estimates of the policy share, e.g. the verdict.
+        per_step: whether the estimate is of `ucfrec.off_policy.per_step`.
 
     Returns:
-        The row. `R_cum` is the mean return, as in `ucfrec.evaluation.metrics`; it may have no
-        interval.
+        The row. `R_cum` is the mean return, as in `ucfrec.evaluation.metrics`, and `R_step` the
+        mean reward of a step; it may have no interval.
     """
-    choice = "softmax" if rule.temperature else "greedy"
+    metric, units = ("R_step", "steps") if per_step else ("R_cum", "sessions")
+    choice = "softmax" if rule.draws else "greedy"
     logged, record = name == LOGGED, trained.record
     row = ResultRow(
         suite=SUITE,
-        table="estimates",
+        table="per step" if per_step else "estimates",
         task="logs",
         method=name,
         policy="behavior" if logged else trained.name,
@@ -52,16 +56,16 @@ def estimate_row(
         evaluation_seed=seed,
         conditions={**conditions, "choice": "as logged" if logged else choice},
         config_hash=config_hash(record.settings),
-        metric="R_cum",
-        metrics={"R_cum": found.value},
+        metric=metric,
+        metrics={metric: found.value},
         interval=None if found.low is None or found.high is None else (found.low, found.high),
         target_return=rule.target,
         rule=rule.hash,
         **provenance(),
     )
     own = {
-        "R_cum_error": found.error,
-        "effective_sessions": found.effective_sessions,
+        f"{metric}_error": found.error,
+        f"effective_{units}": found.effective_sessions,
         "largest_weight": found.largest_weight,
         "parameter": found.parameter,
         "decision_rule": rule.as_dict(),

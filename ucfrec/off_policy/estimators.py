@@ -24,12 +24,12 @@ In the means over sessions at step t, a session that has ended counts with the w
 step, as if it went on without reward (Thomas & Brunskill 2016).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from ucfrec.arrays import Float64Array
+from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.off_policy.intervals import Interval, cluster_intervals
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.pages import independent_terms
@@ -90,15 +90,28 @@ def estimate(steps: LoggedSteps, seed: int) -> dict[str, Estimate]:
     """
     found: dict[str, Estimate] = {}
     for group, terms in _groups(steps):
-        intervals = cluster_intervals(
-            np.stack([one.above for one in terms.values()], axis=1),
-            np.stack([one.below for one in terms.values()], axis=1),
-            group.user,
-            seed,
-        )
-        for (name, one), interval in zip(terms.items(), intervals, strict=True):
-            found[name] = _summary(one, None if one.biased else interval)
+        found |= summaries(terms, group.user, seed)
     return found
+
+
+def summaries(terms: Mapping[str, Terms], user: IntArray | None, seed: int) -> dict[str, Estimate]:
+    """Estimates with intervals.
+
+    Args:
+        terms: of S units each, by name of the estimator.
+        user: (S,) whose they are; None where each is of another user.
+        seed: draws the bootstrap's resamples.
+    """
+    intervals = cluster_intervals(
+        np.stack([one.above for one in terms.values()], axis=1),
+        np.stack([one.below for one in terms.values()], axis=1),
+        user,
+        seed,
+    )
+    return {
+        name: _summary(one, None if one.biased else interval)
+        for (name, one), interval in zip(terms.items(), intervals, strict=True)
+    }
 
 
 def session_terms(steps: LoggedSteps) -> dict[str, Terms]:

@@ -1,5 +1,6 @@
-"""Estimates from logs what a trained policy would have earned, and reports how reliable that is."""
+"""Estimates from logs the return of a trained policy, and reports how reliable that is."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -21,7 +22,7 @@ from ucfrec.off_policy.behavior_model import (
 )
 from ucfrec.off_policy.columns import diagnosis_columns, estimate_row, verdict_columns
 from ucfrec.off_policy.diagnostics import diagnose, implied_items
-from ucfrec.off_policy.estimators import estimate, session_terms
+from ucfrec.off_policy.estimators import Estimate, estimate, session_terms
 from ucfrec.off_policy.features import (
     InputsFile,
     StepInputs,
@@ -32,9 +33,10 @@ from ucfrec.off_policy.features import (
 from ucfrec.off_policy.fqe import ModelReport, fit_models
 from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps
 from ucfrec.off_policy.pages import as_pages, pages_of
+from ucfrec.off_policy.per_step import StepValue, step_value
 from ucfrec.off_policy.score import LoggedSessions, ScoredSteps, scored_steps
 from ucfrec.off_policy.training_rows import seen_too_often, share_seen
-from ucfrec.off_policy.verdict import FAR_OFF, Verdict, cautions, influences, judge
+from ucfrec.off_policy.verdict import FAR_OFF, Verdict, cautions, conclude, influences
 from ucfrec.provenance import without_folders
 from ucfrec.results.row import ResultRow, Scalar
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -87,13 +89,17 @@ class OffPolicyReport:
     returns: Float64Array
     """(S,) of the logged sessions, or pages, with all their propensities; empty if none has."""
     user: IntArray | None
-    """(S,) whose they are; None where each is somebody else's."""
+    """(S,) whose they are; None where each is of another user."""
     terms: Float64Array | None
     """(S,) whose mean is the estimate that the verdict is of; None where nothing can be weighed."""
+    per_step: StepValue | None = None
+    """The value per step, where only some steps have propensities."""
+    step_rows: Sequence[ResultRow] = ()
+    """Its result rows, one for each estimator."""
 
 
 @dataclass(frozen=True)
-class JudgedSteps:
+class EvaluatedSteps:
     """Logged steps with the evaluated policy's probabilities, and the models fitted on them."""
 
     steps: LoggedSteps
@@ -123,7 +129,7 @@ def evaluate_off_policy(
         trained: the policy of the run.
         logged: logs read with `keep_unknown`. The policy would never show an item that it does not
             know, so such a step has weight 0.
-        rule: the decision rule to judge; None for the run's own.
+        rule: the decision rule to evaluate; None for the run's own.
         seed: seed of the folds and of the bootstrap.
         options: what else is asked.
 
@@ -135,22 +141,24 @@ def evaluate_off_policy(
             for and a session has several steps.
     """
     rule = rule or trained.rule
-    judged = logged_steps(trained, logged, rule, seed, options)
-    steps = as_pages(judged.steps, *_pages(logged)) if options.pages else judged.steps
+    evaluated = logged_steps(trained, logged, rule, seed, options)
+    steps = as_pages(evaluated.steps, *_pages(logged)) if options.pages else evaluated.steps
     steps, of_groups = _without_far_off_groups(steps)
     segment = None if options.pages else _quarters(logged.store, steps)
     found, diagnosis = estimate(steps, seed), diagnose(steps, options.reward_range, segment)
     seen = share_seen(trained, logged.store)
-    verdict = judge(
+    verdict = conclude(
         steps,
         seed,
         diagnosis=diagnosis,
         wanted_lift=options.wanted_lift,
-        forbidden=[*seen_too_often(seen), *_too_many_items(trained, judged)],
-        declared=_declared(judged),
+        forbidden=[*seen_too_often(seen), *_too_many_items(trained, evaluated)],
+        declared=_declared(evaluated),
     )
     said = [*verdict.reasons, *cautions(diagnosis, found), *_of_the_logs(seen, logged), *of_groups]
-    said += _of_the_models(judged)
+    said += _of_the_models(evaluated)
+    value = None if options.pages else step_value(evaluated.steps, seed)
+    said += [value.doubt] if value is not None and value.doubt else []
     about = {
         "seen_in_training": seen,
         "warnings": said,
@@ -158,22 +166,34 @@ def evaluate_off_policy(
         "unknown_item_rows": logged.unknown_items,
         **verdict_columns(verdict),
         **diagnosis_columns(diagnosis),
-        **judged.models.columns(),
+        **evaluated.models.columns(),
     }
     conditions = {"run": without_folders(str(run)), **_conditions(steps, options)}
     fingerprint = logged.store.record.fingerprint
-    rows = [
-        replace(
-            estimate_row(name, one, trained, rule, seed, conditions, about),
-            data_fingerprint=fingerprint,
+
+    def rows_of(estimates: Mapping[str, Estimate], per_step: bool) -> list[ResultRow]:
+        rows = (
+            estimate_row(name, one, trained, rule, seed, conditions, about, per_step=per_step)
+            for name, one in estimates.items()
         )
-        for name, one in found.items()
-    ]
+        return [replace(row, data_fingerprint=fingerprint) for row in rows]
+
+    report = OffPolicyReport(
+        rows_of(found, per_step=False),
+        said,
+        verdict,
+        evaluated.models,
+        returns=np.empty(0),
+        user=None,
+        terms=None,
+        per_step=value,
+        step_rows=[] if value is None else rows_of(value.estimates, per_step=True),
+    )
     if diagnosis.left_out == diagnosis.sessions:
-        return OffPolicyReport(rows, said, verdict, judged.models, np.empty(0), None, None)
+        return report
     known = steps.known()
     terms = _terms(known, verdict)
-    return OffPolicyReport(rows, said, verdict, judged.models, known.returns, known.user, terms)
+    return replace(report, returns=known.returns, user=known.user, terms=terms)
 
 
 def _conditions(steps: LoggedSteps, options: EstimateOptions) -> dict[str, Scalar]:
@@ -211,7 +231,7 @@ def _without_far_off_groups(steps: LoggedSteps) -> tuple[LoggedSteps, list[str]]
     weights = steps.cluster_weights
     if weights is None or abs((mean := float(weights[steps.last].mean())) - 1) <= FAR_OFF:
         return steps, []
-    said = f"MIPS is left out: its session weights have mean {mean:.3g} where 1 is expected"
+    said = f"MIPS is excluded: its session weights have mean {mean:.3g} where 1 is expected"
     return replace(steps, cluster_propensity=None, cluster_target=None), [said]
 
 
@@ -222,14 +242,16 @@ def _quarters(store: EpisodeStore, steps: LoggedSteps) -> IntArray:
     return np.asarray(1 + quarters)
 
 
-def _declared(judged: JudgedSteps) -> str:
-    if not judged.estimated:
+def _declared(evaluated: EvaluatedSteps) -> str:
+    if not evaluated.estimated:
         return ""
-    return f"with the propensities of {judged.estimated:,} steps estimated ({judged.behavior})"
+    return (
+        f"with the propensities of {evaluated.estimated:,} steps estimated ({evaluated.behavior})"
+    )
 
 
-def _of_the_models(judged: JudgedSteps) -> list[str]:
-    if judged.models.settled:
+def _of_the_models(evaluated: EvaluatedSteps) -> list[str]:
+    if evaluated.models.settled:
         return []
     return [
         "fitted Q evaluation ran away (its values grew beyond what so many rewards can be) and was "
@@ -237,12 +259,12 @@ def _of_the_models(judged: JudgedSteps) -> list[str]:
     ]
 
 
-def _too_many_items(trained: TrainedPolicy, judged: JudgedSteps) -> list[str]:
-    steps = judged.steps
+def _too_many_items(trained: TrainedPolicy, evaluated: EvaluatedSteps) -> list[str]:
+    steps = evaluated.steps
     assert trained.item_ids is not None
     assert steps.groups is not None
     items = len(trained.item_ids)
-    found = None if judged.estimated else implied_items(steps, steps.groups.number >= 0, items)
+    found = None if evaluated.estimated else implied_items(steps, steps.groups.number >= 0, items)
     if found is None or found.passed:
         return []
     return [
@@ -272,8 +294,8 @@ def logged_steps(
     rule: DecisionRule,
     seed: int,
     options: EstimateOptions = DEFAULTS,
-) -> JudgedSteps:
-    """Collect the logged steps, the policy's probabilities and models of what it would earn.
+) -> EvaluatedSteps:
+    """Collect the logged steps, the policy's probabilities and models of its return.
 
     In memory are some ten numbers a step; what the models see of it, and the probabilities of item
     groups, lie on disk.
@@ -281,7 +303,7 @@ def logged_steps(
     Args:
         trained: a policy that chooses items.
         logged: logs read with `keep_unknown`.
-        rule: the decision rule to judge.
+        rule: the decision rule to evaluate.
         seed: seed of the folds, item groups and samples.
         options: what else is asked.
 
@@ -318,7 +340,7 @@ def logged_steps(
     if behavior is not None:
         estimated = plain.unknown_propensities if options.estimate_propensities else 0
         steps = _weighed_by_model(steps, groups, behavior, options.estimate_propensities)
-    return JudgedSteps(steps, models, behavior, estimated)
+    return EvaluatedSteps(steps, models, behavior, estimated)
 
 
 def _unjudged(logged: LoggedSessions, options: EstimateOptions) -> LoggedSteps:

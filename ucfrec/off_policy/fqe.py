@@ -97,8 +97,8 @@ def fit_models(
             sums.fit(fold, reward[folds != fold], horizon, discount)
             for fold in range(len(sums.rows))
         ]
-        modelled, at_logged = _predicted(chunks, fits, folds, bar.update)
-    return modelled, _report(modelled, at_logged, reward, last, discount, fits)
+        modelled = _predicted(chunks, fits, folds, bar.update)
+    return modelled, _report(modelled, reward, last, discount, fits)
 
 
 @dataclass(frozen=True)
@@ -188,8 +188,8 @@ def _sums(
 
 def _predicted(
     chunks: Chunks, fits: list[_Fit], folds: IntArray, done: Callable[[int], object]
-) -> tuple[Modelled, Float64Array]:
-    """What the models say of every step, and the modelled reward (N,) of the logged action."""
+) -> Modelled:
+    """What the models say of every step."""
     reward_weights = np.stack([fit.reward for fit in fits], axis=1)
     q_weights = np.stack([fit.q for fit in fits], axis=1)
     reward, q, v, at_logged = np.empty((4, len(folds)))
@@ -206,12 +206,11 @@ def _predicted(
             into[rows] = np.take_along_axis(inputs @ weights, fold, axis=1)[:, 0]
         begin = rows.stop
         done(len(features))
-    return Modelled(reward, q, v), at_logged
+    return Modelled(reward, q, v, at_logged)
 
 
 def _report(
     modelled: Modelled,
-    at_logged: Float64Array,
     reward: Float64Array,
     last: BoolArray,
     discount: float,
@@ -220,7 +219,7 @@ def _report(
     following = np.where(last, 0.0, np.roll(modelled.v, -1))
     errors = reward + discount * following - modelled.q
     spread = float(((reward - reward.mean()) ** 2).mean())
-    left = float(((reward - at_logged) ** 2).mean())
+    left = float(((reward - modelled.logged_reward) ** 2).mean())
     return ModelReport(
         reward_r2=1 - left / spread if spread > 0 else 0.0,
         td_loss=float((errors**2).mean()),

@@ -22,11 +22,13 @@ class Modelled:
     """What models fitted on other sessions say of N logged steps, under the evaluated policy."""
 
     reward: Float64Array
-    """(N,) mean reward of the step."""
+    """(N,) mean reward of the step over the evaluated policy's actions."""
     q: Float64Array
     """(N,) discounted return from the logged action on."""
     v: Float64Array
     """(N,) Σ_a π(a | s) q(s, a): the mean of `q` over the evaluated policy's actions."""
+    logged_reward: Float64Array
+    """(N,) mean reward of the logged action."""
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,7 @@ class ScoredSteps:
     returns_left: Tensor
     """(B,): target return less the session's reward before the step."""
     features: Tensor | None
-    """(B, d): last-layer features of the policy's window; None of a learner that is no network of
+    """(B, d): last-layer features of the policy's window; None of a policy that is no network of
     features (item-knn, crm-greedy)."""
 
 
@@ -257,5 +257,5 @@ def held_out_sessions(trained: Sequence[TrainedPolicy]) -> LoggedSessions:
 def _vectors(run: Path) -> InputError:
     return InputError(
         f"{run}: the actions of this policy are vectors; it chooses one for certain, so a logged "
-        "action has no probability. Judge it with ucfrec evaluate"
+        "action has no probability. Evaluate it with ucfrec evaluate"
     )

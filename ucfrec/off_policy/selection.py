@@ -63,15 +63,18 @@ class Selection:
 
     @property
     def headline(self) -> str:
-        """What was chosen, and how sure that is."""
+        """What was chosen, and how certain that is."""
         first = self.chosen
         if len(self.standings) == 1:
             return f"{first.name} is the only candidate"
         sure = f"best with probability {first.probability_best:.2f}"
         if self.regret == 0:
-            return f"No other earns more than {first.name}: {self.corrected:.4g} a session, {sure}"
+            return (
+                f"No other has a higher value than {first.name}: "
+                f"{self.corrected:.4g} per session, {sure}"
+            )
         return (
-            f"{first.name} comes first: {self.corrected:.4g} a session once corrected for the "
+            f"{first.name} comes first: {self.corrected:.4g} per session once corrected for the "
             f"choice ({first.value:.4g} before), {sure}, at most {self.regret:.4g} below the best"
         )
 
@@ -211,7 +214,7 @@ def _require_same_sessions(reports: "Mapping[str, OffPolicyReport]") -> None:
             raise InputError(
                 f"{first} and {name} read these logs as different sessions or rewards (their "
                 "stores were prepared in different ways), so their estimates cannot be compared; "
-                "judge them one at a time"
+                "evaluate them one at a time"
             )
 
 

@@ -15,7 +15,7 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 
 MOST_SEEN: Final = 0.05
 """Largest share of rows seen in training with which an estimate is accepted. It is above 0 because
-with coarse timestamps some rows of other logs have the same user, item and time by chance."""
+with coarse timestamps some rows of other logs have the same user, item and time coincidentally."""
 
 KeyArray = npt.NDArray[np.uint64]
 

@@ -57,16 +57,16 @@ class Verdict:
         if not self.reliable or self.lift_low is None or self.lift_high is None:
             return f"Do not rely on this estimate{self._rests_on}"
         if self.lift_low > 0:
-            says = "The policy earns more than the logged one"
+            says = "The policy has a higher return than the logged one"
         elif self.lift_high < 0:
-            says = "The policy earns less than the logged one"
+            says = "The policy has a lower return than the logged one"
         else:
-            says = "The logs do not tell whether the policy earns more or less than the logged one"
+            says = "The logs do not show whether the policy or the logged one has the higher return"
         return (
-            f"{says}: {self.lift:+.4g} a session [{self.lift_low:+.4g}, {self.lift_high:+.4g}] by "
-            f"{self.estimator}, better with probability {self.probability_better:.3f}; a lift of "
-            f"{self.wanted_lift:.4g} would show with about {self.sessions_needed or 0:,} sessions"
-            f"{self._rests_on}"
+            f"{says}: {self.lift:+.4g} per session [{self.lift_low:+.4g}, {self.lift_high:+.4g}] "
+            f"by {self.estimator}, better with probability {self.probability_better:.3f}; a lift "
+            f"of {self.wanted_lift:.4g} would show with about {self.sessions_needed or 0:,} "
+            f"sessions{self._rests_on}"
         )
 
     @property
@@ -74,7 +74,7 @@ class Verdict:
         return f" ({self.declared})" if self.declared else ""
 
 
-def judge(
+def conclude(
     steps: LoggedSteps,
     seed: int,
     *,
@@ -88,7 +88,7 @@ def judge(
     Args:
         seed: draws the bootstrap's resamples.
         diagnosis: of the same steps; None to make it.
-        wanted_lift: return a session that a launch should gain; None for 5% of the mean logged
+        wanted_lift: return per session that a launch should gain; None for 5% of the mean logged
             return.
         forbidden: what else the caller knows to forbid a conclusion.
         declared: what the estimate rests on beside the logs, said with the verdict.
@@ -141,13 +141,13 @@ def cautions(diagnosis: Diagnosis, found: Mapping[str, Estimate]) -> list[str]:
     if stops is not None:
         said.append(
             f"from step {stops} on fewer than {ENOUGH_USERS} effective users are left: the logs "
-            "stop telling what the policy would earn there"
+            "do not support an estimate there"
         )
     if "DM" in found:
         said.append("DM and FQE are only as good as their models: they carry no interval")
     if "MIPS" in found:
         said.append(
-            "MIPS is right only if what an item earns depends on its group alone: no interval"
+            "MIPS is right only if the reward of an item depends on its group alone: no interval"
         )
     return said
 
@@ -166,11 +166,11 @@ def _reasons(diagnosis: Diagnosis) -> list[str]:
     said += failed
     if not failed and mean is not None and abs(mean - 1) > FAR_OFF:
         said.append(
-            f"the mean session weight is {mean:.2f} where 1 is expected: by chance, sessions that "
+            f"the mean session weight is {mean:.2f} where 1 is expected: at random, sessions that "
             f"the policy would often have are too {'rare' if mean < 1 else 'many'}; give more logs"
         )
     if not diagnosis.rewarded_users:
-        said.append("no session has both weight and reward: the logs say nothing of what is earned")
+        said.append("no session has both weight and reward: the logs support no estimate")
     elif diagnosis.rewarded_users < ENOUGH_REWARDED:
         said.append(
             f"only {diagnosis.rewarded_users} users have both weight and reward (below "
@@ -194,7 +194,7 @@ def _failed_tests(diagnosis: Diagnosis) -> list[str]:
     failed = [test for test in diagnosis.tests if not test.passed]
     if not failed:
         return []
-    # The products tell the size of the error; else the test that is furthest off.
+    # The products show the size of the error; else the test that is furthest off.
     worst = next((t for t in failed if t.name == SESSION_PRODUCTS), None) or max(
         failed, key=lambda test: abs(math.log(max(test.mean, 1e-12)))
     )

@@ -184,7 +184,7 @@ class SequencePolicy(nn.Module, ABC):
         """What fits the policy without the training loop; None if gradients have to.
 
         Args:
-            train: the training episodes, without edited copies.
+            train: the training episodes, without augmented episodes.
             validation: held-out episodes.
             folder: for intermediate results.
             seed: of every random draw.

@@ -1,4 +1,4 @@
-"""What every policy must hold before it is trained: it sees no answer that it is asked for."""
+"""What every policy must hold before it is trained: it sees no answer that it must predict."""
 
 from dataclasses import replace
 

@@ -133,7 +133,7 @@ def relabelled(store: EpisodeStore, config: CQLConfig, folder: Path, seed: int) 
     Backwards through each episode, R_{t−1} = r_{t−1} + max(R_t, V̂(s_t)).
 
     Args:
-        store: training episodes without edited copies.
+        store: training episodes without augmented episodes.
         config: settings of CQL.
         folder: keeps the Q function; training resumes from it.
         seed: seed of every random draw.

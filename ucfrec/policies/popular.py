@@ -20,7 +20,7 @@ class PopularPolicy(SequencePolicy):
     """Baseline that ignores its inputs: only the biases of the head matter.
 
     They are the logs of the items' shares of the training steps, one step added to each item, or
-    give the mean logged action vector. Only the additions to the head that settings switch on
+    give the mean logged action vector. Only the components of the head that settings switch on
     (exposure, values) are learned by gradient.
     """
 

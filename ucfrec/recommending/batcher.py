@@ -21,7 +21,7 @@ class Answers(Protocol):
 
 
 class Watcher(Protocol):
-    """Is told of every batch."""
+    """Receives every batch."""
 
     def batch(self, requests: int, seconds: float) -> None: ...
 
@@ -46,7 +46,7 @@ class Batcher:
         """
         Args:
             answers: computes a batch.
-            watcher: is told of every batch.
+            watcher: receives every batch.
             largest: most requests of a batch.
             queue: most requests that wait.
         """
@@ -62,7 +62,7 @@ class Batcher:
         return len(self._queue)
 
     async def answer(self, request: Request) -> Outcome:
-        """The answer to a request, or what is wrong with it; nobody waits for a cancelled one.
+        """The answer to a request, or what is wrong with it; a cancelled one has no one waiting.
 
         Raises:
             QueueFullError: too many requests wait.
@@ -90,7 +90,7 @@ class Batcher:
                 outcomes: Sequence[Outcome | Exception] = await loop.run_in_executor(
                     self._thread, self._answers.answers, requests
                 )
-            except Exception as error:  # a defect or a lack of memory; told to every caller
+            except Exception as error:  # a defect or a lack of memory; every caller receives it
                 outcomes = [error] * len(batch)
             self._watcher.batch(len(batch), time.perf_counter() - began)
             for each, outcome in zip(batch, outcomes, strict=True):

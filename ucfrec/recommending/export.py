@@ -145,7 +145,7 @@ def _description(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
             "float32",
             [b, len(trained.item_ids)],
             "log-probability of the policy plus the "
-            "reward weight, up to a constant; -inf for items left out",
+            "reward weight, up to a constant; -inf for items excluded",
         ),
         _entry("top_items", "int64", [b, k], "index of the best items; -1 if fewer are left"),
         _entry("top_scores", "float32", [b, k], "their log-probabilities at temperature 1, nats"),
@@ -160,7 +160,7 @@ def _description(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
         "rule_hash": rule.hash,
         "rule_notes": "the graph applies target, minimum_target, reward_weight, tag_window and "
         "tag_run; with exclude_seen, put the session's items into `excluded`; with a temperature, "
-        "draw from `scores`",
+        "draw from `scores`, and with explore, draw that share of the requests uniformly",
         "policy": trained.name,
         "reward": trained.record.reward,
         "session_by": trained.record.session_by,

@@ -2,9 +2,10 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 import torch
 from torch import Tensor
@@ -21,6 +22,7 @@ from ucfrec.recommending.histories import Histories
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 RANK, SCORE = "rank", "score"
+REQUEST_ID: Final = "request_id"
 _USERS_AT_ONCE = 128
 """Most users of a forward pass; scores of more leave the processor's cache."""
 _SCORES = 2**24
@@ -42,7 +44,7 @@ def recommend(
     """`k` next items of every user, by the decision rule.
 
     A user's latest session is assumed to continue: items are scored at its next step, and the
-    rewards that the session has earned lower the target as in acting. A rule with a temperature
+    rewards that the session has had lower the target as in acting. A rule with a temperature
     draws the items one after the other, without repetition; otherwise they are the `k` best. For
     users who are not in the training logs, the state is made of their rows alone.
 
@@ -51,16 +53,20 @@ def recommend(
         batches: the users' histories.
         k: number of items per user, at least 1.
         rule: the decision rule; None for the run's own.
-        filter_seen: leave out every item that the user has seen.
+        filter_seen: exclude every item that the user has seen.
         candidates: the only item_ids to recommend, for all users; None for all items.
         skip_unknown: ignore rows of items that are not in the training data.
-        seed: of the draws of a rule with a temperature.
+        seed: of the draws of a rule with a temperature, or that explores. They also depend on the
+            user and the time of the user's last row: the same history gives the same items, and a
+            later one draws anew.
         index: finds the items approximately, by the same rule; None to find them exactly.
 
     Returns:
         One frame per batch: `user_id`, `rank` (from 1), `item_id`, `score` (log-probability at
         temperature 1 among the items that are left, nats; with an index, less that of the user's
-        best item); k rows per user, fewer if fewer items remain.
+        best item), `propensity` (probability of the item at its position, given those before it),
+        `request_id` (the same for all items of a user); k rows per user, in the order shown, fewer
+        if fewer items remain.
 
     Raises:
         InputError: an argument is wrong, the policy's actions are vectors, or an item of the logs
@@ -111,11 +117,12 @@ class _Choice:
         # Sessions of about the same length share a pass, which costs as much as the longest.
         lengths = np.bincount(latest.owner, minlength=len(latest.users))
         order = np.argsort(lengths, kind="stable")
-        items, values = (
-            np.concatenate(each) for each in zip(*self._parts(latest, order), strict=True)
-        )
+        requests = request_ids(batch, self.seed)
+        parts = self._parts(latest, order, requests)
         back = np.argsort(order, kind="stable")
-        items, values = items[back], values[back]
+        items, values, propensities = (
+            np.concatenate(each)[back] for each in zip(*parts, strict=True)
+        )
         kept, item_ids = np.isfinite(values), self.trained.item_ids
         assert item_ids is not None
         return pd.DataFrame(
@@ -124,17 +131,23 @@ class _Choice:
                 RANK: np.cumsum(kept, axis=1)[kept],
                 schema.ITEM_ID: item_ids[items[kept]],
                 SCORE: values[kept],
+                schema.PROPENSITY: propensities[kept],
+                REQUEST_ID: np.repeat(requests, kept.sum(1)),
             }
         )
 
-    def _parts(self, latest: Histories, order: IntArray) -> Iterator[tuple[Array, Array]]:
-        """Items and their log-probabilities, (M, k) each, of some users after the other."""
+    def _parts(
+        self, latest: Histories, order: IntArray, requests: Array
+    ) -> Iterator[tuple[Array, Array, Array]]:
+        """Items, their log-probabilities and propensities, (M, k) each, of some users after the
+        other."""
         rule = self.scorer.rule
         at_once = users_at_once(len(self.trained.items))
         if self.index is not None:
             at_once = _USERS_AT_ONCE
         for first in range(0, len(order), at_once):
-            part = latest.of_users(order[first : first + at_once])
+            numbers = order[first : first + at_once]
+            part = latest.of_users(numbers)
             users = self.trained.users.numbers(part.users)
             sessions = sessions_of(self.trained, part, users, self.scorer.length)
             known = part.seen_ids >= 0
@@ -142,17 +155,19 @@ class _Choice:
             if rule.exclude_seen:
                 left_out[0].append(part.owner)
                 left_out[1].append(part.item_ids)
-            rows, items = (torch.from_numpy(np.concatenate(each)) for each in left_out)
+            rows, out = (torch.from_numpy(np.concatenate(each)) for each in left_out)
             if self.index is not None:
                 k = min(self.k, len(self.trained.items))
-                found = self.index.best(sessions, (rows, items), self.excluded, k)
-                yield found[0].numpy(), found[1].numpy()
+                found = self.index.best(sessions, (rows, out), self.excluded, k)
+                yield found[0].numpy(), found[1].numpy(), np.ones(found[0].shape)
                 continue
-            scores = self.scorer.scores(sessions, (rows, items), self.excluded, empty=True)
+            scores = self.scorer.scores(sessions, (rows, out), self.excluded, empty=True)
             n_items = scores.shape[1]
-            drawn = uniforms(part.users, n_items, self.seed) if rule.temperature > 0 else None
-            best = best_of(rule, scores, min(self.k, n_items), drawn)
-            yield best[0].numpy(), best[1].numpy()
+            drawn = None
+            if rule.draws:
+                drawn = uniforms(part.users, requests[numbers], n_items + 1, self.seed)
+            items, values, chances = best_of(rule, scores, min(self.k, n_items), drawn)
+            yield items.numpy(), values.numpy(), chances.numpy()
 
 
 def users_at_once(n_items: int) -> int:
@@ -163,23 +178,23 @@ def users_at_once(n_items: int) -> int:
 @torch.inference_mode()
 def best_of(
     rule: DecisionRule, scores: Tensor, k: int, drawn: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    """`k` items (B, k) and their log-probabilities (B, k) at temperature 1 among those left, −∞
-    for items that are left out.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`k` items (B, k), their log-probabilities (B, k) at temperature 1 among those left, −∞ for
+    items that are excluded, and their propensities (B, k) float64.
 
     Args:
         rule: the decision rule.
         scores: (B, n_items) of `Scorer.scores`; may be overwritten.
         k: number of items, at most n_items.
-        drawn: (B, n_items) of `uniforms`; needed at a temperature above 0.
+        drawn: (B, n_items + 1) of `uniforms`; needed if the rule draws.
     """
     total = scores.logsumexp(-1, keepdim=True)
     none = torch.isneginf(total[:, 0])
     if none.any():
         scores[none] = 0.0
-    items = rule.ranked(scores, k, drawn)
+    items, propensities = rule.ranked(scores, k, drawn)
     values = scores.gather(1, items) - total
-    return items, values.masked_fill(none.unsqueeze(1), -torch.inf)
+    return items, values.masked_fill(none.unsqueeze(1), -torch.inf), propensities
 
 
 def _all_but(index: IdLookup, candidates: Sequence[Any]) -> Tensor:
@@ -248,19 +263,33 @@ def sessions_of(
     return Sessions.of_rows(*rows, users, length, observations)
 
 
-def uniforms(users: Array, n_items: int, seed: int) -> Tensor:
-    """Draws (B, n_items) from [0, 1), float64, that depend on the user, the item and the seed only.
+def request_ids(batch: Histories, seed: int) -> Array:
+    """(U,) text that tells the requests of each user apart: the seed and the time (ms) of the
+    user's last row, so that a replay draws the same and later rows draw anew."""
+    last = np.zeros(len(batch.users), dtype=np.int64)
+    np.maximum.at(last, batch.owner, batch.timestamps)
+    return np.asarray([f"{seed}-{time}" for time in last.tolist()], dtype=object)
 
-    A user is recommended the same in any batch. The numbers are SplitMix64's (Steele et al., 2014),
-    from a counter of users' hashes and items.
+
+def uniforms(users: Array, requests: Array, count: int, seed: int) -> Tensor:
+    """Draws (B, count) from [0, 1), float64, that depend on the user, the request and the seed.
+
+    A request is answered the same in any batch. The numbers are SplitMix64's (Steele et al., 2014),
+    from a counter of hashes and items.
     """
-    of_users = pd.util.hash_array(np.asarray(users).astype(str).astype(object))
+    of_users, of_requests = (
+        pd.util.hash_array(np.asarray(ids).astype(str).astype(object)) for ids in (users, requests)
+    )
     with np.errstate(over="ignore"):
-        state = of_users[:, None] + np.arange(1, n_items + 1, dtype=np.uint64) * np.uint64(
-            0x9E3779B97F4A7C15
-        )
-        state = state + np.uint64(seed) * np.uint64(0xD1B54A32D192ED03)
-        state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        state ^= state >> np.uint64(31)
+        key = of_users + _mixed(of_requests + np.uint64(0x9E3779B97F4A7C15))
+        state = _mixed(key + np.uint64(seed % 2**64) * np.uint64(0xD1B54A32D192ED03))[:, None]
+        state = state + np.arange(1, count + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+        state = _mixed(state)
     return torch.from_numpy((state >> np.uint64(11)).astype(np.float64) / 2**53)
+
+
+def _mixed(state: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+    """SplitMix64's finalizer."""
+    state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return state ^ (state >> np.uint64(31))

@@ -40,7 +40,7 @@ _EARLIEST_MS: Final = 365 * DAY_MS
 """Times before 1971 are hardly milliseconds; seconds of today would be there."""
 _LARGEST_FLOAT: Final = float(np.finfo(np.float32).max)
 _MOST_FAULTS: Final = 1000
-"""Beyond so many, it would take too long to look at each."""
+"""Beyond this number, it would take too long to look at each."""
 _SHOWN: Final = 60
 """Most characters of a wrong value in a message."""
 
@@ -70,7 +70,7 @@ class Limits:
     bytes: Annotated[int, Field(ge=1_000, le=2**30)] = 2**21
     """Bytes of a request's JSON."""
     k: Annotated[int, Field(ge=1, le=1_000_000)] = 1_000
-    """Items that may be asked for."""
+    """Items that may be requested."""
     history: Annotated[int, Field(ge=1, le=1_000_000)] = 5_000
     """Rows of a user's history."""
     candidates: Annotated[int, Field(ge=1, le=10_000_000)] = 10_000
@@ -96,7 +96,7 @@ class Row(TypedDict):
 
 
 class Request(BaseModel):
-    """A user, what they were shown, and what is asked for.
+    """A user, what they were shown, and what is requested.
 
     Lists are read up to their first fault: a message about every element would take seconds.
     """
@@ -120,6 +120,18 @@ class Request(BaseModel):
         ]
         | None
     ) = None
+    request_id: (
+        Annotated[
+            str,
+            Field(
+                min_length=1,
+                max_length=200,
+                description="Identifies the request: a repetition gets the same items. Without "
+                "one, the server makes one.",
+            ),
+        ]
+        | None
+    ) = None
 
 
 class StreamRequest(Request):
@@ -131,7 +143,7 @@ class StreamRequest(Request):
 
 
 class UserHistory(NamedTuple):
-    """What a request tells about its user: n rows in the order of time."""
+    """What a request says about its user: n rows in the order of time."""
 
     item_ids: Array
     """(n,) integers or text."""
@@ -198,7 +210,7 @@ def require_within(request: Request, limits: Limits) -> None:
     """Check the limits of a request, but for its bytes.
 
     Raises:
-        InputError: it asks for too much.
+        InputError: it requests too much.
     """
     counts = {
         "k": (request.k or 1, limits.k),
@@ -209,7 +221,7 @@ def require_within(request: Request, limits: Limits) -> None:
         counts["interactions"] = (len(request.interactions), limits.history)
     for name, (given, most) in counts.items():
         if given > most:
-            raise InputError(f"{given:,} {name}: the limit is {most:,}; ask for less")
+            raise InputError(f"{given:,} {name}: the limit is {most:,}; request less")
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
+from uuid import uuid4
 
 import numpy as np
 import torch
@@ -24,17 +25,28 @@ ENGINES: Final = (TORCH, ONNXRUNTIME)
 
 
 class Answer(NamedTuple):
-    """Items for one user, best first."""
+    """Items for one user, in the order shown."""
 
     items: list[int | str]
     scores: list[float]
     """Log-probabilities at temperature 1 among the items that are left, nats."""
+    propensities: list[float]
+    """Probability of each item at its position, given those before it."""
+    request_id: str
+    run: str
+    """Fingerprint of the run."""
+    rule: str
+    """Hash of the decision rule."""
 
     def as_dict(self, user_id: int | str) -> dict[str, Any]:
         """The answer to a request of a user, as a JSON object."""
-        pairs = zip(self.items, self.scores, strict=True)
-        items = [{"item_id": exact_id(item), "score": score} for item, score in pairs]
-        return {"user_id": exact_id(user_id), "items": items}
+        columns = zip(self.items, self.scores, self.propensities, strict=True)
+        items = [
+            {"item_id": exact_id(item), "score": score, "propensity": propensity}
+            for item, score, propensity in columns
+        ]
+        names = {"request_id": self.request_id, "run": self.run, "rule": self.rule}
+        return {"user_id": exact_id(user_id), **names, "items": items}
 
 
 def exact_id(given: int | str) -> int | str:
@@ -48,6 +60,7 @@ class _Asked(NamedTuple):
     number: int
     """Of the request in its batch."""
     user_id: int | str
+    request_id: str
     k: int
     history: UserHistory
     known: IntArray
@@ -82,9 +95,10 @@ class Responder:
             limits: of a request.
             rule: the decision rule; None for the run's own.
             k: items for requests that do not say how many.
-            filter_seen: leave out every item that the user has seen.
+            filter_seen: exclude every item that the user has seen.
             skip_unknown: ignore rows of items that are not in the training data.
-            seed: of the draws of a rule with a temperature.
+            seed: of the draws of a rule with a temperature, or that explores; they also depend on
+                user and request_id.
             engine: what computes the network of a request that comes alone, one of `ENGINES`.
 
         Raises:
@@ -109,6 +123,7 @@ class Responder:
             seed,
         )
         self.rule = self._scorer.rule
+        self._source = trained.fingerprint, self.rule.hash
         self._items, self._users = trained.items, trained.users
         self._reader = HistoryReader.of(trained)
         self._busy = threading.Lock()
@@ -151,7 +166,10 @@ class Responder:
         seen = self._items.numbers(history.seen) if self._filter_seen else np.empty(0, np.int64)
         allowed = None if request.candidates is None else self._candidates(request.candidates)
         k = self._k if request.k is None else request.k
-        return _Asked(number, request.user_id, k, history, known, seen[seen >= 0], allowed)
+        request_id = request.request_id or uuid4().hex
+        return _Asked(
+            number, request.user_id, request_id, k, history, known, seen[seen >= 0], allowed
+        )
 
     def _candidates(self, candidates: Sequence[int | str]) -> IntArray:
         numbers = self._items.numbers(_array(candidates))
@@ -220,21 +238,29 @@ class Responder:
 
     def _best(self, asked: Sequence[_Asked], scores: Tensor) -> list[Answer]:
         n_items, drawn = scores.shape[1], None
-        if self.rule.temperature > 0:
-            drawn = uniforms(_array([one.user_id for one in asked]), n_items, self._seed)
-        answers = [Answer([], [])] * len(asked)
+        if self.rule.draws:
+            users, requests = (
+                _array([getattr(one, name) for one in asked]) for name in ("user_id", "request_id")
+            )
+            drawn = uniforms(users, requests, n_items + 1, self._seed)
+        answers: dict[int, Answer] = {}
         sizes = [min(one.k, n_items) for one in asked]
         for k in set(sizes):
             rows = [n for n, size in enumerate(sizes) if size == k]
             whole = len(rows) == len(asked)
             of_rows = scores if whole else scores[rows]
             draws = drawn if drawn is None or whole else drawn[rows]
-            items, values = (each.numpy() for each in best_of(self.rule, of_rows, k, draws))
-            for row, numbers, value in zip(rows, items, values, strict=True):
-                kept = np.isfinite(value)
-                ids = self._items.ids[numbers[kept]]
-                answers[row] = Answer(ids.tolist(), value[kept].tolist())
-        return answers
+            found = (each.numpy() for each in best_of(self.rule, of_rows, k, draws))
+            for row, numbers, values, chances in zip(rows, *found, strict=True):
+                kept = np.isfinite(values)
+                answers[row] = Answer(
+                    self._items.ids[numbers[kept]].tolist(),
+                    values[kept].tolist(),
+                    chances[kept].tolist(),
+                    asked[row].request_id,
+                    *self._source,
+                )
+        return [answers[row] for row in range(len(asked))]
 
 
 def _array(ids: Sequence[Any]) -> Array:

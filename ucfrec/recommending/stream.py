@@ -7,6 +7,7 @@ from typing import Any, Final, Protocol
 
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import json_text
+from ucfrec.recommending.exposures import ExposureLog
 from ucfrec.recommending.requests import Limits, Request, Row, StreamRequest, parsed
 from ucfrec.recommending.responder import Responder, exact_id
 
@@ -40,7 +41,11 @@ class Counts:
 
 
 def answer_stream(
-    responder: Responder, source: Readable, sink: Writable, remember: int = REMEMBERED
+    responder: Responder,
+    source: Readable,
+    sink: Writable,
+    remember: int = REMEMBERED,
+    exposures: ExposureLog | None = None,
 ) -> Counts:
     """Answer every line of `source` until it ends: the nth answer is that of the nth line.
 
@@ -53,10 +58,11 @@ def answer_stream(
         source: lines of JSON, UTF-8; see `ucfrec.recommending.requests.StreamRequest`.
         sink: lines of JSON.
         remember: rows that are remembered, of all users together.
+        exposures: gets every answer; None for none.
     """
     counts, remembered = Counts(), _Remembered(remember, responder.limits)
     for lines in _lines(source, responder.limits.bytes):
-        for answer in _answered(responder, remembered, lines):
+        for answer in _answered(responder, remembered, lines, exposures):
             sink.write(json_text(answer).encode() + b"\n")
             counts.errors += "error" in answer
             counts.answers += "error" not in answer
@@ -69,7 +75,10 @@ Line = tuple[int, bytes | None]
 
 
 def _answered(
-    responder: Responder, remembered: "_Remembered", lines: Sequence[Line]
+    responder: Responder,
+    remembered: "_Remembered",
+    lines: Sequence[Line],
+    exposures: ExposureLog | None,
 ) -> Iterator[dict[str, Any]]:
     """The answers to lines."""
     waiting: list[tuple[int, StreamRequest | InputError]] = []
@@ -82,10 +91,10 @@ def _answered(
         # Whether rows are remembered is known once they have been answered.
         again = isinstance(request, StreamRequest) and request.user_id in users
         if again or len(waiting) == _AT_ONCE:
-            yield from _together(responder, remembered, waiting)
+            yield from _together(responder, remembered, waiting, exposures)
             waiting = []
         waiting.append((number, request))
-    yield from _together(responder, remembered, waiting)
+    yield from _together(responder, remembered, waiting, exposures)
 
 
 def _parsed(line: bytes | None, limits: Limits) -> StreamRequest:
@@ -101,6 +110,7 @@ def _together(
     responder: Responder,
     remembered: "_Remembered",
     waiting: Sequence[tuple[int, StreamRequest | InputError]],
+    exposures: ExposureLog | None,
 ) -> Iterator[dict[str, Any]]:
     """The answers to requests of different users, with one forward pass."""
     whole = {n: remembered.whole(r) for n, r in waiting if isinstance(r, StreamRequest)}
@@ -114,6 +124,8 @@ def _together(
             yield {"user_id": exact_id(request.user_id), "error": str(answer), "line": number}
         else:
             remembered.keep(request, whole[number].history)
+            if exposures is not None:
+                exposures.add(request.user_id, answer)
             yield answer.as_dict(request.user_id)
 
 
@@ -132,7 +144,10 @@ class _Remembered:
         if len(rows) > self._limits.history:
             rows = sorted(rows, key=lambda row: row["timestamp"])[-self._limits.history :]
         return Request(
-            user_id=request.user_id, k=request.k, candidates=request.candidates
+            user_id=request.user_id,
+            k=request.k,
+            candidates=request.candidates,
+            request_id=request.request_id,
         ).model_copy(update={"history": rows})
 
     def keep(self, request: StreamRequest, rows: list[Row]) -> None:

@@ -24,6 +24,7 @@ from ucfrec import __version__
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import json_text
 from ucfrec.recommending.batcher import Batcher, QueueFullError
+from ucfrec.recommending.exposures import ExposureLog
 from ucfrec.recommending.requests import Request, parsed
 from ucfrec.recommending.responder import Answer, Responder
 from ucfrec.recommending.serving_metrics import ServingMetrics
@@ -41,13 +42,20 @@ _ITEM: Final = {
     "properties": {
         "item_id": {"anyOf": [{"type": "integer"}, {"type": "string"}]},
         "score": {"type": "number", "description": "Log-probability among the items left, nats."},
+        "propensity": {
+            "type": "number",
+            "description": "Probability of the item at its position, given those before it.",
+        },
     },
 }
 _ANSWER: Final = {
     "type": "object",
     "properties": {
         "user_id": {"anyOf": [{"type": "integer"}, {"type": "string"}]},
-        "items": {"type": "array", "items": _ITEM, "description": "Best first."},
+        "request_id": {"type": "string"},
+        "run": {"type": "string", "description": "Fingerprint of the run."},
+        "rule": {"type": "string", "description": "Hash of the decision rule."},
+        "items": {"type": "array", "items": _ITEM, "description": "In the order to show."},
     },
 }
 _FAULTS: Final = {
@@ -65,7 +73,7 @@ _MOST_HEADER_BYTES: Final = 2**16
 """Of the address, names and values of a request. The server itself stops reading a head that is not
 whole by then."""
 _HUNG_UP: Final = 499
-"""For the metrics, as nobody receives it; nginx calls it so."""
+"""For the metrics, as no client receives it; nginx calls it so."""
 
 
 @settings_table("")
@@ -117,7 +125,10 @@ class _RefusalError(Exception):
 
 
 def application(
-    responder: Responder, limits: ServerLimits, allowed_hosts: Sequence[str] = ("*",)
+    responder: Responder,
+    limits: ServerLimits,
+    allowed_hosts: Sequence[str] = ("*",),
+    exposures: ExposureLog | None = None,
 ) -> FastAPI:
     """The application of one model; it keeps no state but the model and its metrics.
 
@@ -126,6 +137,7 @@ def application(
         limits: of the server.
         allowed_hosts: values of the header `Host`, without a port, that are answered: names,
             addresses, *.example.org for all names below, or * for any.
+        exposures: gets every answer; None for none.
 
     Raises:
         InputError: a host is written otherwise.
@@ -156,7 +168,7 @@ def application(
     async def recommendations(http: HTTPRequest) -> Response:
         """The next items for one user."""
         began = time.perf_counter()
-        status, body = await _answered(http, responder, batcher, limits)
+        status, body = await _answered(http, responder, batcher, limits, exposures)
         metrics.request(status, time.perf_counter() - began)
         return _response(status, body, {"Retry-After": "1"} if status == 503 else None)
 
@@ -165,6 +177,7 @@ def application(
         "policy": responder.trained.record.summary,
         "rule": str(responder.rule),
         "rule_hash": responder.rule.hash,
+        "run": responder.trained.fingerprint,
         "version": __version__,
     }
 
@@ -182,7 +195,11 @@ def application(
 
 
 async def _answered(
-    http: HTTPRequest, responder: Responder, batcher: Batcher, limits: ServerLimits
+    http: HTTPRequest,
+    responder: Responder,
+    batcher: Batcher,
+    limits: ServerLimits,
+    exposures: ExposureLog | None,
 ) -> tuple[int, dict[str, Any]]:
     """HTTP status and JSON of the answer."""
     arrived = False
@@ -207,6 +224,8 @@ async def _answered(
         traceback.print_exc(file=sys.stderr)
         return 500, {"error": "the server has a defect or no memory; its log says more"}
     if isinstance(outcome, Answer):
+        if exposures is not None:
+            exposures.add(request.user_id, outcome)
         return 200, outcome.as_dict(request.user_id)
     return 400, {"error": str(outcome)}
 

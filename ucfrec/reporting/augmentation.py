@@ -1,4 +1,4 @@
-"""Table and chart of the reward model and edited copies in the report."""
+"""Table and chart of the reward model and augmented episodes in the report."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -22,7 +22,7 @@ def augmentation_table(runs: Sequence[tuple[str, AugmentationReport]]) -> Table:
          [f"{m.active_dimensions} of {m.latent_dim}" for m in models]),
         ("share of z in the reward's variance", [m.z_share for m in models]),
         ("leak: correlation of z with E[r | s, a]", [m.z_leak for m in models]),
-        ("edited copies", [r.copies for r in reports]),
+        ("augmented episodes", [r.copies for r in reports]),
         ("accepted edits", [m.edits for m in moves]),
         ("acceptance (share of proposals)", [r.acceptance for r in reports]),
         ("δ, error of the reward model", [r.delta for r in reports]),
@@ -38,10 +38,12 @@ def augmentation_table(runs: Sequence[tuple[str, AugmentationReport]]) -> Table:
             ("other actions asked about", [a and a.proposals for a in asked]),
             ("copies with another action", [a and a.copies for a in asked]),
             ("mean change of their reward", [a and a.mean_change for a in asked]),
-            ("share of them that earns more", [a and a.earns_more for a in asked]),
+            ("share of them with a higher reward", [a and a.earns_more for a in asked]),
         ]
     body = [(name, [shown(value) for value in values]) for name, values in rows]
-    caption = "Reward model and edited copies, on held-out steps; δ, ε_r in units of the reward"
+    caption = (
+        "Reward model and augmented episodes, on held-out steps; δ, ε_r in units of the reward"
+    )
     return Table(caption, "", [name for name, _ in runs], body)
 
 

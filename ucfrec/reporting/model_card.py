@@ -1,7 +1,7 @@
 """The model card of a run: what it was trained on, how it acts, its limits, and what was measured.
 
 `MODEL_CARD.md` lies in the run folder. It is written from `run.json` and from `measured.json`, to
-which every evaluation of the run adds its newest values; nothing in it is typed by hand.
+which every evaluation of the run adds its newest values; nothing in it is typed in manually.
 """
 
 import json
@@ -83,7 +83,7 @@ def _plain(value: object) -> object:
 def _about(record: RunRecord) -> str:
     fit = record.policy
     rows = {
-        "learner": record.name,
+        "policy": record.name,
         "configuration": config_hash(record.settings),
         "seed": record.seed,
         "training steps of the model": fit and fit.steps,
@@ -133,7 +133,7 @@ def _rule(run: Path) -> str:
     rule = DecisionRule.from_dict(read_json(run / RULE), str(run / RULE))
     return (
         f"Its decision rule: {rule}. `evaluate`, `ope`, `rank` and `recommend` act by it unless "
-        "they are told otherwise; each measurement below names its own."
+        "another is named; each measurement below names its own."
     )
 
 
@@ -141,19 +141,18 @@ def _limits(record: RunRecord, logged: Container[str]) -> list[str]:
     items = record.sizes["items"]
     limits = []
     if record.refit_of is not None:
-        limits.append("It was trained on all rows of its store: only later logs can judge it.")
+        limits.append("It was trained on all rows of its store: only later logs can evaluate it.")
     if items:
         limits.append(f"It knows {items:,} items and never shows another one.")
     window = _window(record)
     if window is not None:
         limits.append(
-            f"It knows nothing of what happened after {_day(window[1])} UTC; tastes and items "
-            "change."
+            f"It was not trained on anything after {_day(window[1])} UTC; tastes and items change."
         )
     unknown = record.data.unknown_propensities
     if items and unknown is None:
         limits.append(
-            "Its logs have no propensities: what it would earn cannot be told from them without a "
+            "Its logs have no propensities: its return cannot be estimated from them without a "
             "model of how items were chosen."
         )
     elif unknown:
@@ -163,7 +162,7 @@ def _limits(record: RunRecord, logged: Container[str]) -> list[str]:
     if record.augmentation is not None:
         limits.append(f"Counterfactual augmentation: {record.augmentation.verdict}")
     limits.append(
-        "A validation loss says how well logged choices are predicted, not what is earned: see "
+        "A validation loss says how well logged choices are predicted, not the return: see "
         "what was measured."
     )
     return limits

@@ -82,7 +82,7 @@ def write_report(
         by_data.setdefault(run.record.fingerprint, []).append(run)
     evidence = results_of(results)
     with damage_explained(Path(", ".join(map(str, results))), "write its rows again"):
-        judged = {
+        evaluated = {
             "verdict": verdict(evidence),
             "environments": environments(evidence),
             "estimates": estimates(evidence),
@@ -100,7 +100,7 @@ def write_report(
         sections=[_section(group, features) for group in by_data.values()],
         layout=charts,
         points=POINTS,
-        **judged,
+        **evaluated,
     )
     with atomic_file(out) as scratch:
         # Folder names may have bytes that are not valid Unicode.
@@ -203,7 +203,7 @@ def _data(record: RunRecord) -> Table:
 def _summary(runs: Sequence[_Run]) -> Table:
     fitted = [run.record.policy for run in runs]
     rows: list[tuple[str, list[Any]]] = [
-        ("learner", [run.record.name for run in runs]),
+        ("policy", [run.record.name for run in runs]),
         ("seed", [str(run.record.seed) for run in runs]),
         ("status", [run.status for run in runs]),
         ("best validation loss", [fit and fit.best_validation for fit in fitted]),

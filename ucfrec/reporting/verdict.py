@@ -22,7 +22,7 @@ NO_RESULTS = (
 
 
 @dataclass(frozen=True)
-class _Earned:
+class _Return:
     """Return of one policy in one environment, over all its rows."""
 
     policy: str
@@ -37,7 +37,7 @@ class _Earned:
     high: float
     """Highest end of the rows' 95% intervals."""
 
-    def above(self, other: "_Earned") -> bool:
+    def above(self, other: "_Return") -> bool:
         """Whether all intervals are above all intervals of `other`."""
         return self.low > other.high
 
@@ -55,9 +55,9 @@ def verdict(results: Results) -> list[str]:
 
 
 def _of_environment(environment: str, rows: Sequence[ResultRow]) -> str:
-    earned = _earned(rows)
-    trained = sorted((one for one in earned if one.trained), key=lambda one: -one.value)
-    references = [one for one in earned if not one.trained]
+    returns = _returns(rows)
+    trained = sorted((one for one in returns if one.trained), key=lambda one: -one.value)
+    references = [one for one in returns if not one.trained]
     if not trained:
         return f"In {environment}, only built-in policies were evaluated: {_listed(references)}."
     best, *others = trained
@@ -74,14 +74,14 @@ def _of_environment(environment: str, rows: Sequence[ResultRow]) -> str:
     return " ".join(sentences)
 
 
-def _earned(rows: Sequence[ResultRow]) -> list[_Earned]:
+def _returns(rows: Sequence[ResultRow]) -> list[_Return]:
     """One summary per policy and checkpoint, in order of first appearance."""
     groups: dict[tuple[str, str | None], list[ResultRow]] = {}
     for row in rows:
         groups.setdefault((row.method, row.checkpoint), []).append(row)
     several = {policy for policy, _ in groups if sum(key[0] == policy for key in groups) > 1}
     return [
-        _Earned(
+        _Return(
             f"{policy}, checkpoint {checkpoint}" if policy in several else policy,
             any(row.training_seed is not None for row in group),
             len(group),
@@ -94,7 +94,7 @@ def _earned(rows: Sequence[ResultRow]) -> list[_Earned]:
     ]
 
 
-def _best(environment: str, best: _Earned, others: Sequence[_Earned]) -> str:
+def _best(environment: str, best: _Return, others: Sequence[_Return]) -> str:
     if best.trainings > 1:
         how = (
             f"{shown(best.value)} in the mean of {best.trainings} trainings (their 95% intervals "
@@ -103,31 +103,35 @@ def _best(environment: str, best: _Earned, others: Sequence[_Earned]) -> str:
     else:
         how = f"{shown(best.value)} (95% interval {shown(best.low)} to {shown(best.high)})"
     if not others:
-        return f"In {environment}, {best.policy} earned {how} per episode."
+        return f"In {environment}, {best.policy} has a return of {how} per episode."
     text = (
-        f"In {environment}, {best.policy} earned most of {len(others) + 1} trained policies: {how}"
+        f"In {environment}, {best.policy} has the highest return of {len(others) + 1} trained "
+        f"policies: {how}"
     )
     text += " per episode."
     close = [one for one in others if not best.above(one)]
     if close:
         text += f" Its interval overlaps that of {_listed(close)}:"
-        return f"{text} which of them earns more is open."
+        return f"{text} which of them has the higher return is open."
     return f"{text} Its interval lies above those of the others, the next being {others[0]}."
 
 
-def _against(best: _Earned, references: Sequence[_Earned]) -> str:
+def _against(best: _Return, references: Sequence[_Return]) -> str:
     """Compare the best trained policy with the built-in policies."""
     above = [one for one in references if best.above(one)]
     below = [one for one in references if one.above(best)]
     open_ = [one for one in references if one not in above and one not in below]
     parts = []
     if above:
-        parts.append(f"more than {_listed(above)}")
+        parts.append(f"higher than that of {_listed(above)}")
     if below:
-        parts.append(f"less than {_listed(below)}")
-    text = f"It earned {', and '.join(parts)}." if parts else ""
+        parts.append(f"lower than that of {_listed(below)}")
+    text = f"Its return is {', and '.join(parts)}." if parts else ""
     if open_:
-        text += f" Whether it earns more or less than {_listed(open_)} is open: intervals overlap."
+        text += (
+            f" Whether it is higher or lower than that of {_listed(open_)} is open: intervals "
+            "overlap."
+        )
     return text.strip()
 
 
@@ -151,9 +155,8 @@ def _of_estimates(one: Estimates) -> str:
         return f"For {one.name}, {figure}, which is not reliable: {warnings}."
     if one.logged is None:
         return f"For {one.name}, {figure}. The rows lack the return of the logged sessions."
-    return f"For {one.name}, {figure}; the logged sessions earned {interval(one.logged)}. " + (
-        _compared(weighted, one.logged)
-    )
+    text = f"For {one.name}, {figure}; the logged sessions have {interval(one.logged)}. "
+    return text + _compared(weighted, one.logged)
 
 
 def _compared(weighted: Sequence[ResultRow], logged: ResultRow) -> str:
@@ -162,19 +165,19 @@ def _compared(weighted: Sequence[ResultRow], logged: ResultRow) -> str:
     above = [name for name, own in ends.items() if own[0] > high]
     below = [name for name, own in ends.items() if own[1] < low]
     everyone = _listed(list(ends))
-    for names, more in ((above, "more"), (below, "less")):
+    for names, more in ((above, "higher"), (below, "lower")):
         if len(names) == len(weighted):
             return (
-                f"Every weighted estimate ({everyone}) says that it earns {more} than the logging "
-                "policy, provided that the logged propensities are right."
+                f"Every weighted estimate ({everyone}) says that its return is {more} than the "
+                "logging policy, provided that the logged propensities are right."
             )
     if not above and not below:
         return f"No weighted estimate ({everyone}) distinguishes it from the logging policy."
-    sides: Mapping[str, list[str]] = {"more": above, "less": below}
+    sides: Mapping[str, list[str]] = {"higher": above, "lower": below}
     parts = [f"{_listed(names)} {more}" for more, names in sides.items() if names]
     return (
         f"The weighted estimates disagree ({'; '.join(parts)} than the logging policy, of "
-        f"{everyone}), so whether it earns more is open."
+        f"{everyone}), so whether its return is higher is open."
     )
 
 

@@ -28,9 +28,9 @@ class Config:
     """Everything that determines a run, apart from its data."""
 
     policy_name: str
-    """The learner."""
+    """Name of the policy."""
     policy: PolicyConfig
-    """The learner's own settings."""
+    """The policy's own settings."""
     train: LoopConfig = field(default_factory=LoopConfig)
     """The training loop of the policy."""
     crm: CRMConfig = field(default_factory=CRMConfig)
@@ -57,7 +57,7 @@ def resolve_config(
 
     Args:
         policy_name: one of `ucfrec.policies.registry.policy_names`. The default of `augment.copies`
-            is 0 for learners other than UCF: `--policy dt` is the plain baseline and `--policy dt
+            is 0 for policies other than UCF: `--policy dt` is the plain baseline and `--policy dt
             --set augment.copies=1` is the paper's `w/o Arch`.
         file: TOML with tables `policy`, `train`, `crm`, `csg`, `augment` and `rule`.
         overrides: texts `table.field=value`, the value in TOML syntax; or a mapping, either nested
@@ -66,7 +66,7 @@ def resolve_config(
         presets: defaults that a dataset adapter sets for its data; a mapping as in `overrides`.
 
     Raises:
-        InputError: a learner, table or field is unknown, or a value or a combination of values is
+        InputError: a policy, table or field is unknown, or a value or a combination of values is
             not allowed; the message names the source of the setting.
     """
     settings = [*_from_mapping(presets or {}, "presets")]
@@ -105,18 +105,18 @@ class _Setting(NamedTuple):
 
 def _build(policy_name: str, settings: Iterable[_Setting], seed: int) -> Config:
     """Build each table once, from all its settings, so that values are checked together."""
-    learner = policy_class(policy_name)
+    policy_type = policy_class(policy_name)
     tables: dict[str, dict[str, Any]] = {name: {} for name in TABLES}
-    if not learner.augmented:
+    if not policy_type.augmented:
         tables["augment"]["copies"] = 0
     sources = {}
-    for table, key, value, source in (*_from_mapping(learner.presets, policy_name), *settings):
+    for table, key, value, source in (*_from_mapping(policy_type.presets, policy_name), *settings):
         tables[table][key] = value.item() if isinstance(value, np.generic) else value
         sources[f"{table}.{key}"] = source
     try:
         return Config(
             policy_name,
-            learner.Config(**tables["policy"]),
+            policy_type.Config(**tables["policy"]),
             LoopConfig(**tables["train"]),
             CRMConfig(**tables["crm"]),
             CSGConfig(**tables["csg"]),

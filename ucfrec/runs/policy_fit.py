@@ -30,7 +30,7 @@ def fit_policy(
 
     Args:
         policy: trained in place.
-        train: episodes to learn from, with their edited copies.
+        train: episodes to learn from, with their augmented episodes.
         validation: held-out episodes; None to keep the last weights.
         out: folder of the run.
         config: configuration of the run.
@@ -39,7 +39,7 @@ def fit_policy(
         InputError: see `ucfrec.fitting.loop.fit`; or the batch has fewer windows than processes.
     """
     k, device = policy.config.context, policy.state_mean.device
-    base = train.without_copies()
+    base = train.without_augmentation()
     solve = policy.closed_form(base, validation or base, out / "policy", config.seed)
     alone = solve is not None
     validate = None if validation is None else _validation(policy, validation, config.seed, alone)

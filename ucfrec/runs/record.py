@@ -264,7 +264,7 @@ class RunRecord(TrainingRecord):
         if warning := self.learned_nothing(logged):
             lines.append(f"warning       {warning}")
         if self.rule is not None and self.reward_model is not None:
-            lines.append(_describe_rule(self.rule, self.reward_model))
+            lines.append(_describe_rule(self.rule, self.reward_model, self.mean_return))
         if self.screening is not None:
             flagged = ", ".join(map(str, self.screening.flagged)) or "none"
             lines.append(f"screening     observation columns without effect: {flagged}")
@@ -346,20 +346,20 @@ def verified(run: Path) -> None:
 def _describe_augmentation(report: AugmentationReport) -> list[str]:
     crm, moves, actions = report.reward_model, report.moves, report.actions
     lines = [
-        f"reward model  R² {crm.r2:.3f} with z, {crm.r2_without_z:.3f} without; "
+        f"reward model  R² {crm.r2:.3f} with the disturbance z, {crm.r2_without_z:.3f} without; "
         f"{crm.active_dimensions} of {crm.latent_dim} latent dimensions active",
     ]
     if report.proposals:
         lines.append(
-            f"edits         {report.copies} copies, acceptance {report.acceptance:.1%}, "
-            f"mean-move ratio {moves.mean_move_ratio:.2f}, effective rank "
+            f"augmentation  {report.copies:,} augmented episodes, {report.acceptance:.1%} of their "
+            f"edits accepted; mean-move ratio {moves.mean_move_ratio:.2f}, effective rank "
             f"{moves.effective_rank:.1f} of {moves.dimensions}"
         )
     if actions is not None:
         lines.append(
-            f"other actions {actions.copies:,} copies of {actions.proposals:,} asked "
-            f"about; their reward differs by {actions.mean_change:+.3g} on average, "
-            f"{actions.earns_more:.0%} of them earn more"
+            f"other actions {actions.copies:,} augmented steps of {actions.proposals:,} proposed; "
+            f"their reward differs by {actions.mean_change:+.3g} on average, "
+            f"{actions.earns_more:.0%} have a higher one than the logged action"
         )
     lines.append(
         f"bound         δ + ε_r = {report.delta:.3g} + {report.epsilon_r:.3g}: {report.verdict}"
@@ -367,12 +367,21 @@ def _describe_augmentation(report: AugmentationReport) -> list[str]:
     return [*lines, *(f"warning       {warning}" for warning in report.warnings)]
 
 
-def _describe_rule(choice: RuleRecord, model: ItemRewardReport) -> str:
-    value = choice.simulated
-    estimate = "" if value is None else f"; return promised by it {value[0]:.4g} ± {value[1]:.2g}"
+def _describe_rule(choice: RuleRecord, model: ItemRewardReport, logged: float) -> str:
+    value, tried = choice.simulated, len(choice.candidates)
+    if value is None:
+        how = f"It ranked best of {tried} rules in the validation period"
+    else:
+        how = (
+            f"Of {tried} ways to turn the policy into recommendations, tried on simulated users, "
+            "it has the best return\n              (or one level with it) that the log supports: "
+            f"{value[0]:.4g} ± {value[1]:.2g} per session, estimated; logged sessions have "
+            f"{logged:.4g}"
+        )
     return (
-        f"items         reward model: held-out loss {model.loss:.4f}, "
+        f"user model    held-out loss {model.loss:.4f}, "
         f"{model.item_loss - model.loss:.4f} below that of item effects alone\n"
         f"decision rule {choice.rule}\n"
-        f"              chosen by {choice.chosen_by}{estimate}{choice.warning}"
+        f"              {how}.\n"
+        f"              Selected by the {choice.chosen_by}{choice.warning}"
     )

@@ -20,7 +20,7 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
 
     Nothing is chosen again: the settings, the number of steps (those of the best weights of
     `first`), the strength of the reward model's effects and the decision rule are those of `first`.
-    Item embeddings stay those of the store's training split. There is nothing left to judge the
+    Item embeddings stay those of the store's training split. There is nothing left to evaluate the
     policy on but later logs.
 
     Args:
@@ -60,7 +60,7 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
 
 
 def _settings(trained: TrainedPolicy) -> Config:
-    """The settings of a run, for so many steps as its best weights took, and no new choice."""
+    """The settings of a run, for as many steps as its best weights took, and no new choice."""
     config = trained.record.config
     steps = max(1, trained.record.finished.best_step)
     return dataclasses.replace(

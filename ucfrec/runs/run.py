@@ -26,6 +26,7 @@ from ucfrec.fitting.loop import Fit
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.checks import require_sound
+from ucfrec.progress import phase
 from ucfrec.runs.config import Config
 from ucfrec.runs.policy_fit import fit_policy
 from ucfrec.runs.record import RUN, RuleRecord, RunRecord, read_augmentation
@@ -36,6 +37,8 @@ from ucfrec.runs.trained_policy import AUGMENTATION, INPUTS, REWARD_MODEL, RULE,
 from ucfrec.user_model.model import UserModel
 
 _OVERLAY = "overlay.safetensors"
+PHASES = 4
+"""Phases of a training that have progress of their own."""
 
 
 @dataclass(frozen=True)
@@ -105,15 +108,19 @@ def train_run(
             remove_leftovers_within(out)
         begun = time.perf_counter()
         run = _prepare_inputs(store, out, config, about or {}, on_all_rows, shared)
-        overlay, augmentation = _augment(run)
-        fit = _train_policy(run, overlay, more_augmentation, on_all_rows)
+        with phase("Counterfactual augmentation", 1, PHASES):
+            overlay, augmentation = _augment(run)
+        with phase("Training the policy", 2, PHASES):
+            fit = _train_policy(run, overlay, more_augmentation, on_all_rows)
         if not distributed.leads():
             return run.record
         chosen = run.record.rule is not None and run.record.policy == fit
         record = run.record.with_entries(augmentation=augmentation, policy=fit)
         if run.logged.has_items and config.rule.choose and not chosen:
-            user_model = _fit_user_model(run)
-            rule = _choose_rule(run, user_model)
+            with phase("Fitting the user model", 3, PHASES):
+                user_model = _fit_user_model(run)
+            with phase("Selecting the decision rule", 4, PHASES):
+                rule = _choose_rule(run, user_model)
             record = record.with_entries(reward_model=user_model.reward_report, rule=rule)
         _write_samples(run)
         seconds = record.wall_time_s + time.perf_counter() - begun

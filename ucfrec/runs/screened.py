@@ -77,7 +77,7 @@ def train_screened(
     if len(flagged) == store.state_size:
         raise InputError(
             f"{store.path}: screening found no effect of any of the {len(flagged)} state "
-            "dimensions; the log has too few steps, or too noisy ones, to tell: train without "
+            "dimensions; the log has too few steps, or too noisy ones, to decide: train without "
             "--screen"
         )
     entries = {**(about or {}), SCREENING: screening}

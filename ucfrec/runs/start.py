@@ -164,7 +164,7 @@ def returns_of(store: EpisodeStore, config: Config) -> ReturnToGo:
 
 
 def _target_returns(train: EpisodeStore, definition: ReturnToGo) -> Float32Array:
-    """Sorted returns-to-go of sessions, or of steps if targets are set anew at every step.
+    """Sorted returns-to-go of sessions, or of steps if targets are set again at every step.
 
     Sessions as long as only those of bots are count for nothing. Of more than a million, evenly
     spaced order statistics are kept, the lowest and highest too.
@@ -215,7 +215,7 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
     """An untrained policy with the normalisation and item embeddings of `train`."""
     torch.manual_seed(config.seed)
     policy = policy_class(config.policy_name)(config.policy, policy_sizes(train))
-    base = train.without_copies()
+    base = train.without_augmentation()
     mean, std = base.state_statistics
     policy.state_mean.copy_(mean)
     policy.state_std.copy_(torch.where(std > 1e-6, std, 1.0))

@@ -27,6 +27,7 @@ from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors, load_tr
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
+from ucfrec.provenance import config_hash
 from ucfrec.runs.record import RunRecord, read_record
 from ucfrec.user_model.model import load_session_end
 from ucfrec.user_model.reward import FITTED, ItemRewardModel
@@ -59,7 +60,7 @@ class TrainedPolicy:
     """(n_users,) user identifiers in the logs; empty if the store has none."""
     training_returns: Float32Array
     """(M,) returns-to-go that targets are set for, sorted, in reward units: those of sessions, or
-    of steps if a target is set anew at every step (`ReturnToGo.per_session`)."""
+    of steps if a target is set again at every step (`ReturnToGo.per_session`)."""
     rule: DecisionRule
     """The decision rule of the run."""
     reward_model: ItemRewardModel | None = None
@@ -157,6 +158,14 @@ class TrainedPolicy:
     def name(self) -> str:
         """Name of the method; see `RunRecord.name`."""
         return self.record.name
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """12 hexadecimal digits that tell trained runs apart: a hash of the data, the configuration
+        and the checksums of the weights."""
+        weights = {name: seal for name, seal in self.record.files.items() if "safetensors" in name}
+        of = {"data": self.record.fingerprint, "config": self.record.settings, "weights": weights}
+        return config_hash(of)
 
     @cached_property
     def items(self) -> IdLookup:

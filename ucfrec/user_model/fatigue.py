@@ -1,4 +1,4 @@
-"""Fatigue: how much less users reward anything once they liked one tag many times on end."""
+"""Fatigue: how much less users reward anything once they liked one tag many times in a row."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,24 +13,24 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.user_model.main_tags import MainTags
 
 LONGEST: Final = 8
-"""Largest length of a run, and largest number of steps that it tires, that are tried."""
+"""Largest length of a run, and largest number of steps that it lasts, that are tried."""
 _MOST: Final = 0.5
 """Largest factor that counts as fatigue."""
 _EXPECTED: Final = 20.0
-"""Fewest rewards to be expected of users who did not tire, from which a factor is told."""
+"""Fewest rewards to be expected of users without fatigue, from which a factor is estimated."""
 
 
 @dataclass(frozen=True)
 class Fatigue:
-    """After `length` liked items of one main tag on end, the chance of a reward is multiplied by
-    `factor` for `steps` steps."""
+    """After `length` liked items of one main tag in a row, the probability of a reward is
+    multiplied by `factor` for `steps` steps."""
 
     length: int
     steps: int
     factor: float
 
     def tired(self, runs: Tensor) -> Tensor:
-        """Whether users are tired, (M,) bool, from `MainTags.runs` (M, N) before a step."""
+        """Whether users are fatigued, (M,) bool, from `MainTags.runs` (M, N) before a step."""
         return (runs[:, : self.steps] >= self.length).any(1)
 
 
@@ -57,12 +57,12 @@ class LoggedRuns:
 
 
 def fit_fatigue(training: LoggedRuns, held_out: LoggedRuns) -> Fatigue | None:
-    """The fatigue that training rows tell most clearly; None if there is none.
+    """The fatigue that training rows show most clearly; None if there is none.
 
-    The factor is the share of likes at which the log's policies arrived with tired users, relative
-    to the share in the rest of the same sessions. This is cautious: policies that knew of the
-    fatigue, and showed what nobody likes, look as if the users would have liked nothing. Fatigue
-    must at least halve the likes, in held-out rows too.
+    The factor is the share of likes at which the log's policies arrived with fatigued users,
+    relative to the share in the rest of the same sessions. This is cautious: policies that knew of
+    the fatigue, and showed what no one likes, look as if the users would have liked nothing.
+    Fatigue must at least halve the likes, in held-out rows too.
     """
     found, clearest = None, 0.0
     for length, steps in _candidates(training.runs.shape[1]):
@@ -80,7 +80,7 @@ def fit_fatigue(training: LoggedRuns, held_out: LoggedRuns) -> Fatigue | None:
 
 
 def _likes(rows: LoggedRuns, length: int, steps: int) -> tuple[float, float]:
-    """Likes of tired users, and as many as they gave elsewhere in the same sessions."""
+    """Likes of fatigued users, and as many as they gave elsewhere in the same sessions."""
     tired = Fatigue(length, steps, 0.0).tired(rows.runs).numpy()
     count = int(rows.sessions.max(initial=-1)) + 1
     others = np.bincount(rows.sessions[~tired], minlength=count)

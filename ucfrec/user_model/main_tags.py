@@ -1,4 +1,4 @@
-"""The main tag of each item, and how often on end items of one main tag were liked."""
+"""The main tag of each item, and how often in a row items of one main tag were liked."""
 
 from dataclasses import dataclass
 
@@ -46,7 +46,7 @@ class MainTags:
         return (rewards - self.reward_low) / (self.reward_high - self.reward_low) >= LIKED
 
     def runs(self, shown: Shown) -> Tensor:
-        """In how many steps on end, up to each earlier one, one main tag was liked, (B, N).
+        """In how many steps in a row, up to each earlier one, one main tag was liked, (B, N).
 
         0 where the item was not liked, has no tags, or none was shown. Only what `shown` holds is
         counted.

@@ -31,7 +31,7 @@ _MOST_STEPS: Final = 100_000
 
 @dataclass(frozen=True)
 class UserModel:
-    """What users would do: how they reward every item, when they leave, and what tires them."""
+    """What users would do: how they reward every item, when they leave, and their fatigue."""
 
     reward: ItemRewardModel
     """Expected reward of every item, as acting knows it."""

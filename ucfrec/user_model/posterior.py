@@ -1,9 +1,9 @@
-"""What a session tells of the tastes of its user, where users are new.
+"""What a session shows of the tastes of its user, where users are new.
 
 Tastes are a level and an affinity, v = (level, affinity), and add v · (1, e_i) to the score of an
 item with the vector e_i. Before a session begins they are drawn from N(0, C), where C is how
-training users differ. What a step told is its reward less what the item usually earns, v · (1, e_i)
-plus noise. The tastes after some steps are their posterior mean, a ridge regression within the
+training users differ. What a step showed is its reward less what the item usually gets, v · (1,
+e_i) plus noise. The tastes after some steps are their posterior mean, a ridge regression within the
 session (Rasmussen and Williams, 2006, Gaussian Processes for Machine Learning, section 2.1).
 """
 
@@ -14,13 +14,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 MEMORY: Final = 50
-"""Steps of a session that tell of tastes, the latest ones."""
+"""Steps of a session that show tastes, the latest ones."""
 _LEAST: Final = 1e-6
 """Variance of tastes in every direction, relative to the mean."""
 
 
 class UserPosterior(nn.Module):
-    """Tastes of the users of B sessions, from what was shown to them and earned."""
+    """Tastes of the users of B sessions, from what was shown to them, and its rewards."""
 
     root: Tensor
     usual: Tensor
@@ -32,14 +32,14 @@ class UserPosterior(nn.Module):
         self.register_buffer("root", torch.zeros(size, size))
         """L with L Lᵀ = C, in units of the standard deviation of the noise."""
         self.register_buffer("usual", torch.zeros(items))
-        """What every item earns of a user without tastes of their own, as `targets`."""
+        """The reward of every item with a user without tastes of their own, as `targets`."""
         self.register_buffer("weight", torch.zeros(()))
-        """Scores per unit of target; 0 if sessions tell nothing."""
+        """Scores per unit of target; 0 if sessions show nothing."""
         self.known = False
-        """Whether sessions tell of tastes."""
+        """Whether sessions show tastes."""
 
     def weigh(self, weight: Tensor | float) -> None:
-        """Set the weight; 0 if sessions tell nothing."""
+        """Set the weight; 0 if sessions show nothing."""
         self.weight.fill_(weight)
         self.known = bool(self.weight != 0)
 

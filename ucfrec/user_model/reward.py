@@ -26,12 +26,12 @@ class ItemRewardModel(nn.Module):
 
     x being the standardised state, e_i the centred embedding of the item, and exposure_i what
     repeating an item, or showing one like it, n steps after the last time adds (`Likeness`). For
-    new users, user_u and affinity_u are what the session tells of them (`UserPosterior`).
+    new users, user_u and affinity_u are what the session shows of them (`UserPosterior`).
     Item effects include those of tags and embeddings, which items without training rows have too.
     For rewards of two values the model is logistic: η is the log-odds of the higher one. Otherwise
     η is the standardised reward.
 
-    `ucfrec.user_model.reward_fit` fits the model; effects that it leaves out are 0.
+    `ucfrec.user_model.reward_fit` fits the model; effects that it excludes are 0.
     """
 
     binary: Tensor
@@ -128,7 +128,7 @@ class ItemRewardModel(nn.Module):
         return of_user + self.standardised(states) @ self.state
 
     def tastes_after(self, shown: Shown) -> Tensor:
-        """What sessions told of their users' level and affinity, (B, D + 1)."""
+        """What sessions showed of their users' level and affinity, (B, D + 1)."""
         if not self.tastes.known:
             # The length of a tensor would be that of one batch in a graph that is exported.
             size = shown.items.shape[0], self.vectors.shape[1] + 1

@@ -59,7 +59,7 @@ class Design:
     weights: Tensor
     """(M,) how many rows each row counts for."""
     tastes: Tensor
-    """(M,) what `UserPosterior` of weight 1 add; zeros if sessions tell nothing."""
+    """(M,) what `UserPosterior` of weight 1 add; zeros if sessions show nothing."""
 
     @classmethod
     def of(
@@ -292,7 +292,7 @@ def minimum(objective: Callable[[Tensor], Tensor], start: Tensor) -> Tensor:
 
 
 def _newton(gradient: Tensor, history: deque[tuple[Tensor, Tensor]]) -> Tensor:
-    """The gradient times the inverse of the second derivative that `history` tells."""
+    """The gradient times the inverse of the second derivative that `history` gives."""
     result, weights = gradient.clone(), []
     for step, change in reversed(history):
         weights.append(float(step @ result) / float(step @ change))

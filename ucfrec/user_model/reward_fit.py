@@ -43,7 +43,7 @@ _KNOWN: Final = 0.1
 _SCALES: Final = (0.25, 0.5, 1.0, 2.0, 4.0)
 """Standard deviations of tastes that are tried, relative to the noise of single steps."""
 LASTING: Final = ("item", "user", "content", "affinity")
-"""Effects that are told apart by users who were shown several items."""
+"""Effects that are distinguished by users who were shown several items."""
 _MAX_ROWS: Final = 500_000
 _CONSTANT: Final = 1e-6
 _ROWS: Final = 512
@@ -165,7 +165,7 @@ def _of_items(effects: Effects) -> Effects:
 
 
 def set_usual(model: ItemRewardModel, design: Design, effects: Effects) -> None:
-    """Set what items usually earn, for `UserPosterior`, from the effects of mean and items."""
+    """Set usual rewards of items, for `UserPosterior`, from the effects of mean and items."""
     everywhere = effects["mean"] + effects.get("item", torch.zeros(()))
     if "content" in effects:
         everywhere = everywhere + design.of_content(effects["content"])

@@ -80,7 +80,7 @@ class ItemRewardReport:
     gauc: _OrNaN
     """Probability that a liked step scores higher than another of the same user, by impressions.
 
-    What all items share at a step (user and state) is left out of the scores: it does not rank
+    What all items share at a step (user and state) is excluded of the scores: it does not rank
     items, and as the state contains the last reward, it would compare a user's steps by what was
     liked before them."""
     gauc_error: _OrNaN

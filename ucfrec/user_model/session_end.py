@@ -26,7 +26,8 @@ _REWARD: Final = 3
 _REMEMBERED: Final = 10
 """Items shown before that are compared with the item."""
 _FEWEST: Final = 20
-"""Fewest steps that end a session, and that do not, from which more than their share is told."""
+"""Fewest steps that end a session, and that do not, from which more than their share is
+estimated."""
 _LOGISTIC: Final = ("mean", "scale", "weights", "bias")
 _MOST: Final = 20.0
 """Largest log-odds against what happened that count, so that no single step decides."""
@@ -51,7 +52,7 @@ class LoggedEnds:
     def of(cls, store: EpisodeStore, lags: int, most: int, seed: int) -> "LoggedEnds":
         """Steps of a view of a store of items, at most `most` of them, drawn at random.
 
-        The last step of a user's last session, and of a session that was cut, is left out: the
+        The last step of a user's last session, and of a session that was cut, is excluded: the
         log may simply have ended there.
         """
         users = store.episode_values(schema.USER) if store.has_users else np.arange(len(store))

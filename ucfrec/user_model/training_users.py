@@ -5,7 +5,7 @@ drawn from that reward model, a policy is paid for its own guesses: an item that
 counts as liked and goes on paying. Here tastes are there before a session begins: those of training
 users, and nothing that acts knows them.
 
-Logs of policies that knew more of their users than the log tells make what they showed look better
+Logs of policies that knew more of their users than the log shows make what they showed look better
 than it is for anybody else. Where the log has all propensities p, rows are therefore weighted by
 1 / (p · items), cut off at 10, as if all items had been shown alike (inverse propensity weighting).
 So that a few rows of large weight do not pass for much knowledge of a user's tastes, the weights of
@@ -52,7 +52,7 @@ class TrainingUsersReport:
     steps: int
     """Logged steps that the effects are fitted to."""
     effective_steps: float
-    """As many steps of equal weight tell as much; `steps` without propensities."""
+    """As many steps of equal weight count as much; `steps` without propensities."""
     weighted: bool
     """Whether rows were weighted by propensities."""
 
@@ -89,7 +89,7 @@ def fit_training_users(train: EpisodeStore, folder: Path, seed: int) -> Training
     episodes, steps = sessions.all_steps()
     rows = RewardRows.at(sessions, episodes, steps, model.lags)
     set_statistics(model, rows, rows, train.item_states)
-    # What the session tells of tastes is known already: states are features and observations.
+    # What the session shows of tastes is known already: states are features and observations.
     of_session = train.item_states.size - train.item_states.user_features.shape[1]
     model.state_std[:of_session] = torch.inf
     weights = propensity_weights(sessions, episodes, steps, len(model.item))
@@ -123,7 +123,7 @@ def propensity_weights(
     """What logged steps (M,) count for, as if all of `items` had been shown alike.
 
     Of each user in proportion to 1 / (p · items), cut off at 10. Their sum is the number of the
-    user's steps of equal weight that tell as much, (Σ w)² / Σ w² (Kish). None if the log does not
+    user's steps of equal weight that count as much, (Σ w)² / Σ w² (Kish). None if the log does not
     have every p.
     """
     if schema.PROPENSITY not in view.record.columns:

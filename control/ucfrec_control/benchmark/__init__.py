@@ -1,1 +1,1 @@
-"""Tables of every learner on the control files."""
+"""Tables of every method on the control files."""

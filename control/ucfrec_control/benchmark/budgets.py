@@ -42,7 +42,7 @@ _FEWER: Final = {
 TRIED_RATES: Final = {"small": (2e-3, 6e-3, 2e-2), "full": (1e-4, 3e-4, 1e-3)}
 """Learning rates that are tried, by the name of the budget."""
 BUDGETS: Final = {
-    # Batches, steps and width are reduced; no file and no method is left out.
+    # Batches, steps and width are reduced; no file and no method is excluded.
     # At a quarter of the steps sequence policies are below cloning (benchmarks/LOG.md).
     # The authors' learning rates are for 50 times as many steps: see `rates.toml` instead.
     "small": Budget(

@@ -53,8 +53,8 @@ _PURSUITS = {
     "-both": ("policy.advantage_weights=true", "policy.max_return=true"),
     "-best-25": ("policy.best_share=0.25",),
 }
-"""Ways to pursue reward instead of imitating. A policy with `max_return` is asked for the largest
-return that it expects in each state."""
+"""Ways to pursue reward instead of imitating. A policy with `max_return` is conditioned on the
+largest return that it expects in each state."""
 _UCF = ("ucf", "ucf-wo-count")
 _BASELINES = ("dt-wo-time", "dc-wo-time", "lsdt-wo-time")
 

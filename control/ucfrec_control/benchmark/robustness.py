@@ -1,7 +1,7 @@
 """Scores lost by methods that were trained with a distractor (Figures 3 and 4, Appendix G.4).
 
 Every method is trained on the clean data and on the same data with a distractor in the states, and
-evaluated with the distractor fixed to 0. Two trainings also differ by chance. Evaluating the same
+evaluated with the distractor fixed to 0. Two trainings also differ randomly. Evaluating the same
 policy with the distractor fixed to 1 instead isolates the effect of the distractor.
 """
 

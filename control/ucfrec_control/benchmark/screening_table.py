@@ -97,7 +97,7 @@ def screening_rows(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
 
     `effect` and `reward_effect` are those of the distractor on the next state and on the reward.
     `weakest_true` is the smallest effect among the true dimensions, of each the larger one of the
-    two; dimensions that were not tested are left out.
+    two; dimensions that were not tested are excluded.
     """
     lines: list[dict[str, Any]] = []
     for row in rows:

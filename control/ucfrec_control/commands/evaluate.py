@@ -24,7 +24,7 @@ SHOWN = (
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `evaluate`."""
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
-    parser.add_argument("--env", help="environment to play (that of the data)")
+    parser.add_argument("--env", help="environment to evaluate in (that of the data)")
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--seed", type=seed_given, default=0)
     parser.add_argument(

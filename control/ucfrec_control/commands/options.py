@@ -54,7 +54,7 @@ def data_given(options: argparse.Namespace) -> Path:
         InputError: no folder is given.
     """
     if options.data is None:
-        raise InputError("name the folder of the HDF5 files, or --show-only for rows at hand")
+        raise InputError("name the folder of the HDF5 files, or --show-only for rows available")
     folder: Path = options.data
     return folder
 

@@ -118,7 +118,7 @@ _KINDS = ("diverse", "medium-replay", "medium-expert", "medium", "mixed", "exper
 
 
 def find_kind(name: str) -> str:
-    """Tell from a dataset's name how the data was collected.
+    """From a dataset's name, how the data was collected.
 
     Returns:
         The kind, such as `medium` or `mixed`, or "" if the name contains none.

@@ -54,7 +54,7 @@ def store_of(run: Path) -> EpisodeStore:
 
 
 def is_augmented(run: Path) -> bool:
-    """Whether edited copies were made for a run."""
+    """Whether augmented episodes were made for a run."""
     return (run / _REPORT).exists() and read_augmentation(run / _REPORT).proposals > 0
 
 
@@ -183,7 +183,9 @@ def attention(run: Path, seed: int = 0) -> Float64Array:
 
 def _augmentation(run: Path) -> AugmentationReport:
     if not is_augmented(run):
-        raise InputError(f"{run} has no edited copies; train it with augment.copies of 1 or more")
+        raise InputError(
+            f"{run} has no augmented episodes; train it with augment.copies of 1 or more"
+        )
     return read_augmentation(run / _REPORT)
 
 

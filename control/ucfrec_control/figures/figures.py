@@ -29,7 +29,7 @@ LOWS = (0.0, 0.1, 0.2, 0.3, 0.4)
 HIGHS = (0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
 """ρ_low and ρ_high of the acceptance heatmap."""
 
-_COPIES = "a run with edited copies among --runs (`ucfrec-control train --policy ucf`)"
+_COPIES = "a run with augmented episodes among --runs (`ucfrec-control train --policy ucf`)"
 NEEDS = {
     "moves": _COPIES,
     "states": _COPIES,
@@ -185,7 +185,7 @@ def _first(runs: Iterable[_Run], key: Callable[[_Run], Any]) -> Iterable[_Run]:
 
 
 def _of_copies(run: _Run, kind: str) -> Figure:
-    """A figure of the edited copies of a run."""
+    """A figure of the augmented episodes of a run."""
     if kind == "states":
         return plots.state_overlay(*diagnostics.edited_states(run.path), run.title)
     if kind == "moves":

@@ -169,7 +169,7 @@ def return_curves(rows: Sequence[Row], title: str = "") -> Figure:
     axes.set_xlim(0, 1.03 * max(targets))
     axes.set_ylim(0, 1.1 * top)
     axes.set_xlabel("target return")
-    axes.set_ylabel("return earned")
+    axes.set_ylabel("return achieved")
     axes.grid(True)
     _legend_below(figure, axes, 4)
     return figure

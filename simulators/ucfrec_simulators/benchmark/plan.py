@@ -66,7 +66,7 @@ class RecommendationCells:
                 yield from made_by[table](self._task(name, log), log)
 
     def missing(self) -> list[str]:
-        """Tasks of the main table that are left out: their files or package are missing."""
+        """Tasks of the main table that are excluded: their files or package are missing."""
         if self._request.environment is not None:
             return []
         return [name for name in self._wanted("main") if not _available(name)]

@@ -105,8 +105,8 @@ def simulators(
     """The published variants of an environment, for the command line.
 
     Args:
-        make: makes the environment of so many sessions, from a folder, with an exit rule and a
-            regime.
+        make: makes the environment of this number of sessions, from a folder, with an exit rule
+            and a regime.
         own_exit: the environment's exit rule in EasyRL4Rec.
         summary: what the environment is.
         feedback: column of the reward in the logs.

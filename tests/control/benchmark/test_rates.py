@@ -143,7 +143,7 @@ def test_a_file_of_rates_keeps_its_other_rates_and_is_checked(tmp_path: Path) ->
             read_rates(file)
     with pytest.raises(InputError, match="does not exist"):
         read_rates(tmp_path / "missing.toml")
-    # A stranger's rows may name methods of any text.
+    # Untrusted rows may name methods of any text.
     with pytest.raises(InputError, match="is no learning rate of a method"):
         write_rates(tmp_path / "new.toml", "small", {"dt\n[full]\nx": 0.1})
     assert not (tmp_path / "new.toml").exists()

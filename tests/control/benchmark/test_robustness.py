@@ -50,8 +50,8 @@ def test_the_largest_drop_of_a_method_is_over_cases_in_the_mean_over_seeds() -> 
         row("none", 50.0), row("early", 20.0), row("stochastic", 40.0),
         row("none", 100.0, seed=1), row("early", 80.0, seed=1), row("stochastic", 10.0, seed=1),
     ]  # fmt: skip
-    # Lost at 0: early 60 and 20%, stochastic 20 and 90%; at 1, where twice as much is earned: early
-    # 20 and −60%, stochastic −60 and 80%.
+    # Lost at 0: early 60 and 20%, stochastic 20 and 90%; at 1, where twice large a return is
+    # reached: early 20 and −60%, stochastic −60 and 80%.
     (line,) = largest_drops(rows)
     assert (line["method"], line["at 0"], line["at 1"]) == (
         "dt",

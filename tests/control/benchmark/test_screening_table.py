@@ -121,7 +121,7 @@ def test_every_file_is_screened_plain_and_distracted_once(
         assert added == ([] if kind == "none" else [11])
     printed, before = capsys.readouterr().out, results.read_text()
     effect = rows["early"].details["screening"][11]["effect"]
-    # Nothing tells of these rewards, so that only measurements of them are tested.
+    # Nothing shows these rewards, so that only measurements of them are tested.
     assert (NONE if effect is None else f"{effect:#.3g}") in printed
     assert main(arguments) == 0
     assert results.read_text() == before

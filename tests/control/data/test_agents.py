@@ -83,7 +83,7 @@ class _Trap:
 
 
 def rewritten(file: Path, out: Path, **parts: bytes | None) -> Path:
-    """A copy of a zip file with some parts replaced, or left out."""
+    """A copy of a zip file with some parts replaced, or excluded."""
     changed = {name.replace("_", "."): content for name, content in parts.items()}
     with zipfile.ZipFile(file) as old, zipfile.ZipFile(out, "w") as new:
         for name in old.namelist():

@@ -149,14 +149,14 @@ def test_an_interrupted_collection_ends_as_an_uninterrupted_one(
     collected: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     evaluations = 0
-    judge = module._evaluate
+    evaluated = module._evaluate
 
     def interrupted(*given: object) -> None:
         nonlocal evaluations
         evaluations += 1
         if evaluations == 3:
             raise KeyboardInterrupt
-        judge(*given)  # type: ignore[arg-type]
+        evaluated(*given)  # type: ignore[arg-type]
 
     monkeypatch.setattr(module, "_evaluate", interrupted)
     with pytest.raises(KeyboardInterrupt):

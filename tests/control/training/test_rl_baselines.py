@@ -100,31 +100,31 @@ def test_equal_seeds_train_equal_actors_that_are_judged_as_others_are(
     assert "keep their last checkpoint only" in capsys.readouterr().err
 
 
-def learner_of(task: str, kind: str, algorithm: str = "cql", **settings: float) -> Any:
+def agent_of(task: str, kind: str, algorithm: str = "cql", **settings: float) -> Any:
     with random_state_kept():
-        learner = rl_baselines._algorithm(RLConfig(algorithm, 10, task, kind, **settings))
-        learner.create_impl((29,), 8)
-    return learner
+        agent = rl_baselines._algorithm(RLConfig(algorithm, 10, task, kind, **settings))
+        agent.create_impl((29,), 8)
+    return agent
 
 
 def test_cql_has_the_settings_of_corl() -> None:
     scalers = {
-        (task, kind): type(learner_of(task, kind).config.reward_scaler).__name__
+        (task, kind): type(agent_of(task, kind).config.reward_scaler).__name__
         for task in ("hopper", "walker2d")
         for kind in ("medium", "mixed", "medium-expert")
     }
     assert {key for key, name in scalers.items() if name != "NoneType"} == {("hopper", "medium")}
     assert scalers["hopper", "medium"] == "ReturnBasedRewardScaler"
     for task, hidden in (("walker2d", 3), ("antmaze", 5)):
-        modules = learner_of(task, "medium").impl.modules
+        modules = agent_of(task, "medium").impl.modules
         for critic in modules.q_funcs:
             assert sum(isinstance(m, torch.nn.Linear) for m in critic.modules()) == hidden + 1
         actor = [m for m in modules.policy.modules() if isinstance(m, torch.nn.Linear)]
         assert len(actor) == 3 + 2  # mean and deviation
-    learner = learner_of("antmaze", "diverse")
-    assert (learner.config.reward_scaler.shift, learner.config.reward_scaler.multiplier) == (-5, 10)
-    assert learner.config.alpha_learning_rate == learner.config.critic_learning_rate
-    for config in (learner.config, learner_of("walker2d", "medium").config):
+    agent = agent_of("antmaze", "diverse")
+    assert (agent.config.reward_scaler.shift, agent.config.reward_scaler.multiplier) == (-5, 10)
+    assert agent.config.alpha_learning_rate == agent.config.critic_learning_rate
+    for config in (agent.config, agent_of("walker2d", "medium").config):
         assert config.temp_learning_rate == config.actor_learning_rate
 
 
@@ -134,7 +134,7 @@ def test_all_rates_keep_their_proportion(algorithm: str, task: str) -> None:
     usual, ten = (
         {
             name: rate
-            for name, rate in vars(learner_of(task, "medium", algorithm, **settings).config).items()
+            for name, rate in vars(agent_of(task, "medium", algorithm, **settings).config).items()
             if name.endswith("learning_rate")
         }
         for settings in ({}, {"learning_rate": 3e-3})
@@ -145,7 +145,7 @@ def test_all_rates_keep_their_proportion(algorithm: str, task: str) -> None:
 
 def test_steps_of_antmaze_count_no_less_than_the_clip() -> None:
     """Where the logged action is valued far above all others, the gap is held at −200."""
-    impl = learner_of("antmaze", "diverse").impl
+    impl = agent_of("antmaze", "diverse").impl
     states, actions, none = torch.zeros(4, 29), torch.zeros(4, 8), torch.zeros(4, 1)
 
     def gap() -> torch.Tensor:
@@ -206,7 +206,7 @@ def test_the_benchmark_finds_its_rl_rows_again(
     printed = capfd.readouterr()
     assert "1 cells, 1 of them left" in printed.err
     assert "1 cells, 0 of them left" in printed.err
-    # Neither here nor in the workers does d3rlpy tell of its trainings.
+    # Neither here nor in the workers does d3rlpy report its trainings.
     assert "[info" not in re.sub(r"\x1b\[[\d;]*m", "", printed.out)
 
 

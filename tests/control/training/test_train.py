@@ -81,7 +81,7 @@ def test_evaluate_writes_last_and_best_apart(
 
 
 def test_the_best_checkpoint_is_played_whichever_step_it_is_of(folder: Path) -> None:
-    """Asked for together with the last, it may be the same; it earns what it earns alone."""
+    """Asked for together with the last, it may be the same; it has the return that it has alone."""
     run = folder / "store-run"
     both = evaluate_run(run, episodes=2, seed=0, targets=(3600.0,))
     (best,) = evaluate_run(run, episodes=2, seed=0, targets=(3600.0,), checkpoints=("best",))
@@ -172,14 +172,14 @@ def test_a_policy_with_a_distractor_is_judged_at_zero(folder: Path, tmp_path: Pa
 def test_policies_that_know_their_largest_return_are_asked_for_it(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Every sequence learner takes the settings that pursue reward, with vector actions."""
+    """Every sequence policy takes the settings that pursue reward, with vector actions."""
     pursue = ["policy.advantage_weights=true", "policy.max_return=true", "policy.best_share=0.5"]
     own = {"lsdt": ["policy.kernel_groups=4"], "ucf": ["crm.epochs=1", "csg.epochs=1"]}
     store = EpisodeStore.open(folder / "store")
-    for learner in ("dt", "dc", "lsdt", "ucf"):
-        settings = [*TINY, *pursue, "policy.max_timestep=1", *own.get(learner, [])]
-        run = tmp_path / learner
-        record = train_control(store, run, resolve_config(learner, None, settings))
+    for policy_name in ("dt", "dc", "lsdt", "ucf"):
+        settings = [*TINY, *pursue, "policy.max_timestep=1", *own.get(policy_name, [])]
+        run = tmp_path / policy_name
+        record = train_control(store, run, resolve_config(policy_name, None, settings))
         losses = read_metrics(run / "policy")
         assert losses["value_loss"]
         assert record.finished.steps == 4

@@ -69,7 +69,7 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     results = tmp_path / "rows.jsonl"
     request = BenchmarkRequest("small", ["main"], tmp_path / "out", results, 1)
     said = measured(suite, request)
-    assert "kuairand is left out" in said
+    assert "kuairand is excluded" in said
     rows = read_rows(results)
     built_in = [(name, None, None) for name in ("random", "mixture", "optimal")]
     # Seed by seed, so that an interrupted table is one of fewer seeds.
@@ -110,7 +110,7 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     assert measured(suite, request) == said
     assert len(read_rows(results)) == len(rows)
     assert show(suite, ["main", "sweeps"], rows) in said
-    # Trained and played again: the same numbers.
+    # Trained and simulated again: the same numbers.
     monkeypatch.setattr(plan, "METHODS", {"popular": METHODS["popular"]})
     weights = [path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("best.safetensors")]
     measured(suite, replace(request, again=True))
@@ -367,7 +367,7 @@ def test_unknown_cells_are_refused(given: dict[str, Any], message: str, tmp_path
 
 def test_one_task_has_the_cells_of_its_methods_alone(tmp_path: Path) -> None:
     budget = replace(BUDGETS["small"], seeds=1, logs=1, sessions=60)
-    # The second is no task of the budget, but was asked for.
+    # The second is no task of the budget, but was requested.
     for task in ("synthetic-catalog", "synthetic-taobao"):
         plan = planned(tmp_path, budget, tasks=[task])
         assert {cell.task for cell in plan.cells("main")} == {task}

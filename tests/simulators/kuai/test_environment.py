@@ -130,7 +130,7 @@ def test_random_items_have_no_tag_of_the_last_ten_and_are_otherwise_uniform() ->
         tags.append(items % 20)
         env.step(items)
     shown = np.stack(tags[:11])
-    assert all(len(set(session)) == 11 for session in shown.T), "ten steps are left out"
+    assert all(len(set(session)) == 11 for session in shown.T), "ten steps are excluded"
     left = np.array([len(set(session)) for session in np.stack(tags).T])
     assert (left == 11).any(), "the eleventh tag before may come again"
     counts = np.bincount(np.concatenate(tags), minlength=20) / (12 * 4000)

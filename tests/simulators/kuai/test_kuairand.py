@@ -93,10 +93,10 @@ def test_the_same_seed_gives_the_same_files_and_nothing_is_left_of_a_failure(
 def test_real_rows_make_a_environment_that_can_be_believed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Judged by 29–30 April; what policies learn from, the days before, stays out."""
+    """Evaluated on 29–30 April; what policies learn from, the days before, stays out."""
     source = data_folder("kuairand")
     log = pd.read_parquet(next(source.glob("log_*.parquet")))
-    folder = tmp_path / "judge"
+    folder = tmp_path / "later"
     folder.mkdir()
     log[log["date"] >= 20220429].to_parquet(folder / "log_standard_judge_pure.parquet")
     basic = folder / "video_features_basic_pure.csv"

@@ -1,4 +1,4 @@
-"""Logs of a DDPG learner: exact densities, what it learned from is what is logged, it learns."""
+"""Logs of a DDPG agent: exact densities, what it learned from is what is logged, it learns."""
 
 from pathlib import Path
 from typing import Any
@@ -78,11 +78,11 @@ def test_draws_follow_the_density(mean: float) -> None:
 def test_what_it_learns_from_is_what_is_logged() -> None:
     need_sb3()
     env = SyntheticTaobao(16)
-    learner = ddpg.training(env, 0, SMALL)
+    agent = ddpg.training(env, 0, SMALL)
     steps: list[Step] = []
-    rollout(env, learner, 200, 0, steps.append)
-    buffer, high = learner._model.replay_buffer, env.single_observation_space.high
-    # All but the very last step, whose outcome nobody waited for.
+    rollout(env, agent, 200, 0, steps.append)
+    buffer, high = agent._model.replay_buffer, env.single_observation_space.high
+    # All but the very last step, whose outcome no one waited for.
     logged = {
         name: np.concatenate([getattr(step, name) for step in steps[:-1]])
         for name in ("observations", "actions", "rewards", "terminated", "next_observations")
@@ -100,7 +100,7 @@ def test_what_it_learns_from_is_what_is_logged() -> None:
 
 
 class Slope(SyntheticTaobao):
-    """Clicks rise linearly towards one corner of the box: 0.5 to 9.5 a page, 5 by chance."""
+    """Clicks rise linearly towards one corner of the box: 0.5 to 9.5 per page, 5 at random."""
 
     corner = np.where(np.arange(27) % 3 == 0, -1.0, 1.0)
 

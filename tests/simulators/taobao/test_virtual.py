@@ -104,7 +104,7 @@ def test_every_step_agrees_with_the_original(folder: Path) -> None:
     actor = np.random.default_rng(1)
     ends = 0
     for _ in range(steps):
-        # Small actions earn clicks now and then, so that more than zeros are compared.
+        # Small actions get clicks now and then, so that more than zeros are compared.
         actions = actor.normal(0, 0.1, (n, 27)).astype(np.float32)
         observations, rewards, terminated, truncated, info = env.step(actions)
         uniforms = draws.random((n, 2))

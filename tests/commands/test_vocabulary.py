@@ -1,9 +1,11 @@
-"""Documentation uses the words of the field; what remains of other words is right in its sentence.
+"""Documentation, help and messages use the words of the field; what remains of other words is right
+in its sentence.
 
 `PHRASES` lists words that readers outside the project stumble over, each with what to write. A page
 may have a few hits, because a word can be right in one sentence and odd in another.
 """
 
+import ast
 import json
 import re
 from collections.abc import Iterator
@@ -11,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.markdown import ROOT
+from tests.support.markdown import PROGRAMS, ROOT
+from ucfrec.commands.cli import Program, build_parser
 
 PHRASES = {
     r"\btilt(s|ed|ing)?\b": "reward weight",
@@ -41,6 +44,8 @@ PHRASES = {
     r"\bthe (logs|log) (tell|say|know)s?\b": "the log shows, supports",
 }
 """Pattern to what to write instead."""
+SAYING = {"InputError", "InputNote", "SettingError", "print", "_say", "warn"}
+"""Functions and errors whose texts users read."""
 MOST = {"SECURITY.md": 0, "README.md": 0, "CONTRIBUTING.md": 0}
 """Hits that a text may have; `MOST_HITS` for others."""
 MOST_HITS = 2
@@ -73,17 +78,48 @@ def _prose(path: Path) -> str:
 
 @pytest.mark.parametrize(("name", "text"), list(_texts()), ids=lambda value: value[:40])
 def test_the_words_are_those_of_the_field(name: str, text: str) -> None:
-    hits = [
+    hits = _hits(text)
+    assert len(hits) <= MOST.get(name, MOST_HITS), "\n".join(hits)
+
+
+def _hits(text: str) -> list[str]:
+    return [
         f"{found[0]!r} in {_line(text, found.start())!r}: write {better}"
         for pattern, better in PHRASES.items()
         for found in re.finditer(pattern, text, flags=re.IGNORECASE)
     ]
-    assert len(hits) <= MOST.get(name, MOST_HITS), "\n".join(hits)
 
 
 def _line(text: str, at: int) -> str:
     start = text.rfind("\n", 0, at) + 1
     return text[start : start + 90].splitlines()[0]
+
+
+@pytest.mark.parametrize(
+    ("program", "command"),
+    [(program, name) for program in PROGRAMS.values() for name in program.commands],
+    ids=lambda value: value if isinstance(value, str) else value.name,
+)
+def test_help_uses_them(program: Program, command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        build_parser(program, [command]).parse_args([command, "--help"])
+    assert _hits(" ".join(capsys.readouterr().out.split())) == []
+
+
+def _messages(file: Path) -> Iterator[str]:
+    """Texts of the errors and notes that a file raises, and of all that it prints."""
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in SAYING:
+            said = [each for argument in node.args for each in ast.walk(argument)]
+            texts = [each.value for each in said if isinstance(each, ast.Constant)]
+            yield "".join(text for text in texts if isinstance(text, str))
+
+
+@pytest.mark.parametrize("package", ["ucfrec", "datasets", "simulators", "control"])
+def test_messages_use_them(package: str) -> None:
+    messages = [each for file in (ROOT / package).rglob("*.py") for each in _messages(file)]
+    assert messages
+    assert [hit for message in messages for hit in _hits(message)] == []
 
 
 def test_a_hit_is_found() -> None:

@@ -1,0 +1,116 @@
+"""What a server showed is in its files: whole ones, and all of them once it is told to stop."""
+
+import json
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from tests.support.served import histories, requests_of, responder, trained_run, with_rule
+from ucfrec.commands.cli import main
+from ucfrec.recommending.exposures import ExposureLog
+from ucfrec.recommending.requests import Request
+from ucfrec.recommending.responder import Answer
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
+    return trained_run(tmp_path_factory.mktemp("exposures"))
+
+
+def answers(trained: TrainedPolicy) -> dict[int, Answer]:
+    by = responder(trained, k=3, rule=with_rule(trained, temperature=1.0))
+    requests = [Request.model_validate(each) for each in requests_of(histories(users=4))]
+    found = by.answers(requests)
+    assert all(isinstance(answer, Answer) for answer in found)
+    return {int(r.user_id): a for r, a in zip(requests, found, strict=True)}  # type: ignore[misc]
+
+
+def rows_of(given: dict[int, Answer]) -> list[tuple[object, ...]]:
+    return [
+        (str(user), item, answer.request_id, position, propensity, answer.run, answer.rule)
+        for user, answer in given.items()
+        for position, (item, propensity) in enumerate(
+            zip(answer.items, answer.propensities, strict=True), 1
+        )
+    ]
+
+
+def read(folder: Path) -> list[tuple[object, ...]]:
+    frame = pd.concat([pd.read_parquet(file) for file in sorted(folder.glob("*.parquet"))])
+    assert frame.timestamp.between((time.time() - 600) * 1000, time.time() * 1000).all()
+    return list(frame.drop(columns="timestamp").itertuples(index=False, name=None))
+
+
+def test_what_waits_is_written_when_the_log_is_closed(
+    trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    given = answers(trained)
+    with ExposureLog(tmp_path / "shown", trained) as log:
+        for user, answer in given.items():
+            log.add(user, answer)
+        assert not list((tmp_path / "shown").iterdir())
+    assert read(tmp_path / "shown") == rows_of(given)
+
+
+def test_files_rotate_by_size_and_by_time(trained: TrainedPolicy, tmp_path: Path) -> None:
+    given = answers(trained)
+
+    def files_before_the_end(folder: Path, **limits: float) -> int:
+        with ExposureLog(folder, trained, **limits) as log:  # type: ignore[arg-type]
+            for user, answer in given.items():
+                log.add(user, answer)
+                time.sleep(0.1)
+            deadline = time.monotonic() + 20
+            while not (found := len(list(folder.glob("*.parquet")))) and (
+                time.monotonic() < deadline
+            ):
+                time.sleep(0.01)
+        assert sorted(read(folder)) == sorted(rows_of(given))
+        return found
+
+    assert files_before_the_end(tmp_path / "size", rows=3) >= 1
+    assert files_before_the_end(tmp_path / "time", seconds=0.05) >= 1
+
+
+def test_a_folder_that_cannot_be_written_loses_nothing_once_it_can(
+    trained: TrainedPolicy, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given, folder = answers(trained), tmp_path / "shown"
+    with ExposureLog(folder, trained, rows=1, seconds=0.05) as log:
+        folder.rmdir()
+        folder.write_text("in the way")
+        for user, answer in given.items():
+            log.add(user, answer)
+        time.sleep(0.5)
+        folder.unlink()
+        folder.mkdir()
+    assert sorted(read(folder)) == sorted(rows_of(given))
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def test_recommend_writes_the_exposures_of_its_recommendations(
+    trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    histories().to_parquet(tmp_path / "log.parquet")
+    out, shown = tmp_path / "out.parquet", tmp_path / "shown.parquet"
+    arguments = ["recommend", str(trained.folder), str(tmp_path / "log.parquet"), "--k", "4"]
+    arguments += ["--temperature", "1", "--seed", "3", "--out", str(out)]
+    assert main([*arguments, "--exposures", str(shown)]) == 0
+    recommended, exposures = pd.read_parquet(out), pd.read_parquet(shown)
+    assert exposures.user_id.tolist() == recommended.user_id.astype(str).tolist()
+    assert exposures.position.tolist() == recommended["rank"].tolist()
+    for name in ("item_id", "propensity", "request_id"):
+        assert exposures[name].tolist() == recommended[name].tolist()
+    assert set(exposures.run) == {trained.fingerprint}
+    assert set(exposures.rule) == {with_rule(trained, temperature=1.0).hash}
+
+
+def test_an_answer_carries_propensities_and_where_it_is_from(trained: TrainedPolicy) -> None:
+    for user, answer in answers(trained).items():
+        told = json.loads(json.dumps(answer.as_dict(user)))
+        assert [item["propensity"] for item in told["items"]] == answer.propensities
+        assert told["request_id"] == answer.request_id
+        assert told["run"] == trained.fingerprint

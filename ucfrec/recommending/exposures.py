@@ -1,0 +1,192 @@
+"""What was shown to whom, with its probability: the Parquet files that `ucfrec join` reads."""
+
+import sys
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+from uuid import uuid4
+
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from ucfrec import schema
+from ucfrec.errors import InputError
+from ucfrec.files.atomic import atomic_file
+from ucfrec.recommending.recommend import RANK, REQUEST_ID
+from ucfrec.recommending.responder import Answer
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+POSITION: Final = "position"
+RUN: Final = "run"
+RULE: Final = "rule"
+_ROWS: Final = 50_000
+_SECONDS: Final = 60.0
+_MOST_WAITING: Final = 20
+"""Files' worth of rows that wait while the disk cannot be written; later ones are lost."""
+
+
+def exposure_schema(trained: TrainedPolicy) -> pa.Schema:
+    """Columns of exposures: users are text, as any client names them; items as in the run."""
+    assert trained.item_ids is not None
+    item = pa.int64() if trained.item_ids.dtype.kind in "iu" else pa.string()
+    return pa.schema(
+        [
+            (schema.USER_ID, pa.string()),
+            (schema.ITEM_ID, item),
+            (schema.TIMESTAMP, pa.int64()),
+            (REQUEST_ID, pa.string()),
+            (POSITION, pa.int32()),
+            (schema.PROPENSITY, pa.float64()),
+            (RUN, pa.string()),
+            (RULE, pa.string()),
+        ]
+    )
+
+
+@contextmanager
+def exposures_written(
+    path: Path, trained: TrainedPolicy, rule: str, frames: Iterable[pd.DataFrame]
+) -> Iterator[Iterator[pd.DataFrame]]:
+    """Yield the same frames, which are also written to a file, whole once the block ends.
+
+    Args:
+        path: Parquet file.
+        trained: whose recommendations they are.
+        rule: hash of the decision rule.
+        frames: of `recommend`.
+    """
+    columns, now = exposure_schema(trained), int(time.time() * 1000)
+
+    def passed() -> Iterator[pd.DataFrame]:
+        for frame in frames:
+            shown = frame.rename(columns={RANK: POSITION})
+            shown[RUN], shown[RULE], shown[schema.TIMESTAMP] = trained.fingerprint, rule, now
+            shown[schema.USER_ID] = shown[schema.USER_ID].astype(str)
+            table = pa.Table.from_pandas(shown[columns.names], columns, preserve_index=False)
+            writer.write_table(table)
+            yield frame
+
+    with ExitStack() as stack:
+        scratch = stack.enter_context(atomic_file(path))
+        writer = stack.enter_context(pq.ParquetWriter(scratch, columns))
+        yield passed()
+
+
+class ExposureLog:
+    """Writes the exposures of a server to files of a folder, in a thread of its own.
+
+    A file appears whole, once there are enough rows or the oldest has waited long enough, and when
+    the log is closed. What waits is in memory: a killed process loses it.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        trained: TrainedPolicy,
+        rows: int = _ROWS,
+        seconds: float = _SECONDS,
+    ) -> None:
+        """
+        Args:
+            folder: made if it is missing.
+            trained: whose answers they are.
+            rows: from so many on a file is written.
+            seconds: after so long, a file is written if there are any rows.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        self._folder, self._schema = folder, exposure_schema(trained)
+        self._rows, self._seconds = rows, seconds
+        self._waiting: list[tuple[str, int, Answer]] = []
+        self._count, self._lost = 0, 0
+        self._lock, self._wake, self._closed = threading.Lock(), threading.Event(), False
+        self._thread = threading.Thread(target=self._run, name="exposures", daemon=True)
+        self._thread.start()
+
+    def add(self, user_id: int | str, answer: Answer) -> None:
+        """Remember an answer that is given now; takes microseconds."""
+        now, size = int(time.time() * 1000), len(answer.items)
+        with self._lock:
+            if self._count > _MOST_WAITING * self._rows:
+                self._lost += size
+                return
+            self._waiting.append((str(user_id), now, answer))
+            self._count += size
+            full = self._count >= self._rows
+        if full:
+            self._wake.set()
+
+    def close(self) -> None:
+        """Write what waits, and end the thread."""
+        self._closed = True
+        self._wake.set()
+        self._thread.join()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _run(self) -> None:
+        closed = False
+        while not closed:
+            self._wake.wait(self._seconds)
+            # Read first: what is added before the log is closed is written.
+            closed = self._closed
+            self._wake.clear()
+            self._flush(last=closed)
+
+    def _flush(self, last: bool) -> None:
+        with self._lock:
+            waiting, self._waiting, count, self._count = self._waiting, [], self._count, 0
+            lost, self._lost = self._lost, 0
+        if lost:
+            _warn(f"{lost:,} rows are lost, as too many waited to be written")
+        if not count:
+            return
+        name = f"exposures-{datetime.now(UTC):%Y%m%dT%H%M%S}-{uuid4().hex[:12]}.parquet"
+        try:
+            with atomic_file(self._folder / name) as scratch:
+                pq.write_table(self._table(waiting), scratch)
+        except (OSError, InputError, pa.ArrowException) as error:
+            ends = "are lost" if last else "wait"
+            _warn(f"{self._folder / name} cannot be written: {error}; {count:,} rows {ends}")
+            if last:
+                return
+            with self._lock:
+                self._waiting = waiting + self._waiting
+                self._count += count
+            # A full log would otherwise try again at every answer.
+            time.sleep(min(1.0, self._seconds))
+
+    def _table(self, waiting: list[tuple[str, int, Answer]]) -> pa.Table:
+        columns: dict[str, list[object]] = {name: [] for name in self._schema.names}
+        for user_id, now, answer in waiting:
+            shown = len(answer.items)
+            columns[schema.ITEM_ID] += answer.items
+            columns[schema.PROPENSITY] += answer.propensities
+            columns[POSITION] += range(1, shown + 1)
+            for name, value in (
+                (schema.USER_ID, user_id),
+                (schema.TIMESTAMP, now),
+                (REQUEST_ID, answer.request_id),
+                (RUN, answer.run),
+                (RULE, answer.rule),
+            ):
+                columns[name] += [value] * shown
+        return pa.table(columns, self._schema)
+
+
+def _warn(message: str) -> None:
+    print(f"ucfrec: exposures: {message}", file=sys.stderr, flush=True)

@@ -1,10 +1,15 @@
 """The value per step from a randomised slice of the steps, against its known truth."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.support.served import trained_run
+from tests.support.tagged import tagged_log
+from ucfrec.commands.cli import main
 from ucfrec.off_policy.logged_steps import LoggedSteps, Modelled
 from ucfrec.off_policy.per_step import StepValue, step_value
 
@@ -82,3 +87,22 @@ def test_there_is_none_where_all_steps_or_none_have_propensities() -> None:
     assert step_value(replace(logs(3), model=None), 0) is None
     never = logs(3)
     assert step_value(replace(never, target=np.zeros_like(never.target)), 0) is None
+
+
+def test_ope_estimates_per_step_from_a_randomised_slice_and_refuses_sessions(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trained = trained_run(tmp_path, "dt")
+    log, rng = tagged_log(), np.random.default_rng(0)
+    log["propensity"] = np.where(rng.random(len(log)) < 0.3, 1 / 24, np.nan)
+    log.to_parquet(tmp_path / "log.parquet")
+    files = [str(tmp_path / "log.parquet"), "--json", str(tmp_path / "ope.json")]
+    assert main(["ope", str(trained.folder), *files, "--temperature", "1"]) == 0
+    printed = capsys.readouterr().out
+    assert "R_step" in printed
+    assert "steps with a propensity" in printed
+    assert "verdict: Do not rely on this estimate" in printed
+    rows = json.loads((tmp_path / "ope.json").read_text())
+    by_step = [row for row in rows if row["table"] == "per step"]
+    assert [row["method"] for row in by_step] == ["logged", "IPS", "SNIPS", "DR"]
+    assert all(row["metric"] == "R_step" and row["interval"] for row in by_step)

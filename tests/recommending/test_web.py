@@ -61,7 +61,15 @@ def test_answers_are_those_of_the_command_and_share_passes(
 ) -> None:
     log = histories()
     log.to_parquet(tmp_path / "log.parquet")
-    rule = ["--max-return", "--target-floor", "0.1", "--reward-weight", "0.7", "--tag-window", "2"]
+    rule = [
+        "--max-return",
+        "--minimum-target",
+        "0.1",
+        "--reward-weight",
+        "0.7",
+        "--tag-window",
+        "2",
+    ]
     arguments = [str(trained.folder), str(tmp_path / "log.parquet"), "--exclude-seen", *rule]
     assert main(["recommend", *arguments, "--out", str(tmp_path / "out")]) == 0
     by = responder(trained, rule=FULL)
@@ -219,7 +227,7 @@ def test_the_pages_describe_the_requests_and_load_nothing_from_elsewhere(
     assert health.json()["rule_hash"] == trained.rule.hash
     body = described.json()["paths"]["/recommendations"]["post"]["requestBody"]
     properties = body["content"]["application/json"]["schema"]["properties"]
-    assert properties.keys() == {"user_id", "history", "k", "candidates"}
+    assert properties.keys() == {"user_id", "history", "k", "candidates", "request_id"}
     assert "timestamp" in properties["history"]["items"]["required"]
     assert page.status_code == 200
     assert "https://" not in page.text

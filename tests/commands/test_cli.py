@@ -133,7 +133,8 @@ def test_recommend_ranks_for_known_and_new_users(folder: Path, tmp_path: Path) -
     out = tmp_path / "top.parquet"
     assert main([*arguments, "--k", "7", "--temperature", "0", "--out", str(out)]) == 0
     top = pd.read_parquet(out)
-    assert list(top.columns) == ["user_id", "rank", "item_id", "score"]
+    assert list(top.columns[:4]) == ["user_id", "rank", "item_id", "score"]
+    assert (top.propensity == 1).all()  # the best items, for certain
     assert set(top.user_id) == {*log.user_id, 10**6}
     assert (top.groupby("user_id")["rank"].apply(list).map(lambda r: r == [*range(1, 8)])).all()
     assert (top.groupby("user_id").score.diff().dropna() <= 0).all()

@@ -48,7 +48,7 @@ class Net(SequencePolicy):
     def __init__(self, store: EpisodeStore, read: Callable[["Net", Windows], Tensor]) -> None:
         items = len(store.item_states.embeddings) if store.has_items else 0
         action = (
-            store.item_states.embeddings.shape[1] if items else store.meta["columns"]["action"][0]
+            store.item_states.embeddings.shape[1] if items else store.record.columns["action"][0]
         )
         sizes = {"state": store.state_size, "action": action, "items": items}
         super().__init__(PolicyConfig(context=6, dim=16, dropout=0.0), sizes)

@@ -238,8 +238,7 @@ def test_logs_are_cut_where_their_users_would_have_left(rule: ExitRule) -> None:
 
 def known_items(ids: list[Any]) -> Any:
     """As much of a trained policy of items as finding their numbers takes."""
-    sizes = {"items": len(ids), "action": 3}
-    record = {"sizes": sizes, "observation_size": 0}
+    record = SimpleNamespace(sizes={"items": len(ids), "action": 3}, observation_size=0)
     return SimpleNamespace(record=record, item_ids=np.array(ids), logged_observation_size=0)
 
 

@@ -2,9 +2,9 @@
 
 import argparse
 import os
+from typing import TYPE_CHECKING
 
 from ucfrec.benchmark.grid import chosen
-from ucfrec.benchmark.suite import Benchmark, BenchmarkRequest, measure, show
 from ucfrec.commands.grid_options import (
     budget_options,
     grid_options,
@@ -15,6 +15,9 @@ from ucfrec.commands.grid_options import (
 from ucfrec.commands.options import env_options, environment_given
 from ucfrec.plugins import load_plugin
 from ucfrec.results.rows_file import benchmarking
+
+if TYPE_CHECKING:
+    from ucfrec.benchmark.suite import Benchmark
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -56,6 +59,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec benchmark`: measure what is missing, then print the tables."""
+    from ucfrec.benchmark.suite import BenchmarkRequest, measure, show
+
     suite: Benchmark = load_plugin("benchmarks", options.suite)
     tables, results = chosen(suite.tables, options.table, "table"), results_given(options)
     if options.show_only:

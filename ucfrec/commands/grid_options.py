@@ -4,13 +4,17 @@ import argparse
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from ucfrec.benchmark.cells import Cell
-from ucfrec.benchmark.estimate import Costs, announcement
-from ucfrec.benchmark.grid import Measurement, run_grid
+from ucfrec.benchmark.grid import run_grid
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import benchmarking, latest, read_rows
+
+if TYPE_CHECKING:
+    from ucfrec.benchmark.cells import Cell
+    from ucfrec.benchmark.estimate import Costs
+    from ucfrec.benchmark.grid import Measurement
 
 
 def grid_options(parser: argparse.ArgumentParser, out: str, workers: int) -> None:
@@ -143,9 +147,9 @@ def rows_of(
     options: argparse.Namespace,
     suite: str,
     tables: Sequence[str],
-    cells: Callable[[], Iterable[Cell]],
-    how: Measurement[Cell],
-    costs: Callable[[], Costs] | None = None,
+    cells: "Callable[[], Iterable[Cell]]",
+    how: "Measurement[Cell]",
+    costs: "Callable[[], Costs] | None" = None,
     describe: str = "",
 ) -> list[ResultRow]:
     """The rows that a command shows: with --show-only those of --results, else those of `cells`,
@@ -163,6 +167,8 @@ def rows_of(
     Raises:
         InputError: as `rows_given`, as `cells`, or as `run_grid`.
     """
+    from ucfrec.benchmark.estimate import announcement
+
     if options.show_only:
         return rows_given(options, suite, tables)
     results = results_given(options)

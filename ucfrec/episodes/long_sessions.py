@@ -1,16 +1,17 @@
 """Sessions that are much longer than most, as those of bots are."""
 
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ucfrec.episodes.store import EpisodeStore
+if TYPE_CHECKING:
+    from ucfrec.episodes.store import EpisodeStore
 
 LONG: Final = 100
 """Times the median from which on a session is hardly a person's."""
 
 
-def of_people(view: EpisodeStore) -> EpisodeStore:
+def of_people(view: "EpisodeStore") -> "EpisodeStore":
     """The view without sessions of more than `LONG` times the median number of steps.
 
     One session of thousands of steps would otherwise set the largest target return, be a good part

@@ -118,7 +118,7 @@ def test_other_actions_alone_on_the_command_line(
     main([*command, *(text for setting in settings for text in ("--set", setting))])
     printed = capsys.readouterr().out
     report = json.loads((tmp_path / "run" / "run.json").read_text())["augmentation"]
-    assert f"other actions {report['actions']['copies']:,} copies" in printed
+    assert f"other actions {report['actions']['copies']:,} augm" in printed
     assert "acceptance" not in printed
     assert (report["copies"], report["proposals"]) == (0, 0)
     assert not (tmp_path / "run" / "csg").exists()

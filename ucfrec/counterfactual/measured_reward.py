@@ -20,7 +20,6 @@ from typing import Annotated, Final
 import numpy as np
 import torch
 from pydantic import Field
-from scipy import stats
 from torch import Tensor
 
 from ucfrec.arrays import BoolArray, Float32Array, Float64Array, IntArray
@@ -228,6 +227,8 @@ def clustered_p_value(differences: Tensor, episodes: IntArray) -> float:
         differences: (B,).
         episodes: (B,) of which episode each is.
     """
+    from scipy import stats  # takes long to import
+
     _, cluster = np.unique(episodes, return_inverse=True)
     counts = np.bincount(cluster)
     values = differences.double().numpy()

@@ -229,7 +229,9 @@ class RunRecord(TrainingRecord):
     def is_of(self, store: StoreRecord) -> bool:
         """Whether the run was trained on a store: on the same steps and item states."""
         states = [each.files.get(ITEM_STATES) for each in (self, store)]
-        return self.fingerprint == store.fingerprint and states[0] == states[1]
+        # A store whose states a caller made lists no file of them.
+        same_states = None in states or states[0] == states[1]
+        return self.fingerprint == store.fingerprint and same_states
 
     def learned_nothing(self, logged: Container[str]) -> str:
         """A warning if a policy of items predicts logged choices no better than popularity does.

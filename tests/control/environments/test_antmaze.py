@@ -188,7 +188,8 @@ def test_runs_on_d4rl_files_are_judged_in_d4rls_environment(
     assert "0.0 [0.0, 0.0]" in said.out
     assert f"warning: {REBUILT} is rebuilt" in said.err
     (row,) = json.loads(out.read_text())
-    assert (row["env_id"], row["length"], row["score"]) == (REBUILT, 700, 0)
+    found = (row["environment"], row["metrics"]["length"], row["metrics"]["score"])
+    assert found == (REBUILT, 700, 0)
     assert main([*asked, "--env", "AntMaze_UMaze-v5"]) == 2
     assert "have sizes (107, 8)" in capsys.readouterr().err
 

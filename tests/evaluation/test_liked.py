@@ -7,15 +7,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from ucfrec.reporting.evaluation_rows import read_evaluations
 
 from ucfrec import schema
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.liked import LikedByRange, LikedExpression
+from ucfrec.evaluation.ranking import MEASURES
 from ucfrec.files.atomic import write_sealed_json
 from ucfrec.logs.expressions import Expression
+from ucfrec.results.rows_file import read_results
 
 SETTINGS = ["train.steps=20", "train.validate_every=10", "policy.dim=8", "policy.context=4"]
 SETTINGS += ["rule.choose=false", "augment.copies=0"]
@@ -84,9 +85,10 @@ def test_the_default_states_its_threshold(folder: Path) -> None:
 
 
 def ranked(folder: Path, out: Path, *arguments: str) -> pd.DataFrame:
-    """Rows of `rank --json`, which every JSON reader takes."""
+    """Rows of `rank --json`, which every JSON reader takes; what is undefined is not in them."""
     assert main(["rank", str(folder / "run"), *arguments, "--k", "5", "--json", str(out)]) == 0
-    return pd.DataFrame(json.loads(out.read_text(), parse_constant=pytest.fail))
+    json.loads(out.read_text(), parse_constant=pytest.fail)
+    return pd.DataFrame([dict.fromkeys(MEASURES) | row.as_line() for row in read_results(out)])
 
 
 def test_rank_states_what_is_liked_and_takes_another(
@@ -124,8 +126,8 @@ def test_ope_and_rank_without_logs_use_the_test_split(
     printed = capsys.readouterr().out
     assert f"{test.n_episodes:,} sessions, {test.n_steps:,} steps" in printed
     assert "seen in training" not in printed
-    rows = {row["estimator"]: row for row in read_evaluations(out)}
-    assert rows["logged"]["R_cum"] == pytest.approx(float(test.returns.mean()))
+    rows = {row.method: row for row in read_results(out)}
+    assert rows["logged"].metrics["R_cum"] == pytest.approx(float(test.returns.mean()))
     assert (ranked(folder, tmp_path / "rank.json").steps == test.n_steps).all()
     assert "on the test split" in (folder / "run" / "MODEL_CARD.md").read_text()
 

@@ -40,7 +40,7 @@ def counted(values: Array, found: dict[str, Any]) -> None:
     """Check bins and quantiles against the values themselves."""
     edges = found["edges"]
     expected = [((values >= a) & (values < b)).sum() for a, b in itertools.pairwise(edges)]
-    assert found["counts"] == expected
+    assert [*found["counts"]] == expected
     assert sum(expected) == len(values)
     exact = np.quantile(values, [float(q) for q in found["quantiles"]], method="inverted_cdf")
     assert list(found["quantiles"].values()) == pytest.approx(exact.tolist())
@@ -51,11 +51,11 @@ def test_lengths_popularity_and_few_rewards(tmp_path: Path) -> None:
     store = prepared(tmp_path, rewards)
     summary = store.record.source.model_dump()["summary"]
     counted(store.lengths, summary["session_lengths"])
-    assert summary["session_lengths"]["edges"][:4] == [1, 2, 4, 8]
+    assert summary["session_lengths"]["edges"][:4] == (1, 2, 4, 8)
     items = store.step_values(schema.ITEM, *store.all_steps())
     counted(np.bincount(items), summary["item_popularity"])
-    assert summary["rewards"]["values"] == [0, 0.5, 1]
-    assert summary["rewards"]["counts"] == np.bincount((rewards * 2).astype(int)).tolist()
+    assert [*summary["rewards"]["values"]] == [0, 0.5, 1]
+    assert [*summary["rewards"]["counts"]] == np.bincount((rewards * 2).astype(int)).tolist()
 
 
 def test_items_that_were_never_shown_are_counted(tmp_path: Path) -> None:
@@ -64,7 +64,7 @@ def test_items_that_were_never_shown_are_counted(tmp_path: Path) -> None:
     store = prepared(tmp_path, np.arange(400) % 2, LogMapping(item_features=features))
     popularity = store.record.source.model_dump()["summary"]["item_popularity"]
     shown = len(np.unique(store.step_values(schema.ITEM, *store.all_steps())))
-    assert popularity["edges"][:2] == [0, 1]
+    assert popularity["edges"][:2] == (0, 1)
     assert popularity["counts"][0] == 300 - shown
     assert sum(popularity["counts"]) == 300
 

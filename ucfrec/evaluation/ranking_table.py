@@ -21,6 +21,8 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 SUITE: Final = "rank"
 """Suite of the rows."""
 METRIC: Final = "hit_rate_liked"
+_OTHERWISE: Final = "hit_rate_shown"
+"""Metric of rows on logs in which nothing is liked."""
 
 
 def require_one_catalogue(trained: Sequence[TrainedPolicy]) -> None:
@@ -116,7 +118,8 @@ def ranking_rows(
                 training_seed=record.seed,
                 config_hash=config_hash(record.settings),
             )
-        low, high = one.intervals[METRIC]
+        metric = METRIC if math.isfinite(one.values[METRIC]) else _OTHERWISE
+        low, high = one.intervals[metric]
         interval = (low, high) if math.isfinite(low) and math.isfinite(high) else None
         measured = {
             **{name: one.values[name] for name in MEASURES},
@@ -124,5 +127,5 @@ def ranking_rows(
             "intervals": one.intervals,
             "differences": one.differences,
         }
-        rows.append(row.extended(measured, interval=interval))
+        rows.append(row.extended(measured, interval=interval, metric=metric))
     return rows

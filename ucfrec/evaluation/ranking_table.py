@@ -1,7 +1,7 @@
 """The table of `ucfrec rank`: policies of one store and baselines, on the same later steps."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -11,7 +11,7 @@ from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.liked import Liked, LikedByRange
-from ucfrec.evaluation.ranking import MEASURES, Period, compare, rank_steps, rankers_named
+from ucfrec.evaluation.ranking import MEASURES, Compared, Period, compare, rank_steps, rankers_named
 from ucfrec.evaluation.ranking_baselines import PolicyRanker, RewardRanker, baselines
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.results.row import ResultRow
@@ -106,26 +106,30 @@ def ranking_rows(
         "details": {"train_fingerprint": trained.record.fingerprint},
         **provenance(),
     }
-    rows = []
-    for one in compare(period, ranked, k, reference, seed):
-        row = ResultRow(method=one.name, policy=one.name, **shared)
-        if one.name in own:
-            rule, record = own[one.name].rule, own[one.name].trained.record
-            row = row.extended(
-                {"decision_rule": rule.as_dict()},
-                rule=rule.hash,
-                policy=record.config.policy_name,
-                training_seed=record.seed,
-                config_hash=config_hash(record.settings),
-            )
-        metric = METRIC if math.isfinite(one.values[METRIC]) else _OTHERWISE
-        low, high = one.intervals[metric]
-        interval = (low, high) if math.isfinite(low) and math.isfinite(high) else None
-        measured = {
-            **{name: one.values[name] for name in MEASURES},
-            "coverage": one.coverage,
-            "intervals": one.intervals,
-            "differences": one.differences,
-        }
-        rows.append(row.extended(measured, interval=interval, metric=metric))
-    return rows
+    return [
+        _row(one, own.get(one.name), shared) for one in compare(period, ranked, k, reference, seed)
+    ]
+
+
+def _row(one: Compared, policy: PolicyRanker | None, shared: Mapping[str, Any]) -> ResultRow:
+    """The row of one ranker; `policy` is the ranker if it is a trained policy."""
+    row = ResultRow(method=one.name, policy=one.name, **shared)
+    if policy is not None:
+        rule, record = policy.rule, policy.trained.record
+        row = row.extended(
+            {"decision_rule": rule.as_dict()},
+            rule=rule.hash,
+            policy=record.config.policy_name,
+            training_seed=record.seed,
+            config_hash=config_hash(record.settings),
+        )
+    metric = METRIC if math.isfinite(one.values[METRIC]) else _OTHERWISE
+    low, high = one.intervals[metric]
+    interval = (low, high) if math.isfinite(low) and math.isfinite(high) else None
+    measured = {
+        **{name: one.values[name] for name in MEASURES},
+        "coverage": one.coverage,
+        "intervals": one.intervals,
+        "differences": one.differences,
+    }
+    return row.extended(measured, interval=interval, metric=metric)

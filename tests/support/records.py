@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
-from ucfrec.files.record import Record
+from ucfrec.files.record import Record, Undefinable
 
 
 class Example(Record):
@@ -14,7 +14,7 @@ class Example(Record):
     REMEDY: ClassVar[str] = "make it again"
 
     version: int
-    numbers: tuple[float, ...]
+    numbers: tuple[Undefinable, ...]
     note: str | None = None
     needed: str | None = "x"
 

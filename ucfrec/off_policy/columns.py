@@ -40,8 +40,8 @@ def estimate_row(
         per_step: whether the estimate is of `ucfrec.off_policy.per_step`.
 
     Returns:
-        The row. `R_cum` is the mean return, as in `ucfrec.evaluation.metrics`, and `R_step` the
-        mean reward of a step; it may have no interval.
+        The row. `R_cum` is the mean return, as in `ucfrec.evaluation.session_metrics`, and
+        `R_step` the mean reward of a step; it may have no interval.
     """
     metric, units = ("R_step", "steps") if per_step else ("R_cum", "sessions")
     choice = "softmax" if rule.draws else "greedy"

@@ -12,7 +12,7 @@ from gymnasium.vector import VectorEnv
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import rollout
 from ucfrec.errors import InputError
-from ucfrec.evaluation.metrics import bootstrap_interval
+from ucfrec.evaluation.session_metrics import bootstrap_interval
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.reporting.statistics import summary
 from ucfrec.results.row import ResultRow

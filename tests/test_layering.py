@@ -30,6 +30,7 @@ ORDER = (
     {"off_policy"},
     {"reporting"},
     {"benchmark"},
+    {"given_data"},
     {"recommender"},
     {"commands"},
     {"__init__", "__main__"},

@@ -40,7 +40,9 @@ def fitted(folder: Path) -> Recommender:
 
 
 def test_the_names_of_the_package() -> None:
-    assert set(ucfrec.__all__) == {"UCF", "EpisodeStore", "Recommender", "__version__"}
+    assert dir(ucfrec) == sorted(ucfrec.__all__)
+    assert {"UCF", "EpisodeStore", "Recommender", "prepare"} <= set(ucfrec.__all__)
+    assert all(getattr(ucfrec, name) is not None for name in ucfrec.__all__)
     assert UCF is Recommender
     assert UCF(settings=SMALL).config.policy_name == "ucf"
     with pytest.raises(AttributeError, match="no attribute 'Recommendation'"):
@@ -64,7 +66,7 @@ def test_a_store_its_logs_and_a_frame_of_them_train_the_same_policy(
     pd.testing.assert_frame_equal(policy.recommend(log), fitted.recommend(log))
 
 
-def test_a_frame_leaves_only_the_run_behind(
+def test_a_frame_leaves_only_the_run_behind_once_the_recommender_is_gone(
     log: pd.DataFrame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scratch, work = tmp_path / "scratch", tmp_path / "work"
@@ -73,14 +75,19 @@ def test_a_frame_leaves_only_the_run_behind(
     monkeypatch.setattr(tempfile, "tempdir", str(scratch))
     monkeypatch.chdir(work)
     policy = Recommender("dt", settings=SMALL).fit(log, tmp_path / "run")
-    assert not [*scratch.iterdir(), *work.iterdir()]
+    assert not [*work.iterdir()]
     folders = (scratch, work, tmp_path, tmp_path / "run", tmp_path / "run" / "policy")
     before = [folder.stat().st_mtime_ns for folder in folders]
     policy.recommend(log)
     assert [folder.stat().st_mtime_ns for folder in folders] == before  # nothing came and went
     kept = Recommender("dt", settings=SMALL).fit(log)
-    assert [path.name for path in kept.run.parent.iterdir()] == ["run"]
+    assert {path.name for path in kept.run.parent.iterdir()} == {"run", "store"}
     assert kept.run.is_relative_to(scratch)
+    of_store = Recommender("dt", settings=SMALL).fit(kept.run.parent / "store", tmp_path / "other")
+    assert len([path for path in scratch.iterdir() if path.is_dir()]) == 2
+    del policy, kept
+    assert not [*scratch.iterdir()]
+    assert of_store.run.is_dir()
 
 
 KILLED = """

@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ucfrec.commands.cards import card_of_ranking
 from ucfrec.commands.options import log_options, logs_given, rule_given, rule_options
 from ucfrec.errors import InputError
 
@@ -58,6 +57,7 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.off_policy.score import held_out_sessions, logged_sessions
     from ucfrec.off_policy.training_rows import seen_too_often, share_seen
     from ucfrec.provenance import without_folders
+    from ucfrec.reporting.cards import card_of_ranking
     from ucfrec.reporting.tables import format_rows
     from ucfrec.results.rows_file import write_results
     from ucfrec.runs.trained_policy import RUN, TrainedPolicy

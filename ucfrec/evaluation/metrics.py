@@ -109,7 +109,8 @@ def novelty(recommended: pd.DataFrame, history: pd.DataFrame, k: int = 10) -> fl
     _require(history, "history", *_PAIR)
     users = history.groupby(ITEM_ID)[USER_ID].nunique()
     share = top[ITEM_ID].map(users).fillna(1) / history[USER_ID].nunique()
-    return float((-np.log2(share)).groupby(top[USER_ID]).mean().mean())
+    bits = pd.Series(-np.log2(share.to_numpy(np.float64)), top.index)
+    return float(bits.groupby(top[USER_ID]).mean().mean())
 
 
 def diversity(recommended: pd.DataFrame, features: pd.DataFrame, k: int = 10) -> float:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Final, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -84,6 +84,37 @@ class Fit:
     """Wall-clock time up to the last checkpoint, summed over all resumptions."""
 
 
+Watcher = Callable[[int, Mapping[str, float]], None]
+
+
+@dataclass(frozen=True)
+class Callbacks:
+    """What is told of a training while it goes on, for any tracker of experiments.
+
+    What one raises ends the training, which can be resumed. Of the processes of `torchrun`, only
+    the leader's are called.
+    """
+
+    on_step: Watcher | None = None
+    """Called after every update, with the step (from 1) and its `loss`."""
+    on_validation: Watcher | None = None
+    """Called after every validation, with the step and all that is logged: `validation_loss`,
+    `loss`, `gradient_norm`, …"""
+
+    def step(self, step: int, loss: Tensor) -> None:
+        """Tell of an update."""
+        if self.on_step is not None and distributed.leads():
+            self.on_step(step, {"loss": loss.item()})
+
+    def validation(self, step: int, logged: Mapping[str, float]) -> None:
+        """Tell of a validation."""
+        if self.on_validation is not None and distributed.leads():
+            self.on_validation(step, logged)
+
+
+SILENT: Final = Callbacks()
+
+
 def step_generator(seed: int, step: int) -> np.random.Generator:
     """The generator for all random draws of one training step.
 
@@ -105,6 +136,7 @@ def fit(
     validate: Callable[[], float] | None = None,
     describe: str = "train",
     rows: Callable[[Batch], float] | None = None,
+    callbacks: Callbacks = SILENT,
 ) -> Fit:
     """Minimise `loss` over batches from `draw`, resuming from `folder` if it holds a checkpoint.
 
@@ -122,6 +154,7 @@ def fit(
         rows: number of rows of a batch that the loss is a mean of. With it, the processes of
             `torchrun` train together: each draws its part of every batch, gradients and logged
             scalars are means over all rows, and `validate` has to return the same everywhere.
+        callbacks: what is told of the steps.
 
     Raises:
         InputError: a loss or gradient is not finite, or a checkpoint is damaged or does not fit.
@@ -145,6 +178,7 @@ def fit(
         value, scalars = loss(batch)
         count = None if joint is None else joint(batch)
         norm = _descend(value, module, optimizer, average, config, step, count)
+        callbacks.step(step, value)
         if step % config.validate_every and step != config.steps:
             continue
         means = _means({"loss": value, **scalars}, count)
@@ -158,6 +192,7 @@ def fit(
             log.add(step, logged)
             bar.update(0, loss=logged["loss"])
             save_training(last, module, optimizer, counters, average)
+        callbacks.validation(step, logged)
         clock.restart(step)
     if log is not None:
         log.close()

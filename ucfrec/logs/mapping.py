@@ -157,6 +157,16 @@ class LogMapping:
 
 
 @dataclass(frozen=True)
+class LogFiles:
+    """Log files with what their columns mean, as `ucfrec_datasets.load` returns them."""
+
+    files: tuple[Path, ...]
+    mapping: LogMapping
+    dataset: str = "generic"
+    """Name of the dataset adapter, which is recorded with what is made from the files."""
+
+
+@dataclass(frozen=True)
 class Dataset:
     """A kind of log that a package announces under the entry-point group `ucfrec.datasets`."""
 

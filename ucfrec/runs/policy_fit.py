@@ -11,7 +11,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.fitting import distributed
 from ucfrec.fitting.closed_form import fit_once
-from ucfrec.fitting.loop import Fit, fit
+from ucfrec.fitting.loop import SILENT, Callbacks, Fit, fit
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.runs.config import Config
 
@@ -25,6 +25,7 @@ def fit_policy(
     validation: EpisodeStore | None,
     out: Path,
     config: Config,
+    callbacks: Callbacks = SILENT,
 ) -> Fit:
     """Train the policy, or resume its training.
 
@@ -34,6 +35,7 @@ def fit_policy(
         validation: held-out episodes; None to keep the last weights.
         out: folder of the run.
         config: configuration of the run.
+        callbacks: what is told of the training.
 
     Raises:
         InputError: see `ucfrec.fitting.loop.fit`; or the batch has fewer windows than processes.
@@ -45,7 +47,7 @@ def fit_policy(
     validate = None if validation is None else _validation(policy, validation, config.seed, alone)
     if solve is not None:
         with distributed.leader_first():
-            return fit_once(policy, solve, out / "policy", validate, config.policy_name)
+            return fit_once(policy, solve, out / "policy", validate, config.policy_name, callbacks)
     own = distributed.share(config.train.batch_size)
 
     def draw(generator: np.random.Generator) -> Windows:
@@ -68,6 +70,7 @@ def fit_policy(
         validate=validate,
         describe=config.policy_name,
         rows=lambda windows: float(windows.mask.sum()),
+        callbacks=callbacks,
     )
 
 

@@ -22,7 +22,7 @@ from ucfrec.episodes.windows import Overlay
 from ucfrec.files.atomic import write_json
 from ucfrec.files.locks import claimed, remove_leftovers, remove_leftovers_within
 from ucfrec.fitting import distributed
-from ucfrec.fitting.loop import Fit
+from ucfrec.fitting.loop import SILENT, Callbacks, Fit
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.checks import require_sound
@@ -71,6 +71,7 @@ def train_run(
     more_augmentation: Overlay | None = None,
     on_all_rows: bool = False,
     shared: SharedStages = OWN,
+    callbacks: Callbacks = SILENT,
 ) -> RunRecord:
     """Train a policy on the training episodes of `store`, or resume the run in `out`.
 
@@ -93,6 +94,7 @@ def train_run(
         shared: reward models and augmentation that runs on the same store have in common where
             their settings of these stages and their seeds agree; by default a run makes its own.
             The time of a stage is in the record of the run that made it.
+        callbacks: what is told of the training of the policy.
 
     Returns:
         The record of the run: provenance, configuration and the report of every stage.
@@ -111,7 +113,7 @@ def train_run(
         with phase("Counterfactual augmentation", 1, PHASES):
             overlay, augmentation = _augment(run)
         with phase("Training the policy", 2, PHASES):
-            fit = _train_policy(run, overlay, more_augmentation, on_all_rows)
+            fit = _train_policy(run, overlay, more_augmentation, on_all_rows, callbacks)
         if not distributed.leads():
             return run.record
         chosen = run.record.rule is not None and run.record.policy == fit
@@ -193,14 +195,18 @@ def _augment(run: _Inputs) -> tuple[Overlay | None, AugmentationReport | None]:
 
 
 def _train_policy(
-    run: _Inputs, overlay: Overlay | None, more: Overlay | None, on_all_rows: bool
+    run: _Inputs,
+    overlay: Overlay | None,
+    more: Overlay | None,
+    on_all_rows: bool,
+    callbacks: Callbacks,
 ) -> Fit:
     """Fit the policy to logged and augmented episodes (lines 4 and following of Algorithm 1)."""
     if more is not None:
         overlay = more if overlay is None else overlay.joined(more)
     train = run.train if overlay is None else run.train.with_overlay(overlay)
     validation = None if on_all_rows else run.validation
-    return fit_policy(run.policy, train, validation, run.out, run.config)
+    return fit_policy(run.policy, train, validation, run.out, run.config, callbacks)
 
 
 def _fit_user_model(run: _Inputs) -> UserModel:

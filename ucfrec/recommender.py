@@ -437,7 +437,7 @@ class Recommender:
 
         Args:
             file: HTML file to write.
-            results: what `evaluate`, `ope` and `rank` returned, or files of it.
+            results: what `evaluate` and `ope` returned, or files of it.
             items: file with item features to show beside sample recommendations.
 
         Returns:

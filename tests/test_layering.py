@@ -29,7 +29,7 @@ ORDER = (
     {"evaluation", "recommending"},
     {"off_policy"},
     {"reporting"},
-    {"benchmark"},
+    {"benchmark", "tuning"},
     {"given_data"},
     {"recommender"},
     {"commands"},

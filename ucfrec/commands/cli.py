@@ -42,6 +42,7 @@ UCFREC = Program(
         "prepare": "turn logs into an episode store",
         "screen": "which logged observation columns have no effect",
         "train": "train a policy on an episode store; resumes",
+        "tune": "search the settings of a training; resumes",
         "settings": "list every training setting: default, range, meaning",
         "evaluate": "measure the return of policies in a simulator",
         "rank": "measure how well policies rank items shown and clicked later",

@@ -38,6 +38,7 @@ UCFREC = Program(
     "ucfrec.commands",
     {
         "demo": "run every step on simulated logs and write a report; resumes",
+        "datasets": "list public data sets, or download one",
         "collect": "simulate sessions and write them as Parquet logs",
         "prepare": "turn logs into an episode store",
         "screen": "which logged observation columns have no effect",

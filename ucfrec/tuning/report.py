@@ -40,11 +40,12 @@ def write_report(study: "Study", plan: Plan) -> None:
     if "train.steps" in names:
         names.append("train.warmup_steps")
     settings = {**plan.search.fixed, **{name: _field(config, name) for name in names}}
-    command = f"ucfrec train {plan.store} --policy {config.policy_name} --config {plan.out / BEST_TOML}"
+    file = plan.out / BEST_TOML
+    command = f"ucfrec train {plan.store} --policy {config.policy_name} --config {file}"
     head = (
         f"# {plan.metric} {study.best_value:.6g}, of {len(finished(study))} trials\n# {command}\n"
     )
-    with atomic_file(plan.out / BEST_TOML) as scratch:
+    with atomic_file(file) as scratch:
         scratch.write_text(head + _toml(settings), encoding="utf-8")
     with atomic_file(plan.out / PAGE) as scratch:
         scratch.write_text(_page(study, plan, command), encoding="utf-8")

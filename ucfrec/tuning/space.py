@@ -46,7 +46,7 @@ class Dimension:
     @property
     def example(self) -> Value:
         """One of the values."""
-        return self.choices[0] if self.choices else self.low  # type: ignore[return-value]
+        return self.choices[0] if self.choices else self.low or 0
 
     def suggest(self, trial: "Trial", name: str) -> Value:
         """The value of this setting in a trial."""

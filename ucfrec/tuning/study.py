@@ -77,7 +77,7 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
     store = EpisodeStore.open(plan.store)
     with claimed(plan.out, "tuned"):
         plan.out.mkdir(parents=True, exist_ok=True)
-        study = optuna.create_study(
+        study: Study = optuna.create_study(
             storage=plan.storage, study_name=_NAME, direction="maximize", load_if_exists=True
         )
         _require_same(study, plan, store)

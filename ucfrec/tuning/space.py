@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_toml
@@ -51,8 +51,7 @@ class Dimension:
     def suggest(self, trial: "Trial", name: str) -> Value:
         """The value of this setting in a trial."""
         if self.choices:
-            chosen: Value = trial.suggest_categorical(name, self.choices)
-            return chosen
+            return cast(Value, trial.suggest_categorical(name, self.choices))
         low, high = self.low, self.high
         if isinstance(low, int) and isinstance(high, int):
             return trial.suggest_int(name, low, high, log=self.log)

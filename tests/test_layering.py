@@ -31,7 +31,7 @@ ORDER = (
     {"reporting"},
     {"benchmark", "tuning"},
     {"given_data"},
-    {"recommender"},
+    {"exploring", "recommender"},
     {"commands"},
     {"__init__", "__main__"},
 )

@@ -49,6 +49,7 @@ UCFREC = Program(
         "rank": "measure how well policies rank items shown and clicked later",
         "recommend": "recommend the next items to the users of a log",
         "serve": "answer requests for recommendations over HTTP",
+        "explore": "try out one or two policies in the browser",
         "join": "make a log of exposures and the feedback that they got",
         "export": "write the policy with its rule as an ONNX graph",
         "score": "write a policy's probability of every logged choice",

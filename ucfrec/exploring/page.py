@@ -1,5 +1,6 @@
 """The page of the explorer as HTML, from what a visitor asked for."""
 
+import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,6 +22,7 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 
 _TITLES: Final = ("title", "name")
 _IMAGES: Final = ("image", "image_url", "picture")
+_NUMBER: Final = re.compile(r"-?\d{1,12}(\.\d{1,12})?")
 _USERS_LISTED: Final = 1000
 _MOST_ITEMS: Final = 100
 
@@ -145,8 +147,11 @@ class Explorer:
             sliders.pop()
         if given.get("custom") is None:
             return sliders
+        # Where a number is wrong, the list says so.
         return [
-            replace(each, value=_number(given, each.name, each.value, -1e12, 1e12))
+            replace(each, value=float(given[each.name]))
+            if _NUMBER.fullmatch(given.get(each.name, ""))
+            else each
             for each in sliders
         ]
 

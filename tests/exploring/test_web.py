@@ -77,7 +77,7 @@ def test_the_page_works_without_scripts(explorer: Explorer) -> None:
     assert "only here" in got(explorer, "/", user="7", k="3", keep_seen="on", **rule).text
     assert "script-src 'self'" in answer.headers["content-security-policy"]
     assert "Model card" in answer.text
-    assert got(explorer, "/report/0").text.startswith("<!doctype html>")
+    assert got(explorer, "/report/0").text.startswith("<!DOCTYPE html>")
     assert got(explorer, "/report/7").status_code == 404
 
 

@@ -21,7 +21,7 @@ from ucfrec.policies.item_rate import liked_rates
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 _KNN_HISTORY: Final = 20
-"""Steps of the session that item-kNN reads."""
+"""Latest rows of the user that item-kNN reads."""
 _ALS_FACTORS: Final = 32
 
 
@@ -34,8 +34,9 @@ class PolicyRanker:
 
     def scores(self, steps: Steps) -> Tensor:
         """Log-probabilities at temperature 1 (B, n_items); see `Scorer.scores`."""
-        scores = logged_scores(self._scorer, steps.store, steps.episodes, steps.steps)
-        return scores.log_softmax(-1)
+        at = steps.store, steps.episodes, steps.steps
+        scores = logged_scores(self._scorer, *at, steps.left_out)
+        return scores.log_softmax(-1).nan_to_num(nan=-torch.inf, neginf=-torch.inf)
 
 
 @dataclass(frozen=True)
@@ -78,9 +79,9 @@ class Random:
 
 
 class ItemNeighbours:
-    """Ranks items by their cosine to the session's rewarded items; ties go to the popular ones.
+    """Ranks items by their cosine to the user's latest rewarded items; ties go to the popular ones.
 
-    See `ItemKNNPolicy`.
+    See `ItemKNNPolicy`; the items are those of all the user's sessions, also before the log.
     """
 
     name = "item-knn"
@@ -98,8 +99,8 @@ class ItemNeighbours:
 
     def scores(self, steps: Steps) -> Tensor:
         """Scores (B, n_items)."""
-        windows = steps.windows(_KNN_HISTORY)
-        return self._knn.features(windows)[:, -1] + self._tie_break
+        recent = steps.rows.recent(steps.numbers, _KNN_HISTORY)
+        return self._knn.similarity(*map(torch.from_numpy, recent)) + self._tie_break
 
 
 class MatrixFactorisation:

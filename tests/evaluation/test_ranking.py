@@ -201,7 +201,11 @@ def test_the_command_ranks_the_test_split_and_later_logs(
         "most clicked",
         "item click rate",
         "item-knn",
+        "boosted clicks",
         "als",
+        "bpr",
+        "recent clicks",
+        "recent click rate",
     ]
     assert [row.method for row in rows] == names
     assert {row["steps"] for row in rows} == {store.split("test").n_steps}

@@ -75,7 +75,7 @@ def run(options: argparse.Namespace) -> None:
         raise InputError("name a run folder of `ucfrec train` first, then the logs")
     if options.k < 1:
         raise InputError(f"--k is {options.k}; recommend at least 1 item")
-    trained = [TrainedPolicy.load(run, options.checkpoint) for run in runs]
+    trained = [TrainedPolicy.load(run, options.checkpoint, split=not options.logs) for run in runs]
     require_one_catalogue(trained)
     train, liked = training_store(trained[0]), _liked(options, trained[0])
     if options.logs:

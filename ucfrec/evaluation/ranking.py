@@ -22,6 +22,7 @@ from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.group_auc import group_auc
 from ucfrec.episodes.item_counts import liked_steps
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Windows
 from ucfrec.evaluation.liked import Liked
 from ucfrec.evaluation.metrics import resampled_ratios
 
@@ -77,6 +78,13 @@ class Steps:
     """(B,) row of each step's user in the training store; −1 for users that it lacks."""
     left_out: tuple[Tensor, Tensor] | None = None
     """Rows (M,) and items (M,) that may not be recommended; None to rank all items."""
+
+    def windows(self, length: int) -> Windows:
+        """Windows of `length` steps that end with each evaluated step.
+
+        The last column contains the evaluated step's action and reward; rankers must not read them.
+        """
+        return self.store.windows(self.episodes, self.steps, length)
 
 
 class Ranker(Protocol):

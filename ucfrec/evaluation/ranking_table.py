@@ -20,7 +20,12 @@ from ucfrec.evaluation.ranking import (
     rank_steps,
     rankers_named,
 )
-from ucfrec.evaluation.ranking_baselines import PolicyRanker, RewardRanker, baselines
+from ucfrec.evaluation.ranking_baselines import (
+    PolicyRanker,
+    RewardRanker,
+    baselines,
+    recent_rankers,
+)
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.results.row import ResultRow
 from ucfrec.runs.record import store_of
@@ -84,12 +89,16 @@ def ranking_rows(
     counts = trained.counts
     assert counts is not None
     assert trained.item_states is not None
-    fitted_on = None if train is None else train.split("train")
+    whole = trained.record.refit_of is not None
+    fitted_on = train if train is None or whole else train.split("train")
     if liked is not None and fitted_on is not None:
         counts = TrainingCounts.of(fitted_on, liked)
     liked = liked or LikedByRange(trained.item_states)
     model = [] if trained.reward_model is None else [RewardRanker(trained.scorer())]
-    named = rankers_named([*policies, *model, *baselines(counts, fitted_on, seed, liked)])
+    others = baselines(counts, fitted_on, seed, liked)
+    if train is not None and fitted_on is not None:
+        others += recent_rankers(fitted_on, train, liked)
+    named = rankers_named([*policies, *model, *others])
     k = min(k, len(counts.shown))
     period = Period.of(later.store, np.asarray(users), liked)
     ranked = {name: rank_steps(ranker, later, k) for name, ranker in named.items()}

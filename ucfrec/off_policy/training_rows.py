@@ -61,7 +61,7 @@ def seen_too_often(seen: float | None) -> list[str]:
         return []
     return [
         f"{seen:.0%} of the rows were seen in training: on these a policy looks "
-        "better than it is; give later logs"
+        "better than it is; give later logs, or no logs for the test split"
     ]
 
 

@@ -30,7 +30,7 @@ _SPLITS: Final = LEAVES - 1
 class BoostedConfig(PolicyConfig):
     """Settings of the boosted click model; `context` − 1 is the number of items of history."""
 
-    boosted: Annotated[int, Field(ge=1, le=10**6)] = 512
+    boosted: Annotated[int, Field(ge=1, le=10**6)] = 256
     """Items that the trees score, those with the highest rates; others have the item's rate."""
 
 
@@ -61,7 +61,7 @@ class BoostedPolicy(SequencePolicy):
     def __init__(self, config: BoostedConfig, sizes: Mapping[str, int]) -> None:
         require_items("boosted", sizes)
         super().__init__(config, sizes)
-        n_items, splits = sizes["items"], TREES * _SPLITS
+        n_items, splits = sizes["items"], (_SPLITS, TREES)
         for name, value in (
             ("shown", torch.zeros(n_items)),
             ("liked", torch.zeros(n_items)),
@@ -101,9 +101,8 @@ class BoostedPolicy(SequencePolicy):
             trees = BoostedTrees.fit(*self._rows(train, steps), seed)
             self.base.copy_(trees.base)
             for tree in range(len(trees.values)):
-                places = slice(tree * _SPLITS, (tree + 1) * _SPLITS)
-                found = _table(trees, tree)
-                self.split_inputs[places], self.split_thresholds[places], self.leaves[tree] = found
+                inputs, thresholds, self.leaves[tree] = _table(trees, tree)
+                self.split_inputs[:, tree], self.split_thresholds[:, tree] = inputs, thresholds
 
         return solve
 
@@ -169,13 +168,14 @@ class BoostedPolicy(SequencePolicy):
     def _scored(self, windows: Windows, items: Tensor) -> Tensor:
         """Log-odds (B, C) of a like of items as of `_inputs`."""
         inputs = self._inputs(windows, items)
-        powers = 2.0 ** torch.arange(_SPLITS, device=inputs.device)
-        trees = torch.arange(TREES, device=inputs.device)
         scores = []
         for rows in inputs.flatten(0, 1).split(_AT_ONCE):
-            left = rows[:, self.split_inputs] <= self.split_thresholds
-            which = (left.view(len(rows), TREES, _SPLITS).float() @ powers).long()
-            scores.append(self.leaves[trees, which].sum(1))
+            columns = rows.T.contiguous()
+            which = torch.zeros(TREES, len(rows), dtype=torch.int64, device=rows.device)
+            for split in range(_SPLITS):
+                left = columns[self.split_inputs[split]] <= self.split_thresholds[split, :, None]
+                which |= left.long() << split
+            scores.append(self.leaves.gather(1, which).sum(0))
         return self.base + torch.cat(scores).view(inputs.shape[:2])
 
     def features(self, windows: Windows) -> Tensor:

@@ -19,6 +19,7 @@ from ucfrec.errors import InputError, InputNote
 from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.liked import LikedExpression
+from ucfrec.evaluation.ranking import Later
 from ucfrec.evaluation.ranking_baselines import PolicyRanker
 from ucfrec.evaluation.ranking_table import ranking_rows, require_one_catalogue, training_store
 from ucfrec.files.atomic import atomic_folder
@@ -45,6 +46,7 @@ from ucfrec.reporting.model_card import write_card
 from ucfrec.reporting.page import write_report
 from ucfrec.results.table import Evaluation, Ranking, ResultTable
 from ucfrec.runs.config import TABLES, resolve_config, settings_given
+from ucfrec.runs.refit import refit_within
 from ucfrec.runs.screened import train_screened
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -134,6 +136,7 @@ class Recommender:
         mapping: LogMapping | None = None,
         dataset: str | None = None,
         screen: str | None = None,
+        refit: bool = False,
         on_step: Watcher | None = None,
         on_validation: Watcher | None = None,
     ) -> Self:
@@ -152,6 +155,8 @@ class Recommender:
             mapping: logs only: names of the columns, and feature tables.
             dataset: files only: the dataset adapter, as for `ucfrec prepare --dataset`.
             screen: "drop" or "copies", as for `ucfrec train --screen`.
+            refit: go on learning from all rows once everything is chosen, as `ucfrec train` does;
+                `rank` and `ope` on the test split use the weights before that.
             on_step: called after every update with the step and `{"loss": …}`.
             on_validation: called after every validation with the step and all that is logged,
                 `validation_loss` among it.
@@ -179,6 +184,8 @@ class Recommender:
             store = store_given(data, mapping, folder, options)
             out = folder / "run" if out is None else Path(out)
             record = train_screened(store, out, self.config, screen, callbacks=callbacks)
+            if refit:
+                refit_within(store, out)
             if warning := record.learned_nothing(read_metrics(out / "policy")):
                 warnings.warn(InputNote(warning), stacklevel=2)
             write_card(out)
@@ -210,6 +217,13 @@ class Recommender:
         if self._trained is None:
             raise InputError("this policy is not trained yet; call fit(...) or load(run) first")
         return self._trained
+
+    def _evaluated(self, logs: Logs | None) -> TrainedPolicy:
+        """The policy that logs can evaluate: the test split, the weights before a refit."""
+        trained = self.trained
+        if logs is not None or trained.record.refit_of is None:
+            return trained
+        return TrainedPolicy.load(self.run, split=True)
 
     def recommend(
         self,
@@ -294,6 +308,7 @@ class Recommender:
         *,
         others: Iterable["Recommender"] = (),
         rule: DecisionRule | None = None,
+        filter_seen: bool = True,
         liked: str | None = None,
         seed: int = 0,
         mapping: LogMapping | None = None,
@@ -305,6 +320,7 @@ class Recommender:
             k: items recommended at each step.
             others: policies trained on the same store, ranked beside this one.
             rule: the decision rule of this policy; None for the run's own.
+            filter_seen: exclude items that the user has seen before a step.
             liked: truth value over the column reward, such as "reward >= 4"; None for at least 60%
                 of the way from the lowest training reward to the highest.
             seed: of the bootstrap over users and of the random baseline.
@@ -314,8 +330,8 @@ class Recommender:
             InputError: the recommender is not trained, the logs cannot be used, or another policy
                 has another catalogue.
         """
-        trained = self.trained
-        all_trained = [trained, *(other.trained for other in others)]
+        trained, *rest = (each._evaluated(logs) for each in (self, *others))
+        all_trained = [trained, *rest]
         require_one_catalogue(all_trained)
         with in_words_of_python():
             wanted = liked and Expression(liked, "--liked")
@@ -324,7 +340,10 @@ class Recommender:
         rankers[0] = PolicyRanker(trained, rule, trained.name)
         with logs_given(trained, logs, mapping, keep_unknown=False) as logged:
             said = [] if logs is None else seen_too_often(share_seen(trained, logged.store))
-            about = logged.store, logged.users, k, seed
+            said += [logged.history_lacking] if logged.history_lacking else []
+            assert logged.rows is not None
+            later = Later(logged.store, logged.rows, filter_seen)
+            about = later, logged.users, k, seed
             rows = ranking_rows(rankers, trained, training_store(trained), *about, by)
         rows = [replace(row, checkpoint="best") for row in rows]
         card_of_ranking(trained.folder, rows[0], Ranking.shown[:-1], _named(logs), said)
@@ -354,7 +373,7 @@ class Recommender:
         Raises:
             InputError: the recommender is not trained, or the logs cannot be used.
         """
-        trained = self.trained
+        trained = self._evaluated(logs)
         with logs_given(trained, logs, mapping, keep_unknown=True) as logged:
             report = evaluate_off_policy(
                 trained.folder, trained, logged, rule=rule, seed=seed, options=options

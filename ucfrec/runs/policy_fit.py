@@ -10,6 +10,7 @@ from torch import Tensor
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.fitting import distributed
+from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.fitting.closed_form import fit_once
 from ucfrec.fitting.loop import SILENT, Callbacks, Fit, fit
 from ucfrec.policies.base import SequencePolicy
@@ -25,6 +26,7 @@ def fit_policy(
     validation: EpisodeStore | None,
     out: Path,
     config: Config,
+    start: Path | None = None,
     callbacks: Callbacks = SILENT,
 ) -> Fit:
     """Train the policy, or resume its training.
@@ -35,6 +37,8 @@ def fit_policy(
         validation: held-out episodes; None to keep the last weights.
         out: folder of the run.
         config: configuration of the run.
+        start: weights of another training to go on from; of a policy that is fitted without
+            gradients, only what was chosen on held-out episodes is taken from there.
         callbacks: what is told of the training.
 
     Raises:
@@ -42,7 +46,11 @@ def fit_policy(
     """
     k, device = policy.config.context, policy.state_mean.device
     base = train.without_augmentation()
-    solve = policy.closed_form(base, validation or base, out / "policy", config.seed)
+    solve = policy.closed_form(base, validation, out / "policy", config.seed)
+    if start is not None:
+        weights = load_tensors(start)[0]
+        kept = policy.state_dict().keys() if solve is None else policy.chosen
+        policy.load_state_dict({name: weights[name] for name in kept}, strict=solve is None)
     alone = solve is not None
     validate = None if validation is None else _validation(policy, validation, config.seed, alone)
     if solve is not None:

@@ -5,10 +5,11 @@ from typing import Final
 import numpy as np
 
 from ucfrec import schema
+from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.liked import LikedByRange
-from ucfrec.evaluation.ranking import Period, measure, rank_steps
+from ucfrec.evaluation.ranking import Later, Period, measure, rank_steps
 from ucfrec.evaluation.ranking_baselines import PolicyRanker
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -41,11 +42,10 @@ def measured(trained: TrainedPolicy, store: EpisodeStore, metric: str, k: int) -
     assert trained.item_states is not None
     users = validation.episode_values(schema.USER)
     period = Period.of(validation, users, LikedByRange(trained.item_states))
-    ranker = PolicyRanker(trained, None, trained.name)
-    k = min(k, period.n_items)
-    above, below = measure(period, rank_steps(ranker, validation, k, period.users), k)[
-        _MEASURES[metric]
-    ]
+    ranker, k = PolicyRanker(trained, None, trained.name), min(k, period.n_items)
+    rows = UserRows.of(validation, users, store.split("train"))
+    ranked = rank_steps(ranker, Later(validation, rows, filter_seen=True), k)
+    above, below = measure(period, ranked, k)[_MEASURES[metric]]
     if not below.any():
         raise InputError(
             f"{store.path}: no validation row is liked, so there is no {metric}; use another "

@@ -13,7 +13,7 @@ import pytest
 
 from tests.recommending.test_recommend import SMALL, random_log
 from tests.support.browser import CHROMIUM, Browser
-from ucfrec import Recommender
+from ucfrec import DecisionRule, Recommender
 
 httpx = pytest.importorskip("httpx")
 pytest.importorskip("fastapi")
@@ -41,7 +41,13 @@ def explorer(tmp_path_factory: pytest.TempPathFactory) -> Explorer:
         random_log(), folder / "first"
     )
     second = Recommender("popular").fit(random_log(), folder / "second")
-    found = Explorer([first.trained, second.trained], FEATURES)
+    later = random_log().assign(propensity=1 / 30)
+    results = []
+    for target in (1.0, 6.0):
+        report = first.ope(later, rule=DecisionRule(target, temperature=1.0))
+        results.append(folder / f"{target}.json")
+        report.save(results[-1])
+    found = Explorer([first.trained, second.trained], FEATURES, results)
     found.kept = first, second  # type: ignore[attr-defined]  # their stores
     return found
 
@@ -79,6 +85,17 @@ def test_the_page_works_without_scripts(explorer: Explorer) -> None:
     assert "Model card" in answer.text
     assert got(explorer, "/report/0").text.startswith("<!DOCTYPE html>")
     assert got(explorer, "/report/7").status_code == 404
+
+
+def test_off_policy_values_are_shown_by_target(explorer: Explorer) -> None:
+    assert [target for target, _, _ in explorer.values] == [1.0, 6.0]
+    page = got(explorer, "/").text
+    assert "Off-policy value against the target return" in page
+    assert page.count("<tr><th") == 3
+    for _, _, row in explorer.values:
+        assert f"{row.value:.4g} [" in page
+    assert '<svg class="chart"' in page
+    assert "Off-policy value" not in Explorer(explorer.runs).page({})
 
 
 def test_texts_of_others_are_no_markup(explorer: Explorer) -> None:

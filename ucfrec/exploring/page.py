@@ -17,7 +17,12 @@ from ucfrec.errors import InputError
 from ucfrec.exploring.explain import PARTS, Explained, explain, pasted_history
 from ucfrec.files.checksums import CARD
 from ucfrec.given_data import histories_given
+from ucfrec.reporting import charts
+from ucfrec.reporting.charts import LineChart
+from ucfrec.reporting.forest import quoted
 from ucfrec.reporting.page import write_report
+from ucfrec.reporting.page_results import results_of
+from ucfrec.results.row import ResultRow
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 _TITLES: Final = ("title", "name")
@@ -77,12 +82,38 @@ class Explorer:
             given=given,
             runs=[(run.folder.name, run, self._card(run)) for run in self.runs],
             sliders=self._sliders(given),
+            values=self.values,
+            chart=self.values_chart,
+            layout=charts,
             users=self.runs[0].user_ids[:_USERS_LISTED].tolist(),
         )
 
     def results(self, given: Mapping[str, str]) -> str:
         """The part of the page that changes with the form."""
         return _template("explore_results.html").render(**self._shown(given))
+
+    @cached_property
+    def values(self) -> list[tuple[float, str, ResultRow]]:
+        """Off-policy estimates by target return: the target, the policy, the row of the verdict."""
+        found = []
+        for one in results_of(self._results).estimates:
+            row = quoted(one.rows)
+            if row is not None and row.target_return is not None and row.interval is not None:
+                found.append((row.target_return, one.name, row))
+        return sorted(found, key=lambda each: each[:2])
+
+    @cached_property
+    def values_chart(self) -> LineChart | None:
+        """The values as one curve per policy; None with fewer than two targets."""
+        curves: dict[str, dict[float, float]] = {}
+        for target, _, row in self.values:
+            curves.setdefault(row.policy, {})[target] = row.value
+        if max(map(len, curves.values()), default=0) < 2:
+            return None
+        named = [(name, style, curve) for style, (name, curve) in enumerate(curves.items())]
+        return charts.line_chart(
+            "Off-policy value against the target return", "target return", named
+        )
 
     @cached_property
     def reports(self) -> list[str]:

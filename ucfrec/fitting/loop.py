@@ -108,7 +108,6 @@ def fit(
 ) -> Fit:
     """Minimise `loss` over batches from `draw`, resuming from `folder` if it holds a checkpoint.
 
-    With `config.average`, what is validated and saved as the trained weights is their average.
     Writes `last.safetensors` (to resume), `best.safetensors` (weights with the lowest validation
     loss, else the last), `metrics.jsonl` and TensorBoard events to `folder`. A training killed and
     resumed ends with the weights of an uninterrupted one. The global random state is restored.
@@ -120,23 +119,17 @@ def fit(
         validate: the validation loss; called in evaluation mode without gradients.
         describe: name of the training in progress and error messages.
         rows: number of rows of a batch that the loss is a mean of. With it, the processes of
-            `torchrun` train together: each draws its part of every batch, gradients and logged
-            scalars are means over all rows, and `validate` has to return the same everywhere.
+            `torchrun` train together: each draws its part of every batch, and `validate` has to
+            return the same everywhere.
 
     Raises:
         InputError: a loss or gradient is not finite, or a checkpoint is damaged or does not fit.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    last, best = folder / "last.safetensors", folder / "best.safetensors"
-    optimizer = _optimizer(module, config)
-    average = WeightAverage(module, config.average) if config.average else None
-    counters = {"step": 0, "best_step": 0, "best_validation": math.inf, "stale": 0, "seconds": 0.0}
-    if last.exists():
-        counters.update(load_training(last, module, optimizer, average))
-    step = int(counters["step"])
-    clock, log = _Clock(step, counters["seconds"]), _log(folder, step)
+    training = _Training(module, config, folder, describe)
+    step = int(training.counters["step"])
+    clock, log = _Clock(step, training.counters["seconds"]), _log(folder, step)
     joint = rows if distributed.processes() > 1 else None
-    for step, bar in _steps(counters, config, describe):
+    for step, bar in _steps(training.counters, config, describe):
         generator = step_generator(seed, step)
         with clock.waiting():
             batch = draw(generator)
@@ -144,29 +137,117 @@ def fit(
         module.train()
         value, scalars = loss(batch)
         count = None if joint is None else joint(batch)
-        norm = _descend(value, module, optimizer, average, config, step, count)
+        norm = training.descend(value, step, count)
         if step % config.validate_every and step != config.steps:
             continue
-        means = _means({"loss": value, **scalars}, count)
-        logged = {"loss": means["loss"], "gradient_norm": norm.item(), **clock.rates(step, config)}
-        _require_finite(logged["loss"], f"{describe}: the loss", step)
-        _require_finite(logged["gradient_norm"], f"{describe}: the gradient", step)
-        with nullcontext() if average is None else average.applied():
-            logged |= means | _keep_best(module, validate, counters, step, best, describe)
-        counters |= {"step": step, "seconds": clock.total()}
+        logged = _means({"loss": value, **scalars}, count) | {"gradient_norm": norm.item()}
+        training.require_finite(step, loss=logged["loss"], gradient=logged["gradient_norm"])
+        logged |= clock.rates(step, config) | training.keep_best(validate, step)
+        training.counters |= {"step": step, "seconds": clock.total()}
         if log is not None:
             log.add(step, logged)
             bar.update(0, loss=logged["loss"])
-            save_training(last, module, optimizer, counters, average)
+            training.save()
         clock.restart(step)
     if log is not None:
         log.close()
     if joint is not None:
         distributed.wait()  # until the leader has written the best weights
-    load_weights(best, module, load_tensors(best)[0])
-    module.eval()
+    counters = training.end()
     lowest = math.nan if validate is None else counters["best_validation"]
     return Fit(step, int(counters["best_step"]), lowest, counters["seconds"])
+
+
+class _Training:
+    """What a training changes, and the files that it is saved to and resumed from."""
+
+    def __init__(self, module: nn.Module, config: LoopConfig, folder: Path, describe: str) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._last, self._best = folder / "last.safetensors", folder / "best.safetensors"
+        self._module, self._config, self._describe = module, config, describe
+        self._optimizer = RowAdamW(
+            module.parameters(),
+            lr=config.learning_rate,
+            weight_decay=config.weight_decay,
+            fused=True,
+        )
+        self._average = WeightAverage(module, config.average) if config.average else None
+        self.counters: dict[str, float] = {
+            "step": 0,
+            "best_step": 0,
+            "best_validation": math.inf,
+            "stale": 0,
+            "seconds": 0.0,
+        }
+        if self._last.exists():
+            self.counters.update(load_training(self._last, module, self._optimizer, self._average))
+
+    def descend(self, value: Tensor, step: int, count: float | None) -> Tensor:
+        """One optimizer step on the loss `value`; returns the gradient norm before clipping.
+
+        With `count`, the number of rows of `value`, on its mean over all processes.
+        """
+        self._optimizer.zero_grad(set_to_none=True)
+        value.backward()  # type: ignore[no-untyped-call]
+        if count is not None:
+            distributed.average_gradients(self._module.parameters(), count)
+        norm = clip_gradients(self._module.parameters(), self._config.clip_norm)
+        for group in self._optimizer.param_groups:
+            group["lr"] = _learning_rate(self._config, step)
+        moved = None if self._average is None else self._average.before_step()
+        self._optimizer.step()
+        if self._average is not None and moved is not None:
+            self._average.after_step(moved)
+        return norm
+
+    def keep_best(self, validate: Callable[[], float] | None, step: int) -> dict[str, float]:
+        """Save the weights if their validation loss is the lowest so far, or without validation.
+
+        Returns:
+            The validation loss, for the log; empty without validation.
+        """
+        with nullcontext() if self._average is None else self._average.applied():
+            if validate is None:
+                self.counters["best_step"] = step
+                self._save_best({"step": step})
+                return {}
+            self._module.eval()
+            with torch.no_grad():
+                loss = validate()
+            self.require_finite(step, **{"validation loss": loss})
+            if loss < self.counters["best_validation"]:
+                self.counters |= {"best_validation": loss, "best_step": step, "stale": 0}
+                self._save_best({"step": step, "validation_loss": loss})
+            else:
+                self.counters["stale"] += 1
+            return {"validation_loss": loss}
+
+    def require_finite(self, step: int, **values: float) -> None:
+        """Check losses and the norm of the gradient, by name.
+
+        Raises:
+            InputError: one is not finite.
+        """
+        for name, value in values.items():
+            if not math.isfinite(value):
+                raise InputError(
+                    f"{self._describe}: the {name} is {value} at step {step}; lower the learning "
+                    "rate or look for extreme values in the store (`ucfrec prepare --validate`)"
+                )
+
+    def save(self) -> None:
+        """Write what a resumption needs."""
+        save_training(self._last, self._module, self._optimizer, self.counters, self._average)
+
+    def end(self) -> dict[str, float]:
+        """Load the best weights; returns the counters."""
+        load_weights(self._best, self._module, load_tensors(self._best)[0])
+        self._module.eval()
+        return self.counters
+
+    def _save_best(self, about: dict[str, float]) -> None:
+        if distributed.leads():
+            save_tensors(self._best, self._module.state_dict(), about)
 
 
 def _means(scalars: Mapping[str, Tensor], count: float | None) -> dict[str, float]:
@@ -191,42 +272,6 @@ def _steps(
             step += 1
             yield step, bar
             bar.update()
-
-
-def _optimizer(module: nn.Module, config: LoopConfig) -> torch.optim.Optimizer:
-    return RowAdamW(
-        module.parameters(),
-        lr=config.learning_rate,
-        weight_decay=config.weight_decay,
-        fused=True,
-    )
-
-
-def _descend(
-    value: Tensor,
-    module: nn.Module,
-    optimizer: torch.optim.Optimizer,
-    average: WeightAverage | None,
-    config: LoopConfig,
-    step: int,
-    count: float | None,
-) -> Tensor:
-    """One optimizer step on the loss `value`; returns the gradient norm before clipping.
-
-    With `count`, the number of rows of `value`, on its mean over all processes.
-    """
-    optimizer.zero_grad(set_to_none=True)
-    value.backward()  # type: ignore[no-untyped-call]
-    if count is not None:
-        distributed.average_gradients(module.parameters(), count)
-    norm = clip_gradients(module.parameters(), config.clip_norm)
-    for group in optimizer.param_groups:
-        group["lr"] = _learning_rate(config, step)
-    moved = None if average is None else average.before_step()
-    optimizer.step()
-    if average is not None and moved is not None:
-        average.after_step(moved)
-    return norm
 
 
 class _Clock:
@@ -265,45 +310,3 @@ def _learning_rate(config: LoopConfig, step: int) -> float:
         return config.learning_rate * warmup
     done = (step - config.warmup_steps) / max(1, config.steps - config.warmup_steps)
     return config.learning_rate * warmup * (1 + math.cos(math.pi * done)) / 2
-
-
-def _require_finite(value: float, quantity: str, step: int) -> None:
-    if not math.isfinite(value):
-        raise InputError(
-            f"{quantity} is {value} at step {step}; lower the learning rate or "
-            "look for extreme values in the store (`ucfrec prepare --validate`)"
-        )
-
-
-def _keep_best(
-    module: nn.Module,
-    validate: Callable[[], float] | None,
-    counters: dict[str, float],
-    step: int,
-    best: Path,
-    describe: str,
-) -> dict[str, float]:
-    """Save the weights if their validation loss is the lowest so far, or without validation.
-
-    Returns:
-        The validation loss, for the log; empty without validation.
-    """
-    if validate is None:
-        counters["best_step"] = step
-        _save_best(best, module, {"step": step})
-        return {}
-    module.eval()
-    with torch.no_grad():
-        loss = validate()
-    _require_finite(loss, f"{describe}: the validation loss", step)
-    if loss < counters["best_validation"]:
-        counters |= {"best_validation": loss, "best_step": step, "stale": 0}
-        _save_best(best, module, {"step": step, "validation_loss": loss})
-    else:
-        counters["stale"] += 1
-    return {"validation_loss": loss}
-
-
-def _save_best(best: Path, module: nn.Module, about: dict[str, float]) -> None:
-    if distributed.leads():
-        save_tensors(best, module.state_dict(), about)

@@ -15,6 +15,7 @@ from ucfrec.counterfactual.screening import ScreeningConfig
 from ucfrec.reporting.tables import NONE
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import read_rows
+from ucfrec.runs.shared_stages import SharedStages
 from ucfrec_control.benchmark import plan
 from ucfrec_control.benchmark.budgets import BUDGETS
 from ucfrec_control.benchmark.methods import METHODS, SCREENED
@@ -100,12 +101,14 @@ def begin(
     few = MeasurementConfig(trees=5)
     quickest = ScreeningConfig(hidden=16, shared_steps=100, own_steps=50, measurement=few)
     monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: quickest)
-    runs = {}
+    runs, stages = {}, SharedStages(tmp_path / "stages")
     for cell in plan.robustness_cells(tmp_path, out, budget):
         assert cell.run is not None
         runs[str(cell.conditions["distractor"]), cell.method] = cell.run
         if cell.screening is not None:
-            train_control(opened(cell), cell.run, cell.config, screening=cell.screening)
+            train_control(
+                opened(cell), cell.run, cell.config, screening=cell.screening, shared=stages
+            )
     return runs
 
 

@@ -225,7 +225,8 @@ def test_screened_methods_are_rows_of_the_distractor_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: QUICK)
-    given = planned(tmp_path, replace(TINY, sessions=300), tasks=["synthetic-catalog"])
+    budget = replace(TINY, sessions=300, settings=(*TINY.settings, "rule.sessions=10"))
+    given = planned(tmp_path, budget, tasks=["synthetic-catalog"])
     wanted = ("bc", *SCREENED)
     found = {
         cell.method: cell
@@ -330,6 +331,7 @@ def test_windows_drop_repeats_and_are_cut(tmp_path: Path) -> None:
         window([tmp_path / "log.parquet"], "time_ms", "date = 9")
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 def test_kuairand_learns_from_what_came_before_its_environments(tmp_path: Path) -> None:
     data_folder("kuairand")

@@ -11,9 +11,8 @@ import torch
 from ucfrec import schema
 from ucfrec.counterfactual.action_augmentation import ActionGenerator, logged_actions
 from ucfrec.counterfactual.clusters import ActionSupport
-from ucfrec.counterfactual.effects_mean import EffectsMean, EffectTransitions
 from ucfrec.counterfactual.generators import CSGConfig, make_generator, state_clusters
-from ucfrec.counterfactual.reward_model import CRMConfig
+from ucfrec.counterfactual.reward_model import CRMConfig, EffectsMean, EffectTransitions
 from ucfrec.counterfactual.reward_model_fit import fit_crm
 from ucfrec.counterfactual.state_augmentation import (
     AugmentationReport,

@@ -12,8 +12,12 @@ import torch
 from torch import Tensor
 
 from ucfrec.arrays import Float32Array
-from ucfrec.counterfactual.effects_mean import EffectsMean
-from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, kl_to_prior
+from ucfrec.counterfactual.reward_model import (
+    CausalRewardModel,
+    CRMConfig,
+    EffectsMean,
+    kl_to_prior,
+)
 from ucfrec.episodes.windows import Transitions
 from ucfrec.errors import InputError
 from ucfrec.files.record import Undefinable

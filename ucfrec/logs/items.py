@@ -13,7 +13,7 @@ from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
 from ucfrec.episodes.item_table import ITEM_STATES, write_item_table
 from ucfrec.episodes.record import StoreRecord
 from ucfrec.errors import InputError
-from ucfrec.logs.moments import Moments
+from ucfrec.logs.measures import Moments
 from ucfrec.logs.spectral import SparseRows, right_singular_vectors
 from ucfrec.processes import require_blas_memory
 

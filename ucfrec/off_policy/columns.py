@@ -40,7 +40,7 @@ class Subject:
         of a step; a row may have no interval.
 
         Args:
-            per_step: whether the estimates are of `ucfrec.off_policy.per_step`.
+            per_step: whether the estimates are of `step_value`.
         """
         return [self._row(name, one, per_step) for name, one in found.items()]
 

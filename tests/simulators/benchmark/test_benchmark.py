@@ -26,8 +26,7 @@ from ucfrec.results.rows_file import append_rows, read_configurations, read_rows
 from ucfrec.runs.record import read_record
 from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 from ucfrec_simulators.benchmark import plan
-from ucfrec_simulators.benchmark.budgets import BUDGETS
-from ucfrec_simulators.benchmark.costs import COSTS
+from ucfrec_simulators.benchmark.budgets import BUDGETS, COSTS
 from ucfrec_simulators.benchmark.measure import measure
 from ucfrec_simulators.benchmark.methods import METHODS, SCREENED
 from ucfrec_simulators.benchmark.plan import RecommendationCells

@@ -76,7 +76,6 @@ def run_grid(
 
     Args:
         cells: picklable cells.
-        how: how a cell is measured.
         results: file of result rows (JSON lines); its other rows are kept.
         workers: number of cells that are measured at a time, each in a process of its own.
         describe: name of the benchmark in progress output.
@@ -225,7 +224,6 @@ def chosen(known: Iterable[str], wanted: Sequence[str], what: str) -> list[str]:
     """The names of `known` that are in `wanted`, in the order of `known`.
 
     Args:
-        known: available names.
         wanted: selected names; empty for all.
         what: what the names stand for, for the message: "method", "table".
 

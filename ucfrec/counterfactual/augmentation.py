@@ -65,11 +65,7 @@ def counterfactual_augmentation(
     Args:
         train: view to fit both models to and to copy episodes from.
         validation: view for early stopping and for the quality of the reward model.
-        crm_config: settings of the reward model.
-        csg_config: settings of the state generator.
-        config: settings of the copies.
         folder: of the checkpoints, which training resumes from.
-        seed: of everything random.
         device: where both models are fitted and edits are made.
 
     Raises:

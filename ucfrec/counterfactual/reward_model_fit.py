@@ -86,11 +86,8 @@ def fit_crm(
     """Train the reward model (Algorithm 2) with early stopping on held-out steps.
 
     Args:
-        train: transitions to train on.
         validation: held-out transitions, never trained on.
-        config: architecture and training.
         folder: of the checkpoints, which training resumes from.
-        seed: of sampling, initialisation and training.
         mean: E[r | s, a], if it was fitted before; transitions then have the actions that it reads.
         device: where the model is fitted, and stays. What is drawn is the same on all.
 

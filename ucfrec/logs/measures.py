@@ -137,10 +137,8 @@ def measure(spool: Spool, cut: Cut, log_end: int, items: int, folder: Path) -> M
 
     Args:
         spool: rows in the order of the store, at least one.
-        cut: how they form episodes.
         log_end: time (ms) of the log's last usable row.
         items: number of items that have a code.
-        folder: of the spool of users.
 
     Raises:
         InputError: no episode remains, or none in the training split.
@@ -295,7 +293,6 @@ def distributions(
     """Distributions over the steps, as JSON values.
 
     Args:
-        measures: of the log.
         popularity: (items,) number of steps that show each item; None for logs without items.
         passes: over the log's rewards.
 

@@ -91,7 +91,6 @@ def by_sessions(rows: SortedRows, folder: Path, block: int | None = None) -> Spo
 
     Args:
         rows: with the column `session`.
-        folder: of the new spool.
         block: rows in memory at a time, or more if one user has more; None for as many as their
             length allows.
     """
@@ -119,8 +118,6 @@ def end_of_user(spool: Spool, begin: int, rows: int) -> int:
 
     Args:
         spool: with the column `user`.
-        begin: first row of a user.
-        rows: from there.
     """
     while begin + rows < len(spool):
         users = spool.read("user", begin, begin + rows + 1)
@@ -136,7 +133,6 @@ def episodes(spool: Spool, cut: Cut, log_end: int, block: int | None = None) -> 
 
     Args:
         spool: rows in the order of the store.
-        cut: how they form episodes.
         log_end: time (ms) of the log's last usable row.
         block: rows in memory at a time, or more if one episode has more; None for as many as their
             length allows.
@@ -232,11 +228,9 @@ def ranked(
 
     Args:
         spool: with the column `name`.
-        name: of the column.
         low: no value is below it.
         high: no value is above it.
         positions: each from 0 to the number of rows, exclusive.
-        block: rows in memory at a time.
     """
     # Each round counts values in bins and goes on within the bin that has the position.
     found = [(low, high, position) for position in positions]
@@ -262,7 +256,6 @@ def count_unsorted(placed: Spool, block: int = BLOCK) -> int:
 
     Args:
         placed: see `ucfrec.logs.sorted_rows.SortedRows.placed`.
-        block: rows in memory at a time.
     """
     # Such a row has a greater position than some row of the user with a later time. Going backwards
     # through the sorted rows, the least position so far is that of all later rows of the user.

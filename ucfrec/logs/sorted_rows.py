@@ -220,7 +220,6 @@ def with_faults(log: TypedLog, rows: str, conditions: Mapping[str, str]) -> str:
     """DuckDB's SQL of typed rows with `fault`: 0, or the number of the first fault from 1.
 
     Args:
-        log: of the rows.
         rows: relation of some of its typed rows.
         conditions: as from `ucfrec.logs.sorted_rows.faults`.
     """
@@ -242,7 +241,6 @@ def in_order(log: TypedLog, rows: str, left_out: str = "") -> str:
     """SQL of typed rows with faults, with codes, in order, without missing values.
 
     Args:
-        log: of the rows.
         rows: relation of all its rows, as of `with_faults`; beside it are the tables of
             `code_tables`.
         left_out: a column that is not read.
@@ -335,7 +333,6 @@ def faults(log: TypedLog, known_items: Path | None = None) -> dict[str, str]:
     """Reason to the SQL condition on a row of `read`; the first that holds counts.
 
     Args:
-        log: any.
         known_items: `items.parquet` of a store: other items are a fault; None for none.
     """
     keys = [schema.USER_ID, log.key, schema.TIMESTAMP]
@@ -358,12 +355,6 @@ def faults(log: TypedLog, known_items: Path | None = None) -> dict[str, str]:
 def require_rewards_in_range(log: TypedLog, large: int, rows: int, largest: float) -> None:
     """Check the count of rewards beyond `LARGEST_REWARD`.
 
-    Args:
-        log: for the message.
-        large: how many rewards are beyond it.
-        rows: how many rewards there are.
-        largest: the largest absolute reward.
-
     Raises:
         InputError: there are any.
     """
@@ -377,11 +368,6 @@ def require_rewards_in_range(log: TypedLog, large: int, rows: int, largest: floa
 
 def require_rows(log: TypedLog, kept: int, dropped: Mapping[str, int]) -> None:
     """Check that a row is left.
-
-    Args:
-        log: for the message.
-        kept: number of rows that are.
-        dropped: number of dropped rows by reason.
 
     Raises:
         InputError: none is.

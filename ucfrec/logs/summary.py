@@ -50,9 +50,6 @@ def build_report(
     Times are in ms, `reward_statistics` in units of the reward.
 
     Args:
-        rows: of the log.
-        cut: how its episodes were cut.
-        measures: of the episodes.
         unsorted: see `ucfrec.logs.sessions.count_unsorted`.
         summary: of `ucfrec.logs.measures`.
     """
@@ -190,7 +187,6 @@ def note_losses(rows: SortedRows, reward: str, where: str | None = None) -> None
 
     Args:
         rows: of the log; its connection is free.
-        reward: the reward expression.
         where: condition of the rows that are wanted at all.
     """
     wanted = rows.read - rows.dropped["left_out"]
@@ -222,7 +218,6 @@ def note_bots(rows: SortedRows, measures: Measures, user: str) -> None:
 
     Args:
         rows: of the log; its connection is free.
-        measures: of its episodes.
         user: expression over the columns of the files that gives the users.
     """
     lengths = np.array(sorted(measures.lengths))

@@ -278,7 +278,6 @@ def step_value(steps: LoggedSteps, seed: int) -> StepValue | None:
     """Estimate the value per step; None where all steps have propensities, too few, or no weight.
 
     Args:
-        steps: with models of the reward.
         seed: draws the bootstrap's resamples.
     """
     known = ~np.isnan(steps.propensity)

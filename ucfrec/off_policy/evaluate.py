@@ -132,12 +132,10 @@ def evaluate_off_policy(
 
     Args:
         run: folder of the run, named in the rows.
-        trained: the policy of the run.
         logged: logs read with `keep_unknown`. The policy would never show an item that it does not
             know, so such a step has weight 0.
         rule: the decision rule to evaluate; None for the run's own.
         seed: seed of the folds and of the bootstrap.
-        options: what else is asked.
 
     Returns:
         The estimates, the warnings and the verdict.
@@ -294,11 +292,8 @@ def logged_steps(
     groups, lie on disk.
 
     Args:
-        trained: a policy that chooses items.
         logged: logs read with `keep_unknown`.
-        rule: the decision rule to evaluate.
         seed: seed of the folds, item groups and samples.
-        options: what else is asked.
 
     Returns:
         The N logged steps, in order.
@@ -382,10 +377,6 @@ def step_features(trained: TrainedPolicy, batch: ScoredSteps) -> tuple[Array, Te
     """Compute the policy's probability and the models' inputs for B logged steps.
 
     An item that the run does not know (−1) has probability 0 and an embedding of zeros.
-
-    Args:
-        trained: a policy that chooses items.
-        batch: the steps, scored by the policy.
 
     Returns:
         The evaluated policy's probability (B,) of the logged item, and (B, n_items) of all items;

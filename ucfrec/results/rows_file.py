@@ -83,7 +83,6 @@ def append_rows(
 
     Args:
         path: file of result rows; made if missing.
-        rows: rows of one configuration.
         config: configuration with the rows' `config_hash`; None for rows without one.
 
     Raises:
@@ -161,8 +160,6 @@ def measuring(path: Path, key: RowKey, wait: bool) -> Iterator[bool]:
     """Lock one measurement of the file `path`, so that no two processes run it at once.
 
     Args:
-        path: file of result rows.
-        key: the measurement.
         wait: wait until the lock is free, instead of giving up at once.
 
     Yields:

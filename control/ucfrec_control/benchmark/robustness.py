@@ -37,9 +37,6 @@ def drops(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
     NaN if `clean` is not above 0. `score_at_one` and `drop_at_one` are of the second policy, from
     the same initial states, with the distractor fixed to 1. The last of several equal keys counts.
 
-    Args:
-        rows: of one budget.
-
     Returns:
         One mapping per dataset, method, seed and distractor, with these and the values of `SHOWN`.
     """
@@ -104,7 +101,6 @@ def screening_cells(data: Path, stores: Path, files: Sequence[str]) -> Iterator[
 
     Args:
         data: folder of the HDF5 files.
-        stores: where stores are kept.
         files: names of files in `data`, without their ending.
 
     Raises:

@@ -59,7 +59,6 @@ def evaluate_run(
 
     Args:
         run: a run folder on a control store.
-        episodes: episodes of a row.
         seed: seed of the environments and the bootstrap.
         env_id: environment to evaluate in; None for that of the data.
         targets: target returns, None for the largest that the policy expects in each state; empty
@@ -143,9 +142,6 @@ def open_environment(
     Distractors are fixed to `distractor`.
 
     Args:
-        trained: the policy.
-        env_id: environment to make.
-        count: number of parallel environments.
         wrappers: wrappers around each of them.
         distractor: value that every distractor is fixed to.
         settings: arguments of the environment, over those of the data.

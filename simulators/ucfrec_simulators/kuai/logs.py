@@ -24,7 +24,6 @@ def window(files: Sequence[Path], time: str, where: str) -> pa.Table:
 
     Args:
         files: Parquet or CSV files with the same columns.
-        time: name of the time column.
         where: SQL condition that selects the window.
 
     Raises:
@@ -49,7 +48,6 @@ def cut_by_exit(rows: pa.Table, tags: Mapping[int, Sequence[int]], exit_rule: Ex
     Args:
         rows: as returned by `window`.
         tags: tags of each video; videos without tags may be missing.
-        exit_rule: when users leave.
     """
     videos, numbers = np.unique(np.asarray(rows[VIDEO]), return_inverse=True)
     video_tags: list[Sequence[int]] = [tags.get(int(video), ()) for video in videos]
@@ -89,7 +87,6 @@ def sessions_by_exit(
         users: (N,) user of each row; rows of a user are contiguous and in order of time.
         items: (N,) index into `tags` of the item shown.
         tags: tags of each item; an item without any gets the tag −1.
-        exit_rule: when users leave.
 
     Returns:
         (N,) session of each row, numbered from 0 in the order of the rows.

@@ -19,10 +19,10 @@ from ucfrec.errors import InputError, InputNote
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.locks import scratch_folder
 from ucfrec.fitting.metrics_log import read_metrics
+from ucfrec.logs.clean import REASONS
 from ucfrec.logs.histories import log_table
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
-from ucfrec.logs.sorted_rows import REASONS
 from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
 from ucfrec.reporting.model_card import write_card

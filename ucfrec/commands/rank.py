@@ -56,7 +56,7 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.evaluation.ranking_table import require_one_catalogue, training_store
     from ucfrec.logs.summary import format_summary
     from ucfrec.off_policy.score import held_out_sessions, logged_sessions
-    from ucfrec.off_policy.verdict import seen_too_often, share_seen
+    from ucfrec.off_policy.training_rows import seen_too_often, share_seen
     from ucfrec.provenance import without_folders
     from ucfrec.reporting.tables import format_rows
     from ucfrec.results.rows_file import write_results

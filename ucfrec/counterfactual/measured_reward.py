@@ -179,7 +179,7 @@ def _predicted(
 
 
 def steps_with_successor(view: EpisodeStore, most: int, seed: int) -> tuple[IntArray, IntArray]:
-    """Episodes and steps (N,) that are not the last of their session; of more than `most`, so many."""
+    """Episodes and steps (N,), not the last of their session; of more than `most`, so many."""
     episodes, steps = view.all_steps()
     inner = np.flatnonzero(steps < view.lengths[episodes] - 1)
     if len(inner) > most:

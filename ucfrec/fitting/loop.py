@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from ucfrec.fitting import distributed
 from ucfrec.fitting.average import WeightAverage
 from ucfrec.fitting.checkpoint import (
     load_tensors,
+    load_trained,
     load_training,
     load_weights,
     save_tensors,
@@ -30,6 +31,8 @@ from ucfrec.progress import Progress, no_progress, progress
 from ucfrec.settings import BatchSize, Count, LearningRate, WeightDecay, settings_table
 
 Batch = TypeVar("Batch")
+INITIAL: Final = "initial.safetensors"
+"""File of the weights that a training begins with, in its folder, if it is there."""
 
 
 @settings_table("train")
@@ -83,6 +86,37 @@ class Fit:
     """Wall-clock time up to the last checkpoint, summed over all resumptions."""
 
 
+Watcher = Callable[[int, Mapping[str, float]], None]
+
+
+@dataclass(frozen=True)
+class Callbacks:
+    """What is told of a training while it goes on, for any tracker of experiments.
+
+    What one raises ends the training, which can be resumed. Of the processes of `torchrun`, only
+    the leader's are called.
+    """
+
+    on_step: Watcher | None = None
+    """Called after every update, with the step (from 1) and its `loss`."""
+    on_validation: Watcher | None = None
+    """Called after every validation, with the step and all that is logged: `validation_loss`,
+    `loss`, `gradient_norm`, …"""
+
+    def step(self, step: int, loss: Tensor) -> None:
+        """Tell of an update."""
+        if self.on_step is not None and distributed.leads():
+            self.on_step(step, {"loss": loss.item()})
+
+    def validation(self, step: int, logged: Mapping[str, float]) -> None:
+        """Tell of a validation."""
+        if self.on_validation is not None and distributed.leads():
+            self.on_validation(step, logged)
+
+
+SILENT: Final = Callbacks()
+
+
 def step_generator(seed: int, step: int) -> np.random.Generator:
     """The generator for all random draws of one training step.
 
@@ -104,6 +138,7 @@ def fit(
     validate: Callable[[], float] | None = None,
     describe: str = "train",
     rows: Callable[[Batch], float] | None = None,
+    callbacks: Callbacks = SILENT,
 ) -> Fit:
     """Minimise `loss` over batches from `draw`, resuming from `folder` if it holds a checkpoint.
 
@@ -113,10 +148,8 @@ def fit(
 
     Args:
         module: trained in place; holds the best weights on return.
-        draw: draws a batch with the given generator.
         loss: the scalar to minimise, and scalars to log by name, of a batch.
         validate: the validation loss; called in evaluation mode without gradients.
-        describe: name of the training in progress and error messages.
         rows: number of rows of a batch that the loss is a mean of. With it, the processes of
             `torchrun` train together: each draws its part of every batch, and `validate` has to
             return the same everywhere.
@@ -137,24 +170,23 @@ def fit(
         value, scalars = loss(batch)
         count = None if joint is None else joint(batch)
         norm = training.descend(value, step, count)
+        callbacks.step(step, value)
         if step % config.validate_every and step != config.steps:
             continue
         logged = _means({"loss": value, **scalars}, count) | {"gradient_norm": norm.item()}
-        training.require_finite(step, loss=logged["loss"], gradient=logged["gradient_norm"])
-        logged |= clock.rates(step, config) | training.keep_best(validate, step)
-        training.counters |= {"step": step, "seconds": clock.total()}
+        logged |= clock.rates(step, config)
+        logged |= training.validated(step, logged, validate, clock)
         if log is not None:
             log.add(step, logged)
             bar.update(0, loss=logged["loss"])
             training.save()
+        callbacks.validation(step, logged)
         clock.restart(step)
     if log is not None:
         log.close()
     if joint is not None:
         distributed.wait()  # until the leader has written the best weights
-    counters = training.end()
-    lowest = math.nan if validate is None else counters["best_validation"]
-    return Fit(step, int(counters["best_step"]), lowest, counters["seconds"])
+    return training.end(step, validate is not None)
 
 
 class _Training:
@@ -180,6 +212,8 @@ class _Training:
         }
         if self._last.exists():
             self.counters.update(load_training(self._last, module, self._optimizer, self._average))
+        elif (initial := folder / INITIAL).exists():
+            load_weights(initial, module, load_trained(initial))
 
     def descend(self, value: Tensor, step: int, count: float | None) -> Tensor:
         """One optimizer step on the loss `value`; returns the gradient norm before clipping.
@@ -199,12 +233,26 @@ class _Training:
             self._average.after_step(moved)
         return norm
 
-    def keep_best(self, validate: Callable[[], float] | None, step: int) -> dict[str, float]:
-        """Save the weights if their validation loss is the lowest so far, or without validation.
+    def validated(
+        self,
+        step: int,
+        logged: Mapping[str, float],
+        validate: Callable[[], float] | None,
+        clock: "_Clock",
+    ) -> dict[str, float]:
+        """Check and count what was logged of a step, and keep its weights if they are the best.
 
         Returns:
             The validation loss, for the log; empty without validation.
         """
+        self._require_finite("loss", logged["loss"], step)
+        self._require_finite("gradient", logged["gradient_norm"], step)
+        found = self._keep_best(validate, step)
+        self.counters |= {"step": step, "seconds": clock.total()}
+        return found
+
+    def _keep_best(self, validate: Callable[[], float] | None, step: int) -> dict[str, float]:
+        """Save the weights if their validation loss is the lowest so far, or without validation."""
         with nullcontext() if self._average is None else self._average.applied():
             if validate is None:
                 self.counters["best_step"] = step
@@ -213,7 +261,7 @@ class _Training:
             self._module.eval()
             with torch.no_grad():
                 loss = validate()
-            self.require_finite(step, **{"validation loss": loss})
+            self._require_finite("validation loss", loss, step)
             if loss < self.counters["best_validation"]:
                 self.counters |= {"best_validation": loss, "best_step": step, "stale": 0}
                 self._save_best({"step": step, "validation_loss": loss})
@@ -221,28 +269,23 @@ class _Training:
                 self.counters["stale"] += 1
             return {"validation_loss": loss}
 
-    def require_finite(self, step: int, **values: float) -> None:
-        """Check losses and the norm of the gradient, by name.
-
-        Raises:
-            InputError: one is not finite.
-        """
-        for name, value in values.items():
-            if not math.isfinite(value):
-                raise InputError(
-                    f"{self._describe}: the {name} is {value} at step {step}; lower the learning "
-                    "rate or look for extreme values in the store (`ucfrec prepare --validate`)"
-                )
+    def _require_finite(self, quantity: str, value: float, step: int) -> None:
+        if not math.isfinite(value):
+            raise InputError(
+                f"{self._describe}: the {quantity} is {value} at step {step}; lower the learning "
+                "rate or look for extreme values in the store (`ucfrec prepare --validate`)"
+            )
 
     def save(self) -> None:
         """Write what a resumption needs."""
         save_training(self._last, self._module, self._optimizer, self.counters, self._average)
 
-    def end(self) -> dict[str, float]:
-        """Load the best weights; returns the counters."""
+    def end(self, step: int, validated: bool) -> Fit:
+        """Load the best weights; returns the outcome, with the last `step`."""
         load_weights(self._best, self._module, load_tensors(self._best)[0])
         self._module.eval()
-        return self.counters
+        lowest = self.counters["best_validation"] if validated else math.nan
+        return Fit(step, int(self.counters["best_step"]), lowest, self.counters["seconds"])
 
     def _save_best(self, about: dict[str, float]) -> None:
         if distributed.leads():

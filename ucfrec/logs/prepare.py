@@ -22,6 +22,7 @@ from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.binding import explained
+from ucfrec.logs.clean import require_rows
 from ucfrec.logs.engine import engine
 from ucfrec.logs.feature_tables import feature_digest, load_features, require_known_ids
 from ucfrec.logs.ids import (
@@ -46,7 +47,7 @@ from ucfrec.logs.measures import (
 )
 from ucfrec.logs.remembered import settled
 from ucfrec.logs.sessions import Cut, Episodes, by_sessions, count_unsorted, episodes, split_bounds
-from ucfrec.logs.sorted_rows import SortedRows, check_sorted, require_rows, sorted_batches
+from ucfrec.logs.sorted_rows import SortedRows, check_sorted, sorted_batches
 from ucfrec.logs.spool import Spool
 from ucfrec.logs.steps import StepNumbers, write_steps
 from ucfrec.logs.summary import (

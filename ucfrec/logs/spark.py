@@ -24,9 +24,10 @@ import pyarrow.parquet as pq
 from ucfrec import schema
 from ucfrec.errors import InputError, one_line
 from ucfrec.logs.binding import explained
+from ucfrec.logs.clean import faults
 from ucfrec.logs.engine import BATCH_ROWS
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.sorted_rows import code_tables, coded_ids, faults, in_order, with_faults
+from ucfrec.logs.sorted_rows import code_tables, coded_ids, in_order, with_faults
 from ucfrec.logs.spark_tasks import Task, run_tasks
 from ucfrec.logs.tables import Table
 from ucfrec.logs.typed import (

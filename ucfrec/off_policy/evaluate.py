@@ -34,15 +34,8 @@ from ucfrec.off_policy.fqe import ModelReport, fit_models
 from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps
 from ucfrec.off_policy.pages import as_pages, pages_of
 from ucfrec.off_policy.score import LoggedSessions, ScoredSteps, scored_steps
-from ucfrec.off_policy.verdict import (
-    FAR_OFF,
-    Verdict,
-    cautions,
-    conclude,
-    influences,
-    seen_too_often,
-    share_seen,
-)
+from ucfrec.off_policy.training_rows import seen_too_often, share_seen
+from ucfrec.off_policy.verdict import FAR_OFF, Verdict, cautions, conclude, influences
 from ucfrec.provenance import without_folders
 from ucfrec.results.row import ResultRow, Scalar
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -137,9 +130,6 @@ def evaluate_off_policy(
         rule: the decision rule to evaluate; None for the run's own.
         seed: seed of the folds and of the bootstrap.
 
-    Returns:
-        The estimates, the warnings and the verdict.
-
     Raises:
         InputError: propensities are not probabilities, there is only one user, or a page would have
             a session of several steps.
@@ -166,8 +156,8 @@ def evaluate_off_policy(
         **diagnosis_columns(diagnosis),
         **evaluated.models.columns(),
     }
-    fingerprint, conditions = logged.store.record.fingerprint, _conditions(run, steps, options)
-    subject = Subject(trained, rule, seed, fingerprint, conditions, about)
+    read = logged.store.record.fingerprint, _conditions(run, steps, options)
+    subject = Subject(trained, rule, seed, *read, about)
     return OffPolicyReport(
         subject.rows(found),
         warnings,

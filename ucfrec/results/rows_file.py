@@ -110,24 +110,6 @@ def remove_rows(path: Path, keys: Sequence[RowKey]) -> None:
             _write(path, b"", [row.to_json() for row in kept])
 
 
-def read_configurations(folder: Path) -> dict[str, Mapping[str, Any]]:
-    """Read the configurations of the rows in `folder`: hash to configuration.
-
-    Raises:
-        InputError: a line is no configuration, or its hash does not match.
-    """
-    path = folder / CONFIGURATIONS
-    configurations: dict[str, Mapping[str, Any]] = {}
-    for number, value in read_lines(path):
-        config = value.get("config") if isinstance(value, dict) else None
-        if not isinstance(config, dict) or not isinstance(value, dict):
-            raise InputError(f"{path}, line {number}, is no configuration")
-        if value.get("hash") != config_hash(config):
-            raise InputError(f"{path}, line {number}, has another hash than its configuration")
-        configurations[config_hash(config)] = config
-    return configurations
-
-
 def latest(rows: Sequence[ResultRow]) -> list[ResultRow]:
     """The last row of each measurement, regardless of data and configuration."""
     last = {

@@ -10,7 +10,7 @@ import pytest
 
 from tests.support.causes import QUICK
 from tests.support.real_data import data_folder
-from tests.support.result_rows import result_row
+from tests.support.result_rows import read_configurations, result_row
 from ucfrec.benchmark.cells import Budget, Evaluation, key, training_config
 from ucfrec.benchmark.estimate import announcement, estimated_hours
 from ucfrec.benchmark.suite import Benchmark, BenchmarkRequest, show
@@ -22,7 +22,7 @@ from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior
 from ucfrec.files.atomic import read_json
 from ucfrec.plugins import load_plugin
-from ucfrec.results.rows_file import append_rows, read_configurations, read_rows
+from ucfrec.results.rows_file import append_rows, read_rows
 from ucfrec.runs.record import read_record
 from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 from ucfrec_simulators.benchmark import plan

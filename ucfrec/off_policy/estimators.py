@@ -37,8 +37,6 @@ from ucfrec.off_policy.pages import independent_terms
 from ucfrec.off_policy.shrinkage import shrunk
 
 LOGGED = "logged"
-WEIGHTED = ("IPS", "SNIPS", "PDIS", "SNPDIS", "DR", "SNDR", "MIPS")
-"""Estimates that weigh sessions, unshrunk."""
 
 
 @dataclass(frozen=True)

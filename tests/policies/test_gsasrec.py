@@ -26,7 +26,7 @@ def test_the_loss_is_that_of_the_paper(
     drawn = torch.arange(min(negatives, n_items))
     monkeypatch.setattr(policy, "_drawn", lambda _: drawn)
     windows = store.windows(*store.locate(torch.arange(20).numpy()), 6)
-    found, _ = policy.loss(windows)
+    found = policy.loss(windows)[0].detach()
     normalized = policy.normalized(windows)
     with torch.no_grad():
         scores = policy.head.predict(policy.features(normalized)[windows.mask])

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from tests.recommending.test_recommend import random_log
-from ucfrec import EpisodeStore
+from ucfrec import EpisodeStore, Recommender
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
 from ucfrec.logs import LogMapping, PrepareOptions, prepare
 from ucfrec.off_policy.score import held_out_sessions
-from ucfrec.runs.record import REFIT
+from ucfrec.runs.record import REFIT, RunRecord
 from ucfrec.runs.refit import SHARE, refit_within
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -71,6 +71,28 @@ def test_a_refit_is_made_once_and_again_for_other_weights(folder: Path, tmp_path
     assert file.stat().st_mtime_ns > made
     assert main(["train", str(store.path), "--out", str(run), *SETS, *more, "--no-refit"]) == 0
     assert TrainedPolicy.load(run).record.refit_of is None
+
+
+def test_an_interrupted_refit_is_not_used_and_goes_on(folder: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(folder / "run", run)
+    store, whole = EpisodeStore.open(folder / "store"), TrainedPolicy.load(run)
+    file = run / REFIT / "run.json"
+    record = RunRecord.read(run / REFIT)
+    record.with_entries(rule=None).written(run / REFIT)  # killed before the rule is copied
+    assert TrainedPolicy.load(run).record.refit_of is None
+    refit_within(store, run)
+    assert TrainedPolicy.load(run).fingerprint == whole.fingerprint
+    assert file.is_file()
+
+
+def test_in_python_a_refit_is_asked_for(folder: Path, tmp_path: Path) -> None:
+    store, tiny = EpisodeStore.open(folder / "store"), [*TINY, "augment.copies=0"]
+    policies = [
+        Recommender("dt", settings=tiny).fit(store, tmp_path / str(refit), refit=refit)
+        for refit in (False, True)
+    ]
+    assert [each.trained.record.refit_of is None for each in policies] == [True, False]
 
 
 def test_a_refit_moves_with_its_store(folder: Path, tmp_path: Path) -> None:

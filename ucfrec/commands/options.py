@@ -138,6 +138,13 @@ def rule_options(parser: argparse.ArgumentParser) -> None:
     rule = parser.add_argument_group(
         "decision rule", "each part is the run's own, chosen at the end of its training, by default"
     )
+    _score_options(rule)
+    _draw_options(rule)
+    _filter_options(rule)
+
+
+def _score_options(rule: argparse._ArgumentGroup) -> None:
+    """Add what the score of an item is made of."""
     target = rule.add_mutually_exclusive_group()
     target.add_argument(
         "--target-return",
@@ -175,6 +182,10 @@ def rule_options(parser: argparse.ArgumentParser) -> None:
         metavar="RETURN",
         help="expected return after a step that does not end the session; 0 for none",
     )
+
+
+def _draw_options(rule: argparse._ArgumentGroup) -> None:
+    """Add how items are drawn by their scores."""
     rule.add_argument(
         "--temperature", type=float, help="draw items at this temperature; 0 takes the best"
     )
@@ -188,6 +199,10 @@ def rule_options(parser: argparse.ArgumentParser) -> None:
     rule.add_argument(
         "--explore-top", type=int, metavar="N", help="these draw from the N best items only"
     )
+
+
+def _filter_options(rule: argparse._ArgumentGroup) -> None:
+    """Add which items are left out."""
     rule.add_argument(
         "--exclude-seen", action="store_true", help="exclude items that the session has shown"
     )

@@ -23,6 +23,7 @@ from ucfrec.user_model.trees import LEAVES, TREES, BoostedTrees
 _MAX_ROWS: Final = 300_000
 _AT_ONCE: Final = 4096
 _FOLDS: Final = 5
+_DECIMALS: Final = 3
 _SPLITS: Final = LEAVES - 1
 
 
@@ -145,6 +146,8 @@ class BoostedPolicy(SequencePolicy):
         shown_of, liked_of = (self.shown[items], self.liked[items]) if counts is None else counts
         count, likes = before.sum(1, keepdim=True), liked.sum(1, keepdim=True)
         cosines = self.directions[items] @ self.directions[earlier].mT  # (B, C, N)
+        # Products of other batches differ in the last bits, which could change a tree's branch.
+        cosines = _rounded(cosines)
         none = cosines.new_zeros(cosines.shape[:2])
         alike = self.tag[items].unsqueeze(-1) == self.tag[earlier].unsqueeze(1)
         tagged, liked_tagged = (
@@ -157,8 +160,8 @@ class BoostedPolicy(SequencePolicy):
             self._rate(likes, count),
             count,
             liked[:, -1:] - 1 + before[:, -1:] if earlier.shape[1] else none[:, :1],
-            (cosines @ liked.unsqueeze(-1)).squeeze(-1) / likes.clamp(min=1),
-            (cosines @ before.unsqueeze(-1)).squeeze(-1) / count.clamp(min=1),
+            _rounded((cosines @ liked.unsqueeze(-1)).squeeze(-1) / likes.clamp(min=1)),
+            _rounded((cosines @ before.unsqueeze(-1)).squeeze(-1) / count.clamp(min=1)),
             cosines[..., -1] * before[:, -1:] if earlier.shape[1] else none,
             torch.logit((liked_tagged + 2 * whole) / (tagged + 2)),
             tagged,
@@ -169,7 +172,7 @@ class BoostedPolicy(SequencePolicy):
         """Log-odds (B, C) of a like of items as of `_inputs`."""
         inputs = self._inputs(windows, items)
         scores = []
-        for rows in inputs.flatten(0, 1).split(_AT_ONCE):
+        for rows in torch.split(inputs.flatten(0, 1), _AT_ONCE):
             columns = rows.T.contiguous()
             which = torch.zeros(TREES, len(rows), dtype=torch.int64, device=rows.device)
             for split in range(_SPLITS):
@@ -203,6 +206,10 @@ class BoostedPolicy(SequencePolicy):
         liked = (windows.rewards[:, -1] >= least).float()
         scores = self._scored(windows, windows.actions[:, -1:])[:, 0]
         return F.binary_cross_entropy_with_logits(scores, liked)
+
+
+def _rounded(values: Tensor) -> Tensor:
+    return torch.round(values, decimals=_DECIMALS)
 
 
 def _table(trees: BoostedTrees, tree: int) -> tuple[Tensor, Tensor, Tensor]:

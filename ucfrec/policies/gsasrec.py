@@ -71,4 +71,6 @@ class GSASRecPolicy(SASRecPolicy):
         device = self.state_mean.device
         if n_items <= self.config.negatives:
             return torch.arange(n_items, device=device)
-        return torch.randint(n_items, (self.config.negatives,), device=device).unique()
+        drawn = torch.randint(n_items, (self.config.negatives,), device=device)
+        found: Tensor = torch.unique(drawn)  # type: ignore[no-untyped-call]
+        return found

@@ -62,7 +62,6 @@ def add_measurement(
         how: the command, e.g. "ucfrec ope".
         of: what was measured on what, e.g. "DR on sessions.parquet, target return 5".
         values: name to number or text, in the order of the table.
-        said: the verdict and warnings.
     """
     if not os.access(run, os.W_OK):
         return

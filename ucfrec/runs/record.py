@@ -287,6 +287,18 @@ def read_record(run: Path) -> RunRecord:
     return record
 
 
+def refit_of_run(run: Path, record: RunRecord) -> RunRecord | None:
+    """The record of a run's finished refit; None without one.
+
+    A refit whose training or last steps were interrupted is not used.
+    """
+    if not (run / REFIT / RUN).is_file():
+        return None
+    found = read_record(run / REFIT)
+    whole = found.policy is not None and (found.rule is None) == (record.rule is None)
+    return found if whole else None
+
+
 def read_training(run: Path) -> TrainingRecord:
     """The record of a run of whatever library; its other files are not looked at.
 

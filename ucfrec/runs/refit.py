@@ -10,7 +10,7 @@ from ucfrec.errors import InputError
 from ucfrec.fitting import distributed
 from ucfrec.provenance import config_hash
 from ucfrec.runs.config import Config
-from ucfrec.runs.record import REFIT, RUN, RunRecord, read_record, store_from
+from ucfrec.runs.record import REFIT, RUN, RunRecord, refit_of_run, store_from
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import INPUTS, REWARD_MODEL, RULE, TrainedPolicy
 from ucfrec.user_model.model import SESSIONS
@@ -79,11 +79,10 @@ def refit_within(store: EpisodeStore, run: Path) -> RunRecord:
     """
     out = run / REFIT
     if (out / RUN).exists():
-        record = read_record(out)
-        first = _identity(TrainedPolicy.load(run, split=True))
-        if config_hash(record.refit_of or {}) != config_hash(first):
+        first = TrainedPolicy.load(run, split=True)
+        if config_hash(RunRecord.read(out).refit_of or {}) != config_hash(_identity(first)):
             shutil.rmtree(out)
-        elif record.policy is not None and record.rule is not None:
+        elif (record := refit_of_run(run, first.record)) is not None:
             return record
     return refit(store, run, out)
 

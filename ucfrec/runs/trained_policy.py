@@ -28,7 +28,7 @@ from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import config_hash
-from ucfrec.runs.record import REFIT, RunRecord, read_record
+from ucfrec.runs.record import REFIT, RunRecord, read_record, refit_of_run
 from ucfrec.user_model.model import load_session_end
 from ucfrec.user_model.reward import FITTED, ItemRewardModel
 from ucfrec.user_model.session_end import SessionEnd
@@ -92,8 +92,9 @@ class TrainedPolicy:
             InputError: `run` is not a run folder, or has no checkpoint yet.
         """
         record, folder = read_record(run), run
-        if not (in_training or split) and (run / REFIT / RUN).is_file():
-            record, folder = read_record(run / REFIT), run / REFIT
+        refit = None if in_training or split else refit_of_run(run, record)
+        if refit is not None:
+            record, folder = refit, run / REFIT
         if record.policy is None and not in_training:
             warnings.warn(
                 f"the training in {run} has not ended: later weights may be better, and its "

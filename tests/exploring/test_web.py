@@ -114,7 +114,7 @@ def test_texts_of_others_are_no_markup(explorer: Explorer) -> None:
         ({"user": "nobody"}, "none of the 1 users is in the store"),
         ({"user": "7", "k": "0"}, "k is &#39;0&#39;; give a number from 1 to 100"),
         ({"user": "7", "custom": "on", "temperature": "x"}, "temperature is"),
-        ({"user": "7", "custom": "on", "temperature": "-1"}, "the decision rule has temperature"),
+        ({"user": "7", "custom": "on", "temperature": "-1"}, "temperature is -1"),
         ({"history": "99, 1"}, "item_id that the policy does not know"),
         ({"history": "3, much"}, "line 1 of the history"),
     ],

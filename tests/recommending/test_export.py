@@ -179,9 +179,16 @@ def test_the_command_writes_it_whole_or_not_at_all(
     assert not out.exists()
 
 
-def test_what_scores_items_in_its_own_way_is_refused(tmp_path: Path) -> None:
-    trained = trained_run(tmp_path, "item-knn")
-    with pytest.raises(InputError, match=r"'item-knn.*cannot be exported; train"):
+@pytest.mark.parametrize("name", ["gsasrec", "bpr", "recent-rate"])
+def test_peers_are_exported(tmp_path: Path, name: str) -> None:
+    trained = trained_run(tmp_path, name)
+    assert export(trained, tmp_path / "out", k=5).difference <= 1e-5
+
+
+@pytest.mark.parametrize("name", ["item-knn", "boosted"])
+def test_what_scores_items_in_its_own_way_is_refused(tmp_path: Path, name: str) -> None:
+    trained = trained_run(tmp_path, name)
+    with pytest.raises(InputError, match=rf"'{name}.*cannot be exported; train"):
         export(trained, tmp_path / "out")
     assert not (tmp_path / "out").exists()
     assert isinstance(Recommender.load(trained.folder), Recommender)

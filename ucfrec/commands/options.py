@@ -221,13 +221,18 @@ def _filter_options(rule: argparse._ArgumentGroup) -> None:
     )
 
 
-def item_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options on items that users have seen and on items that the run does not know."""
+def keep_seen_option(parser: argparse.ArgumentParser) -> None:
+    """Add the option on items that users have seen."""
     parser.add_argument(
         "--keep-seen",
         action="store_true",
         help="also recommend items that the user has seen (default: leave them out)",
     )
+
+
+def item_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options on items that users have seen and on items that the run does not know."""
+    keep_seen_option(parser)
     parser.add_argument(
         "--skip-unknown",
         action="store_true",

@@ -259,7 +259,8 @@ def _of_the_logs(seen: float | None, logged: LoggedSessions) -> list[str]:
     if seen is None:
         said.append(
             "the store that the run was trained on is gone or has changed: whether these logs were "
-            "seen in training is not known; move the run together with its store"
+            "seen in training is not known, and users begin without a history; move the run "
+            "together with its store"
         )
     if unknown := logged.unknown_items:
         said.append(

@@ -287,9 +287,9 @@ def _prepared(
             with explained(connection, log.tables, spill):
                 rows = check_sorted(log, batches, options.duplicates, scratch)
                 require_rows(log, len(rows.clean), rows.dropped)
+                note_losses(rows, reward, mapping.where)
                 if like is None:
                     require_variety(rows)
-                note_losses(rows, reward, mapping.where)
                 note_equal_times(rows)
                 stage.update()
                 spool, cut = _cut(rows, options, like, scratch)

@@ -19,6 +19,7 @@ from pydantic import (
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.choosing.choice import ValueEstimate
+from ucfrec.choosing.logged import Evidence
 from ucfrec.counterfactual.screening import DimensionReport
 from ucfrec.counterfactual.state_augmentation import AugmentationReport
 from ucfrec.episodes.item_table import ITEM_STATES
@@ -32,6 +33,7 @@ from ucfrec.fitting.loop import Fit
 from ucfrec.policies.registry import policy_class
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.user_model.reward_report import ItemRewardReport
+from ucfrec.user_model.session_end import SessionEndReport
 
 RUN: Final = "run.json"
 
@@ -132,6 +134,7 @@ class Candidate(Entry):
     value: Number | None = None
     """Mean return of a session in the user model; None for a rule that was not simulated."""
     error: Number | None = None
+    evidence: Evidence | None = None
 
 
 class RuleRecord(Entry):
@@ -146,6 +149,7 @@ class RuleRecord(Entry):
     estimate: ValueEstimate | None = None
     halves_agree: tuple[bool, bool] | None = None
     """Whether the sessions of either half of the users would choose the rule, too."""
+    session_end: SessionEndReport | None = None
 
     @property
     def simulated(self) -> tuple[float, float] | None:

@@ -98,12 +98,11 @@ def test_only_rules_that_the_log_can_evaluate_are_chosen(folder: Path) -> None:
     assert best.effective_users < 12
     search = RuleSearch(problem(folder, 10**6))
     assert not any(search.allowed(each) for each in bound.candidates)
-    nearest = search.level(bound.candidates)
-    assert [each.effective_users for each in nearest] == [
-        max(each.effective_users for each in bound.candidates if search.supported(each))
-    ]
-    known = replace(nearest[0], evidence=replace(nearest[0].evidence, effective_users=1e6))
+    assert set(search.level(bound.candidates)) <= {*filter(search.supported, bound.candidates)}
+    assert chosen.evidence is not None
+    known = replace(chosen, evidence=replace(chosen.evidence, effective_users=1e6))
     assert search.level([*bound.candidates, known]) == [known]
+    assert "too small to evaluate" in choose_by_simulation(problem(folder, 10**6)).warning
 
 
 def test_the_report_draws_what_a_bolder_rule_would_gain(folder: Path) -> None:

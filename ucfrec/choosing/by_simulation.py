@@ -151,14 +151,12 @@ class RuleSearch:
         """The allowed candidates that cannot be told apart from the best: within an error, or the
         tolerance.
 
-        If none is allowed, the supported one with the most effective users, or the one with the
-        most effective items.
+        If the log can evaluate none, all that it supports are allowed; if it supports none, the one
+        with the most effective items.
         """
         allowed = [each for each in candidates if self.allowed(each)]
+        allowed = allowed or [each for each in candidates if self.supported(each)]
         if not allowed:
-            supported = [each for each in candidates if self.supported(each)]
-            if self.least_users and supported:
-                return [max(supported, key=lambda each: each.effective_users)]
             return [max(candidates, key=lambda each: each.items)]
         top = max(allowed, key=lambda each: each.value)
         enough = top.value - max(top.error, self._config.tolerance * abs(top.value))
@@ -180,21 +178,22 @@ class RuleSearch:
     def halves_agree(
         self, chosen: SimulatedRule, candidates: Sequence[SimulatedRule]
     ) -> tuple[bool, bool]:
-        """Whether in the sessions of either half of the users no allowed rule is better than the
-        chosen one, by more than a standard error of the difference and the tolerance."""
+        """Whether the chosen rule cannot be told apart from the best allowed one in the sessions of
+        either half of the users, as in `level`."""
         own = self._returns[chosen.rule]
         half = half_of(self._store)[np.arange(len(own)) % len(self._store)]
-        others = [self._returns[each.rule] for each in candidates if self.allowed(each)]
-        agrees = [True, True]
-        for number, other in product((0, 1), others):
-            mine = half == number
-            if len(other) != len(own) or mine.sum() < _FEWEST:
+        allowed = {each.rule for each in candidates if self.allowed(each)} | {chosen.rule}
+        returns = [self._returns[rule] for rule in allowed if len(self._returns[rule]) == len(own)]
+        agree = []
+        for mine in (half == 0, half == 1):
+            top = max((each[mine] for each in returns), key=_mean)
+            if len(top) < _FEWEST:
+                agree.append(True)
                 continue
-            ahead = (other - own)[mine]
-            error = float(ahead.std(ddof=1)) / len(ahead) ** 0.5
-            tolerated = self._config.tolerance * abs(float(other[mine].mean()))
-            agrees[number] &= bool(ahead.mean() <= max(error, tolerated))
-        return agrees[0], agrees[1]
+            error, mean = float(top.std(ddof=1)) / len(top) ** 0.5, float(top.mean())
+            margin = max(error, self._config.tolerance * abs(mean))
+            agree.append(bool(own[mine].mean() >= mean - margin))
+        return agree[0], agree[1]
 
     def estimate(self, rule: DecisionRule) -> ValueEstimate:
         """The return of a session under a rule, in sessions that did not choose it.
@@ -270,7 +269,7 @@ def _warning(search: RuleSearch, best: SimulatedRule) -> str:
     elif not search.allowed(best):
         said.append(
             f"no candidate leaves {search.least_users:g} effective users of the log, this one "
-            f"leaves {best.effective_users:.0f}; ucfrec ope may find the log too small for it"
+            f"{best.effective_users:.0f}: the log is too small to evaluate it"
         )
     return "".join(f"; WARNING: {each}" for each in said)
 
@@ -357,6 +356,10 @@ def _simplicity(candidate: SimulatedRule) -> tuple[float, ...]:
         *(rule.tag_run > 0, rule.tag_window > 0, rule.lookahead > 0, -rule.temperature),
         *(rule.reward_weight, rule.lookahead, -rule.policy_weight, -rule.tag_run),
     )
+
+
+def _mean(values: Float64Array) -> float:
+    return float(values.mean()) if len(values) else 0.0
 
 
 def _least_evident(candidate: SimulatedRule) -> tuple[float, ...]:

@@ -24,7 +24,7 @@ from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 
-SMALL = ("policy.dim=32", "train.steps=150", "train.learning_rate=1e-3", "train.warmup_steps=15")
+SMALL = ("policy.dim=32", "train.steps=100", "train.learning_rate=1e-3", "train.warmup_steps=15")
 SETTINGS = (*SMALL, "train.validate_every=50", "augment.copies=0", "rule.sessions=50")
 CATALOG = Environment("synthetic-catalog")
 
@@ -63,8 +63,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--replications", type=int, default=20)
-    parser.add_argument("--sessions", type=int, default=8000)
-    parser.add_argument("--episodes", type=int, default=4000)
+    parser.add_argument("--sessions", type=int, default=10_000)
+    parser.add_argument("--episodes", type=int, default=3000)
     options = parser.parse_args()
     found = list[dict[str, Any]]()
     for seed in range(options.replications):

@@ -37,10 +37,10 @@ _FEWEST: Final = 10
 """Sessions of a half of the users that can disagree."""
 _FAR_OFF: Final = 0.1
 """Share of the estimated value by which it may be off and still be trusted."""
-_NEAR_THE_LOG: Final = {
-    "temperature": (1.0, 1.5, 2.0, 4.0, 8.0),
-    "reward_weight": (0.0, 0.25, 0.5, 1.0),
-}
+_NEAR_THE_LOG: Final = (
+    {"temperature": (1.0, 1.5, 2.0, 4.0, 8.0), "reward_weight": (0.0, 0.25, 0.5, 1.0)},
+    {"temperature": (1.0,), "reward_weight": (0.125, 0.25, 0.5, 1.0), "policy_weight": (0.0,)},
+)
 """Candidates where a rule must leave effective users of a log with propensities."""
 
 
@@ -238,7 +238,7 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
         tried += _with_tag_run(search, second)
     if search.least_users:
         done = {each.rule for each in tried}
-        near = (replace(first, **parts) for parts in _grid(**_NEAR_THE_LOG))
+        near = (replace(first, **parts) for grid in _NEAR_THE_LOG for parts in _grid(**grid))
         tried += search.simulate([rule for rule in near if rule not in done])
     finalists = tried
     if search.users.reward_report.new_users:

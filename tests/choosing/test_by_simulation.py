@@ -96,6 +96,12 @@ def test_a_run_acts_by_the_rule_that_it_chose_and_says_how(
     assert found.rule.simulated == (rule["estimate"]["value"], rule["estimate"]["error"])
     assert f"the log supports: {rule['estimate']['value']:.4g} ±" in found.describe()
     assert RuleRecord.model_validate({**rule, "estimate": None}).simulated is None
+    estimate = found.rule.estimate
+    assert estimate is not None
+    assert estimate.value == pytest.approx(sum(estimate.halves) / 2)
+    assert estimate.error >= abs(estimate.halves[0] - estimate.halves[1]) / 2
+    assert any("no propensities" in doubt for doubt in estimate.doubts)
+    assert "WARNING: it cannot be trusted: the log has no propensities" in found.describe()
 
 
 def test_a_reward_weight_pays_where_the_reward_model_knows_the_items(
@@ -147,6 +153,17 @@ def test_unsupported_and_narrow_rules_are_not_allowed(folder: Path, trained: Tra
     assert search.best([replace(sure, value=0.985 * sure.value), sure]).value < sure.value
     assert search.best([replace(sure, value=0.975 * sure.value), sure]) == sure
     assert search.best([replace(simulated, items=1.0), replace(simulated, items=1.5)]).items == 1.5
+
+
+def test_halves_of_the_users_say_whether_they_would_choose_another_rule(
+    folder: Path, trained: TrainedPolicy
+) -> None:
+    search = search_of(folder, trained, replace(FEW, sessions=60))
+    plain, weighted = search.simulate(
+        [DecisionRule(2.0, reward_weight=each, temperature=1.0) for each in (0.0, 4.0)]
+    )
+    assert search.halves_agree(weighted, [plain, weighted]) == (True, True)
+    assert not any(search.halves_agree(plain, [plain, weighted]))
 
 
 def test_every_kind_of_candidate_is_simulated(folder: Path, trained: TrainedPolicy) -> None:

@@ -136,7 +136,10 @@ class LoggedEvidence:
         sums = np.bincount(self._episodes, logs - np.log(self._propensities))
         weights = np.exp(np.minimum(sums, 100.0))
         returns = self._view.returns.astype(np.float64)
-        above, below = (np.bincount(self._users, each) for each in (weights * returns, weights))
+        above, below = (
+            np.bincount(self._users, each).astype(np.float64)
+            for each in (weights * returns, weights)
+        )
         enough = min(_effective(below[half::2]) for half in (0, 1)) * 2
         if not below.any():
             return Evidence(rate, likelihood, 0.0)

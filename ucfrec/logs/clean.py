@@ -25,7 +25,7 @@ REASONS: Final = {
 """Reason to its description; a row is dropped for the first reason that applies."""
 
 CLOCK_HINT: Final = (
-    "is the time in milliseconds? Of seconds, make them by --column timestamp='timestamp * 1000'; "
+    "is the time in milliseconds? Seconds are read with --column timestamp='COLUMN * 1000'; "
     "for older times, say --earliest 1990-01-01, or earliest in the mapping"
 )
 

@@ -295,7 +295,7 @@ def _prepared(
                 spool, cut = _cut(rows, options, like, scratch)
                 stage.update()
                 measures = measure(spool, cut, rows.last_ms, rows.items, scratch / "users")
-                note_bots(rows, measures)
+                note_bots(rows, measures, mapping.columns.get(schema.USER_ID, schema.USER_ID))
                 stage.update()
                 features = _features(log, mapping, like)
                 number_ids(log, measures, features, like)

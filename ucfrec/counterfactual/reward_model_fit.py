@@ -12,8 +12,12 @@ import torch
 from torch import Tensor
 
 from ucfrec.arrays import Float32Array
-from ucfrec.counterfactual.effects_mean import EffectsMean
-from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, kl_to_prior
+from ucfrec.counterfactual.reward_model import (
+    CausalRewardModel,
+    CRMConfig,
+    EffectsMean,
+    kl_to_prior,
+)
 from ucfrec.episodes.windows import Transitions
 from ucfrec.errors import InputError
 from ucfrec.files.record import Undefinable
@@ -82,11 +86,8 @@ def fit_crm(
     """Train the reward model (Algorithm 2) with early stopping on held-out steps.
 
     Args:
-        train: transitions to train on.
         validation: held-out transitions, never trained on.
-        config: architecture and training.
         folder: of the checkpoints, which training resumes from.
-        seed: of sampling, initialisation and training.
         mean: E[r | s, a], if it was fitted before; transitions then have the actions that it reads.
         device: where the model is fitted, and stays. What is drawn is the same on all.
 

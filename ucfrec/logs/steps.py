@@ -31,9 +31,7 @@ class StepNumbers:
         """The numbers in the tables of `ucfrec.logs.ids.number_ids`.
 
         Args:
-            log: its engine has the tables.
             measures: of the log's episodes.
-            folder: for scratch.
         """
         users = Spool(folder / "numbers")
         for batch in numbers(log, schema.USER_ID, "users"):
@@ -53,13 +51,6 @@ def write_steps(
     display: Progress,
 ) -> StoreWriter:
     """Write all episodes to the store at `folder`.
-
-    Args:
-        folder: scratch folder of the store.
-        episodes: in the order of the store.
-        spool: their rows.
-        numbered: numbers of users and items.
-        display: counts the steps.
 
     Returns:
         The writer, not finished.

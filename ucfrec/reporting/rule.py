@@ -51,9 +51,11 @@ def frontier(record: RunRecord) -> tuple[LineChart, Table] | None:
         return None
     curve: Mapping[float, float] = {_users(each) or 0.0: each.value or 0.0 for each in best}
     chosen = next((each for each in known if each.rule == record.rule.rule), None)
-    levels = {} if chosen is None else {"chosen": chosen.value or 0.0}
+    curves = [("best rule", 0, curve)]
+    if chosen is not None:
+        curves.append(("chosen rule", 1, {_users(chosen) or 0.0: chosen.value or 0.0}))
     title = "Estimated value against evidence"
-    chart = line_chart(title, "effective users of the log", [("best rule", 0, curve)], levels)
+    chart = line_chart(title, "effective users of the log", curves)
     head = ["estimated value", "effective users", "off-policy interval"]
     return chart, Table(title, "rule", head, [(str(each.rule), _numbers(each)) for each in best])
 

@@ -12,6 +12,7 @@ import torch
 
 from ucfrec.acting.scorer import Scorer
 from ucfrec.choosing.choose import choose_rule
+from ucfrec.choosing.problem import Problem
 from ucfrec.counterfactual.augmentation import MODELS, counterfactual_augmentation
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
@@ -230,7 +231,7 @@ def _choose_rule(run: _Inputs, users: UserModel) -> RuleRecord:
     config = run.config.rule
     targets = {quantile: trained.target_return(quantile) for quantile in config.quantiles}
     views = of_people(run.logged), of_people(run.held_out)
-    choice = choose_rule(scorer, users, targets, *views, config, run.config.seed)
+    choice = choose_rule(Problem(scorer, users, targets, *views, config, run.config.seed))
     write_json(run.out / RULE, choice.rule.as_dict())
     return RuleRecord.model_validate(choice.as_dict())
 

@@ -29,8 +29,9 @@ ORDER = (
     {"evaluation", "recommending"},
     {"off_policy"},
     {"reporting"},
-    {"benchmark"},
-    {"recommender"},
+    {"benchmark", "tuning"},
+    {"given_data"},
+    {"exploring", "recommender"},
     {"commands"},
     {"__init__", "__main__"},
 )

@@ -23,7 +23,7 @@ from ucfrec.episodes.windows import Overlay
 from ucfrec.files.atomic import write_json
 from ucfrec.files.locks import claimed, remove_leftovers, remove_leftovers_within
 from ucfrec.fitting import distributed
-from ucfrec.fitting.loop import Fit
+from ucfrec.fitting.loop import SILENT, Callbacks, Fit
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.checks import require_sound
@@ -72,6 +72,7 @@ def train_run(
     more_augmentation: Overlay | None = None,
     refit_of: Path | None = None,
     shared: SharedStages = OWN,
+    callbacks: Callbacks = SILENT,
 ) -> RunRecord:
     """Train a policy on the training episodes of `store`, or resume the run in `out`.
 
@@ -94,6 +95,7 @@ def train_run(
         shared: reward models and augmentation that runs on the same store have in common where
             their settings of these stages and their seeds agree; by default a run makes its own.
             The time of a stage is in the record of the run that made it.
+        callbacks: what is told of the training of the policy.
 
     Returns:
         The record of the run: provenance, configuration and the report of every stage.
@@ -112,7 +114,7 @@ def train_run(
         with phase("Counterfactual augmentation", 1, PHASES):
             overlay, augmentation = _augment(run, refit_of)
         with phase("Training the policy", 2, PHASES):
-            fit = _train_policy(run, overlay, more_augmentation, refit_of)
+            fit = _train_policy(run, overlay, more_augmentation, refit_of, callbacks)
         if not distributed.leads():
             return run.record
         chosen = run.record.rule is not None and run.record.policy == fit
@@ -200,16 +202,19 @@ def _augment(
 
 
 def _train_policy(
-    run: _Inputs, overlay: Overlay | None, more: Overlay | None, refit_of: Path | None
+    run: _Inputs,
+    overlay: Overlay | None,
+    more: Overlay | None,
+    refit_of: Path | None,
+    callbacks: Callbacks,
 ) -> Fit:
     """Fit the policy to logged and augmented episodes (lines 4 and following of Algorithm 1)."""
     if more is not None:
         overlay = more if overlay is None else overlay.joined(more)
     train = run.train if overlay is None else run.train.with_overlay(overlay)
-    if refit_of is None:
-        return fit_policy(run.policy, train, run.validation, run.out, run.config)
-    start = refit_of / "policy" / "best.safetensors"
-    return fit_policy(run.policy, train, None, run.out, run.config, start)
+    start = None if refit_of is None else refit_of / "policy" / "best.safetensors"
+    validation = run.validation if refit_of is None else None
+    return fit_policy(run.policy, train, validation, run.out, run.config, start, callbacks)
 
 
 def _fit_user_model(run: _Inputs) -> UserModel:

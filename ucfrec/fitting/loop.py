@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Final, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from ucfrec.fitting import distributed
 from ucfrec.fitting.average import WeightAverage
 from ucfrec.fitting.checkpoint import (
     load_tensors,
+    load_trained,
     load_training,
     load_weights,
     save_tensors,
@@ -31,6 +32,8 @@ from ucfrec.progress import Progress, no_progress, progress
 from ucfrec.settings import BatchSize, Count, LearningRate, WeightDecay, settings_table
 
 Batch = TypeVar("Batch")
+INITIAL: Final = "initial.safetensors"
+"""File of the weights that a training begins with, in its folder, if it is there."""
 
 
 @settings_table("train")
@@ -128,11 +131,14 @@ def fit(
     """
     folder.mkdir(parents=True, exist_ok=True)
     last, best = folder / "last.safetensors", folder / "best.safetensors"
+    initial = folder / INITIAL
     optimizer = _optimizer(module, config)
     average = WeightAverage(module, config.average) if config.average else None
     counters = {"step": 0, "best_step": 0, "best_validation": math.inf, "stale": 0, "seconds": 0.0}
     if last.exists():
         counters.update(load_training(last, module, optimizer, average))
+    elif initial.exists():
+        load_weights(initial, module, load_trained(initial))
     step = int(counters["step"])
     clock, log = _Clock(step, counters["seconds"]), _log(folder, step)
     joint = rows if distributed.processes() > 1 else None

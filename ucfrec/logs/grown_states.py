@@ -52,9 +52,7 @@ def write_grown_states(store: Path, folder: Path, found: PreparedLog, steps: Tri
     vectors = _extended(old.embeddings.numpy(), encoded[items], before)
     if encoded[items] is None:
         vectors = _moved(vectors, steps, before, shown, old)
-    features = old.user_features.numpy()
-    if features.shape[1]:
-        features = _extended(features, encoded[users], counts[users])
+    features = _extended(old.user_features.numpy(), encoded[users], counts[users])
     tags = item_tags(log.connection, found.features[items], "items", items)
     write_item_table(
         folder / ITEM_STATES,
@@ -71,7 +69,7 @@ def _extended(old: Float32Array, features: sparse.csr_matrix | None, counts: Int
     known = np.flatnonzero(counts[: len(old)])
     mean = old[known].mean(axis=0) if len(known) else np.zeros(old.shape[1])
     rows = np.tile(mean, (len(counts), 1)).astype(np.float64)
-    if features is not None and len(known):
+    if features is not None and len(known) and old.shape[1]:
         rows += predicted_from_features(features, known, old[known] - mean, counts[known])
         # Of an id without any feature nothing is predicted.
         rows[np.diff(features.indptr) == 0] = mean

@@ -25,6 +25,7 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 POSITION: Final = "position"
 RUN: Final = "run"
 RULE: Final = "rule"
+ARM: Final = "arm"
 _ROWS: Final = 50_000
 _SECONDS: Final = 60.0
 _MOST_WAITING: Final = 20
@@ -45,6 +46,7 @@ def exposure_schema(trained: TrainedPolicy) -> pa.Schema:
             (schema.PROPENSITY, pa.float64()),
             (RUN, pa.string()),
             (RULE, pa.string()),
+            (ARM, pa.string()),
         ]
     )
 
@@ -67,6 +69,7 @@ def exposures_written(
         for frame in frames:
             shown = frame.rename(columns={RANK: POSITION})
             shown[RUN], shown[RULE], shown[schema.TIMESTAMP] = trained.fingerprint, rule, now
+            shown[ARM] = ""
             shown[schema.USER_ID] = shown[schema.USER_ID].astype(str)
             table = pa.Table.from_pandas(shown[columns.names], columns, preserve_index=False)
             writer.write_table(table)
@@ -183,6 +186,7 @@ class ExposureLog:
                 (REQUEST_ID, answer.request_id),
                 (RUN, answer.run),
                 (RULE, answer.rule),
+                (ARM, answer.arm),
             ):
                 columns[name] += [value] * shown
         return pa.table(columns, self._schema)

@@ -34,6 +34,7 @@ from ucfrec.runs.samples import SAMPLES, sample_recommendations
 from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec.runs.start import begin, new_policy, require_startable, training_views
 from ucfrec.runs.trained_policy import AUGMENTATION, INPUTS, REWARD_MODEL, RULE, TrainedPolicy
+from ucfrec.runs.warm_start import start_warm
 from ucfrec.user_model.model import UserModel
 
 _OVERLAY = "overlay.safetensors"
@@ -71,6 +72,7 @@ def train_run(
     more_augmentation: Overlay | None = None,
     on_all_rows: bool = False,
     shared: SharedStages = OWN,
+    initial: Path | None = None,
 ) -> RunRecord:
     """Train a policy on the training episodes of `store`, or resume the run in `out`.
 
@@ -93,6 +95,7 @@ def train_run(
         shared: reward models and augmentation that runs on the same store have in common where
             their settings of these stages and their seeds agree; by default a run makes its own.
             The time of a stage is in the record of the run that made it.
+        initial: a run on an older state of the store, whose weights the training begins with.
 
     Returns:
         The record of the run: provenance, configuration and the report of every stage.
@@ -108,6 +111,8 @@ def train_run(
             remove_leftovers_within(out)
         begun = time.perf_counter()
         run = _prepare_inputs(store, out, config, about or {}, on_all_rows, shared)
+        if initial is not None:
+            start_warm(run.policy, out, initial)
         with phase("Counterfactual augmentation", 1, PHASES):
             overlay, augmentation = _augment(run)
         with phase("Training the policy", 2, PHASES):

@@ -1,0 +1,111 @@
+"""`ucfrec update`: bring a run up to date with new logs."""
+
+import argparse
+import re
+from pathlib import Path
+from typing import Final
+
+from ucfrec.commands.options import log_options, logs_given, memory_option
+from ucfrec.errors import InputError
+from ucfrec.files.remote import Output, uri_or_path
+
+_DAY_MS: Final = 86_400_000
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `ucfrec update`."""
+    parser.add_argument("run", type=Path, metavar="RUN", help="finished run on the older logs")
+    log_options(parser).metavar = "NEW_LOGS"
+    parser.add_argument(
+        "--out",
+        type=uri_or_path(Output, Path),
+        required=True,
+        metavar="RUN2",
+        help="folder of the new run; an interrupted update in it goes on",
+    )
+    parser.add_argument(
+        "--store",
+        type=Path,
+        metavar="STORE",
+        help="folder of the store with the new rows (default: RUN2-store, beside RUN2)",
+    )
+    parser.add_argument(
+        "--window",
+        metavar="TIME",
+        help="leave out sessions that ended longer ago, before the end of the new logs, e.g. 60d "
+        "or 12h (default: keep all)",
+    )
+    parser.add_argument(
+        "--split",
+        metavar="TRAIN,VALIDATION,TEST",
+        help="shares of the new rows in order of time (default: 0.6,0.2,0.2); older rows train",
+    )
+    parser.add_argument("--seed", type=int, help="of everything random (default: that of RUN)")
+    parser.add_argument("--threads", type=int, help="CPU threads (default: all cores)")
+    memory_option(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run `ucfrec update` and print what was read, the drift and the verdict.
+
+    Raises:
+        InputError: the run or the logs cannot be used, or --out holds something else.
+    """
+    import torch
+
+    from ucfrec.logs.append import SPLIT, AppendOptions
+    from ucfrec.logs.prepare import parse_split
+    from ucfrec.reporting.model_card import write_card
+    from ucfrec.runs.record import RunRecord
+    from ucfrec.updating import drift, verdict
+    from ucfrec.updating.update import UpdateOptions, update_run
+
+    if options.threads is not None:
+        torch.set_num_threads(options.threads)
+    files, mapping = logs_given(options)
+    append = AppendOptions(
+        window_ms=None if options.window is None else window_ms(options.window),
+        split=SPLIT if options.split is None else parse_split(options.split),
+        memory_limit=options.memory_limit,
+    )
+    record: RunRecord = update_run(
+        options.run,
+        files,
+        options.out,
+        store=options.store,
+        mapping=mapping,
+        options=UpdateOptions(append, seed=options.seed),
+    )
+    write_card(options.out)
+    update = record.update
+    assert update is not None
+    assert update.drift is not None
+    assert update.verdict is not None
+    read = update.appended
+    print(
+        f"new rows      {read['steps']:,} of {read['rows_read']:,} read"
+        f" ({read['not_newer']:,} not newer than the store); {read['new_users']:,} new users, "
+        f"{read['new_items']:,} new items; {read['expired_steps']:,} old rows left out"
+    )
+    print(record.describe())
+    print(f"{drift.describe(update.drift)}\n{verdict.describe(update.verdict)}")
+    print(f"\nrun: {options.out}")
+    if update.verdict.result == "worse":
+        print("next: keep the old run; more new rows, or train from nothing with ucfrec train")
+    else:
+        print(f"next: ucfrec promote {options.out}, if `serve` follows its folder")
+
+
+def window_ms(given: str) -> int:
+    """Milliseconds of a time such as `60d` or `12h`.
+
+    Raises:
+        InputError: it is written otherwise, or is 0.
+    """
+    found = re.fullmatch(r"(\d{1,6}(?:\.\d+)?)([hd])", given.strip())
+    milliseconds = 0 if found is None else round(float(found[1]) * _DAY_MS)
+    if found is not None and found[2] == "h":
+        milliseconds //= 24
+    if not milliseconds:
+        raise InputError(f"--window {given} is no time; write e.g. 60d or 12h")
+    return milliseconds

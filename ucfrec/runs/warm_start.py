@@ -1,0 +1,77 @@
+"""Begin a training with the weights of a run on an older state of the store."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import torch
+
+from ucfrec.counterfactual.augmentation import MODELS
+from ucfrec.files.atomic import atomic_file
+from ucfrec.fitting.checkpoint import load_trained
+from ucfrec.fitting.loop import INITIAL
+from ucfrec.policies.base import SequencePolicy
+from ucfrec.runs.config import Config
+
+SHARE: Final = 1 / 6
+"""Steps of a warm training, as a share of those of one from nothing."""
+_SCALES: Final = ("state_mean", "state_std", "return_scale", "lowest_return_to_go")
+"""Buffers of a policy that its weights were trained with."""
+_CRM_EPOCHS: Final = 5
+"""Epochs that `crm.epochs` 0 stands for."""
+
+
+@torch.no_grad()
+def start_warm(policy: SequencePolicy, out: Path, initial: Path) -> None:
+    """Give a policy, and the models of its augmentation, the trained weights of another run.
+
+    Rows of users and items that the other run does not know keep what the new policy begins with:
+    for items no correction of their vector, and the log of their share of the training steps.
+
+    Args:
+        policy: untrained, on the grown store.
+        out: folder of the new run, which receives the models' weights.
+        initial: folder of the run.
+    """
+    path = initial / "policy" / "best.safetensors"
+    trained, names = load_trained(path), {name for name, _ in policy.named_parameters()}
+    own = policy.state_dict()
+    for name in sorted(own.keys() & trained.keys()):
+        new, old = own[name], trained[name]
+        if name not in names and name not in _SCALES:
+            continue
+        if new.shape == old.shape:
+            new.copy_(old)
+        elif new.shape[1:] == old.shape[1:] and len(new) > len(old):
+            new[: len(old)] = old
+    for model in MODELS:
+        for best in sorted((initial / model).rglob("best.safetensors")):
+            target = out / best.relative_to(initial).with_name(INITIAL)
+            if not target.exists():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                with atomic_file(target) as scratch:
+                    shutil.copyfile(best, scratch)
+
+
+def warm_settings(config: Config, share: float = SHARE) -> Config:
+    """The settings of a warm training.
+
+    Args:
+        config: settings of a training from nothing.
+        share: of the steps and epochs of a training from nothing.
+    """
+    few = max(1, round(share * config.train.steps))
+    train = replace(
+        config.train,
+        steps=few,
+        warmup_steps=min(config.train.warmup_steps, few // 10),
+        validate_every=min(config.train.validate_every, max(1, few // 2)),
+    )
+    epochs = max(1, round(share * (config.crm.epochs or _CRM_EPOCHS)))
+    return replace(
+        config,
+        train=train,
+        crm=replace(config.crm, epochs=epochs),
+        csg=replace(config.csg, epochs=max(1, round(share * config.csg.epochs))),
+    )

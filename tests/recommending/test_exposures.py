@@ -41,7 +41,7 @@ def rows_of(given: dict[int, Answer]) -> list[tuple[object, ...]]:
 def read(folder: Path) -> list[tuple[object, ...]]:
     frame = pd.concat([pd.read_parquet(file) for file in sorted(folder.glob("*.parquet"))])
     assert frame.timestamp.between((time.time() - 600) * 1000, time.time() * 1000).all()
-    return list(frame.drop(columns="timestamp").itertuples(index=False, name=None))
+    return list(frame.drop(columns=["timestamp", "arm"]).itertuples(index=False, name=None))
 
 
 def test_what_waits_is_written_when_the_log_is_closed(

@@ -137,6 +137,17 @@ class Served:
         """See `Responder.drift`; of the first arm."""
         return self._arms[0].responder.drift()
 
+    def check(self) -> None:
+        """Answer with the current run from now on, if it is another one and passes a trial.
+
+        Raises:
+            InputError: no run is current.
+        """
+        wanted = self._current()
+        if wanted != self._wanted:
+            self._wanted = wanted
+            self._replace(wanted)
+
     def follow(self, seconds: float = SECONDS) -> None:
         """Look every so many seconds whether another run is current, in a thread of its own."""
         given = (seconds,)
@@ -167,21 +178,17 @@ class Served:
         found = promoted(self._folder)
         if found is None:
             raise InputError(
-                f"{self._folder} is not a run folder, and no run in it was promoted; name a run, or "
-                "ucfrec promote one"
+                f"{self._folder} is not a run folder, and no run in it was promoted; name a run, "
+                "or ucfrec promote one"
             )
         return found.run(self._folder).name
 
     def _run(self, seconds: float) -> None:
         while not self._closed.wait(seconds):
             try:
-                wanted = self._current()
+                self.check()
             except InputError as error:
                 _say(str(error))
-                continue
-            if wanted != self._wanted:
-                self._wanted = wanted
-                self._replace(wanted)
 
     def _replace(self, name: str) -> None:
         """Load a run, try it, and answer with it from the next batch on; or say why not."""

@@ -373,16 +373,19 @@ def summary(days: list[Day]) -> str:
         f"estimates cover the true value: {covered:.1%} of {3 * len(days)}",
         f"promoted: {sum(each.promoted for each in days)} of {len(days)} updates",
     ]
-    for each in days:
-        if each.nothing_seconds and each.nothing_loss:
-            lines.append(
-                f"day {each.day}: update {each.update_seconds:.0f} s of processor time, from "
-                f"nothing {each.nothing_seconds:.0f} s "
-                f"({each.update_seconds / each.nothing_seconds:.0%}); validation loss "
-                f"{each.validation_loss:.4f} and {each.nothing_loss:.4f} "
-                f"({each.validation_loss / each.nothing_loss - 1:+.1%})"
-            )
+    lines += [_against_nothing(each) for each in days if each.nothing_seconds is not None]
     return "\n".join(lines)
+
+
+def _against_nothing(day: Day) -> str:
+    assert day.nothing_seconds is not None
+    assert day.nothing_loss is not None
+    return (
+        f"day {day.day}: update {day.update_seconds:.0f} s of processor time, from nothing "
+        f"{day.nothing_seconds:.0f} s ({day.update_seconds / day.nothing_seconds:.0%}); validation "
+        f"loss {day.validation_loss:.4f} and {day.nothing_loss:.4f} "
+        f"({day.validation_loss / day.nothing_loss - 1:+.1%})"
+    )
 
 
 def main() -> None:

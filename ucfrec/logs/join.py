@@ -22,7 +22,7 @@ from ucfrec.logs.typed import typed_columns
 FEEDBACK: Final = "feedback"
 """Column of the log: how many rows of feedback belong to the exposure."""
 _REQUEST: Final = "request_id"
-_ARM: Final = "arm"
+ARM: Final = "arm"
 _EXPOSURE: Final = {
     schema.USER_ID: None,
     schema.ITEM_ID: None,
@@ -32,7 +32,7 @@ _EXPOSURE: Final = {
     schema.PROPENSITY: "DOUBLE",
     "run": "VARCHAR",
     "rule": "VARCHAR",
-    _ARM: "VARCHAR",
+    ARM: "VARCHAR",
 }
 """Columns of exposures and their DuckDB types; those of ids are kept."""
 _KEYS: Final = {*_EXPOSURE, FEEDBACK, "row"}
@@ -109,7 +109,7 @@ def join_feedback(
 def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: Sequence[Table]) -> None:
     """Create the table `exposures`, each once, with its `row`."""
     for table in tables:
-        missing = [name for name in _EXPOSURE if name not in (*table.columns, _ARM)]
+        missing = [name for name in _EXPOSURE if name not in (*table.columns, ARM)]
         if missing:
             raise InputError(
                 f"{table.files[0]} has no column {', '.join(missing)}: it is no file of exposures; "

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs.join import join_feedback
 from ucfrec.logs.mapping import FeatureTable, LogMapping
@@ -119,9 +120,10 @@ class World:
         catalog = self.catalog
         recent = np.full((len(users), catalog.boredom_window - 1), -1)
         live, rows = np.arange(len(users)), []
+        begins = START_MS + day * DAY_MS + rng.integers(DAY_MS // 2, size=len(users))
         for step in range(catalog.max_turn):
-            now = START_MS + day * DAY_MS + step * STEP_MS
-            items, propensities = show(users[live], live, now, step, rows)
+            now = begins + step * STEP_MS
+            items, propensities = show(users[live], now[live], rows)
             tags = catalog.tags[items]
             chances = catalog.click_probabilities[users[live], items]
             clicks = rng.random(len(users))[live] < chances
@@ -130,7 +132,7 @@ class World:
                     {
                         "user_id": users[live],
                         "item_id": items,
-                        "timestamp": now,
+                        "timestamp": now[live],
                         "click": clicks.astype(int),
                         "propensity": propensities,
                     },
@@ -149,12 +151,7 @@ class Show:
     """Chooses the next items of sessions."""
 
     def __call__(
-        self,
-        users: np.ndarray,
-        live: np.ndarray,
-        now: int,
-        step: int,
-        rows: list[pd.DataFrame],
+        self, users: np.ndarray, now: np.ndarray, rows: list[pd.DataFrame]
     ) -> tuple[np.ndarray, np.ndarray]:
         """Items of the live sessions, and their propensities."""
         raise NotImplementedError
@@ -172,12 +169,7 @@ class Guess(Show):
         self._rng = np.random.default_rng(10)
 
     def __call__(
-        self,
-        users: np.ndarray,
-        live: np.ndarray,
-        now: int,
-        step: int,
-        rows: list[pd.DataFrame],
+        self, users: np.ndarray, now: np.ndarray, rows: list[pd.DataFrame]
     ) -> tuple[np.ndarray, np.ndarray]:
         chances = self._chances[users]
         drawn = self._rng.random((len(users), 1)) * chances.sum(axis=1, keepdims=True)
@@ -195,12 +187,7 @@ class Serve(Show):
         self._history: dict[int, list[dict[str, float]]] = {}
 
     def __call__(
-        self,
-        users: np.ndarray,
-        live: np.ndarray,
-        now: int,
-        step: int,
-        rows: list[pd.DataFrame],
+        self, users: np.ndarray, now: np.ndarray, rows: list[pd.DataFrame]
     ) -> tuple[np.ndarray, np.ndarray]:
         if rows:
             for user, item, at, click, _ in rows[-1].itertuples(index=False):
@@ -211,17 +198,17 @@ class Serve(Show):
                 user_id=int(user),
                 history=self._history.get(int(user), []),
                 k=1,
-                request_id=f"{now}-{user}",
+                request_id=f"{at}-{user}",
             )
-            for user in users
+            for user, at in zip(users, now, strict=True)
         ]
-        self._clock.ms = now
         answers = []
         for outcome in self._answers.answers(requests):
             assert isinstance(outcome, Answer), outcome
             answers.append(outcome)
         if self._log is not None:
-            for user, answer in zip(users, answers, strict=True):
+            for user, at, answer in zip(users, now, answers, strict=True):
+                self._clock.ms = int(at)
                 self._log.add(int(user), answer)
         items = np.array([answer.items[0] for answer in answers], dtype=np.int64)
         return items, np.array([answer.propensities[0] for answer in answers])
@@ -276,7 +263,7 @@ def _day(folder: Path, world: World, day: int) -> Day:
     month, clock, runs = world.month, Clock(), folder / "runs"
     shown, log = folder / f"shown-{day:02d}", folder / f"log-{day:02d}.parquet"
     with Served(lambda run: responder(run, month, EXPLORE), runs, None) as served:
-        current = served.described()["name"]
+        current, rule = served.described()["name"], served.trained.rule
         with ExposureLog(shown, served.trained, clock=clock) as exposures:
             steps = world.sessions(day, Serve(served, exposures, clock))
     frozen = world.sessions(day, Serve(responder(runs / "day-00", month, EXPLORE), None, clock))
@@ -305,7 +292,7 @@ def _day(folder: Path, world: World, day: int) -> Day:
         promoted=better,
         update_seconds=seconds,
         validation_loss=record.finished.best_validation,
-        covered=tuple(_covered(world, run, log)),
+        covered=tuple(_covered(world, run, rule, log)),
     )
     if day not in month.from_nothing:
         return found
@@ -320,10 +307,11 @@ def _day(folder: Path, world: World, day: int) -> Day:
     )
 
 
-def _covered(world: World, run: Path, log: Path) -> Iterator[bool]:
+def _covered(world: World, run: Path, served: DecisionRule, log: Path) -> Iterator[bool]:
     """Whether intervals of the reward per step, from the day's exposures, hold the true values.
 
-    Of candidates that the log can say something of: what it never shows, no log can tell.
+    Of candidates with the filters of the rule that was served: of what it never shows, the log
+    says nothing.
     """
     trained = TrainedPolicy.load(run)
     with logged_sessions(run, trained, [log], LogMapping()) as logged:
@@ -334,8 +322,9 @@ def _covered(world: World, run: Path, log: Path) -> Iterator[bool]:
         propensity = store.step_values("propensity", *places).astype(np.float64)
         assert trained.item_ids is not None
         chances = world.catalog.click_probabilities[users.astype(np.int64)][:, trained.item_ids]
-        drawing = replace(trained.rule, temperature=1.0)
-        for rule in (drawing, replace(trained.rule, explore=0.5), replace(drawing, explore=1.0)):
+        own = replace(trained.rule, tag_window=served.tag_window, tag_run=served.tag_run)
+        drawing = replace(own, temperature=1.0)
+        for rule in (drawing, replace(own, explore=0.5), replace(drawing, explore=1.0)):
             parts = [
                 each.log_probabilities.double().exp() for each in scored_steps(trained, store, rule)
             ]

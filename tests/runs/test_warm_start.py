@@ -36,11 +36,11 @@ def test_what_the_old_run_knows_is_kept(tmp_path: Path) -> None:
 
 
 def test_warm_settings_are_a_share_of_the_whole() -> None:
-    config = resolve_config("ucf", None, ["train.steps=600"])
+    config = resolve_config("ucf", None, ["train.steps=800"])
     warm = warm_settings(config)
     assert warm.train.steps == 100
     assert warm.train.warmup_steps == 10
     assert warm.train.validate_every == 50
-    assert (warm.crm.epochs, warm.csg.epochs) == (1, 7)
+    assert (warm.crm.epochs, warm.csg.epochs) == (1, 5)
     assert warm.policy == config.policy
-    assert warm_settings(config, 1.0).train.steps == 600
+    assert warm_settings(config, 1.0).train.steps == 800

@@ -38,7 +38,7 @@ def arm_of(user_id: int | str, shares: Sequence[float]) -> int:
         user_id: as text or as a number.
         shares: of the arms, which add up to 1.
     """
-    place = xxhash.xxh3_64_intdigest(f"arm {user_id}") % _UNITS / _UNITS
+    place = xxhash.xxh3_64_intdigest(f"arm {user_id}".encode()) % _UNITS / _UNITS
     for number, share in enumerate(shares):
         place -= share
         if place < 0:

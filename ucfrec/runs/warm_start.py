@@ -14,7 +14,7 @@ from ucfrec.fitting.loop import INITIAL
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.runs.config import Config
 
-SHARE: Final = 1 / 6
+SHARE: Final = 1 / 8
 """Steps of a warm training, as a share of those of one from nothing."""
 _SCALES: Final = ("state_mean", "state_std", "return_scale", "lowest_return_to_go")
 """Buffers of a policy that its weights were trained with."""

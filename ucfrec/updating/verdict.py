@@ -33,8 +33,8 @@ def compare_runs(
     """Compare two runs, each under its own rule.
 
     Where steps have propensities, the difference in reward per step decides, under the logging
-    policy's distribution of histories: rankings of logged clicks favour whoever showed them. Else
-    the difference in nDCG of liked items decides.
+    policy's distribution of histories, and nothing if that is not reliable: rankings of logged
+    clicks favour whoever showed them. Else the difference in nDCG of liked items decides.
 
     Args:
         new: trained on a store that was grown from that of `old`.
@@ -48,7 +48,7 @@ def compare_runs(
     value = _valued(new, old, rows, known, users, seed)
     if value is not None:
         differences.append(value)
-    decisive = differences[-1] if not differences[-1].doubt else differences[0]
+    decisive = differences[-1]
     results: dict[int, Literal["better", "no significant difference", "worse"]] = {
         1: "better", 0: "no significant difference", -1: "worse"
     }  # fmt: skip

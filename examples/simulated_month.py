@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import torch
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.store import EpisodeStore
@@ -45,6 +46,8 @@ DAY_MS, STEP_MS = 86_400_000, 10_000
 FIRST_ITEMS = 100
 """Items of the first day; the others come evenly over the month."""
 EXPLORE = 0.05
+_ESTIMATED = 300
+"""Sessions of a day that candidates are evaluated on."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,8 @@ class Day:
     """Items in the catalogue."""
     verdict: str
     promoted: bool
+    current: str
+    """The run that answers the next day."""
     update_seconds: float
     """Processor time of the update."""
     validation_loss: float
@@ -245,8 +250,8 @@ def simulate(folder: Path, month: Month) -> list[Day]:
     config = resolve_config(month.policy, None, month.settings, month.seed)
     train_run(EpisodeStore.open(folder / "store"), first, config)
     days = _done(folder)
-    if not days:
-        promote(first)
+    # A day that was interrupted begins again with the run of the day before.
+    promote(runs / (days[-1].current if days else first.name), force=True)
     for day in range(len(days) + 1, month.days + 1):
         days.append(_day(folder, world, day))
         (folder / "month.json").write_text(json.dumps([asdict(each) for each in days], indent=1))
@@ -290,6 +295,7 @@ def _day(folder: Path, world: World, day: int) -> Day:
         items=world.items_on(day),
         verdict=record.update.verdict.result,
         promoted=better,
+        current=run.name if better else current,
         update_seconds=seconds,
         validation_loss=record.finished.best_validation,
         covered=tuple(_covered(world, run, rule, log)),
@@ -314,21 +320,20 @@ def _covered(world: World, run: Path, served: DecisionRule, log: Path) -> Iterat
     says nothing.
     """
     trained = TrainedPolicy.load(run)
+    own = replace(trained.rule, tag_window=served.tag_window, tag_run=served.tag_run)
+    drawing = replace(own, temperature=1.0)
+    rules = drawing, replace(own, explore=0.5), replace(drawing, explore=1.0)
     with logged_sessions(run, trained, [log], LogMapping()) as logged:
-        store = logged.store
+        store = logged.store.select(np.arange(min(_ESTIMATED, logged.store.n_episodes)))
         places = store.all_steps()
         users, items = logged.users[places[0]], store.step_values("item", *places)
         clicks = store.step_values("reward", *places).astype(np.float64)
         propensity = store.step_values("propensity", *places).astype(np.float64)
         assert trained.item_ids is not None
         chances = world.catalog.click_probabilities[users.astype(np.int64)][:, trained.item_ids]
-        own = replace(trained.rule, tag_window=served.tag_window, tag_run=served.tag_run)
-        drawing = replace(own, temperature=1.0)
-        for rule in (drawing, replace(own, explore=0.5), replace(drawing, explore=1.0)):
-            parts = [
-                each.log_probabilities.double().exp() for each in scored_steps(trained, store, rule)
-            ]
-            chosen = np.concatenate([part.numpy() for part in parts])
+        scores = torch.cat([each.scores for each in scored_steps(trained, store, own)])
+        for rule in rules:
+            chosen = rule.log_probabilities(scores).double().exp().numpy()
             weight = chosen[np.arange(len(items)), items] / propensity
             true = (chosen * chances).sum(axis=1).mean()
             (interval,) = cluster_intervals(

@@ -68,8 +68,8 @@ def test_logs_without_two_arms_are_refused(
     log(50, 0.0).assign(**change).to_parquet(tmp_path / "log.parquet")
     with pytest.raises(InputError, match=message):
         compare_arms([tmp_path / "log.parquet"])
+    log(50, 0.0).to_parquet(tmp_path / "log.parquet")
     with pytest.raises(InputError, match="no column clicks"):
-        log(50, 0.0).to_parquet(tmp_path / "log.parquet")
         compare_arms([tmp_path / "log.parquet"], "clicks")
 
 

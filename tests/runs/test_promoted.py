@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.killed import kills
 from tests.support.served import trained_run
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
@@ -93,9 +94,18 @@ def test_a_damaged_run_or_pointer_is_refused(trained: TrainedPolicy, tmp_path: P
     with pytest.raises(InputError, match=r"best\.safetensors"):
         promote(folder / "b", force=True)
     assert current(folder) == "a"
-    for wrong in ({"files": {}, "current": "../a"}, {"files": {}, "current": 3}, {"files": {}}):
+    outside = {"files": {}, "current": "a", "previous": ["../a"]}
+    for wrong in (outside, {"files": {}, "current": 3}, {"files": {}}):
         (folder / POINTER).write_text(json.dumps(wrong))
         with pytest.raises(InputError, match=POINTER):
-            found = promoted(folder)
-            assert found is not None
-            found.run(folder)
+            promote_back(folder)
+
+
+def test_a_promotion_killed_at_any_moment_leaves_a_whole_pointer(
+    trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    folder = runs(trained, tmp_path, "run", "other")
+    promote(folder / "run")
+    assert kills("promote", folder) >= 10
+    promote(folder / "other", force=True)
+    assert current(folder) == "other"

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.support.killed import kills
 from tests.support.later import NEW, later_log, later_mapping
 from tests.support.served import trained_run
 from tests.support.tagged import ITEMS
@@ -143,3 +144,13 @@ def test_a_seed_and_a_share_of_the_steps_may_be_given(folder: Path, tmp_path: Pa
     assert record.config.seed == 7
     assert record.config.train.steps == 10
     assert np.isfinite(record.finished.best_validation)
+
+
+def test_an_update_killed_at_any_moment_ends_as_if_left_alone(folder: Path) -> None:
+    assert kills("update", folder) >= 3
+    alone, killed = (RunRecord.read(folder / name) for name in ("run2", "killed"))
+    assert killed.update == alone.update
+    assert killed.rule == alone.rule
+    name = "policy/best.safetensors"
+    assert killed.files[name] == alone.files[name]
+    assert main(["verify", str(folder / "killed"), str(folder / "killed-store")]) == 0

@@ -14,7 +14,12 @@ _DAY_MS: Final = 86_400_000
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec update`."""
-    parser.add_argument("run", type=Path, metavar="RUN", help="finished run on the older logs")
+    parser.add_argument(
+        "run",
+        type=Path,
+        metavar="RUN",
+        help="finished run on the older logs; or a folder of runs, for the one that was promoted",
+    )
     log_options(parser).metavar = "NEW_LOGS"
     parser.add_argument(
         "--out",
@@ -56,20 +61,24 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.logs.append import SPLIT, AppendOptions
     from ucfrec.logs.prepare import parse_split
     from ucfrec.reporting.model_card import write_card
-    from ucfrec.runs.record import RunRecord
+    from ucfrec.runs.promoted import promoted
+    from ucfrec.runs.trained_policy import RUN, TrainedPolicy
     from ucfrec.updating import drift, verdict
     from ucfrec.updating.update import UpdateOptions, update_run
 
     if options.threads is not None:
         torch.set_num_threads(options.threads)
-    files, mapping = logs_given(options)
+    run = options.run
+    if not (run / RUN).is_file() and (current := promoted(run)) is not None:
+        run = current.run(run)
+    files, mapping = logs_given(options, TrainedPolicy.load(run))
     append = AppendOptions(
         window_ms=None if options.window is None else window_ms(options.window),
         split=SPLIT if options.split is None else parse_split(options.split),
         memory_limit=options.memory_limit,
     )
-    record: RunRecord = update_run(
-        options.run,
+    record = update_run(
+        run,
         files,
         options.out,
         store=options.store,

@@ -45,7 +45,9 @@ START_MS = 1_704_067_200_000
 DAY_MS, STEP_MS = 86_400_000, 10_000
 FIRST_ITEMS = 100
 """Items of the first day; the others come evenly over the month."""
-EXPLORE = 0.05
+EXPLORE, TEMPERATURE = 0.05, 0.5
+"""Of the rules that are served, which draw at least at this temperature."""
+_LEAST_STEPS = 50
 _ESTIMATED = 300
 """Sessions of a day that candidates are evaluated on."""
 
@@ -91,7 +93,7 @@ class Day:
     update_seconds: float
     """Processor time of the update."""
     validation_loss: float
-    covered: tuple[bool, ...]
+    covered: tuple[bool | None, ...]
     """Whether the interval of the estimated reward per step holds the true one, for each
     candidate: the new run drawing at temperature 1, exploring half of the time, and uniform."""
     nothing_seconds: float | None = None
@@ -231,7 +233,8 @@ class Clock:
 def responder(run: Path, month: Month, explore: float) -> Responder:
     """What answers with a run; sessions may repeat items."""
     trained = TrainedPolicy.load(run)
-    rule = replace(trained.rule, explore=explore)
+    temperature = max(trained.rule.temperature, TEMPERATURE)
+    rule = replace(trained.rule, explore=explore, temperature=temperature)
     return Responder(trained, Limits(), rule=rule, k=1, filter_seen=False, seed=month.seed)
 
 
@@ -313,11 +316,11 @@ def _day(folder: Path, world: World, day: int) -> Day:
     )
 
 
-def _covered(world: World, run: Path, served: DecisionRule, log: Path) -> Iterator[bool]:
+def _covered(world: World, run: Path, served: DecisionRule, log: Path) -> Iterator[bool | None]:
     """Whether intervals of the reward per step, from the day's exposures, hold the true values.
 
     Of candidates with the filters of the rule that was served: of what it never shows, the log
-    says nothing.
+    says nothing. None where the weights leave too few effective steps for an estimate.
     """
     trained = TrainedPolicy.load(run)
     own = replace(trained.rule, tag_window=served.tag_window, tag_run=served.tag_run)
@@ -339,7 +342,11 @@ def _covered(world: World, run: Path, served: DecisionRule, log: Path) -> Iterat
             (interval,) = cluster_intervals(
                 (weight * clicks)[:, None], weight[:, None], users.astype(np.int64), 0
             )
-            yield interval is not None and bool(interval.low <= true <= interval.high)
+            effective = weight.sum() ** 2 / (weight**2).sum()
+            if interval is None or effective < _LEAST_STEPS:
+                yield None
+            else:
+                yield bool(interval.low <= true <= interval.high)
 
 
 def plot(days: list[Day], path: Path) -> None:
@@ -359,12 +366,13 @@ def summary(days: list[Day]) -> str:
     """What the month shows."""
     last = days[-7:]
     reward, frozen = (np.mean([getattr(d, name) for d in last]) for name in ("reward", "frozen"))
-    covered = np.mean([each.covered for each in days])
+    covered = [found for each in days for found in each.covered if found is not None]
     lines = [
         f"last {len(last)} days: {reward:.3f} clicks per session, never updated {frozen:.3f} "
         f"({reward / frozen - 1:+.1%})",
         f"first day: {days[0].reward:.3f} and {days[0].frozen:.3f}",
-        f"estimates cover the true value: {covered:.1%} of {3 * len(days)}",
+        f"estimates cover the true value: {np.mean(covered):.1%} of {len(covered)}; of "
+        f"{3 * len(days) - len(covered)} more candidates the log says too little",
         f"promoted: {sum(each.promoted for each in days)} of {len(days)} updates",
     ]
     lines += [_against_nothing(each) for each in days if each.nothing_seconds is not None]

@@ -37,8 +37,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--window",
         metavar="TIME",
-        help="leave out sessions that ended longer ago, before the end of the new logs, e.g. 60d "
-        "or 12h (default: keep all)",
+        help="exclude sessions that ended longer ago, before the end of the new logs, e.g. 60d or "
+        "12h (default: keep all)",
     )
     parser.add_argument(
         "--split",
@@ -94,7 +94,7 @@ def run(options: argparse.Namespace) -> None:
     print(
         f"new rows      {read['steps']:,} of {read['rows_read']:,} read"
         f" ({read['not_newer']:,} not newer than the store); {read['new_users']:,} new users, "
-        f"{read['new_items']:,} new items; {read['expired_steps']:,} old rows left out"
+        f"{read['new_items']:,} new items; {read['expired_steps']:,} old rows excluded"
     )
     print(record.describe())
     print(f"{drift.describe(update.drift)}\n{verdict.describe(update.verdict)}")

@@ -1,5 +1,6 @@
 """The owner of a log sees what is lost in it, and of bots."""
 
+import re
 import warnings
 from pathlib import Path
 
@@ -100,11 +101,27 @@ def test_the_largest_five_bots_are_named(tmp_path: Path, text: bool) -> None:
     assert f"{name} (500 rows), " in note
     assert note.count("(300 rows)") == 4
     assert "the median session has 1 row, " in note
-    assert '--where "user_id NOT IN (…)" or --max-session 100' in note
+    assert (
+        f'--where "user_id NOT IN ({name!r}, ' in note or '--where "user_id NOT IN (2000, ' in note
+    )
     assert not notes_of(path, max_session=100)
     where = "user_id NOT LIKE 'u%000' AND user_id < 'u1'" if text else "USER_ID < 1000"
     report = validate([path], LogMapping(where=where))
     assert report["dropped"]["left_out"] == len(log) - report["steps"] > 2500
+
+
+@pytest.mark.parametrize("bot", ["bot-1", "it's", "$(id)", "`id`", 7000])
+def test_the_condition_that_excludes_bots_can_be_pasted(tmp_path: Path, bot: str | int) -> None:
+    log = with_bots([bot], 300)
+    if isinstance(bot, str):
+        log["user_id"] = log["user_id"].astype(str)
+    path = write(log.rename(columns={"user_id": "visitor"}), tmp_path)
+    (note,) = notes_of(path, LogMapping({"user_id": "visitor"}))
+    (where,) = re.findall(r'--where "(.*)" or', note)
+    assert not set(where) & set("$`")
+    if where != "visitor NOT IN (…)":
+        report = validate([path], LogMapping({"user_id": "visitor"}, where=where))
+        assert report["dropped"]["left_out"] == 300
 
 
 def test_ninety_nine_times_the_median_is_no_bot(tmp_path: Path) -> None:

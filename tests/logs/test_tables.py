@@ -445,3 +445,33 @@ def test_a_policy_scores_users_of_text_and_of_integers_alike(tmp_path: Path, pol
     pd.testing.assert_frame_equal(
         one.drop(columns="session"), other.drop(columns="session"), rtol=1e-4
     )
+
+
+@pytest.mark.parametrize("second", ["reward", "REWARD"])
+@pytest.mark.parametrize("suffix", [".parquet", ".csv", ".csv.gz"])
+def test_two_columns_of_one_name_are_refused(tmp_path: Path, suffix: str, second: str) -> None:
+    log = make_log()
+    log[second + " "] = 1 - log.reward
+    log.columns = [name.strip() for name in log.columns]
+    file = tmp_path / f"log{suffix}"
+    if suffix == ".parquet":
+        names = [str(name) for name in log.columns]
+        pq.write_table(pa.table([log.iloc[:, i] for i in range(log.shape[1])], names=names), file)
+    else:
+        log.to_csv(file, index=False)
+    with pytest.raises(InputError, match=r"(?i)has more than one column reward; rename or remove"):
+        prepared(file, tmp_path / "store")
+
+
+def test_columns_that_only_look_like_repetitions_are_read(tmp_path: Path) -> None:
+    write(make_log().assign(reward_1=0.5), tmp_path / "log.csv")
+    assert prepared(tmp_path / "log.csv", tmp_path / "store")["reward"] == "reward"
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-16"])
+def test_another_encoding_is_named(tmp_path: Path, encoding: str) -> None:
+    log = make_log()
+    log["item_id"] = "é" + log.item_id.astype(str)
+    log.to_csv(tmp_path / "log.csv", index=False, encoding=encoding)
+    with pytest.raises(InputError, match="not in UTF-8; convert it"):
+        prepared(tmp_path / "log.csv", tmp_path / "store")

@@ -26,8 +26,8 @@ REASONS: Final = {
 """Reason to its description; a row is dropped for the first reason that applies."""
 
 CLOCK_HINT: Final = (
-    "is the time in milliseconds? For older times, say --earliest 1990-01-01, or earliest in the "
-    "mapping"
+    "is the time in milliseconds? Seconds are read with --column timestamp='COLUMN * 1000'; "
+    "for older times, say --earliest 1990-01-01, or earliest in the mapping"
 )
 
 

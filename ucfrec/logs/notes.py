@@ -1,5 +1,6 @@
 """Warnings about a log whose owner would want to know: rows that are lost, times, and bots."""
 
+import re
 import warnings
 from typing import Final
 
@@ -12,7 +13,7 @@ from ucfrec.logs.binding import bind
 from ucfrec.logs.clean import CLOCK_HINT, REASONS
 from ucfrec.logs.measures import Measures
 from ucfrec.logs.sorted_rows import CODES, SortedRows, has_codes
-from ucfrec.logs.tables import Table, quoted
+from ucfrec.logs.tables import Table, quoted, text
 from ucfrec.logs.typed import ROWS, TypedLog
 
 MANY: Final = 0.2
@@ -58,29 +59,34 @@ def note_equal_times(rows: SortedRows) -> None:
         )
 
 
-def note_bots(rows: SortedRows, measures: Measures) -> None:
+def note_bots(rows: SortedRows, measures: Measures, user: str) -> None:
     """Warn of sessions that are much longer than most.
 
     Args:
         rows: of the log; its connection is free.
         measures: of its episodes.
+        user: expression over the columns of the files that gives the users.
     """
     lengths = np.array(sorted(measures.lengths))
     counts = np.cumsum([measures.lengths[int(length)] for length in lengths])
     median = int(lengths[np.searchsorted(counts, counts[-1] / 2)])
     if measures.longest[0][0] <= LONG * median:
         return
-    names = _user_ids(rows.log, [user for _, user in measures.longest])
-    named = [
-        f"{name} ({steps:,} rows)"
+    names = _user_ids(rows.log, [code for _, code in measures.longest])
+    found = [
+        (name, steps)
         for (steps, _), name in zip(measures.longest, names, strict=True)
         if steps > LONG * median
     ]
+    named = ", ".join(f"{name} ({steps:,} rows)" for name, steps in found)
+    users = ", ".join(str(n) if isinstance(n, int) else text(str(n)) for n, _ in found)
+    if not re.fullmatch(r"[\w' ,:@.-]*", users):
+        users = "…"  # what a shell would take for a program is not proposed
     _note(
         rows,
         f"the median session has {median:,} row{'s' * (median > 1)}, but these users have sessions "
-        f"of more than {LONG} times that, as bots have: {', '.join(named)}; leave them out with "
-        f'--where "user_id NOT IN (…)" or --max-session {LONG * median}',
+        f"of more than {LONG} times that, as bots have: {named}; leave them out with "
+        f'--where "{user} NOT IN ({users})" or --max-session {LONG * median}',
     )
 
 

@@ -298,15 +298,15 @@ def prepared_log(
             with explained(connection, log.tables, spill):
                 rows = check_sorted(log, batches, options.duplicates, scratch)
                 require_rows(log, len(rows.clean), rows.dropped)
+                note_losses(rows, reward, mapping.where)
                 if like is None and onto is None:
                     require_variety(rows)
-                note_losses(rows, reward, mapping.where)
                 note_equal_times(rows)
                 stage.update()
                 spool, cut = _cut(rows, options, like, scratch)
                 stage.update()
                 measures = measure(spool, cut, rows.last_ms, rows.items, scratch / "users")
-                note_bots(rows, measures)
+                note_bots(rows, measures, mapping.columns.get(schema.USER_ID, schema.USER_ID))
                 stage.update()
                 features = _features(log, mapping, like)
                 number_ids(log, measures, features, like, onto)

@@ -4,6 +4,7 @@ No column comes from the name of a folder unless it is requested, parts of one t
 columns in any order, and text that looks like a number stays available as text (`Table.raw`).
 """
 
+import gzip
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Final
 
 import duckdb
+import pyarrow.parquet as pq
 
 from ucfrec.errors import InputError
 from ucfrec.files.parquet import require_plausible_rows
@@ -290,13 +292,35 @@ def _columns(
             require_plausible_rows(file, rows)
         first_row = connection.sql(f"SELECT 1 FROM {source} LIMIT 1").fetchall()
     except duckdb.Error as error:
+        if "not utf-8 encoded" in str(error):
+            raise InputError(
+                f"{file} is not in UTF-8; convert it, e.g. with iconv -t UTF-8"
+            ) from None
         raise InputError(
             f"{file} cannot be read, it may be truncated ({first_line(error)}); fetch it again"
         ) from None
     if not first_row:
         return None
     columns = tuple((str(name), str(kind)) for name, kind, *_ in types)
+    _require_distinct(file, [name for name, _ in columns])
     return columns if is_parquet else _of_all_rows(connection, file, columns)
+
+
+def _require_distinct(file: Path, columns: Sequence[str]) -> None:
+    """Refuse a file with two columns of one name; DuckDB calls the second of `x` `x_1`."""
+    folded = {name.casefold() for name in columns}
+    second = [n for n in columns if n.endswith("_1") and n[:-2].casefold() in folded]
+    for name in set(second).difference(_written_names(file) if second else ()):
+        raise InputError(f"{file} has more than one column {name[:-2]}; rename or remove one")
+
+
+def _written_names(file: Path) -> list[str]:
+    """Names of the columns as the file has them."""
+    if file.suffix == ".parquet":
+        return list(pq.read_schema(file).names)
+    kind = gzip.open if file.suffix == ".gz" else open
+    with kind(file, "rt", encoding="utf-8-sig") as lines:
+        return [name.strip(" \"'\r\n") for name in re.split(r"[,;\t|]", lines.readline())]
 
 
 def _of_all_rows(

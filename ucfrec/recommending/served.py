@@ -117,8 +117,9 @@ class Served:
                 rows = [row for row, place in enumerate(places) if place == number]
                 outcomes = arm.responder.answers([requests[row] for row in rows]) if rows else []
                 for row, outcome in zip(rows, outcomes, strict=True):
-                    named = isinstance(outcome, Answer)
-                    found[row] = outcome._replace(arm=arm.name) if named else outcome
+                    if isinstance(outcome, Answer):
+                        outcome = outcome._replace(arm=arm.name)
+                    found[row] = outcome
             return [found[row] for row in range(len(requests))]
 
     def described(self) -> dict[str, Any]:

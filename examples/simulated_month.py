@@ -22,7 +22,6 @@ import numpy as np
 import pandas as pd
 import torch
 
-from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs.join import join_feedback
 from ucfrec.logs.mapping import FeatureTable, LogMapping
@@ -48,7 +47,7 @@ FIRST_ITEMS = 100
 EXPLORE, TEMPERATURE = 0.05, 0.5
 """Of the rules that are served, which draw at least at this temperature."""
 _LEAST_STEPS = 50
-_ESTIMATED = 300
+_ESTIMATED = 200
 """Sessions of a day that candidates are evaluated on."""
 
 
@@ -63,7 +62,7 @@ class Month:
     users: int = 2000
     policy: str = "dt"
     settings: tuple[str, ...] = (
-        "train.steps=2500",
+        "train.steps=1500",
         "train.learning_rate=1e-3",
         "policy.dim=32",
         "policy.context=10",
@@ -95,7 +94,7 @@ class Day:
     validation_loss: float
     covered: tuple[bool | None, ...]
     """Whether the interval of the estimated reward per step holds the true one, for each
-    candidate: the new run drawing at temperature 1, exploring half of the time, and uniform."""
+    candidate: the served run drawing at temperature 1, exploring half of the time, and uniform."""
     nothing_seconds: float | None = None
     nothing_loss: float | None = None
 
@@ -271,7 +270,7 @@ def _day(folder: Path, world: World, day: int) -> Day:
     month, clock, runs = world.month, Clock(), folder / "runs"
     shown, log = folder / f"shown-{day:02d}", folder / f"log-{day:02d}.parquet"
     with Served(lambda run: responder(run, month, EXPLORE), runs, None) as served:
-        current, rule = served.described()["name"], served.trained.rule
+        current = served.described()["name"]
         with ExposureLog(shown, served.trained, clock=clock) as exposures:
             steps = world.sessions(day, Serve(served, exposures, clock))
     frozen = world.sessions(day, Serve(responder(runs / "day-00", month, EXPLORE), None, clock))
@@ -301,7 +300,7 @@ def _day(folder: Path, world: World, day: int) -> Day:
         current=run.name if better else current,
         update_seconds=seconds,
         validation_loss=record.finished.best_validation,
-        covered=tuple(_covered(world, run, rule, log)),
+        covered=tuple(_covered(world, runs / current, log)),
     )
     if day not in month.from_nothing:
         return found
@@ -316,16 +315,15 @@ def _day(folder: Path, world: World, day: int) -> Day:
     )
 
 
-def _covered(world: World, run: Path, served: DecisionRule, log: Path) -> Iterator[bool | None]:
+def _covered(world: World, run: Path, log: Path) -> Iterator[bool | None]:
     """Whether intervals of the reward per step, from the day's exposures, hold the true values.
 
-    Of candidates with the filters of the rule that was served: of what it never shows, the log
-    says nothing. None where the weights leave too few effective steps for an estimate.
+    Candidates are other rules of the run that was served, which was not trained on the day. None
+    where the weights leave too few effective steps for an estimate.
     """
     trained = TrainedPolicy.load(run)
-    own = replace(trained.rule, tag_window=served.tag_window, tag_run=served.tag_run)
-    drawing = replace(own, temperature=1.0)
-    rules = drawing, replace(own, explore=0.5), replace(drawing, explore=1.0)
+    drawing = replace(trained.rule, temperature=1.0)
+    rules = drawing, replace(trained.rule, explore=0.5), replace(drawing, explore=1.0)
     with logged_sessions(run, trained, [log], LogMapping()) as logged:
         store = logged.store.select(np.arange(min(_ESTIMATED, logged.store.n_episodes)))
         places = store.all_steps()
@@ -334,7 +332,7 @@ def _covered(world: World, run: Path, served: DecisionRule, log: Path) -> Iterat
         propensity = store.step_values("propensity", *places).astype(np.float64)
         assert trained.item_ids is not None
         chances = world.catalog.click_probabilities[users.astype(np.int64)][:, trained.item_ids]
-        scores = torch.cat([each.scores for each in scored_steps(trained, store, own)])
+        scores = torch.cat([each.scores for each in scored_steps(trained, store)])
         for rule in rules:
             chosen = rule.log_probabilities(scores).double().exp().numpy()
             weight = chosen[np.arange(len(items)), items] / propensity
@@ -396,9 +394,11 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--days", type=int, default=30)
     parser.add_argument("--sessions", type=int, default=1000)
+    parser.add_argument("--users", type=int, default=2000)
     parser.add_argument("--from-nothing", type=int, nargs="*", default=[], metavar="DAY")
     options = parser.parse_args()
-    month = Month(options.days, options.sessions, from_nothing=tuple(options.from_nothing))
+    nothing = tuple(options.from_nothing)
+    month = Month(options.days, options.sessions, users=options.users, from_nothing=nothing)
     days = simulate(options.out, month)
     plot(days, options.out / "month.svg")
     print(summary(days))

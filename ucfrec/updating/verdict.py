@@ -5,13 +5,11 @@ from typing import Final, Literal
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.arrays import Float64Array, IntArray
+from ucfrec.arrays import BoolArray, Float64Array, IntArray
+from ucfrec.episodes.item_counts import liked_steps
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.evaluation.ranking import Period, Steps, compare, rank_steps
-from ucfrec.evaluation.ranking_baselines import PolicyRanker
 from ucfrec.off_policy.intervals import cluster_intervals, cluster_means
 from ucfrec.off_policy.score import scored_steps
 from ucfrec.runs.record import Difference, UpdateVerdict
@@ -42,12 +40,18 @@ def compare_runs(
         rows: newest episodes of the grown store, which neither was trained on.
         seed: of the bootstrap over users.
     """
-    known = as_known(rows, old)
-    users = rows.episode_values(schema.USER).astype(np.int64)
-    differences = [_ranked(new, old, rows, known, users, seed)]
-    value = _valued(new, old, rows, known, users, seed)
-    if value is not None:
-        differences.append(value)
+    places = rows.all_steps()
+    user = rows.episode_values(schema.USER).astype(np.int64)[places[0]]
+    found = _Logged.of(new, rows), _Logged.of(old, as_known(rows, old))
+    liked = liked_steps(rows, *places)
+    differences = [_ranked(*found, liked, user, seed)]
+    if schema.PROPENSITY in rows.record.columns:
+        reward = rows.step_values(schema.REWARD, *places).astype(np.float64)
+        propensity = rows.step_values(schema.PROPENSITY, *places).astype(np.float64)
+        if (weighed := propensity > 0).any():
+            weights = np.stack([each.probability for each in found], axis=1)[weighed]
+            weights /= propensity[weighed, None]
+            differences.append(_valued(weights, reward[weighed], user[weighed], seed))
     decisive = differences[-1]
     results: dict[int, Literal["better", "no significant difference", "worse"]] = {
         1: "better", 0: "no significant difference", -1: "worse"
@@ -57,7 +61,7 @@ def compare_runs(
         decided_by=decisive.measure,
         differences=tuple(differences),
         steps=rows.n_steps,
-        users=len(np.unique(users)),
+        users=len(np.unique(user)),
     )
 
 
@@ -76,91 +80,65 @@ def describe(verdict: UpdateVerdict) -> str:
 
 
 @dataclass(frozen=True)
-class _Padded:
-    """A ranker that knows the first items of a larger catalogue; others come last."""
+class _Logged:
+    """What a run makes of N logged items."""
 
-    ranker: PolicyRanker
-    view: EpisodeStore
-    """The ranked episodes as the ranker sees them."""
-    n_items: int
-    name: str
+    probability: Float64Array
+    """(N,) under the run's rule; 0 of items that it does not know."""
+    gain: Float64Array
+    """(N,) 1 / log2(1 + rank), 0 of items that are not among the first ten."""
 
-    def scores(self, steps: Steps) -> Tensor:
-        """Scores (B, n_items)."""
-        found = self.ranker.scores(Steps(self.view, steps.episodes, steps.steps, steps.users))
-        missing = found.new_full((len(found), self.n_items - found.shape[1]), -torch.inf)
-        return torch.cat([found, missing], dim=1)
+    @classmethod
+    def of(cls, trained: TrainedPolicy, view: EpisodeStore) -> "_Logged":
+        """One pass over a view whose unknown items are −1."""
+        chances, gains = [], []
+        for batch in scored_steps(trained, view):
+            items, unknown = batch.items.clamp(min=0).unsqueeze(1), batch.items < 0
+            chance = batch.log_probabilities.gather(1, items)[:, 0].double().exp()
+            own = batch.scores.gather(1, items)
+            above, equal = ((batch.scores > own).sum(1), (batch.scores == own).sum(1))
+            rank = 1 + above.double() + (equal - 1).double() / 2
+            gain = torch.where(rank <= _K, 1 / torch.log2(1 + rank), 0.0)
+            chances.append(chance.masked_fill(unknown, 0.0).numpy())
+            gains.append(gain.masked_fill(unknown, 0.0).numpy())
+        return cls(np.concatenate(chances), np.concatenate(gains))
 
 
-def _ranked(
-    new: TrainedPolicy,
-    old: TrainedPolicy,
-    rows: EpisodeStore,
-    known: EpisodeStore,
-    users: IntArray,
-    seed: int,
-) -> Difference:
+def _ranked(new: _Logged, old: _Logged, liked: BoolArray, user: IntArray, seed: int) -> Difference:
     """The paired difference in nDCG of liked items."""
-    period = Period.of(rows, users)
-    assert old.item_ids is not None
-    k = min(_K, len(old.item_ids))
-    ranked = {
-        name: rank_steps(
-            _Padded(PolicyRanker(trained, None, name), view, period.n_items, name),
-            *(rows, k, period.users),
-        )
-        for name, trained, view in (("old", old, known), ("new", new, rows))
-    }
-    value, low, high = compare(period, ranked, k, "old", seed)[1].differences[RANKING]
-    if not np.isfinite([value, low, high]).all():
+    if not liked.any():
         return Difference(measure=RANKING, value=0, low=0, high=0, doubt="no step was liked")
-    return Difference(measure=RANKING, value=value, low=low, high=high)
+    gained = ((new.gain - old.gain) * liked)[:, None]
+    return _difference(RANKING, gained, liked[:, None].astype(np.float64), user, seed, "")
 
 
-def _valued(
-    new: TrainedPolicy,
-    old: TrainedPolicy,
-    rows: EpisodeStore,
-    known: EpisodeStore,
-    users: IntArray,
-    seed: int,
-) -> Difference | None:
-    """The difference in reward per step, by inverse propensities; None without propensities.
+def _valued(weights: Float64Array, reward: Float64Array, user: IntArray, seed: int) -> Difference:
+    """The difference in reward per step, by inverse propensities.
 
     The mean reward is a control variate: weights of both policies have mean 1.
+
+    Args:
+        weights: (N, 2) probability under the new and the old rule, by the propensity.
+        reward: (N,).
+        user: (N,).
+        seed: of the bootstrap.
     """
-    if schema.PROPENSITY not in rows.record.columns:
-        return None
-    places = rows.all_steps()
-    propensity = rows.step_values(schema.PROPENSITY, *places).astype(np.float64)
-    weighed = propensity > 0
-    if not weighed.any():
-        return None
-    weights = np.stack(
-        [_probabilities(one, view)[weighed] / propensity[weighed] for one, view in
-         ((new, rows), (old, known))], axis=1
-    )  # fmt: skip
-    reward = rows.step_values(schema.REWARD, *places).astype(np.float64)[weighed]
-    user = users[places[0]][weighed]
-    lift = (weights[:, 0] - weights[:, 1]) * (reward - reward.mean())
-    doubt = _doubt(weights, user)
-    (interval,) = cluster_intervals(lift[:, None], np.ones((len(lift), 1)), user, seed)
+    lift = ((weights[:, 0] - weights[:, 1]) * (reward - reward.mean()))[:, None]
+    return _difference(VALUE, lift, np.ones_like(lift), user, seed, _doubt(weights, user))
+
+
+def _difference(
+    measure: str, above: Float64Array, below: Float64Array, user: IntArray, seed: int, doubt: str
+) -> Difference:
+    """The ratio of sums over steps (N, 1), with its interval over users."""
+    value = float(above.sum() / below.sum())
+    (interval,) = cluster_intervals(above, below, user, seed)
     if interval is None:
-        return Difference(
-            measure=VALUE, value=0, low=0, high=0, doubt=doubt or "the users do not differ enough"
-        )
+        doubt = doubt or ("the users do not differ enough" if value else "")
+        return Difference(measure=measure, value=value, low=value, high=value, doubt=doubt)
     return Difference(
-        measure=VALUE, value=lift.mean(), low=interval.low, high=interval.high, doubt=doubt
+        measure=measure, value=value, low=interval.low, high=interval.high, doubt=doubt
     )
-
-
-def _probabilities(trained: TrainedPolicy, view: EpisodeStore) -> Float64Array:
-    """(N,) probability of each logged item under the run's rule; 0 of items it does not know."""
-    parts = []
-    for batch in scored_steps(trained, view):
-        chosen = batch.log_probabilities.gather(1, batch.items.clamp(min=0).unsqueeze(1))[:, 0]
-        parts.append(torch.where(batch.items < 0, 0.0, chosen.double().exp()).numpy())
-    return np.concatenate(parts)
 
 
 def _doubt(weights: Float64Array, user: IntArray) -> str:

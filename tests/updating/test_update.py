@@ -8,11 +8,14 @@ import torch
 
 from tests.support.killed import kills
 from tests.support.later import NEW, later_log, later_mapping
-from tests.support.served import trained_run
+from tests.support.served import SETTINGS, trained_run
 from tests.support.tagged import ITEMS
+from ucfrec import Recommender
 from ucfrec.commands.cli import main
+from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors
+from ucfrec.logs.append import AppendOptions
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.update import UpdateOptions, update_run
@@ -135,6 +138,26 @@ def test_the_command_says_what_was_read_and_what_is_better(
     assert record.update.verdict.steps == 75
     assert main([*arguments[:5], "--window", "soon"]) == 2
     assert "--window soon is no time" in capsys.readouterr().err
+
+
+def test_augmentation_models_start_warm(folder: Path, tmp_path: Path) -> None:
+    settings = [*SETTINGS, "augment.copies=1", "crm.epochs=12"]
+    Recommender("ucf", settings).fit(EpisodeStore.open(folder / "store"), tmp_path / "run")
+    logs = [folder / "later.parquet"]
+    record = update_run(tmp_path / "run", logs, tmp_path / "run2")
+    assert record.augmentation is not None
+    assert record.config.crm.epochs == 2
+    old = load_tensors(tmp_path / "run" / "crm" / "cvae" / "best.safetensors")[0]
+    new = load_tensors(tmp_path / "run2" / "crm" / "cvae" / "best.safetensors")[0]
+    assert torch.equal(old["state_mean"], new["state_mean"])
+    assert any(not torch.equal(old[name], new[name]) for name in old)
+
+
+def test_logs_that_leave_nothing_to_compare_on_are_refused(folder: Path, tmp_path: Path) -> None:
+    options = UpdateOptions(AppendOptions(split=(0.5, 0.5, 0.0)))
+    with pytest.raises(InputError, match="no test rows"):
+        update_run(folder / "run", [folder / "later.parquet"], tmp_path / "run2", options=options)
+    assert not (tmp_path / "run2").exists()
 
 
 def test_a_seed_and_a_share_of_the_steps_may_be_given(folder: Path, tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ from typing import Final
 
 from ucfrec.commands.options import log_options, logs_given, memory_option
 from ucfrec.errors import InputError
-from ucfrec.files.remote import Output, uri_or_path
 
 _DAY_MS: Final = 86_400_000
 
@@ -23,7 +22,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     log_options(parser).metavar = "NEW_LOGS"
     parser.add_argument(
         "--out",
-        type=uri_or_path(Output, Path),
+        type=Path,
         required=True,
         metavar="RUN2",
         help="folder of the new run; an interrupted update in it goes on",

@@ -7,10 +7,10 @@ from typing import Final
 
 import torch
 
-from ucfrec.counterfactual.augmentation import MODELS
+from ucfrec.counterfactual.augmentation import CRM
+from ucfrec.counterfactual.reward_model_fit import INITIAL
 from ucfrec.files.atomic import atomic_file
 from ucfrec.fitting.checkpoint import load_trained
-from ucfrec.fitting.loop import INITIAL
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.runs.config import Config
 
@@ -24,14 +24,14 @@ _CRM_EPOCHS: Final = 5
 
 @torch.no_grad()
 def start_warm(policy: SequencePolicy, out: Path, initial: Path) -> None:
-    """Give a policy, and the models of its augmentation, the trained weights of another run.
+    """Give a policy, and the reward model of its augmentation, the weights of another run.
 
     Rows of users and items that the other run does not know keep what the new policy begins with:
     for items no correction of their vector, and the log of their share of the training steps.
 
     Args:
         policy: untrained, on the grown store.
-        out: folder of the new run, which receives the models' weights.
+        out: folder of the new run, which receives the reward model's weights.
         initial: folder of the run.
     """
     path = initial / "policy" / "best.safetensors"
@@ -45,13 +45,11 @@ def start_warm(policy: SequencePolicy, out: Path, initial: Path) -> None:
             new.copy_(old)
         elif new.shape[1:] == old.shape[1:] and len(new) > len(old):
             new[: len(old)] = old
-    for model in MODELS:
-        for best in sorted((initial / model).rglob("best.safetensors")):
-            target = out / best.relative_to(initial).with_name(INITIAL)
-            if not target.exists():
-                target.parent.mkdir(parents=True, exist_ok=True)
-                with atomic_file(target) as scratch:
-                    shutil.copyfile(best, scratch)
+    best, target = initial / CRM / "cvae" / "best.safetensors", out / CRM / INITIAL
+    if best.exists() and not target.exists():
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_file(target) as scratch:
+            shutil.copyfile(best, scratch)
 
 
 def warm_settings(config: Config, share: float = SHARE) -> Config:
@@ -69,9 +67,4 @@ def warm_settings(config: Config, share: float = SHARE) -> Config:
         validate_every=min(config.train.validate_every, max(1, few // 2)),
     )
     epochs = max(1, round(share * (config.crm.epochs or _CRM_EPOCHS)))
-    return replace(
-        config,
-        train=train,
-        crm=replace(config.crm, epochs=epochs),
-        csg=replace(config.csg, epochs=max(1, round(share * config.csg.epochs))),
-    )
+    return replace(config, train=train, crm=replace(config.crm, epochs=epochs))

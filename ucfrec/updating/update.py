@@ -74,6 +74,12 @@ def update_run(
     with claimed(grown, "updated"):
         counts = append_logs(before.path, paths, grown, mapping, options.append)
     opened = EpisodeStore.open(grown)
+    for split in ("validation", "test"):
+        if not opened.split(split).n_episodes:
+            raise InputError(
+                f"the new logs leave no {split} rows, to choose a rule and compare the runs on; "
+                "give more rows, or another --split and --store"
+            )
     added = np.arange(opened.n_episodes - counts["episodes"], opened.n_episodes)
     if trained.dropped:
         opened = opened.without_observation_dimensions(trained.dropped)

@@ -133,7 +133,7 @@ def _difference(
     """The ratio of sums over steps (N, 1), with its interval over users."""
     value = float(above.sum() / below.sum())
     (interval,) = cluster_intervals(above, below, user, seed)
-    if interval is None:
+    if interval is None or not np.isfinite([interval.low, interval.high]).all():
         doubt = doubt or ("the users do not differ enough" if value else "")
         return Difference(measure=measure, value=value, low=value, high=value, doubt=doubt)
     return Difference(

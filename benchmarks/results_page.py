@@ -58,8 +58,11 @@ BUILT_IN: Final = ("random", "random-mask", "oracle", "mixture", "optimal", "bes
 """Policies that come with a simulator."""
 KNOWING: Final = ("oracle", "optimal", "best-constant")
 """Policies that know their simulator; never the best of a column."""
-BASELINES = ("popular", "item-rate", "item-rate-mask", "item-knn", "crm-greedy")
-SEQUENCE = ("sasrec", "bc", "bc-10", "dt", "dt4rec", "cdt4rec", "edt4rec")
+BASELINES = (
+    *("popular", "item-rate", "item-rate-mask", "recent-clicks", "recent-rate", "item-knn"),
+    *("boosted", "crm-greedy"),
+)
+SEQUENCE = ("sasrec", "gsasrec", "bpr", "bc", "bc-10", "dt", "dt4rec", "cdt4rec", "edt4rec")
 UCF = (
     *("ucf-paper", "ucf-paper-algorithm-5", "ucf-plain", "ucf-wo-exposure"),
     *("ucf-wo-reward-weight", "ucf-wo-rule", "ucf-weights", "ucf-max-return"),

@@ -34,6 +34,7 @@ from ucfrec.recommending.responder import Answer, Responder
 from ucfrec.recommending.served import Served
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.promoted import promote
+from ucfrec.runs.refit import refit_within
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.update import update_run
@@ -251,6 +252,7 @@ def simulate(folder: Path, month: Month) -> list[Day]:
         prepare(logs, mapping, folder / "store", PrepareOptions(reward="click"))
     config = resolve_config(month.policy, None, month.settings, month.seed)
     train_run(EpisodeStore.open(folder / "store"), first, config)
+    refit_within(EpisodeStore.open(folder / "store"), first)
     days = _done(folder)
     # A day that was interrupted begins again with the run of the day before.
     promote(runs / (days[-1].current if days else first.name), force=True)

@@ -27,6 +27,7 @@ from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
 from ucfrec.reporting.model_card import write_card
 from ucfrec.runs.config import resolve_config
+from ucfrec.runs.refit import refit_within
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -88,6 +89,7 @@ class Recommender:
         gap_minutes: float | None = None,
         split: tuple[float, ...] | None = None,
         mapping: LogMapping | None = None,
+        refit: bool = False,
     ) -> Self:
         """Train on a store's training episodes; logs are prepared into a temporary store first.
 
@@ -101,6 +103,8 @@ class Recommender:
             gap_minutes: logs only: with "gap", a longer pause (minutes) starts a new session (30).
             split: logs only: shares of training, validation and test (0.8, 0.1, 0.1).
             mapping: logs only: names of the columns, and feature tables.
+            refit: go on learning from all rows once everything is chosen, as `ucfrec train` does;
+                only later logs can evaluate the policy then.
 
         Returns:
             This recommender, trained.
@@ -130,6 +134,8 @@ class Recommender:
                 # Whoever fits next removes the run, should this process be killed.
                 out = scratch.enter_context(scratch_folder(temporary, "run")) / "run"
             record = train_run(store, Path(out), self.config)
+            if refit:
+                refit_within(store, Path(out))
             if warning := record.learned_nothing(read_metrics(Path(out) / "policy")):
                 warnings.warn(InputNote(warning), stacklevel=2)
             write_card(Path(out))

@@ -11,7 +11,7 @@ LOGS: Final = ("log_standard_", "log_random_")
 FEATURES: Final = ("user_features_", "video_features_basic_", "video_features_statistic_")
 USERS, BASIC, STATISTIC = FEATURES
 
-USER_COLUMNS: Final = (
+PROFILE: Final = (
     "user_active_degree",
     "is_lowactive_period = 1",
     "is_live_streamer = 1",
@@ -20,6 +20,10 @@ USER_COLUMNS: Final = (
     "ln(1 + fans_user_num)",
     "ln(1 + friend_user_num)",
     "ln(1 + register_days)",
+)
+"""Columns of users that KuaiRec has too."""
+USER_COLUMNS: Final = (
+    *PROFILE,
     *(f"onehot_feat{n}::VARCHAR" for n in (0, 1, 2, 4, 5, 6, *range(9, 18))),
 )
 """Without onehot features 3, 7 and 8, which have 1,471, 118 and 454 values among 27,285 users."""

@@ -6,20 +6,14 @@ from typing import Final
 
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, log_files
+from ucfrec_datasets.kuairand import PROFILE
 
 TRAINING, EVALUATION = "big_matrix", "small_matrix"
 FEATURES: Final = ("user_features", "item_categories", "item_daily_features")
 USERS, CATEGORIES, DAILY = FEATURES
 
 USER_COLUMNS: Final = (
-    "user_active_degree",
-    "is_lowactive_period = 1",
-    "is_live_streamer = 1",
-    "is_video_author = 1",
-    "ln(1 + follow_user_num)",
-    "ln(1 + fans_user_num)",
-    "ln(1 + friend_user_num)",
-    "ln(1 + register_days)",
+    *PROFILE,
     *(f"onehot_feat{n}::VARCHAR" for n in range(18)),
 )
 

@@ -1,5 +1,7 @@
 """Next-period ranking: measures agree with a slow reader, baselines are fitted on training rows."""
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +13,28 @@ from hypothesis import strategies as st
 from sklearn.metrics import roc_auc_score
 from torch import Tensor
 
-from ucfrec import schema
+from tests.recommending.test_recommend import SETTINGS, random_log
+from ucfrec import Recommender, schema
 from ucfrec.commands.cli import main
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation import ranking
-from ucfrec.evaluation.ranking import MEASURES, Period, Ranked, Steps, compare, measure, rank_steps
-from ucfrec.evaluation.ranking_baselines import baselines
+from ucfrec.evaluation.ranking import (
+    MEASURES,
+    Later,
+    Period,
+    Ranked,
+    Steps,
+    compare,
+    measure,
+    rank_steps,
+)
+from ucfrec.evaluation.ranking_baselines import ItemNeighbours, PolicyRanker, baselines
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
+from ucfrec.off_policy.score import logged_sessions
+from ucfrec.recommending.histories import histories_of_frame
+from ucfrec.recommending.recommend import recommend
 from ucfrec.results.rows_file import read_results
 
 N_ITEMS, K = 12, 3
@@ -81,6 +96,10 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> EpisodeStore:
     return EpisodeStore.open(folder / "store")
 
 
+def alone(store: EpisodeStore) -> Later:
+    return Later.alone(store, store.episode_values(schema.USER))
+
+
 class Oracle:
     """Knows the halves."""
 
@@ -96,7 +115,7 @@ def test_planted_taste_is_found_by_those_who_look_at_the_user(store: EpisodeStor
     train, test = store.split("train"), store.split("test")
     rankers = [*baselines(TrainingCounts.of(train), train, seed=0), Oracle()]
     period = Period.of(test, test.episode_values(schema.USER))
-    ranked = {ranker.name: rank_steps(ranker, test, 10, period.users) for ranker in rankers}
+    ranked = {ranker.name: rank_steps(ranker, alone(test), 10) for ranker in rankers}
     found = {row.name: row for row in compare(period, ranked, 10, "oracle", seed=0)}
     assert found["oracle"].values["gauc"] > 0.9
     for name in ("random", "most shown", "most clicked", "item click rate"):
@@ -113,17 +132,17 @@ def test_planted_taste_is_found_by_those_who_look_at_the_user(store: EpisodeStor
             assert low - 1e-9 <= row.values[name] <= high + 1e-9
 
 
-@pytest.mark.parametrize("left", [1, 2, 0])
+@pytest.mark.parametrize(("left", "filter_seen"), [(1, False), (2, True), (0, True)])
 def test_the_size_of_the_last_batch_changes_nothing(
-    store: EpisodeStore, monkeypatch: pytest.MonkeyPatch, left: int
+    store: EpisodeStore, monkeypatch: pytest.MonkeyPatch, left: int, filter_seen: bool
 ) -> None:
     train, test = store.split("train"), store.split("test")
-    users = Period.of(test, test.episode_values(schema.USER)).users
+    later = replace(alone(test), filter_seen=filter_seen)
     rankers = baselines(TrainingCounts.of(train), train, seed=0)[1:]  # `random` draws by batch
-    whole = [rank_steps(ranker, test, 10, users) for ranker in rankers]
+    whole = [rank_steps(ranker, later, 10) for ranker in rankers]
     monkeypatch.setattr(ranking, "_STEPS_AT_ONCE", (test.n_steps - left) // 2 or 1)
     for ranker, expected in zip(rankers, whole, strict=True):
-        found = rank_steps(ranker, test, 10, users)
+        found = rank_steps(ranker, later, 10)
         np.testing.assert_array_equal(found.ranks, expected.ranks)
         assert found.top.shape == (test.n_steps, 10)
 
@@ -136,9 +155,8 @@ def test_one_step_is_ranked(store: EpisodeStore) -> None:
         episodes={name: store.episode_values(name)[:1] for name in (schema.USER, schema.SPLIT)},
         item_states=store.item_states,
     )
-    users = Period.of(one, one.episode_values(schema.USER)).users
     for ranker in baselines(TrainingCounts.of(train), train, seed=0):
-        assert rank_steps(ranker, one, 10, users).ranks.shape == (1,)
+        assert rank_steps(ranker, alone(one), 10).ranks.shape == (1,)
 
 
 def test_nothing_of_the_ranked_step_reaches_a_ranker(store: EpisodeStore) -> None:
@@ -150,13 +168,11 @@ def test_nothing_of_the_ranked_step_reaches_a_ranker(store: EpisodeStore) -> Non
     changed = {name: values.copy() for name, values in steps.items()}
     changed[schema.ITEM][last] = (changed[schema.ITEM][last] + 7) % 40
     changed[schema.REWARD][last] = 1 - changed[schema.REWARD][last]
-    at = test.lengths - 1
-    episodes = np.arange(test.n_episodes)
+    at = np.cumsum(test.lengths) - 1
     for ranker in baselines(TrainingCounts.of(train), train, seed=0)[1:]:
-        users = test.episode_values(schema.USER).astype(np.int64)
-        before = ranker.scores(Steps(test, episodes, at, users))
+        before = ranker.scores(alone(test).steps(at, filter_seen=False))
         other = _rewritten(store, changed).split("test")
-        after = ranker.scores(Steps(other, episodes, at, users))
+        after = ranker.scores(alone(other).steps(at, filter_seen=False))
         torch.testing.assert_close(before, after, rtol=0, atol=0)
 
 
@@ -185,7 +201,11 @@ def test_the_command_ranks_the_test_split_and_later_logs(
         "most clicked",
         "item click rate",
         "item-knn",
+        "boosted clicks",
         "als",
+        "bpr",
+        "recent clicks",
+        "recent click rate",
     ]
     assert [row.method for row in rows] == names
     assert {row["steps"] for row in rows} == {store.split("test").n_steps}
@@ -217,5 +237,69 @@ def test_rewards_within_the_period_do_not_rank_the_items_shown_in_it(store: Epis
     """Of two steps of which one is liked, the earlier one's score is higher where it was liked."""
     test = store.split("test")
     period = Period.of(test, test.episode_values(schema.USER))
-    found = measure(period, rank_steps(Sated(), test, 10, period.users), 10)
+    found = measure(period, rank_steps(Sated(), alone(test), 10), 10)
     assert value(found, "gauc") == pytest.approx(0.5, abs=0.12)
+
+
+@pytest.mark.parametrize("session_by", ["user", "gap"])
+def test_a_later_log_is_ranked_as_recommend_would_for_the_whole_history(
+    tmp_path: Path, session_by: str
+) -> None:
+    """At every step of the later log: the same ten items, from the same history."""
+    log = random_log().sort_values("timestamp", ignore_index=True)
+    log["item_id"] += 100
+    before, after = log[:1200], log[1200:1320]
+    before.to_parquet(tmp_path / "before.parquet")
+    after.to_parquet(tmp_path / "after.parquet")
+    options = PrepareOptions(reward="reward", session_by=session_by, gap_minutes=600)
+    prepare([tmp_path / "before.parquet"], LogMapping(), tmp_path / "store", options)
+    tiny = [*SETTINGS, "rule.choose=true"]
+    policy = Recommender("ucf", settings=tiny).fit(
+        EpisodeStore.open(tmp_path / "store"), tmp_path / "run"
+    )
+    trained = policy.trained
+    assert trained.item_ids is not None
+    rule = replace(trained.rule, temperature=0.0)  # does not draw
+    ranker = PolicyRanker(trained, rule, "ucf")
+    with logged_sessions(
+        trained.folder, trained, [tmp_path / "after.parquet"], LogMapping()
+    ) as logged:
+        assert logged.rows is not None
+        later = Later(logged.store, logged.rows, filter_seen=True)
+        found = rank_steps(ranker, later, 10)
+        assert (logged.store.lengths.sum() > logged.store.n_steps) is np.True_
+        knn = ItemNeighbours(EpisodeStore.open(tmp_path / "store"), torch.ones(30))
+        assert len(np.unique(rank_steps(knn, later, 3).top, axis=0)) > 10
+        times = logged.store.column(schema.TIMESTAMP)
+        _, places = logged.store.all_steps()
+    # `recommend` takes the latest session to go on, which it does not at the first step of another.
+    for number in np.flatnonzero(places > 0)[::5]:
+        (row,) = after[after.timestamp == times[number]].itertuples()
+        mine = log[(log.user_id == row.user_id) & (log.timestamp < row.timestamp)]
+        (frame,) = recommend(
+            trained, histories_of_frame(trained, mine, LogMapping()), 10, rule=rule
+        )
+        said = frame.item_id.tolist()
+        assert trained.item_ids[found.top[number][found.top[number] >= 0]].tolist() == said
+        assert not set(said) & set(mine.item_id)
+
+
+def test_without_the_store_users_start_from_nothing_and_the_command_says_so(
+    store: EpisodeStore, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copied, run = tmp_path / "store", str(tmp_path / "run")
+    shutil.copytree(store.path, copied)
+    log = pd.read_parquet(store.path.parent / "log.parquet").tail(400)
+    later = str(tmp_path / "later.parquet")
+    log.assign(timestamp=log.timestamp + 10**9).to_parquet(later)
+    assert main(["train", str(copied), "--out", run, "--policy", "item-knn"]) == 0
+    outputs = []
+    for gone in (False, True):
+        if gone:
+            shutil.rmtree(copied)
+        capsys.readouterr()
+        assert main(["rank", run, later, "--k", "5"]) == 0
+        outputs.append(capsys.readouterr().out)
+        assert ("without what they were shown before" in outputs[-1]) == gone
+    kept, lost = (next(line for line in out.splitlines() if "item-knn" in line) for out in outputs)
+    assert kept != lost

@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from tests.policies.test_known_answers import ITEMS_ONLY
 from tests.support import killed_run
 from ucfrec.counterfactual.augmentation import counterfactual_augmentation
 from ucfrec.episodes.store import EpisodeStore
@@ -106,7 +107,7 @@ def test_augmentation(store: EpisodeStore, tmp_path: Path, kind: str) -> None:
         )
 
 
-@pytest.mark.parametrize("name", sorted(set(BUILT_IN) - {"item-knn", "item-rate"}))
+@pytest.mark.parametrize("name", sorted({*BUILT_IN} - {*ITEMS_ONLY}))
 def test_a_run_and_reading_it_back(store: EpisodeStore, tmp_path: Path, name: str) -> None:
     quick = {"policy.cql_steps": 3} if name == "edt4rec" else {}
     quick |= {"policy.kernel_groups": 4} if name == "lsdt" else {}

@@ -17,7 +17,7 @@ from ucfrec.policies.registry import BUILT_IN
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import new_policy
 
-ITEMS_ONLY = ("item-knn",)
+ITEMS_ONLY = ("item-knn", "gsasrec", "bpr", "boosted")
 SMALL = {"policy.dim": 16, "policy.context": 6}
 
 

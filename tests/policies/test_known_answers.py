@@ -14,9 +14,9 @@ from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 KINDS, STEPS, SESSIONS = 4, 3, 500
-KNOWS_NOBODY = ("popular", "item-rate")
-SEES_NO_STATE = ("sasrec", "item-knn")
-ITEMS_ONLY = ("item-knn", "item-rate")
+KNOWS_NOBODY = ("popular", "item-rate", "recent-clicks", "recent-rate")
+SEES_NO_STATE = ("sasrec", "gsasrec", "item-knn", "bpr", "boosted")
+ITEMS_ONLY = (*KNOWS_NOBODY[1:], *SEES_NO_STATE[1:])
 SETTINGS = [
     "train.steps=80",
     "train.validate_every=80",

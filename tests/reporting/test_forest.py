@@ -40,12 +40,12 @@ def test_without_an_interval_there_is_no_line() -> None:
     models = [estimate("DM", 1.0, interval=None), estimate("FQE", 2.0, interval=None)]
     assert forest(of(Estimates("ucf", estimate(LOGGED, 2.0), models, ()))) is None
     assert forest(of()) is None
-    snips = estimate("SNIPS", 1.0)
+    snips = estimate("SNIPS", 1.0, details={"verdict_of": "SNIPS"})
     assert quoted([*models, snips]) == snips
 
 
 def test_logs_that_differ_have_no_common_reference() -> None:
-    rows = [estimate("DR", 4.0)]
+    rows = [estimate("DR", 4.0, details={"verdict_of": "DR"})]
     drawn = forest(
         of(
             Estimates("a", estimate(LOGGED, 2.0), rows, ()),

@@ -391,11 +391,18 @@ def logged_history(
 
 
 def logged_scores(
-    scorer: Scorer, store: EpisodeStore, episodes: IntArray, steps: IntArray
+    scorer: Scorer,
+    store: EpisodeStore,
+    episodes: IntArray,
+    steps: IntArray,
+    left_out: tuple[Tensor, Tensor] | None = None,
 ) -> Tensor:
-    """`Scorer.scores` (B, n_items) at logged steps, from what was known before each."""
+    """`Scorer.scores` (B, n_items) at logged steps, from what was known before each.
+
+    With `left_out`, rows and items of what may not be shown, all items of a row may be excluded.
+    """
     history, seen = logged_history(scorer, store, episodes, steps)
-    return scorer.scores(history, excluded=seen)
+    return scorer.scores(history, left_out, seen, empty=left_out is not None)
 
 
 def _require_numbers(scores: Tensor) -> None:

@@ -123,7 +123,7 @@ def run(options: argparse.Namespace) -> None:
     """
     from ucfrec.off_policy.selection import choose, names_of
     from ucfrec.reporting.tables import text_table
-    from ucfrec.runs.trained_policy import RUN, TrainedPolicy
+    from ucfrec.runs.trained_policy import RUN
 
     named = dict.fromkeys(map(Path, options.logs))
     runs = [path for path in named if (path / RUN).is_file()]
@@ -131,9 +131,7 @@ def run(options: argparse.Namespace) -> None:
     if not runs:
         raise InputError("name a run folder of `ucfrec train` first, then the logs")
     candidates = [
-        _Candidate(run, rule)
-        for run in runs
-        for rule in _rules(options, TrainedPolicy.load(run, options.checkpoint))
+        _Candidate(run, rule) for run in runs for rule in _rules(options, _loaded(options, run))
     ]
     reports = {}
     names = names_of([one.parts for one in candidates])
@@ -160,6 +158,13 @@ def run(options: argparse.Namespace) -> None:
     _write(options, reports, {name: choice.columns(name) for name in reports})
 
 
+def _loaded(options: argparse.Namespace, run: Path) -> "TrainedPolicy":
+    """The policy; on the test split, the weights that have not learned from it."""
+    from ucfrec.runs.trained_policy import TrainedPolicy
+
+    return TrainedPolicy.load(run, options.checkpoint, split=not options.logs)
+
+
 @dataclass(frozen=True)
 class _Candidate:
     """One run under one decision rule."""
@@ -181,10 +186,9 @@ def _evaluated(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicy
     """Print and return what the logs say of one candidate."""
     from ucfrec.off_policy.evaluate import evaluate_off_policy
     from ucfrec.reporting.tables import format_rows
-    from ucfrec.runs.trained_policy import TrainedPolicy
 
     run = candidate.run
-    trained = TrainedPolicy.load(run, options.checkpoint)
+    trained = _loaded(options, run)
     with _logged(options, trained) as logged:
         found = evaluate_off_policy(
             run,

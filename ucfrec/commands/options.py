@@ -139,6 +139,13 @@ def rule_options(parser: argparse.ArgumentParser) -> None:
     rule = parser.add_argument_group(
         "decision rule", "each part is the run's own, chosen at the end of its training, by default"
     )
+    _score_options(rule)
+    _draw_options(rule)
+    _filter_options(rule)
+
+
+def _score_options(rule: argparse._ArgumentGroup) -> None:
+    """Add what the score of an item is made of."""
     target = rule.add_mutually_exclusive_group()
     target.add_argument(
         "--target-return",
@@ -176,6 +183,10 @@ def rule_options(parser: argparse.ArgumentParser) -> None:
         metavar="RETURN",
         help="expected return after a step that does not end the session; 0 for none",
     )
+
+
+def _draw_options(rule: argparse._ArgumentGroup) -> None:
+    """Add how items are drawn by their scores."""
     rule.add_argument(
         "--temperature", type=float, help="draw items at this temperature; 0 takes the best"
     )
@@ -189,6 +200,10 @@ def rule_options(parser: argparse.ArgumentParser) -> None:
     rule.add_argument(
         "--explore-top", type=int, metavar="N", help="these draw from the N best items only"
     )
+
+
+def _filter_options(rule: argparse._ArgumentGroup) -> None:
+    """Add which items are left out."""
     rule.add_argument(
         "--exclude-seen", action="store_true", help="exclude items that the session has shown"
     )
@@ -206,13 +221,18 @@ def rule_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def item_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options on items that users have seen and on items that the run does not know."""
+def keep_seen_option(parser: argparse.ArgumentParser) -> None:
+    """Add the option on items that users have seen."""
     parser.add_argument(
         "--keep-seen",
         action="store_true",
         help="also recommend items that the user has seen (default: leave them out)",
     )
+
+
+def item_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options on items that users have seen and on items that the run does not know."""
+    keep_seen_option(parser)
     parser.add_argument(
         "--skip-unknown",
         action="store_true",

@@ -6,7 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ucfrec.commands.cards import card_of_ranking
-from ucfrec.commands.options import log_options, logs_given, rule_given, rule_options
+from ucfrec.commands.options import (
+    keep_seen_option,
+    log_options,
+    logs_given,
+    rule_given,
+    rule_options,
+)
 from ucfrec.errors import InputError
 
 if TYPE_CHECKING:
@@ -25,6 +31,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--k", type=int, default=10, help="items recommended at each step (default: 10)"
     )
+    keep_seen_option(parser)
     rule_options(parser)
     parser.add_argument(
         "--seed",
@@ -68,7 +75,7 @@ def run(options: argparse.Namespace) -> None:
         raise InputError("name a run folder of `ucfrec train` first, then the logs")
     if options.k < 1:
         raise InputError(f"--k is {options.k}; recommend at least 1 item")
-    trained = [TrainedPolicy.load(run, options.checkpoint) for run in runs]
+    trained = [TrainedPolicy.load(run, options.checkpoint, split=not options.logs) for run in runs]
     require_one_catalogue(trained)
     train, liked = training_store(trained[0]), _liked(options, trained[0])
     if options.logs:
@@ -76,6 +83,7 @@ def run(options: argparse.Namespace) -> None:
         with logged_sessions(runs[0], trained[0], files, mapping) as logged:
             print(format_summary(logged.report), end="\n\n")
             warnings = [seen_too_often(share_seen(policy, logged.store)) for policy in trained]
+            warnings[0] += [logged.history_lacking] if logged.history_lacking else []
             rows = _rows(options, trained, train, logged, liked)
     else:
         warnings = [[] for _ in trained]
@@ -129,12 +137,15 @@ def _rows(
     later: "LoggedSessions",
     liked: "LikedExpression | None",
 ) -> "list[ResultRow]":
+    from ucfrec.evaluation.ranking import Later
     from ucfrec.evaluation.ranking_baselines import PolicyRanker
     from ucfrec.evaluation.ranking_table import ranking_rows
 
     policies = [
         PolicyRanker(policy, rule_given(options, policy), policy.name) for policy in trained
     ]
-    about = later.store, later.users, options.k, options.seed
+    assert later.rows is not None
+    steps = Later(later.store, later.rows, not options.keep_seen)
+    about = steps, later.users, options.k, options.seed
     rows = ranking_rows(policies, trained[0], train, *about, liked)
     return [replace(row, checkpoint=options.checkpoint) for row in rows]

@@ -1,12 +1,17 @@
 """`ucfrec train`: train a policy on an episode store."""
 
 import argparse
+import shutil
 import warnings
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ucfrec.errors import InputError, InputNote
 from ucfrec.files.remote import Input, uri_or_path
 from ucfrec.policies.registry import policy_names
+
+if TYPE_CHECKING:
+    from ucfrec.episodes.store import EpisodeStore
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -16,8 +21,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--refit",
         type=Path,
         metavar="RUN",
-        help="train as this finished run did, its settings and decision rule included, on all rows "
-        "of the store, validation and test too (default: on the training rows)",
+        help="go on training this finished run on all rows of the store, with its settings and "
+        "decision rule, in another folder (default: a new training)",
+    )
+    parser.add_argument(
+        "--no-refit",
+        action="store_true",
+        help="keep the weights of the training rows (default: once everything is chosen, go on "
+        "learning from all rows; `rank` and `ope` on the test split use the weights before that)",
     )
 
 
@@ -90,6 +101,7 @@ def _train(options: argparse.Namespace) -> None:
     from ucfrec.fitting.metrics_log import read_metrics
     from ucfrec.reporting.model_card import write_card
     from ucfrec.runs.config import resolve_config
+    from ucfrec.runs.record import REFIT, RUN, read_record
     from ucfrec.runs.refit import refit
     from ucfrec.runs.screened import train_screened
 
@@ -106,10 +118,17 @@ def _train(options: argparse.Namespace) -> None:
     else:
         config = resolve_config(options.policy, options.config, options.set, options.seed)
         record = train_screened(store, options.out, config, options.screen)
+    if options.no_refit:
+        shutil.rmtree(options.out / REFIT, ignore_errors=True)
+    elif options.refit is None:
+        _refit(store, options.out)
     if not leads():
         return
     card = write_card(options.out)
     print(record.describe(read_metrics(options.out / "policy")))
+    if (options.out / REFIT / RUN).exists():
+        done = read_record(options.out / REFIT)
+        print(f"refit         {done.train_steps:,} rows, all of the store")
     print(f"\nrun: {options.out} (TensorBoard can open it)\nmodel card: {card}")
     if record.rule is None:
         print(f"next: ucfrec evaluate {options.out} --env NAME, in a simulator of these actions")
@@ -117,4 +136,20 @@ def _train(options: argparse.Namespace) -> None:
         print(
             f"next: ucfrec ope {options.out}, its value on the test split of the store\n"
             f"      ucfrec recommend {options.out} LOGS --out FILE, the next items of every user"
+        )
+
+
+def _refit(store: "EpisodeStore", run: Path) -> None:
+    """Let the run go on learning from all rows; processes of `torchrun` do not."""
+    from ucfrec.fitting import distributed
+    from ucfrec.runs.refit import refit_within
+
+    if distributed.processes() == 1:
+        refit_within(store, run)
+    elif distributed.leads():
+        warnings.warn(
+            "several processes do not learn from all rows; run the same command in one process, "
+            "which then only does that",
+            InputNote,
+            stacklevel=2,
         )

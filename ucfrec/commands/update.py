@@ -44,6 +44,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="TRAIN,VALIDATION,TEST",
         help="shares of the new rows in order of time (default: 0.6,0.2,0.2); older rows train",
     )
+    parser.add_argument(
+        "--no-refit",
+        action="store_true",
+        help="once the runs are compared, do not go on learning from the validation and test rows "
+        "(default: RUN2 acts by the weights that learned from all rows)",
+    )
     parser.add_argument("--seed", type=int, help="of everything random (default: that of RUN)")
     parser.add_argument("--threads", type=int, help="CPU threads (default: all cores)")
     memory_option(parser)
@@ -82,7 +88,7 @@ def run(options: argparse.Namespace) -> None:
         options.out,
         store=options.store,
         mapping=mapping,
-        options=UpdateOptions(append, seed=options.seed),
+        options=UpdateOptions(append, seed=options.seed, refit=not options.no_refit),
     )
     write_card(options.out)
     update = record.update

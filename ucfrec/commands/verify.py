@@ -36,7 +36,7 @@ def _verified(path: Path) -> int:
     """Print what `path` is and its faults; returns their number."""
     from ucfrec.episodes.record import StoreRecord
     from ucfrec.errors import one_line
-    from ucfrec.runs.record import RunRecord, TrainingRecord, read_training
+    from ucfrec.runs.record import REFIT, RunRecord, TrainingRecord, read_training
 
     if path.is_file():
         from ucfrec.results.rows_file import read_rows
@@ -60,6 +60,8 @@ def _verified(path: Path) -> int:
     for name in sealed.strangers():
         if name != record.FILE:
             print(one_line(f"{path / name} is not listed in {record.FILE}: it was added later"))
+    within = path / REFIT
+    more = _verified(within) if (within / RunRecord.FILE).is_file() else 0
     size = sum(size for size, _ in sealed.files.values())
     print(
         one_line(
@@ -67,4 +69,4 @@ def _verified(path: Path) -> int:
             f"content that was written ({size / 1e6:,.1f} MB{unfinished})"
         )
     )
-    return len(faults)
+    return len(faults) + more

@@ -11,9 +11,8 @@ import torch
 from ucfrec import schema
 from ucfrec.counterfactual.action_augmentation import ActionGenerator, logged_actions
 from ucfrec.counterfactual.clusters import ActionSupport
-from ucfrec.counterfactual.effects_mean import EffectsMean, EffectTransitions
 from ucfrec.counterfactual.generators import CSGConfig, make_generator, state_clusters
-from ucfrec.counterfactual.reward_model import CRMConfig
+from ucfrec.counterfactual.reward_model import CRMConfig, EffectsMean, EffectTransitions
 from ucfrec.counterfactual.reward_model_fit import fit_crm
 from ucfrec.counterfactual.state_augmentation import (
     AugmentationReport,
@@ -68,11 +67,7 @@ def counterfactual_augmentation(
     Args:
         train: view to fit both models to and to copy episodes from.
         validation: view for early stopping and for the quality of the reward model.
-        crm_config: settings of the reward model.
-        csg_config: settings of the state generator.
-        config: settings of the copies.
         folder: of the checkpoints, which training resumes from.
-        seed: of everything random.
         device: where both models are fitted and edits are made.
 
     Raises:

@@ -12,8 +12,12 @@ import torch
 from torch import Tensor
 
 from ucfrec.arrays import Float32Array
-from ucfrec.counterfactual.effects_mean import EffectsMean
-from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, kl_to_prior
+from ucfrec.counterfactual.reward_model import (
+    CausalRewardModel,
+    CRMConfig,
+    EffectsMean,
+    kl_to_prior,
+)
 from ucfrec.episodes.windows import Transitions
 from ucfrec.errors import InputError
 from ucfrec.files.record import Undefinable
@@ -85,12 +89,9 @@ def fit_crm(
     """Train the reward model (Algorithm 2) with early stopping on held-out steps.
 
     Args:
-        train: transitions to train on.
         validation: held-out transitions, never trained on.
-        config: architecture and training.
-        folder: of the checkpoints, which training resumes from; `INITIAL` in it, if it is there, has
-            the weights and scales that training begins with.
-        seed: of sampling, initialisation and training.
+        folder: of the checkpoints, which training resumes from; with the file `INITIAL` in it, of
+            weights and scales that training begins with.
         mean: E[r | s, a], if it was fitted before; transitions then have the actions that it reads.
         device: where the model is fitted, and stays. What is drawn is the same on all.
 

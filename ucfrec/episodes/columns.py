@@ -47,6 +47,9 @@ class Columns:
         self._arrays, self._item_states_in_memory = dict(arrays or {}), item_states
         self._shards = [path / f"shard-{i:05d}" for i in range(record.n_shards)]
         self._steps: dict[str, StepColumn] = {}
+        self.skipped: IntArray | None = None
+        """(E,) number of steps at the beginning of each episode that are known but do not count;
+        None for none."""
 
     @classmethod
     def open(cls, path: Path) -> "Columns":

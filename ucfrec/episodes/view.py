@@ -109,6 +109,8 @@ class EpisodeView:
     def _counts(self) -> IntArray:
         """(E + C + N,) number of steps of each episode that count, which are its last."""
         counts = self.lengths.copy()
+        if self._columns.skipped is not None:
+            counts -= self._columns.skipped[self._sources]
         counts[self._first_action_copy :] = 1
         return counts
 
@@ -120,7 +122,7 @@ class EpisodeView:
     @property
     def has_users(self) -> bool:
         """Whether the store names the user of every episode."""
-        return self._columns.has_episode_column(schema.USER)
+        return self.has_episode_values(schema.USER)
 
     @property
     def item_states(self) -> ItemStates:
@@ -140,6 +142,10 @@ class EpisodeView:
     def state_size(self) -> int:
         """S, size of a state: that of the item state, if actions are items, plus O."""
         return self.observation_size + (self.item_states.size if self.has_items else 0)
+
+    def has_episode_values(self, name: str) -> bool:
+        """Whether the store has an episode column."""
+        return self._columns.has_episode_column(name)
 
     def episode_values(self, name: str) -> Array:
         """An episode column, (E + C + N,); a copy has the value of its source.

@@ -6,8 +6,9 @@ sampled (Krichene & Rendle, KDD 2020). What counts as *liked* (a click) is said 
 """
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
+from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.group_auc import group_auc
 from ucfrec.episodes.item_counts import liked_steps
 from ucfrec.episodes.store import EpisodeStore
@@ -29,16 +31,53 @@ _STEPS_AT_ONCE = 1024
 
 
 @dataclass(frozen=True)
+class Later:
+    """The steps to rank, and what their users were shown before."""
+
+    store: EpisodeStore
+    """A log of items, perhaps with the earlier steps of its sessions; see `UserRows.continued`."""
+    rows: UserRows
+    """Of its N steps."""
+    filter_seen: bool = False
+    """Whether items are left out that the user has seen before the step, as in `recommend`."""
+
+    @classmethod
+    def alone(cls, store: EpisodeStore, users: Array) -> "Later":
+        """A log without earlier rows; `users` (E,) are the user identifiers of its episodes."""
+        return cls(store, UserRows.of(store, users, None))
+
+    def steps(self, numbers: IntArray, filter_seen: bool) -> "Steps":
+        """The steps with the given numbers (B,)."""
+        episodes, steps = self.store.locate(numbers)
+        left_out = None
+        if filter_seen:
+            rows, items = self.rows.seen(numbers)
+            left_out = torch.from_numpy(rows), torch.from_numpy(items)
+        users = self._users[episodes]
+        return Steps(self.store, self.rows, numbers, episodes, steps, users, left_out)
+
+    @cached_property
+    def _users(self) -> IntArray:
+        return self.store.episode_values(schema.USER).astype(np.int64)
+
+
+@dataclass(frozen=True)
 class Steps:
     """B evaluated steps of a store, with their histories."""
 
     store: EpisodeStore
+    rows: UserRows
+    """Of the users."""
+    numbers: IntArray
+    """(B,) number of each step among those of the store."""
     episodes: IntArray
     """(B,) episode of each step, as an index into the store."""
     steps: IntArray
     """(B,) position of each step in its episode, from 0."""
     users: IntArray
     """(B,) row of each step's user in the training store; −1 for users that it lacks."""
+    left_out: tuple[Tensor, Tensor] | None = None
+    """Rows (M,) and items (M,) that may not be recommended; None to rank all items."""
 
     def windows(self, length: int) -> Windows:
         """Windows of `length` steps that end with each evaluated step.
@@ -64,61 +103,57 @@ class Ranked:
     """One ranker's results at N evaluated steps."""
 
     ranks: Float64Array
-    """(N,) rank of the shown item, from 1; tied items share their mean rank."""
+    """(N,) rank of the shown item, from 1; tied items share their mean rank. Infinite for an item
+    that is left out."""
     scores: Float64Array
     """(N,) score of the shown item at its user's first evaluated step: what was known before any of
     the user's evaluated steps. Scores at the steps themselves would depend on the very rewards that
     they are compared by."""
     top: IntArray
-    """(N, k) recommended items, best first."""
-
-
-def evaluated_steps(store: EpisodeStore, at_once: int) -> Iterator[Steps]:
-    """All steps of `store` in order, in batches of `at_once`."""
-    users = store.episode_values(schema.USER).astype(np.int64)
-    for begin in range(0, store.n_steps, at_once):
-        numbers = np.arange(begin, min(begin + at_once, store.n_steps))
-        episodes, steps = store.locate(numbers)
-        yield Steps(store, episodes, steps, users[episodes])
+    """(N, k) recommended items, best first; −1 where too few are left."""
 
 
 @torch.no_grad()
-def rank_steps(ranker: Ranker, store: EpisodeStore, k: int, users: Array) -> Ranked:
-    """Rank every step of `store`.
+def rank_steps(ranker: Ranker, later: Later, k: int) -> Ranked:
+    """Rank every step of a later log.
+
+    An item that is left out has no rank among the recommended ones, and no place in `top`, which
+    has −1 where too few items are left.
 
     Args:
         ranker: scores the items.
-        store: episodes of items.
-        users: (N,) identifier of each step's user.
+        later: the log.
         k: number of recommended items per step, at most n_items.
     """
-    n_items = len(store.item_states.embeddings)
+    store, n_items = later.store, len(later.store.item_states.embeddings)
     at_once = max(1, min(_STEPS_AT_ONCE, _SCORES_AT_ONCE // n_items))
     parts = []
-    for batch in evaluated_steps(store, at_once):
+    for begin in range(0, store.n_steps, at_once):
+        numbers = np.arange(begin, min(begin + at_once, store.n_steps))
+        batch = later.steps(numbers, later.filter_seen)
         shown = store.step_values(schema.ITEM, batch.episodes, batch.steps).astype(np.int64)
         scores = ranker.scores(batch)
-        if len(scores) == 1:
+        if len(scores) == 1 and batch.left_out is None:
             parts.append(_ranked_alike(scores[0], shown, k))
-        else:
-            parts.append(_ranked(scores, torch.from_numpy(shown), k))
+            continue
+        if batch.left_out is not None:
+            scores = scores.expand(len(shown), n_items).clone()
+            scores[batch.left_out] = -torch.inf
+        parts.append(_ranked(scores, torch.from_numpy(shown), k))
     ranks, top = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    return Ranked(ranks, _first_scores(ranker, store, users, at_once), top)
+    return Ranked(ranks, _first_scores(ranker, later, at_once), top)
 
 
-def _first_scores(ranker: Ranker, store: EpisodeStore, users: Array, at_once: int) -> Float64Array:
+def _first_scores(ranker: Ranker, later: Later, at_once: int) -> Float64Array:
     """(N,) score of each step's item at the first step of its user."""
-    _, first, owner = np.unique(users, return_index=True, return_inverse=True)
-    episodes, steps = store.all_steps()
-    items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
-    known = store.episode_values(schema.USER).astype(np.int64)
+    _, first, owner = np.unique(later.rows.first, return_index=True, return_inverse=True)
+    items = later.store.column(schema.ITEM).astype(np.int64)
     order = np.argsort(owner, kind="stable")
     bounds = np.searchsorted(owner[order], np.arange(len(first) + 1))
     found = np.empty(len(owner))
     for begin in range(0, len(first), at_once):
         at = first[begin : begin + at_once]
-        batch = Steps(store, episodes[at], steps[at], known[episodes[at]])
-        scores = ranker.scores(batch)
+        scores = ranker.scores(later.steps(at, filter_seen=False))
         rows = order[bounds[begin] : bounds[begin + len(at)]]
         of_user = owner[rows] - begin if len(scores) > 1 else np.zeros(len(rows), dtype=np.int64)
         found[rows] = scores.double().numpy()[of_user, items[rows]]
@@ -129,7 +164,9 @@ def _ranked(scores: Tensor, shown: Tensor, k: int) -> tuple[Float64Array, IntArr
     of_shown = scores.gather(1, shown.unsqueeze(1))
     above, equal = (scores > of_shown).sum(1), (scores == of_shown).sum(1)
     ranks = 1 + above.double() + (equal - 1).double() / 2
-    return ranks.numpy(), scores.topk(k, dim=1).indices.numpy()
+    ranks[torch.isneginf(of_shown[:, 0])] = torch.inf
+    best, top = scores.topk(k, dim=1)
+    return ranks.numpy(), top.masked_fill(torch.isneginf(best), -1).numpy()
 
 
 def _ranked_alike(scores: Tensor, shown: IntArray, k: int) -> tuple[Float64Array, IntArray]:
@@ -210,7 +247,7 @@ def measure(period: Period, ranked: Ranked, k: int) -> dict[str, tuple[Float64Ar
         return np.bincount(owner, values, minlength=len(users)).astype(np.float64)
 
     every, liked = np.ones(len(owner)), period.liked.astype(np.float64)
-    rates = period.item_rates[ranked.top]
+    rates = np.append(period.item_rates, np.nan)[ranked.top]  # −1: no item
     known = ~np.isnan(rates)
     return {
         "hit_rate_shown": (by_user(hit), by_user(every)),
@@ -286,7 +323,7 @@ def compare(
             dict(zip(MEASURES, values[row].tolist(), strict=True)),
             dict(zip(MEASURES, ends[:, row].T.tolist(), strict=True)),
             dict(zip(MEASURES, differences[:, row].T.tolist(), strict=True)),
-            len(np.unique(each.top)) / period.n_items,
+            len(np.setdiff1d(each.top, [-1])) / period.n_items,
         )
         for row, (name, each) in enumerate(ranked.items())
     ]

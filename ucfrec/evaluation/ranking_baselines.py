@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
-from typing import Final
+from pathlib import Path
+from typing import Final, Literal, get_args
 
 import numpy as np
 import torch
@@ -16,13 +17,16 @@ from ucfrec.episodes.item_counts import TrainingCounts, liked_steps
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.liked import Liked
 from ucfrec.evaluation.ranking import Ranker, Steps
+from ucfrec.policies.boosted import BoostedConfig, BoostedPolicy
 from ucfrec.policies.item_knn import ItemKNNConfig, ItemKNNPolicy
 from ucfrec.policies.item_rate import liked_rates
+from ucfrec.policies.recent import RecentClicksPolicy, RecentRatePolicy, decayed_counts
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 _KNN_HISTORY: Final = 20
-"""Steps of the session that item-kNN reads."""
+"""Latest rows of the user that item-kNN reads."""
 _ALS_FACTORS: Final = 32
+_Factors = Literal["als", "bpr"]
 
 
 class PolicyRanker:
@@ -34,8 +38,9 @@ class PolicyRanker:
 
     def scores(self, steps: Steps) -> Tensor:
         """Log-probabilities at temperature 1 (B, n_items); see `Scorer.scores`."""
-        scores = logged_scores(self._scorer, steps.store, steps.episodes, steps.steps)
-        return scores.log_softmax(-1)
+        at = steps.store, steps.episodes, steps.steps
+        scores = logged_scores(self._scorer, *at, steps.left_out)
+        return scores.log_softmax(-1).nan_to_num(nan=-torch.inf, neginf=-torch.inf)
 
 
 @dataclass(frozen=True)
@@ -78,9 +83,9 @@ class Random:
 
 
 class ItemNeighbours:
-    """Ranks items by their cosine to the session's rewarded items; ties go to the popular ones.
+    """Ranks items by their cosine to the user's latest rewarded items; ties go to the popular ones.
 
-    See `ItemKNNPolicy`.
+    See `ItemKNNPolicy`; the items are those of all the user's sessions, also before the log.
     """
 
     name = "item-knn"
@@ -98,23 +103,51 @@ class ItemNeighbours:
 
     def scores(self, steps: Steps) -> Tensor:
         """Scores (B, n_items)."""
-        windows = steps.windows(_KNN_HISTORY)
-        return self._knn.features(windows)[:, -1] + self._tie_break
+        recent = steps.rows.recent(steps.numbers, _KNN_HISTORY)
+        return self._knn.similarity(*map(torch.from_numpy, recent)) + self._tie_break
+
+
+class BoostedClicks:
+    """Ranks items by gradient-boosted clicks; see `BoostedPolicy`."""
+
+    name = "boosted clicks"
+
+    def __init__(self, train: EpisodeStore, seed: int) -> None:
+        states = train.item_states
+        sizes = {
+            "state": train.state_size,
+            "action": states.embeddings.shape[1],
+            "items": len(states.embeddings),
+        }
+        self._policy = BoostedPolicy(BoostedConfig(context=_KNN_HISTORY + 1, dim=1), sizes)
+        self._policy.start_from(train)
+        self._policy.closed_form(train, None, Path(), seed)()
+
+    def scores(self, steps: Steps) -> Tensor:
+        """Log-odds of a like (B, n_items)."""
+        return self._policy.act(steps.windows(_KNN_HISTORY + 1))
 
 
 class MatrixFactorisation:
-    """Implicit-feedback ALS (Hu et al., 2008) on users' liked items.
+    """Factors of users and items from the users' liked items: ALS (Hu et al., 2008) or BPR (Rendle
+    et al., 2009).
 
     Needs the package `implicit`.
     """
 
-    name = "als"
-
     def __init__(
-        self, train: EpisodeStore, popularity: Tensor, seed: int, liked_of: Liked = liked_steps
+        self,
+        name: _Factors,
+        train: EpisodeStore,
+        popularity: Tensor,
+        seed: int,
+        liked_of: Liked = liked_steps,
     ) -> None:
         from implicit.als import AlternatingLeastSquares
+        from implicit.bpr import BayesianPersonalizedRanking
         from threadpoolctl import threadpool_limits
+
+        self.name = name
 
         episodes, steps = train.all_steps()
         users = train.episode_values(schema.USER).astype(np.int64)[episodes]
@@ -123,13 +156,13 @@ class MatrixFactorisation:
         shape = (int(users.max()) + 1, len(popularity))
         matrix = sparse.csr_matrix((liked, (users, items)), shape=shape)
         matrix.eliminate_zeros()
-        model = AlternatingLeastSquares(
-            factors=_ALS_FACTORS, random_state=seed, num_threads=1, use_gpu=False
-        )
+        kinds = {"als": AlternatingLeastSquares, "bpr": BayesianPersonalizedRanking}
+        model = kinds[name](factors=_ALS_FACTORS, random_state=seed, num_threads=1, use_gpu=False)
         with threadpool_limits(1, "blas"):
             model.fit(matrix, show_progress=False)
         # The last row, zeros, is for unknown users; zeros leave only the popularity tie-break.
-        factors = np.vstack([np.asarray(model.user_factors), np.zeros(_ALS_FACTORS)])
+        of_users = np.asarray(model.user_factors)
+        factors = np.vstack([of_users, np.zeros(of_users.shape[1])])
         factors[:-1][np.diff(matrix.indptr) == 0] = 0.0
         self._users = torch.from_numpy(factors.astype(np.float32))
         self._items = torch.from_numpy(np.array(model.item_factors, dtype=np.float32))
@@ -141,19 +174,42 @@ class MatrixFactorisation:
         return self._users[torch.from_numpy(known)] @ self._items.T + self._tie_break
 
 
+def recent_rankers(
+    train: EpisodeStore, store: EpisodeStore, liked_of: Liked = liked_steps
+) -> list[Ranker]:
+    """Clicks and click rate with half-lives, which the validation split of the store chooses.
+
+    Args:
+        train: the rows to count.
+        store: the whole store.
+        liked_of: says which steps were liked.
+    """
+    first, validation = store.split("train"), store.split("validation")
+    if not validation.n_episodes:
+        return []
+    rankers: list[Ranker] = []
+    for name, kind in (("clicks", RecentClicksPolicy), ("click rate", RecentRatePolicy)):
+        hours = kind.best(first, validation, liked_of)
+        scores = kind.scores_of(decayed_counts(train, hours, liked_of))
+        rankers.append(SameForAll(f"recent {name}", scores.double()))
+    return rankers
+
+
 def baselines(
     counts: TrainingCounts, train: EpisodeStore | None, seed: int, liked_of: Liked = liked_steps
 ) -> list[Ranker]:
-    """Baseline rankers: random, most shown, most clicked, item click rate, item-kNN and ALS.
+    """Baseline rankers: random, most shown, most clicked, item click rate, item-kNN, boosted
+    clicks, ALS and BPR.
 
-    ALS is included if the package `implicit` is installed (extra `rank`).
+    ALS and BPR are included if the package `implicit` is installed (extra `rank`).
 
     Args:
         counts: item counts of the training rows.
-        train: the training episodes; None if their store is unavailable, which excludes item-kNN
-            and ALS.
-        seed: of the random scores and of ALS.
-        liked_of: says which training steps were liked, for ALS; `counts` has its own.
+        train: the training episodes; None if their store is unavailable, which excludes all that
+            learn from single rows.
+        seed: of the random scores, boosted clicks, ALS and BPR.
+        liked_of: says which training steps were liked, for ALS and BPR; `counts` has its own, and
+            boosted clicks those of the run.
     """
     shown, liked = counts.shown.double(), counts.liked.double()
     rankers: list[Ranker] = [
@@ -164,6 +220,10 @@ def baselines(
     ]
     if train is not None:
         rankers.append(ItemNeighbours(train, shown.float()))
+        rankers.append(BoostedClicks(train, seed))
         if find_spec("implicit") is not None:
-            rankers.append(MatrixFactorisation(train, shown.float(), seed, liked_of))
+            rankers += [
+                MatrixFactorisation(name, train, shown.float(), seed, liked_of)
+                for name in get_args(_Factors)
+            ]
     return rankers

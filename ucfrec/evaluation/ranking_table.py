@@ -11,8 +11,21 @@ from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.liked import Liked, LikedByRange
-from ucfrec.evaluation.ranking import MEASURES, Compared, Period, compare, rank_steps, rankers_named
-from ucfrec.evaluation.ranking_baselines import PolicyRanker, RewardRanker, baselines
+from ucfrec.evaluation.ranking import (
+    MEASURES,
+    Compared,
+    Later,
+    Period,
+    compare,
+    rank_steps,
+    rankers_named,
+)
+from ucfrec.evaluation.ranking_baselines import (
+    PolicyRanker,
+    RewardRanker,
+    baselines,
+    recent_rankers,
+)
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.results.row import ResultRow
 from ucfrec.runs.record import store_of
@@ -50,7 +63,7 @@ def ranking_rows(
     policies: Sequence[PolicyRanker],
     trained: TrainedPolicy,
     train: EpisodeStore | None,
-    later: EpisodeStore,
+    later: Later,
     users: Array,
     k: int,
     seed: int,
@@ -67,7 +80,7 @@ def ranking_rows(
         trained: any of their runs, for the counts of the training rows and the reward model.
         train: the store of those rows; None excludes item-kNN and ALS.
         later: the steps to rank.
-        users: (E,) identifier of the user of each episode of `later`.
+        users: (E,) identifier of the user of each of its episodes.
         k: items that are recommended at a step.
         seed: of the resampled users and of `random`.
         liked: which steps were liked; None for the run's own definition. Without `train`, "most
@@ -76,15 +89,19 @@ def ranking_rows(
     counts = trained.counts
     assert counts is not None
     assert trained.item_states is not None
-    fitted_on = None if train is None else train.split("train")
+    whole = trained.record.refit_of is not None
+    fitted_on = train if train is None or whole else train.split("train")
     if liked is not None and fitted_on is not None:
         counts = TrainingCounts.of(fitted_on, liked)
     liked = liked or LikedByRange(trained.item_states)
     model = [] if trained.reward_model is None else [RewardRanker(trained.scorer())]
-    named = rankers_named([*policies, *model, *baselines(counts, fitted_on, seed, liked)])
+    others = baselines(counts, fitted_on, seed, liked)
+    if train is not None and fitted_on is not None:
+        others += recent_rankers(fitted_on, train, liked)
+    named = rankers_named([*policies, *model, *others])
     k = min(k, len(counts.shown))
-    period = Period.of(later, np.asarray(users), liked)
-    ranked = {name: rank_steps(ranker, later, k, period.users) for name, ranker in named.items()}
+    period = Period.of(later.store, np.asarray(users), liked)
+    ranked = {name: rank_steps(ranker, later, k) for name, ranker in named.items()}
     reference = next(iter(named))
     own = dict(zip(named, policies, strict=False))
     shared: dict[str, Any] = {
@@ -94,12 +111,13 @@ def ranking_rows(
         "evaluation_seed": seed,
         "metric": METRIC,
         "metrics": {},
-        "data_fingerprint": later.record.fingerprint,
+        "data_fingerprint": later.store.record.fingerprint,
         "conditions": {
             "k": k,
             "steps": len(period.items),
             "users": len(np.unique(period.users)),
             "reference": reference,
+            "filter_seen": later.filter_seen,
             "liked": str(liked),
             "liked_share": float(period.liked.mean()),
         },

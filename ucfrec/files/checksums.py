@@ -17,6 +17,8 @@ from ucfrec.files.locks import is_lock_or_scratch
 
 CARD, MEASURED = "MODEL_CARD.md", "measured.json"
 """Files of a run that later measurements change; they are never listed."""
+RUN_RECORD: Final = "run.json"
+"""Record of a run."""
 _BLOCK: Final = 2**19
 _THREADS: Final = 2
 
@@ -27,7 +29,6 @@ def files_of(
     """Size and checksum of every file of a complete folder, but its record.
 
     Args:
-        folder: the folder.
         record: name of the record in it, e.g. `meta.json`.
         known: files that keep the entry that they have.
     """
@@ -133,7 +134,9 @@ def _size_fault(path: Path, size: int) -> str:
 
 
 def _names(folder: Path) -> Iterator[str]:
-    for where, _, files in os.walk(folder):
+    for where, folders, files in os.walk(folder):
+        # A folder with a record of its own has checksums of its own.
+        folders[:] = [name for name in folders if not (Path(where) / name / RUN_RECORD).is_file()]
         for name in files:
             if not is_lock_or_scratch(name) and name not in (CARD, MEASURED):
                 yield (Path(where) / name).relative_to(folder).as_posix()

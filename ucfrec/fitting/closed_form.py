@@ -30,7 +30,6 @@ def fit_once(
     Args:
         module: fitted in place, and left in evaluation mode.
         solve: sets the weights of `module`.
-        folder: of the files.
         validate: the validation loss; called in evaluation mode without gradients. None for none.
         describe: name of the fit in error messages.
 

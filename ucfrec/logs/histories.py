@@ -140,7 +140,6 @@ def log_table(frame: "pd.DataFrame", name: str) -> pa.Table:
 
     Args:
         frame: one row per interaction.
-        name: name of the frame in messages.
 
     Raises:
         InputError: `frame` is no data frame or has no rows, two columns have the same name, or a

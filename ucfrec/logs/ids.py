@@ -42,7 +42,6 @@ def number_ids(
 
     Args:
         log: log with the tables of `ucfrec.logs.sorted_rows.code_tables`.
-        measures: of its episodes.
         listed: log column to feature tables whose column `id` lists more users or items.
         like: a store whose numbers are reused instead (without `train_count`); None for none.
         onto: a store whose ids keep their numbers, while others follow in sorted order; their
@@ -174,7 +173,6 @@ def write_episode_users(log: TypedLog, file: Path, codes: Iterator[IntArray]) ->
 
     Args:
         log: after `number_ids`.
-        file: to write.
         codes: code of the user of each episode, in batches.
     """
     reader = pa.RecordBatchReader.from_batches(_PLACED, _placed(codes))

@@ -85,7 +85,6 @@ def join_feedback(
         exposures: files, folders and globs of `serve` and `recommend`.
         feedback: log files with `user_id`, `item_id`, `timestamp` and perhaps `request_id`.
         out: Parquet file: the columns of the exposures, `feedback` and those of the feedback.
-        within_ms: longest time from exposure to feedback.
         mapping: log columns to the columns of the feedback.
         memory_limit: of the engine; rows spill to disk.
 

@@ -145,7 +145,6 @@ class LogMapping:
 
         Args:
             source: in the record of the store or the run.
-            origin: file of the record, for messages.
         """
         columns = {name: Expression(text, origin) for name, text in source.mapping.items()}
         where = source.where and Expression(source.where, origin)
@@ -285,7 +284,6 @@ def _tables(path: Path, above: tuple[Path, ...] = ()) -> list[Path]:
     """The tables at a path, those of a folder and its sub-folders by name.
 
     Args:
-        path: a file or folder.
         above: the folders that it lies in, without links: a link may lead back to one of them.
     """
     if not path.is_dir():

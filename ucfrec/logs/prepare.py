@@ -23,7 +23,6 @@ from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.binding import explained
 from ucfrec.logs.clean import require_rows
-from ucfrec.logs.distributions import RewardPasses, distributions
 from ucfrec.logs.engine import engine
 from ucfrec.logs.feature_tables import feature_digest, load_features, require_known_ids
 from ucfrec.logs.ids import (
@@ -38,15 +37,26 @@ from ucfrec.logs.ids import (
 )
 from ucfrec.logs.kept import DUPLICATES
 from ucfrec.logs.mapping import SESSIONS, FeatureTable, LogMapping, log_files
-from ucfrec.logs.measures import Measures, binned_rewards, measure, sampled_rewards
-from ucfrec.logs.notes import note_bots, note_equal_times, note_losses
-from ucfrec.logs.order import count_unsorted
+from ucfrec.logs.measures import (
+    Measures,
+    RewardPasses,
+    binned_rewards,
+    distributions,
+    measure,
+    sampled_rewards,
+)
 from ucfrec.logs.remembered import settled
-from ucfrec.logs.sessions import Cut, Episodes, by_sessions, episodes, split_bounds
+from ucfrec.logs.sessions import Cut, Episodes, by_sessions, count_unsorted, episodes, split_bounds
 from ucfrec.logs.sorted_rows import SortedRows, check_sorted, sorted_batches
 from ucfrec.logs.spool import Spool
 from ucfrec.logs.steps import StepNumbers, write_steps
-from ucfrec.logs.summary import build_report, require_variety
+from ucfrec.logs.summary import (
+    build_report,
+    note_bots,
+    note_equal_times,
+    note_losses,
+    require_variety,
+)
 from ucfrec.logs.tables import open_tables
 from ucfrec.logs.typed import TypedLog, typed_log
 from ucfrec.progress import progress

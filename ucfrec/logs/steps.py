@@ -32,9 +32,7 @@ class StepNumbers:
         """The numbers in the tables of `ucfrec.logs.ids.number_ids`.
 
         Args:
-            log: its engine has the tables.
             measures: of the log's episodes.
-            folder: for scratch.
         """
         users = Spool(folder / "numbers")
         for batch in numbers(log, schema.USER_ID, "users"):
@@ -58,11 +56,6 @@ def write_steps(
     """Write all episodes to the store at `folder`.
 
     Args:
-        folder: scratch folder of the store.
-        episodes: in the order of the store.
-        spool: their rows.
-        numbered: numbers of users and items.
-        display: counts the steps.
         first_shard: number of the first shard.
         fill: the step columns of the store, with what steps without a value have; others are left
             out. Empty for those of the log.

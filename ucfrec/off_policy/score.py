@@ -17,6 +17,7 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import logged_history
 from ucfrec.arrays import Array, IntArray
+from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.locks import scratch_folder
@@ -46,6 +47,18 @@ class LoggedSessions:
     a store, only "dropped"."""
     unknown_items: int = 0
     """Number of steps that show an item which the run does not know."""
+    rows: UserRows | None = None
+    """The rows of the users, those of the run's store too; None if they were not collected."""
+
+    @property
+    def history_lacking(self) -> str:
+        """A warning where users are taken to have no earlier rows; empty otherwise."""
+        if self.rows is None or self.rows.earlier is not None:
+            return ""
+        return (
+            "the store of the run is gone or has changed: users are ranked without what they were "
+            "shown before these logs; move the run together with its store"
+        )
 
 
 @dataclass(frozen=True)
@@ -126,7 +139,28 @@ def logged_sessions(
             )
         store = _as_seen(store, trained)
         users = np.asarray(pq.read_table(folder / EPISODE_USERS).column(schema.USER_ID))
-        yield LoggedSessions(store, users, report, unknown)
+        yield _with_history(trained, LoggedSessions(store, users, report, unknown), _store(trained))
+
+
+def _store(trained: TrainedPolicy) -> EpisodeStore | None:
+    try:
+        return store_of(trained.folder, trained.record)
+    except InputError:
+        return None
+
+
+def _with_history(
+    trained: TrainedPolicy, logged: LoggedSessions, earlier: EpisodeStore | None
+) -> LoggedSessions:
+    """The sessions with the earlier rows of their users; those of a session that goes on are a
+    part of it, as in `recommend`. Session ids of the store are not kept: such sessions begin
+    with the logs."""
+    record = trained.record
+    seen = None if earlier is None else _as_seen(earlier, trained)
+    rows = UserRows.of(logged.store, logged.users, seen)
+    by_id = record.session_by == schema.SESSION_ID
+    store = logged.store if by_id else rows.continued(record.session_gap_ms)
+    return replace(logged, store=store, rows=rows)
 
 
 def _unknown_items(store: EpisodeStore) -> int:
@@ -251,7 +285,9 @@ def held_out_sessions(trained: Sequence[TrainedPolicy]) -> LoggedSessions:
     if not test.n_episodes:
         raise InputError(f"{store.path} has no test split; name later logs")
     users = test.episode_values(schema.USER)
-    return LoggedSessions(_as_seen(test, first), users, {"dropped": {}})
+    logged = LoggedSessions(_as_seen(test, first), users, {"dropped": {}})
+    before = np.flatnonzero(store.episode_values(schema.SPLIT) != schema.SPLITS.index("test"))
+    return _with_history(first, logged, store.select(before))
 
 
 def _vectors(run: Path) -> InputError:

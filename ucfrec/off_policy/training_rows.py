@@ -38,7 +38,7 @@ def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
         held_out = np.zeros(logged.n_episodes, dtype=bool)
         if record.refit_of is None:
             held_out = logged.episode_values(schema.SPLIT) == schema.SPLITS.index("test")
-        return float(logged.lengths[~held_out].sum() / logged.n_steps)
+        return float((~held_out)[logged.all_steps()[0]].mean())
     try:
         store = store_of(trained.folder, record)
     except InputError:
@@ -61,7 +61,7 @@ def seen_too_often(seen: float | None) -> list[str]:
         return []
     return [
         f"{seen:.0%} of the rows were seen in training: on these a policy looks "
-        "better than it is; give later logs"
+        "better than it is; give later logs, or no logs for the test split"
     ]
 
 

@@ -114,6 +114,8 @@ class SequencePolicy(nn.Module, ABC):
     Config: ClassVar[type[PolicyConfig]] = PolicyConfig
     augmented: ClassVar[bool] = False
     """Whether the default of `augment.copies` is above 0 for this policy."""
+    chosen: ClassVar[tuple[str, ...]] = ()
+    """Buffers that `closed_form` chooses on held-out episodes; a refit keeps them."""
     presets: ClassVar[Mapping[str, Any]] = {}
     """Defaults of this policy for settings outside the table `policy`, by `table.field`."""
 
@@ -179,13 +181,13 @@ class SequencePolicy(nn.Module, ABC):
         """Set buffers from the training episodes, before the first update."""
 
     def closed_form(
-        self, train: EpisodeStore, validation: EpisodeStore, folder: Path, seed: int
+        self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
     ) -> Callable[[], None] | None:
         """What fits the policy without the training loop; None if gradients have to.
 
         Args:
             train: the training episodes, without augmented episodes.
-            validation: held-out episodes.
+            validation: held-out episodes; None in a refit, which keeps what was `chosen` on them.
             folder: for intermediate results.
             seed: of every random draw.
         """
@@ -293,6 +295,18 @@ class SequencePolicy(nn.Module, ABC):
         if not isinstance(self.head, ItemHead) or self.head.exposure is None:
             return None
         return Exposed.before_last(windows, self.head.exposure.lags)
+
+
+def require_items(name: str, sizes: Mapping[str, int]) -> None:
+    """Check that actions are items.
+
+    Raises:
+        InputError: they are vectors.
+    """
+    if not sizes["items"]:
+        raise InputError(
+            f"{name} recommends items; this store's actions are vectors; use another policy"
+        )
 
 
 class TokenEmbedding(nn.Module):

@@ -67,15 +67,22 @@ class CRMGreedyPolicy(SequencePolicy):
         self.candidates.copy_(torch.from_numpy(actions))
 
     def closed_form(
-        self, train: EpisodeStore, validation: EpisodeStore, folder: Path, seed: int
+        self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
     ) -> Callable[[], None] | None:
-        """For items, fits the reward model."""
+        """For items, fits the reward model; its effects are chosen on a tenth of the episodes if
+        none are held out."""
         model = self.model
         if not isinstance(model, ItemRewardModel):
             return None
+        if validation is None:
+            held_out = np.arange(train.n_episodes) % 10 == 1
+            validation = train.select(np.flatnonzero(held_out))
+            train = train.select(np.flatnonzero(~held_out))
+
+        views = train, validation
 
         def solve() -> None:
-            fitted, _ = fit_item_reward_model(train, validation, folder, seed)
+            fitted, _ = fit_item_reward_model(*views, folder, seed)
             model.load_state_dict(fitted.state_dict())
 
         return solve

@@ -159,7 +159,7 @@ class ItemHead(nn.Module):
         """The negative log-likelihood (nats) of each of M steps, (M,), whose mean is `loss`."""
         if not self.samples:
             return F.cross_entropy(self.predict(features, exposed), actions, reduction="none")
-        logit = self._logit(features, actions, exposed)
+        logit = self.logit(features, actions, exposed)
         if not self.training:
             return self._log_normaliser(features, exposed) - logit
         found = self._proposal_now().draw(self.samples)
@@ -199,7 +199,7 @@ class ItemHead(nn.Module):
         bias = self._bias_of(found.items) + found.log_weights
         return self._logits(features, self.vectors(found.items), bias, found.items, exposed)
 
-    def _logit(self, features: Tensor, actions: Tensor, exposed: Exposed | None) -> Tensor:
+    def logit(self, features: Tensor, actions: Tensor, exposed: Exposed | None) -> Tensor:
         """Logits (M,) of the logged items."""
         product = (features * self._vectors_of(actions)).sum(-1) / features.shape[-1] ** 0.5
         logit: Tensor = product + self._bias_of(actions)

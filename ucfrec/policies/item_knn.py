@@ -13,8 +13,7 @@ from torch.nn import functional as F
 from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
-from ucfrec.errors import InputError
-from ucfrec.policies.base import PolicyConfig, SequencePolicy
+from ucfrec.policies.base import PolicyConfig, SequencePolicy, require_items
 from ucfrec.policies.heads import ItemHead
 from ucfrec.settings import settings_table
 
@@ -41,6 +40,7 @@ class ItemKNNPolicy(SequencePolicy):
     """
 
     Config = ItemKNNConfig
+    chosen = ("temperature",)
     config: ItemKNNConfig
     neighbors: Tensor
     cosines: Tensor
@@ -48,11 +48,8 @@ class ItemKNNPolicy(SequencePolicy):
     temperature: Tensor
 
     def __init__(self, config: ItemKNNConfig, sizes: Mapping[str, int]) -> None:
+        require_items("item-knn", sizes)
         super().__init__(config, sizes)
-        if not isinstance(self.head, ItemHead):
-            raise InputError(
-                "item-knn recommends items; this store's actions are vectors; use another policy"
-            )
         shape = (sizes["items"], min(config.neighbors, sizes["items"]))
         self.register_buffer("neighbors", torch.zeros(shape, dtype=torch.int64))
         self.register_buffer("cosines", torch.zeros(shape))
@@ -78,10 +75,10 @@ class ItemKNNPolicy(SequencePolicy):
             self.cosines[rows], self.neighbors[rows] = cosines.topk(self.cosines.shape[1])
 
     def closed_form(
-        self, train: EpisodeStore, validation: EpisodeStore, folder: Path, seed: int
+        self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
     ) -> Callable[[], None]:
         """Chooses the temperature; everything else is set by `start_from`."""
-        return lambda: self._choose_temperature(validation)
+        return lambda: None if validation is None else self._choose_temperature(validation)
 
     @torch.no_grad()
     def _choose_temperature(self, held_out: EpisodeStore) -> None:
@@ -110,6 +107,19 @@ class ItemKNNPolicy(SequencePolicy):
         scores.scatter_add_(-1, self.neighbors[windows.actions], weighted)
         # Row t sums earlier steps only. Subtracting step t from its sum would round.
         return F.pad(scores.cumsum(1)[:, :-1], (0, 0, 1, 0))
+
+    def similarity(self, items: Tensor, rewards: Tensor) -> Tensor:
+        """Cosines to some items, summed with their rewards as weights, (B, n_items).
+
+        Args:
+            items: (B, N) int64; −1 for none.
+            rewards: (B, N) of these, in reward units.
+        """
+        weights = (rewards - self.reward_low) * (items >= 0)
+        known = items.clamp(min=0)
+        weighted = (self.cosines[known] * weights.unsqueeze(-1)).flatten(1)
+        scores = weighted.new_zeros(len(items), len(self.cosines))
+        return scores.scatter_add_(1, self.neighbors[known].flatten(1), weighted)
 
     def _logits(self, windows: Windows) -> Tensor:
         assert isinstance(self.head, ItemHead)

@@ -25,22 +25,30 @@ class ItemRatePolicy(SequencePolicy):
     """
 
     def closed_form(
-        self, train: EpisodeStore, validation: EpisodeStore, folder: Path, seed: int
+        self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
     ) -> Callable[[], None]:
         """Sets the biases of the head.
 
         Raises:
             InputError: actions are vectors.
         """
-        if not isinstance(self.head, ItemHead):
-            raise InputError("item-rate needs a store of items; this store has vector actions")
-        bias = self.head.bias
+        bias = self.item_bias()
 
         def solve() -> None:
             with torch.no_grad():
                 bias.copy_(torch.logit(liked_rates(TrainingCounts.of(train))))
 
         return solve
+
+    def item_bias(self) -> Tensor:
+        """The biases (n_items,) of the head, which are the scores.
+
+        Raises:
+            InputError: actions are vectors.
+        """
+        if not isinstance(self.head, ItemHead):
+            raise InputError("item rates need a store of items; this store has vector actions")
+        return self.head.bias
 
     def features(self, windows: Windows) -> Tensor:
         """(B, K, d) of zeros."""

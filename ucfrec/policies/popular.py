@@ -25,7 +25,7 @@ class PopularPolicy(SequencePolicy):
     """
 
     def closed_form(
-        self, train: EpisodeStore, validation: EpisodeStore, folder: Path, seed: int
+        self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
     ) -> Callable[[], None] | None:
         """Sets the biases, unless settings add something to learn."""
         config = self.config

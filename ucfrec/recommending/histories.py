@@ -13,6 +13,7 @@ import pyarrow as pa
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
+from ucfrec.episodes.earlier import LONGEST_HISTORY
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.histories import frame_histories, read_histories
 from ucfrec.logs.kept import kept_in_order
@@ -23,8 +24,6 @@ _PLAIN = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP)
 _MOST_PLAIN_ROWS = 1_000_000
 """Rows up to which a frame is read at once, not in batches of users."""
 _WORD = re.compile(r"\w+")
-LONGEST_HISTORY = 1000
-"""Most recent rows of a user that are read; older ones only count as seen."""
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from ucfrec.files.locks import claim
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.provenance import config_hash
 from ucfrec.reporting.tables import markdown_table, shown
-from ucfrec.runs.record import RunRecord, read_record
+from ucfrec.runs.record import REFIT, RunRecord, read_record
 from ucfrec.runs.trained_policy import RULE
 
 
@@ -29,15 +29,17 @@ def write_card(run: Path) -> Path:
         InputError: `run` is not a run folder.
     """
     record, card = read_record(run), run / CARD
+    refitted = record.refit_of is not None or (run / REFIT / RunRecord.FILE).is_file()
+    logged = read_metrics(run / "policy")
     parts = [
         f"# Model card: {record.name}",
         _about(record),
         "## Training data",
-        _data(record),
+        _data(record, refitted),
         "## How it acts",
         _rule(run),
         "## Limits",
-        "\n".join(f"- {limit}" for limit in _limits(record, read_metrics(run / "policy"))),
+        "\n".join(f"- {limit}" for limit in _limits(record, refitted, logged)),
         "## Measured",
         _measured(_read(run)),
     ]
@@ -60,7 +62,6 @@ def add_measurement(
         how: the command, e.g. "ucfrec ope".
         of: what was measured on what, e.g. "DR on sessions.parquet, target return 5".
         values: name to number or text, in the order of the table.
-        said: the verdict and warnings.
     """
     if not os.access(run, os.W_OK):
         return
@@ -93,9 +94,9 @@ def _about(record: RunRecord) -> str:
     return _listed(rows)
 
 
-def _data(record: RunRecord) -> str:
+def _data(record: RunRecord, refitted: bool) -> str:
     source = record.data
-    window = _window(record)
+    window = _window(record, refitted)
     files = [PurePath(file).name for file in source.files]
     rows = {
         "files": ", ".join(files) or None,
@@ -113,12 +114,12 @@ def _data(record: RunRecord) -> str:
     return _listed(rows)
 
 
-def _window(record: RunRecord) -> tuple[int, int] | None:
+def _window(record: RunRecord, refitted: bool) -> tuple[int, int] | None:
     """Times (ms) of the first training row, and from which on rows are no longer trained on."""
     times, splits = record.data.time_range_ms, record.data.split_times_ms
     if times is None:
         return None
-    if splits is None or record.refit_of is not None:
+    if splits is None or refitted:
         return times
     return times[0], min(splits[0], times[1])
 
@@ -137,14 +138,19 @@ def _rule(run: Path) -> str:
     )
 
 
-def _limits(record: RunRecord, logged: Container[str]) -> list[str]:
+def _limits(record: RunRecord, refitted: bool, logged: Container[str]) -> list[str]:
     items = record.sizes["items"]
     limits = []
     if record.refit_of is not None:
         limits.append("It was trained on all rows of its store: only later logs can evaluate it.")
+    elif refitted:
+        limits.append(
+            "Once everything was chosen, it went on learning from all rows of its store: only "
+            "later logs can evaluate it. What the test split shows is of the weights before that."
+        )
     if items:
         limits.append(f"It knows {items:,} items and never shows another one.")
-    window = _window(record)
+    window = _window(record, refitted)
     if window is not None:
         limits.append(
             f"It was not trained on anything after {_day(window[1])} UTC; tastes and items change."

@@ -65,8 +65,6 @@ def write_report(
     its last logged step.
 
     Args:
-        out: HTML file to write.
-        runs: run folders.
         results: rows of `ucfrec evaluate --json`, `ucfrec ope --json` or `ucfrec demo`; JSON, or
             JSON lines if the name ends in `.jsonl`.
         items: item features to show with the sample recommendations, Parquet or CSV with a column

@@ -10,6 +10,7 @@ from torch import Tensor
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.fitting import distributed
+from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.fitting.closed_form import fit_once
 from ucfrec.fitting.loop import Fit, fit
 from ucfrec.policies.base import SequencePolicy
@@ -25,6 +26,7 @@ def fit_policy(
     validation: EpisodeStore | None,
     out: Path,
     config: Config,
+    start: Path | None = None,
 ) -> Fit:
     """Train the policy, or resume its training.
 
@@ -34,13 +36,19 @@ def fit_policy(
         validation: held-out episodes; None to keep the last weights.
         out: folder of the run.
         config: configuration of the run.
+        start: weights of another training to go on from; of a policy that is fitted without
+            gradients, only what was chosen on held-out episodes is taken from there.
 
     Raises:
         InputError: see `ucfrec.fitting.loop.fit`; or the batch has fewer windows than processes.
     """
     k, device = policy.config.context, policy.state_mean.device
     base = train.without_augmentation()
-    solve = policy.closed_form(base, validation or base, out / "policy", config.seed)
+    solve = policy.closed_form(base, validation, out / "policy", config.seed)
+    if start is not None:
+        weights = load_tensors(start)[0]
+        kept = policy.state_dict().keys() if solve is None else policy.chosen
+        policy.load_state_dict({name: weights[name] for name in kept}, strict=solve is None)
     alone = solve is not None
     validate = None if validation is None else _validation(policy, validation, config.seed, alone)
     if solve is not None:

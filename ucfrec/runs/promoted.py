@@ -96,7 +96,7 @@ def _require_verdict(run: Path, record: RunRecord, current: Path) -> None:
     update = record.update
     if update is None or update.verdict is None:
         raise InputError(f"{run} has no verdict against the current run {current.name}; {remedy}")
-    if update.run != TrainedPolicy.load(current).fingerprint:
+    if update.run != TrainedPolicy.load(current, split=True).fingerprint:
         raise InputError(
             f"{run} was compared with {update.of}, not with the current run {current.name}; "
             f"{remedy}"

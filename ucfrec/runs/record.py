@@ -26,13 +26,16 @@ from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import read_json
+from ucfrec.files.checksums import RUN_RECORD
 from ucfrec.files.record import Count, Entry, Number, Record, Text
 from ucfrec.fitting.loop import Fit
 from ucfrec.policies.registry import policy_class
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.user_model.reward_report import ItemRewardReport
 
-RUN: Final = "run.json"
+RUN: Final = RUN_RECORD
+REFIT: Final = "refit"
+"""Folder in that of a run, a run of its own, whose weights have learned from all rows."""
 
 
 def _complete(sizes: dict[str, int]) -> dict[str, int]:
@@ -332,6 +335,18 @@ def read_record(run: Path) -> RunRecord:
     return record
 
 
+def refit_of_run(run: Path, record: RunRecord) -> RunRecord | None:
+    """The record of a run's finished refit; None without one.
+
+    A refit whose training or last steps were interrupted is not used.
+    """
+    if not (run / REFIT / RUN).is_file():
+        return None
+    found = read_record(run / REFIT)
+    whole = found.policy is not None and (found.rule is None) == (record.rule is None)
+    return found if whole else None
+
+
 def read_training(run: Path) -> TrainingRecord:
     """The record of a run of whatever library; its other files are not looked at.
 
@@ -391,6 +406,8 @@ def verified(run: Path) -> None:
         raise InputError(f"{run} cannot be verified: its training has not ended; train it again")
     for name, fault in record.checksums(run).faults():
         raise InputError(f"{run / name} {fault}; restore the file, or train again")
+    if (run / REFIT / RUN).is_file():
+        verified(run / REFIT)
 
 
 def _describe_augmentation(report: AugmentationReport) -> list[str]:

@@ -1,32 +1,38 @@
-"""Train once more on all rows, once everything has been chosen."""
+"""Go on learning from all rows, once everything has been chosen."""
 
 import dataclasses
 import shutil
 from pathlib import Path
+from typing import Any, Final
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.fitting import distributed
+from ucfrec.provenance import config_hash
 from ucfrec.runs.config import Config
-from ucfrec.runs.record import RunRecord
+from ucfrec.runs.record import REFIT, RUN, RunRecord, refit_of_run, store_from
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import INPUTS, REWARD_MODEL, RULE, TrainedPolicy
 from ucfrec.user_model.model import SESSIONS
 from ucfrec.user_model.reward_fit import refit_item_reward_model
 
+SHARE: Final = 0.25
+"""Steps of a refit, as a share of those that the best weights took."""
+
 
 def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
-    """Train a policy as the run `first`, but on its validation and test episodes too.
+    """Go on training the policy of the run `first`, on its validation and test episodes too.
 
-    Nothing is chosen again: the settings, the number of steps (those of the best weights of
-    `first`), the strength of the reward model's effects and the decision rule are those of `first`.
-    Item embeddings stay those of the store's training split. There is nothing left to evaluate the
-    policy on but later logs.
+    Nothing is chosen again: the settings, the augmented episodes, the strength of the reward
+    model's effects and the decision rule are those of `first`. The best weights are trained for
+    `SHARE` of the steps that they took, while the learning rate falls to 0; policies that are
+    fitted without gradients are fitted again. Item embeddings stay those of the store's training
+    split. There is nothing left to evaluate the policy on but later logs.
 
     Args:
         store: the store of `first`.
         first: a finished run.
-        out: run folder, new or interrupted.
+        out: run folder, new or interrupted; `first / REFIT` for the weights that `first` acts by.
 
     Returns:
         The record of the new run.
@@ -34,20 +40,23 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
     Raises:
         InputError: `first` is not a finished run on this store, or `out` is another run.
     """
-    trained = TrainedPolicy.load(first)
+    trained = TrainedPolicy.load(first, split=True)
     if not trained.record.is_of(store.record):
         raise InputError(
             f"{first} was trained on another store than {store.path}; name the store of the run"
         )
     if trained.record.policy is None:
         raise InputError(f"{first} is not finished; train it to its end first")
-    about = {
-        "refit_of": trained.record.settings | {"rule": trained.rule.as_dict()},
+    about: dict[str, Any] = {
+        "refit_of": _identity(trained),
         "dropped_observations": trained.dropped,
+        "augmentation": trained.record.augmentation,
     }
+    if out == first / REFIT:
+        about["store_from_run"] = store_from(first, store.path)
     if trained.dropped:
         store = store.without_observation_dimensions(trained.dropped)
-    record = train_run(store, out, _settings(trained), about, on_all_rows=True)
+    record = train_run(store, out, _settings(trained), about, refit_of=first)
     if not distributed.leads():
         return record
     record = record.reopened(out, INPUTS)
@@ -56,15 +65,50 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
         refit_item_reward_model(first / REWARD_MODEL, store, out / REWARD_MODEL, record.seed)
         if (first / REWARD_MODEL / SESSIONS).exists():
             shutil.copyfile(first / REWARD_MODEL / SESSIONS, out / REWARD_MODEL / SESSIONS)
-    return record.sealed(out)
+    chosen = {
+        name: getattr(trained.record, name)
+        for name in ("rule", "reward_model", "screening", "update")
+    }
+    return record.with_entries(**chosen).sealed(out)
+
+
+def refit_within(store: EpisodeStore, run: Path) -> RunRecord:
+    """`refit` a run into its own folder, which then acts by the new weights; made once.
+
+    A refit of other weights than those of the run is made again.
+
+    Raises:
+        InputError: the run is not finished.
+    """
+    out = run / REFIT
+    if (out / RUN).exists():
+        first = TrainedPolicy.load(run, split=True)
+        if config_hash(RunRecord.read(out).refit_of or {}) != config_hash(_identity(first)):
+            shutil.rmtree(out)
+        elif (record := refit_of_run(run, first.record)) is not None:
+            return record
+    return refit(store, run, out)
+
+
+def _identity(trained: TrainedPolicy) -> dict[str, Any]:
+    """Settings, rule and weights of a run."""
+    return {
+        **trained.record.settings,
+        "rule": trained.rule.as_dict(),
+        "weights": trained.fingerprint,
+    }
 
 
 def _settings(trained: TrainedPolicy) -> Config:
-    """The settings of a run, for as many steps as its best weights took, and no new choice."""
-    config = trained.record.config
-    steps = max(1, trained.record.finished.best_step)
-    return dataclasses.replace(
-        config,
-        train=dataclasses.replace(config.train, steps=steps, patience=0),
-        rule=dataclasses.replace(config.rule, choose=False),
+    """The settings of a run for a few more steps, and no new choice."""
+    config, best = trained.record.config, trained.record.finished.best_step
+    steps = max(1, round(SHARE * best))
+    train = dataclasses.replace(
+        config.train,
+        steps=steps,
+        warmup_steps=min(config.train.warmup_steps, steps // 10),
+        cosine=True,
+        patience=0,
     )
+    rule = dataclasses.replace(config.rule, choose=False)
+    return dataclasses.replace(config, train=train, rule=rule)

@@ -70,7 +70,7 @@ def train_run(
     config: Config,
     about: Mapping[str, Any] | None = None,
     more_augmentation: Overlay | None = None,
-    on_all_rows: bool = False,
+    refit_of: Path | None = None,
     shared: SharedStages = OWN,
     initial: Path | None = None,
 ) -> RunRecord:
@@ -90,8 +90,8 @@ def train_run(
         about: entries of `RunRecord` that the caller adds.
         more_augmentation: augmented training episodes that are used in addition to the
             counterfactual ones.
-        on_all_rows: train on the validation and test episodes too, and keep the last weights; see
-            `ucfrec.runs.refit`.
+        refit_of: a finished run whose weights go on learning, from the validation and test
+            episodes too, with its augmented episodes; see `ucfrec.runs.refit`.
         shared: reward models and augmentation that runs on the same store have in common where
             their settings of these stages and their seeds agree; by default a run makes its own.
             The time of a stage is in the record of the run that made it.
@@ -110,13 +110,13 @@ def train_run(
             remove_leftovers(out.parent)
             remove_leftovers_within(out)
         begun = time.perf_counter()
-        run = _prepare_inputs(store, out, config, about or {}, on_all_rows, shared)
+        run = _prepare_inputs(store, out, config, about or {}, refit_of, shared)
         if initial is not None:
             start_warm(run.policy, out, initial)
         with phase("Counterfactual augmentation", 1, PHASES):
-            overlay, augmentation = _augment(run)
+            overlay, augmentation = _augment(run, refit_of)
         with phase("Training the policy", 2, PHASES):
-            fit = _train_policy(run, overlay, more_augmentation, on_all_rows)
+            fit = _train_policy(run, overlay, more_augmentation, refit_of)
         if not distributed.leads():
             return run.record
         chosen = run.record.rule is not None and run.record.policy == fit
@@ -137,12 +137,12 @@ def _prepare_inputs(
     out: Path,
     config: Config,
     about: Mapping[str, Any],
-    on_all_rows: bool,
+    refit_of: Path | None,
     shared: SharedStages,
 ) -> _Inputs:
     """Check all inputs and begin the run or reopen it; views of the episodes, untrained policy."""
     train, validation = logged, held_out = training_views(store)
-    if on_all_rows:
+    if refit_of is not None:
         train = logged = store
     if distributed.leads():
         require_startable(store, train, out, config)
@@ -169,12 +169,18 @@ def _prepare_inputs(
     )
 
 
-def _augment(run: _Inputs) -> tuple[Overlay | None, AugmentationReport | None]:
+def _augment(
+    run: _Inputs, refit_of: Path | None
+) -> tuple[Overlay | None, AugmentationReport | None]:
     """Causal reward model, generator and acceptance gate (lines 1 to 3 of Algorithm 1).
 
-    Made once, then read from the run folder; (None, None) for a run without augmentation.
+    Made once, then read from the run folder, or from that of the run that is refitted; (None, None)
+    for a run without augmentation.
     """
     config, out = run.config, run.out
+    if refit_of is not None:
+        overlay = Overlay.load(refit_of / _OVERLAY) if config.augment.augments else None
+        return overlay, run.record.augmentation
     if not config.augment.augments:
         return None, run.record.augmentation
     settings = (config.crm, config.csg, config.augment)
@@ -198,14 +204,16 @@ def _augment(run: _Inputs) -> tuple[Overlay | None, AugmentationReport | None]:
 
 
 def _train_policy(
-    run: _Inputs, overlay: Overlay | None, more: Overlay | None, on_all_rows: bool
+    run: _Inputs, overlay: Overlay | None, more: Overlay | None, refit_of: Path | None
 ) -> Fit:
     """Fit the policy to logged and augmented episodes (lines 4 and following of Algorithm 1)."""
     if more is not None:
         overlay = more if overlay is None else overlay.joined(more)
     train = run.train if overlay is None else run.train.with_overlay(overlay)
-    validation = None if on_all_rows else run.validation
-    return fit_policy(run.policy, train, validation, run.out, run.config)
+    if refit_of is None:
+        return fit_policy(run.policy, train, run.validation, run.out, run.config)
+    start = refit_of / "policy" / "best.safetensors"
+    return fit_policy(run.policy, train, None, run.out, run.config, start)
 
 
 def _fit_user_model(run: _Inputs) -> UserModel:

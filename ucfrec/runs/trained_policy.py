@@ -28,7 +28,7 @@ from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import config_hash
-from ucfrec.runs.record import RunRecord, read_record
+from ucfrec.runs.record import REFIT, RunRecord, read_record, refit_of_run
 from ucfrec.user_model.model import load_session_end
 from ucfrec.user_model.reward import FITTED, ItemRewardModel
 from ucfrec.user_model.session_end import SessionEnd
@@ -73,7 +73,11 @@ class TrainedPolicy:
 
     @classmethod
     def load(
-        cls, run: Path, checkpoint: str = "best", in_training: bool = False
+        cls,
+        run: Path,
+        checkpoint: str = "best",
+        in_training: bool = False,
+        split: bool = False,
     ) -> "TrainedPolicy":
         """Load a policy from a run folder; warns where its training has not ended.
 
@@ -81,11 +85,16 @@ class TrainedPolicy:
             run: the folder.
             checkpoint: `best` (lowest validation loss) or `last` weights.
             in_training: whether the training that has not ended is what asks.
+            split: the weights that learned from the training split only, which the other splits can
+                evaluate; otherwise those of the refit, if the run has one.
 
         Raises:
             InputError: `run` is not a run folder, or has no checkpoint yet.
         """
-        record = read_record(run)
+        record, folder = read_record(run), run
+        refit = None if in_training or split else refit_of_run(run, record)
+        if refit is not None:
+            record, folder = refit, run / REFIT
         if record.policy is None and not in_training:
             warnings.warn(
                 f"the training in {run} has not ended: later weights may be better, and its "
@@ -93,25 +102,25 @@ class TrainedPolicy:
                 InputNote,
                 stacklevel=2,
             )
-        config, path = record.config, run / "policy" / f"{checkpoint}.safetensors"
+        config, path = record.config, folder / "policy" / f"{checkpoint}.safetensors"
         build = partial(policy_class(config.policy_name), config.policy, record.sizes)
         with random_state_kept():
             policy = load_module(path, build, load_trained(path))
         policy.eval()
-        states, folder = run / ITEM_STATES, run / REWARD_MODEL
-        reward_model = _reward_model(folder / FITTED, record.sizes)
+        states, models = folder / ITEM_STATES, folder / REWARD_MODEL
+        reward_model = _reward_model(models / FITTED, record.sizes)
         trained = cls(
             run,
             policy,
             record,
             ItemStates.load(states) if states.exists() else None,
-            _ids(run / ITEMS, schema.ITEM_ID) if states.exists() else None,
-            _ids(run / USERS, schema.USER_ID),
-            _returns(run / RETURNS),
-            _rule(run / RULE),
+            _ids(folder / ITEMS, schema.ITEM_ID) if states.exists() else None,
+            _ids(folder / USERS, schema.USER_ID),
+            _returns(folder / RETURNS),
+            _rule(folder / RULE),
             reward_model,
-            TrainingCounts.load(run / COUNTS) if (run / COUNTS).exists() else None,
-            load_session_end(folder, reward_model),
+            TrainingCounts.load(folder / COUNTS) if (folder / COUNTS).exists() else None,
+            load_session_end(models, reward_model),
         )
         trained._require_equal_sizes()
         return trained

@@ -13,6 +13,7 @@ from ucfrec.files.atomic import atomic_file
 from ucfrec.fitting.checkpoint import load_trained
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.runs.config import Config
+from ucfrec.runs.record import REFIT, read_record, refit_of_run
 
 SHARE: Final = 1 / 8
 """Steps of a warm training, as a share of those of one from nothing."""
@@ -34,7 +35,8 @@ def start_warm(policy: SequencePolicy, out: Path, initial: Path) -> None:
         out: folder of the new run, which receives the reward model's weights.
         initial: folder of the run.
     """
-    path = initial / "policy" / "best.safetensors"
+    acting = initial if refit_of_run(initial, read_record(initial)) is None else initial / REFIT
+    path = acting / "policy" / "best.safetensors"
     trained, names = load_trained(path), {name for name, _ in policy.named_parameters()}
     own = policy.state_dict()
     for name in sorted(own.keys() & trained.keys()):

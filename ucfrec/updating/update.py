@@ -15,6 +15,7 @@ from ucfrec.logs.append import AppendOptions, append_logs
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.record import RunRecord, Update, store_of
+from ucfrec.runs.refit import refit_within
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.runs.warm_start import SHARE, warm_settings
@@ -35,6 +36,9 @@ class UpdateOptions:
     """Steps of the training, as a share of those of a training from nothing."""
     seed: int | None = None
     """Of everything random; None for that of the run."""
+    refit: bool = True
+    """Go on learning from the newest rows, too, once the runs are compared; see
+    `ucfrec.runs.refit`."""
 
 
 @random_state_kept()
@@ -52,7 +56,8 @@ def update_run(
     The settings are those of the run. Its policy and augmentation models start from its weights,
     with fewer steps; the user model is fitted and the decision rule chosen anew. The validation
     split is the second newest part of the new rows, the test split, on which the runs are compared,
-    the newest. Neither the run nor its store is changed.
+    the newest. Once they are compared, the new run goes on learning from these rows, too. Neither the
+    run nor its store is changed.
 
     Args:
         run: a finished run on a store of logs of items, which must be there.
@@ -68,7 +73,7 @@ def update_run(
     Raises:
         InputError: the run or the logs cannot be used, or `out` or `store` is something else.
     """
-    options, trained = options or UpdateOptions(), TrainedPolicy.load(run)
+    options, trained = options or UpdateOptions(), TrainedPolicy.load(run, split=True)
     before = _store_before(run, trained)
     grown = store or out.with_name(out.name + STORE_SUFFIX)
     with claimed(grown, "updated"):
@@ -101,9 +106,12 @@ def update_run(
     if record.update.verdict is None:
         found = drift(trained, before.split("train"), opened.select(added), counts, config.seed)
         newest = opened.split("test")
-        verdict = compare_runs(TrainedPolicy.load(out), trained, newest, config.seed)
+        acting = TrainedPolicy.load(run)
+        verdict = compare_runs(TrainedPolicy.load(out, split=True), acting, newest, config.seed)
         update = record.update.model_copy(update={"drift": found, "verdict": verdict})
         record = record.with_entries(update=update).written(out)
+    if options.refit:
+        refit_within(EpisodeStore.open(grown), out)
     return record
 
 
@@ -128,7 +136,8 @@ def _from_nothing(record: RunRecord) -> Config:
         return config_from_dict(record.update.settings_from_nothing)
     if record.refit_of is not None:
         # In place of the settings of the rule's choice, it has the rule.
-        given = {name: value for name, value in record.refit_of.items() if name != "rule"}
+        others = ("rule", "weights")
+        given = {name: value for name, value in record.refit_of.items() if name not in others}
         return replace(config_from_dict(given), rule=replace(config.rule, choose=True))
     return config
 

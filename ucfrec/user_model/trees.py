@@ -10,10 +10,13 @@ from torch import Tensor
 
 from ucfrec.arrays import Array
 
+TREES: Final = 100
+LEAVES: Final = 8
+"""Most trees, and leaves of a tree."""
 _SETTINGS: Final = {
     "learning_rate": 0.2,
-    "max_iter": 100,
-    "max_leaf_nodes": 8,
+    "max_iter": TREES,
+    "max_leaf_nodes": LEAVES,
     "early_stopping": True,
 }
 

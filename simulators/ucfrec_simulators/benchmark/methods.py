@@ -28,6 +28,11 @@ def _with(method: Method, settings: tuple[str, ...], vectors: bool) -> Method:
     return replace(method, settings=(*method.settings, *settings), vectors=vectors)
 
 
+PEERS: Final[Mapping[str, Method]] = {
+    "gsasrec": Method("gsasrec", conditioned=False),
+    "bpr": Method("bpr", conditioned=False),
+}
+"""Strong methods of practice that are trained by gradients; items only."""
 PAPER: Final[Mapping[str, Method]] = {
     "ucf-paper": Method("ucf-paper"),
     "ucf-paper-algorithm-5": Method(
@@ -47,9 +52,15 @@ METHODS: Final[Mapping[str, Method]] = {
         tags=True,
     ),
     "item-knn": Method("item-knn", ("rule.choose=false",), conditioned=False, vectors=False),
+    **{
+        name: Method(name, ("rule.choose=false",), conditioned=False, vectors=False)
+        for name in ("recent-clicks", "recent-rate", "boosted")
+    },
     "crm-greedy": Method("crm-greedy", ("rule.choose=false",), conditioned=False),
     **{name: _with(method, PLAIN, True) for name, method in BASELINES.items()},
     **{f"{name}+shared": _with(method, SHARED, False) for name, method in BASELINES.items()},
+    **{name: _with(method, PLAIN, False) for name, method in PEERS.items()},
+    **{f"{name}+shared": _with(method, SHARED, False) for name, method in PEERS.items()},
     **PAPER,
     "ucf-plain": Method("ucf", PLAIN, vectors=False),
     "ucf-wo-count": Method("ucf", ("augment.copies=0",)),

@@ -1,4 +1,4 @@
-"""Distributions in a store's `meta.json` equal those that pandas finds in its steps."""
+"""Moments of batches are those of all numbers; distributions equal those that pandas finds."""
 
 import itertools
 from pathlib import Path
@@ -13,7 +13,20 @@ from ucfrec.arrays import Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs import measures
 from ucfrec.logs.mapping import FeatureTable, LogMapping
+from ucfrec.logs.measures import Moments
 from ucfrec.logs.prepare import PrepareOptions, prepare
+
+
+def test_batches_give_the_moments_of_all() -> None:
+    generator = np.random.default_rng(0)
+    values = 1e9 + generator.normal(size=(2, 1000)) * [[1], [3]]
+    moments = Moments(2)
+    for part in np.split(values, [0, 1, 10, 700], axis=1):
+        moments.add(*part)
+    assert moments.count == 1000
+    np.testing.assert_allclose(moments.mean, values.mean(axis=1), rtol=1e-15)
+    np.testing.assert_allclose(moments.covariance, np.cov(values, ddof=0), rtol=1e-6)
+
 
 START = 1_700_000_000_000
 

@@ -1,0 +1,236 @@
+"""A gradient-boosted click model on rates and likeness: the usual ranker of clicks in practice."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Final
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+from torch.nn import functional as F
+
+from ucfrec import schema
+from ucfrec.arrays import Array, BoolArray, IntArray
+from ucfrec.episodes.item_counts import LIKED, TrainingCounts, liked_steps
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Windows
+from ucfrec.policies.base import PolicyConfig, SequencePolicy, require_items
+from ucfrec.policies.item_rate import PRIOR
+from ucfrec.settings import settings_table
+from ucfrec.user_model.trees import LEAVES, TREES, BoostedTrees
+
+_MAX_ROWS: Final = 300_000
+_AT_ONCE: Final = 4096
+_FOLDS: Final = 5
+_DECIMALS: Final = 3
+_SPLITS: Final = LEAVES - 1
+
+
+@settings_table("policy")
+class BoostedConfig(PolicyConfig):
+    """Settings of the boosted click model; `context` − 1 is the number of items of history."""
+
+    boosted: Annotated[int, Field(ge=1, le=10**6)] = 256
+    """Items that the trees score, those with the highest rates; others have the item's rate."""
+
+
+class BoostedPolicy(SequencePolicy):
+    """Scores items by the log-odds of a like, predicted by gradient-boosted trees.
+
+    The trees (scikit-learn's histogram boosting) see the item's rate of likes and its count in the
+    training rows, the session's rate, its length and whether its last item was liked, the likeness
+    of the item to those that were liked, to all and to the last one, and the rate of likes among
+    the session's items with the same first tag. In training, an item's rate is that of other folds
+    of the episodes, because its own row would tell the trees what they predict. States and returns
+    are not used.
+    """
+
+    Config = BoostedConfig
+    config: BoostedConfig
+    shown: Tensor
+    liked: Tensor
+    directions: Tensor
+    tag: Tensor
+    reward_low: Tensor
+    reward_high: Tensor
+    split_inputs: Tensor
+    split_thresholds: Tensor
+    leaves: Tensor
+    base: Tensor
+
+    def __init__(self, config: BoostedConfig, sizes: Mapping[str, int]) -> None:
+        require_items("boosted", sizes)
+        super().__init__(config, sizes)
+        n_items, splits = sizes["items"], (_SPLITS, TREES)
+        for name, value in (
+            ("shown", torch.zeros(n_items)),
+            ("liked", torch.zeros(n_items)),
+            ("directions", torch.zeros(n_items, sizes["action"])),
+            ("tag", torch.arange(n_items)),
+            ("reward_low", torch.zeros(())),
+            ("reward_high", torch.zeros(())),
+            ("split_inputs", torch.zeros(splits, dtype=torch.int64)),
+            ("split_thresholds", torch.zeros(splits)),
+            ("leaves", torch.zeros(TREES, 2**_SPLITS)),
+            ("base", torch.zeros(())),
+        ):
+            self.register_buffer(name, value)
+
+    def start_from(self, train: EpisodeStore) -> None:
+        """Set counts, directions and first tags of the items, and the range of the rewards."""
+        counts, states = TrainingCounts.of(train), train.item_states
+        self.shown.copy_(counts.shown)
+        self.liked.copy_(counts.liked)
+        self.directions.copy_(F.normalize(states.embeddings, dim=1))
+        if states.tags.shape[1]:
+            self.tag.copy_(states.tags[:, 0])
+        rewards = train.column(schema.REWARD)
+        self.reward_low.fill_(float(rewards.min()))
+        self.reward_high.fill_(float(rewards.max()))
+
+    def closed_form(
+        self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
+    ) -> Callable[[], None]:
+        """Fits the trees."""
+
+        def solve() -> None:
+            steps = np.arange(train.n_steps)
+            if len(steps) > _MAX_ROWS:
+                drawn = np.random.default_rng(seed).choice(len(steps), _MAX_ROWS, replace=False)
+                steps = np.sort(drawn)
+            trees = BoostedTrees.fit(*self._rows(train, steps), seed)
+            self.base.copy_(trees.base)
+            for tree in range(len(trees.values)):
+                inputs, thresholds, self.leaves[tree] = _table(trees, tree)
+                self.split_inputs[:, tree], self.split_thresholds[:, tree] = inputs, thresholds
+
+        return solve
+
+    def _rows(self, train: EpisodeStore, numbers: IntArray) -> tuple[Array, BoolArray]:
+        """Inputs (M, F) of the trees at training steps (M,), and which were liked."""
+        folds = np.arange(train.n_episodes) % _FOLDS
+        others = []
+        for fold in range(_FOLDS):
+            own = TrainingCounts.of(train.select(np.flatnonzero(folds == fold)))
+            others.append(torch.stack([self.shown.cpu() - own.shown, self.liked.cpu() - own.liked]))
+        counts = torch.stack(others, dim=1)  # (2, folds, n_items)
+        inputs, target = [], []
+        for begin in range(0, len(numbers), _AT_ONCE):
+            at = train.locate(numbers[begin : begin + _AT_ONCE])
+            windows = train.windows(*at, self.config.context)
+            items = windows.actions[:, -1:]
+            of_items = counts[:, torch.from_numpy(folds[at[0]]).unsqueeze(1), items]
+            device = self.shown.device
+            found = self._inputs(windows.to(device), items.to(device), of_items.to(device))
+            inputs.append(found[:, 0].cpu().numpy())
+            target.append(liked_steps(train, *at))
+        return np.concatenate(inputs), np.concatenate(target)
+
+    def _rate(self, liked: Tensor, shown: Tensor) -> Tensor:
+        """Log-odds of rates of likes, shrunk to the mean by `PRIOR` rows."""
+        mean = (self.liked.sum() + 0.5) / (self.shown.sum() + 1)
+        return torch.logit((liked + PRIOR * mean) / (shown + PRIOR))
+
+    def _inputs(self, windows: Windows, items: Tensor, counts: Tensor | None = None) -> Tensor:
+        """Inputs (B, C, F) of the trees for C items at the windows' last steps.
+
+        Args:
+            windows: B windows; their last action and reward are not read.
+            items: (C,), or (B, C) int64.
+            counts: (2, B, C) how often the items were shown and liked; None for all training rows.
+        """
+        before = windows.mask[:, :-1].float()  # (B, N)
+        earlier, rewards = windows.actions[:, :-1], windows.rewards[:, :-1]
+        liked = before * (rewards >= self.reward_low + LIKED * (self.reward_high - self.reward_low))
+        shown_of, liked_of = (self.shown[items], self.liked[items]) if counts is None else counts
+        count, likes = before.sum(1, keepdim=True), liked.sum(1, keepdim=True)
+        cosines = self.directions[items] @ self.directions[earlier].mT  # (B, C, N)
+        # Products of other batches differ in the last bits, which could change a tree's branch.
+        cosines = _rounded(cosines)
+        none = cosines.new_zeros(cosines.shape[:2])
+        alike = self.tag[items].unsqueeze(-1) == self.tag[earlier].unsqueeze(1)
+        tagged, liked_tagged = (
+            (alike.float() @ each.unsqueeze(-1)).squeeze(-1) for each in (before, liked)
+        )
+        whole = (likes + 1) / (count + 2)
+        columns = (
+            self._rate(liked_of, shown_of),
+            torch.log1p(shown_of),
+            self._rate(likes, count),
+            count,
+            liked[:, -1:] - 1 + before[:, -1:] if earlier.shape[1] else none[:, :1],
+            _rounded((cosines @ liked.unsqueeze(-1)).squeeze(-1) / likes.clamp(min=1)),
+            _rounded((cosines @ before.unsqueeze(-1)).squeeze(-1) / count.clamp(min=1)),
+            cosines[..., -1] * before[:, -1:] if earlier.shape[1] else none,
+            torch.logit((liked_tagged + 2 * whole) / (tagged + 2)),
+            tagged,
+        )
+        return torch.stack([each.expand_as(none) for each in columns], dim=-1)
+
+    def _scored(self, windows: Windows, items: Tensor) -> Tensor:
+        """Log-odds (B, C) of a like of items as of `_inputs`."""
+        inputs = self._inputs(windows, items)
+        scores = []
+        for rows in torch.split(inputs.flatten(0, 1), _AT_ONCE):
+            columns = rows.T.contiguous()
+            which = torch.zeros(TREES, len(rows), dtype=torch.int64, device=rows.device)
+            for split in range(_SPLITS):
+                left = columns[self.split_inputs[split]] <= self.split_thresholds[split, :, None]
+                which |= left.long() << split
+            scores.append(self.leaves.gather(1, which).sum(0))
+        return self.base + torch.cat(scores).view(inputs.shape[:2])
+
+    def features(self, windows: Windows) -> Tensor:
+        """(B, K, d) of zeros; the policy scores items in a way of its own."""
+        return windows.states.new_zeros(*windows.mask.shape, self.config.dim)
+
+    @torch.no_grad()
+    def act(self, windows: Windows) -> Tensor:
+        """Log-odds of a like of all items at the last step, (B, n_items)."""
+        rates = self._rate(self.liked, self.shown)
+        best = rates.topk(min(self.config.boosted, len(rates))).indices
+        boosted = self._scored(windows, best)
+        # Others have their rate and what the session adds to those that the trees score.
+        added = (boosted - rates[best]).mean(1, keepdim=True)
+        return (rates + added).index_copy(1, best, boosted)
+
+    def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
+        """See `action_loss`."""
+        value = self.action_loss(windows)
+        return value, {"like_loss": value.detach()}
+
+    def action_loss(self, windows: Windows) -> Tensor:
+        """Mean log loss (nats) of likes at the windows' last steps."""
+        least = self.reward_low + LIKED * (self.reward_high - self.reward_low)
+        liked = (windows.rewards[:, -1] >= least).float()
+        scores = self._scored(windows, windows.actions[:, -1:])[:, 0]
+        return F.binary_cross_entropy_with_logits(scores, liked)
+
+
+def _rounded(values: Tensor) -> Tensor:
+    return torch.round(values, decimals=_DECIMALS)
+
+
+def _table(trees: BoostedTrees, tree: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Inputs and thresholds of a tree's splits, (S,) each, and its value for each of their 2^S
+    outcomes, numbered with bit s set where split s sends a row to the left."""
+    left, right = trees.left[tree].tolist(), trees.right[tree].tolist()
+    # Node 0 is the root; others are reached from it.
+    waiting, splits = [0], list[int]()
+    while waiting:
+        node = waiting.pop()
+        if left[node] != node:
+            splits.append(node)
+            waiting += [left[node], right[node]]
+    number = {node: place for place, node in enumerate(splits)}
+    outcomes = torch.zeros(2**_SPLITS)
+    for outcome in range(2**_SPLITS):
+        node = 0
+        while node in number:
+            node = left[node] if outcome >> number[node] & 1 else right[node]
+        outcomes[outcome] = trees.values[tree, node]
+    inputs, thresholds = torch.zeros(_SPLITS, dtype=torch.int64), torch.zeros(_SPLITS)
+    inputs[: len(splits)] = trees.inputs[tree, splits]
+    thresholds[: len(splits)] = trees.thresholds[tree, splits]
+    return inputs, thresholds, outcomes

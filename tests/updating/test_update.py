@@ -90,38 +90,6 @@ def test_the_same_command_goes_on_and_another_is_refused(
     assert "run folder" in capsys.readouterr().err
 
 
-def test_an_interrupted_update_ends_as_if_left_alone(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Interrupted after the store, in the middle of the training, and before the verdict."""
-    mapping, logs = later_mapping(folder), [folder / "later.parquet"]
-
-    def interrupted(name: str) -> None:
-        def stop(*_: object, **__: object) -> None:
-            raise KeyboardInterrupt
-
-        with monkeypatch.context() as patch:
-            patch.setattr(name, stop)
-            with pytest.raises(KeyboardInterrupt):
-                update_run(folder / "run", logs, tmp_path / "run2", mapping=mapping)
-
-    interrupted("ucfrec.updating.update.train_run")
-    interrupted("ucfrec.fitting.loop._descend")
-    interrupted("ucfrec.runs.run._choose_rule")
-    interrupted("ucfrec.updating.update.compare_runs")
-    record = update_run(folder / "run", logs, tmp_path / "run2", mapping=mapping)
-    alone = RunRecord.read(folder / "run2")
-    assert record.update == alone.update
-    assert record.rule == alone.rule
-    for name in ("best", "last"):
-        expected, found = (
-            load_tensors(each / "run2" / "policy" / f"{name}.safetensors")[0]
-            for each in (folder, tmp_path)
-        )
-        assert expected.keys() == found.keys()
-        assert all(torch.equal(expected[key], found[key]) for key in expected)
-
-
 def test_the_command_says_what_was_read_and_what_is_better(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -174,6 +142,8 @@ def test_an_update_killed_at_any_moment_ends_as_if_left_alone(folder: Path) -> N
     alone, killed = (RunRecord.read(folder / name) for name in ("run2", "killed"))
     assert killed.update == alone.update
     assert killed.rule == alone.rule
-    name = "policy/best.safetensors"
-    assert killed.files[name] == alone.files[name]
+    for name in ("policy/best.safetensors", "refit/policy/best.safetensors"):
+        expected, found = (load_tensors(folder / run / name)[0] for run in ("run2", "killed"))
+        assert expected.keys() == found.keys()
+        assert all(torch.equal(expected[key], found[key]) for key in expected)
     assert main(["verify", str(folder / "killed"), str(folder / "killed-store")]) == 0

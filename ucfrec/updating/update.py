@@ -56,8 +56,8 @@ def update_run(
     The settings are those of the run. Its policy and augmentation models start from its weights,
     with fewer steps; the user model is fitted and the decision rule chosen anew. The validation
     split is the second newest part of the new rows, the test split, on which the runs are compared,
-    the newest. Once they are compared, the new run goes on learning from these rows, too. Neither the
-    run nor its store is changed.
+    the newest. Once they are compared, the new run goes on learning from these rows, too. Neither
+    the run nor its store is changed.
 
     Args:
         run: a finished run on a store of logs of items, which must be there.

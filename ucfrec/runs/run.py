@@ -35,6 +35,7 @@ from ucfrec.runs.samples import SAMPLES, sample_recommendations
 from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec.runs.start import begin, new_policy, require_startable, training_views
 from ucfrec.runs.trained_policy import AUGMENTATION, INPUTS, REWARD_MODEL, RULE, TrainedPolicy
+from ucfrec.runs.warm_start import start_warm
 from ucfrec.user_model.model import UserModel
 
 _OVERLAY = "overlay.safetensors"
@@ -73,6 +74,7 @@ def train_run(
     refit_of: Path | None = None,
     shared: SharedStages = OWN,
     callbacks: Callbacks = SILENT,
+    initial: Path | None = None,
 ) -> RunRecord:
     """Train a policy on the training episodes of `store`, or resume the run in `out`.
 
@@ -96,6 +98,7 @@ def train_run(
             their settings of these stages and their seeds agree; by default a run makes its own.
             The time of a stage is in the record of the run that made it.
         callbacks: what is told of the training of the policy.
+        initial: a run on an older state of the store, whose weights the training begins with.
 
     Returns:
         The record of the run: provenance, configuration and the report of every stage.
@@ -111,6 +114,8 @@ def train_run(
             remove_leftovers_within(out)
         begun = time.perf_counter()
         run = _prepare_inputs(store, out, config, about or {}, refit_of, shared)
+        if initial is not None:
+            start_warm(run.policy, out, initial)
         with phase("Counterfactual augmentation", 1, PHASES):
             overlay, augmentation = _augment(run, refit_of)
         with phase("Training the policy", 2, PHASES):

@@ -9,7 +9,7 @@ from ucfrec.arrays import Array, Float64Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.new_rows import as_known
-from ucfrec.user_model.reward_report import calibrate, calibration, scores_of
+from ucfrec.user_model.reward_report import calibration, fit_line, scores_of
 from ucfrec.user_model.reward_rows import RewardRows
 
 _GROUPS: Final = 10
@@ -111,13 +111,14 @@ def _calibration(old: TrainedPolicy, known: EpisodeStore, seed: int) -> dict[str
         *(rows.items[keep], rows.users[keep], rows.shown.at(keep), rows.states[keep]),
         *(rows.rewards[keep], rows.observations),
     )
-    predicted = model.expected(scores_of(model, rows)[0]).double().numpy()
-    observed = rows.rewards.double().numpy()
+    scores = scores_of(model, rows)[0]
+    predicted, observed = model.expected(scores).double().numpy(), rows.rewards.double().numpy()
+    slope, _ = fit_line(scores, model.target(rows.rewards), bool(model.binary))
     return {
         "predicted": float(predicted.mean()),
         "observed": float(observed.mean()),
         "calibration_error": calibration(predicted, observed).error,
-        "slope": calibrate(model, rows)[0],
+        "slope": slope,
     }
 
 

@@ -28,6 +28,7 @@ ORDER = (
     {"runs"},
     {"evaluation", "recommending"},
     {"off_policy"},
+    {"updating"},
     {"reporting"},
     {"benchmark", "tuning"},
     {"given_data"},

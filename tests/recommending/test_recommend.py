@@ -415,7 +415,7 @@ def test_wrong_numbers_are_refused(fitted: tuple[Recommender, Path], log: pd.Dat
         with pytest.raises(InputError, match=r"k is .*; give a whole number, 1 or more"):
             policy.recommend(log, k=k)  # type: ignore[arg-type]
     assert policy.recommend(log, k=np.int64(2)).groupby("user_id").size().max() == 2
-    with pytest.raises(InputError, match="target nan; give a finite number"):
+    with pytest.raises(InputError, match="target is nan; it must be a number"):
         policy.recommend(log, rule=DecisionRule(float("nan")))
 
 

@@ -17,7 +17,8 @@ DAY_MS: Final = 86_400_000
 REASONS: Final = {
     "left_out": "does not fulfil --where",
     "null_key": "user, item or action, time or session is missing",
-    "clock_out_of_range": "time before 2000 (or --earliest) or more than a day ahead of now",
+    "clock_out_of_range": "time before 2000 (or --earliest, or the end of an updated store) or "
+    "more than a day ahead of now",
     "vector_not_finite": "action is missing or holds NaN or infinity",
     "unknown_item": "item is not in the store",
     "duplicate": "repeats user, item or action, and time of another row, which is kept",

@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping
 from typing import Annotated
 
-import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor
@@ -73,5 +72,5 @@ class GSASRecPolicy(SASRecPolicy):
         if n_items <= self.config.negatives:
             return torch.arange(n_items, device=device)
         drawn = torch.randint(n_items, (self.config.negatives,), device=device)
-        # NumPy's, because mypy takes torch.unique for typed or not, as its cache has it.
-        return torch.from_numpy(np.unique(drawn.cpu().numpy())).to(device)
+        found: Tensor = torch.unique(drawn)
+        return found

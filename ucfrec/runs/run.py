@@ -12,6 +12,7 @@ import torch
 
 from ucfrec.acting.scorer import Scorer
 from ucfrec.choosing.choose import choose_rule
+from ucfrec.choosing.problem import Problem
 from ucfrec.counterfactual.augmentation import MODELS, counterfactual_augmentation
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
@@ -34,6 +35,7 @@ from ucfrec.runs.samples import SAMPLES, sample_recommendations
 from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec.runs.start import begin, new_policy, require_startable, training_views
 from ucfrec.runs.trained_policy import AUGMENTATION, INPUTS, REWARD_MODEL, RULE, TrainedPolicy
+from ucfrec.runs.warm_start import start_warm
 from ucfrec.user_model.model import UserModel
 
 _OVERLAY = "overlay.safetensors"
@@ -72,6 +74,7 @@ def train_run(
     refit_of: Path | None = None,
     shared: SharedStages = OWN,
     callbacks: Callbacks = SILENT,
+    initial: Path | None = None,
 ) -> RunRecord:
     """Train a policy on the training episodes of `store`, or resume the run in `out`.
 
@@ -95,6 +98,7 @@ def train_run(
             their settings of these stages and their seeds agree; by default a run makes its own.
             The time of a stage is in the record of the run that made it.
         callbacks: what is told of the training of the policy.
+        initial: a run on an older state of the store, whose weights the training begins with.
 
     Returns:
         The record of the run: provenance, configuration and the report of every stage.
@@ -110,6 +114,8 @@ def train_run(
             remove_leftovers_within(out)
         begun = time.perf_counter()
         run = _prepare_inputs(store, out, config, about or {}, refit_of, shared)
+        if initial is not None:
+            start_warm(run.policy, out, initial)
         with phase("Counterfactual augmentation", 1, PHASES):
             overlay, augmentation = _augment(run, refit_of)
         with phase("Training the policy", 2, PHASES):
@@ -235,7 +241,7 @@ def _choose_rule(run: _Inputs, users: UserModel) -> RuleRecord:
     config = run.config.rule
     targets = {quantile: trained.target_return(quantile) for quantile in config.quantiles}
     views = of_people(run.logged), of_people(run.held_out)
-    choice = choose_rule(scorer, users, targets, *views, config, run.config.seed)
+    choice = choose_rule(Problem(scorer, users, targets, *views, config, run.config.seed))
     write_json(run.out / RULE, choice.rule.as_dict())
     return RuleRecord.model_validate(choice.as_dict())
 

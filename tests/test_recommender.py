@@ -345,3 +345,16 @@ def test_evaluated_in_a_simulator(tmp_path: Path) -> None:
     found = policy.evaluate("synthetic-catalog", 8, behaviors=["random"])
     assert [row.method for row in found] == ["item-rate", "random"]
     assert found.to_frame()["R_cum"].notna().all()
+
+
+def test_new_logs_bring_it_up_to_date(log: pd.DataFrame, tmp_path: Path) -> None:
+    policy = Recommender("dt", settings=[*SMALL, "rule.sessions=3"]).fit(log[:1000])
+    new = policy.update(log[1000:], tmp_path / "new")
+    update = new.trained.record.update
+    assert update is not None
+    assert update.appended["steps"] == 500
+    assert update.verdict is not None
+    assert new.run == tmp_path / "new"
+    assert new.recommend(log, k=2).groupby("user_id").size().max() == 2
+    with pytest.raises(InputError, match="gone|no row"):
+        Recommender.load(tmp_path / "new").update(log[:10], tmp_path / "third")

@@ -100,21 +100,34 @@ def logs_given(
             raise InputError("mapping is of logs, and none are given; leave it out")
         yield held_out_sessions([trained])
         return
-    given = mapping or LogMapping()
     with ExitStack() as stack:
-        scratch = None
-        if isinstance(logs, LogFiles):
-            files, given = logs.files, given.over(logs.mapping)
-        elif _are_paths(logs):
-            files, given = later_logs(trained, _paths(logs), given)
-        else:
-            scratch = stack.enter_context(scratch_folder(Path(gettempdir()), "frame"))
-            files = (_written(logs, scratch),)
-        with in_words_of_python(scratch and files[0]):
+        files, given, frame = stack.enter_context(files_given(trained, logs, mapping))
+        with in_words_of_python(frame):
             read = logged_sessions(trained.folder, trained, files, given, keep_unknown)
             logged = stack.enter_context(read)
         note_dropped("", logged.report["dropped"], logged.report["rows_read"])
         yield logged
+
+
+@contextmanager
+def files_given(
+    trained: TrainedPolicy, logs: Logs, mapping: LogMapping | None
+) -> Iterator[tuple[tuple[Path, ...], LogMapping, Path | None]]:
+    """Later logs of a policy as files: the files, the mapping, and the file of a frame, which lasts
+    as long as the block; None for files.
+
+    Raises:
+        InputError: a path is missing, or the frame cannot be used.
+    """
+    given = mapping or LogMapping()
+    if isinstance(logs, LogFiles):
+        yield logs.files, given.over(logs.mapping), None
+    elif _are_paths(logs):
+        yield *later_logs(trained, _paths(logs), given), None
+    else:
+        with scratch_folder(Path(gettempdir()), "frame") as scratch:
+            file = _written(logs, scratch)
+            yield (file,), given, file
 
 
 def histories_given(

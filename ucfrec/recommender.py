@@ -26,7 +26,15 @@ from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.locks import scratch_folder
 from ucfrec.fitting.loop import Callbacks, Watcher
 from ucfrec.fitting.metrics_log import read_metrics
-from ucfrec.given_data import Logs, histories_given, in_words_of_python, logs_given, store_given
+from ucfrec.given_data import (
+    Logs,
+    files_given,
+    histories_given,
+    in_words_of_python,
+    logs_given,
+    store_given,
+)
+from ucfrec.logs.append import AppendOptions
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.mapping import LogFiles, LogMapping
 from ucfrec.off_policy.evaluate import (
@@ -49,6 +57,7 @@ from ucfrec.runs.config import TABLES, resolve_config, settings_given
 from ucfrec.runs.refit import refit_within
 from ucfrec.runs.screened import train_screened
 from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.updating.update import UpdateOptions, update_run
 
 _OWN = ("policy", "settings", "seed")
 _FRAME = "a frame"
@@ -429,6 +438,42 @@ class Recommender:
         """
         with logs_given(self.trained, logs, mapping, keep_unknown=False) as logged:
             return pd.concat(score(self.trained, logged, rule), ignore_index=True)
+
+    def update(
+        self,
+        logs: Logs,
+        out: Path | str,
+        *,
+        window_days: float | None = None,
+        refit: bool = True,
+        mapping: LogMapping | None = None,
+    ) -> Self:
+        """Bring the policy up to date with new logs: `ucfrec update`.
+
+        Args:
+            logs: new logs, as for `fit`; rows that are not newer than the store are left out.
+            out: folder of the new run; the store with the new rows is beside it, with `-store`
+                added to its name.
+            window_days: leave out sessions that ended longer ago, before the end of the new logs;
+                None to keep all.
+            refit: go on learning from all rows once both policies are compared.
+            mapping: of the logs' columns; what it leaves open is as in the training log.
+
+        Returns:
+            The new recommender; this one is not changed. `trained.record.update` has the drift and
+            the verdict on both.
+
+        Raises:
+            InputError: the recommender is not trained, its store is gone, or the logs cannot be
+                used.
+        """
+        window = None if window_days is None else round(window_days * 86_400_000)
+        options = UpdateOptions(AppendOptions(window), refit=refit)
+        given = files_given(self.trained, logs, mapping)
+        with given as (files, columns, frame), in_words_of_python(frame):
+            update_run(self.run, files, Path(out), mapping=columns, options=options)
+        write_card(Path(out))
+        return self.load(out)
 
     def export(
         self, folder: Path | str, k: int = 100, *, rule: DecisionRule | None = None

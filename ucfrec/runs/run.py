@@ -94,9 +94,6 @@ def train_run(
             their settings of these stages and their seeds agree; by default a run makes its own.
             The time of a stage is in the record of the run that made it.
 
-    Returns:
-        The record of the run: provenance, configuration and the report of every stage.
-
     Raises:
         InputError: `out` is a run on another store or with another configuration, the store has
             too few training episodes or constant rewards, or the policy does not support its

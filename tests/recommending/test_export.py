@@ -116,16 +116,13 @@ RULES = {
     "everything": replace(FULL, tag_run=2),
 }
 TAGGED = ("run", "full", "everything")
-THRESHOLD = pytest.mark.xfail(
-    reason="likeness without tags may round to the other side of a tree's threshold"
-)
 CASES = [
     *(("tags", False, rule) for rule in RULES),
     # Tastes move what the reward model says; without its weight they would move nothing.
     *(("tags", True, rule) for rule in ("weighted", "ahead", "everything")),
     *((run, False, "target") for run in ("no tags", "observations")),
     *((run, True, "weighted") for run in ("no tags", "observations")),
-    *(pytest.param(run, False, "ahead", marks=THRESHOLD) for run in ("no tags", "observations")),
+    *((run, False, "ahead") for run in ("no tags", "observations")),
 ]
 """Run, whether sessions show tastes, rule."""
 

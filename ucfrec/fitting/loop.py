@@ -153,6 +153,7 @@ def fit(
         rows: number of rows of a batch that the loss is a mean of. With it, the processes of
             `torchrun` train together: each draws its part of every batch, and `validate` has to
             return the same everywhere.
+        callbacks: what is told of the steps.
 
     Raises:
         InputError: a loss or gradient is not finite, or a checkpoint is damaged or does not fit.

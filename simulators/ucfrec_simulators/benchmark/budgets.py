@@ -40,6 +40,7 @@ BUDGETS: Final[Mapping[str, Budget]] = {
             "crm.epochs=8",
             "crm.learning_rate=4e-3",
             "rule.sessions=50",
+            "rule.evidence=0",
         ),
         of_policies={"dt4rec": ("policy.negatives=1",), "edt4rec": ("policy.cql_steps=400",)},
         evaluation=Evaluation(episodes=300, seed=1_000_000),
@@ -51,7 +52,7 @@ BUDGETS: Final[Mapping[str, Budget]] = {
         tasks=(*MAIN, "sardine-static"),
         tasks_of={"shared": SHARED_TASKS, "sweeps": SWEPT, "distractor": tuple(DISTRACTED)},
         sessions=50_000,
-        settings=("train.steps=20000", "train.learning_rate=3e-4"),
+        settings=("train.steps=20000", "train.learning_rate=3e-4", "rule.evidence=0"),
         evaluation=Evaluation(episodes=5000, seed=1_000_000),
     ),
 }

@@ -80,7 +80,6 @@ def ranking_rows(
         policies: at least one; the first is the reference of the differences.
         trained: any of their runs, for the counts of the training rows and the reward model.
         train: the store of those rows; None excludes item-kNN and ALS.
-        later: the steps to rank.
         users: (E,) identifier of the user of each of its episodes.
         k: items that are recommended at a step.
         seed: of the resampled users and of `random`.

@@ -268,10 +268,8 @@ def prepared_log(
     """The log, sorted and counted, with the tables of its ids.
 
     Args:
-        files: of the log.
         mapping: as of `prepare`.
         options: as of `prepare`.
-        spill: folder for scratch.
         like: as of `prepare`.
         keep_unknown: as of `prepare`.
         onto: a store whose users and items keep their numbers; others follow.

@@ -86,9 +86,7 @@ def train_run(
     the rest, and the others return once the policy is trained.
 
     Args:
-        store: prepared episodes.
         out: run folder, new or interrupted.
-        config: configuration of all stages.
         about: entries of `RunRecord` that the caller adds.
         more_augmentation: augmented training episodes that are used in addition to the
             counterfactual ones.

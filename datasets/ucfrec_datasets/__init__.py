@@ -17,7 +17,6 @@ def load(name: str, folder: Path | str, part: str | None = None) -> "LogFiles":
 
     Args:
         name: "kuairand-pure", "kuairec", "open-bandit" or "movielens-100k".
-        folder: of the archive and its files.
         part: of "open-bandit", the logging policy and campaign, such as "bts/men"; None for
             "random/all".
 

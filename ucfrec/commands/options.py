@@ -240,11 +240,7 @@ def item_options(parser: argparse.ArgumentParser) -> None:
 
 
 def draw_options(parser: argparse.ArgumentParser, place: str) -> None:
-    """Add --seed and --exposures, of a rule that draws items.
-
-    Args:
-        place: FILE or DIR.
-    """
+    """Add --seed and --exposures, of a rule that draws items."""
     parser.add_argument(
         "--seed",
         type=int,
@@ -373,7 +369,6 @@ def logs_given(
     """Log files and column mapping that `log_options` name.
 
     Args:
-        options: with the logs.
         trained: policy that the logs are for, which remembers the dataset of its training logs.
 
     Raises:

@@ -31,6 +31,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="trainings that the search has at the end (default: 30)",
     )
+    _search_options(parser)
+    parser.add_argument(
+        "--seed", type=int, default=0, help="seed of the search and of every training (default: 0)"
+    )
+    parser.epilog = "Needs ucfrec[tune] (Optuna). The test split stays unseen."
+
+
+def _search_options(parser: argparse.ArgumentParser) -> None:
+    """Add what is searched, for what, and how."""
     parser.add_argument(
         "--metric",
         choices=("value", "ndcg", "gauc"),
@@ -69,10 +78,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="train every trial to its end (default: end those whose validation loss is above the "
         "median of earlier ones)",
     )
-    parser.add_argument(
-        "--seed", type=int, default=0, help="seed of the search and of every training (default: 0)"
-    )
-    parser.epilog = "Needs ucfrec[tune] (Optuna). The test split stays unseen."
 
 
 def run(options: argparse.Namespace) -> None:

@@ -61,7 +61,6 @@ class EpisodeStore(EpisodeView):
         """Write a store from arrays in memory, atomically.
 
         Args:
-            path: folder of the store.
             steps: step columns of `ucfrec.schema`, each (N,) or (N, size).
             lengths: (E,) number of steps of each episode, at least 1, with sum N.
             episodes: episode columns of `ucfrec.schema`, each (E,); without `split`, all episodes
@@ -69,9 +68,6 @@ class EpisodeStore(EpisodeView):
             reward: the expression that computed the rewards, for the record.
             source: what the store was made from, for the record.
             shard_steps: a shard ends with the first episode that brings it to this many steps.
-
-        Returns:
-            The store, opened.
 
         Raises:
             InputError: `path` exists already, an episode has no steps, columns differ in length, or

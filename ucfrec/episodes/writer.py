@@ -34,9 +34,7 @@ class StoreWriter:
     def __init__(self, folder: Path, shard_steps: int = 2**24, first_shard: int = 0) -> None:
         """
         Args:
-            folder: to write to.
             shard_steps: a shard ends with the first episode that brings it to this many steps.
-            first_shard: number of the first shard.
         """
         self._folder = folder
         self._shard_steps = shard_steps
@@ -155,9 +153,6 @@ class StoreWriter:
             ids: original identifiers (of items, of users) in the order in which the columns number
                 them, by name; they enter the fingerprint.
 
-        Returns:
-            The record of the store.
-
         Raises:
             InputError: no step was appended.
         """
@@ -211,7 +206,6 @@ def require_steps(path: Path | str, lengths: Array) -> IntArray:
     """Check that every episode has at least one step.
 
     Args:
-        path: of the store, for the message.
         lengths: (E,) number of steps of each episode.
 
     Returns:

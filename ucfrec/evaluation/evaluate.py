@@ -37,9 +37,6 @@ def evaluate_behavior(
     """Result row of an environment's built-in policy (`random`, `optimal`, …).
 
     Args:
-        environment: the simulated environment.
-        behavior: name of the policy.
-        episodes: number of episodes.
         seed: seed of the environments and of the policy.
 
     Raises:
@@ -67,10 +64,7 @@ def evaluate_policy(
     """Result row of a trained policy.
 
     Args:
-        environment: the simulated environment.
-        trained: the policy.
         name: name of the policy in the row.
-        episodes: number of episodes.
         seed: environment i is seeded with `seed` + i; also of the draws of the rule.
         rule: the decision rule; None for the run's own.
 

@@ -63,9 +63,6 @@ def ndcg(
     mean over users.
 
     Args:
-        recommended: the recommendations.
-        relevant: what users liked.
-        k: places of a list.
         achievable: the ideal is `k` relevant items (RecTools' default), or with true as many as the
             user has (RecTools' `divide_by_achievable`, and scikit-learn's `ndcg_score`).
     """
@@ -101,9 +98,7 @@ def novelty(recommended: pd.DataFrame, history: pd.DataFrame, k: int = 10) -> fl
     users who have the item, mean over a user's items and then over users.
 
     Args:
-        recommended: the recommendations.
         history: pairs `user_id`, `item_id` of the past; an item that it lacks counts as one user's.
-        k: places of a list.
     """
     top = _top(recommended, k)
     _require(history, "history", *_PAIR)
@@ -118,9 +113,7 @@ def diversity(recommended: pd.DataFrame, features: pd.DataFrame, k: int = 10) ->
     over pairs and then over users; a user with one item counts 0.
 
     Args:
-        recommended: the recommendations.
         features: one row per item, `item_id` as the index.
-        k: places of a list.
 
     Raises:
         InputError: an item has no features.
@@ -156,11 +149,7 @@ def serendipity(
     item's popularity in the history; 0 for items that it lacks.
 
     Args:
-        recommended: the recommendations.
-        relevant: what users liked.
         history: pairs `user_id`, `item_id` of the past, rows counted.
-        catalogue: all item ids.
-        k: places of a list.
     """
     top, n = _top(recommended, k), len(catalogue)
     _require(relevant, "relevant", *_PAIR)

@@ -60,8 +60,6 @@ def ratio_intervals(
     Args:
         above: (N, C) numerators.
         below: (N, C) denominators, at least 0.
-        seed: of the resamples.
-        level: coverage of the interval.
     """
     ratios = resampled_ratios(above, below, seed)
     return np.asarray(np.nanquantile(ratios, [(1 - level) / 2, (1 + level) / 2], axis=0).T)

@@ -71,10 +71,6 @@ def explain(
     """The recommendations of `ucfrec recommend` for one user, with their reasons.
 
     Args:
-        trained: a policy of items.
-        rule: the decision rule.
-        user: the history of one user.
-        k: number of items.
         filter_seen: whether items that the user has seen are excluded.
 
     Raises:

@@ -23,7 +23,6 @@ def application(explorer: Explorer, allowed_hosts: Sequence[str]) -> FastAPI:
     """The application, which keeps no state of its visitors.
 
     Args:
-        explorer: the runs.
         allowed_hosts: values of the header `Host` that are answered.
     """
     app = FastAPI(title="ucfrec explorer", docs_url=None, redoc_url=None, openapi_url=None)

@@ -33,7 +33,6 @@ def fit_once(
         solve: sets the weights of `module`.
         validate: the validation loss; called in evaluation mode without gradients. None for none.
         describe: name of the fit in error messages.
-        callbacks: what is told of the validation.
 
     Raises:
         InputError: the validation loss is not finite, or a file is damaged or does not fit.

@@ -153,7 +153,6 @@ def fit(
         rows: number of rows of a batch that the loss is a mean of. With it, the processes of
             `torchrun` train together: each draws its part of every batch, and `validate` has to
             return the same everywhere.
-        callbacks: what is told of the steps.
 
     Raises:
         InputError: a loss or gradient is not finite, or a checkpoint is damaged or does not fit.
@@ -396,9 +395,6 @@ def clip_gradients(parameters: Iterable[nn.Parameter], largest: float) -> Tensor
     """Scale the gradients so that their joint norm is at most `largest`, 0 for no limit.
 
     Sparse gradients are coalesced.
-
-    Returns:
-        The norm before.
     """
     gradients = []
     for parameter in parameters:

@@ -37,7 +37,6 @@ def faults(log: TypedLog, known_items: Path | None = None) -> dict[str, str]:
     """Reason to the SQL condition on a row of `read`; the first that holds counts.
 
     Args:
-        log: any.
         known_items: `items.parquet` of a store: other items are a fault; None for none.
     """
     keys = [schema.USER_ID, log.key, schema.TIMESTAMP]
@@ -60,12 +59,6 @@ def faults(log: TypedLog, known_items: Path | None = None) -> dict[str, str]:
 def require_rewards_in_range(log: TypedLog, large: int, rows: int, largest: float) -> None:
     """Check the count of rewards beyond `LARGEST_REWARD`.
 
-    Args:
-        log: for the message.
-        large: how many rewards are beyond it.
-        rows: how many rewards there are.
-        largest: the largest absolute reward.
-
     Raises:
         InputError: there are any.
     """
@@ -84,8 +77,6 @@ def note_dropped(
 
     Args:
         name: of the data, for the message; empty for none.
-        dropped: number of rows by reason.
-        read: number of rows read.
         fine: reasons that need no warning of their own.
     """
     counts = {reason: n for reason, n in dropped.items() if n}
@@ -104,11 +95,6 @@ def note_dropped(
 
 def require_rows(log: TypedLog, kept: int, dropped: Mapping[str, int]) -> None:
     """Check that a row is left.
-
-    Args:
-        log: for the message.
-        kept: number of rows that are.
-        dropped: number of dropped rows by reason.
 
     Raises:
         InputError: none is.

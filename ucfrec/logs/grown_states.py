@@ -33,8 +33,6 @@ def write_grown_states(store: Path, folder: Path, found: PreparedLog, steps: Tri
     old.
 
     Args:
-        store: the old store.
-        folder: the new one.
         found: the new log, with the tables `users` and `items` of all ids.
         steps: users, items and rewards of the new training steps.
     """
@@ -108,7 +106,6 @@ def _tags(old: IntArray, given: IntArray, n_items: int) -> IntArray:
     Args:
         old: (n_old, T).
         given: (n_items, T') of the new tables, numbered otherwise; T' is 0 without tables.
-        n_items: of the grown store.
     """
     tags = np.full((n_items, old.shape[1]), -1, dtype=np.int64)
     tags[: len(old)] = old

@@ -268,10 +268,8 @@ def prepared_log(
     """The log, sorted and counted, with the tables of its ids.
 
     Args:
-        files: of the log.
         mapping: as of `prepare`.
         options: as of `prepare`.
-        spill: folder for scratch.
         like: as of `prepare`.
         keep_unknown: as of `prepare`.
         onto: a store whose users and items keep their numbers; others follow.
@@ -287,22 +285,13 @@ def prepared_log(
         with progress(4, "check the logs", "stages") as stage:
             tables = tuple(open_tables(connection, files, mapping.partitions))
             mapping, reward = settled(connection, tables, mapping, reward)
+            typed = connection, tables, mapping, reward, session_by
             if options.engine == "spark":
-                # Spark is an extra.
-                from ucfrec.logs.spark import sorted_with_spark
+                from ucfrec.logs.spark import sorted_with_spark  # an extra
 
-                log, batches = sorted_with_spark(
-                    connection,
-                    tables,
-                    mapping,
-                    reward,
-                    session_by,
-                    known,
-                    scratch,
-                    options.spark_master,
-                )
+                log, batches = sorted_with_spark(*typed, known, scratch, options.spark_master)
             else:
-                log = typed_log(connection, tables, mapping, reward, session_by, spill)
+                log = typed_log(*typed, spill)
                 with explained(connection, log.tables, spill):
                     batches = sorted_batches(log, known, scratch)
             with explained(connection, log.tables, spill):

@@ -20,9 +20,6 @@ def load_release(
     """The logs of a release with their columns mapped, downloaded where they are not there yet.
 
     Args:
-        adapter: name of the dataset adapter.
-        dataset: the adapter.
-        name: of the release.
         folder: of the archive, and of what it holds in a folder of the release's name.
         part: key of `Release.parts`; None for the first.
 

@@ -56,12 +56,8 @@ def write_steps(
     """Write all episodes to the store at `folder`.
 
     Args:
-        first_shard: number of the first shard.
         fill: the step columns of the store, with what steps without a value have; others are left
             out. Empty for those of the log.
-
-    Returns:
-        The writer, not finished.
     """
     writer = StoreWriter(folder, first_shard=first_shard)
     names = [name for name in schema.STEP_DTYPES if name in spool.names]

@@ -86,11 +86,9 @@ def always_valid(
     Sinha, Kennedy & Ramdas, Annals of Statistics 2024).
 
     Args:
-        difference: the estimate so far.
         variance: of the estimate so far, above 0.
         expected: standard deviation τ of the mixture, fixed beforehand: near the differences that
             matter, the interval is shortest.
-        level: of the sequence.
     """
     mixed = variance + expected**2
     inside = math.log(mixed / variance) - 2 * math.log(1 - level)
@@ -109,12 +107,10 @@ def compare_arms(
 
     Args:
         paths: logs, with the column `arm`.
-        column: feedback that counts.
         arms: names of the first arm and the other; None for the two that there are, the one with
             more users first.
         expected: difference that the always-valid interval is tuned for, fixed beforehand; None for
             5% of the first arm's value.
-        memory_limit: of the engine.
 
     Raises:
         InputError: a column is missing or no number, or there are not two arms with two users each.

@@ -58,9 +58,6 @@ def exposures_written(
     """Yield the same frames, which are also written to a file, whole once the block ends.
 
     Args:
-        path: Parquet file.
-        trained: whose recommendations they are.
-        rule: hash of the decision rule.
         frames: of `recommend`.
     """
     columns, now = exposure_schema(trained), int(time.time() * 1000)
@@ -98,8 +95,6 @@ class ExposureLog:
     ) -> None:
         """
         Args:
-            folder: made if it is missing.
-            trained: whose answers they are.
             rows: from so many on a file is written.
             seconds: after so long, a file is written if there are any rows.
             clock: seconds since 1970, when an answer is given.

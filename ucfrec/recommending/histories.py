@@ -176,9 +176,6 @@ def histories_of_files(
         mapping: names of the columns; what it leaves open is as in the training log.
         memory_limit: of the process, such as "2GB"; rows spill to disk.
 
-    Returns:
-        The batches.
-
     Raises:
         InputError: a file or a column is missing, or has values that cannot be used.
     """
@@ -205,9 +202,6 @@ def histories_of_frame(
         trained: policy whose reward expression, session rule and observations apply.
         frame: one row per interaction.
         mapping: names of the columns; what it leaves open is as in the training log.
-
-    Returns:
-        The batches.
 
     Raises:
         InputError: a column is missing, or has values that cannot be used.

@@ -94,8 +94,6 @@ class Responder:
     ) -> None:
         """
         Args:
-            trained: a policy of items.
-            limits: of a request.
             rule: the decision rule; None for the run's own.
             k: items for requests that do not say how many.
             filter_seen: exclude every item that the user has seen.

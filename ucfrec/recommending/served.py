@@ -35,7 +35,6 @@ def arm_of(user_id: int | str, shares: Sequence[float]) -> int:
     """Index of a user's arm: users are divided by a hash of their identifier, the same for ever.
 
     Args:
-        user_id: as text or as a number.
         shares: of the arms, which add up to 1.
     """
     place = xxhash.xxh3_64_intdigest(f"arm {user_id}".encode()) % _UNITS / _UNITS
@@ -77,7 +76,6 @@ class Served:
         """
         Args:
             make: loads a run and checks its files.
-            folder: of the runs.
             shares: name of each arm's run to its share of the users; None for the current run.
 
         Raises:

@@ -28,9 +28,7 @@ def similar_items(
     of its own, such as `item-knn`, the store's embeddings of the items.
 
     Args:
-        trained: a policy of items.
         items: item_ids; None for all.
-        k: number of similar items.
 
     Returns:
         `item_id`, `rank` (from 1), `similar_item_id`, `score` (cosine, −1 to 1).

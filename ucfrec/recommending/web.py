@@ -135,8 +135,6 @@ def application(
     """The application of one model; it keeps no state but the model and its metrics.
 
     Args:
-        responder: answers the requests.
-        limits: of the server.
         allowed_hosts: values of the header `Host`, without a port, that are answered: names,
             addresses, *.example.org for all names below, or * for any.
         exposures: gets every answer; None for none.

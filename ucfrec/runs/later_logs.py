@@ -16,12 +16,8 @@ def later_logs(
     """Log files of the dataset that a policy was trained on, whose columns may have plain names.
 
     Args:
-        trained: the policy.
         paths: files, folders and globs.
         given: what the caller says of the columns.
-
-    Returns:
-        The files, and the whole mapping.
 
     Raises:
         InputError: a path is missing, or holds no log of the dataset.

@@ -35,11 +35,8 @@ def fit_policy(
         policy: trained in place.
         train: episodes to learn from, with their augmented episodes.
         validation: held-out episodes; None to keep the last weights.
-        out: folder of the run.
-        config: configuration of the run.
         start: weights of another training to go on from; of a policy that is fitted without
             gradients, only what was chosen on held-out episodes is taken from there.
-        callbacks: what is told of the training.
 
     Raises:
         InputError: see `ucfrec.fitting.loop.fit`; or the batch has fewer windows than processes.

@@ -34,9 +34,6 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
         first: a finished run.
         out: run folder, new or interrupted; `first / REFIT` for the weights that `first` acts by.
 
-    Returns:
-        The record of the new run.
-
     Raises:
         InputError: `first` is not a finished run on this store, or `out` is another run.
     """

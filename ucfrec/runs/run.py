@@ -86,9 +86,7 @@ def train_run(
     the rest, and the others return once the policy is trained.
 
     Args:
-        store: prepared episodes.
         out: run folder, new or interrupted.
-        config: configuration of all stages.
         about: entries of `RunRecord` that the caller adds.
         more_augmentation: augmented training episodes that are used in addition to the
             counterfactual ones.
@@ -99,9 +97,6 @@ def train_run(
             The time of a stage is in the record of the run that made it.
         callbacks: what is told of the training of the policy.
         initial: a run on an older state of the store, whose weights the training begins with.
-
-    Returns:
-        The record of the run: provenance, configuration and the report of every stage.
 
     Raises:
         InputError: `out` is a run on another store or with another configuration, the store has
@@ -125,14 +120,19 @@ def train_run(
         chosen = run.record.rule is not None and run.record.policy == fit
         record = run.record.with_entries(augmentation=augmentation, policy=fit)
         if run.logged.has_items and config.rule.choose and not chosen:
-            with phase("Fitting the user model", 3, PHASES):
-                user_model = _fit_user_model(run)
-            with phase("Selecting the decision rule", 4, PHASES):
-                rule = _choose_rule(run, user_model)
-            record = record.with_entries(reward_model=user_model.reward_report, rule=rule)
+            record = record.with_entries(**_selected(run))
         _write_samples(run)
         seconds = record.wall_time_s + time.perf_counter() - begun
         return record.with_entries(wall_time_s=seconds).sealed(out)
+
+
+def _selected(run: _Inputs) -> dict[str, Any]:
+    """Entries of the record: the user model and the decision rule that is best in it."""
+    with phase("Fitting the user model", 3, PHASES):
+        user_model = _fit_user_model(run)
+    with phase("Selecting the decision rule", 4, PHASES):
+        rule = _choose_rule(run, user_model)
+    return {"reward_model": user_model.reward_report, "rule": rule}
 
 
 def _prepare_inputs(

@@ -48,17 +48,12 @@ def train_screened(
     """`ucfrec.runs.run.train_run` after screening.
 
     Args:
-        store: prepared episodes.
         out: run folder; an interrupted run resumes, with the columns it started with.
-        config: of the training.
         how: one of `SCREENINGS`; None to train on the store as it is.
         about: entries that a dataset adapter adds to the record.
         shared: as `train_run` has it, and for screening; a run whose columns are dropped has its
             other stages to itself.
         callbacks: what is told of the training of the policy.
-
-    Returns:
-        The run's record.
 
     Raises:
         InputError: as `train_run` and `screen_store`; the run was started with another `how`; or no

@@ -31,9 +31,7 @@ def start_warm(policy: SequencePolicy, out: Path, initial: Path) -> None:
     for items no correction of their vector, and the log of their share of the training steps.
 
     Args:
-        policy: untrained, on the grown store.
         out: folder of the new run, which receives the reward model's weights.
-        initial: folder of the run.
     """
     acting = initial if refit_of_run(initial, read_record(initial)) is None else initial / REFIT
     path = acting / "policy" / "best.safetensors"
@@ -58,7 +56,6 @@ def warm_settings(config: Config, share: float = SHARE) -> Config:
     """The settings of a warm training.
 
     Args:
-        config: settings of a training from nothing.
         share: of the steps and epochs of a training from nothing.
     """
     few = max(1, round(share * config.train.steps))

@@ -80,7 +80,6 @@ def default_space(policy: str, by_value: bool) -> Space:
     """The settings that matter for a policy.
 
     Args:
-        policy: its name.
         by_value: whether trials are measured by the estimated value. The training then searches
             the reward weight itself in every trial, so it is no setting of the search.
     """

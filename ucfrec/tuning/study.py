@@ -61,7 +61,6 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
     The best run lies in `plan.out / "best"`; those of other trials are deleted.
 
     Args:
-        plan: of the search.
         trials: number of finished trials that the study has at the end, those ended early too.
         workers: processes that train trials side by side.
 

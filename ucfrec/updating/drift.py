@@ -60,7 +60,6 @@ def drift(
     """What is different in new rows.
 
     Args:
-        old: the run.
         before: its training episodes.
         added: the new episodes of the grown store.
         counts: of `ucfrec.logs.append.append_logs`.

@@ -57,7 +57,7 @@ def update_run(
     with fewer steps; the user model is fitted and the decision rule chosen anew. The validation
     split is the second newest part of the new rows, the test split, on which the runs are compared,
     the newest. Once they are compared, the new run goes on learning from these rows, too. Neither
-    the run nor its store is changed.
+    the run nor its store is changed. `update` of the record has the drift and the verdict.
 
     Args:
         run: a finished run on a store of logs of items, which must be there.
@@ -67,9 +67,6 @@ def update_run(
         mapping: as of `ucfrec.logs.append.append_logs`.
         options: None for the defaults.
 
-    Returns:
-        The record of the new run; `update` has the drift of the new rows and the verdict.
-
     Raises:
         InputError: the run or the logs cannot be used, or `out` or `store` is something else.
     """
@@ -78,41 +75,43 @@ def update_run(
     grown = store or out.with_name(out.name + STORE_SUFFIX)
     with claimed(grown, "updated"):
         counts = append_logs(before.path, paths, grown, mapping, options.append)
-    opened = EpisodeStore.open(grown)
-    for split in ("validation", "test"):
-        if not opened.split(split).n_episodes:
-            raise InputError(
-                f"the new logs leave no {split} rows, to choose a rule and compare the runs on; "
-                "give more rows, or another --split and --store"
-            )
+    opened = _with_splits(EpisodeStore.open(grown))
     added = np.arange(opened.n_episodes - counts["episodes"], opened.n_episodes)
     if trained.dropped:
         opened = opened.without_observation_dimensions(trained.dropped)
         before = before.without_observation_dimensions(trained.dropped)
     full = _from_nothing(trained.record)
     config = warm_settings(full, options.share)
-    if options.seed is not None:
-        config = replace(config, seed=options.seed)
+    config = config if options.seed is None else replace(config, seed=options.seed)
+    of, appended = run.resolve().name, _numbers(counts)
     update = Update(
-        of=run.resolve().name,
-        run=trained.fingerprint,
-        settings_from_nothing=asdict(full),
-        appended=_numbers(counts),
+        of=of, run=trained.fingerprint, settings_from_nothing=asdict(full), appended=appended
     )
     about = {"update": update, "dropped_observations": trained.dropped}
     record = train_run(opened, out, config, about, initial=run)
     if record.update is None or record.update.run != trained.fingerprint:
         raise InputError(f"{out} is no update of {run}; name another run folder")
     if record.update.verdict is None:
-        found = drift(trained, before.split("train"), opened.select(added), counts, config.seed)
-        newest = opened.split("test")
-        acting = TrainedPolicy.load(run)
-        verdict = compare_runs(TrainedPolicy.load(out, split=True), acting, newest, config.seed)
-        update = record.update.model_copy(update={"drift": found, "verdict": verdict})
+        seed, newest = config.seed, opened.split("test")
+        found = drift(trained, before.split("train"), opened.select(added), counts, seed)
+        runs = TrainedPolicy.load(out, split=True), TrainedPolicy.load(run)
+        entries = {"drift": found, "verdict": compare_runs(*runs, newest, seed)}
+        update = record.update.model_copy(update=entries)
         record = record.with_entries(update=update).written(out)
     if options.refit:
         refit_within(EpisodeStore.open(grown), out)
     return record
+
+
+def _with_splits(grown: EpisodeStore) -> EpisodeStore:
+    """Check that a grown store has rows to choose a rule and compare the runs on."""
+    for split in ("validation", "test"):
+        if not grown.split(split).n_episodes:
+            raise InputError(
+                f"the new logs leave no {split} rows, to choose a rule and compare the runs on; "
+                "give more rows, or another --split and --store"
+            )
+    return grown
 
 
 def _store_before(run: Path, trained: TrainedPolicy) -> EpisodeStore:

@@ -36,9 +36,7 @@ def compare_runs(
 
     Args:
         new: trained on a store that was grown from that of `old`.
-        old: the run before.
         rows: newest episodes of the grown store, which neither was trained on.
-        seed: of the bootstrap over users.
     """
     places = rows.all_steps()
     user = rows.episode_values(schema.USER).astype(np.int64)[places[0]]
@@ -121,7 +119,6 @@ def _valued(weights: Float64Array, reward: Float64Array, user: IntArray, seed: i
         weights: (N, 2) probability under the new and the old rule, by the propensity.
         reward: (N,).
         user: (N,).
-        seed: of the bootstrap.
     """
     lift = ((weights[:, 0] - weights[:, 1]) * (reward - reward.mean()))[:, None]
     return _difference(VALUE, lift, np.ones_like(lift), user, seed, _doubt(weights, user))

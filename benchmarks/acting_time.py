@@ -34,6 +34,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import logged_history
 from ucfrec.choosing.by_simulation import RuleSearch
 from ucfrec.choosing.config import RuleConfig
+from ucfrec.choosing.problem import Problem
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.policies.registry import policy_class
@@ -202,7 +203,7 @@ def rule_ways(run: Path, store: EpisodeStore, sessions: int) -> tuple[Way, Way]:
     target, config = trained.target_return(1.0), RuleConfig(sessions=sessions)
     scorer = trained.scorer(DecisionRule(target))
     users = UserModel.fit(*views, run / REWARD_MODEL, 0)
-    search = RuleSearch(scorer, users, *views, config, seed=0)
+    search = RuleSearch(Problem(scorer, users, {}, *views, config, seed=0))
     rules = [
         DecisionRule(target, minimum, reward_weight=reward_weight, temperature=temperature)
         for minimum in (None, target)

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from ucfrec.episodes.windows import Windows
-from ucfrec.fitting.row_optimizer import RowAdamW
+from ucfrec.fitting.loop import RowAdamW
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import provenance

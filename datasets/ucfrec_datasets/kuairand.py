@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import Final
 
 from ucfrec.errors import InputError
-from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, log_files
+from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, Release, log_files
 
 LOGS: Final = ("log_standard_", "log_random_")
 FEATURES: Final = ("user_features_", "video_features_basic_", "video_features_statistic_")
 USERS, BASIC, STATISTIC = FEATURES
 
-USER_COLUMNS: Final = (
+PROFILE: Final = (
     "user_active_degree",
     "is_lowactive_period = 1",
     "is_live_streamer = 1",
@@ -20,6 +20,10 @@ USER_COLUMNS: Final = (
     "ln(1 + fans_user_num)",
     "ln(1 + friend_user_num)",
     "ln(1 + register_days)",
+)
+"""Columns of users that KuaiRec has too."""
+USER_COLUMNS: Final = (
+    *PROFILE,
     *(f"onehot_feat{n}::VARCHAR" for n in (0, 1, 2, 4, 5, 6, *range(9, 18))),
 )
 """Without onehot features 3, 7 and 8, which have 1,471, 118 and 454 values among 27,285 users."""
@@ -101,4 +105,14 @@ def _table(
 DATASET: Final = Dataset(
     summary="KuaiRand Pure, 1K or 27K: the official folder, or files of it (CSV or Parquet)",
     resolve=_resolve,
+    releases={
+        "kuairand-pure": Release(
+            url="https://zenodo.org/records/10439422/files/KuaiRand-Pure.tar.gz",
+            homepage="https://kuairand.com",
+            licence="CC BY-SA 4.0",
+            checksum="md5:0820331067a3784d9691136f772b35a7",
+            size=47_432_272,
+            parts={"all": "KuaiRand-Pure/data"},
+        )
+    },
 )

@@ -5,21 +5,15 @@ from pathlib import Path
 from typing import Final
 
 from ucfrec.errors import InputError
-from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, log_files
+from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, Release, log_files
+from ucfrec_datasets.kuairand import PROFILE
 
 TRAINING, EVALUATION = "big_matrix", "small_matrix"
 FEATURES: Final = ("user_features", "item_categories", "item_daily_features")
 USERS, CATEGORIES, DAILY = FEATURES
 
 USER_COLUMNS: Final = (
-    "user_active_degree",
-    "is_lowactive_period = 1",
-    "is_live_streamer = 1",
-    "is_video_author = 1",
-    "ln(1 + follow_user_num)",
-    "ln(1 + fans_user_num)",
-    "ln(1 + friend_user_num)",
-    "ln(1 + register_days)",
+    *PROFILE,
     *(f"onehot_feat{n}::VARCHAR" for n in range(18)),
 )
 
@@ -84,4 +78,14 @@ def _table(
 DATASET: Final = Dataset(
     summary="KuaiRec: the official folder (its big_matrix), or files of it (CSV or Parquet)",
     resolve=_resolve,
+    releases={
+        "kuairec": Release(
+            url="https://zenodo.org/records/18164998/files/KuaiRec.zip",
+            homepage="https://kuairec.com",
+            licence="CC BY-SA 4.0",
+            checksum="md5:261550d472c48eff4990fb13c0e5bcf7",
+            size=431_964_858,
+            parts={"all": "KuaiRec 2.0/data"},
+        )
+    },
 )

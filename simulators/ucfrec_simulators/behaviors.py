@@ -36,7 +36,6 @@ def truncated_normal(
     Args:
         mean: (N, A) inside the box.
         scale: standard deviation of the normal before truncation.
-        generator: source of the draws.
 
     Returns:
         Actions (N, A), and their densities (N,): products over the dimensions, which may exceed 1.

@@ -39,10 +39,7 @@ def plant_distractor(
     distractor is 1.
 
     Args:
-        store: of items or of vector actions.
-        out: folder of the copy.
         flip: probability that the distractor is the opposite of the reward bit.
-        seed: seed of the flips.
 
     Raises:
         InputError: as `ucfrec.episodes.distractor.reward_bit`, or `out` exists.

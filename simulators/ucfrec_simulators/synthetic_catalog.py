@@ -295,6 +295,16 @@ def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
     )
 
 
+def softmax(env: VectorEnv[Any, Any, Any], seed: int) -> SoftmaxGuess:
+    """A logging policy that tries much: other policies can be evaluated on its logs.
+
+    Raises:
+        InputError: `env` is not a SyntheticCatalog.
+    """
+    knobs = {"error": 1.0, "temperature": 4.0, "epsilon": 0.1, "variety": 0.0}
+    return SoftmaxGuess(_catalog(env), seed, **knobs)
+
+
 def _make(num_envs: int, folder: Path | None, mood: float) -> SyntheticCatalog:
     return SyntheticCatalog(num_envs, mood=mood)
 
@@ -305,7 +315,13 @@ def simulator(mood: float = 0.0) -> Simulator:
         summary="built-in users and 200 tagged items with a known best policy: one item a step, "
         "clicks",
         make=partial(_make, mood=mood),
-        behaviors={"random": Uniform, "popular": popular, "mixture": mixture, "optimal": optimal},
+        behaviors={
+            "random": Uniform,
+            "popular": popular,
+            "mixture": mixture,
+            "softmax": softmax,
+            "optimal": optimal,
+        },
         feedback="is_click",
     )
 

@@ -260,7 +260,7 @@ def test_a_rule_needs_what_it_uses() -> None:
         for given in (None, states):
             with pytest.raises(InputError, match="the store has none"):
                 Scorer(policy, rule, given)
-    with pytest.raises(InputError, match="tag_run 11; give a whole number from 0 to 10"):
+    with pytest.raises(InputError, match="tag_run is 11; it must be a whole number from 0 to 10"):
         DecisionRule(1.0, tag_run=11)
     tagged = Scorer(policy, DecisionRule(1.0), replace(states, tags=TAGS))
     assert K < 10  # items further back than the policy sees are known from the session

@@ -10,9 +10,11 @@ import torch
 
 from tests.support.tagged import tagged_log, tagged_mapping
 from ucfrec.acting.scorer import logged_scores
-from ucfrec.choosing.by_ranking import SHOWN, choose_by_ranking
+from ucfrec.choosing.by_ranking import choose_by_ranking
 from ucfrec.choosing.choice import RankedRule, RuleChoice
 from ucfrec.choosing.config import RuleConfig
+from ucfrec.choosing.logged import SHOWN
+from ucfrec.choosing.problem import Problem
 from ucfrec.episodes.item_counts import TrainingCounts, liked_steps
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
@@ -22,6 +24,7 @@ from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.user_model.model import UserModel
 
 SETTINGS = ["train.steps=5", "policy.dim=16", "policy.context=4", "augment.copies=0"]
 
@@ -47,7 +50,11 @@ def chosen(folder: Path, liked_bias: float, *weights: float) -> RuleChoice:
     with torch.no_grad():
         policy.head.bias.copy_(torch.zeros(24).index_fill(0, liked, liked_bias))
     config = RuleConfig(reward_weights=weights)
-    return choose_by_ranking(replace(trained, policy=policy).scorer(), *views, config, 0)
+    scorer, users = (
+        replace(trained, policy=policy).scorer(),
+        UserModel.fit(*views, folder / "um", 0),
+    )
+    return choose_by_ranking(Problem(scorer, users, {}, *views, config, 0))
 
 
 def test_all_reward_weights_at_once_are_evaluated_as_each_rule_alone(folder: Path) -> None:

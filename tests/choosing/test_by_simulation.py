@@ -16,6 +16,7 @@ from ucfrec.acting.scorer import Scorer
 from ucfrec.choosing.by_simulation import RuleSearch, choose_by_simulation
 from ucfrec.choosing.choice import RuleChoice
 from ucfrec.choosing.config import RuleConfig
+from ucfrec.choosing.problem import Problem
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
 from ucfrec.logs.mapping import FeatureTable, LogMapping
@@ -65,7 +66,7 @@ def users_of(run: Path, store: EpisodeStore) -> UserModel:
 def search_of(folder: Path, trained: TrainedPolicy, config: RuleConfig = FEW) -> RuleSearch:
     store, scorer = EpisodeStore.open(folder / "store"), trained.scorer(DecisionRule(2.0))
     users = users_of(folder / "run", store)
-    return RuleSearch(scorer, users, *training_views(store), config, seed=0)
+    return RuleSearch(Problem(scorer, users, {}, *training_views(store), config, 0))
 
 
 def chosen(
@@ -76,7 +77,7 @@ def chosen(
     parts = scorer.returns, users.reward, users.session_end
     scorer = Scorer(scorer.policy, scorer.rule, states, *parts)
     given = dict(zip((0.9, 1.0), targets, strict=True))
-    return choose_by_simulation(scorer, users, given, *training_views(store), config, 0)
+    return choose_by_simulation(Problem(scorer, users, given, *training_views(store), config, 0))
 
 
 def test_a_run_acts_by_the_rule_that_it_chose_and_says_how(
@@ -92,9 +93,15 @@ def test_a_run_acts_by_the_rule_that_it_chose_and_says_how(
     assert own["value"] >= best["value"] - best["error"] or best["items"] < rule["least_items"]
     found = read_record(folder / "run")
     assert found.rule is not None
-    assert found.rule.simulated == (own["value"], own["error"])
-    assert f"the log supports: {own['value']:.4g} ±" in found.describe()
-    assert RuleRecord.model_validate({**rule, "candidates": []}).simulated is None
+    assert found.rule.simulated == (rule["estimate"]["value"], rule["estimate"]["error"])
+    assert f"the log supports: {rule['estimate']['value']:.4g} ±" in found.describe()
+    assert RuleRecord.model_validate({**rule, "estimate": None}).simulated is None
+    estimate = found.rule.estimate
+    assert estimate is not None
+    assert estimate.value == pytest.approx(sum(estimate.halves) / 2)
+    assert estimate.error >= abs(estimate.halves[0] - estimate.halves[1]) / 2
+    assert any("no propensities" in doubt for doubt in estimate.doubts)
+    assert "WARNING: it cannot be trusted: the log has no propensities" in found.describe()
 
 
 def test_a_reward_weight_pays_where_the_reward_model_knows_the_items(
@@ -146,6 +153,17 @@ def test_unsupported_and_narrow_rules_are_not_allowed(folder: Path, trained: Tra
     assert search.best([replace(sure, value=0.985 * sure.value), sure]).value < sure.value
     assert search.best([replace(sure, value=0.975 * sure.value), sure]) == sure
     assert search.best([replace(simulated, items=1.0), replace(simulated, items=1.5)]).items == 1.5
+
+
+def test_halves_of_the_users_say_whether_they_would_choose_another_rule(
+    folder: Path, trained: TrainedPolicy
+) -> None:
+    search = search_of(folder, trained, replace(FEW, sessions=60))
+    plain, weighted = search.simulate(
+        [DecisionRule(2.0, reward_weight=each, temperature=1.0) for each in (0.0, 4.0)]
+    )
+    assert search.halves_agree(weighted, [plain, weighted]) == (True, True)
+    assert not any(search.halves_agree(plain, [plain, weighted]))
 
 
 def test_every_kind_of_candidate_is_simulated(folder: Path, trained: TrainedPolicy) -> None:
@@ -241,11 +259,10 @@ def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_pat
     assert not model.affinity.any()
     assert not model.user.any()
     # The chosen rule was simulated again in four times the sessions.
-    given = (trained.scorer(DecisionRule(2.0)), users_of(tmp_path / "run", store))
-    four_times = replace(config.rule, sessions=160)
-    more = RuleSearch(*given, *training_views(store), four_times, config.seed)
+    more = search_of(tmp_path, trained, replace(config.rule, sessions=160))
     (simulated,) = more.simulate([trained.rule])
-    assert record.rule.simulated == (simulated.value, simulated.error)
+    own = next(each for each in record.rule.candidates if each.rule == trained.rule)
+    assert (own.value, own.error) == (simulated.value, simulated.error)
 
 
 def test_of_rules_that_the_model_cannot_tell_apart_the_widest_draws_are_taken(

@@ -11,9 +11,8 @@ from tests.support.causes import planted_vectors
 from tests.support.planted import planted_store
 from ucfrec import schema
 from ucfrec.counterfactual.augmentation import counterfactual_augmentation, interventions
-from ucfrec.counterfactual.effects_mean import EffectTransitions
 from ucfrec.counterfactual.generators import CSGConfig
-from ucfrec.counterfactual.reward_model import CRMConfig
+from ucfrec.counterfactual.reward_model import CRMConfig, EffectTransitions
 from ucfrec.counterfactual.state_augmentation import AugmentConfig
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore

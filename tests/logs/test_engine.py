@@ -256,13 +256,13 @@ def test_an_output_folder_needs_no_opening(tmp_path: Path) -> None:
 
 
 def test_every_connection_is_closed_to_the_environment() -> None:
-    """`duckdb.connect`, and its default connection, are used in one file, and by a peer."""
+    """`duckdb.connect`, and its default connection, are used in one file."""
     root = Path(sys.modules["ucfrec"].__path__[0]).parent
     opens = re.compile(r"duckdb\.(connect|sql|query|execute|read_|from_|default_connection|cursor)")
-    packages = ("ucfrec", "datasets", "simulators", "control", "benchmarks")
+    packages = ("ucfrec", "datasets", "simulators", "control")
     files = (path for package in packages for path in (root / package).rglob("*.py"))
     found = {path.name for path in files if opens.search(path.read_text(encoding="utf-8"))}
-    assert found == {"engine.py", "prepare_time.py"}
+    assert found == {"engine.py"}
     assert text("it's") == "'it''s'"
 
 

@@ -1,4 +1,4 @@
-"""Episodes are the same however many rows are in memory at a time."""
+"""Episodes and order statistics are the same however many rows are in memory at a time."""
 
 from pathlib import Path
 
@@ -8,8 +8,9 @@ import pytest
 
 from ucfrec.logs.engine import engine
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.sessions import Cut, by_sessions, episodes
+from ucfrec.logs.sessions import Cut, by_sessions, count_unsorted, episodes, ranked
 from ucfrec.logs.sorted_rows import check_sorted, sorted_batches
+from ucfrec.logs.spool import Spool
 from ucfrec.logs.tables import open_tables
 from ucfrec.logs.typed import typed_log
 
@@ -58,3 +59,35 @@ def test_blocks_of_any_size_give_the_same_episodes(
     assert (np.diff(times)[np.diff(within) == 0] > 0).all()
     if session_by == "gap":
         assert np.diff(times)[np.diff(within) == 0].max() <= 20
+
+
+def spooled(folder: Path, **columns: object) -> Spool:
+    spool = Spool(folder)
+    spool.append({name: np.asarray(values) for name, values in columns.items()})
+    return spool
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_rows_after_a_later_row_of_their_user_are_counted(tmp_path: Path, seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    n = int(generator.integers(1, 50))
+    user, time = generator.integers(-1, 3, n), generator.integers(6, size=n)
+    row = generator.permutation(n) + 1
+    expected = sum(
+        any((user[j] == user[i]) and time[j] > time[i] and row[j] < row[i] for j in range(n))
+        for i in range(n)
+    )
+    order = np.lexsort((time, user))
+    placed = spooled(tmp_path / "s", user=user[order], timestamp=time[order], row=row[order])
+    for block in (1, 2, 3, 7, 100):
+        assert count_unsorted(placed, block) == expected
+
+
+@pytest.mark.parametrize("span", [1, 50, 10**7, 10**12])
+def test_ranks_are_those_of_the_sorted_values(tmp_path: Path, span: int) -> None:
+    generator = np.random.default_rng(0)
+    values = 1_700_000_000_000 + generator.integers(span, size=200)
+    spool = spooled(tmp_path / "s", t=values)
+    positions = [0, 3, 160, 199]
+    found = ranked(spool, "t", int(values.min()), int(values.max()), positions, block=17)
+    assert found == np.sort(values)[positions].tolist()

@@ -15,7 +15,7 @@ from ucfrec.acting.sessions import History
 from ucfrec.episodes.exposure import Exposed, Shown
 from ucfrec.episodes.states import ItemStates
 from ucfrec.errors import InputError
-from ucfrec.fitting.row_optimizer import RowAdamW, clip_gradients
+from ucfrec.fitting.loop import RowAdamW, clip_gradients
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
 from ucfrec.policies.registry import policy_class

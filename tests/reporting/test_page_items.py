@@ -190,7 +190,7 @@ def test_estimates_from_logs_are_shown_with_their_warnings(folder: Path, tmp_pat
             policy,
             metrics={"effective_sessions": 33.25, "largest_weight": 0.5, "overlap": 1.01},
             conditions={"sessions": 600, "run": "runs/ucf", "choice": choice},
-            details={"warnings": [HOSTILE]},
+            details={"warnings": [HOSTILE], "verdict": "Do not rely on it"},
         )
         for name, policy, value, choice in (
             ("logged", "behavior", 2.0, "as logged"),
@@ -205,7 +205,7 @@ def test_estimates_from_logs_are_shown_with_their_warnings(folder: Path, tmp_pat
         "share of the largest weight": "0.5", "sessions": "600", "overlap": "1.01",
     }  # fmt: skip
     assert table["logged sessions"]["mean return of a session"] == "2 [1.5, 3.5]"
-    assert page.text.index("which is not reliable") < page.text.index("Trained on")
+    assert page.text.index("Do not rely on it") < page.text.index("Trained on")
     assert len([d for t, d in page.elements if t == "rect" and d["class"] == "bar"][:4]) == 4
     assert not {tag for tag, _ in page.elements} & {"script", "img"}
 

@@ -2,8 +2,6 @@
 
 from typing import Any
 
-import pytest
-
 from tests.support.report_page import estimate, row
 from ucfrec.reporting.page_results import Estimates, Results
 from ucfrec.reporting.verdict import NO_RESULTS, verdict
@@ -16,16 +14,6 @@ def earned(policy: str, value: float, **more: Any) -> ResultRow:
 
 def of_environment(*rows: ResultRow) -> str:
     (said,) = verdict(Results({"a": rows}, ()))
-    return said
-
-
-def estimated(name: str, value: float) -> ResultRow:
-    return estimate(name, value, interval=(value - 0.1, value + 0.1))
-
-
-def of_logs(*rows: ResultRow, warnings: tuple[str, ...] = (), logged: bool = True) -> str:
-    of_logged = estimated("logged", 1.0) if logged else None
-    (said,) = verdict(Results({}, [Estimates("ucf", of_logged, rows, warnings)]))
     return said
 
 
@@ -75,33 +63,9 @@ def test_built_in_policies_alone_say_nothing_of_trained_ones() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("dr", "ips", "says"),
-    [
-        (2.0, 3.0, "Every weighted estimate (IPS and DR) says that its return is higher"),
-        (0.2, 0.1, "Every weighted estimate (IPS and DR) says that its return is lower"),
-        (1.1, 0.9, "No weighted estimate (IPS and DR) distinguishes it from the logging policy"),
-        (2.0, 1.0, "disagree (DR higher than the logging policy, of IPS and DR)"),
-        (2.0, 0.1, "disagree (DR higher; IPS lower than the logging policy, of IPS and DR)"),
-    ],
-)
-def test_estimates_conclude_only_where_all_of_them_do(dr: float, ips: float, says: str) -> None:
-    said = of_logs(estimated("DM", 9.0), estimated("IPS", ips), estimated("DR", dr))
-    assert f"DR estimates {dr:g} [" in said
-    assert "logged sessions have 1 [0.9, 1.1]" in said
-    assert says in said
-
-
-def test_an_estimate_with_warnings_is_not_relied_on() -> None:
-    said = of_logs(estimated("DR", 5.0), warnings=("effective sample 3",))
-    assert "DR estimates 5 [4.9, 5.1] per session, which is not reliable: effective" in said
-    assert "is higher" not in said
-
-
-def test_models_alone_conclude_nothing() -> None:
-    said = of_logs(estimated("DM", 5.0), estimated("FQE", 6.0), warnings=("no propensity",))
-    assert "allow no weighted estimate (no propensity)" in said
-    assert "Models alone (no conclusion): DM 5 [4.9, 5.1] and FQE 6 [5.9, 6.1]." in said
-    assert "The rows lack the return of the logged sessions" in of_logs(
-        estimated("DR", 5.0), logged=False
-    )
+def test_of_logs_the_verdict_of_ope_is_quoted() -> None:
+    rows = [estimate("DM", 9.0), estimate("DR", 2.0, details={"verdict": "higher"})]
+    (said,) = verdict(Results({}, [Estimates("ucf", None, rows, ())]))
+    assert said == "For ucf: higher."
+    (said,) = verdict(Results({}, [Estimates("ucf", None, rows[:1], ())]))
+    assert "no verdict" in said

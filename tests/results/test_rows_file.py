@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.result_rows import result_row
+from tests.support.result_rows import read_configurations, result_row
 from ucfrec.errors import InputError
 from ucfrec.provenance import config_hash
 from ucfrec.results.row import RowKey
@@ -18,7 +18,6 @@ from ucfrec.results.rows_file import (
     benchmarking,
     latest,
     measuring,
-    read_configurations,
     read_rows,
 )
 
@@ -42,13 +41,6 @@ def test_configurations_lie_once_beside_the_rows(tmp_path: Path) -> None:
     assert len((tmp_path / CONFIGURATIONS).read_text().splitlines()) == 1
     with pytest.raises(InputError, match="have the hash of another configuration"):
         append_rows(tmp_path / "a.jsonl", [result_row(config_hash="other")], config)
-
-
-@pytest.mark.parametrize("line", ['{"hash": "x"}', "[1]", '{"hash": "x", "config": {}}'])
-def test_what_is_no_configuration_is_refused(tmp_path: Path, line: str) -> None:
-    (tmp_path / CONFIGURATIONS).write_text(line + "\n")
-    with pytest.raises(InputError, match=r"configurations\.jsonl, line 1"):
-        read_configurations(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -72,7 +72,7 @@ def test_a_run_killed_at_any_moment_ends_as_if_left_alone(
 def test_the_record_tells_what_was_done(store: Path, left_alone: Path) -> None:
     record = json.loads((left_alone / "run.json").read_text())
     assert record["fingerprint"] == EpisodeStore.open(store).record.fingerprint
-    assert record["config"]["train"]["steps"] == 120
+    assert record["config"]["train"]["steps"] == 60
     assert {"command", "seed", "versions", "wall_time_s"} <= record.keys()
     report = record["augmentation"]
     assert report["bound"] == pytest.approx(report["delta"] + report["epsilon_r"])

@@ -18,7 +18,7 @@ from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 
 SETTINGS = (
-    "train.steps=120",
+    "train.steps=60",
     "train.validate_every=5",
     "policy.dim=16",
     "policy.context=5",

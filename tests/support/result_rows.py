@@ -1,9 +1,12 @@
 """Result rows written out."""
 
+import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from ucfrec.results.row import ResultRow
+from ucfrec.results.rows_file import CONFIGURATIONS
 
 
 def result_row(value: float = 1.0, **fields: Any) -> ResultRow:
@@ -25,6 +28,12 @@ def result_row(value: float = 1.0, **fields: Any) -> ResultRow:
     metric = fields.get("metric", given["metric"])
     metrics = {metric: value, **fields.pop("metrics", {})}
     return ResultRow(**given | {"metrics": metrics} | fields)
+
+
+def read_configurations(folder: Path) -> dict[str, Any]:
+    """The configurations of the rows in `folder`, by hash."""
+    lines = map(json.loads, (folder / CONFIGURATIONS).read_text().splitlines())
+    return {line["hash"]: line["config"] for line in lines}
 
 
 def distractor_rows(values: Mapping[float | None, Sequence[float]]) -> list[ResultRow]:

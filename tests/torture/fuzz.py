@@ -250,106 +250,104 @@ def _other_bytes(generator: random.Random, content: bytes) -> bytes:
 
 def _targets(inputs: Inputs) -> dict[str, tuple[Path, str, Reader]]:
     """Name of a reader to (file or folder, the file in it that is changed, the reader)."""
-    from tests.torture.damage import read_run, read_store
+    texts = _texts(inputs)
+    found = {**_of_stores(inputs), **_of_runs(inputs)}
+    for name, (file, reader) in _of_texts(inputs, texts).items():
+        found[name] = (texts / file, file, reader)
+    return found
+
+
+def _of_stores(inputs: Inputs) -> dict[str, tuple[Path, str, Reader]]:
+    from tests.torture.damage import read_store
+
+    unsealed = _unsealed(inputs)
+
+    def read(levels: int) -> Reader:
+        return lambda path: read_store(path.parents[levels - 1])
+
+    return {
+        "meta.json": (inputs.store, "meta.json", read(1)),
+        "column.npy": (unsealed, "shard-00000/reward.npy", read(2)),
+        "offsets.npy": (unsealed, "shard-00000/offsets.npy", read(2)),
+        "item states": (unsealed, "item_states.safetensors", read(1)),
+    }
+
+
+def _acts(levels: int) -> Reader:
+    """Loads the policy of the run so many folders above, and lets it act."""
+
+    def read(path: Path) -> object:
+        import numpy as np
+
+        from ucfrec.runs.trained_policy import TrainedPolicy
+
+        trained = TrainedPolicy.load(path.parents[levels - 1])
+        observations = np.zeros((2, trained.record.observation_size), dtype=np.float32)
+        return trained.actor(2).act(observations, np.array([True, False]))
+
+    return read
+
+
+def _of_runs(inputs: Inputs) -> dict[str, tuple[Path, str, Reader]]:
+    from tests.torture.damage import read_run
     from ucfrec.episodes.windows import Overlay
     from ucfrec.files.parquet import read_ids
     from ucfrec.fitting.checkpoint import load_tensors
     from ucfrec.fitting.metrics_log import read_metrics
+    from ucfrec.reporting.page import write_report
+
+    run, unsealed = inputs.run, _unsealed_run(inputs)
+
+    def page(path: Path) -> object:
+        return write_report(path.parent / "out.html", [path.parent])
+
+    return {
+        "run.json": (run, "run.json", lambda path: read_run(path.parent)),
+        "run.json in a report": (run, "run.json", page),
+        "samples in a report": (unsealed, "samples.json", page),
+        "augmentation in a report": (unsealed, "augmentation.json", page),
+        "decision rule": (unsealed, "decision_rule.json", _acts(1)),
+        "policy": (unsealed, "policy/best.safetensors", _acts(2)),
+        "reward model": (unsealed, "reward_model/item_reward.safetensors", _acts(2)),
+        "item states of a run": (unsealed, "item_states.safetensors", _acts(1)),
+        "training counts": (unsealed, "training_counts.safetensors", _acts(1)),
+        "training returns": (unsealed, "training_returns.safetensors", _acts(1)),
+        "items of a run": (unsealed, "items.parquet", _acts(1)),
+        "copies": (run, "overlay.safetensors", Overlay.load),
+        "checkpoint": (run, "policy/best.safetensors", load_tensors),
+        "metrics.jsonl": (run, "policy/metrics.jsonl", lambda path: read_metrics(path.parent)),
+        "ids.parquet": (run, "items.parquet", lambda path: read_ids(path, "item_id")),
+    }
+
+
+def _of_texts(inputs: Inputs, texts: Path) -> dict[str, tuple[str, Reader]]:
     from ucfrec.logs.mapping import read_mapping
-    from ucfrec.results.rows_file import read_configurations, read_results, read_rows
+    from ucfrec.logs.prepare import validate
+    from ucfrec.reporting.page import write_report
+    from ucfrec.results.rows_file import read_results, read_rows
     from ucfrec.runs.config import resolve_config
-
-    texts = _texts(inputs)
-    folder = _of(0)
-    column = "shard-00000/reward.npy"
-
-    def config(path: Path) -> object:
-        return resolve_config(file=path)
+    from ucfrec_control.data.d4rl import read_d4rl
 
     def one_setting(path: Path) -> object:
         return resolve_config(overrides=[path.read_bytes().decode("utf-8", "replace")])
 
     def validated(path: Path) -> object:
-        from ucfrec.logs.prepare import validate
-
         return validate([path], read_mapping(texts / "empty.toml"))
 
-    def acts(levels: int) -> Reader:
-        def read(path: Path) -> object:
-            import numpy as np
-
-            from ucfrec.runs.trained_policy import TrainedPolicy
-
-            trained = TrainedPolicy.load(folder(path, levels))
-            observations = np.zeros((2, trained.record.observation_size), dtype=np.float32)
-            return trained.actor(2).act(observations, np.array([True, False]))
-
-        return read
-
     def page(path: Path) -> object:
-        from ucfrec.reporting.page import write_report
-
-        return write_report(path.parent / "out.html", [path.parent])
-
-    def d4rl(path: Path) -> object:
-        from ucfrec_control.data.d4rl import read_d4rl
-
-        return read_d4rl(path)
-
-    def evaluations_page(path: Path) -> object:
-        from ucfrec.reporting.page import write_report
-
         return write_report(path.parent / "out.html", [inputs.run], [path])
 
-    store, run = inputs.store, inputs.run
     return {
-        "meta.json": (store, "meta.json", lambda path: read_store(path.parent)),
-        "column.npy": (_unsealed(inputs), column, lambda path: read_store(folder(path, 2))),
-        "offsets.npy": (
-            *(_unsealed(inputs), "shard-00000/offsets.npy"),
-            lambda path: read_store(folder(path, 2)),
-        ),
-        "item states": (
-            *(_unsealed(inputs), "item_states.safetensors"),
-            lambda path: read_store(path.parent),
-        ),
-        "run.json": (run, "run.json", lambda path: read_run(path.parent)),
-        "run.json in a report": (run, "run.json", page),
-        "samples in a report": (_unsealed_run(inputs), "samples.json", page),
-        "augmentation in a report": (_unsealed_run(inputs), "augmentation.json", page),
-        "decision rule": (_unsealed_run(inputs), "decision_rule.json", acts(1)),
-        "policy": (_unsealed_run(inputs), "policy/best.safetensors", acts(2)),
-        "reward model": (_unsealed_run(inputs), "reward_model/item_reward.safetensors", acts(2)),
-        "item states of a run": (_unsealed_run(inputs), "item_states.safetensors", acts(1)),
-        "training counts": (_unsealed_run(inputs), "training_counts.safetensors", acts(1)),
-        "training returns": (_unsealed_run(inputs), "training_returns.safetensors", acts(1)),
-        "items of a run": (_unsealed_run(inputs), "items.parquet", acts(1)),
-        "copies": (run, "overlay.safetensors", Overlay.load),
-        "checkpoint": (run, "policy/best.safetensors", load_tensors),
-        "metrics.jsonl": (run, "policy/metrics.jsonl", lambda path: read_metrics(path.parent)),
-        "ids.parquet": (run, "items.parquet", lambda path: read_ids(path, "item_id")),
-        "rows.jsonl": (texts / "rows.jsonl", "rows.jsonl", read_rows),
-        "configurations": (
-            *(texts / "configurations.jsonl", "configurations.jsonl"),
-            lambda path: read_configurations(path.parent),
-        ),
-        "evaluations": (texts / "evaluations.json", "evaluations.json", read_results),
-        "evaluations in a report": (
-            texts / "evaluations.json",
-            "evaluations.json",
-            evaluations_page,
-        ),
-        "mapping.toml": (texts / "mapping.toml", "mapping.toml", read_mapping),
-        "config.toml": (texts / "config.toml", "config.toml", config),
-        "a setting": (texts / "setting.txt", "setting.txt", one_setting),
-        "log.csv": (texts / "log.csv", "log.csv", validated),
-        "log.parquet": (texts / "log.parquet", "log.parquet", validated),
-        "D4RL": (texts / "hopper.hdf5", "hopper.hdf5", d4rl),
+        "rows.jsonl": ("rows.jsonl", read_rows),
+        "evaluations": ("evaluations.json", read_results),
+        "evaluations in a report": ("evaluations.json", page),
+        "mapping.toml": ("mapping.toml", read_mapping),
+        "config.toml": ("config.toml", lambda path: resolve_config(file=path)),
+        "a setting": ("setting.txt", one_setting),
+        "log.csv": ("log.csv", validated),
+        "log.parquet": ("log.parquet", validated),
+        "D4RL": ("hopper.hdf5", read_d4rl),
     }
-
-
-def _of(_: int) -> Callable[[Path, int], Path]:
-    return lambda path, levels: path.parents[levels - 1]
 
 
 def _unsealed(inputs: Inputs) -> Path:
@@ -380,13 +378,8 @@ def _texts(inputs: Inputs) -> Path:
         return folder
     from tests.support.control_files import hopper_like, write_hdf5
     from tests.torture.children import run
-    from ucfrec.provenance import config_hash
 
     folder.mkdir()
-    config = {"policy_name": "ucf", "seed": 0}
-    (folder / "configurations.jsonl").write_text(
-        json.dumps({"hash": config_hash(config), "config": config}) + "\n"
-    )
     row = {"suite": "s", "table": "t", "task": "a", "method": "m", "policy": "p", "metric": "r"}
     row |= {"metrics": {"r": 1.0}, "interval": [0.5, 1.5], "conditions": {"b": 1}}  # type: ignore[dict-item]
     (folder / "rows.jsonl").write_text(f"{json.dumps(row)}\n" * 3)

@@ -14,13 +14,13 @@ from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.user_model.calibration import UserCalibration
 from ucfrec.user_model.posterior import MEMORY
 from ucfrec.user_model.reward import LAGS
 from ucfrec.user_model.reward_fit import (
     fit_item_reward_model,
     refit_item_reward_model,
 )
-from ucfrec.user_model.reward_report import calibrate
 from ucfrec.user_model.reward_rows import RewardRows
 
 ITEMS, USERS, LENGTH, DIM, TAGS = 40, 150, 20, 4, 6
@@ -157,7 +157,7 @@ def test_for_new_users_the_session_tells_what_users_effects_tell_of_training_row
     assert "tastes" in report.kept
     assert model.reach == MEMORY
     rows = RewardRows.of(store.split("validation"), model.reach, 10**6, 0)
-    slope, intercept = calibrate(model, rows)
+    slope, intercept = UserCalibration.fit(model, store.split("validation"), 10**6, 0).line
     assert 0.85 < slope < 1.15
     assert abs(intercept) < 0.3
     # After ten steps, the session shows what its user likes, which the log never says.

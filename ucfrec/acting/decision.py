@@ -2,42 +2,30 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
-from typing import Any, Final, Self
+from dataclasses import asdict
+from typing import Annotated, Any, Final, Self
 
-import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from ucfrec.episodes.item_table import WINDOW
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.errors import InputError
 from ucfrec.provenance import config_hash
+from ucfrec.settings import Share, Weight, settings_table
 
-_RANGES: Final = {
-    "target": (-1e12, 1e12),
-    "minimum_target": (-1e12, 1e12),
-    "reward_weight": (0.0, 1e6),
-    "policy_weight": (0.0, 1e6),
-    "lookahead": (0.0, 1e12),
-    "temperature": (0.0, 1e6),
-    "top_k": (1, 10**9),
-    "tag_window": (0, 10**4),
-    "tag_run": (0, WINDOW),
-    "explore": (0.0, 1.0),
-    "explore_top": (1, 10**9),
-}
+_Return = Annotated[float, Field(ge=-1e12, le=1e12)]
+_Items = Annotated[int, Field(ge=1, le=10**9)]
 _COLDEST: Final = 1e-30
 """Temperature below which dividing by it would leave the range of float32."""
-_OPTIONAL: Final = ("target", "minimum_target", "top_k", "explore_top")
-_WHOLE: Final = ("top_k", "tag_window", "tag_run", "explore_top")
 _FEW: Final = 2**16
 """Scores up to which looking for blocks first costs more."""
 _BLOCK: Final = 128
 """Items of the smallest block; maxima of fewer cost more."""
 
 
-@dataclass(frozen=True)
+@settings_table("")
 class DecisionRule:
     """How a trained policy decides: π(i) ∝ [π(i | s, Ĝ)^w · exp(β · f̂_r(s, i))]^(1/T) over what is
     allowed.
@@ -50,56 +38,42 @@ class DecisionRule:
         InputError: a value is out of range.
     """
 
-    target: float | None
+    target: _Return | None
     """Target return in units of the training reward, of a session or of every step (`ReturnToGo`);
     None for the largest return that the policy expects in each state."""
-    minimum_target: float | None = None
+    minimum_target: _Return | None = None
     """Target returns are at least this, also once a session has reached its target; None for no
     minimum."""
-    reward_weight: float = 0.0
+    reward_weight: Weight = 0.0
     """β, weight of the reward model, whose predictions are log-odds of a reward, or rewards in
     standard deviations; 0 for none."""
-    policy_weight: float = 1.0
+    policy_weight: Weight = 1.0
     """w, weight of the policy; 0 for none."""
-    lookahead: float = 0.0
+    lookahead: Annotated[float, Field(ge=0, le=1e12)] = 0.0
     """V, expected return after the step, in reward units, of a session that it does not end; 0 for
     none."""
-    temperature: float = 0.0
+    temperature: Weight = 0.0
     """T; items are drawn, or, at 0, the best is taken."""
-    top_k: int | None = None
+    top_k: _Items | None = None
     """Only this number of best items are drawn from; None for all."""
     exclude_seen: bool = False
     """Whether items that the session has shown are excluded."""
-    tag_window: int = 0
+    tag_window: Annotated[int, Field(ge=0, le=10**4)] = 0
     """Items that share a tag with one of this number shown before are excluded, unless none
     remain."""
-    tag_run: int = 0
+    tag_run: Annotated[int, Field(ge=0, le=WINDOW)] = 0
     """Items with the main tag of the so many shown before are excluded, if all of these had it and
     were liked, unless none remain; 0 for no such limit."""
-    explore: float = 0.0
+    explore: Share = 0.0
     """Share of the requests whose items are drawn uniformly from all that are allowed."""
-    explore_top: int | None = None
+    explore_top: _Items | None = None
     """Such requests draw from the so many best items only; None for all."""
 
     def __post_init__(self) -> None:
-        for name, (low, high) in _RANGES.items():
-            value = getattr(self, name)
-            if value is None and name in _OPTIONAL:
-                continue
-            whole, kinds = name in _WHOLE, (int, np.integer)
-            right = isinstance(value, kinds if whole else (*kinds, float, np.floating))
-            if not right or isinstance(value, bool) or not low <= value <= high:
-                number = "whole number" if whole else "finite number"
-                raise InputError(
-                    f"the decision rule has {name} {value!r}; give a {number} from {low:g} to "
-                    f"{high:g}"
-                )
-            # Equal rules have equal types, and so the same hash.
-            object.__setattr__(self, name, int(value) if whole else float(value) + 0.0)
-        if not isinstance(self.exclude_seen, bool):
-            raise InputError(
-                f"the decision rule has exclude_seen {self.exclude_seen!r}; give true or false"
-            )
+        for name, value in vars(self).items():
+            if isinstance(value, float):
+                # Equal rules have the same hash: 0 is not −0.
+                object.__setattr__(self, name, float(value) + 0.0)
 
     def as_dict(self) -> dict[str, Any]:
         """The fields, as a JSON object."""
@@ -110,22 +84,15 @@ class DecisionRule:
         """Rebuild a rule from its `as_dict`.
 
         Args:
-            values: the fields.
-            source: where they come from, for messages.
+            source: where the fields come from, for messages.
 
         Raises:
             InputError: a field is unknown, missing, of another type or out of range.
         """
-        known = {each.name for each in fields(cls)}
-        if "target" not in values or not values.keys() <= known:
-            raise InputError(
-                f"{source} is not a decision rule: it has the fields {', '.join(values)}; it needs "
-                f"target and knows {', '.join(sorted(known))}"
-            )
         try:
             return cls(**values)
         except InputError as error:
-            raise InputError(f"{source}: {error}") from None
+            raise InputError(f"{source} is not a decision rule: {error}") from None
 
     def __str__(self) -> str:
         target = "the largest return expected" if self.target is None else f"{self.target:g}"

@@ -76,7 +76,6 @@ def run_grid(
 
     Args:
         cells: picklable cells.
-        how: how a cell is measured.
         results: file of result rows (JSON lines); its other rows are kept.
         workers: number of cells that are measured at a time, each in a process of its own.
         describe: name of the benchmark in progress output.
@@ -93,12 +92,7 @@ def run_grid(
     """
     if workers < 1:
         raise InputError(f"--workers is {workers}; at least one is needed")
-    tasks: dict[str, _Task[Cell]] = {}
-    for cell in cells:
-        config = _plain(how.config(cell))
-        named = None if config is None else config_hash(config)
-        key = replace(how.key(cell), config_hash=named)
-        tasks.setdefault(str(key), _Task(cell, key, config, how, results, wait=False))
+    tasks = _tasks(cells, how, results)
     if again:
         remove_rows(results, [task.key for task in tasks.values()])
         for made in {folder for task in tasks.values() for folder in how.made(task.cell)}:
@@ -122,6 +116,17 @@ def run_grid(
                 f"them. The first: {failed[0]}"
             )
     return [row for rows in found.values() for row in rows]
+
+
+def _tasks(cells: Sequence[Cell], how: Measurement[Cell], results: Path) -> dict[str, _Task[Cell]]:
+    """One task for each key, by its text."""
+    tasks: dict[str, _Task[Cell]] = {}
+    for cell in cells:
+        config = how.config(cell)
+        plain = None if config is None else json.loads(json.dumps(config))  # tuples become lists
+        key = replace(how.key(cell), config_hash=None if plain is None else config_hash(plain))
+        tasks.setdefault(str(key), _Task(cell, key, plain, how, results, wait=False))
+    return tasks
 
 
 def _measure_all(
@@ -219,7 +224,6 @@ def chosen(known: Iterable[str], wanted: Sequence[str], what: str) -> list[str]:
     """The names of `known` that are in `wanted`, in the order of `known`.
 
     Args:
-        known: available names.
         wanted: selected names; empty for all.
         what: what the names stand for, for the message: "method", "table".
 
@@ -230,9 +234,3 @@ def chosen(known: Iterable[str], wanted: Sequence[str], what: str) -> list[str]:
     if unknown := [name for name in wanted if name not in known]:
         raise InputError(f"no {what} is called {', '.join(unknown)}; there are {', '.join(known)}")
     return [name for name in known if name in wanted or not wanted]
-
-
-def _plain(config: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
-    """A configuration after a JSON round trip, which turns tuples into lists."""
-    plain: Mapping[str, Any] | None = json.loads(json.dumps(config))
-    return plain

@@ -42,11 +42,7 @@ class Plan:
         Cells of equal trainings share a run.
 
         Args:
-            table: table of the rows.
-            task: what the methods are trained on.
-            methods: by name.
             evaluation: None for the budget's.
-            conditions: further conditions of the rows.
         """
         store = EpisodeStore.open(task.store)
         for name, method in methods.items():
@@ -91,8 +87,6 @@ class Plan:
         """One cell for each built-in policy of the task's environments.
 
         Args:
-            table: table of the rows.
-            task: whose behaviors are evaluated.
             methods: of the table; a built-in policy of the same name is distinguished from it.
         """
         for name in task.behaviors:

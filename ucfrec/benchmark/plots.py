@@ -22,8 +22,6 @@ def plot_methods(rows: _Rows, folder: Path, kind: str = "methods") -> list[Path]
     """One plot per environment: return of every method, mean and standard deviation over seeds.
 
     Args:
-        rows: of one table.
-        folder: of the files.
         kind: what the files are called, before the environment.
     """
     return _by_environment(kind, _bars, rows, folder)

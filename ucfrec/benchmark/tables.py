@@ -175,7 +175,6 @@ def over_seeds(
     Args:
         lines: as `ResultRow.as_line` returns them; a value may be missing or None.
         by: names of the columns to group by.
-        values: names of the numeric columns.
     """
     groups = grouped(lines, lambda line: tuple(line[name] for name in by))
     return [
@@ -197,8 +196,6 @@ def difference_table(
     over datasets if both have rows of all.
 
     Args:
-        rows: rows of one checkpoint.
-        first: the reference.
         metric: name of a metric; of methods without it there is no line.
     """
     values, tasks = _by_seed(rows, metric), list(dict.fromkeys(row.task for row in rows))

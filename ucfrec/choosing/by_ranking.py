@@ -12,48 +12,42 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.scorer import Scorer, logged_history
+from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.choosing.choice import RankedRule, RuleChoice
-from ucfrec.choosing.config import RuleConfig
+from ucfrec.choosing.logged import SHOWN, scores_at
+from ucfrec.choosing.problem import Problem
 from ucfrec.episodes.item_counts import TrainingCounts, liked_steps
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.progress import progress
 
-SHOWN = 10
-"""Items that a rule shows at a step."""
 _MOST_STEPS = 4000
 """Validation rows that are ranked at most."""
 _HALVINGS = 3
 """How often the interval between the best reward weight and the next larger one is halved."""
 _PRIOR = 10.0
 """Impressions at the mean rate that are added to those of an item."""
-_AT_ONCE = 256
 
 
-def choose_by_ranking(
-    scorer: Scorer, train: EpisodeStore, validation: EpisodeStore, config: RuleConfig, seed: int
-) -> RuleChoice:
-    """Choose the reward weight of the rule of `scorer`; its other parts stay.
+def choose_by_ranking(problem: Problem) -> RuleChoice:
+    """Choose the reward weight of the rule; its other parts stay.
 
     Of those with enough overlap, the one with the highest rate is chosen, and of those whose rates
     cannot be distinguished the one with the most hits; without any, no reward weight. If the next
     larger of the candidates overlaps too little, reward weights between the two are tried. The
-    arguments are those of `ucfrec.choosing.choose.choose_rule`; `config.reward_weights` are the
-    first candidates, and `seed` is of the validation rows that are drawn from more than 4,000.
+    first candidates are the configured ones; of more than 4,000 validation rows, so many are drawn.
     """
-    rows, tried = _Rows.of(train, validation, seed), list[_Tried]()
+    scorer, tried = problem.scorer, list[_Tried]()
+    rows = _Rows.of(problem.train, problem.validation, problem.seed)
 
     def rank(weights: Sequence[float]) -> _Tried:
         for weight, top in zip(weights, _tops(scorer, weights, rows), strict=True):
             tried.append(_Tried.of(replace(scorer.rule, reward_weight=weight), top, rows))
         return _best(tried)
 
-    best = rank(sorted({0.0, *config.reward_weights}))
+    best = rank(sorted({0.0, *problem.config.reward_weights}))
     for _ in range(_HALVINGS):
         weight = best.rule.reward_weight
         larger = [each for each in tried if each.rule.reward_weight > weight]
@@ -180,22 +174,11 @@ class _Rows:
         )
 
 
-@torch.no_grad()
 def _tops(scorer: Scorer, reward_weights: Sequence[float], rows: _Rows) -> list[IntArray]:
-    """The items (M, `SHOWN`) that are shown with each reward weight.
-
-    Policy and reward model are computed once for all reward weights.
-    """
-    scorers = [scorer.under(replace(scorer.rule, reward_weight=each)) for each in reward_weights]
-    tops = list[list[Tensor]]()
-    with progress(len(rows.steps), "choose the rule", "rows") as bar:
-        for first in range(0, len(rows.steps), _AT_ONCE):
-            part = slice(first, first + _AT_ONCE)
-            episodes, steps = rows.episodes[part], rows.steps[part]
-            known, seen = logged_history(scorer, rows.store, episodes, steps)
-            history = scorer.with_target(known)
-            query = scorer.query(history, rewards=any(reward_weights))
-            scores = (each.scores_of(query, history, excluded=seen) for each in scorers)
-            tops.append([each.topk(min(SHOWN, each.shape[1])).indices for each in scores])
-            bar.update(len(steps))
+    """The items (M, `SHOWN`) that are shown with each reward weight."""
+    rules = [replace(scorer.rule, reward_weight=each) for each in reward_weights]
+    batches = scores_at(scorer, rules, rows.store, rows.episodes, rows.steps)
+    tops = [
+        [each.topk(min(SHOWN, each.shape[1])).indices for each in scores] for _, scores in batches
+    ]
     return [torch.cat(parts).numpy() for parts in zip(*tops, strict=True)]

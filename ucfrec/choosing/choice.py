@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.choosing.logged import Evidence
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,29 @@ class SimulatedRule:
     """Share of decisions on items that the log supports."""
     items: float
     """Effective number of items shown."""
+    evidence: Evidence | None = None
+    """What validation sessions show of it; None if no one looked."""
+
+    @property
+    def effective_users(self) -> float:
+        """Of `evidence`; 0 without."""
+        return self.evidence.effective_users or 0.0 if self.evidence else 0.0
+
+
+@dataclass(frozen=True)
+class ValueEstimate:
+    """Return of a session under the chosen rule, in simulated sessions that did not choose it."""
+
+    value: float
+    error: float
+    """Its standard error, over the sessions or between the halves, whichever is larger."""
+    halves: tuple[float, float]
+    """The value in the sessions of either half of the users."""
+    optimism: tuple[float, float] | None
+    """By what share the user model expects too much on validation rows of users that it is not
+    calibrated on, and the standard error; None where validation users are new."""
+    doubts: tuple[str, ...]
+    """Why it cannot be trusted; empty if it can."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +71,8 @@ class RuleChoice:
     chosen_by: str
     """What chose it, in words."""
     candidates: Sequence[SimulatedRule | RankedRule]
+    estimate: ValueEstimate | None = None
+    """Its value; None for a rule that was not simulated."""
     warning: str = ""
     """What is wrong with the rule, in words; empty if nothing is."""
     details: Mapping[str, Any] = field(default_factory=dict)

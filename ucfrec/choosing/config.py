@@ -55,6 +55,9 @@ class RuleConfig:
     least_items: Annotated[float, Field(ge=1, le=10**9)] = 10.0
     """Smallest effective number of items that a rule must show, the exponential of their entropy: a
     page of them; at most a quarter of the items that the log supports."""
+    evidence: Annotated[int, Field(ge=0, le=10**9)] = 200
+    """Effective users of the validation sessions that a rule must leave where the log has
+    propensities, so that its value can be estimated from logs; 0 for any."""
     tolerance: Annotated[float, Field(ge=0, lt=1)] = 0.02
     """Share of the best estimate by which that of a rule at a higher temperature, or with less
     reward weight, may fall short: the standard error of the sessions, which is allowed in any

@@ -44,6 +44,7 @@ class DemoConfig:
         "train.learning_rate=2e-3",
         "crm.epochs=4",
         "rule.sessions=50",
+        "rule.evidence=0",
     )
     context: int = 11
     dim: int = 32

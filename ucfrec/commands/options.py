@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ucfrec.errors import InputError
 from ucfrec.files.remote import Input, uri_or_path
 
 if TYPE_CHECKING:
@@ -139,6 +138,13 @@ def rule_options(parser: argparse.ArgumentParser) -> None:
     rule = parser.add_argument_group(
         "decision rule", "each part is the run's own, chosen at the end of its training, by default"
     )
+    _score_options(rule)
+    _draw_options(rule)
+    _filter_options(rule)
+
+
+def _score_options(rule: argparse._ArgumentGroup) -> None:
+    """Add what the score of an item is made of."""
     target = rule.add_mutually_exclusive_group()
     target.add_argument(
         "--target-return",
@@ -176,6 +182,10 @@ def rule_options(parser: argparse.ArgumentParser) -> None:
         metavar="RETURN",
         help="expected return after a step that does not end the session; 0 for none",
     )
+
+
+def _draw_options(rule: argparse._ArgumentGroup) -> None:
+    """Add how items are drawn by their scores."""
     rule.add_argument(
         "--temperature", type=float, help="draw items at this temperature; 0 takes the best"
     )
@@ -189,6 +199,10 @@ def rule_options(parser: argparse.ArgumentParser) -> None:
     rule.add_argument(
         "--explore-top", type=int, metavar="N", help="these draw from the N best items only"
     )
+
+
+def _filter_options(rule: argparse._ArgumentGroup) -> None:
+    """Add which items are left out."""
     rule.add_argument(
         "--exclude-seen", action="store_true", help="exclude items that the session has shown"
     )
@@ -379,29 +393,11 @@ def logs_given(
     if options.mapping is not None:
         given = given.over(read_mapping(options.mapping))
     if trained is not None and options.dataset is None:
-        return _logs_like(trained, options.logs, given)
+        from ucfrec.runs.later_logs import later_logs
+
+        return later_logs(trained, options.logs, given)
     dataset: Dataset = load_plugin("datasets", options.dataset or "generic")
     return dataset.resolve(options.logs, given)
-
-
-def _logs_like(
-    trained: "TrainedPolicy", paths: list[str], given: "LogMapping"
-) -> "tuple[tuple[Path, ...], LogMapping]":
-    """Logs of the dataset that a policy was trained on, whose columns may have plain names too."""
-    from ucfrec.logs.mapping import LogMapping
-    from ucfrec.plugins import load_plugin, plugin_names
-
-    source = trained.record.data
-    # A record may also name a dataset that is not read by an adapter.
-    known = source.dataset in plugin_names("datasets")
-    dataset: Dataset = load_plugin("datasets", str(source.dataset) if known else "generic")
-    remembered = LogMapping.of_source(source, str(trained.folder)).remembered or LogMapping()
-    try:
-        files, found = dataset.resolve(paths, given)
-    except InputError:
-        files, found = dataset.resolve(paths, given.over(LogMapping(remembered.columns)))
-    columns = {name: text for name, text in found.columns.items() if name not in given.columns}
-    return files, replace(given, remembered=LogMapping(columns))
 
 
 def environment_given(options: argparse.Namespace) -> "Environment":

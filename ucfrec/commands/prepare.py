@@ -55,6 +55,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="exclude and count sessions of more than N rows, as of bots (default: none)",
     )
     parser.add_argument(
+        "--validate", action="store_true", help="check the logs without writing a store"
+    )
+    _engine_options(parser)
+
+
+def _engine_options(parser: argparse.ArgumentParser) -> None:
+    """Add what reads the rows, and in how much memory."""
+    parser.add_argument(
         "--memory-limit",
         metavar="SIZE",
         help="memory of the whole command, from 800MB on; beyond it rows spill to a scratch folder "
@@ -71,9 +79,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="MASTER",
         help="with --engine spark: its master, e.g. spark://HOST:7077; logs and STORE must lie "
         "where every worker sees them (default: local[*], this machine)",
-    )
-    parser.add_argument(
-        "--validate", action="store_true", help="check the logs without writing a store"
     )
 
 

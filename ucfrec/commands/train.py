@@ -30,6 +30,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="keep the weights of the training rows (default: once everything is chosen, go on "
         "learning from all rows; `rank` and `ope` on the test split use the weights before that)",
     )
+    parser.add_argument(
+        "--evidence",
+        type=int,
+        metavar="N",
+        help="effective users that the decision rule must leave in the validation sessions, where "
+        "the log has propensities, so that `ope` can estimate its value; 0 for any (default: 200)",
+    )
 
 
 def training_options(parser: argparse.ArgumentParser) -> None:
@@ -110,13 +117,17 @@ def _train(options: argparse.Namespace) -> None:
         wait()  # until the leader has begun the run
     store = EpisodeStore.open(options.store)
     if options.refit is not None:
-        if options.config is not None or options.set or options.screen:
+        given = (options.config, options.set or None, options.screen, options.evidence)
+        if any(each is not None for each in given):
             raise InputError(
-                "--refit takes all settings of the run; omit --config, --set and --screen"
+                "--refit takes all settings of the run; omit --config, --set, --screen and "
+                "--evidence"
             )
         record = refit(store, options.refit, options.out)
     else:
-        config = resolve_config(options.policy, options.config, options.set, options.seed)
+        wanted = [] if options.evidence is None else [f"rule.evidence={options.evidence}"]
+        settings = [*options.set, *wanted]
+        config = resolve_config(options.policy, options.config, settings, options.seed)
         record = train_screened(store, options.out, config, options.screen)
     if options.no_refit:
         shutil.rmtree(options.out / REFIT, ignore_errors=True)

@@ -73,7 +73,6 @@ class ActionGenerator:
             episodes: (M,) positions in the view.
             steps: (M,) steps of those episodes.
             count: actions drawn for each step.
-            seed: of the draws.
         """
         exact, rng = copy.deepcopy(self.crm).double(), np.random.default_rng([seed, _STREAM])
         chunks = []

@@ -11,9 +11,8 @@ import torch
 from ucfrec import schema
 from ucfrec.counterfactual.action_augmentation import ActionGenerator, logged_actions
 from ucfrec.counterfactual.clusters import ActionSupport
-from ucfrec.counterfactual.effects_mean import EffectsMean, EffectTransitions
 from ucfrec.counterfactual.generators import CSGConfig, make_generator, state_clusters
-from ucfrec.counterfactual.reward_model import CRMConfig
+from ucfrec.counterfactual.reward_model import CRMConfig, EffectsMean, EffectTransitions
 from ucfrec.counterfactual.reward_model_fit import fit_crm
 from ucfrec.counterfactual.state_augmentation import (
     AugmentationReport,
@@ -28,7 +27,9 @@ from ucfrec.errors import InputError
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.user_model.reward_fit import fit_item_reward_model
 
-MODELS: Final = ("item-reward", "crm", "csg")
+CRM: Final = "crm"
+"""Folder of the reward model."""
+MODELS: Final = ("item-reward", CRM, "csg")
 """Folders of the checkpoints of `counterfactual_augmentation`; which of them there are depends on
 the settings."""
 _CPU: Final = torch.device("cpu")
@@ -66,11 +67,7 @@ def counterfactual_augmentation(
     Args:
         train: view to fit both models to and to copy episodes from.
         validation: view for early stopping and for the quality of the reward model.
-        crm_config: settings of the reward model.
-        csg_config: settings of the state generator.
-        config: settings of the copies.
         folder: of the checkpoints, which training resumes from.
-        seed: of everything random.
         device: where both models are fitted and edits are made.
 
     Raises:
@@ -85,7 +82,7 @@ def counterfactual_augmentation(
     sampled = sample_steps(train, limit, seed)
     training = read(train, *sampled)
     held_out = sample_transitions(validation, limit // 10, seed, read)
-    crm, crm_report = fit_crm(training, held_out, crm_config, folder / "crm", seed, mean, device)
+    crm, crm_report = fit_crm(training, held_out, crm_config, folder / CRM, seed, mean, device)
     if not config.copies:
         # Nothing proposes states, so no generator is trained.
         csg_config = replace(csg_config, kind="noise")

@@ -74,7 +74,6 @@ class ActionSupport:
 
         Args:
             labels: (B,) clusters.
-            generator: of the draws.
 
         Returns:
             Actions, (B,) or (B, A), and (B,) whether the cluster has a logged step at all; where it

@@ -107,9 +107,7 @@ class TangentGenerator:
     def __init__(self, crm: CausalRewardModel, clusters: StateClusters, config: CSGConfig) -> None:
         """
         Args:
-            crm: the fitted reward model.
             clusters: of the states that edits are proposed for.
-            config: band and number of Newton steps.
         """
         self._crm = crm
         self._clusters = clusters.to(crm.device)
@@ -235,9 +233,7 @@ def make_generator(
         train: M transitions to fit to, on the CPU.
         crm: the fitted reward model, whose device the generator shares; its parameters are frozen
             if the kind is `faithful`.
-        config: kind and settings.
         folder: of the checkpoints of `faithful`, which resumes from them.
-        seed: of sampling, clustering and training.
         clusters: the `state_clusters` of the same arguments, if they are known.
     """
     if config.kind == "noise":

@@ -63,8 +63,6 @@ def measured_reward(
 
     Args:
         train: a view of the training episodes, with observations.
-        config: of the test.
-        most: largest number of transitions used.
         seed: of the transitions and of the rows kept apart.
         dimensions: to test; None for all.
 
@@ -181,13 +179,7 @@ def _predicted(
 
 
 def steps_with_successor(view: EpisodeStore, most: int, seed: int) -> tuple[IntArray, IntArray]:
-    """Episodes and steps (N,) that are not the last of their session; of more than `most`, so many.
-
-    Args:
-        view: any.
-        most: steps.
-        seed: of the draw.
-    """
+    """Episodes and steps (N,), not the last of their session; of more than `most`, so many."""
     episodes, steps = view.all_steps()
     inner = np.flatnonzero(steps < view.lengths[episodes] - 1)
     if len(inner) > most:

@@ -121,10 +121,6 @@ def shared_pair(
 
     Args:
         data: steps, of which those held out are not seen.
-        width: of the two hidden layers.
-        steps: number of updates.
-        batch_size: transitions of an update.
-        learning_rate: highest step size.
     """
     size = data.states.shape[1]
     inputs = 2 * size + data.actions.shape[1]

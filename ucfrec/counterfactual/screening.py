@@ -130,8 +130,6 @@ def screen(train: EpisodeStore, config: ScreeningConfig, seed: int) -> Screening
 
     Args:
         train: a view of the training episodes.
-        config: of the tests.
-        seed: of the predictors.
 
     Raises:
         InputError: no observations are logged, or there are too few episodes to hold some out.
@@ -357,8 +355,6 @@ def _effect_on_next(
 
     Args:
         pair: (2, B, H) squared errors of helped dimensions, without and with a dimension.
-        data: all steps.
-        config: of the tests.
     """
     capped = pair.minimum(pair.flatten(0, 1).quantile(1 - config.capped, dim=0))
     saved = (capped[0] - capped[1]) / capped[0].mean(0).clamp(min=1e-12)

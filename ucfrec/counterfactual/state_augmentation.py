@@ -113,7 +113,6 @@ class MoveStatistics:
 
         Args:
             rho_high: upper end of the histogram of lengths.
-            dimensions: number of state dimensions that vary.
         """
         lengths = torch.cat([torch.zeros(0, dtype=torch.float64), *self._lengths]).numpy()
         counts, edges = np.histogram(lengths, bins=_BINS, range=(0.0, rho_high))
@@ -179,7 +178,6 @@ def accept(
     """Which proposals pass both gates of Eq. 4 (Algorithm 4).
 
     Args:
-        crm: the fitted reward model.
         factual: M logged steps.
         z: (M, latent_dim) disturbances abduced from them.
         proposals: (M, S) counterfactual states.
@@ -208,11 +206,7 @@ def augment(
 
     Args:
         view: the training episodes, without augmented episodes.
-        crm: the fitted reward model.
-        crm_report: its quality, for the report.
-        generator: proposes counterfactual states.
         config: numbers of copies and edits, and the gate.
-        seed: of sampling and proposals.
         read: reads transitions with the actions that the reward model was fitted to.
     """
     rng = np.random.default_rng(seed)
@@ -296,7 +290,6 @@ def candidates(
 
     Args:
         view: the training episodes, without copies.
-        config: filter and number of steps.
         rng: draws episodes if there are too many steps.
     """
     order = rng.permutation(view.n_episodes)

@@ -31,11 +31,12 @@ class StoreWriter:
         writer.finish(reward="is_click", source={})
     """
 
-    def __init__(self, folder: Path, shard_steps: int = 2**24) -> None:
+    def __init__(self, folder: Path, shard_steps: int = 2**24, first_shard: int = 0) -> None:
         """
         Args:
             folder: to write to.
             shard_steps: a shard ends with the first episode that brings it to this many steps.
+            first_shard: number of the first shard.
         """
         self._folder = folder
         self._shard_steps = shard_steps
@@ -45,7 +46,8 @@ class StoreWriter:
         self._offsets: list[IntArray] = []
         self._episode_values: dict[str, list[Array]] = {}
         self._split_counts = np.zeros((len(schema.SPLITS), 2), dtype=np.int64)
-        self._shards = self._steps_in_shard = self._n_steps = self._n_episodes = 0
+        self._steps_in_shard = self._n_steps = self._n_episodes = 0
+        self._shards = first_shard
 
     def append(
         self,

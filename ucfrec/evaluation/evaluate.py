@@ -18,7 +18,7 @@ from ucfrec.evaluation.collect import environment_items
 from ucfrec.evaluation.diversity import Recommended
 from ucfrec.evaluation.diversity_columns import variety_columns
 from ucfrec.evaluation.environment import Environment
-from ucfrec.evaluation.metrics import session_metrics
+from ucfrec.evaluation.session_metrics import session_metrics
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.results.row import ResultRow

@@ -24,7 +24,7 @@ from ucfrec.episodes.item_counts import liked_steps
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.evaluation.liked import Liked
-from ucfrec.evaluation.metrics import resampled_ratios
+from ucfrec.evaluation.session_metrics import resampled_ratios
 
 _SCORES_AT_ONCE = 2**24
 _STEPS_AT_ONCE = 1024

@@ -29,7 +29,6 @@ def files_of(
     """Size and checksum of every file of a complete folder, but its record.
 
     Args:
-        folder: the folder.
         record: name of the record in it, e.g. `meta.json`.
         known: files that keep the entry that they have.
     """

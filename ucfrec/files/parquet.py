@@ -20,10 +20,6 @@ def require_plausible_rows(path: Path, rows: int) -> None:
     A log has at least a user, an item and a time a row, which take some bytes however well they are
     compressed; ten rows a byte can only be repetitions, of which duplicates are dropped anyway.
 
-    Args:
-        path: of the file.
-        rows: that it claims to hold.
-
     Raises:
         InputError: it claims over a million rows, and over ten for each of its bytes.
     """

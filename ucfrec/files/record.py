@@ -93,10 +93,6 @@ class Record(Entry):
     def of(cls, value: Mapping[str, Any], path: Path) -> Self:
         """The record of a JSON object.
 
-        Args:
-            value: the object.
-            path: of its file, for messages.
-
         Raises:
             InputError: an entry is missing, has another type or is out of range.
         """

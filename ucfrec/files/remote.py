@@ -47,7 +47,6 @@ def uri_or_path(
     """Type of an argument that may be a URI.
 
     Args:
-        kind: what the argument is.
         local: type of the argument if it is a path.
     """
 

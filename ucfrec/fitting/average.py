@@ -117,7 +117,6 @@ def averages(
 
     Args:
         tensors: of `WeightAverage.state`; others are ignored.
-        weights: of the same step, by name.
         counters: of `WeightAverage.state`.
     """
     means = {}

@@ -161,8 +161,6 @@ def load_module(path: Path, build: Callable[[], _Module], tensors: dict[str, Ten
 
     Args:
         path: where `tensors` were read from, for messages.
-        build: makes the module.
-        tensors: its weights.
 
     Raises:
         InputError: they are the weights of another architecture.

@@ -2,11 +2,11 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from ucfrec.fitting import distributed
 from ucfrec.fitting.average import WeightAverage
 from ucfrec.fitting.checkpoint import (
     load_tensors,
+    load_trained,
     load_training,
     load_weights,
     save_tensors,
@@ -26,11 +27,12 @@ from ucfrec.fitting.checkpoint import (
 )
 from ucfrec.fitting.metrics_log import MetricsLog
 from ucfrec.fitting.random_state import random_state_kept
-from ucfrec.fitting.row_optimizer import RowAdamW, clip_gradients
 from ucfrec.progress import Progress, no_progress, progress
 from ucfrec.settings import BatchSize, Count, LearningRate, WeightDecay, settings_table
 
 Batch = TypeVar("Batch")
+INITIAL: Final = "initial.safetensors"
+"""File of the weights that a training begins with, in its folder, if it is there."""
 
 
 @settings_table("train")
@@ -84,6 +86,37 @@ class Fit:
     """Wall-clock time up to the last checkpoint, summed over all resumptions."""
 
 
+Watcher = Callable[[int, Mapping[str, float]], None]
+
+
+@dataclass(frozen=True)
+class Callbacks:
+    """What is told of a training while it goes on, for any tracker of experiments.
+
+    What one raises ends the training, which can be resumed. Of the processes of `torchrun`, only
+    the leader's are called.
+    """
+
+    on_step: Watcher | None = None
+    """Called after every update, with the step (from 1) and its `loss`."""
+    on_validation: Watcher | None = None
+    """Called after every validation, with the step and all that is logged: `validation_loss`,
+    `loss`, `gradient_norm`, …"""
+
+    def step(self, step: int, loss: Tensor) -> None:
+        """Tell of an update."""
+        if self.on_step is not None and distributed.leads():
+            self.on_step(step, {"loss": loss.item()})
+
+    def validation(self, step: int, logged: Mapping[str, float]) -> None:
+        """Tell of a validation."""
+        if self.on_validation is not None and distributed.leads():
+            self.on_validation(step, logged)
+
+
+SILENT: Final = Callbacks()
+
+
 def step_generator(seed: int, step: int) -> np.random.Generator:
     """The generator for all random draws of one training step.
 
@@ -105,38 +138,31 @@ def fit(
     validate: Callable[[], float] | None = None,
     describe: str = "train",
     rows: Callable[[Batch], float] | None = None,
+    callbacks: Callbacks = SILENT,
 ) -> Fit:
     """Minimise `loss` over batches from `draw`, resuming from `folder` if it holds a checkpoint.
 
-    With `config.average`, what is validated and saved as the trained weights is their average.
     Writes `last.safetensors` (to resume), `best.safetensors` (weights with the lowest validation
     loss, else the last), `metrics.jsonl` and TensorBoard events to `folder`. A training killed and
     resumed ends with the weights of an uninterrupted one. The global random state is restored.
 
     Args:
         module: trained in place; holds the best weights on return.
-        draw: draws a batch with the given generator.
         loss: the scalar to minimise, and scalars to log by name, of a batch.
         validate: the validation loss; called in evaluation mode without gradients.
-        describe: name of the training in progress and error messages.
         rows: number of rows of a batch that the loss is a mean of. With it, the processes of
-            `torchrun` train together: each draws its part of every batch, gradients and logged
-            scalars are means over all rows, and `validate` has to return the same everywhere.
+            `torchrun` train together: each draws its part of every batch, and `validate` has to
+            return the same everywhere.
+        callbacks: what is told of the steps.
 
     Raises:
         InputError: a loss or gradient is not finite, or a checkpoint is damaged or does not fit.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    last, best = folder / "last.safetensors", folder / "best.safetensors"
-    optimizer = _optimizer(module, config)
-    average = WeightAverage(module, config.average) if config.average else None
-    counters = {"step": 0, "best_step": 0, "best_validation": math.inf, "stale": 0, "seconds": 0.0}
-    if last.exists():
-        counters.update(load_training(last, module, optimizer, average))
-    step = int(counters["step"])
-    clock, log = _Clock(step, counters["seconds"]), _log(folder, step)
+    training = _Training(module, config, folder, describe)
+    step = int(training.counters["step"])
+    clock, log = _Clock(step, training.counters["seconds"]), _log(folder, step)
     joint = rows if distributed.processes() > 1 else None
-    for step, bar in _steps(counters, config, describe):
+    for step, bar in _steps(training.counters, config, describe):
         generator = step_generator(seed, step)
         with clock.waiting():
             batch = draw(generator)
@@ -144,29 +170,127 @@ def fit(
         module.train()
         value, scalars = loss(batch)
         count = None if joint is None else joint(batch)
-        norm = _descend(value, module, optimizer, average, config, step, count)
+        norm = training.descend(value, step, count)
+        callbacks.step(step, value)
         if step % config.validate_every and step != config.steps:
             continue
-        means = _means({"loss": value, **scalars}, count)
-        logged = {"loss": means["loss"], "gradient_norm": norm.item(), **clock.rates(step, config)}
-        _require_finite(logged["loss"], f"{describe}: the loss", step)
-        _require_finite(logged["gradient_norm"], f"{describe}: the gradient", step)
-        with nullcontext() if average is None else average.applied():
-            logged |= means | _keep_best(module, validate, counters, step, best, describe)
-        counters |= {"step": step, "seconds": clock.total()}
+        logged = _means({"loss": value, **scalars}, count) | {"gradient_norm": norm.item()}
+        logged |= clock.rates(step, config)
+        logged |= training.validated(step, logged, validate, clock)
         if log is not None:
             log.add(step, logged)
             bar.update(0, loss=logged["loss"])
-            save_training(last, module, optimizer, counters, average)
+            training.save()
+        callbacks.validation(step, logged)
         clock.restart(step)
     if log is not None:
         log.close()
     if joint is not None:
         distributed.wait()  # until the leader has written the best weights
-    load_weights(best, module, load_tensors(best)[0])
-    module.eval()
-    lowest = math.nan if validate is None else counters["best_validation"]
-    return Fit(step, int(counters["best_step"]), lowest, counters["seconds"])
+    return training.end(step, validate is not None)
+
+
+class _Training:
+    """What a training changes, and the files that it is saved to and resumed from."""
+
+    def __init__(self, module: nn.Module, config: LoopConfig, folder: Path, describe: str) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._last, self._best = folder / "last.safetensors", folder / "best.safetensors"
+        self._module, self._config, self._describe = module, config, describe
+        self._optimizer = RowAdamW(
+            module.parameters(),
+            lr=config.learning_rate,
+            weight_decay=config.weight_decay,
+            fused=True,
+        )
+        self._average = WeightAverage(module, config.average) if config.average else None
+        self.counters: dict[str, float] = {
+            "step": 0,
+            "best_step": 0,
+            "best_validation": math.inf,
+            "stale": 0,
+            "seconds": 0.0,
+        }
+        if self._last.exists():
+            self.counters.update(load_training(self._last, module, self._optimizer, self._average))
+        elif (initial := folder / INITIAL).exists():
+            load_weights(initial, module, load_trained(initial))
+
+    def descend(self, value: Tensor, step: int, count: float | None) -> Tensor:
+        """One optimizer step on the loss `value`; returns the gradient norm before clipping.
+
+        With `count`, the number of rows of `value`, on its mean over all processes.
+        """
+        self._optimizer.zero_grad(set_to_none=True)
+        value.backward()  # type: ignore[no-untyped-call]
+        if count is not None:
+            distributed.average_gradients(self._module.parameters(), count)
+        norm = clip_gradients(self._module.parameters(), self._config.clip_norm)
+        for group in self._optimizer.param_groups:
+            group["lr"] = _learning_rate(self._config, step)
+        moved = None if self._average is None else self._average.before_step()
+        self._optimizer.step()
+        if self._average is not None and moved is not None:
+            self._average.after_step(moved)
+        return norm
+
+    def validated(
+        self,
+        step: int,
+        logged: Mapping[str, float],
+        validate: Callable[[], float] | None,
+        clock: "_Clock",
+    ) -> dict[str, float]:
+        """Check and count what was logged of a step, and keep its weights if they are the best.
+
+        Returns:
+            The validation loss, for the log; empty without validation.
+        """
+        self._require_finite("loss", logged["loss"], step)
+        self._require_finite("gradient", logged["gradient_norm"], step)
+        found = self._keep_best(validate, step)
+        self.counters |= {"step": step, "seconds": clock.total()}
+        return found
+
+    def _keep_best(self, validate: Callable[[], float] | None, step: int) -> dict[str, float]:
+        """Save the weights if their validation loss is the lowest so far, or without validation."""
+        with nullcontext() if self._average is None else self._average.applied():
+            if validate is None:
+                self.counters["best_step"] = step
+                self._save_best({"step": step})
+                return {}
+            self._module.eval()
+            with torch.no_grad():
+                loss = validate()
+            self._require_finite("validation loss", loss, step)
+            if loss < self.counters["best_validation"]:
+                self.counters |= {"best_validation": loss, "best_step": step, "stale": 0}
+                self._save_best({"step": step, "validation_loss": loss})
+            else:
+                self.counters["stale"] += 1
+            return {"validation_loss": loss}
+
+    def _require_finite(self, quantity: str, value: float, step: int) -> None:
+        if not math.isfinite(value):
+            raise InputError(
+                f"{self._describe}: the {quantity} is {value} at step {step}; lower the learning "
+                "rate or look for extreme values in the store (`ucfrec prepare --validate`)"
+            )
+
+    def save(self) -> None:
+        """Write what a resumption needs."""
+        save_training(self._last, self._module, self._optimizer, self.counters, self._average)
+
+    def end(self, step: int, validated: bool) -> Fit:
+        """Load the best weights; returns the outcome, with the last `step`."""
+        load_weights(self._best, self._module, load_tensors(self._best)[0])
+        self._module.eval()
+        lowest = self.counters["best_validation"] if validated else math.nan
+        return Fit(step, int(self.counters["best_step"]), lowest, self.counters["seconds"])
+
+    def _save_best(self, about: dict[str, float]) -> None:
+        if distributed.leads():
+            save_tensors(self._best, self._module.state_dict(), about)
 
 
 def _means(scalars: Mapping[str, Tensor], count: float | None) -> dict[str, float]:
@@ -191,42 +315,6 @@ def _steps(
             step += 1
             yield step, bar
             bar.update()
-
-
-def _optimizer(module: nn.Module, config: LoopConfig) -> torch.optim.Optimizer:
-    return RowAdamW(
-        module.parameters(),
-        lr=config.learning_rate,
-        weight_decay=config.weight_decay,
-        fused=True,
-    )
-
-
-def _descend(
-    value: Tensor,
-    module: nn.Module,
-    optimizer: torch.optim.Optimizer,
-    average: WeightAverage | None,
-    config: LoopConfig,
-    step: int,
-    count: float | None,
-) -> Tensor:
-    """One optimizer step on the loss `value`; returns the gradient norm before clipping.
-
-    With `count`, the number of rows of `value`, on its mean over all processes.
-    """
-    optimizer.zero_grad(set_to_none=True)
-    value.backward()  # type: ignore[no-untyped-call]
-    if count is not None:
-        distributed.average_gradients(module.parameters(), count)
-    norm = clip_gradients(module.parameters(), config.clip_norm)
-    for group in optimizer.param_groups:
-        group["lr"] = _learning_rate(config, step)
-    moved = None if average is None else average.before_step()
-    optimizer.step()
-    if average is not None and moved is not None:
-        average.after_step(moved)
-    return norm
 
 
 class _Clock:
@@ -267,43 +355,61 @@ def _learning_rate(config: LoopConfig, step: int) -> float:
     return config.learning_rate * warmup * (1 + math.cos(math.pi * done)) / 2
 
 
-def _require_finite(value: float, quantity: str, step: int) -> None:
-    if not math.isfinite(value):
-        raise InputError(
-            f"{quantity} is {value} at step {step}; lower the learning rate or "
-            "look for extreme values in the store (`ucfrec prepare --validate`)"
-        )
+class RowAdamW(torch.optim.AdamW):
+    """AdamW; of parameters with sparse gradients, only the rows that take part are updated.
+
+    Such a row is moved, decayed and its moments are renewed when it has a gradient, and is left
+    alone otherwise, as in `torch.optim.SparseAdam`. So a step costs what its rows cost, however
+    long the table. Dense gradients are AdamW's own.
+    """
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> Any:
+        """One update; see `torch.optim.AdamW.step`."""
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                gradient = parameter.grad
+                if gradient is not None and gradient.is_sparse:
+                    self._update_rows(parameter, gradient.coalesce(), group)
+                    parameter.grad = None
+        return super().step(closure)
+
+    def _update_rows(self, table: Tensor, gradient: Tensor, group: dict[str, Any]) -> None:
+        rows, values = gradient.indices()[0], gradient.values()
+        state = self.state[table]
+        if not state:
+            state["step"] = torch.zeros((), device=table.device)
+            state["exp_avg"] = torch.zeros_like(table)
+            state["exp_avg_sq"] = torch.zeros_like(table)
+        state["step"] += 1
+        (first, second), count = group["betas"], float(state["step"])
+        mean = state["exp_avg"][rows].lerp_(values, 1 - first)
+        square = state["exp_avg_sq"][rows].mul_(second).addcmul_(values, values, value=1 - second)
+        state["exp_avg"][rows] = mean
+        state["exp_avg_sq"][rows] = square
+        scale = square.div_(1 - second**count).sqrt_().add_(group["eps"])
+        kept = table[rows].mul_(1 - group["lr"] * group["weight_decay"])
+        table[rows] = kept.addcdiv_(mean, scale, value=-group["lr"] / (1 - first**count))
 
 
-def _keep_best(
-    module: nn.Module,
-    validate: Callable[[], float] | None,
-    counters: dict[str, float],
-    step: int,
-    best: Path,
-    describe: str,
-) -> dict[str, float]:
-    """Save the weights if their validation loss is the lowest so far, or without validation.
+def clip_gradients(parameters: Iterable[nn.Parameter], largest: float) -> Tensor:
+    """Scale the gradients so that their joint norm is at most `largest`, 0 for no limit.
+
+    Sparse gradients are coalesced.
 
     Returns:
-        The validation loss, for the log; empty without validation.
+        The norm before.
     """
-    if validate is None:
-        counters["best_step"] = step
-        _save_best(best, module, {"step": step})
-        return {}
-    module.eval()
-    with torch.no_grad():
-        loss = validate()
-    _require_finite(loss, f"{describe}: the validation loss", step)
-    if loss < counters["best_validation"]:
-        counters |= {"best_validation": loss, "best_step": step, "stale": 0}
-        _save_best(best, module, {"step": step, "validation_loss": loss})
-    else:
-        counters["stale"] += 1
-    return {"validation_loss": loss}
-
-
-def _save_best(best: Path, module: nn.Module, about: dict[str, float]) -> None:
-    if distributed.leads():
-        save_tensors(best, module.state_dict(), about)
+    gradients = []
+    for parameter in parameters:
+        if parameter.grad is None:
+            continue
+        if parameter.grad.is_sparse:
+            parameter.grad = parameter.grad.coalesce()
+            gradients.append(parameter.grad.values())
+        else:
+            gradients.append(parameter.grad)
+    norm = nn.utils.get_total_norm(gradients)
+    if largest:
+        torch._foreach_mul_(gradients, torch.clamp(largest / (norm + 1e-6), max=1.0))
+    return norm

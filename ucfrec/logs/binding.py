@@ -47,9 +47,6 @@ def bind(connection: duckdb.DuckDBPyConnection, table: Table, what: str, given: 
     and 1.
 
     Args:
-        connection: any engine.
-        table: with the columns.
-        what: purpose of the expression, for messages.
         given: column name (case does not matter) or SQL expression.
 
     Raises:
@@ -94,14 +91,7 @@ def _missing(table: Table, what: str, name: str) -> str:
 
 
 def wrong_type(table: Table, what: str, given: str, kind: str, wanted: str) -> InputError:
-    """Error for a column of an unsupported type.
-
-    Args:
-        what: log column or feature.
-        given: its column name or expression.
-        kind: its DuckDB type.
-        wanted: remedy, for the message.
-    """
+    """Error for a column of an unsupported type."""
     return InputError(f"{table.files[0]}: {what} ({given}) is {kind}; {wanted}")
 
 
@@ -112,7 +102,6 @@ def explained(
     """Turn errors of files, memory and disk that occur in the block into `InputError`.
 
     Args:
-        tables: tables that the block reads.
         folder: folder named when its disk is full.
 
     Raises:

@@ -48,7 +48,6 @@ def engine(
     configuration is locked. Every DuckDB connection of ucfrec is made in this module.
 
     Args:
-        inputs: files that will be read.
         folder: parent of the scratch folder, which is removed at the end; so is the scratch of
             killed processes in it.
         memory_limit: size such as "2GB", of the engine or with `shared` of the process, beyond

@@ -152,9 +152,7 @@ def refused(what: str, given: str, over: str, reason: str) -> InputError:
 
     Args:
         what: purpose of the expression, e.g. "for the reward".
-        given: the expression.
         over: file or table whose columns it may use.
-        reason: why it cannot be used.
     """
     origin = f"{given.origin}: " if isinstance(given, Expression) else ""
     reason = "".join(char if char.isprintable() else " " for char in reason)
@@ -198,9 +196,7 @@ def with_numbers_for_truth_values(
     """The same expression with 0 and 1 in place of the truth values of some columns.
 
     Args:
-        connection: parses the expression.
         given: as `columns_of` allows it.
-        columns: names of columns of truth values.
     """
     query = "SELECT json_serialize_sql(?)"
     (tree,) = connection.execute(query, [f"SELECT {given}\n"]).fetchall()[0]
@@ -303,7 +299,6 @@ def _walk(tree: Any, depth: int, columns: dict[str, None]) -> int:
     """Check every node of a tree.
 
     Args:
-        depth: number of nodes above it.
         columns: the names of the columns that the tree reads are added to it.
 
     Returns:

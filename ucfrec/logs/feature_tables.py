@@ -52,7 +52,6 @@ def load_features(
 
     Args:
         connection: engine that may open the tables' files.
-        tables: feature tables of the mapping.
         kind: "item_id" or "user_id".
         id_type: DuckDB type of the log's ids; rows whose key is none are excluded.
 
@@ -93,7 +92,6 @@ def feature_digest(connection: duckdb.DuckDBPyConnection, names: Sequence[str]) 
     """A digest of every id and value of feature tables, in whatever order their rows are.
 
     Args:
-        connection: engine with the tables.
         names: of `load_features`.
     """
     digest = hashlib.sha256()
@@ -186,8 +184,6 @@ def require_known_ids(
     """Check that each feature table has a feature of an id of the log.
 
     Args:
-        connection: engine with the tables.
-        tables: feature tables of the mapping.
         names: of `load_features`, for each of them.
         kind: "item_id" or "user_id".
         kept: table of the log's ids, in the column `kind`.

@@ -29,10 +29,8 @@ def encode_features(
     training split (`train_count` above 0).
 
     Args:
-        connection: engine with the tables.
         names: feature tables of `load_features`.
         ids: table with `number`, `train_count` and the ids.
-        id_column: column of the ids in it.
 
     Returns:
         (n_ids, F) float32; None if no column has a feature.
@@ -61,10 +59,8 @@ def item_tags(
     the category of a missing value.
 
     Args:
-        connection: engine with the tables.
         names: feature tables of `load_features`.
         ids: table with `number` and the ids.
-        id_column: column of the ids in it.
 
     Returns:
         (n_ids, T) int64, padded with −1, T at most `TAGS_PER_ITEM`, and 0 without columns of lists.

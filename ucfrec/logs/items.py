@@ -13,7 +13,7 @@ from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
 from ucfrec.episodes.item_table import ITEM_STATES, write_item_table
 from ucfrec.episodes.record import StoreRecord
 from ucfrec.errors import InputError
-from ucfrec.logs.moments import Moments
+from ucfrec.logs.measures import Moments
 from ucfrec.logs.spectral import SparseRows, right_singular_vectors
 from ucfrec.processes import require_blas_memory
 
@@ -119,9 +119,6 @@ def write_item_states(
         scratch: folder for files that are of no use afterwards.
         item_features: (n_items, F) as from `ucfrec.logs.features.encode_features`; None for none.
         user_features: (n_users, G) likewise.
-        n_items: number of items of the store.
-        n_users: number of users of the store.
-        size: most dimensions of the item embeddings.
         tags: (n_items, T) as from `ucfrec.logs.features.item_tags`; None for none.
 
     Raises:
@@ -161,7 +158,6 @@ class Exposure:
     def __init__(self, path: Path, counts: IntArray) -> None:
         """
         Args:
-            path: of a new file for scratch.
             counts: (n_items,) number of training steps that show each item.
         """
         self.counts = counts
@@ -219,7 +215,6 @@ def item_embeddings(
     features themselves, reduced by SVD. No embedding has a norm above 1.
 
     Args:
-        exposure: all training steps.
         features: (n_items, F); None for none.
         size: largest D.
 
@@ -234,14 +229,14 @@ def item_embeddings(
     trust = (counts / (counts + PRIOR_COUNT))[:, None]
     combined = np.zeros((len(exposure.counts), cooccurrence.shape[1]))
     if features is not None:
-        combined = _predicted(features, trained, cooccurrence, counts)
+        combined = predicted_from_features(features, trained, cooccurrence, counts)
     combined[trained] = trust * cooccurrence + (1 - trust) * combined[trained]
     if content is None:
         return np.asarray(combined, dtype=np.float32)
     return np.asarray(np.hstack([combined, content]) / np.sqrt(2), dtype=np.float32)
 
 
-def _predicted(
+def predicted_from_features(
     features: sparse.csr_matrix,
     trained: IntArray,
     cooccurrence: Float64Array,

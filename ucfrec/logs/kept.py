@@ -133,7 +133,6 @@ def in_hashed_order(
     Args:
         rows: as of `kept_rows`.
         kept: (K,) positions, in order, of the rows that are kept.
-        hashes: of the identifiers.
 
     Returns:
         (K,) the positions in the new order, and how many rows share their user and time.

@@ -1,16 +1,16 @@
-"""What a log's episodes hold, counted in one pass over its sorted rows."""
+"""What a log's episodes hold, counted in one pass over its sorted rows, and its distributions."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from ucfrec import schema
-from ucfrec.arrays import Array, IntArray
+from ucfrec.arrays import Array, Float64Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.logs.moments import Moments
 from ucfrec.logs.sessions import Cut, Episodes, episodes
 from ucfrec.logs.spool import BLOCK, Spool
 
@@ -55,6 +55,46 @@ class ValueCounts:
         self.counts += np.bincount(places, minlength=len(self.values))
 
 
+class Moments:
+    """Number, mean and sums of squared deviations of vectors of one size.
+
+    Batches are merged by the formula of Chan, Golub and LeVeque (1983), whose rounding errors do
+    not grow with the mean.
+    """
+
+    def __init__(self, size: int) -> None:
+        """
+        Args:
+            size: of a vector.
+        """
+        self.count = 0
+        self.mean = np.zeros(size)
+        self._deviations = np.zeros((size, size))
+
+    def add(self, *values: Array) -> None:
+        """Add M vectors.
+
+        Args:
+            values: (M,) numbers of each of their entries.
+        """
+        batch = np.array(values, dtype=np.float64)
+        if not batch.shape[1]:
+            return
+        mean = batch.mean(axis=1)
+        centred = batch - mean[:, None]
+        apart = mean - self.mean
+        total = self.count + batch.shape[1]
+        self._deviations += centred @ centred.T
+        self._deviations += np.outer(apart, apart) * (self.count * batch.shape[1] / total)
+        self.mean += apart * (batch.shape[1] / total)
+        self.count = total
+
+    @property
+    def covariance(self) -> Float64Array:
+        """(size, size) covariance of all vectors so far, not corrected for their number."""
+        return self._deviations / max(self.count, 1)
+
+
 @dataclass
 class Measures:
     """Counts and statistics of the steps in episodes that are kept."""
@@ -97,10 +137,8 @@ def measure(spool: Spool, cut: Cut, log_end: int, items: int, folder: Path) -> M
 
     Args:
         spool: rows in the order of the store, at least one.
-        cut: how they form episodes.
         log_end: time (ms) of the log's last usable row.
         items: number of items that have a code.
-        folder: of the spool of users.
 
     Raises:
         InputError: no episode remains, or none in the training split.
@@ -230,3 +268,84 @@ def binned_rewards(
         places = np.clip(np.floor((rewards - low) / width), 0, bins - 1).astype(np.int64)
         counts += np.bincount(places, minlength=bins)
     return counts
+
+
+QUANTILES: Final = (0.0, 0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 1.0)
+
+Distribution = dict[str, Any]
+"""`counts` (N), either `values` (N) or bin `edges` (N + 1; a bin includes its left edge but not its
+right one), and `quantiles` by share, e.g. `{"0.5": 3}`."""
+
+
+@dataclass(frozen=True)
+class RewardPasses:
+    """Passes over the steps that only rewards of many values need."""
+
+    sampled: Callable[[], Array]
+    """See `ucfrec.logs.measures.sampled_rewards`."""
+    binned: Callable[[float, float, int], IntArray]
+    """See `ucfrec.logs.measures.binned_rewards`."""
+
+
+def distributions(
+    measures: Measures, popularity: IntArray | None, passes: RewardPasses
+) -> dict[str, Distribution]:
+    """Distributions over the steps, as JSON values.
+
+    Args:
+        popularity: (items,) number of steps that show each item; None for logs without items.
+        passes: over the log's rewards.
+
+    Returns:
+        `session_lengths`: episodes by length in steps (each piece of a session that a split cuts
+        counts as one), in bins of doubling width. `rewards`: steps by reward; the first and last
+        bin include the values beyond them. `item_popularity` (logs with items only): items by the
+        number of steps that show them, in bins of doubling width; items that only the feature
+        tables list have 0.
+    """
+    lengths = np.array(sorted(measures.lengths.items()), dtype=np.int64).T
+    result = {"session_lengths": _counts(*lengths), "rewards": _rewards(measures, passes)}
+    if popularity is not None:
+        result["item_popularity"] = _counts(*np.unique(popularity, return_counts=True))
+    return result
+
+
+def _counts(values: IntArray, counts: IntArray) -> Distribution:
+    """Distribution of distinct integers ≥ 0, ascending, in bins 0, 1, 2–3, 4–7, …"""
+    edges = [0, *(2**power for power in range(int(values[-1]).bit_length() + 1))]
+    edges = edges[1:] if values[0] > 0 else edges
+    binned, _ = np.histogram(values, edges, weights=counts)
+    return {
+        "edges": edges,
+        "counts": binned.astype(np.int64).tolist(),
+        "quantiles": _quantiles(values, counts),
+    }
+
+
+def _rewards(measures: Measures, passes: RewardPasses) -> Distribution:
+    counted = measures.values
+    if counted.few:
+        return {
+            "values": counted.values.tolist(),
+            "counts": counted.counts.tolist(),
+            "quantiles": _quantiles(counted.values, counted.counts),
+        }
+    sample = passes.sampled()
+    quantiles = _quantiles(sample, np.ones(len(sample), dtype=np.int64))
+    ends = list(quantiles.values())
+    low, high = ends[1], ends[-2]
+    if not low < high:
+        low, high = measures.lowest, measures.highest
+    return {
+        "edges": np.linspace(low, high, FEW_VALUES + 1).tolist(),
+        "counts": passes.binned(low, high, FEW_VALUES).tolist(),
+        "quantiles": quantiles,
+    }
+
+
+def _quantiles(values: Array, counts: IntArray) -> dict[str, Any]:
+    """Quantiles, each one of the ascending values, of which there are `counts`."""
+    cumulative = np.cumsum(counts)
+    ranks = np.ceil(np.array(QUANTILES) * cumulative[-1]).clip(min=1)
+    found = values[np.searchsorted(cumulative, ranks)].tolist()
+    return {f"{share:g}": value for share, value in zip(QUANTILES, found, strict=True)}

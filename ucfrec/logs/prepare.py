@@ -23,7 +23,6 @@ from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.binding import explained
 from ucfrec.logs.clean import require_rows
-from ucfrec.logs.distributions import RewardPasses, distributions
 from ucfrec.logs.engine import engine
 from ucfrec.logs.feature_tables import feature_digest, load_features, require_known_ids
 from ucfrec.logs.ids import (
@@ -38,15 +37,26 @@ from ucfrec.logs.ids import (
 )
 from ucfrec.logs.kept import DUPLICATES
 from ucfrec.logs.mapping import SESSIONS, FeatureTable, LogMapping, log_files
-from ucfrec.logs.measures import Measures, binned_rewards, measure, sampled_rewards
-from ucfrec.logs.notes import note_bots, note_equal_times, note_losses
-from ucfrec.logs.order import count_unsorted
+from ucfrec.logs.measures import (
+    Measures,
+    RewardPasses,
+    binned_rewards,
+    distributions,
+    measure,
+    sampled_rewards,
+)
 from ucfrec.logs.remembered import settled
-from ucfrec.logs.sessions import Cut, Episodes, by_sessions, episodes, split_bounds
+from ucfrec.logs.sessions import Cut, Episodes, by_sessions, count_unsorted, episodes, split_bounds
 from ucfrec.logs.sorted_rows import SortedRows, check_sorted, sorted_batches
 from ucfrec.logs.spool import Spool
 from ucfrec.logs.steps import StepNumbers, write_steps
-from ucfrec.logs.summary import build_report, require_variety
+from ucfrec.logs.summary import (
+    build_report,
+    note_bots,
+    note_equal_times,
+    note_losses,
+    require_variety,
+)
 from ucfrec.logs.tables import open_tables
 from ucfrec.logs.typed import TypedLog, typed_log
 from ucfrec.progress import progress
@@ -182,7 +192,7 @@ def prepare(
     with atomic_folder(out) as folder:
         spill = options.temp_folder or out.parent
         with (
-            _prepared(files, mapping, options, spill, like, keep_unknown) as found,
+            prepared_log(files, mapping, options, spill, like, keep_unknown) as found,
             explained(found.rows.log.connection, found.rows.log.tables, out.parent),
         ):
             log, report = found.rows.log, found.report
@@ -218,7 +228,7 @@ def validate(
     """
     options = options or PrepareOptions()
     spill = options.temp_folder or Path(gettempdir())
-    with _prepared(log_files(paths), mapping, options, spill, None) as found:
+    with prepared_log(log_files(paths), mapping, options, spill, None) as found:
         return found.report
 
 
@@ -227,7 +237,7 @@ Features = dict[str, list[str]]
 
 
 @dataclass(frozen=True)
-class _Prepared:
+class PreparedLog:
     """A log that is sorted and counted."""
 
     rows: SortedRows
@@ -246,19 +256,30 @@ class _Prepared:
 
 
 @contextmanager
-def _prepared(
+def prepared_log(
     files: Sequence[Path],
     mapping: LogMapping,
     options: PrepareOptions,
     spill: Path,
     like: Path | None,
     keep_unknown: bool = False,
-) -> Iterator[_Prepared]:
-    """The log, sorted and counted, with the tables of its ids."""
+    onto: Path | None = None,
+) -> Iterator[PreparedLog]:
+    """The log, sorted and counted, with the tables of its ids.
+
+    Args:
+        files: of the log.
+        mapping: as of `prepare`.
+        options: as of `prepare`.
+        spill: folder for scratch.
+        like: as of `prepare`.
+        keep_unknown: as of `prepare`.
+        onto: a store whose users and items keep their numbers; others follow.
+    """
     reward = options.reward or mapping.reward or schema.REWARD
     session_by = options.session_by or mapping.session_by
     known = None if like is None or keep_unknown else like / ITEMS_FILE
-    inputs = (*files, *_other_inputs(mapping, like))
+    inputs = (*files, *_other_inputs(mapping, like, onto))
     with (
         scratch_folder(spill, "sorted") as scratch,
         engine(inputs, spill, options.memory_limit, shared=True) as connection,
@@ -288,7 +309,7 @@ def _prepared(
                 rows = check_sorted(log, batches, options.duplicates, scratch)
                 require_rows(log, len(rows.clean), rows.dropped)
                 note_losses(rows, reward, mapping.where)
-                if like is None:
+                if like is None and onto is None:
                     require_variety(rows)
                 note_equal_times(rows)
                 stage.update()
@@ -298,14 +319,14 @@ def _prepared(
                 note_bots(rows, measures, mapping.columns.get(schema.USER_ID, schema.USER_ID))
                 stage.update()
                 features = _features(log, mapping, like)
-                number_ids(log, measures, features, like)
+                number_ids(log, measures, features, like, onto)
                 _require_known_ids(log, mapping, features)
                 report = _report(rows, spool, cut, measures)
                 report = {"reward": reward, **report, "duplicates": options.duplicates}
                 report["dataset"] = options.dataset
                 report |= _remembered(mapping)
                 stage.update()
-        yield _Prepared(rows, spool, cut, measures, features, report, scratch)
+        yield PreparedLog(rows, spool, cut, measures, features, report, scratch)
 
 
 def _cut(
@@ -351,7 +372,7 @@ def _features(log: TypedLog, mapping: LogMapping, like: Path | None) -> Features
     }
 
 
-def _feature_digests(found: _Prepared) -> dict[str, list[Any]]:
+def _feature_digests(found: PreparedLog) -> dict[str, list[Any]]:
     """Digests for the fingerprint of the feature tables, if there are any."""
     return {
         f"features of {name}": [feature_digest(found.rows.log.connection, names)]
@@ -372,16 +393,20 @@ def _require_known_ids(log: TypedLog, mapping: LogMapping, features: Features) -
         require_known_ids(log.connection, tables, names, name, kept[name])
 
 
-def _other_inputs(mapping: LogMapping, like: Path | None) -> Iterator[Path]:
+def _other_inputs(
+    mapping: LogMapping, like: Path | None, onto: Path | None = None
+) -> Iterator[Path]:
     """Files that are read in addition to the logs."""
+    for store in (like, onto):
+        if store is not None:
+            yield from (store / file for _, _, file in ID_TABLES if (store / file).is_file())
     if like is not None:
-        yield from (like / file for _, _, file in ID_TABLES)
         return
     for table in (*mapping.user_features, *mapping.item_features):
         yield from log_files(table.files)
 
 
-def _write_states(found: _Prepared, folder: Path, size: int, like: Path | None) -> None:
+def _write_states(found: PreparedLog, folder: Path, size: int, like: Path | None) -> None:
     """Learn the item states, or copy those of the store `like`."""
     # Only a store needs scipy, which takes a moment to import.
     from ucfrec.logs.features import encode_features, item_tags

@@ -25,12 +25,6 @@ def settled(
     have the columns that it needs; if not, the plain name does, and no condition. The column
     `reward` stands for the reward of a log whose columns were mapped.
 
-    Args:
-        connection: any engine.
-        tables: of the log.
-        mapping: perhaps with a remembered one.
-        reward: of the run, or as given.
-
     Returns:
         The mapping, with nothing remembered, and the reward.
 

@@ -198,7 +198,6 @@ def with_faults(log: TypedLog, rows: str, conditions: Mapping[str, str]) -> str:
     """DuckDB's SQL of typed rows with `fault`: 0, or the number of the first fault from 1.
 
     Args:
-        log: of the rows.
         rows: relation of some of its typed rows.
         conditions: as from `ucfrec.logs.clean.faults`.
     """
@@ -220,7 +219,6 @@ def in_order(log: TypedLog, rows: str, left_out: str = "") -> str:
     """SQL of typed rows with faults, with codes, in order, without missing values.
 
     Args:
-        log: of the rows.
         rows: relation of all its rows, as of `with_faults`; beside it are the tables of
             `code_tables`.
         left_out: a column that is not read.

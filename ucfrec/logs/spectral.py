@@ -63,7 +63,6 @@ def right_singular_vectors(
         matrix: (m, n).
         by_column: (n,) what columns are divided by, above 0.
         rank: number of vectors, at most min(m, n).
-        seed: of the random start.
 
     Returns:
         Singular values (rank,), and vectors (rank, n), each with its largest entry above 0. Values

@@ -193,8 +193,6 @@ def open_tables(
     Files without rows are excluded, if others have some.
 
     Args:
-        connection: engine that may open the files.
-        files: of one table.
         partitions: read columns from the names of folders, such as `date=2026-08-01`.
 
     Returns:

@@ -47,9 +47,6 @@ def text_time(
     """SQL of the milliseconds since 1970 (UTC) that a column of text means, NULL where it is none.
 
     Args:
-        connection: engine that may open the table.
-        table: with the column.
-        sql: of the text.
         given: name or expression of the column, for messages.
         time_format: of `strptime`, in which all times are written; None for numbers, ISO 8601, and
             dates whose order of day and month every file settles. Times without a zone are UTC.

@@ -169,7 +169,6 @@ def typed_log(
     """Create `read` from tables that are open.
 
     Args:
-        connection: engine that may open the tables.
         tables: of the log's files.
         mapping: log columns to the files' columns.
         reward: scalar SQL expression over the files' columns.
@@ -220,9 +219,7 @@ def require_observations(tables: Sequence[Table], bad: int, rows: int) -> None:
     """Check that a log has a finite observation in every row.
 
     Args:
-        tables: of the log.
         bad: number of rows without one.
-        rows: number of rows.
 
     Raises:
         InputError: there are rows without one.
@@ -263,7 +260,6 @@ def _note_partial(tables: Sequence[Table], settled: set[str]) -> None:
     """Warn of optional columns that some files have and others do not.
 
     Args:
-        tables: of the log.
         settled: columns that every file has, and those that the mapping names.
     """
     have = {name: _files_with(tables, name) for name in OPTIONAL_COLUMNS if name not in settled}

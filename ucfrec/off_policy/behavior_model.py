@@ -90,7 +90,6 @@ def fit_behavior(
         item: (N,) logged items; −1, unknown, gets probability 1 and is fitted on nowhere.
         group: (N,) their groups, from 0.
         session: (N,) number of each step's session, from 0.
-        seed: draws folds and samples.
         user: (S,) of each session; None where each is of another user.
     """
     rng = np.random.default_rng(seed)

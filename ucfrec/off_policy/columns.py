@@ -1,7 +1,7 @@
 """Result rows of estimates, and the verdict and diagnosis as their columns."""
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 from ucfrec.acting.decision import DecisionRule
@@ -16,61 +16,64 @@ SUITE: Final = "off-policy"
 """Suite of the rows."""
 
 
-def estimate_row(
-    name: str,
-    found: Estimate,
-    trained: TrainedPolicy,
-    rule: DecisionRule,
-    seed: int,
-    conditions: Mapping[str, Scalar],
-    about: Mapping[str, Any],
-    *,
-    per_step: bool = False,
-) -> ResultRow:
-    """The result row of an estimate.
+@dataclass(frozen=True)
+class Subject:
+    """What the rows of one evaluation share."""
 
-    Args:
-        name: name of the estimator, which is the row's method.
-        found: its estimate.
-        trained: the evaluated policy.
-        rule: the decision rule by which it would act.
-        seed: seed of the estimate.
-        conditions: how the logs were read.
-        about: what all estimates of the policy share, e.g. the verdict.
-        per_step: whether the estimate is of `ucfrec.off_policy.per_step`.
+    trained: TrainedPolicy
+    """The evaluated policy."""
+    rule: DecisionRule
+    """By which it would act."""
+    seed: int
+    """Of the estimates."""
+    fingerprint: str | None
+    """Of the logs."""
+    conditions: Mapping[str, Scalar]
+    """How the logs were read."""
+    about: Mapping[str, Any]
+    """Further columns, e.g. the verdict."""
 
-    Returns:
-        The row. `R_cum` is the mean return, as in `ucfrec.evaluation.metrics`, and `R_step` the
-        mean reward of a step; it may have no interval.
-    """
-    metric, units = ("R_step", "steps") if per_step else ("R_cum", "sessions")
-    choice = "softmax" if rule.draws else "greedy"
-    logged, record = name == LOGGED, trained.record
-    row = ResultRow(
-        suite=SUITE,
-        table="per step" if per_step else "estimates",
-        task="logs",
-        method=name,
-        policy="behavior" if logged else trained.name,
-        training_seed=record.seed,
-        evaluation_seed=seed,
-        conditions={**conditions, "choice": "as logged" if logged else choice},
-        config_hash=config_hash(record.settings),
-        metric=metric,
-        metrics={metric: found.value},
-        interval=None if found.low is None or found.high is None else (found.low, found.high),
-        target_return=rule.target,
-        rule=rule.hash,
-        **provenance(),
-    )
-    own = {
-        f"{metric}_error": found.error,
-        f"effective_{units}": found.effective_sessions,
-        "largest_weight": found.largest_weight,
-        "parameter": found.parameter,
-        "decision_rule": rule.as_dict(),
-    }
-    return row.extended({**own, **about})
+    def rows(self, found: Mapping[str, Estimate], per_step: bool = False) -> list[ResultRow]:
+        """The result rows of estimates by name of the estimator, which is the row's method.
+
+        `R_cum` is the mean return, as in `ucfrec.evaluation.session_metrics`, and `R_step` the
+        mean reward of a step; a row may have no interval.
+
+        Args:
+            per_step: whether the estimates are of `step_value`.
+        """
+        return [self._row(name, one, per_step) for name, one in found.items()]
+
+    def _row(self, name: str, found: Estimate, per_step: bool) -> ResultRow:
+        metric, units = ("R_step", "steps") if per_step else ("R_cum", "sessions")
+        choice = "softmax" if self.rule.draws else "greedy"
+        logged, record = name == LOGGED, self.trained.record
+        row = ResultRow(
+            suite=SUITE,
+            table="per step" if per_step else "estimates",
+            task="logs",
+            method=name,
+            policy="behavior" if logged else self.trained.name,
+            training_seed=record.seed,
+            evaluation_seed=self.seed,
+            conditions={**self.conditions, "choice": "as logged" if logged else choice},
+            config_hash=config_hash(record.settings),
+            data_fingerprint=self.fingerprint,
+            metric=metric,
+            metrics={metric: found.value},
+            interval=None if found.low is None or found.high is None else (found.low, found.high),
+            target_return=self.rule.target,
+            rule=self.rule.hash,
+            **provenance(),
+        )
+        own = {
+            f"{metric}_error": found.error,
+            f"effective_{units}": found.effective_sessions,
+            "largest_weight": found.largest_weight,
+            "parameter": found.parameter,
+            "decision_rule": self.rule.as_dict(),
+        }
+        return row.extended({**own, **self.about})
 
 
 def verdict_columns(verdict: Verdict) -> dict[str, Any]:

@@ -178,7 +178,6 @@ def implied_items(steps: LoggedSteps, listed: BoolArray, items: int) -> WeightTe
 
     Args:
         listed: (N,) whether the logged item is one of the items.
-        items: how many there are.
 
     Returns:
         The implied share of the items as a test, errors clustered by user; None with fewer than 30

@@ -1,7 +1,8 @@
 """Estimates from logs the return of a trained policy, and reports how reliable that is."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from html import escape
 from pathlib import Path
 from typing import Annotated
 
@@ -20,9 +21,9 @@ from ucfrec.off_policy.behavior_model import (
     fit_behavior,
     group_items,
 )
-from ucfrec.off_policy.columns import diagnosis_columns, estimate_row, verdict_columns
-from ucfrec.off_policy.diagnostics import diagnose, implied_items
-from ucfrec.off_policy.estimators import Estimate, estimate, session_terms
+from ucfrec.off_policy.columns import Subject, diagnosis_columns, verdict_columns
+from ucfrec.off_policy.diagnostics import Diagnosis, diagnose, implied_items
+from ucfrec.off_policy.estimators import StepValue, estimate, session_terms, step_value
 from ucfrec.off_policy.features import (
     InputsFile,
     StepInputs,
@@ -33,12 +34,12 @@ from ucfrec.off_policy.features import (
 from ucfrec.off_policy.fqe import ModelReport, fit_models
 from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps
 from ucfrec.off_policy.pages import as_pages, pages_of
-from ucfrec.off_policy.per_step import StepValue, step_value
 from ucfrec.off_policy.score import LoggedSessions, ScoredSteps, scored_steps
 from ucfrec.off_policy.training_rows import seen_too_often, share_seen
 from ucfrec.off_policy.verdict import FAR_OFF, Verdict, cautions, conclude, influences
 from ucfrec.provenance import without_folders
 from ucfrec.results.row import ResultRow, Scalar
+from ucfrec.results.table import ResultTable
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import require, settings_table
 
@@ -75,9 +76,11 @@ class EstimateOptions:
 DEFAULTS = EstimateOptions()
 
 
-@dataclass(frozen=True)
-class OffPolicyReport:
+@dataclass(frozen=True, repr=False)
+class OffPolicyReport(ResultTable):
     """The estimates, and whether to believe them."""
+
+    shown = ("choice", "R_cum", "R_cum_low", "R_cum_high", "effective_sessions", "sessions")
 
     rows: list[ResultRow]
     """One result row for each estimator."""
@@ -96,6 +99,10 @@ class OffPolicyReport:
     """The value per step, where only some steps have propensities."""
     step_rows: Sequence[ResultRow] = ()
     """Its result rows, one for each estimator."""
+
+    def _repr_html_(self) -> str:
+        said = [f"verdict: {self.verdict.headline}", *(f"warning: {w}" for w in self.warnings)]
+        return super()._repr_html_() + "".join(f"<p>{escape(text)}</p>" for text in said)
 
 
 @dataclass(frozen=True)
@@ -126,19 +133,14 @@ def evaluate_off_policy(
 
     Args:
         run: folder of the run, named in the rows.
-        trained: the policy of the run.
         logged: logs read with `keep_unknown`. The policy would never show an item that it does not
             know, so such a step has weight 0.
         rule: the decision rule to evaluate; None for the run's own.
         seed: seed of the folds and of the bootstrap.
-        options: what else is asked.
-
-    Returns:
-        The estimates, the warnings and the verdict.
 
     Raises:
-        InputError: propensities are not probabilities, there is only one user, or pages are asked
-            for and a session has several steps.
+        InputError: propensities are not probabilities, there is only one user, or a page would have
+            a session of several steps.
     """
     rule = rule or trained.rule
     evaluated = logged_steps(trained, logged, rule, seed, options)
@@ -146,59 +148,39 @@ def evaluate_off_policy(
     steps, of_groups = _without_far_off_groups(steps)
     segment = None if options.pages else _quarters(logged.store, steps)
     found, diagnosis = estimate(steps, seed), diagnose(steps, options.reward_range, segment)
-    seen = share_seen(trained, logged.store)
-    verdict = conclude(
-        steps,
-        seed,
-        diagnosis=diagnosis,
-        wanted_lift=options.wanted_lift,
-        forbidden=[*seen_too_often(seen), *_too_many_items(trained, evaluated)],
-        declared=_declared(evaluated),
-    )
-    said = [*verdict.reasons, *cautions(diagnosis, found), *_of_the_logs(seen, logged), *of_groups]
-    said += _of_the_models(evaluated)
     value = None if options.pages else step_value(evaluated.steps, seed)
-    said += [value.doubt] if value is not None and value.doubt else []
+    seen = share_seen(trained, logged.store)
+    forbidden = [*seen_too_often(seen), *_too_many_items(trained, evaluated)]
+    verdict = conclude(steps, seed, diagnosis, options.wanted_lift, forbidden, _declared(evaluated))
+    warnings = [*verdict.reasons, *cautions(diagnosis, found), *_of_the_logs(seen, logged)]
+    warnings += [*of_groups, *_of_the_models(evaluated)]
+    warnings += [value.doubt] if value is not None and value.doubt else []
     about = {
         "seen_in_training": seen,
-        "warnings": said,
+        "warnings": warnings,
         "dropped": logged.report["dropped"],
         "unknown_item_rows": logged.unknown_items,
         **verdict_columns(verdict),
         **diagnosis_columns(diagnosis),
         **evaluated.models.columns(),
     }
-    conditions = {"run": without_folders(str(run)), **_conditions(steps, options)}
-    fingerprint = logged.store.record.fingerprint
-
-    def rows_of(estimates: Mapping[str, Estimate], per_step: bool) -> list[ResultRow]:
-        rows = (
-            estimate_row(name, one, trained, rule, seed, conditions, about, per_step=per_step)
-            for name, one in estimates.items()
-        )
-        return [replace(row, data_fingerprint=fingerprint) for row in rows]
-
-    report = OffPolicyReport(
-        rows_of(found, per_step=False),
-        said,
+    read = logged.store.record.fingerprint, _conditions(run, steps, options)
+    subject = Subject(trained, rule, seed, *read, about)
+    return OffPolicyReport(
+        subject.rows(found),
+        warnings,
         verdict,
         evaluated.models,
-        returns=np.empty(0),
-        user=None,
-        terms=None,
-        per_step=value,
-        step_rows=[] if value is None else rows_of(value.estimates, per_step=True),
+        *_of_sessions(steps, diagnosis, verdict),
+        value,
+        [] if value is None else subject.rows(value.estimates, per_step=True),
     )
-    if diagnosis.left_out == diagnosis.sessions:
-        return report
-    known = steps.known()
-    terms = _terms(known, verdict)
-    return replace(report, returns=known.returns, user=known.user, terms=terms)
 
 
-def _conditions(steps: LoggedSteps, options: EstimateOptions) -> dict[str, Scalar]:
+def _conditions(run: Path, steps: LoggedSteps, options: EstimateOptions) -> dict[str, Scalar]:
     """How the logs were read, and their size."""
     return {
+        "run": without_folders(str(run)),
         "discount": options.discount,
         "pages": options.pages,
         "anonymous": not options.users_known,
@@ -207,9 +189,16 @@ def _conditions(steps: LoggedSteps, options: EstimateOptions) -> dict[str, Scala
     }
 
 
-def _terms(known: LoggedSteps, verdict: Verdict) -> Float64Array | None:
+def _of_sessions(
+    steps: LoggedSteps, diagnosis: Diagnosis, verdict: Verdict
+) -> tuple[Float64Array, IntArray | None, Float64Array | None]:
+    """`returns`, `user` and `terms` of the report."""
+    if diagnosis.left_out == diagnosis.sessions:
+        return np.empty(0), None, None
+    known = steps.known()
     terms = {} if verdict.estimator is None else session_terms(known)
-    return influences(terms[verdict.estimator]) if verdict.estimator in terms else None
+    weighed = influences(terms[verdict.estimator]) if verdict.estimator in terms else None
+    return known.returns, known.user, weighed
 
 
 def _pages(logged: LoggedSessions) -> tuple[IntArray, IntArray | None]:
@@ -302,11 +291,8 @@ def logged_steps(
     groups, lie on disk.
 
     Args:
-        trained: a policy that chooses items.
         logged: logs read with `keep_unknown`.
-        rule: the decision rule to evaluate.
         seed: seed of the folds, item groups and samples.
-        options: what else is asked.
 
     Returns:
         The N logged steps, in order.
@@ -390,10 +376,6 @@ def step_features(trained: TrainedPolicy, batch: ScoredSteps) -> tuple[Array, Te
     """Compute the policy's probability and the models' inputs for B logged steps.
 
     An item that the run does not know (−1) has probability 0 and an embedding of zeros.
-
-    Args:
-        trained: a policy that chooses items.
-        batch: the steps, scored by the policy.
 
     Returns:
         The evaluated policy's probability (B,) of the logged item, and (B, n_items) of all items;

@@ -70,10 +70,8 @@ def fit_models(
     that saw it, nor by one that saw another session of its user.
 
     Args:
-        chunks: reads the features.
         reward: (N,).
         session: (N,) number of each step's session, from 0, never falling; steps in order.
-        seed: draws the folds.
         user: (S,) whose session each is; None where each is of another user.
         discount: γ of Q.
 

@@ -47,8 +47,6 @@ def cluster_intervals(
         above: (S, K), a row a session, a column a number.
         below: (S, K).
         cluster: (S,) of each session, any integers; None where each session is its own.
-        seed: draws the resamples.
-        level: of the intervals.
 
     Returns:
         One a column; None where nothing spreads: one cluster, all clusters equal, or so few that
@@ -105,7 +103,6 @@ def resample(
         above: (S, K), a row a session, a column a number Σ above / Σ below.
         below: (S, K).
         cluster: (S,) of each session, any integers; None where each session is its own.
-        seed: draws the resamples.
     """
     names, clusters = _numbered(cluster, len(above))
     if clusters > MOST_CLUSTERS:

@@ -87,7 +87,6 @@ def select(
     Args:
         names: K candidates.
         terms: (S, K) whose means over sessions are the estimates, e.g. `influences` of DR.
-        seed: draws the resamples.
         user: (S,) whose session each is; None where each is of another user.
 
     Raises:

@@ -77,7 +77,6 @@ class Verdict:
 def conclude(
     steps: LoggedSteps,
     seed: int,
-    *,
     diagnosis: Diagnosis | None = None,
     wanted_lift: float | None = None,
     forbidden: Sequence[str] = (),

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ucfrec import __version__
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.scorer import Scorer
 from ucfrec.files.atomic import atomic_folder, write_json
 from ucfrec.recommending.export_graph import (
     EXCLUDED,
@@ -107,68 +108,61 @@ def _difference(graph: RuleGraph, path: Path, sessions: int) -> float:
 
 def _description(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
     """What a program needs to know to use the graph."""
-    scorer, rule = graph.scorer, graph.scorer.rule
-    b, length, k = "batch", scorer.length, graph.k
+    rule, record = graph.scorer.rule, trained.record
     assert trained.item_ids is not None
-    inputs = [
-        _entry(
-            "items",
-            "int64",
-            [b, length],
-            "index of each item shown in the session, the latest last; -1 before the session began",
-        ),
-        _entry("rewards", "float32", [b, length], "reward of each; 0 before the session began"),
-        _entry("steps", "int64", [b], "number of items that the session has shown"),
-        _entry("collected", "float64", [b], "sum of the rewards of the session"),
-        _entry("users", "int64", [b], "index of the user in user_ids; -1 for others"),
-        _entry(
-            "excluded",
-            "int64",
-            [b, "excluded_items"],
-            "items that may not be shown, e.g. those "
-            "already seen; padded with -1, at least one column",
-        ),
-    ]
-    if observed := trained.record.observation_size:
-        inputs.append(
-            _entry(
-                "observations",
-                "float32",
-                [b, scorer.policy.config.context, observed],
-                "of the "
-                "last steps, the one to decide included; `ucfrec recommend` repeats the last",
-            )
-        )
-    outputs = [
-        _entry(
-            "scores",
-            "float32",
-            [b, len(trained.item_ids)],
-            "log-probability of the policy plus the "
-            "reward weight, up to a constant; -inf for items excluded",
-        ),
-        _entry("top_items", "int64", [b, k], "index of the best items; -1 if fewer are left"),
-        _entry("top_scores", "float32", [b, k], "their log-probabilities at temperature 1, nats"),
-    ]
     return {
         "format": 1,
         "ucfrec": __version__,
         "graph": GRAPH,
-        "inputs": inputs,
-        "outputs": outputs,
+        "inputs": _inputs(graph.scorer, record.observation_size),
+        "outputs": _outputs(len(trained.item_ids), graph.k),
         "rule": rule.as_dict(),
         "rule_hash": rule.hash,
         "rule_notes": "the graph applies target, minimum_target, reward_weight, tag_window and "
         "tag_run; with exclude_seen, put the session's items into `excluded`; with a temperature, "
         "draw from `scores`, and with explore, draw that share of the requests uniformly",
         "policy": trained.name,
-        "reward": trained.record.reward,
-        "session_by": trained.record.session_by,
-        "session_gap_ms": trained.record.session_gap_ms,
-        "fingerprint": trained.record.fingerprint,
+        "reward": record.reward,
+        "session_by": record.session_by,
+        "session_gap_ms": record.session_gap_ms,
+        "fingerprint": record.fingerprint,
         "item_ids": trained.item_ids.tolist(),
         "user_ids": trained.user_ids.tolist(),
     }
+
+
+def _inputs(scorer: Scorer, observed: int) -> list[dict[str, Any]]:
+    b, length = "batch", scorer.length
+    shown = "index of each item shown in the session, the latest last; -1 before the session began"
+    excluded = (
+        "items that may not be shown, e.g. those already seen; padded with -1, at least one column"
+    )
+    inputs = [
+        _entry("items", "int64", [b, length], shown),
+        _entry("rewards", "float32", [b, length], "reward of each; 0 before the session began"),
+        _entry("steps", "int64", [b], "number of items that the session has shown"),
+        _entry("collected", "float64", [b], "sum of the rewards of the session"),
+        _entry("users", "int64", [b], "index of the user in user_ids; -1 for others"),
+        _entry("excluded", "int64", [b, "excluded_items"], excluded),
+    ]
+    if observed:
+        shape: list[int | str] = [b, scorer.policy.config.context, observed]
+        last = "of the last steps, the one to decide included; `ucfrec recommend` repeats the last"
+        inputs.append(_entry("observations", "float32", shape, last))
+    return inputs
+
+
+def _outputs(items: int, k: int) -> list[dict[str, Any]]:
+    b = "batch"
+    scores = (
+        "log-probability of the policy plus the reward weight, up to a constant; -inf for items "
+        "excluded"
+    )
+    return [
+        _entry("scores", "float32", [b, items], scores),
+        _entry("top_items", "int64", [b, k], "index of the best items; -1 if fewer are left"),
+        _entry("top_scores", "float32", [b, k], "their log-probabilities at temperature 1, nats"),
+    ]
 
 
 def _entry(name: str, dtype: str, shape: list[int | str], meaning: str) -> dict[str, Any]:

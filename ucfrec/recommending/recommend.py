@@ -78,19 +78,23 @@ def recommend(
     known_ids = trained.items
     excluded = None if candidates is None else _all_but(known_ids, candidates)
 
-    def frames() -> Iterator[pd.DataFrame]:
-        remaining = iter(batches)
-        for batch in remaining:
-            known = known_ids.numbers(batch.item_ids)
-            if not ((known >= 0).all() or skip_unknown):
-                raise _unknown(known_ids, [batch, *remaining])
-            seen = np.full(len(batch.seen_ids), -1)
-            if filter_seen:
-                seen = known_ids.numbers(batch.seen_ids)
-            numbered = replace(batch, item_ids=known, seen_ids=seen)
-            yield _Choice(trained, scorer, k, excluded, seed, index).frame(numbered)
+    choice = _Choice(trained, scorer, k, excluded, seed, index)
+    return map(choice.frame, _numbered(known_ids, batches, filter_seen, skip_unknown))
 
-    return frames()
+
+def _numbered(
+    known_ids: IdLookup, batches: Iterable[Histories], filter_seen: bool, skip_unknown: bool
+) -> Iterator[Histories]:
+    """Histories with the numbers of their items, −1 for unknown ones."""
+    remaining = iter(batches)
+    for batch in remaining:
+        known = known_ids.numbers(batch.item_ids)
+        if not ((known >= 0).all() or skip_unknown):
+            raise _unknown(known_ids, [batch, *remaining])
+        seen = np.full(len(batch.seen_ids), -1)
+        if filter_seen:
+            seen = known_ids.numbers(batch.seen_ids)
+        yield replace(batch, item_ids=known, seen_ids=seen)
 
 
 def _require_whole(k: int) -> None:

@@ -166,8 +166,6 @@ def line_chart(
     """Draw curves in one chart.
 
     Args:
-        title: title of the chart.
-        x_label: label of the x-axis.
         curves: (name, style, {x: y}) of each; at least one point, y finite.
         levels: name to a finite reference value, drawn as a horizontal line.
     """
@@ -204,7 +202,6 @@ def bar_chart(title: str, bars: Sequence[tuple[str, float, float, float]]) -> Ba
     """Draw horizontal bars one below the other.
 
     Args:
-        title: title of the chart.
         bars: (name, value, low, high) of each, with the ends of its 95% interval.
     """
     values = [0.0, *(end for bar in bars for end in bar[1:])]
@@ -230,8 +227,6 @@ def histogram(
     """Draw counts as columns of equal width, whatever the width of their bins.
 
     Args:
-        title: title of the chart.
-        x_label: label of the x-axis.
         counts: (N,).
         edges: (N + 1,) ascending bin edges; a bin includes its left edge but not its right one.
         values: (N,) counted values, instead of `edges`.

@@ -4,7 +4,6 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ucfrec.off_policy.estimators import LOGGED
 from ucfrec.reporting.charts import (
     BAR_BOTTOM,
     LEFT_OF_BARS,
@@ -83,10 +82,6 @@ def forest(results: Results) -> Forest | None:
 
 
 def quoted(rows: Sequence[ResultRow]) -> ResultRow | None:
-    """The row that the verdict is of, if it has an interval; else the first weighted one."""
-    with_interval = [row for row in rows if row.interval is not None and row.method != LOGGED]
-    for row in with_interval:
-        if row.method == row.details.get("verdict_of"):
-            return row
-    preferred = {row.method: row for row in with_interval}
-    return next((preferred[name] for name in ("DR", "SNPDIS", "SNIPS") if name in preferred), None)
+    """The row that the verdict is of, if it has an interval."""
+    of = (row for row in rows if row.interval and row.method == row.details.get("verdict_of"))
+    return next(of, None)

@@ -17,6 +17,7 @@ from ucfrec.files.checksums import CARD, MEASURED
 from ucfrec.files.locks import claim
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.provenance import config_hash
+from ucfrec.reporting.rule import user_model_table
 from ucfrec.reporting.tables import markdown_table, shown
 from ucfrec.runs.record import REFIT, RunRecord, read_record
 from ucfrec.runs.trained_policy import RULE
@@ -38,6 +39,7 @@ def write_card(run: Path) -> Path:
         _data(record, refitted),
         "## How it acts",
         _rule(run),
+        _user_model(record),
         "## Limits",
         "\n".join(f"- {limit}" for limit in _limits(record, refitted, logged)),
         "## Measured",
@@ -62,7 +64,6 @@ def add_measurement(
         how: the command, e.g. "ucfrec ope".
         of: what was measured on what, e.g. "DR on sessions.parquet, target return 5".
         values: name to number or text, in the order of the table.
-        said: the verdict and warnings.
     """
     if not os.access(run, os.W_OK):
         return
@@ -137,6 +138,14 @@ def _rule(run: Path) -> str:
         f"Its decision rule: {rule}. `evaluate`, `ope`, `rank` and `recommend` act by it unless "
         "another is named; each measurement below names its own."
     )
+
+
+def _user_model(record: RunRecord) -> str:
+    numbers = user_model_table(record)
+    if numbers is None:
+        return "It was chosen without a user model."
+    rows = [[name, *values] for name, values in numbers.rows]
+    return "The user model, which chose the rule:\n\n" + markdown_table(["part", "value"], rows)
 
 
 def _limits(record: RunRecord, refitted: bool, logged: Container[str]) -> list[str]:

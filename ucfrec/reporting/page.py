@@ -1,7 +1,7 @@
 """The HTML report on runs: conclusions from their results, and how they were trained."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -21,6 +21,7 @@ from ucfrec.reporting.curves import POINTS, REFERENCES, Curves, draw_curves, tra
 from ucfrec.reporting.data_quality import data_quality
 from ucfrec.reporting.forest import forest
 from ucfrec.reporting.page_results import environments, estimates, results_of
+from ucfrec.reporting.rule import frontier, user_model_table
 from ucfrec.reporting.samples import read_features, sample_tables
 from ucfrec.reporting.tables import Table, shown
 from ucfrec.reporting.verdict import verdict
@@ -65,8 +66,6 @@ def write_report(
     its last logged step.
 
     Args:
-        out: HTML file to write.
-        runs: run folders.
         results: rows of `ucfrec evaluate --json`, `ucfrec ope --json` or `ucfrec demo`; JSON, or
             JSON lines if the name ends in `.jsonl`.
         items: item features to show with the sample recommendations, Parquet or CSV with a column
@@ -177,10 +176,18 @@ def _variables(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any
         "verdicts": [(name, report.verdict) for name, report in edited],
         "copies": augmentation_table(edited) if edited else None,
         "moves": moves_chart(styled),
+        "user_models": _named(item_runs, user_model_table),
+        "frontiers": _named(item_runs, frontier),
         "samples": [(run.name, sample_tables(run.folder, features)) for run in item_runs],
         "differences": _differences(runs),
         "records": [(run.name, json_text(run.record.model_dump(), indent=2)) for run in runs],
     }
+
+
+def _named(runs: Sequence[_Run], of: Callable[[RunRecord], Any]) -> list[tuple[str, Any]]:
+    """Name and what there is of each run."""
+    found = [(run.name, of(run.record)) for run in runs]
+    return [(name, each) for name, each in found if each is not None]
 
 
 def _data(record: RunRecord) -> Table:

@@ -25,7 +25,6 @@ def sample_tables(run: Path, features: pa.Table | None) -> tuple[str, list[Table
     """The decision rule of the samples and one table per session; None if a run has no samples.
 
     Args:
-        run: run folder.
         features: one row per item with its `item_id` and features to show; None for none.
     """
     if not (run / SAMPLES).exists() or not (run / ITEMS).exists():

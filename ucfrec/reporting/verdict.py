@@ -4,12 +4,11 @@ Two results count as different only if their 95% intervals do not overlap, which
 test of the difference at 5%.
 """
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ucfrec.off_policy.estimators import WEIGHTED
-from ucfrec.reporting.page_results import Estimates, Results, interval
+from ucfrec.reporting.page_results import Estimates, Results
+from ucfrec.reporting.statistics import grouped
 from ucfrec.reporting.tables import shown
 from ucfrec.results.row import ResultRow
 
@@ -76,9 +75,7 @@ def _of_environment(environment: str, rows: Sequence[ResultRow]) -> str:
 
 def _returns(rows: Sequence[ResultRow]) -> list[_Return]:
     """One summary per policy and checkpoint, in order of first appearance."""
-    groups: dict[tuple[str, str | None], list[ResultRow]] = {}
-    for row in rows:
-        groups.setdefault((row.method, row.checkpoint), []).append(row)
+    groups = grouped(rows, lambda row: (row.method, row.checkpoint))
     several = {policy for policy, _ in groups if sum(key[0] == policy for key in groups) > 1}
     return [
         _Return(
@@ -106,9 +103,8 @@ def _best(environment: str, best: _Return, others: Sequence[_Return]) -> str:
         return f"In {environment}, {best.policy} has a return of {how} per episode."
     text = (
         f"In {environment}, {best.policy} has the highest return of {len(others) + 1} trained "
-        f"policies: {how}"
+        f"policies: {how} per episode."
     )
-    text += " per episode."
     close = [one for one in others if not best.above(one)]
     if close:
         text += f" Its interval overlaps that of {_listed(close)}:"
@@ -136,49 +132,12 @@ def _against(best: _Return, references: Sequence[_Return]) -> str:
 
 
 def _of_estimates(one: Estimates) -> str:
-    computed = next(
-        (row.details["verdict"] for row in one.rows if row.details.get("verdict")), None
-    )
-    if computed is not None:
-        return f"For {one.name}: {computed}."
-    weighted = [row for row in one.rows if row.method in WEIGHTED]
-    warnings = "; ".join(one.warnings)
-    if not weighted:
-        models = _listed([f"{row.method} {interval(row)}" for row in one.rows])
-        because = f" ({warnings})" if warnings else ""
-        text = f"For {one.name}, these logs allow no weighted estimate{because}."
-        return f"{text} Models alone (no conclusion): {models}." if models else text
-    named = {row.method: row for row in weighted}
-    quoted = named.get("DR") or named.get("SNIPS") or weighted[0]
-    figure = f"{quoted.method} estimates {interval(quoted)} per session"
-    if warnings:
-        return f"For {one.name}, {figure}, which is not reliable: {warnings}."
-    if one.logged is None:
-        return f"For {one.name}, {figure}. The rows lack the return of the logged sessions."
-    text = f"For {one.name}, {figure}; the logged sessions have {interval(one.logged)}. "
-    return text + _compared(weighted, one.logged)
-
-
-def _compared(weighted: Sequence[ResultRow], logged: ResultRow) -> str:
-    low, high = logged.interval or (logged.value, logged.value)
-    ends = {row.method: row.interval or (-math.inf, math.inf) for row in weighted}
-    above = [name for name, own in ends.items() if own[0] > high]
-    below = [name for name, own in ends.items() if own[1] < low]
-    everyone = _listed(list(ends))
-    for names, more in ((above, "higher"), (below, "lower")):
-        if len(names) == len(weighted):
-            return (
-                f"Every weighted estimate ({everyone}) says that its return is {more} than the "
-                "logging policy, provided that the logged propensities are right."
-            )
-    if not above and not below:
-        return f"No weighted estimate ({everyone}) distinguishes it from the logging policy."
-    sides: Mapping[str, list[str]] = {"higher": above, "lower": below}
-    parts = [f"{_listed(names)} {more}" for more, names in sides.items() if names]
-    return (
-        f"The weighted estimates disagree ({'; '.join(parts)} than the logging policy, of "
-        f"{everyone}), so whether its return is higher is open."
-    )
+    """What `ucfrec ope` concluded of a policy, as its rows say."""
+    rows = [*one.rows, *([one.logged] if one.logged else [])]
+    said = next((row.details["verdict"] for row in rows if row.details.get("verdict")), None)
+    if said is None:
+        return f"For {one.name}, the rows have no verdict of ucfrec ope."
+    return f"For {one.name}: {said}."
 
 
 def _listed(things: Sequence[object]) -> str:

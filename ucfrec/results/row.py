@@ -124,10 +124,6 @@ class ResultRow(RowKey):
     def extended(self, values: Mapping[str, Any], **changes: Any) -> "ResultRow":
         """The row with further values: finite numbers are metrics, the rest that is not None are
         details.
-
-        Args:
-            values: by name.
-            changes: other fields that change.
         """
         metrics = {name: float(value) for name, value in values.items() if _is_number(value)}
         details = {
@@ -174,7 +170,6 @@ def row_from_json(value: object, where: str) -> ResultRow:
     """Inverse of `ResultRow.to_json`.
 
     Args:
-        value: JSON value.
         where: origin of `value` (file and line), for messages.
 
     Raises:

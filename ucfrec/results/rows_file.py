@@ -83,7 +83,6 @@ def append_rows(
 
     Args:
         path: file of result rows; made if missing.
-        rows: rows of one configuration.
         config: configuration with the rows' `config_hash`; None for rows without one.
 
     Raises:
@@ -109,24 +108,6 @@ def remove_rows(path: Path, keys: Sequence[RowKey]) -> None:
         kept = [row for row in rows if not any(key.covers(row) for key in keys)]
         if len(kept) < len(rows):
             _write(path, b"", [row.to_json() for row in kept])
-
-
-def read_configurations(folder: Path) -> dict[str, Mapping[str, Any]]:
-    """Read the configurations of the rows in `folder`: hash to configuration.
-
-    Raises:
-        InputError: a line is no configuration, or its hash does not match.
-    """
-    path = folder / CONFIGURATIONS
-    configurations: dict[str, Mapping[str, Any]] = {}
-    for number, value in read_lines(path):
-        config = value.get("config") if isinstance(value, dict) else None
-        if not isinstance(config, dict) or not isinstance(value, dict):
-            raise InputError(f"{path}, line {number}, is no configuration")
-        if value.get("hash") != config_hash(config):
-            raise InputError(f"{path}, line {number}, has another hash than its configuration")
-        configurations[config_hash(config)] = config
-    return configurations
 
 
 def latest(rows: Sequence[ResultRow]) -> list[ResultRow]:
@@ -161,8 +142,6 @@ def measuring(path: Path, key: RowKey, wait: bool) -> Iterator[bool]:
     """Lock one measurement of the file `path`, so that no two processes run it at once.
 
     Args:
-        path: file of result rows.
-        key: the measurement.
         wait: wait until the lock is free, instead of giving up at once.
 
     Yields:

@@ -18,6 +18,8 @@ from pydantic import (
 )
 
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.choosing.choice import ValueEstimate
+from ucfrec.choosing.logged import Evidence
 from ucfrec.counterfactual.screening import DimensionReport
 from ucfrec.counterfactual.state_augmentation import AugmentationReport
 from ucfrec.episodes.item_table import ITEM_STATES
@@ -32,6 +34,7 @@ from ucfrec.fitting.loop import Fit
 from ucfrec.policies.registry import policy_class
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.user_model.reward_report import ItemRewardReport
+from ucfrec.user_model.session_end import SessionEndReport
 
 RUN: Final = RUN_RECORD
 REFIT: Final = "refit"
@@ -134,6 +137,7 @@ class Candidate(Entry):
     value: Number | None = None
     """Mean return of a session in the user model; None for a rule that was not simulated."""
     error: Number | None = None
+    evidence: Evidence | None = None
 
 
 class RuleRecord(Entry):
@@ -145,15 +149,62 @@ class RuleRecord(Entry):
     chosen_by: Text
     warning: Text = ""
     candidates: tuple[Candidate, ...] = ()
+    estimate: ValueEstimate | None = None
+    halves_agree: tuple[bool, bool] | None = None
+    """Whether the sessions of either half of the users would choose the rule, too."""
+    session_end: SessionEndReport | None = None
 
     @property
     def simulated(self) -> tuple[float, float] | None:
         """Return of a session under the rule in the user model, with its standard error; None for
         a rule that was not simulated."""
-        for tried in self.candidates:
-            if tried.rule == self.rule and tried.value is not None and tried.error is not None:
-                return tried.value, tried.error
-        return None
+        return None if self.estimate is None else (self.estimate.value, self.estimate.error)
+
+
+class Difference(Entry):
+    """What the newest rows say of a new run against the old one, by one measure."""
+
+    measure: Text
+    value: Number
+    """Of the new run less that of the old one."""
+    low: Number
+    """Ends of the 95% interval, over users."""
+    high: Number
+    doubt: Text = ""
+    """Why not to rely on it; empty if nothing is found."""
+
+    @property
+    def sign(self) -> int:
+        """1 if it shows that the new run is better, −1 that it is worse, 0 neither."""
+        return 0 if self.doubt else int(self.low > 0) - int(self.high < 0)
+
+
+class UpdateVerdict(Entry):
+    """Whether a new run is better than the old one (`ucfrec.updating.verdict`)."""
+
+    result: Literal["better", "no significant difference", "worse"]
+    decided_by: Text
+    """The measure that decides."""
+    differences: tuple[Difference, ...]
+    steps: Count
+    """Rows that the runs are compared on, which neither was trained on."""
+    users: Count
+
+
+class Update(Entry):
+    """How a run came from an older one (`ucfrec.updating.update`)."""
+
+    of: Text
+    """Name of the older run."""
+    run: Text
+    """Its fingerprint."""
+    settings_from_nothing: dict[str, Any]
+    """Those of a training that does not start from the weights of another run."""
+    appended: dict[str, Any]
+    """Counts of the new logs; see `ucfrec.logs.append.append_logs`."""
+    drift: dict[str, Any] | None = None
+    """See `ucfrec.updating.drift`."""
+    verdict: UpdateVerdict | None = None
 
 
 class RunRecord(TrainingRecord):
@@ -183,6 +234,8 @@ class RunRecord(TrainingRecord):
     screening: Screening | None = None
     refit_of: dict[str, Any] | None = None
     """Configuration and rule of the run that this one repeats on all rows (`ucfrec.runs.refit`)."""
+    update: Update | None = None
+    """None for a run that was trained from nothing."""
     augmentation: AugmentationReport | None = None
     policy: Fit | None = None
     reward_model: ItemRewardReport | None = None
@@ -387,20 +440,35 @@ def _describe_augmentation(report: AugmentationReport) -> list[str]:
 
 
 def _describe_rule(choice: RuleRecord, model: ItemRewardReport, logged: float) -> str:
-    value, tried = choice.simulated, len(choice.candidates)
-    if value is None:
-        how = f"It ranked best of {tried} rules in the validation period"
+    estimate, tried = choice.estimate, len(choice.candidates)
+    if estimate is None:
+        how = f"It ranked best of {tried} rules in the validation period.\n"
     else:
         how = (
             f"Of {tried} ways to turn the policy into recommendations, tried on simulated users, "
             "it has the best return\n              (or one level with it) that the log supports: "
-            f"{value[0]:.4g} ± {value[1]:.2g} per session, estimated; logged sessions have "
-            f"{logged:.4g}"
+            f"{estimate.value:.4g} ± {estimate.error:.2g} per session, estimated; logged sessions "
+            f"have {logged:.4g}.\n"
+            f"{_describe_estimate(estimate, choice.halves_agree)}"
         )
     return (
         f"user model    held-out loss {model.loss:.4f}, "
         f"{model.item_loss - model.loss:.4f} below that of item effects alone\n"
         f"decision rule {choice.rule}\n"
-        f"              {how}.\n"
+        f"              {how}"
         f"              Selected by the {choice.chosen_by}{choice.warning}"
     )
+
+
+def _describe_estimate(estimate: ValueEstimate, agree: tuple[bool, bool] | None) -> str:
+    """How far the estimated return can be trusted, lines of text."""
+    said = [f"Halves of the users: {estimate.halves[0]:.4g} and {estimate.halves[1]:.4g}"]
+    if agree is not None:
+        would = {2: "both choose this rule", 1: "one chooses this rule", 0: "both choose another"}
+        said.append(would[sum(agree)])
+    if estimate.optimism is not None:
+        off, error = estimate.optimism
+        said.append(f"on held-out rows the user model is off by {off:+.1%} ± {error:.1%}")
+    lines = [f"{'; '.join(said)}."]
+    lines += [f"WARNING: it cannot be trusted: {doubt}." for doubt in estimate.doubts]
+    return "".join(f"              {line}\n" for line in lines)

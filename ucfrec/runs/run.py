@@ -12,6 +12,7 @@ import torch
 
 from ucfrec.acting.scorer import Scorer
 from ucfrec.choosing.choose import choose_rule
+from ucfrec.choosing.problem import Problem
 from ucfrec.counterfactual.augmentation import MODELS, counterfactual_augmentation
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
@@ -22,7 +23,7 @@ from ucfrec.episodes.windows import Overlay
 from ucfrec.files.atomic import write_json
 from ucfrec.files.locks import claimed, remove_leftovers, remove_leftovers_within
 from ucfrec.fitting import distributed
-from ucfrec.fitting.loop import Fit
+from ucfrec.fitting.loop import SILENT, Callbacks, Fit
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.checks import require_sound
@@ -34,6 +35,7 @@ from ucfrec.runs.samples import SAMPLES, sample_recommendations
 from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec.runs.start import begin, new_policy, require_startable, training_views
 from ucfrec.runs.trained_policy import AUGMENTATION, INPUTS, REWARD_MODEL, RULE, TrainedPolicy
+from ucfrec.runs.warm_start import start_warm
 from ucfrec.user_model.model import UserModel
 
 _OVERLAY = "overlay.safetensors"
@@ -71,6 +73,8 @@ def train_run(
     more_augmentation: Overlay | None = None,
     refit_of: Path | None = None,
     shared: SharedStages = OWN,
+    callbacks: Callbacks = SILENT,
+    initial: Path | None = None,
 ) -> RunRecord:
     """Train a policy on the training episodes of `store`, or resume the run in `out`.
 
@@ -93,6 +97,8 @@ def train_run(
         shared: reward models and augmentation that runs on the same store have in common where
             their settings of these stages and their seeds agree; by default a run makes its own.
             The time of a stage is in the record of the run that made it.
+        callbacks: what is told of the training of the policy.
+        initial: a run on an older state of the store, whose weights the training begins with.
 
     Returns:
         The record of the run: provenance, configuration and the report of every stage.
@@ -108,10 +114,12 @@ def train_run(
             remove_leftovers_within(out)
         begun = time.perf_counter()
         run = _prepare_inputs(store, out, config, about or {}, refit_of, shared)
+        if initial is not None:
+            start_warm(run.policy, out, initial)
         with phase("Counterfactual augmentation", 1, PHASES):
             overlay, augmentation = _augment(run, refit_of)
         with phase("Training the policy", 2, PHASES):
-            fit = _train_policy(run, overlay, more_augmentation, refit_of)
+            fit = _train_policy(run, overlay, more_augmentation, refit_of, callbacks)
         if not distributed.leads():
             return run.record
         chosen = run.record.rule is not None and run.record.policy == fit
@@ -199,16 +207,19 @@ def _augment(
 
 
 def _train_policy(
-    run: _Inputs, overlay: Overlay | None, more: Overlay | None, refit_of: Path | None
+    run: _Inputs,
+    overlay: Overlay | None,
+    more: Overlay | None,
+    refit_of: Path | None,
+    callbacks: Callbacks,
 ) -> Fit:
     """Fit the policy to logged and augmented episodes (lines 4 and following of Algorithm 1)."""
     if more is not None:
         overlay = more if overlay is None else overlay.joined(more)
     train = run.train if overlay is None else run.train.with_overlay(overlay)
-    if refit_of is None:
-        return fit_policy(run.policy, train, run.validation, run.out, run.config)
-    start = refit_of / "policy" / "best.safetensors"
-    return fit_policy(run.policy, train, None, run.out, run.config, start)
+    start = None if refit_of is None else refit_of / "policy" / "best.safetensors"
+    validation = run.validation if refit_of is None else None
+    return fit_policy(run.policy, train, validation, run.out, run.config, start, callbacks)
 
 
 def _fit_user_model(run: _Inputs) -> UserModel:
@@ -230,7 +241,7 @@ def _choose_rule(run: _Inputs, users: UserModel) -> RuleRecord:
     config = run.config.rule
     targets = {quantile: trained.target_return(quantile) for quantile in config.quantiles}
     views = of_people(run.logged), of_people(run.held_out)
-    choice = choose_rule(scorer, users, targets, *views, config, run.config.seed)
+    choice = choose_rule(Problem(scorer, users, targets, *views, config, run.config.seed))
     write_json(run.out / RULE, choice.rule.as_dict())
     return RuleRecord.model_validate(choice.as_dict())
 

@@ -14,12 +14,12 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 from ucfrec.processes import require_blas_memory
+from ucfrec.user_model.calibration import UserCalibration
 from ucfrec.user_model.fatigue import Fatigue, LoggedRuns, fit_fatigue
 from ucfrec.user_model.main_tags import MainTags
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_fit import fit_item_reward_model
-from ucfrec.user_model.reward_report import ItemRewardReport, calibrate
-from ucfrec.user_model.reward_rows import RewardRows
+from ucfrec.user_model.reward_report import ItemRewardReport
 from ucfrec.user_model.session_end import LoggedEnds, SessionEnd, SessionEndReport
 from ucfrec.user_model.training_users import TrainingUsers, fit_training_users
 
@@ -47,6 +47,9 @@ class UserModel:
     fatigue: Fatigue | None
     """None if the log shows none."""
     main_tags: MainTags
+    calibration_report: UserCalibration | None = None
+    """How far the calibration can be trusted; None where validation users are new, whose tastes
+    no one knows."""
 
     @classmethod
     def fit(
@@ -81,13 +84,15 @@ class UserModel:
                 LoggedEnds.of(view, reward.lags, _MOST_STEPS, seed) for view in (train, validation)
             )
             end, end_report = SessionEnd.fit(reward.likeness, logged, held_out, seed)
-            line = users.report.calibration if users else (1.0, 0.0)
+            line, checked = users.report.calibration if users else (1.0, 0.0), None
             if users is None or not report.new_users:
-                rows = RewardRows.of(validation, reward.reach, _MOST_STEPS, seed)
-                line = calibrate(users.model if users else reward, rows)
+                model = users.model if users else reward
+                checked = UserCalibration.fit(model, validation, _MOST_STEPS, seed)
+                line = checked.line
             fitted = {
                 "fatigue": None if tired is None else dataclasses.asdict(tired),
                 "calibration": line,
+                "calibration_report": checked and dataclasses.asdict(checked),
                 "session_end": dataclasses.asdict(end_report),
             }
             save_tensors(path, dict(end.tensors), fitted)
@@ -96,9 +101,10 @@ class UserModel:
             slope, intercept = about["calibration"]
             fatigue = None if about["fatigue"] is None else Fatigue(**about["fatigue"])
             end_report = SessionEndReport(**about["session_end"])
+            checked = about["calibration_report"] and UserCalibration(**about["calibration_report"])
             end = SessionEnd.of(reward.likeness, tensors)
         line = slope, intercept
-        return cls(reward, report, users, line, end, end_report, fatigue, tags)
+        return cls(reward, report, users, line, end, end_report, fatigue, tags, checked)
 
     @property
     def rewarding(self) -> ItemRewardModel:
@@ -127,9 +133,11 @@ class UserModel:
 
     def report(self) -> dict[str, Any]:
         """What simulated sessions are drawn from, as a JSON object."""
+        checked = self.calibration_report
         users = None if self.training_users is None else self.training_users.report
         return {
             "calibration": list(self.calibration),
+            "calibration_report": checked and dataclasses.asdict(checked),
             "users": None if users is None else dataclasses.asdict(users),
             "session_end": dataclasses.asdict(self.session_end_report),
             "fatigue": None if self.fatigue is None else dataclasses.asdict(self.fatigue),

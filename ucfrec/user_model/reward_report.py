@@ -149,11 +149,6 @@ def fit_line(
     return float(fitted.coef_[0]), float(fitted.intercept_)
 
 
-def calibrate(model: ItemRewardModel, rows: RewardRows) -> tuple[float, float]:
-    """`fit_line` of the model's scores to logged rewards."""
-    return fit_line(scores_of(model, rows)[0], model.target(rows.rewards), bool(model.binary))
-
-
 def item_rates(rows: RewardRows, liked: Tensor, n_items: int) -> Tensor:
     """(n_items,) share of liked rows of each item, 10 impressions at the mean added."""
     shown = torch.bincount(rows.items, minlength=n_items).double()

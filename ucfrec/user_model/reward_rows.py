@@ -41,12 +41,7 @@ class RewardRows:
         Of what was shown earlier, the latest `lags` steps are read. Nothing of a step but its item
         and reward is read, nor anything of later steps.
         """
-        if view.n_steps > limit:
-            drawn = np.random.default_rng(seed).choice(view.n_steps, limit, replace=False)
-            numbers = np.sort(drawn)
-        else:
-            numbers = np.arange(view.n_steps)
-        return cls.at(view, *view.locate(numbers), lags)
+        return cls.at(view, *drawn_steps(view, limit, seed), lags)
 
     @classmethod
     def at(cls, view: EpisodeStore, episodes: IntArray, steps: IntArray, lags: int) -> "RewardRows":
@@ -63,6 +58,15 @@ class RewardRows:
             torch.from_numpy(view.step_values(schema.REWARD, episodes, steps)),
             view.observation_size,
         )
+
+
+def drawn_steps(view: EpisodeStore, limit: int, seed: int) -> tuple[IntArray, IntArray]:
+    """Episodes and steps (M,) of all steps of a view; of more than `limit`, so many drawn."""
+    numbers = np.arange(view.n_steps)
+    if view.n_steps > limit:
+        drawn = np.random.default_rng(seed).choice(view.n_steps, limit, replace=False)
+        numbers = np.sort(drawn)
+    return view.locate(numbers)
 
 
 def _shown(view: EpisodeStore, episodes: IntArray, steps: IntArray, lags: int) -> Shown:

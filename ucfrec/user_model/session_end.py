@@ -28,6 +28,9 @@ _REMEMBERED: Final = 10
 _FEWEST: Final = 20
 """Fewest steps that end a session, and that do not, from which more than their share is
 estimated."""
+_STEP: Final = 2.0**-10
+"""Likeness is rounded to multiples of this: what torch and onnxruntime round differently then lies
+on one side of a tree's threshold."""
 _LOGISTIC: Final = ("mean", "scale", "weights", "bias")
 _MOST: Final = 20.0
 """Largest log-odds against what happened that count, so that no single step decides."""
@@ -226,7 +229,8 @@ def _columns(alike: Tensor, repeated: Tensor, rewards: Tensor, steps: Tensor) ->
     """Inputs (M, ..., F) from likeness (M, 6, ...) and repetition (M, L, ...), the latest first."""
     numbers = steps.double().expand(rewards.shape)
     columns = [torch.log1p(numbers), numbers, numbers.clamp(max=1), rewards.double()]
-    columns += [*alike.double().unbind(1)]
-    columns += [alike[:, :reach].amax(1).double() for reach in (2, 3, 4)]
+    alike = (alike.double() / _STEP).round() * _STEP
+    columns += [*alike.unbind(1)]
+    columns += [alike[:, :reach].amax(1) for reach in (2, 3, 4)]
     columns += [repeated[:, :reach].sum(1).double() for reach in (1, 3, _REMEMBERED)]
     return torch.stack(columns, -1)

@@ -11,11 +11,10 @@ from ucfrec.results.row import ResultRow, RowKey
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.screened import SCREENING
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec_control.benchmark.screening_table import verdicts
+from ucfrec_control.benchmark.robustness import verdicts
 from ucfrec_control.data.distractor import CLEAN
 from ucfrec_control.data.trajectories import PACKAGES
-from ucfrec_control.training.evaluate import evaluate_run
-from ucfrec_control.training.held_out_losses import held_out_losses
+from ucfrec_control.training.evaluate import evaluate_run, held_out_losses
 from ucfrec_control.training.rl_baselines import (
     ALGORITHMS,
     RLConfig,

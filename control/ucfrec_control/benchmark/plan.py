@@ -31,7 +31,6 @@ def score_cells(
 
     Args:
         data: folder of the HDF5 files.
-        folder: where stores and runs are kept.
         budget: as `budget_of` returns it.
         table: a key of `TABLES`.
         methods: rows of the table; empty for all.

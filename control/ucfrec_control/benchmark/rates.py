@@ -52,11 +52,7 @@ SEARCHED: Final = _one_each(_DIFFERING)
 
 @cache
 def chosen_rates(budget: str) -> Mapping[str, float]:
-    """The chosen rate of each method of `SEARCHED`; empty for a budget without a search.
-
-    Args:
-        budget: a name of a budget.
-    """
+    """The chosen rate of each method of `SEARCHED`; empty for a budget without a search."""
     text = files("ucfrec_control.benchmark").joinpath("rates.toml").read_text(encoding="utf-8")
     rates: Mapping[str, float] = tomllib.loads(text).get(budget, {})
     return rates
@@ -109,13 +105,7 @@ def format_rates(table: tuple[str, Mapping[str, float]]) -> str:
 
 
 def settings_of(budget: Budget, name: str, method: Method) -> tuple[str, ...]:
-    """Settings of a training over its presets: the budget's, the chosen rate, the method's own.
-
-    Args:
-        budget: size of the benchmark.
-        name: name of the method.
-        method: its policy and settings.
-    """
+    """Settings of a training over its presets: the budget's, the chosen rate, the method's own."""
     own = budget.of_policies.get(method.policy, ())
     rate = _rate_of(budget, method)
     if method.policy in ALGORITHMS:

@@ -59,7 +59,6 @@ def cells_of_part(part: Part, data: Path, folder: Path, budget: Budget) -> Itera
     Args:
         part: of `PARTS`.
         data: folder of the HDF5 files.
-        folder: where stores and runs are kept.
         budget: of `budget_of_part`.
 
     Raises:
@@ -75,8 +74,6 @@ def rows_of_part(part: Part, rows: Sequence[ResultRow], name: str) -> list[Resul
 
     Args:
         part: of `PARTS`.
-        rows: of any tables.
-        name: of the budget.
     """
     return [row for row in rows if row.conditions.get("budget") == name and _is_of(part, row)]
 

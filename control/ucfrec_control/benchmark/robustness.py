@@ -1,16 +1,28 @@
-"""Scores lost by methods that were trained with a distractor (Figures 3 and 4, Appendix G.4).
+"""What distractors cost (Figures 3 and 4, Appendix G.4), and whether screening flags them.
 
 Every method is trained on the clean data and on the same data with a distractor in the states, and
 evaluated with the distractor fixed to 0. Two trainings also differ randomly. Evaluating the same
 policy with the distractor fixed to 1 instead isolates the effect of the distractor.
 """
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from itertools import product
+from pathlib import Path
+from typing import Any, Final
 
+from ucfrec.benchmark.cells import Cell, Evaluation, measured_by, opened
+from ucfrec.counterfactual.screening import DimensionReport, ScreeningConfig, screen
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.provenance import provenance
 from ucfrec.reporting.statistics import grouped, summary
-from ucfrec.results.row import ResultRow
-from ucfrec_control.data.distractor import CLEAN
+from ucfrec.reporting.tables import NONE
+from ucfrec.results.row import ResultRow, RowKey
+from ucfrec.runs.start import training_views
+from ucfrec_control.data.distractor import CLEAN, DISTRACTORS, zoo_store
+from ucfrec_control.data.trajectories import PACKAGES
 
 SHOWN = ("clean", "score", "drop", "score_at_one", "drop_at_one")
 SHOWN_LARGEST = ("method", "at 0", "at 1")
@@ -24,9 +36,6 @@ def drops(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
     distractor, which is fixed to 0. `drop` is the loss in percent of `clean`: negative for a gain,
     NaN if `clean` is not above 0. `score_at_one` and `drop_at_one` are of the second policy, from
     the same initial states, with the distractor fixed to 1. The last of several equal keys counts.
-
-    Args:
-        rows: of one budget.
 
     Returns:
         One mapping per dataset, method, seed and distractor, with these and the values of `SHOWN`.
@@ -76,3 +85,106 @@ def loss_rises(rows: Sequence[ResultRow]) -> list[Mapping[str, Any]]:
 def _pair(row: ResultRow) -> tuple[str, str, int | None]:
     """Dataset, method and seed, which are equal for a row with and one without a distractor."""
     return row.task, row.method, row.training_seed
+
+
+SHOWN_SCREENING: Final = (
+    *("task", "distractor", "training_seed", "flagged", "effect", "reward_effect"),
+    *("true_flagged", "weakest_true"),
+)
+SEED: Final = 0
+SCREENING: Final = "screening"
+"""Suite of the rows."""
+
+
+def screening_cells(data: Path, stores: Path, files: Sequence[str]) -> Iterator[Cell]:
+    """A cell for each file, clean and with each distractor.
+
+    Args:
+        data: folder of the HDF5 files.
+        files: names of files in `data`, without their ending.
+
+    Raises:
+        InputError: a file is missing.
+    """
+    for file, distractor in product(files, DISTRACTORS):
+        yield Cell(
+            *(SCREENING, SCREENING, file, SCREENING, SCREENING, Evaluation(0, SEED)),
+            training_seed=SEED,
+            store=zoo_store(data, stores, file, distractor),
+            conditions={"distractor": distractor},
+        )
+
+
+def _config(cell: Cell) -> dict[str, Any]:
+    return asdict(ScreeningConfig())
+
+
+def _measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
+    store = opened(cell)
+    began = time.perf_counter()
+    report = screen(training_views(store)[0], ScreeningConfig(), SEED)
+    dimensions = verdicts(report.dimensions, store)
+    wrong = sum(each["flagged"] and not each["distractor"] for each in dimensions)
+    row = ResultRow(
+        **vars(row_key),
+        metric="true_flagged",
+        metrics={
+            "true_flagged": float(wrong),
+            "reward_r2": math.nan if report.reward_r2 is None else report.reward_r2,
+            "transitions": float(report.transitions),
+        },
+        details={"screening": dimensions},
+        wall_time_s=time.perf_counter() - began,
+        **provenance(PACKAGES),
+    )
+    return [row]
+
+
+SCREENING_MEASUREMENT: Final = measured_by(_measure, _config)
+
+
+def verdicts(dimensions: Sequence[DimensionReport], store: EpisodeStore) -> list[dict[str, Any]]:
+    """The verdict of a screening report on each state dimension of `store`."""
+    added = {each["dimension"] for each in store.record.source.others.get("distractors", [])}
+    return [
+        {
+            "dimension": d.dimension,
+            "distractor": d.dimension in added,
+            "flagged": not d.causes,
+            "effect": d.effect,
+            "p_value": d.p_value,
+            "reward_effect": d.reward_effect,
+            "reward_p_value": d.reward_p_value,
+        }
+        for d in dimensions
+    ]
+
+
+def screening_rows(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
+    """One line per row with a screening: flagged dimensions and estimated effects.
+
+    `effect` and `reward_effect` are those of the distractor on the next state and on the reward.
+    `weakest_true` is the smallest effect among the true dimensions, of each the larger one of the
+    two; dimensions that were not tested are excluded.
+    """
+    lines: list[dict[str, Any]] = []
+    for row in rows:
+        verdicts = row.details.get("screening")
+        if verdicts is None:
+            continue
+        added = [d for d in verdicts if d["distractor"]]
+        true = [d for d in verdicts if not d["distractor"]]
+        effects = [max(d["effect"], d["reward_effect"]) for d in true if d["effect"] is not None]
+        lines.append(
+            {
+                "task": row.task,
+                "distractor": row.conditions["distractor"],
+                "training_seed": row.training_seed,
+                "flagged": all(d["flagged"] for d in added) if added else NONE,
+                "effect": added[0]["effect"] if added else NONE,
+                "reward_effect": added[0]["reward_effect"] if added else NONE,
+                "true_flagged": [d["dimension"] for d in true if d["flagged"]],
+                "weakest_true": min(effects, default=NONE),
+            }
+        )
+    return lines

@@ -60,8 +60,6 @@ def print_scores(
     """Print the tables of rows of a benchmark, and how learning rates were chosen.
 
     Args:
-        rows: of one table.
-        table: its name.
         given: rates that were used instead of the package's.
     """
     _print_tables(rows, table)

@@ -17,12 +17,12 @@ from ucfrec_control.benchmark.robustness import (
     SHOWN,
     SHOWN_LARGEST,
     SHOWN_LOSSES,
+    SHOWN_SCREENING,
     drops,
     largest_drops,
     loss_rises,
+    screening_rows,
 )
-from ucfrec_control.benchmark.screening_table import SHOWN as SHOWN_SCREENING
-from ucfrec_control.benchmark.screening_table import screening_rows
 from ucfrec_control.commands.options import (
     control_grid_options,
     data_given,

@@ -8,10 +8,10 @@ from ucfrec.commands.grid_options import results_given, rows_explained, rows_of
 from ucfrec.reporting.tables import format_rows
 from ucfrec_control.benchmark.budgets import ZOO
 from ucfrec_control.benchmark.plan import stores_of
-from ucfrec_control.benchmark.screening_table import (
+from ucfrec_control.benchmark.robustness import (
     SCREENING,
     SCREENING_MEASUREMENT,
-    SHOWN,
+    SHOWN_SCREENING,
     screening_cells,
     screening_rows,
 )
@@ -32,5 +32,5 @@ def run(options: argparse.Namespace) -> None:
 
     rows = rows_of(options, SCREENING, (), cells, SCREENING_MEASUREMENT)
     with rows_explained(options):
-        print(format_rows(screening_rows(rows), SHOWN))
+        print(format_rows(screening_rows(rows), SHOWN_SCREENING))
     print(f"\nrows: {results_given(options)}")

@@ -75,9 +75,6 @@ def collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[di
 
     Args:
         env_id: Gymnasium environment with a `Box` action space and a step limit.
-        out: output folder.
-        seed: seed of training, evaluations and rollouts.
-        config: training and rollout settings.
 
     Returns:
         One row per dataset: `file`, `dataset`, numbers of `trajectories` and `steps`, and
@@ -105,7 +102,6 @@ def collect_agent(
         noise: standard deviation of Gaussian noise on the agent's deterministic actions, in halves
             of the action space's range.
         size: steps, rounded up to whole episodes.
-        seed: of environments and noise.
 
     Returns:
         One row: `file`, `dataset`, numbers of `trajectories` and `steps`, `mean_return`.
@@ -321,11 +317,7 @@ def roll_out(
     Every round has a fixed number of episodes, so that short episodes are not overrepresented.
 
     Args:
-        actor: whose actions are taken.
         env_id: Gymnasium environment.
-        size: least number of steps.
-        key: seeds of the episodes.
-        describe: shown with the progress.
 
     Raises:
         InputError: the environment cannot be made.

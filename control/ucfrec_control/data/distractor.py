@@ -32,9 +32,7 @@ def add_distractor(
 
     Args:
         store: store with observed states; (N, S) observations become (N, S + 1).
-        out: folder to create.
         flip: probability that the bit is flipped; see `ucfrec.episodes.distractor.reward_bit`.
-        seed: seed of the random flips.
         early: indicate the next reward, as `reward_bit` does.
 
     Returns:
@@ -60,7 +58,6 @@ def zoo_store(data: Path, stores: Path, file: str, distractor: str = CLEAN) -> P
 
     Args:
         data: folder with the HDF5 files.
-        stores: folder with the stores.
         file: name of the HDF5 file without its extension.
         distractor: key of `DISTRACTORS`.
 

@@ -47,7 +47,6 @@ def read_numbers(file: Any, path: Path, name: str) -> Array:
 
     Args:
         file: yielded by `opened`.
-        path: of the file, for messages.
         name: of the data set, which may lie in groups: `infos/final_observations`.
 
     Raises:

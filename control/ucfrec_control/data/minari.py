@@ -54,7 +54,6 @@ def read_minari(source: str, env_id: str | None = None, download: bool = False) 
     desired goal is excluded.
 
     Args:
-        source: identifier or folder of a dataset.
         env_id: environment that the data comes from; None for the one recorded in the dataset.
         download: download the dataset with Minari if it is not available locally.
 
@@ -108,7 +107,6 @@ def write_minari(trajectories: Trajectories, identifier: str, env_id: str | None
     it, the last known observation is repeated, and the dataset's description says so.
 
     Args:
-        trajectories: trajectories to write.
         identifier: Minari identifier of the new dataset, such as `mujoco/hopper/medium-v0`.
         env_id: environment to record; None for the one recorded in `trajectories`.
 

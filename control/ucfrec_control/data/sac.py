@@ -131,19 +131,11 @@ class SacTraining(Memoryless):
         }
 
     def save_policy(self, path: Path, metadata: dict[str, Any]) -> None:
-        """Write the policy's weights.
-
-        Args:
-            path: safetensors file.
-            metadata: JSON values stored with the weights.
-        """
+        """Write the policy's weights."""
         save_tensors(path, dict(self._model.actor.state_dict()), metadata)
 
     def load_policy(self, path: Path) -> dict[str, Any]:
         """Replace the policy's weights by those that `save_policy` wrote.
-
-        Args:
-            path: safetensors file.
 
         Returns:
             The metadata given to `save_policy`.
@@ -153,12 +145,7 @@ class SacTraining(Memoryless):
         return metadata
 
     def save(self, path: Path, metadata: dict[str, Any]) -> None:
-        """Write a checkpoint from which training can resume, atomically.
-
-        Args:
-            path: safetensors file.
-            metadata: JSON values stored with the checkpoint.
-        """
+        """Write a checkpoint from which training can resume, atomically."""
         tensors = {"log_ent_coef": self._model.log_ent_coef}
         for name, state in self._model.get_parameters().items():
             moments = state.get("state")
@@ -171,9 +158,6 @@ class SacTraining(Memoryless):
 
     def load(self, path: Path) -> dict[str, Any]:
         """Restore, in place, a checkpoint that `save` wrote.
-
-        Args:
-            path: safetensors file.
 
         Returns:
             The metadata given to `save`.

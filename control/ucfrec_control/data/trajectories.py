@@ -46,7 +46,6 @@ def control_source(source: Source, where: Path) -> dict[str, Any]:
     """Check what a store or a run says of its data: it may be an untrusted one.
 
     Args:
-        source: of its record.
         where: file or folder that holds it, for the message.
 
     Returns:
@@ -126,9 +125,6 @@ class Trajectories:
         control data are independent, so holding out the last ones has no advantage. Files are also
         often ordered by behaviour policy, from weakest to best, so the last trajectories would
         represent a single policy.
-
-        Args:
-            out: folder to create.
 
         Returns:
             The new store.

@@ -44,9 +44,7 @@ def make_env(
 
     Args:
         env_id: Gymnasium's identifier.
-        count: number of environments.
         appended: constants that stand in for distractors at the end of every observation.
-        settings: keyword arguments of the environment.
         wrappers: wrappers around each environment, the innermost first.
 
     Returns:

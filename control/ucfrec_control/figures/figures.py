@@ -109,7 +109,6 @@ def make_row_figures(rows: Sequence[ResultRow], out: Path) -> list[Path]:
 
     Args:
         rows: of `benchmark` or `robustness`.
-        out: folder of the figures.
     """
     return _drawn(list(_of_rows(rows)), out)[0]
 

@@ -94,7 +94,6 @@ def state_overlay(factual: Float64Array, edited: Float64Array, title: str = "") 
 
     Args:
         factual: (M, S) in standard deviations.
-        edited: the same states after their edits.
     """
     figure, axes = _figure(COLUMN, 2.9, title)
     centre = factual.mean(axis=0)

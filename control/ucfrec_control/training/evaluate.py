@@ -1,4 +1,4 @@
-"""Evaluation of trained policies in their environment, with D4RL's normalised scores."""
+"""Trained policies in their environment: D4RL's normalised scores; losses by a distractor."""
 
 import time
 from collections.abc import Sequence
@@ -7,16 +7,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from gymnasium.vector import VectorEnv
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import rollout
+from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.metrics import bootstrap_interval
+from ucfrec.evaluation.session_metrics import bootstrap_interval
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.reporting.statistics import summary
 from ucfrec.results.row import ResultRow
 from ucfrec.runs.record import RUN, RunRecord
+from ucfrec.runs.screened import without_columns
+from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_control.data.trajectories import PACKAGES, control_source
 from ucfrec_control.environments.environments import (
@@ -55,7 +59,6 @@ def evaluate_run(
 
     Args:
         run: a run folder on a control store.
-        episodes: episodes of a row.
         seed: seed of the environments and the bootstrap.
         env_id: environment to evaluate in; None for that of the data.
         targets: target returns, None for the largest that the policy expects in each state; empty
@@ -139,9 +142,6 @@ def open_environment(
     Distractors are fixed to `distractor`.
 
     Args:
-        trained: the policy.
-        env_id: environment to make.
-        count: number of parallel environments.
         wrappers: wrappers around each of them.
         distractor: value that every distractor is fixed to.
         settings: arguments of the environment, over those of the data.
@@ -245,3 +245,32 @@ def _row(
         "warnings": mismatches(dataset, env_id) or None,
     }
     return row.extended(found)
+
+
+_BATCHES, _BATCH = 8, 512
+
+
+@torch.no_grad()
+def held_out_losses(trained: TrainedPolicy, store: EpisodeStore) -> dict[str, float]:
+    """Mean action loss at 4,096 steps of validation episodes.
+
+    Unlike scores, the losses do not vary with the course of the rollout.
+
+    Returns:
+        `loss` with the logged states, and `loss_at_zero` with every distractor fixed to 0.
+    """
+    dropped = trained.dropped
+    _, validation = training_views(without_columns(store, dropped))
+    generator = np.random.default_rng(0)
+    added = [each["dimension"] for each in trained.record.data.others.get("distractors", [])]
+    dimensions = [d - sum(other < d for other in dropped) for d in added if d not in dropped]
+    losses = []
+    for _ in range(_BATCHES):
+        steps = validation.draw_steps(generator, _BATCH)
+        windows = validation.windows(*steps, trained.policy.config.context)
+        fixed = windows.states.clone()
+        fixed[..., dimensions] = 0.0
+        both = (windows, replace(windows, states=fixed))
+        losses.append([float(trained.policy.action_loss(each)) for each in both])
+    loss, at_zero = np.mean(losses, axis=0)
+    return {"loss": float(loss), "loss_at_zero": float(at_zero)}

@@ -166,7 +166,6 @@ def rl_config(dataset: Mapping[str, Any], algorithm: Any, **settings: Any) -> RL
     """The settings for the data that `ucfrec_control.training.train.dataset_of` describes.
 
     Args:
-        dataset: description of the data.
         algorithm: one of `ALGORITHMS`.
         settings: the other fields of `RLConfig`.
     """

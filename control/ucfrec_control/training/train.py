@@ -85,9 +85,7 @@ def train_control(
     """`ucfrec.runs.screened.train_screened` on a control store.
 
     Args:
-        store: a control store.
         out: run folder; an interrupted run resumes.
-        config: of the training.
         screening: one of `ucfrec.runs.screened.SCREENINGS`; None for none.
         shared: as `ucfrec.runs.run.train_run` has it.
 

@@ -43,7 +43,6 @@ def record_episode(
         run: a run folder on a control store.
         out: `NAME.mp4`, or a folder for `frame-00000.png`, …; the first frame is the initial state.
             It is written when the episode has ended.
-        seed: seed of the environment.
         checkpoint: "last" or "best".
         env_id: environment to act in; None for that of the data.
         target: target return; None for the preset's first.

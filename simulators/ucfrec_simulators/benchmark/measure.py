@@ -23,10 +23,6 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
 
     It acts by its run's own decision rule, which was chosen on its log, not in an environment.
 
-    Args:
-        cell: what to train and evaluate.
-        row_key: key of the rows.
-
     Returns:
         One row for each environment, of trained methods with the best validation loss.
     """

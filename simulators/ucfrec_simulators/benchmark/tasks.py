@@ -78,7 +78,6 @@ def sardine(name: str, folder: Path, log: Log) -> Task:
 
     Args:
         name: `sardine-static` or `sardine-boredinf`.
-        folder, log: as for every task.
 
     Raises:
         InputError: `sardine-rec` is not installed.

@@ -108,7 +108,6 @@ def simulators(
         make: makes the environment of this number of sessions, from a folder, with an exit rule
             and a regime.
         own_exit: the environment's exit rule in EasyRL4Rec.
-        summary: what the environment is.
         feedback: column of the reward in the logs.
 
     Returns:

@@ -141,8 +141,6 @@ def complete(
     Args:
         store: logs of items with clicks (0 or 1) as rewards, split in time.
         tags: tags of each video id; a missing video has no tags.
-        out: folder to write.
-        config: size and training of the model.
         seed: seed of the initial weights and of the batches.
 
     Raises:

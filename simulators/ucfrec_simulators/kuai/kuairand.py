@@ -45,8 +45,6 @@ def kuairand(
         num_envs: number of parallel sessions, N.
         folder: written by `ucfrec_simulators.kuai.completion.complete`; None for
             `kuairand-environment` in the data folder.
-        exit_rule: when users leave.
-        regime: masking and length of sessions.
 
     Raises:
         InputError: a file is missing.

@@ -38,8 +38,6 @@ def kuairec(
         num_envs: number of parallel sessions, N.
         folder: has `small_matrix.csv` and `item_categories.csv`; None for `kuairec` in the data
             folder.
-        exit_rule: when users leave.
-        regime: masking and length of sessions.
 
     Raises:
         InputError: a file is missing or is not the official one, or a video has no categories.

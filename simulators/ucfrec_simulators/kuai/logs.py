@@ -8,13 +8,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from ucfrec.arrays import IntArray
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file
 from ucfrec.logs.engine import engine
 from ucfrec.logs.tables import glob_pattern, text
 from ucfrec.schema import SESSION_ID
-from ucfrec_simulators.kuai.environment import ExitRule
-from ucfrec_simulators.kuai.exit_cuts import sessions_by_exit
+from ucfrec_simulators.kuai.environment import ExitRule, KuaiEnv
 
 USER, VIDEO = "user_id", "video_id"
 
@@ -24,7 +24,6 @@ def window(files: Sequence[Path], time: str, where: str) -> pa.Table:
 
     Args:
         files: Parquet or CSV files with the same columns.
-        time: name of the time column.
         where: SQL condition that selects the window.
 
     Raises:
@@ -49,7 +48,6 @@ def cut_by_exit(rows: pa.Table, tags: Mapping[int, Sequence[int]], exit_rule: Ex
     Args:
         rows: as returned by `window`.
         tags: tags of each video; videos without tags may be missing.
-        exit_rule: when users leave.
     """
     videos, numbers = np.unique(np.asarray(rows[VIDEO]), return_inverse=True)
     video_tags: list[Sequence[int]] = [tags.get(int(video), ()) for video in videos]
@@ -74,3 +72,34 @@ def write_log(rows: pa.Table, path: Path) -> None:
     """Write rows as Parquet, atomically."""
     with atomic_file(path) as scratch:
         pq.write_table(rows, scratch)
+
+
+def sessions_by_exit(
+    users: IntArray, items: IntArray, tags: Sequence[Sequence[int]], exit_rule: ExitRule
+) -> IntArray:
+    """Replay logged items through an exit rule, as the public code (EasyRL4Rec) makes its episodes.
+
+    The row at which the rule ends a session, or at which the session has its maximum length, is the
+    session's last; the user's next row starts a new session. All users are replayed in parallel,
+    one row each per step.
+
+    Args:
+        users: (N,) user of each row; rows of a user are contiguous and in order of time.
+        items: (N,) index into `tags` of the item shown.
+        tags: tags of each item; an item without any gets the tag −1.
+
+    Returns:
+        (N,) session of each row, numbered from 0 in the order of the rows.
+    """
+    _, starts, lengths = np.unique(users, return_index=True, return_counts=True)
+    environment = KuaiEnv(len(starts), np.zeros((1, len(tags)), dtype=np.float32), tags, exit_rule)
+    environment.reset(seed=0)
+    last = np.zeros(len(users), dtype=np.bool_)
+    for step in range(lengths.max()):
+        # Users without further rows repeat their last one, whose session is ended below anyway.
+        rows = starts + np.minimum(step, lengths - 1)
+        _, _, terminated, truncated, _ = environment.step(items[rows])
+        active = step < lengths
+        last[rows[active]] = (terminated | truncated)[active]
+    last[starts + lengths - 1] = True
+    return np.concatenate([[0], np.cumsum(last)[:-1]])

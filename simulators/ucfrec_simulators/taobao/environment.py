@@ -119,10 +119,6 @@ def best_constant(env: TaobaoEnv, seed: int) -> Float32Array:
     The best result of several cross-entropy searches, since one may end in a local optimum. It uses
     the environment's expected clicks, which no recommender can, and draws its users from a separate
     random stream, independent of all episodes.
-
-    Args:
-        env: the environment.
-        seed: seed of the search.
     """
     restarts, rounds = 16, 15
     # A round scores 160 actions on 64 new pages; the best 16 give the next mean and spread.

@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 
 from tests.support.control_files import hopper_like, write_hdf5
-from tests.support.result_rows import result_row
+from tests.support.result_rows import read_configurations, result_row
 from ucfrec.benchmark.cells import Budget, Evaluation
 from ucfrec.errors import InputError
 from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import read_configurations, read_rows
+from ucfrec.results.rows_file import read_rows
 from ucfrec_control.benchmark import rates
 from ucfrec_control.benchmark.budgets import BUDGETS, TRIED_RATES
 from ucfrec_control.benchmark.methods import METHODS, TABLES, WITH_TIME

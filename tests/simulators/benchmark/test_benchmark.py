@@ -10,7 +10,7 @@ import pytest
 
 from tests.support.causes import QUICK
 from tests.support.real_data import data_folder
-from tests.support.result_rows import result_row
+from tests.support.result_rows import read_configurations, result_row
 from ucfrec.benchmark.cells import Budget, Evaluation, key, training_config
 from ucfrec.benchmark.estimate import announcement, estimated_hours
 from ucfrec.benchmark.suite import Benchmark, BenchmarkRequest, show
@@ -22,12 +22,11 @@ from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior
 from ucfrec.files.atomic import read_json
 from ucfrec.plugins import load_plugin
-from ucfrec.results.rows_file import append_rows, read_configurations, read_rows
+from ucfrec.results.rows_file import append_rows, read_rows
 from ucfrec.runs.record import read_record
 from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 from ucfrec_simulators.benchmark import plan
-from ucfrec_simulators.benchmark.budgets import BUDGETS
-from ucfrec_simulators.benchmark.costs import COSTS
+from ucfrec_simulators.benchmark.budgets import BUDGETS, COSTS
 from ucfrec_simulators.benchmark.measure import measure
 from ucfrec_simulators.benchmark.methods import METHODS, SCREENED
 from ucfrec_simulators.benchmark.plan import RecommendationCells
@@ -225,7 +224,8 @@ def test_screened_methods_are_rows_of_the_distractor_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: QUICK)
-    given = planned(tmp_path, replace(TINY, sessions=300), tasks=["synthetic-catalog"])
+    budget = replace(TINY, sessions=300, settings=(*TINY.settings, "rule.sessions=10"))
+    given = planned(tmp_path, budget, tasks=["synthetic-catalog"])
     wanted = ("bc", *SCREENED)
     found = {
         cell.method: cell
@@ -330,6 +330,7 @@ def test_windows_drop_repeats_and_are_cut(tmp_path: Path) -> None:
         window([tmp_path / "log.parquet"], "time_ms", "date = 9")
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 def test_kuairand_learns_from_what_came_before_its_environments(tmp_path: Path) -> None:
     data_folder("kuairand")

@@ -32,7 +32,7 @@ from ucfrec.schema import FORBIDDEN
 from ucfrec_simulators.behaviors import Constant
 from ucfrec_simulators.kuai.behaviors import MASK, oracle, random_mask
 from ucfrec_simulators.kuai.environment import EXITS, REGIMES, ExitRule, KuaiEnv
-from ucfrec_simulators.kuai.exit_cuts import sessions_by_exit
+from ucfrec_simulators.kuai.logs import sessions_by_exit
 from ucfrec_simulators.session_env import SingleSession
 
 RULES = [replace(rule, sliced=sliced) for rule in EXITS.values() for sliced in (False, True)]

@@ -89,6 +89,7 @@ def test_the_same_seed_gives_the_same_files_and_nothing_is_left_of_a_failure(
         kuairand(1, tmp_path / "c")
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 def test_real_rows_make_a_environment_that_can_be_believed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -165,6 +165,7 @@ def test_known_clicks_per_page(folder: Path, behavior: str, low: float, high: fl
     assert interval[1] - interval[0] < 0.05
 
 
+@pytest.mark.slow
 def test_session_lengths_and_ceiling(folder: Path) -> None:
     best = played(folder, "best-constant", 4000)
     assert best.lengths.min() == 1
@@ -173,6 +174,7 @@ def test_session_lengths_and_ceiling(folder: Path) -> None:
     assert best.returns.sum() / best.lengths.sum() > 9.9
 
 
+@pytest.mark.slow
 def test_the_mixture_is_mediocre_and_varied(folder: Path) -> None:
     mixed = played(folder, "mixture", 4000)
     rates = mixed.returns / mixed.lengths

@@ -1,0 +1,154 @@
+"""What several decision rules of one policy would have done at logged steps."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ucfrec import schema
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.scorer import Scorer, logged_history
+from ucfrec.arrays import BoolArray, Float64Array, IntArray
+from ucfrec.episodes.item_counts import liked_steps
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.progress import progress
+
+SHOWN = 10
+"""Items that a rule shows at a step."""
+_AT_ONCE = 256
+_Z = 1.96
+
+
+@torch.no_grad()
+def scores_at(
+    scorer: Scorer,
+    rules: Sequence[DecisionRule],
+    view: EpisodeStore,
+    episodes: IntArray,
+    steps: IntArray,
+) -> Iterator[tuple[slice, list[Tensor]]]:
+    """Scores (B, n_items) by each rule of batches of logged steps (M,), and which steps they are.
+
+    Policy and reward model are computed once for all rules of one target.
+    """
+    scorers = [scorer.under(rule) for rule in rules]
+    widest = max(scorers, key=lambda each: each.reach)
+    weighted = any(rule.reward_weight for rule in rules)
+    with progress(len(steps), "logged steps under each rule", "rows") as bar:
+        for first in range(0, len(steps), _AT_ONCE):
+            part = slice(first, min(first + _AT_ONCE, len(steps)))
+            known, seen = logged_history(widest, view, episodes[part], steps[part])
+            queries, scores = {}, list[Tensor]()
+            for each in scorers:
+                target = each.rule.target, each.rule.minimum_target
+                if target not in queries:
+                    aimed = each.with_target(known)
+                    queries[target] = aimed, each.query(aimed, rewards=weighted)
+                aimed, query = queries[target]
+                excluded = seen if each.rule.exclude_seen else None
+                scores.append(each.scores_of(query, aimed, excluded=excluded))
+            yield part, scores
+            bar.update(part.stop - part.start)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What validation sessions show of a rule without any model of the users."""
+
+    hits: float
+    """Share of liked steps whose item is among the ten best."""
+    likelihood: float
+    """Geometric mean of the probabilities with which the rule shows what was logged."""
+    effective_users: float | None = None
+    """Users of equal weight that say as much of the rule as the logged ones, whose sessions are
+    weighted by the rule's over the logged probabilities; of the half of the users with fewer, twice
+    the number. None without propensities."""
+    value: float | None = None
+    """Off-policy estimate of the return of a session (SNIPS); None where nothing has weight."""
+    error: float | None = None
+    """Its standard error over users."""
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """The 95% interval of `value`."""
+        if self.value is None or self.error is None:
+            return None
+        return self.value - _Z * self.error, self.value + _Z * self.error
+
+
+class LoggedEvidence:
+    """Validation sessions on which rules of one policy are compared with the log."""
+
+    def __init__(self, scorer: Scorer, view: EpisodeStore, most: int, seed: int) -> None:
+        """Args:
+        scorer: the policy.
+        view: validation episodes.
+        most: about the number of steps of the sessions that are drawn from many.
+        seed: of the draw.
+        """
+        order = np.random.default_rng([seed, 7]).permutation(view.n_episodes)
+        last = int(np.searchsorted(np.cumsum(view.lengths[order]), most))
+        self._scorer, self._view = scorer, view.select(np.sort(order[: last + 1]))
+        self._episodes, self._steps = self._view.all_steps()
+        at = self._episodes, self._steps
+        self._items = torch.from_numpy(self._view.step_values(schema.ITEM, *at).astype(np.int64))
+        self._liked = liked_steps(self._view, *at)
+        self._propensities: Float64Array | None = None
+        if schema.PROPENSITY in view.record.columns:
+            logged = self._view.step_values(schema.PROPENSITY, *at).astype(np.float64)
+            self._propensities = logged if (logged > 0).all() else None
+        owners = np.arange(self._view.n_episodes)
+        if view.has_users:
+            owners = self._view.episode_values(schema.USER)
+        self._users = np.unique(owners, return_inverse=True)[1]
+
+    @property
+    def has_propensities(self) -> bool:
+        """Whether all steps have one."""
+        return self._propensities is not None
+
+    @property
+    def users(self) -> int:
+        """The number of users."""
+        return int(self._users.max(initial=-1)) + 1
+
+    def of(self, rules: Sequence[DecisionRule]) -> list[Evidence]:
+        """The evidence of each rule."""
+        shape = len(rules), len(self._steps)
+        logs, hits = np.zeros(shape), np.zeros(shape, dtype=bool)
+        at = self._view, self._episodes, self._steps
+        for part, scores in scores_at(self._scorer, rules, *at):
+            items = self._items[part].unsqueeze(1)
+            for n, (rule, each) in enumerate(zip(rules, scores, strict=True)):
+                chances = rule.log_probabilities(each)
+                logs[n, part] = chances.gather(1, items)[:, 0].double().numpy()
+                top = each.topk(min(SHOWN, each.shape[1])).indices
+                hits[n, part] = (top == items).any(1).numpy()
+        return [self._evidence(one, hit) for one, hit in zip(logs, hits, strict=True)]
+
+    def _evidence(self, logs: Float64Array, hits: BoolArray) -> Evidence:
+        rate = float(hits[self._liked].mean()) if self._liked.any() else 0.0
+        likelihood = float(np.exp(logs.mean()))
+        if self._propensities is None:
+            return Evidence(rate, likelihood)
+        sums = np.bincount(self._episodes, logs - np.log(self._propensities))
+        weights = np.exp(np.minimum(sums, 100.0))
+        returns = self._view.returns.astype(np.float64)
+        above, below = (
+            np.bincount(self._users, each).astype(np.float64)
+            for each in (weights * returns, weights)
+        )
+        enough = min(_effective(below[half::2]) for half in (0, 1)) * 2
+        if not below.any():
+            return Evidence(rate, likelihood, 0.0)
+        value = above.sum() / below.sum()
+        error = np.sqrt(np.square(above - value * below).sum()) / below.sum()
+        return Evidence(rate, likelihood, enough, float(value), float(error))
+
+
+def _effective(weights: Float64Array) -> float:
+    """(Σw)² / Σw² (Kish 1965)."""
+    total = float(weights.sum())
+    return total**2 / float(np.square(weights).sum()) if total else 0.0

@@ -78,17 +78,7 @@ def update_run(
     grown = store or out.with_name(out.name + STORE_SUFFIX)
     with claimed(grown, "updated"):
         counts = append_logs(before.path, paths, grown, mapping, options.append)
-    opened = EpisodeStore.open(grown)
-    for split in ("validation", "test"):
-        if not opened.split(split).n_episodes:
-            raise InputError(
-                f"the new logs leave no {split} rows, to choose a rule and compare the runs on; "
-                "give more rows, or another --split and --store"
-            )
-    added = np.arange(opened.n_episodes - counts["episodes"], opened.n_episodes)
-    if trained.dropped:
-        opened = opened.without_observation_dimensions(trained.dropped)
-        before = before.without_observation_dimensions(trained.dropped)
+    opened = _opened(grown, trained)
     full = _from_nothing(trained.record)
     config = warm_settings(full, options.share)
     if options.seed is not None:
@@ -104,15 +94,45 @@ def update_run(
     if record.update is None or record.update.run != trained.fingerprint:
         raise InputError(f"{out} is no update of {run}; name another run folder")
     if record.update.verdict is None:
-        found = drift(trained, before.split("train"), opened.select(added), counts, config.seed)
-        newest = opened.split("test")
-        acting = TrainedPolicy.load(run)
-        verdict = compare_runs(TrainedPolicy.load(out, split=True), acting, newest, config.seed)
-        update = record.update.model_copy(update={"drift": found, "verdict": verdict})
-        record = record.with_entries(update=update).written(out)
+        record = _compared(out, record, trained, before, opened, counts)
     if options.refit:
         refit_within(EpisodeStore.open(grown), out)
     return record
+
+
+def _compared(
+    out: Path,
+    record: RunRecord,
+    trained: TrainedPolicy,
+    before: EpisodeStore,
+    opened: EpisodeStore,
+    counts: dict[str, Any],
+) -> RunRecord:
+    """Write the drift of the new rows and the verdict to the record of the new run."""
+    assert record.update is not None
+    seed, first = record.config.seed, opened.n_episodes - counts["episodes"]
+    added = opened.select(np.arange(first, opened.n_episodes))
+    found = drift(trained, before.split("train"), added, counts, seed)
+    new, acting = TrainedPolicy.load(out, split=True), TrainedPolicy.load(trained.folder)
+    verdict = compare_runs(new, acting, opened.split("test"), seed)
+    update = record.update.model_copy(update={"drift": found, "verdict": verdict})
+    return record.with_entries(update=update).written(out)
+
+
+def _opened(path: Path, trained: TrainedPolicy) -> EpisodeStore:
+    """A store as the run sees it, with rows to choose a rule and to compare on.
+
+    Raises:
+        InputError: there are none.
+    """
+    store = EpisodeStore.open(path)
+    for split in ("validation", "test"):
+        if not store.split(split).n_episodes:
+            raise InputError(
+                f"the new logs leave no {split} rows, to choose a rule and compare the runs on; "
+                "give more rows, or another --split and --store"
+            )
+    return store.without_observation_dimensions(trained.dropped) if trained.dropped else store
 
 
 def _store_before(run: Path, trained: TrainedPolicy) -> EpisodeStore:

@@ -265,15 +265,8 @@ def prepared_log(
     keep_unknown: bool = False,
     onto: Path | None = None,
 ) -> Iterator[PreparedLog]:
-    """The log, sorted and counted, with the tables of its ids.
-
-    Args:
-        mapping: as of `prepare`.
-        options: as of `prepare`.
-        like: as of `prepare`.
-        keep_unknown: as of `prepare`.
-        onto: a store whose users and items keep their numbers; others follow.
-    """
+    """The log, sorted and counted, with the tables of its ids; `onto` is a store whose users and
+    items keep their numbers, and others follow."""
     reward = options.reward or mapping.reward or schema.REWARD
     session_by = options.session_by or mapping.session_by
     known = None if like is None or keep_unknown else like / ITEMS_FILE

@@ -57,7 +57,7 @@ def update_run(
     with fewer steps; the user model is fitted and the decision rule chosen anew. The validation
     split is the second newest part of the new rows, the test split, on which the runs are compared,
     the newest. Once they are compared, the new run goes on learning from these rows, too. Neither
-    the run nor its store is changed. `update` of the record has the drift and the verdict.
+    the run nor its store is changed.
 
     Args:
         run: a finished run on a store of logs of items, which must be there.
@@ -67,6 +67,9 @@ def update_run(
         mapping: as of `ucfrec.logs.append.append_logs`.
         options: None for the defaults.
 
+    Returns:
+        The record of the new run; `update` has the drift of the new rows and the verdict.
+
     Raises:
         InputError: the run or the logs cannot be used, or `out` or `store` is something else.
     """
@@ -75,43 +78,61 @@ def update_run(
     grown = store or out.with_name(out.name + STORE_SUFFIX)
     with claimed(grown, "updated"):
         counts = append_logs(before.path, paths, grown, mapping, options.append)
-    opened = _with_splits(EpisodeStore.open(grown))
-    added = np.arange(opened.n_episodes - counts["episodes"], opened.n_episodes)
-    if trained.dropped:
-        opened = opened.without_observation_dimensions(trained.dropped)
-        before = before.without_observation_dimensions(trained.dropped)
+    opened = _opened(grown, trained)
     full = _from_nothing(trained.record)
     config = warm_settings(full, options.share)
-    config = config if options.seed is None else replace(config, seed=options.seed)
-    of, appended = run.resolve().name, _numbers(counts)
+    if options.seed is not None:
+        config = replace(config, seed=options.seed)
     update = Update(
-        of=of, run=trained.fingerprint, settings_from_nothing=asdict(full), appended=appended
+        of=run.resolve().name,
+        run=trained.fingerprint,
+        settings_from_nothing=asdict(full),
+        appended=_numbers(counts),
     )
     about = {"update": update, "dropped_observations": trained.dropped}
     record = train_run(opened, out, config, about, initial=run)
     if record.update is None or record.update.run != trained.fingerprint:
         raise InputError(f"{out} is no update of {run}; name another run folder")
     if record.update.verdict is None:
-        seed, newest = config.seed, opened.split("test")
-        found = drift(trained, before.split("train"), opened.select(added), counts, seed)
-        runs = TrainedPolicy.load(out, split=True), TrainedPolicy.load(run)
-        entries = {"drift": found, "verdict": compare_runs(*runs, newest, seed)}
-        update = record.update.model_copy(update=entries)
-        record = record.with_entries(update=update).written(out)
+        record = _compared(out, record, trained, before, opened, counts)
     if options.refit:
         refit_within(EpisodeStore.open(grown), out)
     return record
 
 
-def _with_splits(grown: EpisodeStore) -> EpisodeStore:
-    """Check that a grown store has rows to choose a rule and compare the runs on."""
+def _compared(
+    out: Path,
+    record: RunRecord,
+    trained: TrainedPolicy,
+    before: EpisodeStore,
+    opened: EpisodeStore,
+    counts: dict[str, Any],
+) -> RunRecord:
+    """Write the drift of the new rows and the verdict to the record of the new run."""
+    assert record.update is not None
+    seed, first = record.config.seed, opened.n_episodes - counts["episodes"]
+    added = opened.select(np.arange(first, opened.n_episodes))
+    found = drift(trained, before.split("train"), added, counts, seed)
+    new, acting = TrainedPolicy.load(out, split=True), TrainedPolicy.load(trained.folder)
+    verdict = compare_runs(new, acting, opened.split("test"), seed)
+    update = record.update.model_copy(update={"drift": found, "verdict": verdict})
+    return record.with_entries(update=update).written(out)
+
+
+def _opened(path: Path, trained: TrainedPolicy) -> EpisodeStore:
+    """A store as the run sees it, with rows to choose a rule and to compare on.
+
+    Raises:
+        InputError: there are none.
+    """
+    store = EpisodeStore.open(path)
     for split in ("validation", "test"):
-        if not grown.split(split).n_episodes:
+        if not store.split(split).n_episodes:
             raise InputError(
                 f"the new logs leave no {split} rows, to choose a rule and compare the runs on; "
                 "give more rows, or another --split and --store"
             )
-    return grown
+    return store.without_observation_dimensions(trained.dropped) if trained.dropped else store
 
 
 def _store_before(run: Path, trained: TrainedPolicy) -> EpisodeStore:
